@@ -1,0 +1,57 @@
+"""The PID that all of the field compares with."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax.numpy as jnp
+from jax import Array
+
+from ventbench.controllers.base import Observation
+
+#: Time constant of the exponential averages, s (authors' code; the recordings obey it).
+TIME_CONSTANT = 0.5
+
+
+@flax.struct.dataclass
+class PIDState:
+    """Averages of a PID: proportional error of the step before, I and D term, cmH2O, ``(...)``."""
+
+    error: Array
+    integral: Array
+    derivative: Array
+
+
+@flax.struct.dataclass
+class PID:
+    """PID on the pressure error with leaky integral and smoothed difference.
+
+    With ``e = target - pressure`` and ``a = dt / (dt + 0.5 s)``, at each step:
+    ``i += a (e - i)``; ``d += a (e - e_before - d)``; ``u_in = P e + I i + D d``. All three start
+    from zero at every breath.
+
+    Attributes:
+        P: proportional gain, %/cmH2O, shape ``(...)``; so ``I`` and ``D``.
+    """
+
+    P: Array | float
+    I: Array | float  # noqa: E741 - the field's name
+    D: Array | float = 0.0
+
+    def init(self, shape: tuple[int, ...]) -> PIDState:
+        """State before the first breath."""
+        zero = jnp.zeros(shape)
+        return PIDState(zero, zero, zero)
+
+    def step(self, state: PIDState, observation: Observation) -> tuple[PIDState, Array]:
+        """One control step; see the class."""
+        restart = observation.time == 0
+        before, integral, derivative = (
+            jnp.where(restart, 0.0, leaf)
+            for leaf in (state.error, state.integral, state.derivative)
+        )
+        error = observation.target - observation.pressure
+        a = observation.dt / (observation.dt + TIME_CONSTANT)
+        integral = integral + a * (error - integral)
+        derivative = derivative + a * (error - before - derivative)
+        u_in = self.P * error + self.I * integral + self.D * derivative
+        return PIDState(error, integral, derivative), u_in

@@ -1,0 +1,107 @@
+"""The loop around a plant, one control step at a time: the only place where it is written.
+
+The scan of :mod:`ventbench.rollout` and the stepwise scorer of :mod:`ventbench.submissions` both
+call these functions, so that a controller scores the same either way.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.struct
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ventbench import protocol, waveform
+from ventbench.controllers import expiratory
+from ventbench.controllers.base import Observation
+from ventbench.plants.base import Plant
+from ventbench.scenario import Scenario
+
+# Tables over the step of the breath: two breaths of target, so that looking ahead needs no modulo.
+_TARGET = waveform.shape(np.arange(2 * protocol.BREATH_STEPS))
+_EXPIRATORY = expiratory.u_in(np.arange(protocol.BREATH_STEPS))
+
+
+@flax.struct.dataclass
+class Bench:
+    """A batch of plants in mid-breath.
+
+    Attributes:
+        plant: state of the plants.
+        pressure: true airway pressure, cmH2O, shape ``(...)``.
+        previous: command of the step before as applied, %, shape ``(...)``.
+    """
+
+    plant: Any
+    pressure: Array
+    previous: Array
+
+
+def vary(plant: Plant, scenario: Scenario) -> Plant:
+    """Return the plants of the scenario's cells: R and C off their nominal values.
+
+    Raises:
+        TypeError: if the plant cannot be varied.
+    """
+    if not hasattr(plant, "vary"):
+        raise TypeError(f"{type(plant).__name__} has no vary(r_scale, c_scale)")
+    return plant.vary(scenario.r_scale, scenario.c_scale)  # type: ignore[attr-defined]
+
+
+def start_breath(plant: Plant, scenario: Scenario) -> Bench:
+    """Lungs at rest at the start of an inspiration."""
+    return Bench(
+        plant.init(scenario.start, scenario.peep), scenario.start, jnp.zeros_like(scenario.start)
+    )
+
+
+def target(scenario: Scenario, step: Array | int) -> Array:
+    """Target pressure at a step of the breath, cmH2O, shape ``(...)``."""
+    return scenario.peep + (scenario.pip - scenario.peep) * jnp.asarray(_TARGET)[step]
+
+
+def observe(scenario: Scenario, bench: Bench, breath: Array | int, step: Array | int) -> Observation:
+    """What the controller sees at a step of an inspiration.
+
+    Args:
+        scenario: the cells.
+        bench: their plants now.
+        breath: index of the breath.
+        step: index of the step in the breath, below ``INSPIRATION_STEPS``.
+    """
+    measured = bench.pressure + scenario.noise[..., breath, step]
+    quantum = jnp.where(scenario.quantum > 0, scenario.quantum, 1.0)
+    measured = jnp.where(scenario.quantum > 0, jnp.round(measured / quantum) * quantum, measured)
+    ahead = jnp.stack(
+        [target(scenario, step + 1 + k) for k in range(protocol.TARGETS_AHEAD)], axis=-1
+    )
+    now = jnp.broadcast_to(target(scenario, step), measured.shape)
+    return Observation(step * scenario.dt, scenario.dt, measured, now, ahead, bench.previous)
+
+
+def inspire(plant: Plant, scenario: Scenario, bench: Bench, u_in: Array) -> tuple[Bench, Array]:
+    """Apply one inspiratory command, clipped to the valve's range.
+
+    Args:
+        plant: the varied plants.
+        scenario: the cells.
+        bench: their plants now.
+        u_in: what the controller asked for, %, shape ``(...)``.
+
+    Returns:
+        The plants one step later and the command as applied, %.
+    """
+    applied = jnp.clip(u_in, 0.0, protocol.U_MAX)
+    # The held command reaches the valve `delay` of a step late: over this step it averages to
+    late = (1.0 - scenario.delay) * applied + scenario.delay * bench.previous
+    state, pressure = plant.step(bench.plant, late, jnp.zeros_like(late), scenario.dt)
+    return Bench(state, pressure, applied), applied
+
+
+def expire(plant: Plant, scenario: Scenario, bench: Bench, step: Array | int) -> tuple[Bench, Array]:
+    """Apply the hard-coded expiratory command of a step; likewise."""
+    u_in = jnp.broadcast_to(jnp.asarray(_EXPIRATORY)[step], bench.pressure.shape).astype(bench.pressure.dtype)
+    state, pressure = plant.step(bench.plant, u_in, jnp.ones_like(u_in), scenario.dt)
+    return Bench(state, pressure, u_in), u_in

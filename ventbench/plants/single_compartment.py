@@ -1,0 +1,91 @@
+"""The textbook lung: one resistance, one compliance, and the PVP's valves."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax.numpy as jnp
+from jax import Array
+from numpy.typing import ArrayLike
+
+from ventbench.lungs import Lung
+
+#: Flow of the PVP's inspiratory valve, mL/s per % (137 L/min fully open).
+VALVE_GAIN = 22.8
+
+#: Resistance of the expiratory path, cmH2O/(L/s).
+EXPIRATORY_RESISTANCE = 5.0
+
+
+@flax.struct.dataclass
+class SingleCompartmentState:
+    """Alveolar pressure and pressure behind the expiratory valve, cmH2O, shape ``(...)``."""
+
+    alveolar: Array
+    peep: Array
+
+
+@flax.struct.dataclass
+class SingleCompartment:
+    """R-C lung, solved exactly over each held command.
+
+    Inspiration: ``dP_alv/dt = q / C``, ``p = P_alv + R q`` with the valve's flow
+    ``q = gain u_in``. Expiration (valve open): flow leaves through ``R_ex`` in series with ``R``
+    towards PEEP, so that ``P_alv`` relaxes to ``peep + R_ex q_in`` with time constant
+    ``(R + R_ex) C``. Everything with R in cmH2O s/L and C in L/cmH2O inside.
+
+    Attributes:
+        R: airway resistance, cmH2O/(L/s), shape ``()`` or ``(...)``.
+        C: compliance, mL/cmH2O, likewise.
+        gain: flow of the inspiratory valve, mL/s per %.
+        R_ex: resistance of the expiratory path, cmH2O/(L/s).
+    """
+
+    R: Array
+    C: Array
+    gain: Array
+    R_ex: Array
+
+    def init(self, pressure: Array, peep: Array | None = None) -> SingleCompartmentState:
+        """Lung at rest; see :class:`~ventbench.plants.base.Plant`."""
+        return SingleCompartmentState(pressure, pressure if peep is None else peep)
+
+    def step(
+        self, state: SingleCompartmentState, u_in: Array, u_out: Array, dt: Array
+    ) -> tuple[SingleCompartmentState, Array]:
+        """Exact solution over one held command; see the class."""
+        flow = self.gain * u_in / 1000.0  # L/s
+        compliance = self.C / 1000.0  # L/cmH2O
+        # Inspiration: all of the valve's flow enters the lung.
+        filled = state.alveolar + flow * dt / compliance
+        inspired = filled + self.R * flow
+        # Expiration: the airway sits between the valve's flow, R to the lung and R_ex to PEEP.
+        rest = state.peep + self.R_ex * flow
+        decay = jnp.exp(-dt / ((self.R + self.R_ex) * compliance))
+        emptied = rest + (state.alveolar - rest) * decay
+        expired = (self.R * rest + self.R_ex * emptied) / (self.R + self.R_ex)
+        alveolar = u_out * emptied + (1.0 - u_out) * filled
+        pressure = u_out * expired + (1.0 - u_out) * inspired
+        return SingleCompartmentState(alveolar, state.peep), pressure
+
+    def vary(self, r_scale: Array, c_scale: Array) -> SingleCompartment:
+        """Return the same lung with other R and C."""
+        return self.replace(R=self.R * r_scale, C=self.C * c_scale)  # type: ignore[attr-defined]
+
+
+def single_compartment(
+    lung: Lung, *, gain: ArrayLike = VALVE_GAIN, R_ex: ArrayLike = EXPIRATORY_RESISTANCE
+) -> SingleCompartment:
+    """Build a :class:`SingleCompartment` lung.
+
+    Args:
+        lung: its label's R, cmH2O/(L/s), and C, mL/cmH2O.
+        gain: flow of the inspiratory valve, mL/s per %.
+        R_ex: resistance of the expiratory path, cmH2O/(L/s).
+
+    Raises:
+        ValueError: if a parameter is not positive.
+    """
+    for name, value in (("R", lung.R), ("C", lung.C), ("gain", gain), ("R_ex", R_ex)):
+        if not jnp.all(jnp.asarray(value) > 0):
+            raise ValueError(f"single compartment: {name} = {value} must be positive")
+    return SingleCompartment(*(jnp.asarray(x, float) for x in (lung.R, lung.C, gain, R_ex)))

@@ -1,0 +1,109 @@
+"""Whole runs in one compiled scan over time, vectorised over everything else."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ventbench import environment as env
+from ventbench import protocol
+from ventbench.controllers.base import Controller
+from ventbench.plants.base import Plant
+from ventbench.scenario import Scenario
+
+BREATHS, INSPIRATION = protocol.BREATHS, protocol.INSPIRATION_STEPS
+
+
+@jax.jit
+def open_loop(plant: Plant, start: Array, u_in: Array, u_out: Array, dt: Array) -> Array:
+    """Pressures that a plant answers to recorded commands with, from the recorded start.
+
+    Args:
+        plant: any plant.
+        start: first pressure, cmH2O, shape ``(n,)``.
+        u_in: inspiratory valve, %, shape ``(n, T)``.
+        u_out: expiratory valve, 0/1, shape ``(n, T)``.
+        dt: time from each sample to the next, s, shape ``(n, T)``; the last one is not used.
+
+    Returns:
+        Pressure at each sample, cmH2O, shape ``(n, T)``; the first is ``start``.
+    """
+
+    def step(state: Any, command: tuple[Array, Array, Array]) -> tuple[Any, Array]:
+        return plant.step(state, *command)
+
+    commands = tuple(jnp.moveaxis(x[:, :-1], 1, 0) for x in (u_in, u_out, dt))
+    _, pressure = jax.lax.scan(step, plant.init(start), commands)
+    return jnp.concatenate([start[:, None], jnp.moveaxis(pressure, 0, 1)], axis=1)
+
+
+@flax.struct.dataclass
+class Inspirations:
+    """Inspirations of a closed-loop run; every array has shape ``(..., BREATHS, steps)``.
+
+    Attributes:
+        pressure: true airway pressure at each step, cmH2O.
+        requested: what the controller asked for, %.
+        u_in: what was applied, %.
+    """
+
+    pressure: Array
+    requested: Array
+    u_in: Array
+
+
+@flax.struct.dataclass
+class Expirations:
+    """The expirations that follow, likewise shaped; the expiratory valve is open throughout."""
+
+    pressure: Array
+    u_in: Array
+
+
+def _breath(
+    plant: Plant, controller: Controller, scenario: Scenario, whole: bool, state: Any, breath: Array
+) -> tuple[Any, tuple[Inspirations, Expirations | None]]:
+    def inspire(carry: tuple[env.Bench, Any], step: Array) -> tuple[Any, Inspirations]:
+        bench, state = carry
+        state, requested = controller.step(state, env.observe(scenario, bench, breath, step))
+        after, applied = env.inspire(plant, scenario, bench, requested)
+        return (after, state), Inspirations(bench.pressure, requested, applied)
+
+    def expire(bench: env.Bench, step: Array) -> tuple[env.Bench, Expirations]:
+        after, u_in = env.expire(plant, scenario, bench, step)
+        return after, Expirations(bench.pressure, u_in)
+
+    steps = jnp.arange(protocol.BREATH_STEPS)
+    start = (env.start_breath(plant, scenario), state)
+    (bench, state), inspirations = jax.lax.scan(inspire, start, steps[:INSPIRATION])
+    expirations = None
+    if whole:
+        _, expirations = jax.lax.scan(expire, bench, steps[INSPIRATION:])
+    return state, (inspirations, expirations)
+
+
+@partial(jax.jit, static_argnames="whole")
+def closed_loop(
+    plant: Plant, controller: Controller, scenario: Scenario, *, whole: bool = False
+) -> tuple[Inspirations, Expirations | None]:
+    """Run a pure controller through the protocol on one lung, all cells at once.
+
+    Args:
+        plant: any plant that can be varied.
+        controller: parameters broadcast against the cells.
+        scenario: the cells, batch shape ``(...)``.
+        whole: simulate the expirations too (for pictures; no score depends on them).
+
+    Returns:
+        The inspirations, and the expirations if asked for.
+    """
+    varied = env.vary(plant, scenario)
+    run = partial(_breath, varied, controller, scenario, whole)
+    _, out = jax.lax.scan(run, controller.init(scenario.pip.shape), jnp.arange(BREATHS))
+    # Scans stack time in front: (breath, step, ...) -> (..., breath, step).
+    return jax.tree.map(lambda x: jnp.moveaxis(x, (0, 1), (-2, -1)), out)

@@ -41,13 +41,18 @@ def write_text(path: Path, text: str) -> None:
     write_atomically(path, lambda file: file.write(text.encode()))
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Create or replace a JSON file in one step; NaN and infinity are refused.
+def as_json(value: Any) -> str:
+    """Text of a JSON file.
 
     Raises:
         ValueError: if a number is not finite.
     """
-    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+    return json.dumps(value, indent=2, allow_nan=False) + "\n"
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Create or replace a JSON file in one step; see :func:`as_json`."""
+    write_text(path, as_json(value))
 
 
 def sha256(path: Path) -> str:

@@ -1,0 +1,69 @@
+"""The public recordings, where they are present."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ventbench.recordings import check, iter_breaths, load, load_respiraworks, split_by_breath
+from ventbench.recordings.times import interval_table
+
+
+def test_the_measured_breaths(public):
+    path = public / "pvp_quicklung.csv"
+    breaths, report = load(path), check(path)
+    assert report.ok
+    assert not report.warnings
+    assert breaths.pressure.shape == (141, 80)
+    assert len(report.lungs) == len(breaths.by_lung()) == 9
+    assert {11, 22} == {min(report.lungs.values()), max(report.lungs.values())}
+    assert report.lungs == {name: len(part) for name, part in breaths.by_lung().items()}
+    assert breaths.breath_id[breaths.time_inferred].tolist() == [40, 48, 96, 145, 148, 166]
+    assert list(report.time_inferred) == [40, 48, 96, 145, 148, 166]
+    assert not np.isnan(breaths.pressure).any()
+    assert (breaths.dt > 0.02).all()
+    assert (breaths.dt < 0.04).all()
+    assert set(breaths.inspiratory.sum(axis=1)) <= set(range(28, 33))
+    assert "6 breaths have no times" in breaths.notes[0]
+    parts = list(iter_breaths(path, batch=50))
+    np.testing.assert_array_equal(np.concatenate([p.time for p in parts]), breaths.time)
+
+
+def test_inferred_intervals_are_good(public):
+    breaths = load(public / "pvp_quicklung.csv")
+    known = ~breaths.time_inferred
+    interval = breaths.time[known, -1] / 79
+    count = breaths.inspiratory[known].sum(axis=1)
+    off = []
+    for i, (n, dt) in enumerate(zip(count, interval, strict=True)):
+        others = np.arange(len(count)) != i
+        estimate = interval_table(count[others], interval[others]).estimate(int(n), 80)
+        assert estimate is not None
+        off.append(abs(estimate - dt))
+    assert np.median(off) < 0.13e-3
+    assert np.quantile(off, 0.9) < 0.4e-3
+
+
+def test_the_reconstructed_breaths(public):
+    path = public / "pvp_quicklung_reconstructed.csv"
+    breaths, report = load(path), check(path)
+    assert len(breaths) == 599
+    assert int(np.isfinite(breaths.pressure).sum()) == 13_013
+    assert report.blank_pressures == 599 * 80 - 13_013
+    assert not breaths.time_inferred.any()
+
+
+def test_a_split_of_the_measured_breaths(public):
+    breaths = load(public / "pvp_quicklung.csv")
+    split = split_by_breath(breaths)
+    assert 141 * 0.15 < len(split.held_out_ids) < 141 * 0.25
+    train, held_out = split.apply(breaths)
+    assert set(held_out.lung_ids) == set(train.lung_ids)
+    assert len(set(held_out.lung_ids)) == 9
+
+
+def test_respiraworks(public):
+    path = public / "respiraworks_quicklung.parquet"
+    assert "missing columns id, breath_id, u_in, u_out" in str(check(path).problems[0])
+    runs = load_respiraworks(path)
+    assert len(runs) == 48
+    assert all(abs(np.diff(run.time) - 0.01).max() < 1e-6 for run in runs)

@@ -1,0 +1,102 @@
+"""Recordings of the RespiraWorks ventilator: another schema, 100 Hz, several breaths a run.
+
+Its valves are not those of the ventilator that ventbench simulates, so its commands are kept as
+they are and not turned into u_in and u_out. Lung mechanics can be read from pressure and flow.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+
+from ventbench.recordings.files import fail, kind_of
+
+SIGNALS = {
+    "pressure": "cmH2O",
+    "flow": "mL/s",
+    "volume": "mL",
+    "target": "cmH2O",
+    "cmd_inh_valve": "as logged",
+    "cmd_exh_valve": "as logged",
+    "cmd_psol": "as logged",
+    "dp_inhale": "as logged",
+    "dp_exhale": "as logged",
+}
+"""Signals of a run and their units."""
+_LABELS = ("run", "test", "breath", "time_step", "R", "C", "drive")
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One test of one day: consecutive breaths on one lung.
+
+    Attributes:
+        name: name of the test day or gas supply.
+        test: number of the ISO test condition.
+        drive: what drives the gas.
+        R: resistance the operators wrote down, cmH2O/(L/s).
+        C: compliance the operators wrote down, mL/cmH2O.
+        breath: number of each sample's breath, int64, (T,).
+        time: s, float64, (T,).
+        signals: by the names of `SIGNALS`, float64, NaN where not logged, each (T,).
+    """
+
+    name: str
+    test: int
+    drive: str
+    R: float
+    C: float
+    breath: np.ndarray
+    time: np.ndarray
+    signals: dict[str, np.ndarray]
+
+
+def load_respiraworks(path: str | os.PathLike[str]) -> tuple[Run, ...]:
+    """Read a RespiraWorks Parquet file.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Its runs in file order.
+
+    Raises:
+        RecordingError: the file cannot be read, lacks a column, or its times do not increase.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    name = str(path)
+    if kind_of(path) != "parquet":
+        raise fail(name, "this is not a Parquet file", "RespiraWorks recordings are Parquet.")
+    try:
+        frame = parquet.read_table(name).to_pandas()
+    except (pa.ArrowException, OSError) as error:
+        raise fail(name, f"the Parquet file cannot be read ({error})", "Copy it again.") from None
+    missing = [column for column in (*_LABELS, *SIGNALS) if column not in frame.columns]
+    if missing:
+        advice = "Name a RespiraWorks file; other recordings are read with load."
+        raise fail(name, f"missing columns {', '.join(missing)}", advice)
+    runs = []
+    for (run, test), rows in frame.groupby(["run", "test"], sort=False):
+        time = rows["time_step"].to_numpy(np.float64)
+        if not (np.diff(time) > 0.0).all():
+            what = f"time_step does not increase in run {run}, test {test}"
+            raise fail(name, what, "Write the file again in time order.")
+        signals = {column: rows[column].to_numpy(np.float64) for column in SIGNALS}
+        first = rows.iloc[0]
+        runs.append(
+            Run(
+                str(run),
+                int(str(test)),
+                str(first["drive"]),
+                float(first["R"]),
+                float(first["C"]),
+                rows["breath"].to_numpy(np.int64),
+                time,
+                signals,
+            )
+        )
+    return tuple(runs)

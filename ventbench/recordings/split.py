@@ -1,0 +1,158 @@
+"""Splitting recordings into training and held-out breaths: by breath, seeded, recorded."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections import Counter
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ventbench.errors import InputError
+from ventbench.files import write_text
+from ventbench.recordings.breaths import Breaths
+
+FORMAT = "ventbench-split-1"
+
+
+@dataclass(frozen=True)
+class Split:
+    """Which breaths are for training and which are held out.
+
+    Attributes:
+        train_ids: breath ids for training, increasing.
+        held_out_ids: breath ids held out, increasing; none of them is in `train_ids`.
+        seed: the seed it was made with.
+        fraction: the fraction held out that was asked for.
+        sha256: of the file the breaths came from, hex, or None.
+    """
+
+    train_ids: tuple[int, ...]
+    held_out_ids: tuple[int, ...]
+    seed: int
+    fraction: float
+    sha256: str | None
+
+    def __post_init__(self) -> None:
+        """Refuse an id that is there twice.
+
+        Raises:
+            InputError: an id is in both parts, or twice in one.
+        """
+        counts = Counter(self.train_ids + self.held_out_ids)
+        twice = [breath for breath, count in counts.items() if count > 1]
+        if twice:
+            raise InputError(
+                f"the split names breaths more than once: {twice[:10]} ({len(twice)} in all); "
+                "make a new one, and give each breath an id of its own"
+            )
+
+    def apply(self, breaths: Breaths) -> tuple[Breaths, Breaths]:
+        """Divide breaths as the split says.
+
+        Args:
+            breaths: from the file that was split; a selection of it is fine.
+
+        Returns:
+            Training and held-out breaths, each in the order of `breaths`.
+
+        Raises:
+            InputError: the breaths are from another file, or the split does not know one of them.
+        """
+        if self.sha256 and breaths.sha256 and self.sha256 != breaths.sha256:
+            raise InputError(
+                f"the split was made of a file with SHA-256 {self.sha256[:12]}..., but "
+                f"{breaths.source} has {breaths.sha256[:12]}...; make a new split of this file"
+            )
+        held_out = np.isin(breaths.breath_id, np.array(self.held_out_ids, dtype=np.int64))
+        train = np.isin(breaths.breath_id, np.array(self.train_ids, dtype=np.int64))
+        unknown = breaths.breath_id[~held_out & ~train]
+        if len(unknown):
+            raise InputError(
+                f"the split does not name breaths {unknown[:10].tolist()} ({len(unknown)} in all); "
+                "make a new split of this file"
+            )
+        return breaths.select(train), breaths.select(held_out)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {"format": FORMAT, **asdict(self)}
+
+    @classmethod
+    def from_dict(cls, plain: dict[str, Any]) -> Split:
+        """Read what `to_dict` gave.
+
+        Raises:
+            InputError: it is no split, or one that overlaps.
+        """
+        if plain.get("format") != FORMAT:
+            raise InputError(f"this is no split: format is {plain.get('format')!r}, not {FORMAT!r}")
+        try:
+            return cls(
+                tuple(int(i) for i in plain["train_ids"]),
+                tuple(int(i) for i in plain["held_out_ids"]),
+                int(plain["seed"]),
+                float(plain["fraction"]),
+                plain["sha256"],
+            )
+        except (KeyError, TypeError) as error:
+            raise InputError(f"this split is incomplete: {error}") from error
+
+
+def split_by_breath(breaths: Breaths, *, held_out: float = 0.2, seed: int = 0) -> Split:
+    """Hold out a fraction of the breaths of each lung.
+
+    The breaths of a lung are ordered by the SHA-256 of `{seed}:{breath_id}:{lung}` and the first
+    ones are held out: the same on every platform, and no matter how the breaths are ordered. A lung
+    of two breaths or more has at least one in each part; the only breath of a lung is for training.
+
+    Args:
+        breaths: ids must differ.
+        held_out: fraction to hold out, between 0 and 1.
+        seed: any whole number.
+
+    Returns:
+        The split.
+
+    Raises:
+        InputError: the fraction is not between 0 and 1, or an id is there twice.
+    """
+    if not 0.0 < held_out < 1.0:
+        raise InputError(f"held_out is {held_out}, but it must lie between 0 and 1")
+    train: list[int] = []
+    kept_out: list[int] = []
+    for lung, index in breaths.by_lung_index.items():
+        keyed = [(_key(seed, i, lung), i) for i in breaths.breath_id[index].tolist()]
+        ids = [breath for _, breath in sorted(keyed)]
+        wanted = math.floor(held_out * len(ids) + 0.5)
+        count = 0 if len(ids) < 2 else min(max(wanted, 1), len(ids) - 1)
+        kept_out += ids[:count]
+        train += ids[count:]
+    return Split(tuple(sorted(train)), tuple(sorted(kept_out)), seed, held_out, breaths.sha256)
+
+
+def save_split(split: Split, path: str | os.PathLike[str]) -> None:
+    """Write a split as JSON: a temporary file first, then a rename."""
+    write_text(Path(path), json.dumps(split.to_dict()) + "\n")
+
+
+def load_split(path: str | os.PathLike[str]) -> Split:
+    """Read a split from JSON.
+
+    Raises:
+        InputError: the file holds no split.
+        OSError: the file cannot be read.
+    """
+    try:
+        return Split.from_dict(json.loads(Path(path).read_text("utf-8")))
+    except (ValueError, AttributeError) as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _key(seed: int, breath_id: int, lung: str) -> bytes:
+    return hashlib.sha256(f"{seed}:{breath_id}:{lung}".encode()).digest()

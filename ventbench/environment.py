@@ -12,6 +12,7 @@ import flax.struct
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import NDArray
 
 from ventbench import protocol, waveform
 from ventbench.controllers import expiratory
@@ -22,6 +23,12 @@ from ventbench.scenario import Scenario
 # Tables over the step of the breath: two breaths of target, so that looking ahead needs no modulo.
 _TARGET = waveform.shape(np.arange(2 * protocol.BREATH_STEPS))
 _EXPIRATORY = expiratory.u_in(np.arange(protocol.BREATH_STEPS))
+
+
+def _table(values: NDArray[np.float64], scenario: Scenario) -> Array:
+    # With its type spelled out: JAX keeps the constant that it makes of a numpy array, and would
+    # bring a 64-bit one from an earlier trace into a 32-bit trace.
+    return jnp.asarray(values, jnp.result_type(scenario.pip))
 
 
 @flax.struct.dataclass
@@ -59,10 +66,12 @@ def start_breath(plant: Plant, scenario: Scenario) -> Bench:
 
 def target(scenario: Scenario, step: Array | int) -> Array:
     """Target pressure at a step of the breath, cmH2O, shape ``(...)``."""
-    return scenario.peep + (scenario.pip - scenario.peep) * jnp.asarray(_TARGET)[step]
+    return scenario.peep + (scenario.pip - scenario.peep) * _table(_TARGET, scenario)[step]
 
 
-def observe(scenario: Scenario, bench: Bench, breath: Array | int, step: Array | int) -> Observation:
+def observe(
+    scenario: Scenario, bench: Bench, breath: Array | int, step: Array | int
+) -> Observation:
     """What the controller sees at a step of an inspiration.
 
     Args:
@@ -100,8 +109,10 @@ def inspire(plant: Plant, scenario: Scenario, bench: Bench, u_in: Array) -> tupl
     return Bench(state, pressure, applied), applied
 
 
-def expire(plant: Plant, scenario: Scenario, bench: Bench, step: Array | int) -> tuple[Bench, Array]:
+def expire(
+    plant: Plant, scenario: Scenario, bench: Bench, step: Array | int
+) -> tuple[Bench, Array]:
     """Apply the hard-coded expiratory command of a step; likewise."""
-    u_in = jnp.broadcast_to(jnp.asarray(_EXPIRATORY)[step], bench.pressure.shape).astype(bench.pressure.dtype)
+    u_in = jnp.broadcast_to(_table(_EXPIRATORY, scenario)[step], bench.pressure.shape)
     state, pressure = plant.step(bench.plant, u_in, jnp.ones_like(u_in), scenario.dt)
     return Bench(state, pressure, u_in), u_in

@@ -14,3 +14,8 @@ def float64() -> AbstractContextManager[None]:
     each.
     """
     return jax.enable_x64(True)
+
+
+def float32() -> AbstractContextManager[None]:
+    """Context in which new JAX arrays and traces are 32-bit, which is JAX's default."""
+    return jax.enable_x64(False)

@@ -37,7 +37,7 @@ def open_loop(plant: Plant, start: Array, u_in: Array, u_out: Array, dt: Array) 
     def step(state: Any, command: tuple[Array, Array, Array]) -> tuple[Any, Array]:
         return plant.step(state, *command)
 
-    commands = tuple(jnp.moveaxis(x[:, :-1], 1, 0) for x in (u_in, u_out, dt))
+    commands = jax.tree.map(lambda x: jnp.moveaxis(x[:, :-1], 1, 0), (u_in, u_out, dt))
     _, pressure = jax.lax.scan(step, plant.init(start), commands)
     return jnp.concatenate([start[:, None], jnp.moveaxis(pressure, 0, 1)], axis=1)
 

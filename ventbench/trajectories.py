@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench import files
+from ventbench.errors import InputError
 
 Floats = NDArray[np.float64]
 
@@ -59,11 +62,12 @@ def load(path: Path) -> Trajectories:
     """Read what :meth:`Trajectories.save` wrote.
 
     Raises:
-        ValueError: if the file is not such a file.
+        InputError: if the file is not such a file.
         OSError: if it cannot be read.
     """
     try:
-        with np.load(path, allow_pickle=False) as npz:
+        # Opened here: np.load leaves a file open that it cannot make sense of.
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as npz:
             return Trajectories(
                 name=str(npz["name"]),
                 track=str(npz["track"]),
@@ -71,5 +75,6 @@ def load(path: Path) -> Trajectories:
                 pips=tuple(float(x) for x in npz["pips"]),
                 **{k: npz[k] for k in ("time", "target", "pressure", "u_in", "u_out")},
             )
-    except (KeyError, ValueError) as error:
-        raise ValueError(f"{path} is not a trajectory file of ventbench: {error}") from error
+    # What np.load raises for a text, an empty or cut-off file, and for a plain array (TypeError).
+    except (KeyError, ValueError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path} is not a trajectory file of ventbench: {error}") from error

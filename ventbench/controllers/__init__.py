@@ -1,0 +1,1 @@
+"""Controllers: what they are, the PID, the hard-coded expiration."""

@@ -1,0 +1,79 @@
+# Everything a developer runs. `make` alone lists it.
+#
+# The environment is ./.venv, made from requirements.lock (versions and hashes) on first need and
+# reused until pyproject.toml, the lock or the version changes.
+
+PYTHON ?= python3
+PYTEST_ARGS ?=
+LOCK_ARGS ?=
+
+VENV := .venv
+PY := $(VENV)/bin/python
+READY := $(VENV)/.ready
+
+# What `make demo` does, once it is set up.
+DEMO := $(VENV)/bin/ventbench score submissions/pid_best submissions/pid_robust --out runs/demo
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-slow lint format lock bench wheel clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@echo "Variables: PYTHON (to make .venv with; $(PYTHON)), PYTEST_ARGS, LOCK_ARGS (--upgrade)"
+
+setup: $(READY) ## make .venv, or bring it up to date
+
+demo: setup ## score the PID submissions on the six lungs: table, report, rerun file
+	$(DEMO)
+
+test: lint ## lint, type check and the fast tests
+	$(PY) -m pytest -n auto $(PYTEST_ARGS)
+	@echo "The fast tests passed. 'make test-slow' runs the proofs that take minutes."
+
+test-slow: setup ## the tests that take minutes
+	$(PY) -m pytest -n auto -m slow $(PYTEST_ARGS)
+
+lint: setup ## ruff and pyright, changing nothing
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m pyright --pythonpath $(PY)
+
+format: setup ## let ruff mend and format the code
+	$(PY) -m ruff check --fix .
+	$(PY) -m ruff format .
+
+lock: setup ## write requirements.lock anew from pyproject.toml
+	$(PY) -m uv pip compile pyproject.toml --all-extras --universal --python-version 3.11 \
+		--fork-strategy fewest --generate-hashes --quiet --custom-compile-command "make lock" \
+		--output-file requirements.lock $(LOCK_ARGS)
+
+bench: setup ## every benchmark
+	@set -e; for file in $(wildcard benchmarks/[a-z]*.py); do \
+		echo "== $$file"; $(PY) $$file; \
+	done
+
+wheel: setup ## dist/ventbench-*.whl, with the frozen simulators and the submissions in it
+	rm -rf dist
+	$(PY) -m build --wheel --no-isolation --outdir dist
+
+clean: ## remove what was built; .venv, runs and records stay
+	rm -rf build dist .pytest_cache .ruff_cache .hypothesis
+	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Wheels only, each with a hash: nothing is built, so no build tool is fetched unpinned either.
+# A Python without ensurepip (Debian's, bare) makes a .venv without pip and installs from outside.
+$(READY): pyproject.toml requirements.lock ventbench/__init__.py
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+		found=$$($(PYTHON) --version 2>/dev/null) || found="no Python"; \
+		echo "ventbench needs Python 3.11 or newer; '$(PYTHON)' is $$found." >&2; \
+		echo "Name another one: make setup PYTHON=python3.12" >&2; exit 1; }
+	@$(PY) -c '' 2>/dev/null || $(PYTHON) -m venv --clear $(VENV) >/dev/null 2>&1 \
+		|| $(PYTHON) -m venv --clear --without-pip $(VENV)
+	@echo "Installing the packages of requirements.lock into $(VENV): a minute or a few."
+	@set -e; \
+	if $(PY) -m pip --version >/dev/null 2>&1; then pip="$(PY) -m pip"; \
+	else pip="$(PYTHON) -m pip --python $(PY)"; fi; \
+	install="$$pip install --quiet --disable-pip-version-check --progress-bar off"; \
+	$$install --require-hashes --only-binary :all: --requirement requirements.lock; \
+	$$install --no-deps --no-build-isolation --editable .
+	@touch $@

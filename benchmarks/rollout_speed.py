@@ -1,0 +1,214 @@
+"""Closed-loop rollout speed against the machine's own matrix products, measured in one run.
+
+Prints, for float32 batched PID rollouts on a learned plant of the paper's size (9 x 150):
+environment steps/s, GFLOP/s (multiply and add of every executed layer, boundary network included)
+and their ratio to plain matrix products of the same layer shapes; the latency of one run of 300
+steps; steps/s of the other plants. Nothing is asserted on time. Usage:
+
+    python benchmarks/rollout_speed.py [--batch 512 1024 2048] [--rounds 5] [--cpu-time]
+        [--json FILE]
+
+Rounds alternate rollouts and products, and the best of each is compared, since a machine shared
+with others slows both. With ``--cpu-time`` the clock counts this process's own processor seconds
+over all threads, so that the ratio holds on a busy machine too; rates are then those of one core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ventbench import protocol
+from ventbench.controllers.pid import PID
+from ventbench.files import write_json
+from ventbench.lungs import LUNGS
+from ventbench.plants.base import Plant
+from ventbench.plants.learned import Architecture, Learned, learned
+from ventbench.plants.single_compartment import single_compartment
+from ventbench.plants.two_balloon import two_balloon
+from ventbench.rollout import closed_loop
+from ventbench.scenario import Scenario, nominal
+
+#: Environment steps of one run without and with its expirations.
+STEPS = protocol.BREATHS * protocol.INSPIRATION_STEPS
+WHOLE_STEPS = protocol.BREATHS * protocol.BREATH_STEPS
+
+#: Plants that are compared besides the learned one; add a line for each new kind.
+OTHERS: dict[str, Callable[[], Plant]] = {
+    "single_compartment": lambda: single_compartment(LUNGS[4]),
+    "two_balloon": lambda: two_balloon(LUNGS[4]),
+}
+
+
+#: The clock in use.
+_CLOCK = [time.perf_counter]
+
+
+def layers(plant: Learned) -> list[tuple[int, int]]:
+    """Shapes of the matrices that one step multiplies with."""
+    shapes = [w.shape for w in plant.general.weights]
+    if plant.boundary is not None:
+        shapes += [plant.boundary.hidden.shape, plant.boundary.output.shape]
+    return [(int(a), int(b)) for a, b in shapes]
+
+
+def seconds(run: Callable[[], Any]) -> float:
+    """Time of one call by :data:`_CLOCK`, results waited for."""
+    started = _CLOCK[0]()
+    jax.block_until_ready(run())
+    return _CLOCK[0]() - started
+
+
+def cells(batch: int) -> tuple[PID, Scenario]:
+    """A grid's worth of PIDs and their nominal cells, shape ``(batch,)``."""
+    rng = np.random.default_rng(0)
+    pid = PID(*(jnp.asarray(rng.uniform(0, 5, batch), jnp.float32) for _ in range(2)))
+    return pid, nominal(np.resize(protocol.PIPS, batch))
+
+
+def xla_products(plant: Learned, batch: int) -> Callable[[], Any]:
+    """The general network's matrices alone, chained, as often as a run steps."""
+    weights = plant.general.weights
+
+    @jax.jit
+    def run(weights: tuple[jax.Array, ...], x: jax.Array) -> jax.Array:
+        def step(x: jax.Array, _: None) -> tuple[jax.Array, None]:
+            h = x
+            for w in weights:
+                h = h @ w
+            # Feed a little of the result back, so that no product can be left out.
+            return x.at[:, :2].add(1e-3 * h), None
+
+        return jax.lax.scan(step, x, None, length=STEPS)[0]
+
+    x = jax.random.normal(jax.random.key(0), (batch, weights[0].shape[0]), jnp.float32)
+    return lambda: run(weights, x)
+
+
+def blas_products(plant: Learned, batch: int) -> Callable[[], Any]:
+    """Likewise with NumPy's BLAS, in place and without Python between but the loop."""
+    weights = [np.asarray(w) for w in plant.general.weights]
+    rng = np.random.default_rng(0)
+    inputs = rng.standard_normal((batch, weights[0].shape[0]), np.float32)
+    outputs = [np.zeros((batch, w.shape[1]), np.float32) for w in weights]
+
+    def run() -> np.ndarray:
+        for _ in range(STEPS):
+            x = inputs
+            for w, out in zip(weights, outputs, strict=True):
+                x = np.matmul(x, w, out=out)
+        return outputs[-1]
+
+    return run
+
+
+def throughput(plant: Learned, batches: list[int], rounds: int) -> list[dict[str, float]]:
+    """Best rates a batch size; GFLOP/s and steps/s."""
+    step_flop = 2.0 * sum(a * b for a, b in layers(plant))
+    product_flop = 2.0 * sum(w.shape[0] * w.shape[1] for w in plant.general.weights)
+    rows = []
+    jobs = {}
+    for batch in batches:
+        pid, scenario = cells(batch)
+        jobs[batch] = {
+            "rollout": lambda pid=pid, scenario=scenario: closed_loop(plant, pid, scenario),
+            "xla": xla_products(plant, batch),
+            "blas": blas_products(plant, batch),
+        }
+        for run in jobs[batch].values():
+            jax.block_until_ready(run())
+    best = {(batch, name): np.inf for batch in batches for name in jobs[batch]}
+    for _ in range(rounds):
+        for batch, runs in jobs.items():
+            for name, run in runs.items():
+                best[batch, name] = min(best[batch, name], seconds(run))
+    for batch in batches:
+        rate = batch * STEPS / best[batch, "rollout"]
+        rows.append(
+            {
+                "batch": batch,
+                "steps_per_s": rate,
+                "rollout_gflops": rate * step_flop / 1e9,
+                "xla_gflops": batch * STEPS * product_flop / best[batch, "xla"] / 1e9,
+                "blas_gflops": batch * STEPS * product_flop / best[batch, "blas"] / 1e9,
+            }
+        )
+    return rows
+
+
+def latency(plant: Plant, repeats: int = 50) -> dict[str, float]:
+    """Best and median milliseconds of one compiled run of one cell."""
+    pid, scenario = PID(1.0, 3.0), nominal(20.0)
+    found = {}
+    for whole in (False, True):
+        run = lambda whole=whole: closed_loop(plant, pid, scenario, whole=whole)  # noqa: E731
+        jax.block_until_ready(run())
+        times = [1e3 * seconds(run) for _ in range(repeats)]
+        name = "300_steps" if whole else "inspirations"
+        found |= {f"{name}_best_ms": min(times), f"{name}_median_ms": float(np.median(times))}
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--batch", type=int, nargs="+", default=[512, 1024, 2048, 4096])
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--width", type=int, default=150)
+    parser.add_argument("--depth", type=int, default=9)
+    parser.add_argument("--activation", default="tanh")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--cpu-time", action="store_true")
+    options = parser.parse_args()
+    if options.cpu_time:
+        _CLOCK[0] = time.process_time
+    shape = Architecture(width=options.width, depth=options.depth, activation=options.activation)
+    plant = learned(jax.random.key(0), shape)
+    name = f"learned {options.depth} x {options.width} {options.activation}"
+    device = jax.devices()[0]
+    print(f"{device.platform} {device.device_kind}, {os.cpu_count()} cores, JAX {jax.__version__}")
+
+    print(f"\n{name}, closed-loop PID, float32; GFLOP/s")
+    print(f"{'batch':>6} {'steps/s':>10} {'rollout':>8} {'XLA':>6} {'BLAS':>6} {'ratio':>6}")
+    rows = throughput(plant, options.batch, options.rounds)
+    for row in rows:
+        reference = max(row["xla_gflops"], row["blas_gflops"])
+        print(
+            f"{row['batch']:6.0f} {row['steps_per_s']:10.0f} {row['rollout_gflops']:8.1f} "
+            f"{row['xla_gflops']:6.1f} {row['blas_gflops']:6.1f} "
+            f"{row['rollout_gflops'] / reference:6.2f}"
+        )
+    fastest = max(row["rollout_gflops"] for row in rows)
+    reference = max(max(row["xla_gflops"], row["blas_gflops"]) for row in rows)
+    ratio = fastest / reference
+    print(f"best rollout / best product of any batch: {ratio:.2f} (goal 0.80)")
+
+    single = latency(plant)
+    print(f"\none run, {name} (goal 4 ms):")
+    for key, value in single.items():
+        print(f"  {key:24} {value:8.2f}")
+
+    print("\nother plants, steps/s at the largest batch")
+    others = {}
+    pid, scenario = cells(max(options.batch))
+    for other, build in OTHERS.items():
+        run = lambda plant=build(): closed_loop(plant, pid, scenario)  # noqa: B008, E731
+        jax.block_until_ready(run())
+        others[other] = max(options.batch) * STEPS / min(seconds(run) for _ in range(10))
+        print(f"  {other:24} {others[other]:12.0f}")
+    if options.json:
+        write_json(
+            options.json,
+            {"plant": name, "rows": rows, "ratio": ratio, "latency": single, "others": others},
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,193 @@
+"""What every plant must hold. Add a plant by one line in PLANTS; sizes as in the protocol.
+
+Physics plants promise more (CLAIMS): a learned one gives what its training gave.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.typing import ArrayLike
+
+from ventbench import protocol
+from ventbench.controllers import expiratory
+from ventbench.lungs import lung
+from ventbench.plants.base import Plant
+from ventbench.plants.learned import Architecture, learned
+from ventbench.plants.single_compartment import single_compartment
+from ventbench.plants.two_balloon import two_balloon
+from ventbench.precision import float64
+from ventbench.rollout import open_loop
+
+SMALL = Architecture(pressures=3, controls=4, width=16, depth=3, boundaries=2, boundary_width=8)
+SELU = Architecture(width=24, depth=4, boundaries=0, activation="selu")
+#: The two ends of the scored settings.
+STIFF_AND_SOFT = ("R5C10", "R20C50")
+#: Built anew in each precision.
+PLANTS = {
+    **{f"single_compartment-{x}": partial(single_compartment, lung(x)) for x in STIFF_AND_SOFT},
+    **{f"two_balloon-{x}": partial(two_balloon, lung(x)) for x in STIFF_AND_SOFT},
+    "learned-tanh": lambda: learned(jax.random.key(0), SMALL),
+    "learned-selu": lambda: learned(jax.random.key(1), SELU),
+}
+PHYSICS = [name for name in PLANTS if not name.startswith("learned")]
+#: Plants whose two half steps under a held command are one step; the tolerance, cmH2O.
+REAL_DT = {name: 2e-4 for name in PHYSICS}
+
+T = 40
+DT = np.full((1, T), protocol.DT)
+every_plant = pytest.mark.parametrize("name", PLANTS)
+physics_plant = pytest.mark.parametrize("name", PHYSICS)
+
+
+def pressures(
+    plant: Plant, u_in, u_out=None, dt: ArrayLike = DT, start=protocol.PEEP
+) -> np.ndarray:
+    """Open-loop pressures, shape ``(n, T)``."""
+    u_in = jnp.atleast_2d(jnp.asarray(u_in, float))
+    u_out = jnp.zeros_like(u_in) if u_out is None else jnp.broadcast_to(u_out, u_in.shape) * 1.0
+    start = jnp.broadcast_to(jnp.asarray(start, float), u_in.shape[:1])
+    return np.asarray(
+        open_loop(plant, start, u_in, u_out, jnp.broadcast_to(jnp.asarray(dt), u_in.shape))
+    )
+
+
+def breaths(count: int, u_in: float) -> tuple[np.ndarray, np.ndarray]:
+    """Commands of whole breaths."""
+    steps = np.arange(protocol.BREATH_STEPS)
+    opened = (steps >= protocol.INSPIRATION_STEPS) * 1.0
+    command = np.where(opened > 0, expiratory.u_in(steps), u_in)
+    return np.tile(command, count)[None], np.tile(opened, count)[None]
+
+
+@physics_plant
+def test_pressure_never_falls_as_the_valve_opens(name):
+    levels = np.arange(0.0, 101.0)
+    p = pressures(PLANTS[name](), np.repeat(levels[:, None], T, axis=1))
+    assert np.all(np.diff(p, axis=0) >= -1e-4)
+    assert np.all(np.diff(p, axis=1) >= -1e-4)
+
+
+@physics_plant
+def test_settles_when_the_valve_closes(name):
+    command = np.where(np.arange(2 * T) < 10, 30.0, 0.0)
+    p = pressures(PLANTS[name](), command, dt=protocol.DT)
+    assert np.ptp(p[0, 15:]) < 1e-3
+    assert p[0, -1] > protocol.PEEP
+
+
+@every_plant
+@settings(max_examples=20, deadline=None)
+@given(
+    u_in=hnp.arrays(np.float32, (T,), elements=st.floats(0, 100, width=32)),
+    u_out=hnp.arrays(np.int8, (T,), elements=st.integers(0, 1)),
+)
+def test_stays_finite_for_any_commands(name, u_in, u_out):
+    assert np.all(np.isfinite(pressures(PLANTS[name](), u_in, u_out)))
+
+
+@every_plant
+def test_stays_finite_through_a_minute_of_noise(name):
+    u_in = np.random.default_rng(0).uniform(0, 100, (3, 2000))
+    opened = (np.arange(2000) % 100) >= 34
+    p = pressures(PLANTS[name](), u_in, opened, dt=protocol.DT)
+    assert np.all(np.isfinite(p))
+
+
+@every_plant
+@pytest.mark.parametrize("start", [0.0, 12.0, 35.0])
+def test_expiration_returns_to_peep(name, start):
+    plant = PLANTS[name]()
+    state = plant.init(jnp.asarray(start), jnp.asarray(5.0))
+    step = jax.jit(lambda s: plant.step(s, jnp.asarray(0.0), jnp.asarray(1.0), jnp.asarray(0.03)))
+    for _ in range(400):
+        state, pressure = step(state)
+    assert float(pressure) == pytest.approx(5.0, abs=0.05)
+
+
+@every_plant
+def test_no_drift_over_300_breaths(name):
+    u_in, u_out = breaths(300, 8.0)
+    p = pressures(PLANTS[name](), u_in, u_out, dt=protocol.DT)[0]
+    p = p.reshape(300, protocol.BREATH_STEPS)
+    assert np.all(np.abs(p[20:] - p[20]) < 0.02)
+
+
+@every_plant
+def test_batched_equals_vmapped_equals_single(name):
+    plant = PLANTS[name]()
+    rng = np.random.default_rng(1)
+    u_in = rng.uniform(0, 20, (4, T)).astype(np.float32)
+    start = rng.uniform(2, 9, 4).astype(np.float32)
+    opened, dt = np.zeros((4, T), np.float32), np.full((4, T), 0.03, np.float32)
+    batched = np.asarray(open_loop(plant, *map(jnp.asarray, (start, u_in, opened, dt))))
+    rows = [jnp.asarray(x)[:, None] for x in (start, u_in, opened, dt)]
+    vmapped = np.asarray(jax.vmap(partial(open_loop, plant))(*rows))[:, 0]
+    single = np.stack([pressures(plant, u_in[i], start=start[i])[0] for i in range(4)])
+    np.testing.assert_allclose(vmapped, batched, atol=2e-4)
+    np.testing.assert_allclose(single, batched, atol=2e-4)
+
+
+@every_plant
+def test_stacked_plants_are_each_their_own(name):
+    plants = [PLANTS[name](), PLANTS[name]().vary(jnp.asarray(1.1), jnp.asarray(0.9))]
+    stack = jax.tree.map(lambda *x: jnp.stack(x), *plants)
+    run = partial(pressures, u_in=np.full(T, 6.0))
+    commands = jnp.full((1, T), 6.0), jnp.zeros((1, T)), jnp.full((1, T), 0.03)
+    together = jax.vmap(lambda p: open_loop(p, jnp.full(1, 5.0), *commands))(stack)
+    np.testing.assert_allclose(together[0], run(plants[0]), atol=2e-4)
+    np.testing.assert_allclose(together[1], run(plants[1]), atol=2e-4)
+
+
+@every_plant
+def test_float32_agrees_with_float64(name):
+    u_in = np.random.default_rng(2).uniform(0, 15, (2, T))
+    single = pressures(PLANTS[name](), u_in)
+    assert single.dtype == np.float32
+    with float64():
+        double = pressures(PLANTS[name](), u_in)
+    assert double.dtype == np.float64
+    np.testing.assert_allclose(single, double, atol=5e-4)
+
+
+@every_plant
+def test_gradients_are_finite(name):
+    plant = PLANTS[name]()
+
+    def mean(plant, u_in):
+        return jnp.mean(
+            open_loop(plant, jnp.full(1, 5.0), u_in, jnp.zeros((1, T)), jnp.full((1, T), 0.03))
+        )
+
+    by_plant, by_command = jax.grad(mean, argnums=(0, 1))(plant, jnp.full((1, T), 8.0))
+    assert all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(by_plant))
+    assert bool(jnp.all(jnp.isfinite(by_command)))
+    if name in PHYSICS:
+        assert bool(jnp.all(by_command[:, :-1] > 0))
+
+
+@pytest.mark.parametrize("name", REAL_DT)
+def test_half_steps_agree_with_whole_ones(name):
+    rng = np.random.default_rng(3)
+    u_in = rng.uniform(0, 15, (1, T))
+    u_out = (np.arange(T) >= 25)[None] * 1.0
+    with float64():
+        plant = PLANTS[name]()
+        whole = pressures(plant, u_in, u_out)
+        halves = pressures(plant, *(np.repeat(x, 2, axis=1) for x in (u_in, u_out)), dt=0.015)
+    np.testing.assert_allclose(halves[:, ::2], whole, atol=REAL_DT[name])
+
+
+@every_plant
+def test_nominal_variation_changes_nothing(name):
+    plant = PLANTS[name]()
+    one = jnp.asarray(1.0)
+    u_in = np.random.default_rng(4).uniform(0, 15, (1, T))
+    np.testing.assert_array_equal(pressures(plant, u_in), pressures(plant.vary(one, one), u_in))

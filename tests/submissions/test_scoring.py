@@ -1,0 +1,375 @@
+import dataclasses
+import json
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ventbench import draws, precision, protocol, rollout, scenario, waveform
+from ventbench.controllers.base import Task
+from ventbench.controllers.pid import PID
+from ventbench.errors import InputError
+from ventbench.lungs import LUNG_IDS, LUNGS, lung
+from ventbench.metrics.waveform import run_error
+from ventbench.plants.stack import take
+from ventbench.submissions import stepping
+from ventbench.submissions.errors import Failure, SubmissionError
+from ventbench.submissions.folder import open_submission
+from ventbench.submissions.runner import InProcessRunner
+from ventbench.submissions.scoring import score
+
+GAINS = {
+    "R5C10": (10.0, 0.2),
+    "R5C20": (10.0, 10.0),
+    "R5C50": (10.0, 10.0),
+    "R20C10": (8.0, 1.0),
+    "R20C20": (5.0, 10.0),
+    "R20C50": (5.0, 10.0),
+}
+
+
+def pure_errors(plants, cells, gains):
+    """Errors of the pure PID in the compiled scan, shape ``(L, ...)``."""
+    errors = []
+    with precision.float64():
+        for i, gain in enumerate(gains):
+            found, _ = rollout.closed_loop(take(plants, i), PID(*gain), cells)
+            errors.append(run_error(found.pressure, np.asarray(cells.pip)[..., None, None]))
+    return np.stack(errors)
+
+
+@pytest.fixture(scope="module")
+def best(plants):
+    return score(open_submission("pid_best"), plants, draws=20)
+
+
+def test_nominal_is_that_of_the_pure_pid(plants, best):
+    with precision.float64():
+        cells = scenario.nominal(np.array(protocol.PIPS))
+    expected = pure_errors(plants, cells, GAINS.values())
+    np.testing.assert_allclose(best[0].nominal, expected, rtol=0, atol=1e-9)
+
+
+def test_draws_are_those_of_the_pure_pid(plants, best):
+    with precision.float64():
+        cells = draws.scenarios()
+    expected = np.moveaxis(pure_errors(plants, cells, GAINS.values()), 0, 1)
+    np.testing.assert_allclose(best[0].drawn, expected, rtol=0, atol=1e-9)
+
+
+def test_robust_pid(plants):
+    for track in ("robustness", "performance"):
+        found, _ = score(open_submission("pid_robust"), plants, track=track)
+        with precision.float64():
+            cells = scenario.nominal(np.array(protocol.PIPS))
+        expected = pure_errors(plants, cells, [(1.0, 10.0, 6.0)] * 6)
+        np.testing.assert_allclose(found.nominal, expected, rtol=0, atol=1e-9)
+
+
+def test_json(best):
+    found = best[0].to_json()
+    json.dumps(found, allow_nan=False)
+    assert found["protocol"] == 1
+    assert list(found["lungs"]) == list(LUNG_IDS)
+    for lung_id, result in found["lungs"].items():
+        assert list(result["pips"]) == ["10", "15", "20", "25", "30", "35"]
+        assert result["score"] == pytest.approx(np.mean(list(result["pips"].values())))
+        own = result["draws"]
+        assert own["score"] == pytest.approx(np.mean(own["values"]))
+        assert own["ci95"][0] < own["score"] < own["ci95"][1], lung_id
+    assert found["score"] == pytest.approx(np.mean([x["score"] for x in found["lungs"].values()]))
+    assert len(found["draws"]["values"]) == 20
+    assert found["draws"]["values"][3] == pytest.approx(best[0].drawn[3].mean())
+    assert found["draws"]["sha256"] == draws.SHA256
+    assert found["sandbox"] is None
+    assert found["official"] is False
+    assert found["complete"] is True
+    assert found["failures"] == []
+    clipped = found["clipped"]
+    assert clipped["commands"] == 6 * 6 * 102
+    assert clipped["below"] == sum(x["clipped"]["below"] for x in found["lungs"].values())
+    assert clipped["share"] == (clipped["below"] + clipped["above"]) / clipped["commands"]
+
+
+def test_secondary_figures_are_those_of_the_lung(best, plants):
+    result, trajectories = best
+    for values in result.figures.values():
+        assert values.shape == (6, 6, 2)
+    inspirations = trajectories.pressure.reshape(6, 6, 3, 100)[:, :, 1:, :34]
+    over = np.maximum(inspirations.max(axis=-1) - np.array(protocol.PIPS)[:, None], 0)
+    np.testing.assert_allclose(result.figures["overshoot_cmH2O"], over, atol=1e-9)
+    found = result.to_json()["lungs"]["R20C10"]
+    assert found["secondary"]["overshoot_cmH2O"] == pytest.approx(over[3].mean())
+    settling = result.figures["settling_time_s"][3]
+    assert found["secondary_missing"].get("settling_time_s", 0) == np.isnan(settling).sum()
+
+
+def test_deterministic(best, plants):
+    again, _ = score(open_submission("pid_best"), plants, draws=20)
+    first, second = best[0].to_json(), again.to_json()
+    assert set(first.pop("timing")) == set(second.pop("timing"))
+    assert first == second
+
+
+def test_trajectories(best, plants):
+    result, found = best
+    assert found.pressure.shape == (6, 6, 300)
+    np.testing.assert_allclose(found.time, 0.03 * np.arange(300))
+    np.testing.assert_array_equal(found.target[2, 3], waveform.target(np.arange(300), 25.0))
+    phase = np.arange(300) % 100
+    assert np.all((found.u_out == 1) == (phase >= 34))
+    scored = (phase < 34) & (np.arange(300) >= 100)
+    error = np.abs(found.pressure - found.target)[..., scored].mean(axis=-1)
+    np.testing.assert_allclose(error, result.nominal, rtol=0, atol=1e-9)
+    with precision.float64():
+        cells = scenario.nominal(np.array(protocol.PIPS))
+        inspired, expired = rollout.closed_loop(take(plants, 4), PID(5.0, 10.0), cells, whole=True)
+    for name in ("pressure", "u_in"):
+        whole = np.concatenate([getattr(inspired, name), getattr(expired, name)], axis=-1)
+        np.testing.assert_allclose(
+            getattr(found, name)[4], whole.reshape(6, 300), rtol=0, atol=1e-8
+        )
+
+
+def test_parts(best, plants):
+    part = jax.tree.map(lambda leaf: leaf[jnp.array([5, 0])], plants)
+    found, _ = score(
+        open_submission("pid_best"),
+        part,
+        draws=2,
+        lungs=[lung("R20C50"), lung("R5C10")],
+        pips=[35.0, 10.0],
+        simulators={"version": 1},
+    )
+    np.testing.assert_allclose(found.nominal, best[0].nominal[[5, 0]][:, [5, 0]], atol=1e-12)
+    np.testing.assert_allclose(found.drawn, best[0].drawn[:2, [5, 0]][:, :, [5, 0]], atol=1e-12)
+    result = found.to_json()
+    assert result["complete"] is False
+    assert result["simulators"] == {"version": 1}
+    assert list(result["lungs"]["R20C50"]["pips"]) == ["35", "10"]
+
+
+def test_without_draws(plants):
+    result = score(open_submission("pid_best"), plants)[0].to_json()
+    assert result["draws"] is None
+    assert result["lungs"]["R5C10"]["draws"] is None
+
+
+def test_compiles_once(plants):
+    compiled: list[Any] = [stepping._inspire, stepping._observe]
+    for function in compiled:
+        function.clear_cache()
+    score(open_submission("pid_best"), plants, draws=1)
+    score(open_submission("pid_robust"), plants, draws=1)
+    assert [function._cache_size() for function in compiled] == [1, 1]
+
+
+@pytest.mark.parametrize(("track", "known"), [("robustness", False), ("performance", True)])
+def test_what_a_submission_is_told(make, plants, track, known):
+    source = """
+        import json, pathlib
+        LOG = pathlib.Path(__file__).parent.parent / "log"
+        class Controller:
+            def reset(self, task):
+                self.task, self.seen = task, []
+            def act(self, observation):
+                self.seen.append(observation)
+                if len(self.seen) == 102:
+                    with LOG.open("a") as file:
+                        print(json.dumps([self.task, self.seen]), file=file)
+                return 2.0 * len(self.seen) - 20.0
+        """
+    folder = make(source)
+    score(open_submission(str(folder)), plants, track=track, draws=1)
+    runs = [json.loads(line) for line in (folder.parent / "log").read_text().splitlines()]
+    assert len(runs) == 6 * 2 * 6
+    for index, (task, seen) in enumerate(runs):
+        lung_index, draw, pip_index = np.unravel_index(index, (6, 2, 6))
+        assert task == [track, LUNG_IDS[lung_index] if known else None, 0.03, 34]
+        times, dts, pressures, targets, ahead, previous = (list(x) for x in zip(*seen, strict=True))
+        if draw == 0:
+            np.testing.assert_allclose(times, np.tile(0.03 * np.arange(34), 3))
+            np.testing.assert_allclose(targets, protocol.PIPS[pip_index])
+            assert pressures[0] == pressures[34] == 5.0
+            for step in (0, 24, 33):
+                expected = waveform.targets_ahead(step, protocol.PIPS[pip_index])
+                np.testing.assert_allclose(ahead[step], expected)
+        assert len(set(dts)) == 1
+        requested = np.clip(2.0 * np.arange(1, 103) - 20.0, 0, 100)
+        requested[[33, 67]] = 0.0  # the step after is the first of a breath
+        np.testing.assert_allclose(previous[1:], requested[:-1])
+
+
+def test_failed_cells(make, plants):
+    act = """
+        self.calls = getattr(self, "calls", 0) + 1
+        if self.task.lung == "R5C20" and self.calls == 40 and observation.target == 20.0:
+            raise ValueError("no idea")
+        return 3.0
+        """
+    found, trajectories = score(
+        open_submission(str(make(act=act))), plants, track="performance", draws=1
+    )
+    result = found.to_json()
+    assert result["score"] is None
+    assert result["lungs"]["R5C20"]["score"] is None
+    assert result["lungs"]["R5C20"]["pips"]["20"] is None
+    assert result["lungs"]["R5C20"]["pips"]["25"] > 0
+    assert result["lungs"]["R5C10"]["score"] > 0
+    (failure,) = result["failures"]
+    assert {k: failure[k] for k in ("lung", "pip", "draw", "breath", "step", "kind")} == {
+        "lung": "R5C20", "pip": 20.0, "draw": None, "breath": 2, "step": 6, "kind": "act",
+    }  # fmt: skip
+    assert failure["message"].endswith(
+        "controller.py line 8 raised ValueError at step 6 of breath 2 (lung R5C20): no idea; "
+        "the entry is not ranked."
+    )
+    inspired = trajectories.u_in[1, 2].reshape(3, 100)[:, :34].ravel()
+    np.testing.assert_array_equal(inspired, np.where(np.arange(102) < 39, 3.0, 0.0))
+    json.dumps(result, allow_nan=False)
+
+
+def test_failure_in_a_draw(make, plants):
+    act = "return 3.0 if observation.target in (10, 15, 20, 25, 30, 35) else None"
+    result = score(open_submission(str(make(act=act))), plants, draws=2)[0].to_json()
+    assert result["score"] is None
+    assert result["draws"]["score"] is None
+    assert result["draws"]["values"] == [None, None]
+    assert len(result["failures"]) == 6 * 2 * 6
+    assert {f["draw"] for f in result["failures"]} == {1, 2}
+    assert "(lung hidden)" in result["failures"][0]["message"]
+    assert result["lungs"]["R5C10"]["pips"]["10"] > 0
+
+
+def test_all_cells_fail_before_the_first_step(make, plants):
+    source = "class Controller:\n def reset(self): pass\n def act(self, o): return 0.0\n"
+    result = score(open_submission(str(make(source))), plants)[0].to_json()
+    assert len(result["failures"]) == 36
+    assert "raised TypeError in reset (lung hidden)" in result["failures"][0]["message"]
+
+
+def test_unsafe_lung(make, plants):
+    act = "return 100.0 if self.task.lung == 'R5C10' else 0.0"
+    found, _ = score(open_submission(str(make(act=act))), plants, track="performance")
+    np.testing.assert_array_equal(found.safe, [False] + [True] * 5)
+    result = found.to_json()
+    assert result["safe"] is False
+    assert result["lungs"]["R5C10"]["peak_pressure_cmH2O"] > 100
+
+
+def test_clipping(make, plants):
+    act = "return -1.0 if observation.time == 0 else 101.0 if observation.time > 0.95 else 1.0"
+    result = score(open_submission(str(make(act=act))), plants)[0].to_json()
+    assert result["lungs"]["R5C10"]["clipped"] == {
+        "below": 18, "above": 36, "commands": 612, "share": 54 / 612,
+    }  # fmt: skip
+    assert result["secondary"]["clipped_share"] == pytest.approx(3 / 34)
+
+
+def test_wrong_track(plants):
+    with pytest.raises(SubmissionError, match="enters performance; it cannot be scored for robus"):
+        score(open_submission("pid_best"), plants, track="robustness")
+
+
+def test_too_many_draws(plants):
+    with pytest.raises(InputError, match="20 published draws"):
+        score(open_submission("pid_best"), plants, draws=21)
+
+
+def test_plants_of_other_lungs(plants):
+    with pytest.raises(ValueError, match="not stacked over 2 lungs"):
+        score(open_submission("pid_best"), plants, lungs=LUNGS[:2])
+
+
+def test_broken_simulator_is_no_score(plants):
+    broken = dataclasses.replace(plants, C=np.array([10.0, 20.0, np.nan, 10.0, 20.0, 50.0]))
+    with pytest.raises(FloatingPointError, match="simulator 2 answered with NaN"):
+        score(open_submission("pid_best"), broken)
+
+
+def test_code_that_cannot_be_imported(make, plants):
+    with pytest.raises(SubmissionError, match=r"controller.py line 1: "):
+        score(open_submission(str(make("x = (\n"))), plants)
+
+
+class Recorder:
+    """A runner of another kind: one call for all cells, closed once; its last cell times out."""
+
+    def __init__(self):
+        self.sandbox = {"layers": ["none really"]}
+
+    def start(self, submission, tasks):
+        self.tasks, self.closed, self.failures, self.rows = tasks, 0, {}, []
+        return self
+
+    def act(self, observations):
+        self.rows.append(observations)
+        if len(self.rows) == 50:
+            self.failures[len(self.tasks) - 1] = Failure("timeout", "took 1 s", "", 2, 16)
+        return np.full(len(observations), 2.0)
+
+    def close(self):
+        self.closed += 1
+
+
+def test_another_runner(plants):
+    runner = Recorder()
+    found, _ = score(open_submission("pid_best"), plants, draws=1, runner=runner)
+    assert len(runner.rows) == 102
+    assert all(rows.shape == (72, 15) and rows.dtype == np.float64 for rows in runner.rows)
+    assert [task.lung for task in runner.tasks[::12]] == list(LUNG_IDS)
+    assert runner.closed == 1
+    result = found.to_json()
+    assert result["sandbox"] == {"layers": ["none really"]}
+    (failure,) = result["failures"]
+    assert (failure["lung"], failure["pip"], failure["draw"]) == ("R20C50", 35.0, 1)
+    assert failure["message"] == (
+        "pid_best: took 1 s at step 16 of breath 2 (lung R20C50); the entry is not ranked."
+    )
+
+
+def test_session_is_closed_when_the_loop_breaks(plants):
+    class Breaks(Recorder):
+        def act(self, observations):
+            raise KeyboardInterrupt
+
+    runner = Breaks()
+    with pytest.raises(KeyboardInterrupt):
+        score(open_submission("pid_best"), plants, runner=runner)
+    assert runner.closed == 1
+
+
+def test_cells_do_not_share_controllers(make):
+    source = """
+        class Controller:
+            def reset(self, task): self.calls = 0
+            def act(self, observation):
+                self.calls += 1
+                return float(self.calls)
+        """
+    submission = open_submission(str(make(source)))
+    session = InProcessRunner().start(submission, [Task("robustness", None, 0.03, 34)] * 3)
+    for call in (1.0, 2.0):
+        np.testing.assert_array_equal(session.act(np.zeros((3, 15))), call)
+    session.close()
+    session.close()
+
+
+def test_jax_in_a_submission_is_as_elsewhere(make, plants):
+    act = """
+        import jax.numpy as jnp
+        assert jnp.zeros(()).dtype == "float32"
+        return jnp.asarray(observation.pressure)
+        """
+    part = jax.tree.map(lambda leaf: leaf[:1], plants)
+    found, _ = score(open_submission(str(make(act=act))), part, lungs=LUNGS[:1], pips=[10.0])
+    assert found.failures == ()
+
+
+def test_nothing_is_left_on_the_search_path(plants):
+    before = list(sys.path)
+    score(open_submission("pid_best"), plants)
+    assert sys.path == before

@@ -1,0 +1,102 @@
+import json
+import os
+import stat
+
+import numpy as np
+import pytest
+
+from ventbench import files
+from ventbench.errors import InputError
+from ventbench.trajectories import Trajectories, load
+
+
+def test_creates_folders_and_replaces(tmp_path):
+    path = tmp_path / "a" / "b.txt"
+    files.write_text(path, "eins")
+    files.write_text(path, "zwei ü\n")
+    assert path.read_bytes() == "zwei ü\n".encode()
+    assert [p.name for p in path.parent.iterdir()] == ["b.txt"]
+
+
+def test_never_half_written(tmp_path):
+    path = tmp_path / "a.txt"
+    files.write_text(path, "old")
+
+    def fail(file):
+        file.write(b"ne")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        files.write_atomically(path, fail)
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_mode_is_that_of_an_ordinary_file(tmp_path):
+    path = tmp_path / "a.txt"
+    files.write_text(path, "x")
+    plain = tmp_path / "plain"
+    plain.touch()
+    assert stat.S_IMODE(os.stat(path).st_mode) == stat.S_IMODE(os.stat(plain).st_mode)
+
+
+def test_folder_in_the_way(tmp_path):
+    with pytest.raises(OSError, match="directory"):
+        files.write_text(tmp_path, "x")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_json(tmp_path):
+    path = tmp_path / "a.json"
+    files.write_json(path, {"a": [1, None, 0.1]})
+    assert json.loads(path.read_text()) == {"a": [1, None, 0.1]}
+    with pytest.raises(ValueError, match="JSON"):
+        files.write_json(path, float("nan"))
+    assert json.loads(path.read_text()) == {"a": [1, None, 0.1]}
+
+
+def test_sha256(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"abc")
+    assert files.sha256(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+@pytest.fixture
+def run():
+    arrays = {k: np.random.default_rng(0).normal(size=(2, 1, 300)) for k in ("target", "pressure")}
+    return Trajectories(
+        "mine",
+        "robustness",
+        ("R5C10", "R20C50"),
+        (10.0,),
+        np.linspace(0, 8.97, 300),
+        **arrays,
+        u_in=arrays["target"],
+        u_out=arrays["pressure"],
+    )
+
+
+def test_trajectories_round_trip(run, tmp_path):
+    run.save(tmp_path / "run.npz")
+    found = load(tmp_path / "run.npz")
+    for name, value in vars(run).items():
+        np.testing.assert_array_equal(getattr(found, name), value)
+
+
+def test_trajectories_that_are_none(run, tmp_path):
+    path = tmp_path / "run.npz"
+    run.save(path)
+    content = path.read_bytes()
+    broken = bytearray(content)
+    broken[len(content) // 2] ^= 255
+    plain = tmp_path / "plain.npy"
+    np.save(plain, np.zeros(3))
+    other = tmp_path / "other.npz"
+    np.savez(other, a=np.zeros(3))
+    contents = [b"", b"text", content[:200], content[:-50], bytes(broken), plain.read_bytes()]
+    for wrong in (*contents, other.read_bytes()):
+        path.write_bytes(wrong)
+        with pytest.raises(InputError, match=r"run.npz is not a trajectory file of ventbench"):
+            load(path)
+    with pytest.raises(FileNotFoundError):
+        load(tmp_path / "none.npz")

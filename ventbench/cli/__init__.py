@@ -1,0 +1,55 @@
+"""The command line ``ventbench``: parses, calls, prints. One module a group of commands.
+
+Exit codes: 0 done; 1 it ran and the answer is no; 2 bad input. Heavy packages are imported inside
+the commands, so that ``ventbench --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from ventbench import __version__
+from ventbench.cli import data, run, score, simulators, view
+from ventbench.errors import InputError
+
+app = typer.Typer(
+    name="ventbench",
+    help="The benchmark for mechanical-ventilator control.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+)
+
+
+def _version(value: bool) -> None:
+    if value:
+        print(f"ventbench {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Print the version and exit."
+    ),
+) -> None:
+    pass
+
+
+score.register(app)
+run.register(app)
+simulators.register(app)
+view.register(app)
+app.add_typer(data.app)
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    try:
+        app()
+    except (InputError, OSError) as error:
+        print(f"ventbench: {error}", file=sys.stderr)
+        sys.exit(2)

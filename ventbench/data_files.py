@@ -1,0 +1,37 @@
+"""Where the files beside the code are: in the checkout, or inside the installed wheel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ventbench.errors import InputError
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def _folder(name: str) -> Path:
+    # Inside a wheel first: beside an installed package, `data` may be anybody's.
+    installed = _PACKAGE / f"_{name}"
+    return installed if installed.is_dir() else _PACKAGE.parent / name
+
+
+def data_path(name: str) -> Path:
+    """Path of a file that travels with ventbench.
+
+    Args:
+        name: relative to the folder ``data``, such as ``"draws-v1.npz"``.
+
+    Raises:
+        InputError: if it is not there.
+    """
+    path = _folder("data") / name
+    if not path.exists():
+        raise InputError(
+            f"{path} is missing; it belongs to ventbench: reinstall it, or restore the file"
+        )
+    return path
+
+
+def submissions_folder() -> Path:
+    """Folder of the submissions that travel with ventbench; may be missing."""
+    return _folder("submissions")

@@ -1,0 +1,146 @@
+"""The published paired draws: how the bench deviates from nominal, the same for every entry.
+
+One draw is one deviation for each PIP, common to all lungs and entries: sensor noise and converter,
+pressure at the start of the inspiration, R, C, dead time, control step, PIP and PEEP. They are
+frozen in ``data/draws-v1.npz``; ``python -m ventbench.draws FILE`` makes that file again.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import io
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import NormalDist
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench import data_files, files, protocol
+from ventbench.errors import InputError
+from ventbench.scenario import Scenario
+
+#: Version of the draws, how many there are, their file and its SHA-256.
+VERSION = 1
+COUNT = 20
+FILE = "draws-v1.npz"
+SHA256 = "114cb9c7e553cb7de26159760e25af60a59f331c25129134b81bfe41c63e3d92"
+
+_SEED = 20210215  # the paper's date
+
+#: Step of the pressure sensor's converter, cmH2O (PVP).
+QUANTUM = 0.0703
+
+#: Standard deviation of the sensor's noise, cmH2O: uniform in this range for each run (recordings).
+NOISE_SD = (0.20, 0.25)
+
+#: Every other deviation is uniform in its range: shifts in cmH2O, scales as true over nominal, the
+#: delay as a share of one step.
+RANGES = {
+    "pip_shift": (-1.0, 1.0),
+    "peep_shift": (-0.5, 0.5),
+    "start_shift": (-0.5, 0.5),
+    "dt_scale": (0.97, 1.03),
+    "r_scale": (0.95, 1.05),
+    "c_scale": (0.95, 1.05),
+    "delay": (0.0, 0.5),
+}
+
+Floats = NDArray[np.float64]
+
+
+def build() -> dict[str, Floats]:
+    """Draw all deviations anew; the result is the same everywhere.
+
+    Uniform numbers come from the raw stream of PCG64, which no numpy version changes; the rounding
+    to 4 decimals removes what differs between mathematical libraries.
+
+    Returns:
+        For each key of :data:`RANGES` an array of shape ``(COUNT, P)`` with P nominal PIPs, and
+        ``noise``, cmH2O, shape ``(COUNT, P, BREATHS, INSPIRATION_STEPS)``.
+    """
+    bits = np.random.PCG64(_SEED)
+
+    def uniform(*shape: int) -> Floats:
+        # The upper 53 bits, centred so that neither 0 nor 1 occurs.
+        return ((bits.random_raw(shape) >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53
+
+    cells = (COUNT, len(protocol.PIPS))
+    drawn = {name: low + (high - low) * uniform(*cells) for name, (low, high) in RANGES.items()}
+    sd = NOISE_SD[0] + (NOISE_SD[1] - NOISE_SD[0]) * uniform(*cells)
+    normal = np.vectorize(NormalDist().inv_cdf, otypes=[float])
+    noise = normal(uniform(*cells, protocol.BREATHS, protocol.INSPIRATION_STEPS))
+    drawn["noise"] = sd[..., None, None] * noise
+    return {name: np.round(values, 4) for name, values in drawn.items()}
+
+
+def write(path: Path) -> str:
+    """Write the file of :func:`build` and return its SHA-256.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    # Not compressed: the bytes then depend on no version of zlib.
+    arrays: dict[str, Any] = dict(build())
+    files.write_atomically(path, lambda file: np.savez(file, **arrays))
+    return files.sha256(path)
+
+
+@functools.cache
+def _frozen() -> dict[str, Floats]:
+    path = data_files.data_path(FILE)
+    content = path.read_bytes()
+    found = hashlib.sha256(content).hexdigest()
+    if found != SHA256:
+        raise InputError(
+            f"{path} is not the published draws version {VERSION}: its SHA-256 is {found}, "
+            f"expected {SHA256}; restore the file"
+        )
+    with np.load(io.BytesIO(content), allow_pickle=False) as npz:
+        return {name: npz[name] for name in npz.files}
+
+
+def scenarios(pips: Sequence[float] = protocol.PIPS, n: int = COUNT) -> Scenario:
+    """Return the first draws as cells.
+
+    Args:
+        pips: nominal PIPs, cmH2O, each one of the protocol's; length P.
+        n: number of draws, 1..20.
+
+    Returns:
+        Cells with batch shape ``(n, P)``.
+
+    Raises:
+        InputError: if ``n`` or a PIP has no draws, or the file is missing or not the published one.
+    """
+    if not 1 <= n <= COUNT:
+        raise InputError(f"there are {COUNT} published draws; {n} is outside 1..{COUNT}")
+    unknown = [pip for pip in pips if pip not in protocol.PIPS]
+    if unknown:
+        raise InputError(
+            f"no draws for PIP {unknown[0]:g} cmH2O; they exist for "
+            f"{', '.join(f'{pip:g}' for pip in protocol.PIPS)}"
+        )
+    columns = [protocol.PIPS.index(pip) for pip in pips]
+    drawn = {name: values[:n, columns] for name, values in _frozen().items()}
+    pip = np.asarray(pips, float) + drawn["pip_shift"]
+    peep = protocol.PEEP + drawn["peep_shift"]
+    return Scenario(
+        pip=jnp.asarray(pip),
+        peep=jnp.asarray(peep),
+        start=jnp.asarray(peep + drawn["start_shift"]),
+        dt=jnp.asarray(protocol.DT * drawn["dt_scale"]),
+        r_scale=jnp.asarray(drawn["r_scale"]),
+        c_scale=jnp.asarray(drawn["c_scale"]),
+        delay=jnp.asarray(drawn["delay"]),
+        quantum=jnp.full(pip.shape, QUANTUM),
+        noise=jnp.asarray(drawn["noise"]),
+    )
+
+
+if __name__ == "__main__":
+    print(write(Path(sys.argv[1])))

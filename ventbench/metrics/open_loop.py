@@ -1,0 +1,88 @@
+"""Open-loop distance: how far a simulator strays under the same controls from the same start."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+
+def _differences(measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None) -> Floats:
+    """Absolute differences, NaN where they do not count; checks the shapes."""
+    measured, simulated = np.asarray(measured, float), np.asarray(simulated, float)
+    if measured.ndim == 0 or measured.shape != simulated.shape:
+        raise ValueError(f"pressures of shapes {measured.shape} and {simulated.shape} do not pair")
+    counts = np.broadcast_to(True if mask is None else np.asarray(mask, bool), measured.shape)
+    counts = counts & ~np.isnan(measured)
+    # The first sample is the common start, given and not predicted: T samples hold T - 1 steps.
+    counts[..., 0] = False
+    simulated = np.where(np.isnan(simulated), np.inf, simulated)
+    return np.where(counts, np.abs(np.where(counts, measured, 0.0) - simulated), np.nan)
+
+
+def _sum(differences: Floats) -> Floats:
+    empty = np.all(np.isnan(differences), axis=-1)
+    return np.where(empty, np.nan, np.nansum(differences, axis=-1))
+
+
+def distance(
+    measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None = None
+) -> NDArray[np.float64]:
+    """Open-loop distance of each breath, the paper's equation for one sequence of controls.
+
+    ``sum over t = 1..T of |f1(x_t1, u_t) - f2(x_t2, u_t)|``: both systems start from the same
+    pressure, get the same controls, and their answers are compared after each control. The
+    expectation over controls is the mean over breaths, see :mod:`ventbench.metrics.bootstrap`.
+
+    Args:
+        measured: recorded pressure, cmH2O, shape ``(..., T + 1)``; the first sample is the common
+            start and is never counted. NaN marks a missing sample, which is not counted either.
+        simulated: pressure of the simulator at the same samples, cmH2O, same shape.
+        mask: samples that count (such as the inspiratory ones), broadcast against ``measured``.
+
+    Returns:
+        Sum over counted steps, cmH2O, shape ``(...)``; NaN for a breath in which none counts, and
+        infinite for one in which the simulator itself gave NaN or infinity at a counted sample.
+
+    Raises:
+        ValueError: if the shapes do not pair.
+    """
+    return _sum(_differences(measured, simulated, mask))
+
+
+def mae(
+    measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None = None
+) -> NDArray[np.float64]:
+    """Mean absolute error per step of each breath: :func:`distance` over the counted steps.
+
+    Args:
+        measured: as in :func:`distance`, and so are the rest and the errors.
+        simulated: likewise.
+        mask: likewise.
+
+    Returns:
+        Mean over counted steps, cmH2O, shape ``(...)``; NaN where none counts.
+    """
+    differences = _differences(measured, simulated, mask)
+    steps = np.sum(~np.isnan(differences), axis=-1)
+    return _sum(differences) / np.where(steps, steps, 1)
+
+
+def by_horizon(
+    measured: ArrayLike, simulated: ArrayLike, mask: ArrayLike | None = None
+) -> NDArray[np.float64]:
+    """Mean absolute error at each step after the start, over breaths (the paper's figure).
+
+    Args:
+        measured: as in :func:`distance`, shape ``(n, T + 1)``, and so are the rest and the errors.
+        simulated: likewise.
+        mask: likewise.
+
+    Returns:
+        Mean over the breaths that count a step, cmH2O, shape ``(T,)``; NaN where none does.
+    """
+    differences = _differences(measured, simulated, mask)[:, 1:]
+    counted = np.sum(~np.isnan(differences), axis=0)
+    total = np.nansum(differences, axis=0)
+    return np.where(counted, total / np.where(counted, counted, 1), np.nan)

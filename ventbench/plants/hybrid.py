@@ -1,0 +1,213 @@
+"""Lung, circuit and valves of the real rig: physics whose unknown shapes are learned.
+
+What is physics: a lung with flow-dependent resistance and an elastic curve, filled through a valve
+with dead time and lag, beside the compliance of the circuit, emptied through the expiratory valve,
+read by a sensor with lag. What is learned, pooled over all lung settings: the monotone curve of the
+valve, the elastic curve, what a change of direction of the command adds (the valve's driver
+switches between an opening and a closing table), and what differs from rig to rig.
+"""
+
+from __future__ import annotations
+
+import flax.struct
+import jax.numpy as jnp
+from jax import Array
+
+from ventbench.plants.delay import overlap
+
+#: Knots of the valve's piecewise linear curve, %; the last segment ends at infinity.
+VALVE_KNOTS = (0.0, 1.0, 2.0, 3.5, 5.0, 7.0, 10.0, 14.0, 19.0, 26.0, 36.0, 50.0, 70.0)
+
+#: Knots of the elastic curve, cmH2O of a linear lung, above which its slope may change.
+ELASTIC_KNOTS = (10.0, 16.0, 22.0, 28.0, 36.0)
+
+#: Half-widths of the plays that remember the direction of the command, %.
+PLAYS = (0.7, 3.0, 10.0)
+
+#: Change of the command at which the sensor's answer to a direction saturates, %.
+DIRECTION_WIDTH = 0.4
+
+#: The relief opens here and holds the pressure below the sum, cmH2O. No recording goes above 61.4.
+RELIEF, RELIEF_ROOM = 60.0, 10.0
+
+#: Substeps of one sample.
+SUBSTEPS = 4
+
+
+@flax.struct.dataclass
+class HybridState:
+    """State between two samples; every array has shape ``(...)`` unless it says otherwise.
+
+    Attributes:
+        elastic: lung volume over linear compliance, ``V / C``, cmH2O.
+        drop: airway pressure minus elastic recoil, cmH2O.
+        sensor: pressure that the sensor shows, cmH2O.
+        flow: flow out of the inspiratory valve, L/s.
+        commanded: flows that the last two commands ask for, L/s.
+        opened: expiratory valve during the last two samples, 0/1.
+        before: duration of the last sample, s.
+        plays: where each play stands, %, one array a play.
+        u_in: last command, %.
+        peep: end-expiratory pressure, cmH2O.
+    """
+
+    elastic: Array
+    drop: Array
+    sensor: Array
+    flow: Array
+    commanded: tuple[Array, Array]
+    opened: tuple[Array, Array]
+    before: Array
+    plays: tuple[Array, ...]
+    u_in: Array
+    peep: Array
+
+
+@flax.struct.dataclass
+class Hybrid:
+    """One lung on one rig; every array has shape ``()`` or ``(...)`` unless it says otherwise.
+
+    Attributes:
+        R: laminar part of the resistance, cmH2O s/L.
+        K2: quadratic part, cmH2O s2/L2: the drop over the airway is ``R Q + K2 Q |Q|``.
+        E: elastance at low volume, cmH2O/L.
+        stiffening: change of relative slope of the elastic curve at each knot, ``(..., 5)``.
+        offset: elastic recoil minus airway pressure at rest, cmH2O.
+        slopes: of the valve's curve between knots, L/s per %, ``(..., 13)``.
+        direction: weight of each play in the effective command, ``(..., 3)``.
+        valve_delay: dead time of the inspiratory valve, s.
+        valve_lag: its time constant, s.
+        circuit_compliance: of tubing and bellows' dead space, L/cmH2O.
+        sensor_lag: time constant of the sensor, s.
+        rising: added to the reading while the command rises, cmH2O.
+        falling: subtracted while it falls, cmH2O.
+        conductance: of the open expiratory valve, L/s per cmH2O.
+        opening_delay: of the expiratory valve, s.
+        closing_delay: likewise.
+        rest: command that held the flow before the first sample, %.
+    """
+
+    R: Array
+    K2: Array
+    E: Array
+    stiffening: Array
+    offset: Array
+    slopes: Array
+    direction: Array
+    valve_delay: Array
+    valve_lag: Array
+    circuit_compliance: Array
+    sensor_lag: Array
+    rising: Array
+    falling: Array
+    conductance: Array
+    opening_delay: Array
+    closing_delay: Array
+    rest: Array
+
+    def valve(self, u_in: Array) -> Array:
+        """Flow that a steady command gives, L/s: monotone in ``u_in``, %."""
+        knots = jnp.asarray(VALVE_KNOTS, u_in.dtype)
+        widths = jnp.append(jnp.diff(knots), jnp.inf)
+        covered = jnp.clip(u_in[..., None] - knots, 0.0, widths)
+        return jnp.sum(self.slopes * covered, axis=-1)
+
+    def recoil(self, elastic: Array) -> tuple[Array, Array]:
+        """Elastic recoil, cmH2O, and its relative slope, of ``V / C``, cmH2O."""
+        pressure, slope = elastic, jnp.ones_like(elastic)
+        for index, knot in enumerate(ELASTIC_KNOTS):
+            change = self.stiffening[..., index]
+            pressure = pressure + change * jnp.maximum(elastic - knot, 0.0)
+            slope = slope + change * (elastic > knot)
+        return pressure, slope
+
+    def init(self, pressure: Array, peep: Array | None = None) -> HybridState:
+        """Lung at the end of an expiration; see :class:`~ventbench.plants.base.Plant`.
+
+        The expiratory valve is open and the resting command holds the pressure, as before every
+        inspiration on the rig.
+        """
+        pressure = jnp.asarray(pressure)
+        zero = jnp.zeros_like(pressure)
+        rest = self.rest + zero
+        flow = self.valve(rest)
+        return HybridState(
+            elastic=pressure + self.offset,
+            drop=zero - self.offset,
+            sensor=pressure,
+            flow=flow,
+            commanded=(flow, flow),
+            opened=(zero + 1.0, zero + 1.0),
+            before=zero + 0.03,
+            plays=tuple(rest for _ in PLAYS),
+            u_in=rest,
+            peep=pressure if peep is None else peep + zero,
+        )
+
+    def step(
+        self, state: HybridState, u_in: Array, u_out: Array, dt: Array
+    ) -> tuple[HybridState, Array]:
+        """Hold one command; see :class:`~ventbench.plants.base.Plant`.
+
+        Each substep is an exponential step of the drop over the airway, with the airway's
+        resistance and the elastic slope of its start.
+        """
+        plays = tuple(
+            jnp.clip(play, u_in - half, u_in + half)
+            for play, half in zip(state.plays, PLAYS, strict=True)
+        )
+        effective = u_in + sum(
+            self.direction[..., i] * (play - u_in) for i, play in enumerate(plays)
+        )
+        commanded = (self.valve(jnp.maximum(effective, 0.0)), *state.commanded)
+        opened = (u_out + jnp.zeros_like(state.u_in), *state.opened)
+        # Behind the expiratory valve stands what makes the resting flow hold PEEP.
+        behind = state.peep - self.valve(self.rest + jnp.zeros_like(u_in)) / self.conductance
+        elastic, drop, sensor, flow = state.elastic, state.drop, state.sensor, state.flow
+        h = dt / SUBSTEPS
+        lag, smooth = jnp.exp(-h / self.valve_lag), jnp.exp(-h / self.sensor_lag)
+        open_or_close = u_out * self.opening_delay + (1.0 - u_out) * self.closing_delay
+        for k in range(SUBSTEPS):
+            shares = overlap(k * h - self.valve_delay, h, state.before)
+            wanted = sum(share * q for share, q in zip(shares, commanded, strict=True))
+            inflow = wanted + (flow - wanted) * self.valve_lag / h * (1.0 - lag)  # mean over h
+            flow = wanted + (flow - wanted) * lag
+            shares = overlap(k * h - open_or_close, h, state.before)
+            outlet = self.conductance * sum(s * o for s, o in zip(shares, opened, strict=True))
+            elastic, drop, pressure = self._fill(elastic, drop, inflow, outlet, behind, h)
+            sensor = pressure + (sensor - pressure) * smooth
+        change = (u_in - state.u_in) / DIRECTION_WIDTH
+        reading = sensor + (1.0 - u_out) * (
+            self.rising * jnp.tanh(jnp.maximum(change, 0.0))
+            + self.falling * jnp.tanh(jnp.minimum(change, 0.0))
+        )
+        after = HybridState(
+            elastic, drop, sensor, flow, commanded[:2], opened[:2], dt + 0.0 * drop, plays, u_in,
+            state.peep,
+        )  # fmt: skip
+        return after, reading
+
+    def _fill(
+        self, elastic: Array, drop: Array, inflow: Array, outlet: Array, behind: Array, h: Array
+    ) -> tuple[Array, Array, Array]:
+        """One substep of circuit and lung; returns elastic, drop and airway pressure."""
+        recoil, slope = self.recoil(elastic)
+        # Q from drop = R Q + K2 Q |Q|; 1e-6 keeps the derivative finite at rest.
+        resistance = 0.5 * (self.R + jnp.sqrt(self.R**2 + 4.0 * self.K2 * (jnp.abs(drop) + 1e-6)))
+        rate = (1.0 / self.circuit_compliance + self.E * slope) / resistance
+        rate = rate + outlet / self.circuit_compliance
+        goal = (inflow - outlet * (recoil - behind)) / self.circuit_compliance / rate
+        decay = jnp.exp(-rate * h)
+        mean = goal + (drop - goal) * (1.0 - decay) / (rate * h)
+        elastic = elastic + self.E * mean / resistance * h
+        recoil, _ = self.recoil(elastic)
+        pressure = recoil + goal + (drop - goal) * decay
+        excess = jnp.maximum(pressure - RELIEF, 0.0)
+        pressure = pressure - excess + RELIEF_ROOM * (1.0 - jnp.exp(-excess / RELIEF_ROOM))
+        return elastic, pressure - recoil, pressure
+
+    def vary(self, r_scale: Array, c_scale: Array) -> Hybrid:
+        """Return the same rig with another resistance and compliance of the lung."""
+        return self.replace(  # type: ignore[attr-defined]
+            R=self.R * r_scale, K2=self.K2 * r_scale, E=self.E / c_scale
+        )

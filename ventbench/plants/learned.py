@@ -1,0 +1,315 @@
+"""The paper's stitched network: windows of past pressures and controls to the next pressure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ventbench import protocol
+from ventbench.plants.mlp import ACTIVATIONS, MLP, layer_sizes, mlp
+
+#: Interval at which the network's rate output is an increment, s (mean of the recordings').
+REFERENCE_DT = 0.033
+
+#: Pressures that a learned plant can reach, cmH2O: it bends towards them within 1 cmH2O and is
+#: exact (to float32) between 15 cmH2O above the lower and 15 below the upper one.
+LOWEST, HIGHEST = -15.0, 100.0
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Shape of a learned plant; the defaults are the paper's for R5C10.
+
+    Attributes:
+        pressures: length of the pressure window, H_p.
+        controls: length of the control window, H_c; the command now is its last entry.
+        width: of each hidden layer.
+        depth: number of matrices, the output's included (the authors' count).
+        boundaries: N_B, one-hidden-layer networks for the first steps of an inspiration.
+        boundary_width: their hidden width (authors' code: 100).
+        activation: ``"tanh"`` or ``"selu"``, of the general network; boundary ones are tanh.
+    """
+
+    pressures: int = 5
+    controls: int = 10
+    width: int = 150
+    depth: int = 9
+    boundaries: int = 1
+    boundary_width: int = 100
+    activation: str = "tanh"
+
+    def __post_init__(self) -> None:
+        """Refuse impossible shapes.
+
+        Raises:
+            ValueError: naming the field and its value.
+        """
+        for name in ("pressures", "controls", "width", "depth", "boundary_width"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"learned plant: {name} = {getattr(self, name)} must be >= 1")
+        if self.boundaries < 0:
+            raise ValueError(f"learned plant: boundaries = {self.boundaries} must be >= 0")
+        if self.activation not in ACTIVATIONS:
+            raise ValueError(
+                f"learned plant: activation {self.activation!r} is not one of "
+                f"{', '.join(ACTIVATIONS)}"
+            )
+
+
+@flax.struct.dataclass
+class Boundary:
+    """N_B networks of one hidden tanh layer, side by side in two matrices.
+
+    Attributes:
+        hidden: shape ``(in, N_B * width)``.
+        hidden_bias: shape ``(N_B * width,)``.
+        output: shape ``(N_B * width, 2)``.
+        output_bias: shape ``(N_B, 2)``.
+    """
+
+    hidden: Array
+    hidden_bias: Array
+    output: Array
+    output_bias: Array
+
+    def __call__(self, x: Array, index: Array) -> Array:
+        """Evaluate network ``index`` (shape ``(...)``) at inputs of shape ``(..., in)``.
+
+        All hidden layers are one matrix product; the others' units are then set to zero, so that
+        the output is one product too and no weight is gathered. Zero for an index beyond N_B.
+        """
+        count = self.output_bias.shape[0]
+        chosen = (index[..., None] == jnp.arange(count)).astype(x.dtype)
+        units = jnp.tanh(x @ self.hidden + self.hidden_bias)
+        units = units * jnp.repeat(chosen, units.shape[-1] // count, axis=-1)
+        return units @ self.output + chosen @ self.output_bias
+
+
+@flax.struct.dataclass
+class LearnedState:
+    """Windows of a learned plant.
+
+    Attributes:
+        pressures: the last samples, the newest last, cmH2O, shape ``(..., H_p)``.
+        controls: the last commands, the newest last, %, shape ``(..., H_c)``.
+        count: steps since the inspiration began, shape ``(...)``.
+        peep: pressure behind the expiratory valve, cmH2O, shape ``(...)``.
+    """
+
+    pressures: Array
+    controls: Array
+    count: Array
+    peep: Array
+
+
+@flax.struct.dataclass
+class Learned:
+    """Stitched network for the inspiration, first-order relaxation for the expiration.
+
+    *Inspiration.* From the window of pressures and that of controls (the command now included) a
+    network gives two numbers, a *jump* and a *rate*, and the next pressure is ``p + jump_scale
+    jump (u - u_before) / control_scale + rate_scale rate dt / REFERENCE_DT``. For an R-C lung the
+    jump is R times the step of flow, which does not depend on dt, and the rate is flow / C, so
+    that a network trained at 31.9 and 34.0 ms is right at 30 ms too; the interval is no input,
+    since in the recordings it betrays the rig. Windows hold samples, whatever their interval. At
+    one fixed interval this is the paper's family of models. Before the inspiration the windows
+    hold the first pressure and command 0. The first N_B steps of an inspiration use a boundary
+    network each. All are evaluated at every step and one is selected; they are shallow (authors'
+    code), 2 % of a 9 x 150 network's cost each.
+
+    *Expiration* (``u_out`` = 1). The network is not used (the paper learned inspirations only):
+    pressure relaxes to PEEP with one time constant whatever ``u_in``, and the windows start anew.
+
+    *Bounds.* ``u_in`` is clipped to the valve's range and the pressure is bent towards ``LOWEST``
+    and ``HIGHEST``, so that it stays finite for any sequence of commands.
+
+    *What it cannot promise.* Pressure need not rise with ``u_in``; see
+    :func:`ventbench.plants.sensitivity.control_sensitivity`. Where the recordings' commands come
+    from a feedback law, the command now tells the pressure now, and a network that sees both can
+    learn to read it there (the paper's does so too): its open-loop error on such recordings is
+    then better than its physics.
+
+    Source: the paper, section 4.3 and appendix B; authors' code for the boundary networks.
+
+    Attributes:
+        general: network after the boundary steps.
+        boundary: networks of the first steps; None if there are none.
+        pressure_mean: of the windows' normalisation, cmH2O.
+        pressure_scale: likewise.
+        control_mean: likewise, %.
+        control_scale: likewise, %.
+        jump_scale: cmH2O for a unit jump output at a command step of ``control_scale``.
+        rate_scale: cmH2O in ``REFERENCE_DT`` for a unit rate output.
+        tau: time constant of expiration, s.
+        valve_scale: factor on commands, see :meth:`vary`; shape ``(...)`` or ``()``.
+        time_scale: factor on time constants, see :meth:`vary`; likewise.
+        windows: ``(H_p, H_c)``.
+    """
+
+    general: MLP
+    boundary: Boundary | None
+    pressure_mean: Array
+    pressure_scale: Array
+    control_mean: Array
+    control_scale: Array
+    jump_scale: Array
+    rate_scale: Array
+    tau: Array
+    valve_scale: Array
+    time_scale: Array
+    windows: tuple[int, int] = flax.struct.field(pytree_node=False)
+
+    def init(self, pressure: Array, peep: Array | None = None) -> LearnedState:
+        """Lung at rest; see :class:`~ventbench.plants.base.Plant`."""
+        pressure = jnp.asarray(pressure) * 1.0
+        behind = pressure if peep is None else jnp.broadcast_to(peep, pressure.shape)
+        return self._rest(pressure, behind.astype(pressure.dtype))
+
+    def _rest(self, pressure: Array, peep: Array) -> LearnedState:
+        pressures, controls = self.windows
+        return LearnedState(
+            jnp.broadcast_to(pressure[..., None], (*pressure.shape, pressures)),
+            jnp.zeros((*pressure.shape, controls), pressure.dtype),
+            jnp.zeros(pressure.shape, jnp.int32),
+            peep,
+        )
+
+    def step(
+        self, state: LearnedState, u_in: Array, u_out: Array, dt: Array
+    ) -> tuple[LearnedState, Array]:
+        """One control step; see the class."""
+        now = state.pressures[..., -1]
+        dt = dt / self.time_scale
+        u_in = self.valve_scale * jnp.clip(u_in, 0.0, protocol.U_MAX)
+        u_in = jnp.broadcast_to(u_in, now.shape).astype(now.dtype)
+        controls = jnp.concatenate([state.controls[..., 1:], u_in[..., None]], axis=-1)
+        features = jnp.concatenate(
+            [
+                (state.pressures - self.pressure_mean) / self.pressure_scale,
+                (controls - self.control_mean) / self.control_scale,
+            ],
+            axis=-1,
+        )
+        out = self.general(features)
+        if self.boundary is not None:
+            first = state.count < self.boundary.output_bias.shape[0]
+            out = jnp.where(first[..., None], self.boundary(features, state.count), out)
+        change = (u_in - state.controls[..., -1]) / self.control_scale
+        jump = self.jump_scale * out[..., 0] * change
+        rate = self.rate_scale * out[..., 1] * dt / REFERENCE_DT
+        inspired = _bend(now + jump + rate)
+        expired = state.peep + (now - state.peep) * jnp.exp(-dt / self.tau)
+
+        is_open = jnp.broadcast_to(u_out > 0.5, now.shape)
+        pressure = jnp.where(is_open, expired, inspired)
+        window = jnp.concatenate([state.pressures[..., 1:], pressure[..., None]], axis=-1)
+        going = LearnedState(window, controls, state.count + 1, state.peep)
+        rest = self._rest(pressure, state.peep)
+        return jax.tree.map(
+            lambda a, b: jnp.where(
+                is_open.reshape(is_open.shape + (1,) * (a.ndim - now.ndim)), a, b
+            ),
+            rest,
+            going,
+        ), pressure
+
+    def vary(self, r_scale: Array, c_scale: Array) -> Learned:
+        """Return the plant of a lung with other R and C, through two exact symmetries.
+
+        A network has no R and C, but an R-C lung obeys ``p = R q + integral(q dt) / C``: R and
+        1 / C together ``r`` times larger answer like ``r`` times the flow; both time constants
+        ``s`` times longer answer like steps of ``dt / s``. So commands are multiplied by
+        ``r_scale`` and intervals divided by ``r_scale c_scale``. Exact for a linear lung and
+        valve; the valve's own lag is scaled along, which is small for the few percent that the
+        published draws vary.
+        """
+        return replace(
+            self,
+            valve_scale=self.valve_scale * r_scale,
+            time_scale=self.time_scale * r_scale * c_scale,
+        )
+
+
+def _bend(pressure: Array) -> Array:
+    """Bend towards ``LOWEST`` and ``HIGHEST``, the identity between."""
+    raised = LOWEST + jax.nn.softplus(pressure - LOWEST)
+    return HIGHEST - jax.nn.softplus(HIGHEST - raised)
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """Constants of a learned plant, see :class:`Learned` for units."""
+
+    pressure_mean: float = 16.0
+    pressure_scale: float = 9.0
+    control_mean: float = 13.0
+    control_scale: float = 16.0
+    jump_scale: float = 2.0
+    rate_scale: float = 2.0
+    tau: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Refuse scales that are not positive.
+
+        Raises:
+            ValueError: naming the constant and its value.
+        """
+        for name in ("pressure_scale", "control_scale", "jump_scale", "rate_scale", "tau"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"learned plant: {name} = {getattr(self, name)} must be positive")
+
+
+def learned(
+    key: Array, architecture: Architecture, normalisation: Normalisation | None = None
+) -> Learned:
+    """Draw an untrained learned plant; :func:`ventbench.training.learned.fit` trains one.
+
+    Args:
+        key: a JAX key that is used for nothing else.
+        architecture: its shape.
+        normalisation: its constants; the recordings' typical ones if not given.
+
+    Returns:
+        The plant with float32 leaves.
+    """
+    shape, n = architecture, normalisation or Normalisation()
+    inputs = shape.pressures + shape.controls
+    general_key, hidden_key, output_key = jax.random.split(key, 3)
+    general = mlp(
+        general_key,
+        layer_sizes(inputs, shape.width, shape.depth, 2),
+        shape.activation,
+        last_scale=0.1,
+    )
+    boundary = None
+    if shape.boundaries:
+        units = shape.boundaries * shape.boundary_width
+        hidden = jax.random.normal(hidden_key, (inputs, units), jnp.float32)
+        output = jax.random.normal(output_key, (units, 2), jnp.float32)
+        boundary = Boundary(
+            hidden * inputs**-0.5,
+            jnp.zeros(units, jnp.float32),
+            output * 0.1 * shape.boundary_width**-0.5,
+            jnp.zeros((shape.boundaries, 2), jnp.float32),
+        )
+    constants = (
+        n.pressure_mean,
+        n.pressure_scale,
+        n.control_mean,
+        n.control_scale,
+        n.jump_scale,
+        n.rate_scale,
+        n.tau,
+        1.0,
+        1.0,
+    )
+    return Learned(
+        general,
+        boundary,
+        *(jnp.asarray(x, jnp.float32) for x in constants),
+        windows=(shape.pressures, shape.controls),
+    )

@@ -1,0 +1,128 @@
+"""A submission is a folder: how it is found, what it may hold, what identifies it."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from ventbench import data_files, files
+from ventbench.submissions.errors import SubmissionError
+from ventbench.submissions.manifest import Manifest, read
+
+#: Files that every submission has.
+CONTROLLER = "controller.py"
+MANIFEST = "submission.toml"
+
+#: Largest folder, bytes, and number of files.
+MAX_BYTES = 5_000_000
+MAX_FILES = 1000
+
+# Written by Python and by desktops, not by the author.
+_IGNORED_FOLDERS = {"__pycache__"}
+_IGNORED_FILES = {".DS_Store"}
+
+
+@dataclass(frozen=True)
+class Submission:
+    """A submission whose folder and manifest are in order; its code has not been touched.
+
+    Attributes:
+        label: how the person named it; starts every message.
+        folder: absolute path.
+        manifest: of ``submission.toml``.
+        sha256: of the folder, see :func:`content_hash`.
+    """
+
+    label: str
+    folder: Path
+    manifest: Manifest
+    sha256: str
+
+
+def bundled() -> list[str]:
+    """Names of the submissions that travel with ventbench."""
+    folder = data_files.submissions_folder()
+    return sorted(path.parent.name for path in folder.glob(f"*/{MANIFEST}"))
+
+
+def resolve(name: str) -> Path:
+    """Find the folder of a submission.
+
+    Args:
+        name: path of a folder, or the name of a bundled submission.
+
+    Raises:
+        SubmissionError: if there is neither.
+    """
+    path = Path(name)
+    if path.is_dir():
+        return path.resolve()
+    if path.is_file():
+        raise SubmissionError(f"{name} is a file; give the folder that holds {CONTROLLER}")
+    if name in bundled():
+        return data_files.submissions_folder() / name
+    close = difflib.get_close_matches(path.name, bundled(), n=1)
+    hint = f"did you mean {close[0]}?" if close else f"bundled are {', '.join(bundled())}"
+    raise SubmissionError(f"{name}: no such folder and no bundled submission of that name; {hint}")
+
+
+def open_submission(name: str) -> Submission:
+    """Find a submission and check its folder and manifest.
+
+    Args:
+        name: path of a folder, or the name of a bundled submission.
+
+    Raises:
+        SubmissionError: naming every problem.
+    """
+    folder = resolve(name)
+    problems = []
+    paths, size = [], 0
+    for path in _walk(folder):
+        relative = path.relative_to(folder).as_posix()
+        if path.is_symlink():
+            problems.append(f"{name}: {relative} is a symbolic link; put the file itself there")
+        elif not path.is_file():
+            problems.append(f"{name}: {relative} is neither a file nor a folder")
+        else:
+            paths.append(path)
+            size += path.stat().st_size
+        if len(paths) > MAX_FILES:
+            problems.append(f"{name}: more than {MAX_FILES} files")
+            break
+    if size > MAX_BYTES:
+        problems.append(f"{name}: {size / 1e6:.1f} MB; at most {MAX_BYTES / 1e6:g} MB are accepted")
+    for required in (CONTROLLER, MANIFEST):
+        if not (folder / required).is_file():
+            problems.append(f"{name}: {required} is missing")
+    if problems:
+        raise SubmissionError(*problems)
+    manifest = read(folder / MANIFEST, f"{name}/{MANIFEST}".replace("//", "/"))
+    return Submission(name.rstrip("/"), folder, manifest, content_hash(folder, paths))
+
+
+def _walk(folder: Path) -> list[Path]:
+    found = []
+    for parent, folders, names in os.walk(folder):
+        links = [name for name in folders if (Path(parent) / name).is_symlink()]
+        folders[:] = sorted(set(folders) - _IGNORED_FOLDERS - set(links))
+        found += [Path(parent) / name for name in (*links, *names) if name not in _IGNORED_FILES]
+    return sorted(found)
+
+
+def content_hash(folder: Path, paths: list[Path]) -> str:
+    """SHA-256 of the names and contents of a submission's files.
+
+    Of the text that ``sha256sum`` prints for the files, sorted by relative path:
+    ``HASH  PATH`` a line.
+
+    Args:
+        folder: of the submission.
+        paths: its files.
+    """
+    lines = sorted((path.relative_to(folder).as_posix(), files.sha256(path)) for path in paths)
+    text = "".join(f"{digest}  {name}\n" for name, digest in lines)
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()

@@ -1,0 +1,142 @@
+"""Who runs the controllers: an interface that a sandbox fills, and the plain way in this process.
+
+A runner starts one fresh controller for each cell and then answers a batch of observations at a
+time. Only numbers cross: a :class:`Task` for each cell at the start, then at every step
+:data:`~ventbench.submissions.cell.ROW` floats to each controller and one float back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.controllers.base import Observation, Task
+from ventbench.submissions.cell import Cell, Failed
+from ventbench.submissions.errors import Failure
+from ventbench.submissions.folder import Submission
+from ventbench.submissions.load import controller_class
+
+Floats = NDArray[np.float64]
+
+
+class Session(Protocol):
+    """Controllers of all cells of one submission, between start and close."""
+
+    @property
+    def failures(self) -> Mapping[int, Failure]:
+        """By index of the cell, what went wrong up to now; a failed cell stays failed."""
+        ...
+
+    def act(self, observations: Floats) -> Floats:
+        """Ask every controller for its next command.
+
+        Called once for each step of each inspiration, in order.
+
+        Args:
+            observations: one row a cell, see :func:`pack`, shape ``(cells, ROW)``.
+
+        Returns:
+            ``u_in``, %, shape ``(cells,)``: finite, 0 for a failed cell, not clipped.
+        """
+        ...
+
+    def close(self) -> None:
+        """End all controllers; may be called more than once."""
+        ...
+
+
+class Runner(Protocol):
+    """Starts sessions.
+
+    Attributes:
+        sandbox: the layers that keep a submission apart, as they go into the record; None if there
+            is none, and the result then is not official.
+    """
+
+    @property
+    def sandbox(self) -> Mapping[str, Any] | None:
+        """See the class."""
+        ...
+
+    def start(self, submission: Submission, tasks: Sequence[Task]) -> Session:
+        """Make and reset one fresh controller for each cell.
+
+        A controller that cannot be made or reset is a failure of its cell, found in the session.
+
+        Args:
+            submission: whose folder holds the code.
+            tasks: one for each cell.
+
+        Raises:
+            SubmissionError: if the code cannot be imported or lacks what it must have.
+        """
+        ...
+
+
+def pack(observation: Observation) -> Floats:
+    """Lay a batch of observations out as rows.
+
+    Args:
+        observation: fields of shape ``(...)``, ``targets_ahead`` ``(..., TARGETS_AHEAD)``.
+
+    Returns:
+        float64, shape ``(cells, ROW)``: the fields in their order, batch axes flattened.
+    """
+    shape = np.shape(observation.pressure)
+    columns = [
+        np.broadcast_to(np.asarray(field, float), shape)[..., None]
+        if name != "targets_ahead"
+        else np.asarray(field, float)
+        for name, field in zip(Observation._fields, observation, strict=True)
+    ]
+    rows = np.concatenate(columns, axis=-1)
+    return rows.reshape(-1, rows.shape[-1])
+
+
+class InProcessSession:
+    """See :class:`InProcessRunner`."""
+
+    def __init__(self, submission: Submission, tasks: Sequence[Task]):
+        controller = controller_class(submission.folder, submission.label)
+        self.failures: dict[int, Failure] = {}
+        self._count = len(tasks)
+        self._cells: dict[int, Cell] = {}
+        for index, task in enumerate(tasks):
+            try:
+                self._cells[index] = Cell(controller, task, submission.folder)
+            except Failed as failed:
+                self.failures[index] = failed.failure
+
+    def act(self, observations: Floats) -> Floats:
+        """See :class:`Session`."""
+        commands = np.zeros(self._count)
+        rows = observations.tolist()
+        for index, cell in list(self._cells.items()):
+            try:
+                commands[index] = cell.act(rows[index])
+            except Failed as failed:
+                self.failures[index] = failed.failure
+                del self._cells[index]
+        return commands
+
+    def close(self) -> None:
+        """Forget the controllers."""
+        self._cells.clear()
+
+
+class InProcessRunner:
+    """Runs controllers in this process, with all of its rights: for code that you trust.
+
+    Quick, and good for one's own development. Nothing stops a submission from reading the
+    simulators or keeping state from cell to cell, so results carry ``"sandbox": null`` and
+    ``"official": false``.
+    """
+
+    sandbox: Mapping[str, Any] | None = None
+
+    def start(self, submission: Submission, tasks: Sequence[Task]) -> Session:
+        """See :class:`Runner`."""
+        return InProcessSession(submission, tasks)

@@ -1,0 +1,190 @@
+"""Scoring a submission: the nominal cells, the published draws, the safety gate."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench import draws as published
+from ventbench import precision, protocol, scenario, waveform
+from ventbench.controllers.base import Task
+from ventbench.lungs import LUNGS, Lung
+from ventbench.metrics import effort, safety, step_response
+from ventbench.metrics.waveform import run_error
+from ventbench.plants.base import Plant
+from ventbench.scenario import Scenario
+from ventbench.submissions.errors import SubmissionError
+from ventbench.submissions.folder import Submission
+from ventbench.submissions.result import CellFailure, Score
+from ventbench.submissions.runner import InProcessRunner, Runner
+from ventbench.submissions.stepping import Run, as_float64, replay, step_through
+from ventbench.trajectories import Trajectories
+
+Floats = NDArray[np.float64]
+
+
+def score(
+    submission: Submission,
+    plants: Plant,
+    *,
+    track: str | None = None,
+    draws: int = 0,
+    lungs: Sequence[Lung] = LUNGS,
+    pips: Sequence[float] = protocol.PIPS,
+    runner: Runner | None = None,
+    simulators: Mapping[str, Any] | None = None,
+) -> tuple[Score, Trajectories]:
+    """Run a submission through the protocol.
+
+    Args:
+        submission: from :func:`ventbench.submissions.folder.open_submission`.
+        plants: one plant, stacked over the lungs on the leading axis of every leaf.
+        track: ``"performance"`` or ``"robustness"``; the manifest's first if not given.
+        draws: how many of the published draws to run besides the nominal cells, 0..20.
+        lungs: of ``plants``, in their order.
+        pips: cmH2O.
+        runner: of the controllers; in this process if not given.
+        simulators: what is known of the plants (version, hashes), to be written into the result.
+
+    Returns:
+        The score, and the nominal trajectories with their expirations.
+
+    Raises:
+        SubmissionError: if the submission cannot be run at all, or does not enter the track.
+        InputError: if there are no such draws.
+        ValueError: if the plants are not stacked over the lungs.
+        FloatingPointError: if a plant answers with NaN or infinity.
+    """
+    started = time.perf_counter()
+    runner = runner or InProcessRunner()
+    entered = submission.manifest.tracks
+    track = track or entered[0]
+    if track not in entered:
+        raise SubmissionError(
+            f"{submission.label}: submission.toml, key tracks: enters {', '.join(entered)}; "
+            f"it cannot be scored for {track}"
+        )
+    names, pips = tuple(lung.id for lung in lungs), tuple(float(pip) for pip in pips)
+    known = track == "performance"
+    tasks = [
+        Task(track, name if known else None, protocol.DT, protocol.INSPIRATION_STEPS)
+        for name in names
+    ]
+    with precision.float64():
+        plants = as_float64(plants, len(names))
+        cells = _cells(pips, draws)
+        run = step_through(plants, cells, runner, submission, tasks)
+        nominal = jax.tree.map(lambda x: x[0], cells)
+        inspired, expired = replay(plants, nominal, run.requested[:, 0])
+
+    # The expiration of the last breath is run for the picture only; no score depends on either.
+    joined = [
+        np.concatenate([getattr(inspired, name), getattr(expired, name)], axis=-1)
+        for name in ("pressure", "u_in")
+    ]
+    trajectories = _trajectories(submission.manifest.name, track, names, pips, *joined)
+
+    timing = {
+        "seconds": time.perf_counter() - started,
+        "act_median_us": 1e6 * float(np.median(run.act_seconds)),
+        "act_max_us": 1e6 * float(np.max(run.act_seconds)),
+    }
+    pip = cells.pip[..., None]  # the target of every inspiratory step
+    errors = run_error(run.pressure, pip[..., None])
+    for cell in run.failures:
+        errors[cell] = np.nan
+    requested = run.requested[:, 0]
+    result = Score(
+        submission=submission,
+        track=track,
+        lungs=names,
+        pips=pips,
+        nominal=errors[:, 0],
+        drawn=np.moveaxis(errors[:, 1:], 1, 0),
+        safe=np.all(safety.safe(run.pressure, pip, cells.dt[..., None]), axis=(1, 2, 3)),
+        peak=run.pressure.max(axis=(1, 2, 3, 4)),
+        figures=_figures(run, cells),
+        below=np.sum(requested < 0.0, axis=(1, 2, 3)),
+        above=np.sum(requested > protocol.U_MAX, axis=(1, 2, 3)),
+        commands=requested[0].size,
+        failures=_failures(run, submission, tasks, names, pips),
+        sandbox=runner.sandbox,
+        simulators=simulators,
+        timing=timing,
+    )
+    return result, trajectories
+
+
+def _cells(pips: tuple[float, ...], draws: int) -> Scenario:
+    """Nominal cells and draws, batch shape ``(1 + draws, P)``."""
+    # In numpy: each eager JAX operation would compile a kernel of its own.
+    cells = jax.tree.map(lambda x: np.asarray(x)[None], scenario.nominal(np.asarray(pips)))
+    if draws == 0:
+        return cells
+    return jax.tree.map(lambda *x: np.concatenate(x), cells, published.scenarios(pips, draws))
+
+
+def _figures(run: Run, cells: Scenario) -> dict[str, Floats]:
+    """Secondary figures of the scored nominal inspirations, shape ``(L, P, scored breaths)``."""
+    pressure, u_in, requested = (
+        x[:, 0][:, :, protocol.SCORED_BREATHS, :] for x in (run.pressure, run.u_in, run.requested)
+    )
+    peep, pip, dt = (x[0, :, None] for x in (cells.peep, cells.pip, cells.dt))
+    return {
+        "rise_time_s": step_response.rise_time(pressure, peep, pip, dt),
+        "overshoot_cmH2O": step_response.overshoot(pressure, pip),
+        "overshoot_percent": step_response.overshoot_percent(pressure, peep, pip),
+        "settling_time_s": step_response.settling_time(pressure, peep, pip, dt),
+        "steady_error_cmH2O": step_response.steady_error(pressure, pip),
+        "swings": step_response.swings(pressure, pip),
+        "ripple_cmH2O": step_response.ripple(pressure),
+        "time_above_alarm_s": safety.time_above_alarm(pressure, pip, dt),
+        "mean_u_in_percent": effort.mean_command(u_in),
+        "mean_change_percent_per_step": effort.mean_change(u_in),
+        "clipped_share": effort.clipped_share(requested),
+    }
+
+
+def _failures(
+    run: Run,
+    submission: Submission,
+    tasks: Sequence[Task],
+    lungs: tuple[str, ...],
+    pips: tuple[float, ...],
+) -> tuple[CellFailure, ...]:
+    return tuple(
+        CellFailure(
+            lungs[i], pips[p], k or None, failure, failure.message(submission.label, tasks[i].lung)
+        )
+        for (i, k, p), failure in sorted(run.failures.items())
+    )
+
+
+def _trajectories(
+    name: str,
+    track: str,
+    lungs: tuple[str, ...],
+    pips: tuple[float, ...],
+    pressure: Floats,
+    u_in: Floats,
+) -> Trajectories:
+    """Lay breaths end to end; ``pressure`` and ``u_in`` have shape ``(L, P, BREATHS, steps)``."""
+    steps = np.arange(protocol.BREATHS * protocol.BREATH_STEPS)
+    shape = (len(lungs), len(pips), steps.size)
+    u_out = (steps % protocol.BREATH_STEPS >= protocol.INSPIRATION_STEPS).astype(float)
+    return Trajectories(
+        name=name,
+        track=track,
+        lungs=lungs,
+        pips=pips,
+        time=np.asarray(steps * protocol.DT, np.float64),
+        target=np.broadcast_to(waveform.target(steps, np.asarray(pips)[:, None]), shape),
+        pressure=pressure.reshape(shape),
+        u_in=u_in.reshape(shape),
+        u_out=np.broadcast_to(u_out, shape),
+    )

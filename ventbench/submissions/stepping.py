@@ -1,0 +1,172 @@
+"""The loop between plants and controllers: all cells together, only numbers between them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from ventbench import environment as env
+from ventbench import precision, protocol, rollout
+from ventbench.controllers.base import Observation, Task
+from ventbench.controllers.script import Script
+from ventbench.plants.base import Plant, PlantT
+from ventbench.scenario import Scenario
+from ventbench.submissions.errors import Failure
+from ventbench.submissions.folder import Submission
+from ventbench.submissions.runner import Runner, pack
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Run:
+    """Inspirations of all cells; arrays of shape ``(L, ..., BREATHS, INSPIRATION_STEPS)``.
+
+    L lungs; ``(...)`` is the batch shape of the scenario.
+
+    Attributes:
+        pressure: true airway pressure at each step, cmH2O.
+        requested: what the controllers asked for, %; 0 once a cell has failed.
+        u_in: what was applied, %.
+        failures: by cell, index ``(lung, ...)``.
+        act_seconds: time that one ``act`` took on average, s, for each round of all cells, shape
+            ``(BREATHS * INSPIRATION_STEPS,)``.
+    """
+
+    pressure: Floats
+    requested: Floats
+    u_in: Floats
+    failures: Mapping[tuple[int, ...], Failure]
+    act_seconds: Floats
+
+
+def as_float64(plants: PlantT, count: int) -> PlantT:
+    """Return stacked plants with 64-bit leaves.
+
+    Args:
+        plants: one plant whose leaves have the lungs on their leading axis.
+        count: number of lungs.
+
+    Raises:
+        ValueError: if a leaf has another leading axis.
+    """
+
+    def convert(leaf: Any) -> Array:
+        leaf = jnp.asarray(leaf)
+        if leaf.shape[:1] != (count,):
+            raise ValueError(
+                f"a plant's parameter of shape {leaf.shape} is not stacked over {count} lungs"
+            )
+        return leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+
+    return jax.tree.map(convert, plants)
+
+
+def _strong(tree: Any) -> Any:
+    """Drop weak types, which would make the second step compile anew."""
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), tree)
+
+
+@jax.jit
+def _begin(plants: Plant, scenario: Scenario) -> tuple[Plant, env.Bench]:
+    def begin(plant: Plant) -> tuple[Plant, env.Bench]:
+        varied = env.vary(plant, scenario)
+        return varied, env.start_breath(varied, scenario)
+
+    return _strong(jax.vmap(begin)(plants))
+
+
+@jax.jit
+def _observe(scenario: Scenario, bench: env.Bench, breath: Array, step: Array) -> Observation:
+    return jax.vmap(lambda bench: env.observe(scenario, bench, breath, step))(bench)
+
+
+@jax.jit
+def _inspire(
+    plants: Plant, scenario: Scenario, bench: env.Bench, u_in: Array
+) -> tuple[env.Bench, Array]:
+    def inspire(plant: Plant, bench: env.Bench, u_in: Array) -> tuple[env.Bench, Array]:
+        return env.inspire(plant, scenario, bench, u_in)
+
+    return _strong(jax.vmap(inspire)(plants, bench, u_in))
+
+
+def step_through(
+    plants: Plant,
+    scenario: Scenario,
+    runner: Runner,
+    submission: Submission,
+    tasks: Sequence[Task],
+) -> Run:
+    """Run a submission on every lung and cell. Call it within ``precision.float64()``.
+
+    Args:
+        plants: from :func:`as_float64`, L lungs.
+        scenario: cells of each lung, batch shape ``(...)``.
+        runner: of the controllers.
+        submission: whose they are.
+        tasks: what is told of each lung, length L.
+
+    Raises:
+        SubmissionError: if the submission cannot be run at all.
+        FloatingPointError: if a plant answers with NaN or infinity.
+    """
+    batch = (len(tasks), *scenario.pip.shape)
+    cells = int(np.prod(batch))
+    shape = (*batch, protocol.BREATHS, protocol.INSPIRATION_STEPS)
+    pressure, requested, applied = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    seconds = []
+    varied, rest = _begin(plants, scenario)
+    each = [task for task in tasks for _ in range(cells // len(tasks))]
+    with precision.float32():  # a submission that uses JAX finds it as it is elsewhere
+        session = runner.start(submission, each)
+    try:
+        for breath in range(protocol.BREATHS):
+            bench = rest
+            for step in range(protocol.INSPIRATION_STEPS):
+                rows = pack(_observe(scenario, bench, breath, step))
+                live = max(1, cells - len(session.failures))
+                start = time.perf_counter()
+                with precision.float32():
+                    commands = session.act(rows)
+                seconds.append((time.perf_counter() - start) / live)
+                commands = commands.reshape(batch)
+                now = (..., breath, step)
+                pressure[now], requested[now] = bench.pressure, commands
+                bench, applied[now] = _inspire(varied, scenario, bench, commands)
+        failures = dict(session.failures)
+    finally:
+        session.close()
+    broken = np.flatnonzero(~np.isfinite(pressure).reshape(len(tasks), -1).all(axis=1))
+    if broken.size:
+        raise FloatingPointError(f"simulator {broken[0]} answered with NaN or infinity")
+    by_cell = {tuple(int(i) for i in np.unravel_index(k, batch)): v for k, v in failures.items()}
+    return Run(pressure, requested, applied, by_cell, np.array(seconds))
+
+
+def replay(
+    plants: Plant, scenario: Scenario, requested: Floats
+) -> tuple[rollout.Inspirations, rollout.Expirations]:
+    """Apply recorded commands again, with the expirations. Call it within ``float64()``.
+
+    Args:
+        plants: from :func:`as_float64`, L lungs.
+        scenario: cells of each lung, batch shape ``(...)``.
+        requested: as in :class:`Run`.
+
+    Returns:
+        Arrays of shape ``(L, ..., BREATHS, steps)``, cmH2O and %.
+    """
+
+    def run(plant: Plant, commands: Array) -> Any:
+        return rollout.closed_loop(plant, Script(commands), scenario, whole=True)
+
+    return jax.vmap(run)(plants, jnp.asarray(requested.reshape(*requested.shape[:-2], -1)))

@@ -1,0 +1,153 @@
+"""The small multiples as a PNG, through matplotlib's object interface: no global state.
+
+All panels lie in one axes in panel units: 36 axes would take seconds.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+import numpy as np
+
+from ventbench import protocol
+from ventbench.lungs import lung as parse_lung
+from ventbench.trajectories import Trajectories
+from ventbench.views import panels, scores, style
+from ventbench.views.drawing import Drawing
+from ventbench.views.runs import Floats, labels, number
+
+#: Width, pixels.
+PIXELS = 1800
+
+#: Panel units: margin, gap between panels, heads of the figure (without legend) and of a row.
+MARGIN, GAP, HEAD, ROW_HEAD = 14.0, 6.0, 50.0, 40.0
+
+#: Height of one row of the legend, panel units.
+LEGEND = 19.0
+
+INK, QUIET, RULE, BAND = "#16191d", "#5b636d", "#d9dde2", "#eef1f4"
+
+
+def png(runs: Sequence[Trajectories]) -> bytes:
+    """Return the PNG; equal input gives equal bytes.
+
+    Args:
+        runs: matching runs, the one to look at first.
+    """
+    columns, rows = len(runs[0].pips), len(runs[0].lungs)
+    width = 2 * MARGIN + columns * panels.WIDTH + (columns - 1) * GAP
+    height = 2 * MARGIN + HEAD + len(runs) * LEGEND + rows * (ROW_HEAD + panels.HEIGHT)
+    draw = Drawing(width, height, PIXELS)
+    numbers, names = scores.collect(runs), [draw.known(name) for name in labels(runs)]
+    start = _head(draw, names, runs[0].track)
+    for i, row in enumerate(panels.panels(runs)):
+        top = start + i * (ROW_HEAD + panels.HEIGHT)
+        _row_head(draw, row[0].lung, names, numbers.lungs[:, i], top)
+        for j, panel in enumerate(row):
+            origin = (MARGIN + j * (panels.WIDTH + GAP), top + ROW_HEAD)
+            _panel(draw, panel, numbers.cells[:, i, j], origin, first=j == 0)
+    used = start + rows * (ROW_HEAD + panels.HEIGHT) + MARGIN
+    output = io.BytesIO()
+    image = draw.image()
+    # Room was kept for a legend of one row a run.
+    image.crop((0, 0, image.width, round(used * PIXELS / width))).save(
+        output, format="PNG", optimize=True
+    )
+    return output.getvalue()
+
+
+def _head(draw: Drawing, names: Sequence[str], track: str) -> float:
+    """Title, how to read the panels, legend; returns where the panels may start."""
+    draw.text(MARGIN, MARGIN + 14, names[0], 17, INK, weight="bold")
+    about = f"{draw.known(track)} track, protocol {protocol.VERSION}"
+    read = (
+        f"Breath {panels.BREATH + 1} on each lung at each PIP. Above: airway pressure, cmH2O; "
+        "below: u_in, %; against time, s. Band: scored. Numbers: mean absolute error, cmH2O."
+    )
+    draw.text(MARGIN, MARGIN + 34, f"{about}. {read}", 10, QUIET)
+    x, y = MARGIN, MARGIN + HEAD
+    shown = [("target", INK, 1.1), *((n, _color(i), _width(i)) for i, n in enumerate(names))]
+    for name, color, width in shown:
+        length = 48 + draw.text_width(name, 11)
+        if x > MARGIN and x + length > draw.width - MARGIN:
+            x, y = MARGIN, y + LEGEND
+        draw.line(np.array([[x, y + 4], [x + 18, y + 4]]), color, width, 5)
+        draw.text(x + 23, y + 8, name, 11, INK)
+        x += length
+    return y + LEGEND
+
+
+def _row_head(draw: Drawing, lung: str, names: Sequence[str], errors: Floats, top: float) -> None:
+    """Name of a lung on the left, its first two numbers on the right."""
+    about = parse_lung(lung)
+    draw.text(MARGIN, top + 21, lung, 12, INK, weight="bold")
+    text = f"R {about.R:g} cmH2O/(L/s), C {about.C:g} mL/cmH2O"
+    draw.text(MARGIN + 70, top + 21, text, 10, QUIET)
+    x = draw.width - MARGIN - 2
+    for k in reversed(range(min(2, len(names)))):
+        said = f"{names[k]} {number(errors[k])}"
+        draw.text(x, top + 21, said, 10, _color(k), ha="right")
+        x -= draw.text_width(said, 10) + 14
+
+
+def _panel(
+    draw: Drawing, panel: panels.Panel, errors: Floats, origin: tuple[float, float], first: bool
+) -> None:
+    at = np.array(origin)
+    left, right = panels.LEFT, panels.LEFT + panels.PLOT_WIDTH
+    bottom = panels.VALVE_TOP + panels.VALVE_HEIGHT
+    end = float(panels.time_x(protocol.INSPIRATION_STEPS * protocol.DT))
+    band = np.array([[left, panels.TOP], [end, panels.TOP], [end, bottom], [left, bottom]])
+    draw.fill(at + band, BAND, 1.0)
+    marks = [*panel.ticks, (panel.valve_limit, panels.VALVE_TOP), (0.0, bottom)]
+    for value, y in marks:
+        draw.line(at + np.array([[left, y], [right, y]]), RULE, 0.7, 0)
+        draw.text(at[0] + left - 4, at[1] + y + 3, f"{value:g}", 8.5, QUIET, ha="right")
+    for t in panels.TIMES:
+        x, last = float(panels.time_x(t)), t == panels.TIMES[-1]
+        text = f"{t:g}{' s' if last else ''}"
+        draw.text(at[0] + x, at[1] + panels.HEIGHT - 3, text, 8.5, QUIET, ha="center")
+    draw.text(at[0] + left, at[1] - 1, f"PIP {panel.pip:g}", 9, QUIET)
+    for k, error in enumerate(errors[:2]):
+        x = at[0] + right - (32 if len(errors) > 1 and k == 0 else 0)
+        look = {"weight": "bold"} if k == 0 else {}
+        draw.text(x, at[1] - 1, number(error), 9, _color(k), ha="right", **look)
+    if first:
+        draw.text(at[0] + right, at[1] + panels.TOP + 9, "cmH2O", 8.5, QUIET, ha="right")
+        draw.text(at[0] + right, at[1] + panels.VALVE_TOP + 10, "u_in, %", 8.5, QUIET, ha="right")
+    target = panels.inspiration(panel.target)
+    scored = panels.inspiration(panel.pressures[0])
+    if np.isfinite(scored).all():
+        area = np.concatenate([_inside(scored), target[::-1]])
+        draw.fill(at + area, _color(0), 0.16)
+    draw.line(at + panel.target, INK, 1.1, 1)
+    for k in range(len(panel.pressures) - 1, -1, -1):
+        order = 2 + (k == 0)
+        line = _inside(panel.pressures[k])
+        draw.line(at + line, _color(k), 0.9, order, 0.5)
+        draw.line(at + panels.inspiration(line), _color(k), _width(k), order)
+        draw.line(at + panel.valves[k], _color(k), 1.0, order)
+    if panel.above is not None:
+        draw.text(
+            at[0] + right,
+            at[1] + panels.TOP + 21,
+            f"↑ {panel.above:.0f}",
+            8.5,
+            _color(0),
+            ha="right",
+        )
+
+
+def _inside(line: Floats) -> Floats:
+    """A pressure line that stays in its frame."""
+    limits = (panels.TOP, panels.TOP + panels.PRESSURE_HEIGHT)
+    return np.stack([line[:, 0], np.clip(line[:, 1], *limits)], axis=-1)
+
+
+def _color(run: int) -> str:
+    return style.RUN_COLORS[style.run_index(run)]
+
+
+def _width(run: int) -> float:
+    return 1.9 if run == 0 else 1.4

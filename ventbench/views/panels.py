@@ -1,0 +1,135 @@
+"""Geometry of the small multiples, the same for the HTML report and the PNG.
+
+A panel is one lung and PIP: pressure above, u_in below, on one time axis: the last scored breath
+from its start to just after the target's fall. Lengths are in units of the panel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ventbench import protocol
+from ventbench.trajectories import Trajectories
+from ventbench.views.runs import Floats
+
+#: Size of a panel, and its two plots: left, top, width, height.
+WIDTH, HEIGHT = 184.0, 150.0
+LEFT, TOP, PLOT_WIDTH, PRESSURE_HEIGHT = 25.0, 5.0, 156.0, 88.0
+VALVE_TOP, VALVE_HEIGHT = 102.0, 34.0
+
+#: Times that are marked on the axis, s.
+TIMES = (0.0, 0.5, 1.0, 1.5)
+
+#: Steps of the breath that are shown: until 0.3 s after the target's fall.
+SHOWN = round((protocol.FALL_END + 0.3) / protocol.DT)
+
+#: The breath that is shown, counted from 0.
+BREATH = max(protocol.SCORED_BREATHS)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One lung and PIP, in panel units (y downwards).
+
+    Attributes:
+        lung: id.
+        pip: cmH2O.
+        ticks: of the pressure axis, value in cmH2O and y.
+        target: polyline, shape ``(SHOWN + 1, 2)``.
+        pressures: one polyline a run, likewise; NaN where there is no finite pressure.
+        valves: likewise, u_in as a staircase.
+        valve_limit: top of the u_in axis, %.
+        above: highest pressure of the first run if that is above the frame, cmH2O.
+    """
+
+    lung: str
+    pip: float
+    ticks: tuple[tuple[float, float], ...]
+    target: Floats
+    pressures: tuple[Floats, ...]
+    valves: tuple[Floats, ...]
+    valve_limit: float
+    above: float | None
+
+
+def panels(runs: Sequence[Trajectories]) -> list[list[Panel]]:
+    """All panels, a row a lung; axes are the same down a column (one PIP)."""
+    columns = [_column(runs, j) for j in range(len(runs[0].pips))]
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def time_x(seconds: Floats | float) -> Floats:
+    """Where a time since the start of the breath lies, panel units."""
+    return LEFT + np.asarray(seconds) / (SHOWN * protocol.DT) * PLOT_WIDTH
+
+
+def inspiration(line: Floats) -> Floats:
+    """Part of a pressure polyline that is scored."""
+    return line[: protocol.INSPIRATION_STEPS]
+
+
+def _window() -> slice:
+    start = BREATH * protocol.BREATH_STEPS
+    return slice(start, start + SHOWN + 1)
+
+
+def _column(runs: Sequence[Trajectories], j: int) -> list[Panel]:
+    pip, window, top = runs[0].pips[j], _window(), _valve_limit(runs, j)
+    x = time_x(np.arange(SHOWN + 1, dtype=np.float64) * protocol.DT)
+    low, high = _limits([run.pressure[:, j, window] for run in runs], runs[0].target[:, j, window])
+
+    def y(pressure: Floats | float) -> Floats:
+        return TOP + (high - np.asarray(pressure)) / (high - low) * PRESSURE_HEIGHT
+
+    def line(pressure: Floats) -> Floats:
+        inside = np.clip(pressure, low - (high - low), high + (high - low))
+        return np.stack([x, np.where(np.isfinite(pressure), y(inside), np.nan)], axis=-1)
+
+    column = []
+    for i, lung in enumerate(runs[0].lungs):
+        pressures = [run.pressure[i, j, window] for run in runs]
+        finite = pressures[0][np.isfinite(pressures[0])]
+        highest = float(finite.max(initial=-np.inf))
+        target = runs[0].target[i, j, window]
+        marks = (float(target.min()), pip)
+        column.append(
+            Panel(
+                lung=lung,
+                pip=pip,
+                ticks=tuple((value, float(y(value))) for value in marks),
+                target=line(target),
+                pressures=tuple(line(pressure) for pressure in pressures),
+                valves=tuple(_stairs(x, run.u_in[i, j, window], top) for run in runs),
+                valve_limit=top,
+                above=highest if highest > high else None,
+            )
+        )
+    return column
+
+
+def _limits(pressures: Sequence[Floats], target: Floats) -> tuple[float, float]:
+    """Pressure axis: holds all runs, up to half the target's height beyond it."""
+    bottom, top = float(target.min()), float(target.max())
+    height = max(top - bottom, 1.0)
+    values = np.concatenate([pressure[np.isfinite(pressure)] for pressure in pressures])
+    high = min(float(values.max(initial=top)), top + 0.5 * height)
+    low = max(float(values.min(initial=bottom)), bottom - 0.5 * height)
+    return low - 0.08 * height, high + 0.08 * height
+
+
+def _valve_limit(runs: Sequence[Trajectories], j: int) -> float:
+    """Top of a column's u_in axes, %: the highest command, up to a multiple of 20."""
+    u_in = [run.u_in[:, j, _window()] for run in runs]
+    highest = max(float(np.max(u, initial=0.0, where=np.isfinite(u))) for u in u_in)
+    return min(max(20.0 * math.ceil(highest / 20.0), 20.0), protocol.U_MAX)
+
+
+def _stairs(x: Floats, u_in: Floats, top: float) -> Floats:
+    """A command holds until the next step."""
+    share = np.where(np.isfinite(u_in), np.clip(u_in, 0.0, top), np.nan) / top
+    y = VALVE_TOP + (1.0 - share) * VALVE_HEIGHT
+    return np.stack([np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]], axis=-1)

@@ -1,0 +1,145 @@
+"""The HTML report: one file, no script, nothing from the network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jinja2
+import numpy as np
+
+import ventbench
+from ventbench import protocol
+from ventbench.lungs import lung as parse_lung
+from ventbench.trajectories import Trajectories
+from ventbench.views import panels, scores, style, svg
+from ventbench.views.runs import Floats, labels, number
+
+
+def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None = None) -> str:
+    """Return the whole page.
+
+    Args:
+        runs: matching runs, the one to look at first; differences are to the second.
+        given: score files in the order of the runs, or None.
+
+    Raises:
+        InputError: if the score files do not belong to the runs.
+    """
+    names = labels(runs)
+    numbers = scores.collect(runs, given)
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("ventbench.views"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html.j2").render(
+        title=names[0],
+        names=names,
+        classes=[f"r{style.run_index(i)}" for i in range(len(runs))],
+        dashed=[i >= len(style.RUN_COLORS) for i in range(len(runs))],
+        light=style.RUN_COLORS,
+        dark=style.RUN_COLORS_DARK,
+        track=runs[0].track,
+        tracks=[run.track for run in runs],
+        table=table(runs[0].lungs, numbers),
+        draws=[scores.draws(score) for score in given or ()],
+        lungs=sections(runs, names, numbers),
+        pips=runs[0].pips,
+        frame=frame(),
+        protocol=protocol,
+        scored=[breath + 1 for breath in protocol.SCORED_BREATHS],
+        shown_breath=panels.BREATH + 1,
+        official=given is not None,
+        provenance=[scores.provenance(score) for score in given or ()],
+        failures=[scores.failures(score) for score in given or ()],
+        version=ventbench.__version__,
+    )
+
+
+def table(lungs: Sequence[str], numbers: scores.Scores) -> list[dict[str, Any]]:
+    """Rows of the score table: the mean, then each lung; for each run text, difference, best."""
+    rows = [("All lungs", numbers.overall), *zip(lungs, numbers.lungs.T, strict=True)]
+    return [{"name": name, "cells": _cells(values)} for name, values in rows]
+
+
+def sections(
+    runs: Sequence[Trajectories], names: Sequence[str], numbers: scores.Scores
+) -> list[dict[str, Any]]:
+    """A lung each: its numbers and its panels."""
+    return [
+        {
+            "id": row[0].lung,
+            "R": f"{parse_lung(row[0].lung).R:g}",
+            "C": f"{parse_lung(row[0].lung).C:g}",
+            "scores": [number(value) for value in numbers.lungs[:, i]],
+            "panels": [_panel(panel, names, numbers.cells[:, i, j]) for j, panel in enumerate(row)],
+        }
+        for i, row in enumerate(panels.panels(runs))
+    ]
+
+
+def frame() -> dict[str, Any]:
+    """What all panels share: sizes, time ticks, the scored part."""
+    end = float(panels.time_x(protocol.INSPIRATION_STEPS * protocol.DT))
+    return {
+        "width": panels.WIDTH,
+        "height": panels.HEIGHT,
+        "left": panels.LEFT,
+        "right": panels.LEFT + panels.PLOT_WIDTH,
+        "top": panels.TOP,
+        "bottom": panels.TOP + panels.PRESSURE_HEIGHT,
+        "scored_width": round(end - panels.LEFT, 1),
+        "scored_end": round(end, 1),
+        "valve_top": panels.VALVE_TOP,
+        "valve_bottom": panels.VALVE_TOP + panels.VALVE_HEIGHT,
+        "times": [(f"{t:g}", round(float(panels.time_x(t)), 1)) for t in panels.TIMES],
+    }
+
+
+def _panel(panel: panels.Panel, names: Sequence[str], errors: Floats) -> dict[str, Any]:
+    said = "; ".join(
+        f"{name} {number(e)}{' cmH2O' if np.isfinite(e) else ''}"
+        for name, e in zip(names, errors, strict=True)
+    )
+    first = panels.inspiration(panel.pressures[0])
+    return {
+        "pip": f"{panel.pip:g}",
+        "alt": f"{panel.lung} at PIP {panel.pip:g} cmH2O: pressure and u_in over one breath. "
+        f"Mean absolute error: {said}.",
+        "errors": [number(error) for error in errors],
+        "ticks": [(f"{value:g}", round(y, 1)) for value, y in panel.ticks],
+        "target": svg.path(panel.target),
+        "area": svg.area(first, panels.inspiration(panel.target)),
+        "pressures": [svg.path(line) for line in panel.pressures],
+        "scored": [svg.path(panels.inspiration(line)) for line in panel.pressures],
+        "valves": [svg.path(line) for line in panel.valves],
+        "valve_limit": f"{panel.valve_limit:g}",
+        "above": None if panel.above is None else f"{panel.above:.0f}",
+    }
+
+
+def _cells(values: Floats) -> list[dict[str, Any]]:
+    """One row of the score table; nothing is best where there is nothing to compare."""
+    best = np.nanmin(values) if len(values) > 1 and np.isfinite(values).any() else np.nan
+    base = values[1] if len(values) > 1 else np.nan
+    return [
+        {
+            "text": number(value),
+            "best": bool(value == best),
+            "failed": not np.isfinite(value),
+            **_difference(value - base if i != 1 else np.nan),
+        }
+        for i, value in enumerate(values)
+    ]
+
+
+def _difference(value: float) -> dict[str, str]:
+    """Text of a difference and whether that is better; what rounds to 0.00 is neither."""
+    if not np.isfinite(value):
+        return {"difference": "", "class": ""}
+    text = number(value, sign=True)
+    kind = "same" if round(value, 2) == 0.0 else "better" if value < 0.0 else "worse"
+    return {"difference": "±0.00" if kind == "same" else text, "class": kind}

@@ -1,0 +1,124 @@
+"""Numbers of the report: from score files where given, else from the runs themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ventbench.errors import InputError
+from ventbench.trajectories import Trajectories
+from ventbench.views.runs import Floats, errors, number
+
+#: Keys of a score that are shown elsewhere or say nothing about where the score comes from.
+NOT_PROVENANCE = frozenset(
+    ("score", "lungs", "secondary", "secondary_missing", "failures", "timing", "cells", "values")
+)
+
+#: Rows of provenance shown for one score, and characters of one of them.
+MOST_ROWS, MOST_CHARACTERS = 60, 200
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of N runs, cmH2O; NaN where a run failed.
+
+    Attributes:
+        overall: shape ``(N,)``.
+        lungs: shape ``(N, L)``.
+        cells: shape ``(N, L, P)``.
+    """
+
+    overall: Floats
+    lungs: Floats
+    cells: Floats
+
+
+def collect(
+    runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None = None
+) -> Scores:
+    """Scores of runs.
+
+    Args:
+        runs: matching runs.
+        given: score files in the order of the runs, or None: then computed from the runs.
+
+    Raises:
+        InputError: if the files are not as many as the runs, or lack one of their lungs.
+    """
+    if given is None:
+        cells = np.stack([errors(run) for run in runs])
+        lungs = cells.mean(axis=2)
+        return Scores(lungs.mean(axis=1), lungs, cells)
+    if len(given) != len(runs):
+        raise InputError(f"{len(given)} scores for {len(runs)} runs; give one score for each run")
+    read = [_read(run, score) for run, score in zip(runs, given, strict=True)]
+    overall, lungs, cells = (np.array(column) for column in zip(*read, strict=True))
+    return Scores(overall, lungs, cells)
+
+
+def draws(score: Mapping[str, Any]) -> str:
+    """Mean over the published draws with its interval, cmH2O; empty if there were none."""
+    found = score.get("draws")
+    if not isinstance(found, Mapping):
+        return ""
+    name = str(score.get("name", "a run"))
+    mean, limits = _number(name, found.get("score")), found.get("ci95") or ()
+    if not np.isfinite(mean) or len(limits) != 2 or None in limits:
+        return number(mean)
+    low, high = (number(_number(name, limit)) for limit in limits)
+    return f"{number(mean)} [{low}, {high}]"
+
+
+def failures(score: Mapping[str, Any]) -> list[str]:
+    """Why a score does not count: safety gate and failed cells, each message once."""
+    items = score.get("failures") or ()
+    messages = [str(x.get("message", x)) if isinstance(x, Mapping) else str(x) for x in items]
+    unsafe = ["did not pass the safety gate"] if score.get("safe") is False else []
+    return list(dict.fromkeys([*unsafe, *messages]))
+
+
+def provenance(score: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What a score says about its origin, as flat pairs of text; not escaped."""
+    rows: list[tuple[str, str]] = []
+    _flatten("", {k: v for k, v in score.items() if k not in NOT_PROVENANCE}, rows)
+    return rows[:MOST_ROWS]
+
+
+def _flatten(prefix: str, value: Any, rows: list[tuple[str, str]]) -> None:
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            if key not in NOT_PROVENANCE and (prefix, key) != ("draws", "ci95"):
+                _flatten(f"{prefix} {key}".strip(), item, rows)
+    elif value not in (None, "", [], ()):
+        items = value if isinstance(value, list | tuple) else [value]
+        text = ", ".join(f"{x:.6g}" if isinstance(x, float) else str(x) for x in items)
+        cut = text[: MOST_CHARACTERS - 1] + "…" if len(text) > MOST_CHARACTERS else text
+        rows.append((prefix, cut))
+
+
+def _read(run: Trajectories, score: Mapping[str, Any]) -> tuple[float, list[float], Floats]:
+    """Overall, lungs and cells of one score file; cells it does not have come from the run."""
+    cells = errors(run)
+    lungs = []
+    for i, lung in enumerate(run.lungs):
+        entry = score.get("lungs", {}).get(lung)
+        if not isinstance(entry, Mapping) or "score" not in entry:
+            raise InputError(f"the score of {run.name!r} has no lung {lung}; is it of another run?")
+        lungs.append(_number(run.name, entry["score"]))
+        pips = entry.get("pips") or {}
+        for j, pip in enumerate(run.pips):
+            if f"{pip:g}" in pips:
+                cells[i, j] = _number(run.name, pips[f"{pip:g}"])
+    return _number(run.name, score.get("score")), lungs, cells
+
+
+def _number(name: str, value: Any) -> float:
+    """A score; null stands for a failed one."""
+    if value is None:
+        return np.nan
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"the score of {name!r} holds {value!r} where a number belongs")
+    return float(value)

@@ -159,7 +159,7 @@ def latency(plant: Plant, repeats: int = 50) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--batch", type=int, nargs="+", default=[512, 1024, 2048, 4096])
+    parser.add_argument("--batch", type=int, nargs="+", default=[1024, 2048, 4096, 8192])
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--width", type=int, default=150)
     parser.add_argument("--depth", type=int, default=9)

@@ -38,7 +38,7 @@ def test_nominal_scenario():
 def test_start_of_a_breath(plant):
     bench = env.start_breath(plant, cell(start=6.0, peep=4.5))
     np.testing.assert_array_equal(bench.pressure, 6.0)
-    np.testing.assert_array_equal(bench.previous, 0.0)
+    np.testing.assert_allclose(bench.previous, 5.0 * (1.0 - np.exp(-5.0 * (99 * 0.03 - 1.5))))
     np.testing.assert_array_equal(bench.plant.peep, 4.5)
 
 

@@ -58,9 +58,12 @@ def vary(plant: Plant, scenario: Scenario) -> Plant:
 
 
 def start_breath(plant: Plant, scenario: Scenario) -> Bench:
-    """Lungs at rest at the start of an inspiration."""
+    """Lungs at rest at the start of an inspiration, the bias flow of the expiration still on."""
+    bias = _table(_EXPIRATORY, scenario)[-1]
     return Bench(
-        plant.init(scenario.start, scenario.peep), scenario.start, jnp.zeros_like(scenario.start)
+        plant.init(scenario.start, scenario.peep),
+        scenario.start,
+        jnp.full_like(scenario.start, bias),
     )
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+from ventbench.errors import InputError
+
 _ID = re.compile(r"R(\d+(?:\.\d+)?)C(\d+(?:\.\d+)?)")
 
 
@@ -37,11 +39,11 @@ def lung(lung_id: str) -> Lung:
         lung_id: such as ``"R20C50"``.
 
     Raises:
-        ValueError: if the text is not a lung id.
+        InputError: if the text is not a lung id.
     """
     match = _ID.fullmatch(lung_id)
     if match is None:
-        raise ValueError(
+        raise InputError(
             f"{lung_id!r} is not a lung id; write R<cmH2O/(L/s)>C<mL/cmH2O>, such as R20C50"
         )
     return Lung(float(match[1]), float(match[2]))
@@ -61,9 +63,9 @@ def scored_lung(lung_id: str) -> Lung:
     """Like :func:`lung`, but only the six scored settings are accepted.
 
     Raises:
-        ValueError: if the text is not the id of a scored lung.
+        InputError: if the text is not the id of a scored lung.
     """
     found = lung(lung_id)
     if found not in LUNGS:
-        raise ValueError(f"{lung_id} is not a scored lung; choose one of {', '.join(LUNG_IDS)}")
+        raise InputError(f"{lung_id} is not a scored lung; choose one of {', '.join(LUNG_IDS)}")
     return found

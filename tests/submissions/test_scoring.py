@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ventbench import draws, precision, protocol, rollout, scenario, waveform
+from ventbench.controllers import expiratory
 from ventbench.controllers.base import Task
 from ventbench.controllers.pid import PID
 from ventbench.errors import InputError
@@ -199,8 +200,9 @@ def test_what_a_submission_is_told(make, plants, track, known):
                 np.testing.assert_allclose(ahead[step], expected)
         assert len(set(dts)) == 1
         requested = np.clip(2.0 * np.arange(1, 103) - 20.0, 0, 100)
-        requested[[33, 67]] = 0.0  # the step after is the first of a breath
-        np.testing.assert_allclose(previous[1:], requested[:-1])
+        bias = expiratory.u_in(protocol.BREATH_STEPS - 1)
+        requested[[33, 67]] = bias  # the step after is the first of a breath
+        np.testing.assert_allclose(previous, [bias, *requested[:-1]])
 
 
 def test_failed_cells(make, plants):

@@ -14,11 +14,11 @@ from ventbench.rollout import open_loop
 from ventbench.training.learned import (
     CHUNK,
     Recipe,
-    _horizon,
     expiratory_time_constant,
     fit,
     inspirations,
 )
+from ventbench.training.learned.loss import horizon
 
 SHAPE = Architecture(pressures=3, controls=4, width=24, depth=3, boundary_width=8)
 SHORT = Recipe(steps=2 * CHUNK + 20, batch=8)
@@ -147,7 +147,7 @@ def test_a_blank_first_pressure_takes_the_next_one():
 def test_horizons_grow_from_one_step_to_the_whole_inspiration():
     recipe = Recipe(one_step=0.2, whole=0.4)
     shares = (0.0, 0.19, 0.4, 0.59, 0.61, 1.0)
-    found = [int(_horizon(recipe, jnp.asarray(x), 32)) for x in shares]
+    found = [int(horizon(recipe, jnp.asarray(x), 32)) for x in shares]
     assert found[:2] == [1, 1]
     assert 1 < found[2] < found[3] <= 32
     assert found[4:] == [33, 33]

@@ -36,7 +36,8 @@ class Observation(NamedTuple):
         pressure: measured airway pressure, cmH2O.
         target: target pressure now, cmH2O.
         targets_ahead: the next 10 targets, cmH2O; shape ``(..., 10)``.
-        previous_u_in: command of the step before as applied, %; 0 at the start of a breath.
+        previous_u_in: command of the step before as applied, %; at the start of a breath the bias
+            flow of the expiration, 5 %.
     """
 
     time: Any

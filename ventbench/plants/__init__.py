@@ -1,0 +1,1 @@
+"""Plants: everything that answers to valve commands with a pressure."""

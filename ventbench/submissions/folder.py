@@ -123,6 +123,16 @@ def content_hash(folder: Path, paths: list[Path]) -> str:
         folder: of the submission.
         paths: its files.
     """
-    lines = sorted((path.relative_to(folder).as_posix(), files.sha256(path)) for path in paths)
-    text = "".join(f"{digest}  {name}\n" for name, digest in lines)
+    return combined_hash({p.relative_to(folder).as_posix(): files.sha256(p) for p in paths})
+
+
+def file_hashes(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file of a submission now, by relative path; links are left out."""
+    paths = [path for path in _walk(folder) if path.is_file() and not path.is_symlink()]
+    return {path.relative_to(folder).as_posix(): files.sha256(path) for path in paths}
+
+
+def combined_hash(hashes: dict[str, str]) -> str:
+    """Return :func:`content_hash` of files whose own hashes are known, by relative path."""
+    text = "".join(f"{digest}  {name}\n" for name, digest in sorted(hashes.items()))
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()

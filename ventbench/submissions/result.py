@@ -47,6 +47,8 @@ class CellFailure:
 class Score:
     """Scores of one submission on one track; L lungs, P PIPs, K draws, cmH2O.
 
+    The JSON holds all but ``requested``, which is what a record is replayed from.
+
     Attributes:
         submission: that was scored.
         track: ``"performance"`` or ``"robustness"``.
@@ -62,6 +64,8 @@ class Score:
         above: nominal commands above 100 %, likewise.
         commands: nominal commands on each lung.
         failures: of all cells.
+        requested: all commands, nominal cells first, %, shape
+            ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``; 0 once a cell has failed.
         sandbox: the runner's layers; None in this process.
         simulators: what the caller says about the plants (version, hashes); goes into the JSON.
         timing: seconds, by name; the only numbers that differ from run to run.
@@ -80,6 +84,7 @@ class Score:
     above: NDArray[np.int64]
     commands: int
     failures: tuple[CellFailure, ...]
+    requested: Floats
     sandbox: Mapping[str, Any] | None
     simulators: Mapping[str, Any] | None
     timing: Mapping[str, float]

@@ -77,7 +77,7 @@ def score(
     ]
     with precision.float64():
         plants = as_float64(plants, len(names))
-        cells = _cells(pips, draws)
+        cells = protocol_cells(pips, draws)
         run = step_through(plants, cells, runner, submission, tasks)
         nominal = jax.tree.map(lambda x: x[0], cells)
         inspired, expired = replay(plants, nominal, run.requested[:, 0])
@@ -113,6 +113,7 @@ def score(
         above=np.sum(requested > protocol.U_MAX, axis=(1, 2, 3)),
         commands=requested[0].size,
         failures=_failures(run, submission, tasks, names, pips),
+        requested=run.requested,
         sandbox=runner.sandbox,
         simulators=simulators,
         timing=timing,
@@ -120,7 +121,7 @@ def score(
     return result, trajectories
 
 
-def _cells(pips: tuple[float, ...], draws: int) -> Scenario:
+def protocol_cells(pips: tuple[float, ...], draws: int) -> Scenario:
     """Nominal cells and draws, batch shape ``(1 + draws, P)``."""
     # In numpy: each eager JAX operation would compile a kernel of its own.
     cells = jax.tree.map(lambda x: np.asarray(x)[None], scenario.nominal(np.asarray(pips)))

@@ -1,0 +1,69 @@
+"""What the sandbox costs: starting cells, one step, ending; beside the same in this process.
+
+python benchmarks/sandbox_cost.py [--cells 756] [--entry pid_best]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+
+import numpy as np
+
+from ventbench import protocol
+from ventbench.controllers.base import Task
+from ventbench.lungs import LUNG_IDS
+from ventbench.sandbox.runner import SandboxRunner
+from ventbench.submissions.cell import ROW
+from ventbench.submissions.folder import open_submission
+from ventbench.submissions.runner import InProcessRunner, Runner
+
+
+def measure(runner: Runner, entry: str, cells: int) -> dict[str, float]:
+    tasks = [
+        Task("performance", LUNG_IDS[k % len(LUNG_IDS)], protocol.DT, protocol.INSPIRATION_STEPS)
+        for k in range(cells)
+    ]
+    steps = protocol.BREATHS * protocol.INSPIRATION_STEPS
+    rows = np.random.default_rng(0).uniform(5.0, 35.0, (steps, cells, ROW))
+    rows[:: protocol.INSPIRATION_STEPS, :, 0] = 0.0  # a breath starts
+    times = [time.perf_counter()]
+    session = runner.start(open_submission(entry), tasks)
+    times.append(time.perf_counter())
+    for row in rows:
+        session.act(row)
+    times.append(time.perf_counter())
+    if session.failures:
+        raise SystemExit(f"the entry failed: {next(iter(session.failures.values()))}")
+    session.close()
+    times.append(time.perf_counter())
+    start, act, close = np.diff(times)
+    return {
+        "start, s": start,
+        "a cell's start, ms": 1e3 * start / cells,
+        "a step of a cell, us": 1e6 * act / steps / cells,
+        "all steps, s": act,
+        "close, s": close,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--cells", type=int, default=756)
+    parser.add_argument("--entry", default="pid_best")
+    arguments = parser.parse_args()
+    begun = time.perf_counter()
+    sandbox = SandboxRunner()
+    probe = time.perf_counter() - begun
+    print(f"{arguments.cells} cells of {arguments.entry} on {os.cpu_count()} cores")
+    print(f"layers: {', '.join(sandbox.sandbox['layers'])}; first cell {probe:.2f} s")
+    print(f"{'':24}{'sandbox':>10}{'in process':>12}")
+    apart = measure(sandbox, arguments.entry, arguments.cells)
+    plain = measure(InProcessRunner(), arguments.entry, arguments.cells)
+    for name, value in apart.items():
+        print(f"{name:24}{value:10.2f}{plain[name]:12.2f}")
+
+
+if __name__ == "__main__":
+    main()

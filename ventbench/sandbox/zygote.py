@@ -1,0 +1,173 @@
+"""The scorer's end of the zygote: starts it, asks it for cells, hears how they ended."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import ventbench
+from ventbench.sandbox import bubblewrap
+from ventbench.sandbox.child.zygote import (
+    ENDED,
+    INTERRUPT,
+    KILL,
+    NO_TASK,
+    PREPARED,
+    REQUEST,
+    SIZE,
+    START,
+)
+from ventbench.sandbox.errors import SandboxError
+
+_ROOT = str(Path(ventbench.__file__).resolve().parents[1])
+_SITE = str(Path(np.__file__).resolve().parents[1])
+
+#: Not -I, which would make it ignore the fixed hash seed: the environment holds nothing but this.
+_OPTIONS = ("-P", "-s", "-S", "-B")
+_BOOT = (
+    "import sys; sys.path.insert(0, sys.argv[2]); from ventbench.sandbox.child import zygote; "
+    "del sys.path[0]; zygote.main(int(sys.argv[1]))"
+)
+ENVIRONMENT = {
+    "PYTHONHASHSEED": "0",
+    "LC_ALL": "C.UTF-8",
+    "TZ": "UTC",
+    "HOME": "/nonexistent",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "VECLIB_MAXIMUM_THREADS": "1",
+    "JAX_PLATFORMS": "cpu",
+}
+
+_START_S = 60.0
+
+
+class Zygote:
+    """A running zygote.
+
+    Args:
+        config: for :func:`ventbench.sandbox.child.zygote.main`, less ``site`` and ``bubblewrap``.
+
+    Raises:
+        SandboxError: if it does not start.
+    """
+
+    def __init__(self, config: dict[str, Any]):
+        words = bubblewrap.prefix([_SITE, os.path.join(_ROOT, "ventbench"), config["folder"]])
+        config = {**config, "site": [_SITE], "bubblewrap": bool(words)}
+        self._ended: dict[int, int] = {}
+        self._data = b""
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed in close()
+        self._control, theirs = socket.socketpair()
+        command = [*words, sys.executable, *_OPTIONS, "-c", _BOOT, str(theirs.fileno()), _ROOT]
+        try:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=self._stderr,
+                cwd="/",
+                env=ENVIRONMENT,
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+            )
+        except OSError as error:
+            self._control.close()
+            self._stderr.close()
+            raise SandboxError(f"the sandbox cannot start {command[0]}: {error}") from error
+        finally:
+            theirs.close()
+        self._configure(json.dumps(config).encode())
+
+    def _configure(self, config: bytes) -> None:
+        self._control.settimeout(_START_S)
+        answer = b""
+        with contextlib.suppress(OSError):  # what it wrote to stderr says more
+            self._control.sendall(SIZE.pack(len(config)) + config)
+            answer = self._control.recv(len(PREPARED), socket.MSG_WAITALL)
+        self._control.settimeout(None)
+        if answer != PREPARED:
+            self._process.kill()
+            self._process.wait()
+            self._stderr.seek(0)
+            said = self._stderr.read()[-2000:].decode(errors="replace").strip()
+            self.close()
+            raise SandboxError(f"the sandbox's process ended before it was ready: {said}")
+
+    def start(self, cell: int, task: int | None, pipes: Sequence[int]) -> None:
+        """Start a cell.
+
+        Args:
+            cell: any number, named when it ends.
+            task: index of its task, or None for one that only locks itself down.
+            pipes: the ends for its observations and its replies; may be closed afterwards.
+        """
+        request = REQUEST.pack(START, cell, NO_TASK if task is None else task)
+        socket.send_fds(self._control, [request], pipes)
+
+    def interrupt(self, cell: int) -> None:
+        """Ask a cell to say where it is and end."""
+        self._control.sendall(REQUEST.pack(INTERRUPT, cell, 0))
+
+    def kill(self, cell: int) -> None:
+        """End a cell."""
+        self._control.sendall(REQUEST.pack(KILL, cell, 0))
+
+    def status(self, cell: int, timeout_s: float) -> int | None:
+        """How a cell ended.
+
+        Args:
+            cell: which one.
+            timeout_s: how long to wait for it to end.
+
+        Returns:
+            Exit code, or minus the signal's number; None if it has not ended.
+        """
+        deadline = time.monotonic() + timeout_s
+        while cell not in self._ended:
+            self._control.settimeout(max(deadline - time.monotonic(), 1e-3))
+            try:
+                data = self._control.recv(4096)
+            except OSError:
+                data = b""
+            finally:
+                self._control.settimeout(None)
+            if not data:
+                return None
+            self._data += data
+            while len(self._data) >= ENDED.size:
+                number, status = ENDED.unpack_from(self._data)
+                self._ended[number] = os.waitstatus_to_exitcode(status)
+                self._data = self._data[ENDED.size :]
+        return self._ended[cell]
+
+    def close(self) -> None:
+        """End it and all its cells; may be called more than once."""
+        self._control.close()
+        self._stderr.close()
+        try:
+            self._process.wait(5)
+        except subprocess.TimeoutExpired:
+            self._process.kill()  # its cells die with it
+            self._process.wait()
+
+
+def signal_name(status: int) -> str:
+    """Name of the signal of a negative exit status, such as ``"SIGSEGV"``."""
+    try:
+        return signal.Signals(-status).name
+    except ValueError:
+        return f"signal {-status}"

@@ -30,9 +30,11 @@ from ventbench import protocol
 from ventbench.controllers.pid import PID
 from ventbench.files import write_json
 from ventbench.lungs import LUNGS
+from ventbench.plants import frozen
 from ventbench.plants.base import Plant
 from ventbench.plants.learned import Architecture, Learned, learned
 from ventbench.plants.single_compartment import single_compartment
+from ventbench.plants.stack import take
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.rollout import closed_loop
 from ventbench.scenario import Scenario, nominal
@@ -45,6 +47,7 @@ WHOLE_STEPS = protocol.BREATHS * protocol.BREATH_STEPS
 OTHERS: dict[str, Callable[[], Plant]] = {
     "single_compartment": lambda: single_compartment(LUNGS[4]),
     "two_balloon": lambda: two_balloon(LUNGS[4]),
+    "frozen hybrid": lambda: take(frozen.load().plants, 4),
 }
 
 

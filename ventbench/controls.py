@@ -55,6 +55,10 @@ def _first(path: Path, column: str, bad: NDArray[np.bool_], values: Floats, why:
         raise InputError(f"{path} line {row + 2}, column {column}: {values[row]:g} {why}")
 
 
+def _steps(count: int) -> Floats:
+    return np.arange(count, dtype=np.float64) * protocol.DT
+
+
 def read(path: Path) -> Controls:
     """Read a CSV file of commands.
 
@@ -82,7 +86,7 @@ def read(path: Path) -> Controls:
 
     u_in = column("u_in")
     u_out = column("u_out") if "u_out" in rows[0] else np.zeros(len(rows))
-    time = column("time_step") if "time_step" in rows[0] else np.arange(len(rows)) * protocol.DT
+    time = column("time_step") if "time_step" in rows[0] else _steps(len(rows))
     out = (u_in < 0) | (u_in > protocol.U_MAX)
     _first(path, "u_in", out, u_in, "is outside 0..100 %. Fix the row.")
     _first(path, "u_out", (u_out != 0) & (u_out != 1), u_out, "is neither 0 nor 1. Fix the row.")

@@ -134,25 +134,24 @@ def misfits(
     ]
 
 
-def summary(error: Floats, held_out: NDArray[np.bool_]) -> dict[str, Any]:
-    """Figures of one lung.
+def summary(prefix: str, error: Floats) -> dict[str, Any]:
+    """Figures of some breaths.
 
     Args:
+        prefix: of the keys, such as ``"held_out_"``.
         error: of each breath, cmH2O, shape ``(n,)``; NaN for one that could not be judged.
-        held_out: whether the simulator has never seen the breath, shape ``(n,)``.
 
     Returns:
-        JSON values: ``mae``, ``median_mae``, ``ci95``, ``breaths`` over all breaths, and the same
-        with ``held_out_`` in front; null where there is no breath.
+        JSON values: ``mae``, ``median_mae``, ``ci95`` (bootstrap interval of the mean) and
+        ``breaths``, with the prefix; null where there is no breath.
     """
-    out: dict[str, Any] = {}
-    for prefix, chosen in (("", slice(None)), ("held_out_", held_out)):
-        found = bootstrap.summary(error[chosen])
-        out[f"{prefix}mae"] = _number(found.mean)
-        out[f"{prefix}median_mae"] = _number(found.median)
-        out[f"{prefix}ci95"] = [_number(limit) for limit in found.ci95]
-        out[f"{prefix}breaths"] = found.count
-    return out
+    found = bootstrap.summary(error)
+    return {
+        f"{prefix}mae": _number(found.mean),
+        f"{prefix}median_mae": _number(found.median),
+        f"{prefix}ci95": [_number(limit) for limit in found.ci95],
+        f"{prefix}breaths": found.count,
+    }
 
 
 def _number(value: float) -> float | None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,14 +45,14 @@ def _encode(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     raise TypeError(f"{path}: a {type(value).__name__} cannot be stored in a plant file")
 
 
-def _decode(node: dict[str, Any], arrays: Any) -> Any:
+def _decode(node: dict[str, Any], arrays: Any, as_array: Callable[[Any], Any]) -> Any:
     if "type" in node:
-        fields = {name: _decode(child, arrays) for name, child in node["fields"].items()}
+        fields = {name: _decode(child, arrays, as_array) for name, child in node["fields"].items()}
         return _types()[node["type"]](**fields)
     if "tuple" in node:
-        return tuple(_decode(child, arrays) for child in node["tuple"])
+        return tuple(_decode(child, arrays, as_array) for child in node["tuple"])
     if "array" in node:
-        return jnp.asarray(arrays[node["array"]])
+        return as_array(arrays[node["array"]])
     return node["value"]
 
 
@@ -63,8 +64,13 @@ def save(path: Path, plant: Any) -> None:
     files.write_atomically(path, lambda file: np.savez(file, **arrays))  # pyright: ignore[reportArgumentType]
 
 
-def load(path: Path) -> Any:
-    """Read what :func:`save` wrote; arrays take the precision that is in force.
+def load(path: Path, as_array: Callable[[Any], Any] = jnp.asarray) -> Any:
+    """Read what :func:`save` wrote.
+
+    Args:
+        path: of the file.
+        as_array: makes the leaves; the default gives them the precision that is in force,
+            ``numpy.asarray`` that of the file.
 
     Raises:
         InputError: if the file is not a plant file, or names an unknown type of plant.
@@ -72,6 +78,6 @@ def load(path: Path) -> Any:
     """
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            return _decode(json.loads(str(arrays[_STRUCTURE])), arrays)
+            return _decode(json.loads(str(arrays[_STRUCTURE])), arrays, as_array)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is not a plant file of ventbench: {error!r}") from error

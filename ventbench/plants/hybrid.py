@@ -13,7 +13,7 @@ import flax.struct
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.plants.delay import overlap
+from ventbench.plants.delay import shares
 
 #: Knots of the valve's piecewise linear curve, %; the last segment ends at infinity.
 VALVE_KNOTS = (0.0, 1.0, 2.0, 3.5, 5.0, 7.0, 10.0, 14.0, 19.0, 26.0, 36.0, 50.0, 70.0)
@@ -30,6 +30,9 @@ DIRECTION_WIDTH = 0.4
 #: The relief opens here and holds the pressure below the sum, cmH2O. No recording goes above 61.4.
 RELIEF, RELIEF_ROOM = 60.0, 10.0
 
+#: Samples whose commands are remembered; at 10 ms they reach back as far as the longest dead time.
+MEMORY = 6
+
 #: Substeps of one sample.
 SUBSTEPS = 4
 
@@ -43,9 +46,9 @@ class HybridState:
         drop: airway pressure minus elastic recoil, cmH2O.
         sensor: pressure that the sensor shows, cmH2O.
         flow: flow out of the inspiratory valve, L/s.
-        commanded: flows that the last two commands ask for, L/s.
-        opened: expiratory valve during the last two samples, 0/1.
-        before: duration of the last sample, s.
+        commanded: flows that the last commands ask for, the latest first, L/s, ``(..., 7)``.
+        opened: expiratory valve during the last samples, likewise, 0/1.
+        past: durations of the last samples, likewise, s, ``(..., 6)``.
         plays: where each play stands, %, one array a play.
         u_in: last command, %.
         peep: end-expiratory pressure, cmH2O.
@@ -55,9 +58,9 @@ class HybridState:
     drop: Array
     sensor: Array
     flow: Array
-    commanded: tuple[Array, Array]
-    opened: tuple[Array, Array]
-    before: Array
+    commanded: Array
+    opened: Array
+    past: Array
     plays: tuple[Array, ...]
     u_in: Array
     peep: Array
@@ -82,6 +85,7 @@ class Hybrid:
         rising: added to the reading while the command rises, cmH2O.
         falling: subtracted while it falls, cmH2O.
         conductance: of the open expiratory valve, L/s per cmH2O.
+        closing_conductance: of the valve while it closes, likewise.
         opening_delay: of the expiratory valve, s.
         closing_delay: likewise.
         rest: command that held the flow before the first sample, %.
@@ -101,6 +105,7 @@ class Hybrid:
     rising: Array
     falling: Array
     conductance: Array
+    closing_conductance: Array
     opening_delay: Array
     closing_delay: Array
     rest: Array
@@ -136,9 +141,9 @@ class Hybrid:
             drop=zero - self.offset,
             sensor=pressure,
             flow=flow,
-            commanded=(flow, flow),
-            opened=(zero + 1.0, zero + 1.0),
-            before=zero + 0.03,
+            commanded=_repeat(flow, MEMORY + 1),
+            opened=_repeat(zero + 1.0, MEMORY + 1),
+            past=_repeat(zero + 0.03, MEMORY),
             plays=tuple(rest for _ in PLAYS),
             u_in=rest,
             peep=pressure if peep is None else peep + zero,
@@ -159,21 +164,22 @@ class Hybrid:
         effective = u_in + sum(
             self.direction[..., i] * (play - u_in) for i, play in enumerate(plays)
         )
-        commanded = (self.valve(jnp.maximum(effective, 0.0)), *state.commanded)
-        opened = (u_out + jnp.zeros_like(state.u_in), *state.opened)
+        commanded = _push(self.valve(jnp.maximum(effective, 0.0)), state.commanded)
+        opened = _push(u_out + jnp.zeros_like(state.u_in), state.opened)
         # Behind the expiratory valve stands what makes the resting flow hold PEEP.
-        behind = state.peep - self.valve(self.rest + jnp.zeros_like(u_in)) / self.conductance
+        conductance = u_out * self.conductance + (1.0 - u_out) * self.closing_conductance
+        behind = state.peep - self.valve(self.rest + jnp.zeros_like(u_in)) / conductance
         elastic, drop, sensor, flow = state.elastic, state.drop, state.sensor, state.flow
         h = dt / SUBSTEPS
         lag, smooth = jnp.exp(-h / self.valve_lag), jnp.exp(-h / self.sensor_lag)
         open_or_close = u_out * self.opening_delay + (1.0 - u_out) * self.closing_delay
         for k in range(SUBSTEPS):
-            shares = overlap(k * h - self.valve_delay, h, state.before)
-            wanted = sum(share * q for share, q in zip(shares, commanded, strict=True))
+            held = shares(k * h - self.valve_delay, h, state.past)
+            wanted = jnp.sum(held * commanded, axis=-1)
             inflow = wanted + (flow - wanted) * self.valve_lag / h * (1.0 - lag)  # mean over h
             flow = wanted + (flow - wanted) * lag
-            shares = overlap(k * h - open_or_close, h, state.before)
-            outlet = self.conductance * sum(s * o for s, o in zip(shares, opened, strict=True))
+            held = shares(k * h - open_or_close, h, state.past)
+            outlet = conductance * jnp.sum(held * opened, axis=-1)
             elastic, drop, pressure = self._fill(elastic, drop, inflow, outlet, behind, h)
             sensor = pressure + (sensor - pressure) * smooth
         change = (u_in - state.u_in) / DIRECTION_WIDTH
@@ -182,8 +188,8 @@ class Hybrid:
             + self.falling * jnp.tanh(jnp.minimum(change, 0.0))
         )
         after = HybridState(
-            elastic, drop, sensor, flow, commanded[:2], opened[:2], dt + 0.0 * drop, plays, u_in,
-            state.peep,
+            elastic, drop, sensor, flow, commanded[..., :-1], opened[..., :-1],
+            _push(dt + 0.0 * drop, state.past)[..., :-1], plays, u_in, state.peep,
         )  # fmt: skip
         return after, reading
 
@@ -211,3 +217,11 @@ class Hybrid:
         return self.replace(  # type: ignore[attr-defined]
             R=self.R * r_scale, K2=self.K2 * r_scale, E=self.E / c_scale
         )
+
+
+def _repeat(value: Array, count: int) -> Array:
+    return jnp.repeat(value[..., None], count, axis=-1)
+
+
+def _push(value: Array, before: Array) -> Array:
+    return jnp.concatenate([value[..., None], before], axis=-1)

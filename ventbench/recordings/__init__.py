@@ -5,6 +5,7 @@ from ventbench.recordings.build import make_breaths as make_breaths
 from ventbench.recordings.errors import Problem as Problem
 from ventbench.recordings.errors import RecordingError as RecordingError
 from ventbench.recordings.folder import recordings_dir as recordings_dir
+from ventbench.recordings.join import join as join
 from ventbench.recordings.read import check as check
 from ventbench.recordings.read import iter_breaths as iter_breaths
 from ventbench.recordings.read import load as load
@@ -14,6 +15,7 @@ from ventbench.recordings.respiraworks import load_respiraworks as load_respiraw
 from ventbench.recordings.schema import COLUMNS as COLUMNS
 from ventbench.recordings.schema import Column as Column
 from ventbench.recordings.split import Split as Split
+from ventbench.recordings.split import folds as folds
 from ventbench.recordings.split import load_split as load_split
 from ventbench.recordings.split import save_split as save_split
 from ventbench.recordings.split import split_by_breath as split_by_breath

@@ -127,13 +127,41 @@ def split_by_breath(breaths: Breaths, *, held_out: float = 0.2, seed: int = 0) -
     train: list[int] = []
     kept_out: list[int] = []
     for lung, index in breaths.by_lung_index.items():
-        keyed = [(_key(seed, i, lung), i) for i in breaths.breath_id[index].tolist()]
-        ids = [breath for _, breath in sorted(keyed)]
+        ids = _shuffled(seed, breaths.breath_id[index].tolist(), lung)
         wanted = math.floor(held_out * len(ids) + 0.5)
         count = 0 if len(ids) < 2 else min(max(wanted, 1), len(ids) - 1)
         kept_out += ids[:count]
         train += ids[count:]
     return Split(tuple(sorted(train)), tuple(sorted(kept_out)), seed, held_out, breaths.sha256)
+
+
+def folds(breaths: Breaths, *, count: int = 5, seed: int = 0) -> np.ndarray:
+    """Deal the breaths of each lung out to folds for a cross-validation.
+
+    In the order of :func:`split_by_breath`, one to each fold in turn; so, for equal sizes, a fold
+    is about what one split holds out.
+
+    Args:
+        breaths: ids must differ.
+        count: of folds, at least 2.
+        seed: any whole number.
+
+    Returns:
+        Fold of each breath, 0 to ``count - 1``, int64, shape ``(n,)``.
+
+    Raises:
+        InputError: fewer than two folds, or an id is there twice.
+    """
+    if count < 2:
+        raise InputError(f"a cross-validation needs at least 2 folds, not {count}")
+    if len(np.unique(breaths.breath_id)) < len(breaths):
+        raise InputError("breath ids are there more than once; give each breath an id of its own")
+    fold = np.empty(len(breaths), np.int64)
+    for lung, index in breaths.by_lung_index.items():
+        place = {int(i): at for at, i in zip(index, breaths.breath_id[index], strict=True)}
+        for turn, breath in enumerate(_shuffled(seed, list(place), lung)):
+            fold[place[breath]] = turn % count
+    return fold
 
 
 def save_split(split: Split, path: str | os.PathLike[str]) -> None:
@@ -152,6 +180,10 @@ def load_split(path: str | os.PathLike[str]) -> Split:
         return Split.from_dict(json.loads(Path(path).read_text("utf-8")))
     except (ValueError, AttributeError) as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def _shuffled(seed: int, ids: list[int], lung: str) -> list[int]:
+    return sorted(ids, key=lambda breath: _key(seed, breath, lung))
 
 
 def _key(seed: int, breath_id: int, lung: str) -> bytes:

@@ -1,0 +1,215 @@
+"""The official simulators: six lungs learned from real recordings, fixed by their hashes.
+
+An ensemble of five: member k has seen every recording but those of fold k, so that each measured
+breath is new to one of them. Member 0 is the official simulator, by which scores are made.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench import files
+from ventbench.data_files import data_path
+from ventbench.errors import InputError
+from ventbench.lungs import LUNG_IDS, RECORDED_LUNGS
+from ventbench.plants import files as plant_files
+from ventbench.plants.base import Plant
+from ventbench.plants.each import Each
+from ventbench.plants.fingerprints import BY_ALL, Seen
+from ventbench.plants.hybrid import Hybrid
+from ventbench.plants.sessions import Sessions
+from ventbench.recordings.breaths import Breaths
+
+FORMAT = "ventbench-simulators-1"
+MANIFEST, MEMBERS, LEARNED, SEEN = "manifest.toml", "hybrid.npz", "learned.npz", "seen.npz"
+
+
+@dataclass(frozen=True, eq=False)
+class Frozen:
+    """Version and parameters of the official simulators.
+
+    Plants that it gives have numpy leaves: they take the precision in force where they are used.
+
+    Attributes:
+        folder: where they were read.
+        manifest: as in the file: provenance, split, sessions, errors.
+        manifest_sha256: of that file.
+        sessions: what a breath's clock is compared with.
+        members: float64 leaves ``(members, sessions, ...)``.
+        seen: the breaths of the training.
+    """
+
+    folder: Path
+    manifest: dict[str, Any]
+    manifest_sha256: str
+    sessions: Sessions
+    members: Hybrid
+    seen: Seen
+
+    @property
+    def _references(self) -> NDArray[np.int64]:
+        return np.array([self.manifest["lungs"][name]["session"] for name in LUNG_IDS])
+
+    @property
+    def plants(self) -> Hybrid:
+        """The six simulators, leaves ``(6, ...)`` in the order of ``LUNGS``."""
+        at = self._references
+        return jax.tree.map(lambda leaf: leaf[0, at], self.members)
+
+    @property
+    def ensemble(self) -> Hybrid:
+        """All members of the six, leaves ``(5, 6, ...)``; the first are :attr:`plants`."""
+        at = self._references
+        return jax.tree.map(lambda leaf: leaf[:, at], self.members)
+
+    def for_breaths(self, breaths: Breaths) -> Hybrid:
+        """Official simulators of breaths: of their lung, on the rig that their clock tells.
+
+        Returns:
+            Plants with leaves ``(n, ...)``.
+
+        Raises:
+            InputError: if a lung is none of the recorded settings.
+        """
+        return self._of(breaths, np.zeros(len(breaths), np.int64))
+
+    def cross_fitted(self, breaths: Breaths) -> Hybrid:
+        """Like :meth:`for_breaths`, of the member that has not seen the breath; 0 if all have."""
+        return self._of(breaths, np.maximum(self.seen.folds(breaths), 0))
+
+    def held_out(self, breaths: Breaths) -> NDArray[np.bool_]:
+        """Whether some member has not seen the breath, so that it can be judged by it, ``(n,)``."""
+        return self.seen.folds(breaths) != BY_ALL
+
+    def unseen(self, breaths: Breaths) -> NDArray[np.bool_]:
+        """Whether the official simulators, member 0, have not seen the breath, ``(n,)``."""
+        return np.isin(self.seen.folds(breaths), (BY_ALL, *range(1, self._count)), invert=True)
+
+    @property
+    def _count(self) -> int:
+        return self.members.R.shape[0]
+
+    def _of(self, breaths: Breaths, member: NDArray[np.int64]) -> Hybrid:
+        at = self.sessions.assign(breaths)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[member, at]), self.members)
+
+    def lungs(self) -> dict[str, dict[str, Any]]:
+        """Settings and held-out errors of the six lungs, by id."""
+        return {name: dict(self.manifest["lungs"][name]) for name in LUNG_IDS}
+
+    def about(self) -> dict[str, Any]:
+        """What a score must say of the simulators it was made with."""
+        hashes = {name: entry["sha256"] for name, entry in self.manifest["files"].items()}
+        return {
+            "version": self.manifest["version"],
+            "kind": self.manifest["kind"],
+            "manifest_sha256": self.manifest_sha256,
+            "files": hashes,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class FrozenLearned:
+    """The paper's networks, trained on the same breaths, to compare with.
+
+    Attributes:
+        members: leaves ``(members, settings, ...)``, settings in the order of ``RECORDED_LUNGS``.
+        seen: the breaths of the training.
+    """
+
+    members: Plant
+    seen: Seen
+
+    def for_breaths(self, breaths: Breaths) -> Plant:
+        """As of :meth:`Frozen.for_breaths`; a network knows the lung, not the rig."""
+        return self._of(breaths, np.zeros(len(breaths), np.int64))
+
+    def cross_fitted(self, breaths: Breaths) -> Plant:
+        """As of :meth:`Frozen.cross_fitted`."""
+        return self._of(breaths, np.maximum(self.seen.folds(breaths), 0))
+
+    def _of(self, breaths: Breaths, member: NDArray[np.int64]) -> Plant:
+        ids = [lung.id for lung in RECORDED_LUNGS]
+        unknown = sorted(set(breaths.lung_ids.tolist()) - set(ids))
+        if unknown:
+            raise InputError(
+                f"no network was trained for {', '.join(unknown)}; known are {', '.join(ids)}"
+            )
+        at = np.array([ids.index(name) for name in breaths.lung_ids.tolist()], np.int64)
+        return Each(jax.tree.map(lambda leaf: jnp.asarray(leaf[member, at]), self.members))
+
+
+def folder(version: int = 1) -> Path:
+    """Where a version is kept."""
+    return data_path(f"simulators/v{version}")
+
+
+def load(version: int = 1, path: Path | None = None) -> Frozen:
+    """Read the official simulators and check every file against the manifest.
+
+    Args:
+        version: of the simulators; 1 is the only one so far.
+        path: another folder, such as one that ``ventbench train simulator`` wrote.
+
+    Raises:
+        InputError: if a file is missing or is not what the manifest says.
+    """
+    path = path or folder(version)
+    manifest = _manifest(path)
+    members = plant_files.load(_checked(path, MEMBERS, manifest), as_array=np.asarray)
+    _checked(path, LEARNED, manifest)  # its hash is told with every score too
+    return Frozen(
+        path,
+        manifest,
+        files.sha256(path / MANIFEST),
+        Sessions.from_list(manifest["sessions"]),
+        members,
+        _seen(path, manifest),
+    )
+
+
+def load_learned(version: int = 1, path: Path | None = None) -> FrozenLearned:
+    """Read the networks; see :func:`load`."""
+    path = path or folder(version)
+    manifest = _manifest(path)
+    members = plant_files.load(_checked(path, LEARNED, manifest), as_array=np.asarray)
+    return FrozenLearned(members, _seen(path, manifest))
+
+
+def _manifest(path: Path) -> dict[str, Any]:
+    try:
+        manifest = tomllib.loads((path / MANIFEST).read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path / MANIFEST} cannot be read: {error}") from error
+    if manifest.get("format") != FORMAT:
+        raise InputError(
+            f"{path / MANIFEST}, key format: {manifest.get('format')!r} is not {FORMAT!r}; "
+            "this ventbench reads no other"
+        )
+    return manifest
+
+
+def _checked(path: Path, name: str, manifest: dict[str, Any]) -> Path:
+    try:
+        found, wanted = files.sha256(path / name), manifest["files"][name]["sha256"]
+    except (OSError, KeyError) as error:
+        raise InputError(f"{path / name} is missing, or the manifest lacks it: {error}") from error
+    if found != wanted:
+        raise InputError(
+            f"{path / name} has SHA-256 {found[:16]}..., the manifest says {wanted[:16]}...; it is "
+            "damaged or changed: restore it, or reinstall ventbench"
+        )
+    return path / name
+
+
+def _seen(path: Path, manifest: dict[str, Any]) -> Seen:
+    with np.load(_checked(path, SEEN, manifest), allow_pickle=False) as arrays:
+        return Seen(arrays["key"], arrays["fold"])

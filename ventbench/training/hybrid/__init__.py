@@ -1,0 +1,1 @@
+"""Fitting the hybrid plant to recordings of all settings at once."""

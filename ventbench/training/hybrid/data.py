@@ -1,0 +1,102 @@
+"""Recorded inspirations as the arrays that the fit wants."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from ventbench.errors import InputError
+from ventbench.lungs import RECORDED_LUNGS
+from ventbench.plants.sessions import Sessions
+from ventbench.recordings.breaths import Breaths
+from ventbench.training.hybrid.parameters import SESSION_ROOM, Groups
+
+#: Samples of an inspiration that are used; the longest in the recordings has 32.
+SAMPLES = 33
+
+
+@flax.struct.dataclass
+class Inspirations:
+    """n inspirations, float64; what comes after the inspiration is not counted.
+
+    Attributes:
+        groups: setting, kind of rig and session.
+        start: first pressure, cmH2O, ``(n,)``; 0 where unknown.
+        start_known: whether it was measured, ``(n,)``.
+        u_in: commands, %, ``(n, SAMPLES - 1)``.
+        dt: time for which each is held, s, likewise.
+        pressure: at the end of each, cmH2O, likewise; 0 where it does not count.
+        share: weight of each in its breath's mean, adding up to one, likewise.
+    """
+
+    groups: Groups
+    start: Array
+    start_known: Array
+    u_in: Array
+    dt: Array
+    pressure: Array
+    share: Array
+
+
+def groups_of(breaths: Breaths, sessions: Sessions) -> Groups:
+    """To which setting, kind of rig and session each breath belongs.
+
+    Raises:
+        InputError: a lung was never recorded, or there are too many sessions.
+    """
+    if len(sessions) > SESSION_ROOM:
+        raise InputError(f"{len(sessions)} sessions are more than the {SESSION_ROOM} there can be")
+    session = sessions.assign(breaths)
+    ids = [lung.id for lung in RECORDED_LUNGS]
+    lung = np.array([ids.index(name) for name in breaths.lung_ids.tolist()], np.int64)
+    return Groups(jnp.asarray(lung), jnp.asarray(sessions.rigs()[session]), jnp.asarray(session))
+
+
+def groups_of_sessions(sessions: Sessions) -> Groups:
+    """Groups of one breath of each session, to build the sessions' plants."""
+    ids = [lung.id for lung in RECORDED_LUNGS]
+    lung = np.array([ids.index(session.lung) for session in sessions.table])
+    index = np.arange(len(sessions))
+    return Groups(jnp.asarray(lung), jnp.asarray(sessions.rigs()), jnp.asarray(index))
+
+
+def inspirations(breaths: Breaths, sessions: Sessions) -> Inspirations:
+    """Arrange breaths for the fit; the pressure of each inspiratory sample but the first counts.
+
+    Raises:
+        InputError: as :func:`groups_of`, or a breath has no pressure to learn from, or too few
+            samples.
+    """
+    if breaths.pressure.shape[1] < 2:
+        raise InputError("breaths of one sample hold nothing to learn")
+    counted = breaths.inspiratory & np.isfinite(breaths.pressure)
+    counted[:, 0] = False
+    counted = _first(counted, False)[:, 1:]
+    total = counted.sum(axis=1, keepdims=True)
+    if not total.all():
+        number = int(np.flatnonzero(total == 0)[0])
+        raise InputError(f"breath {breaths.breath_id[number]} has no inspiratory pressure to fit")
+    start = breaths.pressure[:, 0]
+    pressure = _first(breaths.pressure, np.nan)[:, 1:]
+    arrays = {
+        "start": np.nan_to_num(start),
+        "start_known": np.isfinite(start) * 1.0,
+        "u_in": _first(breaths.u_in, 0.0)[:, :-1],
+        "dt": _first(breaths.dt, 0.03)[:, :-1],
+        "pressure": np.where(counted, pressure, 0.0),
+        "share": counted / total,
+    }
+    return Inspirations(
+        groups_of(breaths, sessions),
+        **{name: jnp.asarray(value, float) for name, value in arrays.items()},
+    )
+
+
+def _first(values: NDArray, fill: float) -> NDArray:
+    """The first samples, padded to SAMPLES."""
+    missing = max(0, SAMPLES - values.shape[1])
+    padded = np.pad(values, ((0, 0), (0, missing)), constant_values=fill)
+    return padded[:, :SAMPLES]

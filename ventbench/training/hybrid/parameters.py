@@ -1,0 +1,189 @@
+"""What is fitted: unconstrained numbers, pooled over lung settings, rigs and sessions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.struct
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ventbench.lungs import RECORDED_LUNGS
+from ventbench.plants.hybrid import ELASTIC_KNOTS, PLAYS, VALVE_KNOTS, Hybrid
+
+#: Settings and kinds of rig that share parameters.
+LUNG_COUNT, RIG_COUNT = len(RECORDED_LUNGS), 4
+
+#: Most sessions that a fit can hold; tables are padded to it, so that all share one compilation.
+SESSION_ROOM = 40
+
+#: The plays' weights add up to less than this, so that pressure rises with a command held.
+DIRECTION_SUM = 0.98
+
+
+@flax.struct.dataclass
+class Groups:
+    """To which setting, kind of rig and session each breath belongs, ints, shape ``(n,)``."""
+
+    lung: Array
+    rig: Array
+    session: Array
+
+
+@flax.struct.dataclass
+class Pooled:
+    """Unconstrained parameters; L settings, G kinds of rig, J sessions. Logarithms unless said.
+
+    Attributes:
+        slopes: of the valve's curve, L/s per %, shape ``(13,)``.
+        slopes_rig: added for a kind of rig, ``(G, 13)``.
+        R: laminar resistance, cmH2O s/L, ``(L,)``.
+        K2: quadratic resistance, cmH2O s2/L2, ``(L,)``.
+        E: elastance, cmH2O/L, ``(L,)``.
+        stiffening: ratio of the elastic curve's slope to that below each knot, ``(L, 5)``.
+        offset: elastic recoil minus pressure at rest, cmH2O, no logarithm, ``(L,)``.
+        direction: odds of the plays' weights, ``(G, 3)``.
+        rising: cmH2O, ``(G,)``.
+        falling: cmH2O, ``(G,)``.
+        valve_delay: s, ``(G,)``; so are the five that follow.
+        valve_lag: s.
+        sensor_lag: s.
+        closing_delay: s.
+        opening_delay: s.
+        circuit_compliance: L/cmH2O, ``(G,)``.
+        conductance: L/s per cmH2O, ``(G,)``.
+        closing_conductance: likewise.
+        rest: %, ``()``.
+        session_gain: added to all slopes, ``(J,)``.
+        session_R: added to both resistances, ``(J,)``.
+        session_K2: added to the quadratic one, ``(J,)``.
+        session_E: added to the elastance, ``(J,)``.
+        session_offset: added to the offset, cmH2O, no logarithm, ``(J,)``.
+        session_conductance: added to the conductance, ``(J,)``.
+        session_closing_conductance: added to the closing one, ``(J,)``.
+    """
+
+    slopes: Array
+    slopes_rig: Array
+    R: Array
+    K2: Array
+    E: Array
+    stiffening: Array
+    offset: Array
+    direction: Array
+    rising: Array
+    falling: Array
+    valve_delay: Array
+    valve_lag: Array
+    sensor_lag: Array
+    closing_delay: Array
+    opening_delay: Array
+    circuit_compliance: Array
+    conductance: Array
+    closing_conductance: Array
+    rest: Array
+    session_gain: Array
+    session_R: Array
+    session_K2: Array
+    session_E: Array
+    session_offset: Array
+    session_conductance: Array
+    session_closing_conductance: Array
+
+
+def initial() -> Pooled:
+    """Where every fit starts: the labels, and the data sheet's orders of magnitude."""
+    knots = len(VALVE_KNOTS)
+    resistance = np.array([lung.R for lung in RECORDED_LUNGS])
+    elastance = np.array([1000.0 / lung.C for lung in RECORDED_LUNGS])
+
+    def rig(value: float) -> np.ndarray:
+        return np.full(RIG_COUNT, np.log(value))
+
+    session = np.zeros(SESSION_ROOM)
+    values: dict[str, Any] = dict(
+        slopes=np.full(knots, np.log(0.02)),
+        slopes_rig=np.zeros((RIG_COUNT, knots)),
+        R=np.log(0.4 * resistance),
+        K2=np.log(0.6 * resistance),
+        E=np.log(elastance),
+        stiffening=np.zeros((LUNG_COUNT, len(ELASTIC_KNOTS))),
+        offset=np.zeros(LUNG_COUNT),
+        direction=np.full((RIG_COUNT, len(PLAYS)), np.log(0.03)),
+        rising=rig(0.05),
+        falling=rig(0.05),
+        valve_delay=rig(0.02),
+        valve_lag=rig(0.01),
+        sensor_lag=rig(0.01),
+        closing_delay=rig(0.03),
+        opening_delay=rig(0.05),
+        circuit_compliance=rig(0.0008),
+        conductance=rig(0.2),
+        closing_conductance=rig(0.2),
+        rest=np.log(5.0),
+        session_gain=session,
+        session_R=session,
+        session_K2=session,
+        session_E=session,
+        session_offset=session,
+        session_conductance=session,
+        session_closing_conductance=session,
+    )
+    return Pooled(**{name: jnp.asarray(value, float) for name, value in values.items()})
+
+
+def direction(pooled: Pooled) -> Array:
+    """Weights of the plays, negative, adding up to more than -``DIRECTION_SUM``, ``(G, 3)``.
+
+    Negative ones make the valve answer more to the latest change, and a command held from rest
+    still asks for more flow the higher it is.
+    """
+    odds = jnp.exp(pooled.direction)
+    return -DIRECTION_SUM * odds / (1.0 + jnp.sum(odds, axis=-1, keepdims=True))
+
+
+def stiffening(pooled: Pooled) -> Array:
+    """Changes of the elastic curve's relative slope at its knots, ``(L, 5)``."""
+    slope = jnp.exp(jnp.cumsum(pooled.stiffening, axis=-1))
+    return jnp.diff(slope, axis=-1, prepend=jnp.ones_like(slope[:, :1]))
+
+
+def plants(pooled: Pooled, groups: Groups, *, directed: bool = True) -> Hybrid:
+    """Build the plants of breaths or sessions.
+
+    Args:
+        pooled: the parameters.
+        groups: where each belongs.
+        directed: whether the direction of the command has an effect.
+
+    Returns:
+        Plants with leaves ``(n, ...)``.
+    """
+    lung, rig, session = groups.lung, groups.rig, groups.session
+    gain = pooled.session_gain[session][:, None]
+    on = 1.0 if directed else 0.0
+    laminar = pooled.R[lung] + pooled.session_R[session]
+    quadratic = pooled.K2[lung] + pooled.session_R[session] + pooled.session_K2[session]
+    return Hybrid(
+        R=jnp.exp(laminar),
+        K2=jnp.exp(quadratic),
+        E=jnp.exp(pooled.E[lung] + pooled.session_E[session]),
+        stiffening=stiffening(pooled)[lung],
+        offset=pooled.offset[lung] + pooled.session_offset[session],
+        slopes=jnp.exp(pooled.slopes + pooled.slopes_rig[rig] + gain),
+        direction=on * direction(pooled)[rig],
+        valve_delay=jnp.exp(pooled.valve_delay[rig]),
+        valve_lag=jnp.exp(pooled.valve_lag[rig]),
+        circuit_compliance=jnp.exp(pooled.circuit_compliance[rig]),
+        sensor_lag=jnp.exp(pooled.sensor_lag[rig]),
+        rising=on * jnp.exp(pooled.rising[rig]),
+        falling=on * jnp.exp(pooled.falling[rig]),
+        conductance=jnp.exp(pooled.conductance[rig] + pooled.session_conductance[session]),
+        closing_conductance=jnp.exp(
+            pooled.closing_conductance[rig] + pooled.session_closing_conductance[session]
+        ),
+        opening_delay=jnp.exp(pooled.opening_delay[rig]),
+        closing_delay=jnp.exp(pooled.closing_delay[rig]),
+        rest=jnp.exp(pooled.rest) + jnp.zeros_like(laminar),
+    )

@@ -90,6 +90,11 @@ def write(path: Path) -> str:
     return files.sha256(path)
 
 
+def about() -> dict[str, Any]:
+    """What a record says about all of the draws."""
+    return {"version": VERSION, "sha256": SHA256, "count": COUNT}
+
+
 @functools.cache
 def _frozen() -> dict[str, Floats]:
     path = data_files.data_path(FILE)

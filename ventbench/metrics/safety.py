@@ -43,6 +43,11 @@ def longest_run(flags: ArrayLike) -> NDArray[np.int64]:
     return np.max(steps - last_false, axis=-1, initial=0)
 
 
+def limit(pip: ArrayLike) -> NDArray[np.float64]:
+    """Pressure that the safety gate allows, cmH2O, of any shape: ``min(60, pip + 15)``."""
+    return np.minimum(protocol.SAFETY_PRESSURE, np.asarray(pip, float) + protocol.SAFETY_MARGIN)
+
+
 def safe(pressure: ArrayLike, pip: ArrayLike, dt: ArrayLike) -> NDArray[np.bool_]:
     """Whether inspirations pass the protocol's safety gate.
 
@@ -58,9 +63,8 @@ def safe(pressure: ArrayLike, pip: ArrayLike, dt: ArrayLike) -> NDArray[np.bool_
         Shape ``(...)``; false if a pressure is NaN.
     """
     pressure, pip = np.asarray(pressure, float), np.asarray(pip, float)[..., None]
-    limit = np.minimum(protocol.SAFETY_PRESSURE, pip + protocol.SAFETY_MARGIN)
     # "Not below" instead of "above", so that NaN is unsafe.
-    above = longest_run(~(pressure <= limit))
+    above = longest_run(~(pressure <= limit(pip)))
     # 1e-9: a run of exactly 0.1 s passes despite rounding.
     gate = above * np.asarray(dt, float) <= protocol.SAFETY_TIME + 1e-9
     return gate & ~np.any(np.isnan(pressure), axis=-1)

@@ -101,6 +101,11 @@ class Score:
         return float(np.mean(self.by_lung))
 
     @property
+    def official(self) -> bool:
+        """Whether its sandbox had every layer that the word needs."""
+        return self.sandbox is not None and self.sandbox.get("official") is True
+
+    @property
     def complete(self) -> bool:
         """Whether all lungs and PIPs of the protocol were run."""
         return self.lungs == LUNG_IDS and self.pips == protocol.PIPS
@@ -113,7 +118,7 @@ class Score:
             "score": _number(self.score),
             "name": manifest.name,
             "track": self.track,
-            "official": False,  # says only the sandboxed scorer, of a record
+            "official": self.official,
             "complete": self.complete,
             "safe": bool(np.all(self.safe)),
             "draws": self._draws(lung_score(self.drawn).mean(axis=1), published=True),

@@ -1,0 +1,112 @@
+"""How long a leaderboard of many records takes to build and to verify.
+
+python benchmarks/board_speed.py [--records 1000] [--verified 100]
+
+Synthetic entries from a few real ones: their commands times a factor, replayed, under new names.
+Verification is measured on a part of them and its time a record multiplied.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import tempfile
+import time
+from pathlib import Path
+
+from ventbench import draws
+from ventbench.board import build, canonical, chain, create, record, store
+from ventbench.board.replay import replay
+from ventbench.board.replayed import Simulators
+from ventbench.board.verify import verify
+from ventbench.plants import frozen
+from ventbench.submissions.folder import open_submission
+from ventbench.submissions.scoring import score
+
+#: What must not be exceeded with 1,000 records, s.
+BUILD_LIMIT_S, VERIFY_LIMIT_S = 10.0, 300.0
+
+SANDBOX = {"layers": ["landlock", "seccomp"], "official": True}
+FACTORS = (1.0, 0.99, 0.98, 0.97, 0.96, 0.95, 0.94, 0.93)
+
+
+def drafts(plants: Simulators) -> list[create.Draft]:
+    """Real records: commands of the PID times a factor."""
+    result, _ = score(open_submission("pid_best"), plants.plants, draws=draws.COUNT)
+    found = []
+    for factor in FACTORS:
+        requested = result.requested * factor
+        (new,) = replay(plants, result.pips, [requested])
+        varied = dataclasses.replace(
+            result,
+            requested=requested,
+            nominal=new.nominal,
+            drawn=new.drawn,
+            safe=new.safe,
+            peak=new.peak.max(axis=(0, 2)),
+            sandbox=SANDBOX,
+        )
+        found.append(create.create(varied, plants))
+    return found
+
+
+def fill(folder: Path, made: list[create.Draft], count: int) -> None:
+    """Write a leaderboard of that many entries; the first keeps its name, as the PID."""
+    lines, head = b"", chain.START
+    for draft in made:
+        draft.save(folder / store.RECORDS).unlink()
+    for index in range(count):
+        values = json.loads(made[index % len(made)].content)
+        if index:
+            values["submission"]["manifest"]["name"] = f"entry{index}"
+        content = canonical.canonical(values)
+        item = record.from_bytes(content, "synthetic")
+        (folder / store.RECORDS / f"{item.sha256}{record.SUFFIX}").write_bytes(content)
+        line = chain.line(index, item, head)
+        head, lines = canonical.digest(line), lines + line
+    (folder / chain.FILE).write_bytes(lines)
+
+
+def report(what: str, seconds: float, limit: float) -> None:
+    print(f"{what:44}{seconds:8.1f} s   limit {limit:5.0f} s   ratio {seconds / limit:.2f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--records", type=int, default=1000)
+    parser.add_argument("--verified", type=int, default=100)
+    arguments = parser.parse_args()
+    plants = frozen.load()
+    made = drafts(plants)
+    share = arguments.records / 1000
+    print(f"{arguments.records} records on {os.cpu_count()} cores")
+    sizes = [len(x.content) + len(x.commands) for x in made]
+    print(f"a record with its commands: {max(sizes) / 1e3:.0f} kB at most")
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "large"
+        fill(folder, made, arguments.records)
+        begun = time.perf_counter()
+        done = build.build(folder)
+        report("build, first", time.perf_counter() - begun, BUILD_LIMIT_S * share)
+        begun = time.perf_counter()
+        again = build.build(folder)
+        report("build, again", time.perf_counter() - begun, BUILD_LIMIT_S * share)
+        if again.changed or len(done.changed) != done.pages:
+            raise SystemExit("the second build changed something")
+        part = Path(temporary) / "part"
+        fill(part, made, min(arguments.verified, arguments.records))
+        build.build(part)
+        begun = time.perf_counter()
+        found = verify(part, lambda version: plants)
+        seconds = time.perf_counter() - begun
+        if found.problems:
+            raise SystemExit("\n".join(found.problems[:5]))
+        scaled = seconds * arguments.records / found.records
+        what = f"verify ({found.replayed} took {seconds:.1f} s)"
+        report(what, scaled, VERIFY_LIMIT_S * share)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""Records made on the spot: real commands of the PIDs on textbook lungs, and variations of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from ventbench import draws, precision
+from ventbench.board import build, create, record, store
+from ventbench.board.record import Record
+from ventbench.board.replay import replay
+from ventbench.board.replayed import Simulators
+from ventbench.lungs import LUNG_IDS, LUNGS, Lung
+from ventbench.plants.single_compartment import SingleCompartment, single_compartment
+from ventbench.plants.stack import stack
+from ventbench.submissions.errors import Failure
+from ventbench.submissions.folder import open_submission
+from ventbench.submissions.result import CellFailure, Score
+from ventbench.submissions.scoring import score
+
+SANDBOX = {"layers": ["landlock", "seccomp"], "official": True}
+NOW = datetime(2026, 11, 20, 12, tzinfo=UTC)
+
+#: Text that must never be anything but text.
+HOSTILE = (
+    "<script>document.title='owned'</script>\"'><img src=x onerror=alert(1)> {{ 7*7 }} \u202eevil"
+)
+
+
+class Textbook:
+    """Textbook lungs, as :func:`ventbench.plants.frozen.load` returns the frozen ones."""
+
+    def __init__(self) -> None:
+        with precision.float64():
+            # Numpy leaves, as the frozen ones have: they take the precision of their user.
+            self.plants = jax.tree.map(np.asarray, _lungs(1.0))
+            each = [_lungs(factor) for factor in (1.0, 0.97, 1.04)]
+            self.ensemble: SingleCompartment = jax.tree.map(np.asarray, stack(each))
+
+    def about(self) -> Mapping[str, Any]:
+        return {"version": 1, "kind": "textbook", "manifest_sha256": "0" * 64}
+
+
+def _lungs(factor: float) -> SingleCompartment:
+    return stack([single_compartment(Lung(x.R * factor, x.C / factor)) for x in LUNGS])
+
+
+@pytest.fixture(scope="session")
+def simulators() -> Textbook:
+    return Textbook()
+
+
+@pytest.fixture(scope="session")
+def scores(simulators: Textbook) -> dict[str, Score]:
+    """The two PIDs, scored."""
+    found = {}
+    for name in ("pid_best", "pid_robust"):
+        result, _ = score(open_submission(name), simulators.plants, draws=draws.COUNT)
+        found[name] = dataclasses.replace(result, sandbox=SANDBOX)
+    return found
+
+
+Draft = Callable[..., create.Draft]
+
+
+@pytest.fixture(scope="session")
+def draft(
+    scores: dict[str, Score], simulators: Textbook, tmp_path_factory: pytest.TempPathFactory
+) -> Draft:
+    """Make a record: the commands of a PID times a factor, under any name."""
+
+    def make(
+        name: str,
+        base: str = "pid_best",
+        factor: float = 1.0,
+        *,
+        sandbox: dict[str, Any] | None = SANDBOX,
+        texts: str | None = None,
+        failed: int = 0,
+        wide_open: bool = False,
+        **about: Any,
+    ) -> create.Draft:
+        score = scores[base]
+        folder = tmp_path_factory.mktemp("entries") / name
+        shutil.copytree(score.submission.folder, folder, ignore=lambda *_: ["__pycache__"])
+        manifest = dataclasses.replace(score.submission.manifest, name=name)
+        if texts is not None:
+            manifest = dataclasses.replace(
+                manifest, authors=(texts,), licence=texts, description=texts
+            )
+        (folder / "submission.toml").write_text(f"# {name}\n")
+        opened = dataclasses.replace(
+            score.submission, label=str(folder), folder=folder, manifest=manifest,
+            sha256=create.combined_hash(create.file_hashes(folder)),
+        )  # fmt: skip
+        requested = np.full_like(score.requested, 100.0) if wide_open else score.requested * factor
+        cells = [(i, j) for i in range(6) for j in range(6)][:failed]
+        for i, j in cells:
+            requested[i, 0, j] = 0.0
+        (found,) = replay(simulators, score.pips, [requested])
+        nominal = found.nominal.copy()
+        failures = []
+        for i, j in cells:
+            nominal[i, j] = np.nan
+            what = Failure("act", texts or "raised ValueError", texts or "", 1, 2)
+            message = what.message(str(folder), LUNG_IDS[i])
+            failures.append(CellFailure(LUNG_IDS[i], score.pips[j], None, what, message))
+        varied = dataclasses.replace(
+            score, submission=opened, requested=requested, nominal=nominal, drawn=found.drawn,
+            safe=found.safe, peak=found.peak.max(axis=(0, 2)), sandbox=sandbox,
+            failures=tuple(failures),
+        )  # fmt: skip
+        return create.create(varied, simulators, now=NOW, **about)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def drafts(draft: Draft) -> dict[str, create.Draft]:
+    """Entries of every kind: ranked, failed, unsafe, not official, hostile."""
+    return {
+        "pid_best": draft("pid_best"),
+        "pid_robust": draft("pid_robust", "pid_robust"),
+        "softer": draft("softer", factor=0.97),
+        "harder": draft("harder", factor=1.04, texts=HOSTILE),
+        "robust": draft("robust", "pid_robust", factor=0.98),
+        "broken": draft("broken", failed=2, texts=HOSTILE),
+        "open": draft("open", wide_open=True),
+        "home": draft("home", factor=1.01, sandbox=None),
+    }
+
+
+@pytest.fixture(scope="session")
+def full(
+    drafts: dict[str, create.Draft], simulators: Textbook, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A built leaderboard that nobody may change; see :func:`leaderboard`."""
+    folder = tmp_path_factory.mktemp("full") / "leaderboard"
+    for made in drafts.values():
+        put(folder, made, simulators)
+    build.build(folder)
+    return folder
+
+
+@pytest.fixture
+def leaderboard(full: Path, tmp_path: Path) -> Path:
+    """A built leaderboard to change."""
+    return shutil.copytree(full, tmp_path / "leaderboard")
+
+
+def put(folder: Path, made: create.Draft, simulators: Simulators | None = None) -> Record:
+    """Save a draft and add it."""
+    return store.add(folder, made.save(folder.parent / "drafts"), simulators)
+
+
+def opened(made: create.Draft) -> Record:
+    """Return the record of a draft."""
+    found = record.from_bytes(made.content, "draft")
+    assert isinstance(found, Record)
+    return found

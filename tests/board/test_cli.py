@@ -1,0 +1,111 @@
+"""The commands, on textbook lungs in the place of the frozen ones."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from ventbench.board import store
+from ventbench.cli import app
+from ventbench.errors import InputError
+from ventbench.plants import frozen
+
+from .conftest import Textbook
+
+RUN = CliRunner()
+
+
+@pytest.fixture(autouse=True)
+def _textbook(monkeypatch: pytest.MonkeyPatch, simulators: Textbook) -> None:
+    monkeypatch.setattr(frozen, "load", lambda version=1: simulators)
+
+
+def run(*arguments: object, code: int = 0) -> str:
+    found = RUN.invoke(app, ["board", *map(str, arguments)])
+    if isinstance(found.exception, InputError):  # main() prints it and exits with 2
+        assert code == 2
+        return str(found.exception)
+    assert found.exit_code == code, found.output
+    return found.output
+
+
+def test_from_records_to_a_verified_board(drafts, tmp_path: Path) -> None:
+    folder = tmp_path / "board"
+    for name in ("pid_best", "softer", "broken"):
+        path = drafts[name].save(tmp_path / "records")
+        assert f"added {name} (performance)" in run("add", path, "--folder", folder)
+    assert "3 records, 5 files, 5 changed" in run("build", "--folder", folder)
+    assert "3 records, 5 files, 0 changed" in run("build", "--folder", folder)
+    output = run("verify", "--folder", folder)
+    assert "all is well: 3 records, 3 replayed" in output
+    report = tmp_path / "show.json"
+    text = run("show", "--folder", folder, "--json", report)
+    rows = json.loads(report.read_text())["rows"]
+    assert [(row["name"], row["rank"]) for row in rows] == [
+        ("softer", 1), ("pid_best", 2), ("broken", ""),
+    ]  # fmt: skip
+    assert "softer" in text
+    written = csv.DictReader(io.StringIO((folder / "leaderboard.csv").read_text()))
+    assert [row["score_cmH2O"] for row in written] == [row["score_cmH2O"] for row in rows]
+
+
+def test_verify_says_no_with_exit_code_1(leaderboard: Path, tmp_path: Path) -> None:
+    path = leaderboard / "leaderboard.csv"
+    path.write_bytes(path.read_bytes().replace(b"softer", b"better"))
+    output = run("verify", "--folder", leaderboard, "--json", tmp_path / "report.json", code=1)
+    assert f"{path} is not what the records give: byte" in output
+    assert "1 problem:" in output
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert len(report["problems"]) == 1
+    assert report["replayed"] == 8
+
+
+def test_withdraw(leaderboard: Path) -> None:
+    item = store.load(leaderboard).scores[2]
+    output = run("withdraw", item.sha256[:12], "--reason", "a bug", "--folder", leaderboard)
+    assert item.sha256 in output
+    run("build", "--folder", leaderboard)
+    assert "withdrawn: a bug" in (leaderboard / "index.html").read_text()
+    assert "all is well" in run("verify", "--folder", leaderboard)
+
+
+def test_a_correction_says_why_and_whence(leaderboard: Path, draft) -> None:
+    old = store.load(leaderboard).scores[2]
+    path = draft("softer", factor=0.95).save(leaderboard.parent / "new")
+    options = ("--supersedes", old.sha256[:8], "--reason", "a bug", "--source", "commit=9c1e5d0")
+    run("add", path, *options, "--folder", leaderboard)
+    run("build", "--folder", leaderboard)
+    assert "all is well: 9 records" in run("verify", "--folder", leaderboard)
+    new = store.load(leaderboard).scores[-1]
+    assert new.content["supersedes"] == old.sha256
+    assert new.content["provenance"] == {"commit": "9c1e5d0"}
+    page = (leaderboard / "entries/v1/performance/softer.html").read_text()
+    assert "<b>counts</b>: a bug" in page
+    assert '<th scope="row">commit</th><td>9c1e5d0</td>' in page
+    message = run("add", path, "--source", "commit", "--folder", leaderboard, code=2)
+    assert "KEY=TEXT" in message
+
+
+def test_bad_input_is_explained(tmp_path: Path, full: Path) -> None:
+    assert "holds no record" in run("show", "--folder", tmp_path, code=2)
+    assert "has no version 9; there are 1" in run("show", "--version", 9, "--folder", full, code=2)
+    (tmp_path / "x.json").write_text("{}\n")
+    assert "key kind" in run("add", tmp_path / "x.json", "--folder", tmp_path, code=2)
+
+
+def test_score_keeps_a_record_that_can_be_added(tmp_path: Path) -> None:
+    folder = tmp_path / "board"
+    arguments = ["score", "pid_robust", "--draws", "20", "--record", str(tmp_path / "records")]
+    found = RUN.invoke(app, arguments)
+    assert found.exit_code == 0, found.output
+    (path,) = (tmp_path / "records").glob("*.json")
+    assert path.name in found.output
+    assert "added pid_robust (robustness)" in run("add", path, "--folder", folder)
+    refused = RUN.invoke(app, ["score", "pid_robust", "--record", str(tmp_path / "other")])
+    assert "add --draws 20" in str(refused.exception)
+    assert not (tmp_path / "other").exists()

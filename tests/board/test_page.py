@@ -1,0 +1,143 @@
+"""The pages in a browser: they sort, open, fit, say nothing to the console, ask for nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from .browser import Page, browser, find
+from .conftest import HOSTILE
+
+NAMES = "[...document.querySelectorAll('#performance ~ .scroll tbody tr th')].map(x => x.innerText)"
+SORT = "document.querySelector('#performance ~ .scroll thead th:nth-child({}) button')"
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    path = find()
+    if path is None:
+        pytest.skip("no Chromium is installed")
+    with browser(path, tmp_path_factory.mktemp("profile")) as page:
+        yield page
+
+
+@pytest.fixture
+def quiet(page: Page) -> Iterator[Page]:
+    """The browser; afterwards nothing may have been said to the console or asked of the network."""
+    page.complaints.clear()
+    page.requests.clear()
+    yield page
+    page.run("0")  # brings events that are still under way
+    assert page.complaints == []
+    assert all(url.startswith("file://") for url in page.requests)
+
+
+def names(page: Page) -> list[str]:
+    return [name.split("\n")[0] for name in page.run(NAMES)]
+
+
+def test_tables_sort_by_click(quiet: Page, full: Path) -> None:
+    quiet.open(full / "index.html", 1280)
+    assert names(quiet) == ["softer", "pid_best", "harder"]
+    quiet.run(SORT.format(2) + ".click()")
+    assert names(quiet) == ["harder", "pid_best", "softer"]
+    sort = SORT.format(2) + ".closest('th').getAttribute('aria-sort')"
+    assert quiet.run(sort) == "ascending"
+    quiet.run(SORT.format(2) + ".click()")
+    assert names(quiet) == ["softer", "pid_best", "harder"]
+    assert quiet.run(sort) == "descending"
+    assert (
+        quiet.run("document.getElementById('said').textContent") == "Sorted by Entry, descending."
+    )
+    # The PID has no difference to itself: without a value it stays last either way.
+    for expected in (["softer", "harder", "pid_best"], ["harder", "softer", "pid_best"]):
+        quiet.run(SORT.format(5) + ".click()")
+        assert names(quiet) == expected
+    assert quiet.run("document.querySelectorAll('[aria-sort]').length") == 2  # one a table
+
+
+def test_tables_sort_by_keyboard(quiet: Page, full: Path) -> None:
+    quiet.open(full / "index.html", 1280)
+    reached = False
+    for _ in range(30):
+        quiet.press("Tab", 9)
+        if quiet.run("document.activeElement === " + SORT.format(3)):
+            reached = True
+            break
+    assert reached
+    quiet.press("Enter", 13)
+    quiet.press("Enter", 13)
+    assert names(quiet) == ["harder", "pid_best", "softer"]
+
+
+def test_an_entry_opens_and_leads_back(quiet: Page, full: Path) -> None:
+    quiet.open(full / "index.html", 1280)
+    quiet.run("document.querySelector('tbody a').click()")
+    quiet.settle("performance/softer.html")
+    assert quiet.run("document.querySelector('h1').innerText") == "softer"
+    assert quiet.run("document.querySelectorAll('.grid figure').length") == 36
+    assert quiet.run("document.querySelectorAll('.heat tbody td:not(.mean)').length") == 72
+    boxes = "[...document.querySelectorAll('.grid path.p')].every(x => x.getBBox().width > 500)"
+    assert quiet.run(boxes)
+    quiet.run("document.querySelector('.kicker a').click()")
+    quiet.settle("index.html")
+
+
+def test_foreign_text_is_text(quiet: Page, full: Path) -> None:
+    quiet.open(full / "entries/v1/performance/harder.html", 1280)
+    assert quiet.run("document.title") == "harder, performance – ventbench"
+    lead = quiet.run("document.querySelector('.lead').innerText")
+    assert lead == HOSTILE.replace("\u202e", "\ufffd")
+    assert quiet.run("document.images.length") == 0
+    assert quiet.run("document.scripts.length") == 1
+    quiet.open(full / "entries/v1/performance/broken.html", 1280)
+    assert quiet.run("document.title").startswith("broken")
+    assert HOSTILE[:40] in quiet.run("document.querySelector('.notice').innerText")
+
+
+def test_the_policy_stops_a_script_that_got_in(page: Page, full: Path, tmp_path: Path) -> None:
+    content = (full / "index.html").read_text()
+    copy = tmp_path / "index.html"
+    copy.write_text(content.replace("</main>", "<script>document.title='owned'</script></main>"))
+    page.open(copy, 1280)
+    assert page.run("document.title") == "Leaderboard, protocol version 1 – ventbench"
+    page.run("0")
+    assert any("Content Security Policy" in text for text in page.complaints)
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("width", [390, 1280])
+@pytest.mark.parametrize("name", ["index", "entries/v1/performance/harder"])
+def test_pages_fit(quiet: Page, full: Path, name: str, width: int, dark: bool) -> None:
+    quiet.open(full / f"{name}.html", width, dark=dark)
+    root = "document.documentElement"
+    assert quiet.run(f"{root}.scrollWidth <= {root}.clientWidth")
+    ground = quiet.run("getComputedStyle(document.body).backgroundColor")
+    assert ground == ("rgb(17, 20, 24)" if dark else "rgb(255, 255, 255)")
+    # Every text of a table's cell stands out from its ground (WCAG's 4.5).
+    assert quiet.run(CONTRAST) >= 4.5
+    assert quiet.picture()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+#: Least contrast of any cell's text, where the cell has a ground of its own.
+CONTRAST = """(() => {
+  const canvas = document.createElement('canvas').getContext('2d', {willReadFrequently: true});
+  const light = (color) => {
+    canvas.fillStyle = color; canvas.fillRect(0, 0, 1, 1);
+    const parts = [...canvas.getImageData(0, 0, 1, 1).data].slice(0, 3).map((v) => v / 255)
+      .map((v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+    return 0.2126 * parts[0] + 0.7152 * parts[1] + 0.0722 * parts[2];
+  };
+  let least = 21;
+  for (const cell of document.querySelectorAll('td, th, .note, .lead, dt, dd')) {
+    let ground = cell, style = getComputedStyle(cell);
+    while (ground && getComputedStyle(ground).backgroundColor === 'rgba(0, 0, 0, 0)')
+      ground = ground.parentElement;
+    const a = light(style.color);
+    const b = light(getComputedStyle(ground ?? document.body).backgroundColor);
+    least = Math.min(least, (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05));
+  }
+  return least;
+})()"""

@@ -1,0 +1,276 @@
+"""One wrong byte anywhere is found, and named."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ventbench import protocol
+from ventbench.board import actions, build, canonical, chain, commands, create, record, store
+from ventbench.board.verify import Report, verify
+from ventbench.errors import InputError
+from ventbench.plants import frozen
+from ventbench.submissions.folder import open_submission
+from ventbench.submissions.scoring import score
+
+from .conftest import Textbook, put
+
+
+@pytest.fixture
+def check(simulators: Textbook):
+    """Verify with the textbook lungs."""
+    return lambda folder, **options: verify(folder, lambda version: simulators, **options)
+
+
+def test_all_is_well(full: Path, check) -> None:
+    told: list[tuple[int, int]] = []
+    report: Report = check(full, progress=lambda *x: told.append(x))
+    assert report.problems == []
+    assert report.notes == []
+    assert (report.records, report.replayed) == (8, 8)
+    assert report.deviation <= 1e-9
+    assert told[-1] == (8, 8)
+    assert report.head == canonical.digest((full / chain.FILE).read_bytes().splitlines(True)[-1])
+
+
+def _flip(path: Path, index: int, bit: int = 0) -> None:
+    content = bytearray(path.read_bytes())
+    content[index] ^= 1 << bit
+    path.write_bytes(content)
+
+
+def _sound(folder: Path, only: str | None = None) -> list[str]:
+    """Quick part of a verification: hashes, of all records or of one file, without replay."""
+    links = [x for x in store.read_chain(folder) if only in (None, x.record, x.actions)]
+    wrong = []
+    for link in links:
+        try:
+            item = store.read_record(folder, link)
+            if isinstance(item, record.Record):
+                commands.load(item, folder / store.RECORDS)
+        except InputError as error:
+            wrong.append(str(error))
+    return wrong
+
+
+@pytest.mark.parametrize("suffix", [record.SUFFIX, actions.SUFFIX])
+def test_every_flipped_byte_of_a_record_is_found(leaderboard: Path, suffix: str) -> None:
+    random = np.random.default_rng(7)
+    paths = sorted((leaderboard / store.RECORDS).glob(f"*{suffix}"))
+    assert len(paths) >= 7
+    for path in paths:
+        content = path.read_bytes()
+        places = {0, len(content) - 1, *random.integers(0, len(content), 25).tolist()}
+        for place in places:
+            _flip(path, place, int(random.integers(8)))
+            wrong = _sound(leaderboard, path.stem)
+            assert wrong, f"byte {place} of {path}"
+            assert all(path.name in text for text in wrong)
+            path.write_bytes(content)
+        assert _sound(leaderboard, path.stem) == []
+
+
+def test_every_flipped_byte_of_the_chain_is_found(leaderboard: Path, check) -> None:
+    path = leaderboard / chain.FILE
+    content = path.read_bytes()
+    for place in range(0, len(content), 29):
+        _flip(path, place)
+        with pytest.raises((InputError, AssertionError)):
+            assert not _sound(leaderboard)
+        path.write_bytes(content)
+    _flip(path, len(content) // 2)
+    (problem,) = check(leaderboard).problems
+    assert f"{chain.FILE} line" in problem
+
+
+def test_a_flipped_record_and_its_replay_are_named(leaderboard: Path, check) -> None:
+    path = sorted((leaderboard / store.RECORDS).glob("*.json"))[3]
+    _flip(path, path.read_bytes().index(b'"authors":') + 1)
+    report = check(leaderboard)
+    assert len(report.problems) == 1
+    assert str(path) in report.problems[0]
+    assert "key submission: does not have the form" in report.problems[0]
+    assert report.replayed == 7
+
+
+def test_flipped_commands_are_named(leaderboard: Path, check) -> None:
+    path = sorted((leaderboard / store.RECORDS).glob("*.actions"))[2]
+    _flip(path, 1000, 3)
+    report = check(leaderboard)
+    assert [str(path) in text for text in report.problems] == [True] * len(report.problems)
+    assert 1 <= len(report.problems) <= 2  # two records may share commands
+    assert report.replayed == 8 - len(report.problems)
+
+
+@pytest.mark.parametrize("name", ["index.html", "leaderboard.csv"])
+def test_a_flipped_page_is_named_with_its_byte(leaderboard: Path, check, name: str) -> None:
+    _flip(leaderboard / name, 777)
+    (problem,) = check(leaderboard).problems
+    assert problem.startswith(str(leaderboard / name))
+    assert problem.endswith("byte 777")
+
+
+def test_missing_and_strange_files_are_named(leaderboard: Path, check) -> None:
+    (leaderboard / "entries/v1/performance/harder.html").unlink()
+    (leaderboard / "version-7.html").write_text("")
+    (leaderboard / store.RECORDS / "x.json").write_text("{}")
+    problems = "\n".join(check(leaderboard).problems)
+    assert "harder.html is missing" in problems
+    assert "version-7.html belongs to no record" in problems
+    assert "x.json is not named by chain.jsonl" in problems
+    assert problems.count("\n") == 2
+
+
+def test_changed_simulators_are_named(leaderboard: Path, simulators: Textbook) -> None:
+    def broken(version: int) -> Any:
+        raise InputError("data/simulators/v1/hybrid.npz has SHA-256 ...; it is damaged")
+
+    assert "hybrid.npz" in verify(leaderboard, broken).problems[0]
+
+    class Other(Textbook):
+        def about(self) -> dict[str, Any]:
+            return {**simulators.about(), "manifest_sha256": "1" * 64}
+
+    (problem,) = verify(leaderboard, lambda version: Other()).problems
+    assert "manifest_sha256 differ" in problem
+
+
+def test_the_frozen_simulators_replay_and_no_byte_of_them_may_change(tmp_path: Path) -> None:
+    folder, simulators = tmp_path / "leaderboard", frozen.load()
+    entry = open_submission("pid_robust")
+    result, _ = score(entry, simulators.plants, draws=20, simulators=simulators.about())
+    put(folder, create.create(result, simulators), simulators)
+    build.build(folder)
+    report = verify(folder, frozen.load)
+    assert (report.problems, report.replayed) == ([], 1)
+    assert report.deviation <= 1e-9
+
+    copy = shutil.copytree(frozen.folder(1), tmp_path / "simulators")
+    for name in (frozen.MANIFEST, frozen.MEMBERS, frozen.SEEN):
+        size = (copy / name).stat().st_size
+        for place in (0, size // 5, size // 3, size // 2, size - 1):
+            _flip(copy / name, place)
+            (problem,) = verify(folder, lambda version: frozen.load(version, copy)).problems
+            assert problem.startswith("simulators: ")
+            assert name == frozen.MANIFEST or name in problem
+            _flip(copy / name, place)
+
+
+#: Entries of a forged leaderboard: enough, and quick to replay.
+KEPT = ("pid_best", "softer", "harder")
+
+
+def _forge(folder: Path, name: str, change: dict[str, Any]) -> Path:
+    """A leaderboard whose owner rewrote a record, its name, the chain and the pages."""
+    fresh = folder.parent / "forged"
+    shutil.rmtree(fresh, ignore_errors=True)
+    (fresh / store.RECORDS).mkdir(parents=True)
+    lines, head = b"", chain.START
+    kept = [item for item in store.load(folder).scores if item.name in KEPT]
+    for index, item in enumerate(kept):
+        content = (folder / store.RECORDS / f"{item.sha256}.json").read_bytes()
+        if item.name == name:
+            values = json.loads(content)
+            for key, value in change.items():
+                values[key] = value(values[key])
+            content = canonical.canonical(values)
+        (fresh / store.RECORDS / f"{canonical.digest(content)}.json").write_bytes(content)
+        new = record.from_bytes(content, "forged")
+        assert isinstance(new, record.Record)
+        shutil.copy(commands.path_of(new, folder / store.RECORDS), fresh / store.RECORDS)
+        line = chain.line(index, new, head)
+        head = canonical.digest(line)
+        lines += line
+    (fresh / chain.FILE).write_bytes(lines)
+    build.build(fresh)
+    return fresh
+
+
+def _lower(table: Any) -> Any:
+    return [_lower(x) for x in table] if isinstance(table, list) else table * 0.99
+
+
+FORGERIES = {
+    "errors.nominal": {"errors": lambda x: {**x, "nominal": _lower(x["nominal"])}},
+    "errors.drawn": {"errors": lambda x: {**x, "drawn": _lower(x["drawn"])}},
+    "spread": {"spread": _lower},
+    "safe": {"safe": lambda x: [not x[0], *x[1:]]},
+    "peak_pressure_cmH2O": {"peak_pressure_cmH2O": _lower},
+    "safety.peak_centi_cmH2O": {
+        "safety": lambda x: {**x, "peak_centi_cmH2O": np.maximum(
+            np.array(x["peak_centi_cmH2O"]) - 2, 0).tolist()}
+    },
+    "safety.steps_above": {
+        "safety": lambda x: {**x, "steps_above": (np.array(x["steps_above"]) + 1).tolist()}
+    },
+    "clipped.below": {"clipped": lambda x: {**x, "below": [0] * 6}},
+    "clipped.commands": {"clipped": lambda x: {**x, "commands": 10**6}},
+    "trace.pressure_centi_cmH2O": {
+        "trace": lambda x: {**x, "pressure_centi_cmH2O": (
+            np.array(x["pressure_centi_cmH2O"]) + 2).tolist()}
+    },
+    "trace.u_in_tenths_percent": {
+        "trace": lambda x: {**x, "u_in_tenths_percent": (
+            np.array(x["u_in_tenths_percent"]) * 0).tolist()}
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("key", FORGERIES)
+def test_a_consistent_forgery_does_not_replay(full: Path, tmp_path: Path, check, key: str) -> None:
+    shutil.copytree(full, tmp_path / "copy")
+    fresh = _forge(tmp_path / "copy", "softer", FORGERIES[key])
+    report = check(fresh)
+    (problem,) = report.problems
+    assert f"key {key}" in problem
+    (item,) = [x for x in store.load(fresh).scores if x.name == "softer"]
+    assert item.sha256 in problem
+    assert "its commands give" in problem
+
+
+def test_a_noted_head_must_still_be_there(leaderboard: Path, check) -> None:
+    links = store.read_chain(leaderboard)
+    assert check(leaderboard, head=links[3].sha256).problems == []
+    path = leaderboard / chain.FILE
+    path.write_bytes(b"".join(path.read_bytes().splitlines(True)[:-1]))
+    build.build(leaderboard)
+    problems = check(leaderboard, head=links[-1].sha256).problems
+    assert any(links[-1].sha256 in text for text in problems)
+
+
+def test_versions_have_pages_of_their_own(full: Path, tmp_path: Path, check) -> None:
+    shutil.copytree(full, tmp_path / "copy")
+    fresh = _forge(tmp_path / "copy", "softer", {"protocol": lambda x: 2})
+    new, old = ((fresh / name).read_text() for name in ("index.html", "version-1.html"))
+    assert "softer" in new
+    assert "harder" not in new
+    assert "harder" in old
+    assert "softer" not in old
+    assert '<a href="version-1.html">1</a>' in new
+    assert '<a href="index.html">2</a>' in old
+    assert (fresh / "entries/v2/performance/softer.html").is_file()
+    assert not (fresh / "entries/v1/performance/softer.html").exists()
+    (problem,) = check(fresh).problems
+    assert "key protocol: version 2 is not known" in problem
+
+
+def test_an_old_board_stays_and_rebuilds(
+    full: Path, check, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(protocol, "VERSION", 2)
+    report = check(full)
+    assert report.problems == []
+    assert report.replayed == 0
+    assert report.notes == [
+        "records of protocol version 1 were not replayed; an older ventbench does that"
+    ]
+
+
+def test_no_leaderboard_is_an_error(tmp_path: Path, check) -> None:
+    with pytest.raises(InputError, match="holds no leaderboard"):
+        check(tmp_path)

@@ -1,0 +1,76 @@
+"""CSV and pages: a pure function of the records, the same bytes at every build."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from ventbench import files
+from ventbench.board import board, entry_page, index_page, pages, store
+from ventbench.board.store import Store
+
+#: What a build writes, as patterns within the leaderboard's folder; anything else is left alone.
+BUILT = ("index.html", "leaderboard.csv", "version-*.html", "entries/**/*.html")
+
+
+@dataclass(frozen=True)
+class Built:
+    """What a build did.
+
+    Attributes:
+        records: how many there are.
+        pages: how many files belong to the leaderboard, CSV included.
+        changed: relative paths that were written or removed.
+    """
+
+    records: int
+    pages: int
+    changed: tuple[str, ...]
+
+
+def content(found: Store) -> dict[str, bytes]:
+    """Return every built file by its path within the leaderboard's folder.
+
+    Raises:
+        InputError: if jinja2 is not installed.
+    """
+    boards = board.boards(found.records) or {pages.CURRENT: board.empty(pages.CURRENT)}
+    made = {"leaderboard.csv": board.csv_text(boards).encode()}
+    environment = pages.environment()
+    versions = list(boards)
+    for version, tracks in boards.items():
+        page = index_page.render(environment, found, version, versions, tracks)
+        made[pages.version_path(version, versions)] = page.encode()
+        for track in tracks:
+            made.update(entry_page.render_all(environment, track, versions))
+    return made
+
+
+def build(folder: Path) -> Built:
+    """Bring CSV and pages up to date with the records; only files that differ are written.
+
+    Args:
+        folder: of the leaderboard.
+
+    Raises:
+        InputError: if a record or the chain was changed, or jinja2 is not installed.
+        OSError: if a file cannot be read or written.
+    """
+    found = store.load(folder)
+    made = content(found)
+    changed = []
+    for name, text in made.items():
+        path = folder / name
+        if not path.is_file() or path.read_bytes() != text:
+            files.write_atomically(path, lambda file, text=text: file.write(text))
+            changed.append(name)
+    for name in sorted(present(folder) - made.keys()):
+        (folder / name).unlink()
+        changed.append(name)
+    return Built(len(found.records), len(made), tuple(changed))
+
+
+def present(folder: Path) -> set[str]:
+    """Relative paths of the built files that are there now."""
+    paths = (path for pattern in BUILT for path in folder.glob(pattern))
+    return {path.relative_to(folder).as_posix() for path in paths}

@@ -1,0 +1,159 @@
+"""The page of one entry: figures, heat maps, traces against the PID, how to reproduce it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from ventbench import protocol
+from ventbench.board import heat, pages, text, traces
+from ventbench.board.board import Track
+from ventbench.board.dumbbells import dumbbells
+from ventbench.board.ranking import BASELINES, Row
+from ventbench.board.record import Record
+from ventbench.lungs import lung as parse_lung
+
+if TYPE_CHECKING:
+    import jinja2
+
+#: How many failures a page lists; the record has all.
+MOST_FAILURES = 12
+
+
+def render_all(
+    environment: jinja2.Environment, track: Track, versions: Sequence[int]
+) -> dict[str, bytes]:
+    """Return the pages of all entries of a track by their paths; see ``index_page.render``."""
+    template = environment.get_template("entry.html.j2")
+    base = track.baseline
+    other = None if base is None else traces.paths(base)
+    made = {}
+    for status, row in track.rows:
+        path = pages.entry_path(track.version, track.name, row.record.name)
+        if path in made:  # an older official record beside a newer unofficial one
+            continue
+        same = base is not None and row.record.sha256 == base.sha256
+        values = _values(track, status, row, None if same else base)
+        values["panels"] = _panels(row.record, None if same else other)
+        values["back"] = "../" * path.count("/") + pages.version_path(track.version, versions)
+        values["root"] = "../" * path.count("/")
+        made[path] = template.render(values).encode()
+    return made
+
+
+def _values(track: Track, status: str, row: Row, base: Record | None) -> dict[str, Any]:
+    record, content = row.record, row.record.content
+    worst, lung, pip = row.worst
+    draws = dumbbells(record, base)
+    gap = row.score.value - row.nominal if row.score else math.nan
+    return {
+        "record": record,
+        "content": content,
+        "manifest": record.manifest,
+        "status": status,
+        "reasons": row.entry.reasons,
+        "track": track.name,
+        "version": track.version,
+        "rank": row.rank,
+        "ranks": row.ranks,
+        "count": len(track.ranked),
+        "score": text.interval(row.score),
+        "to_pid": text.difference(row.to_baseline),
+        "to_above": text.difference(row.to_above),
+        "above": _above(track, row),
+        "baseline": BASELINES[track.name],
+        "compared": base.name if base else None,
+        "nominal": text.figure(row.nominal),
+        "gap": text.signed(gap),
+        "worst": text.figure(worst),
+        "worst_where": f"{lung} at PIP {pip:g}" if lung else "",
+        "exploitation": text.figure(record.exploitation),
+        "clipped": text.figure(100.0 * record.clipped_share, 1),
+        "step": text.figure(text.step_time(content["timing"]), 0),
+        "heat": heat.errors(record),
+        "limits": heat.ERRORS,
+        "differences": heat.differences(record, base) if base else None,
+        "draws": draws,
+        "dots": pages.trusted(draws.drawing) if draws else None,
+        "safety": _safety(record),
+        "failures": content["failures"][:MOST_FAILURES],
+        "frames": [pages.trusted(traces.frame(pip)) for pip in record.pips],
+        "pips": [f"{pip:g}" for pip in record.pips],
+        "lungs": [(name, *_setting(name)) for name in record.lungs],
+        "breath": record.breath,
+        "provenance": _provenance(content),
+        "history": _history(row),
+        "protocol": protocol,
+        "box": f"0 0 {traces.WIDTH} {traces.HEIGHT}",
+    }
+
+
+def _panels(record: Record, other: list[list[tuple[str, str]]] | None) -> list[list[Any]]:
+    """Traces of the entry and of the PID of each lung and PIP, ready for the page."""
+    drawn = traces.panels(traces.paths(record), other)
+    return [[pages.trusted(panel) for panel in row] for row in drawn]
+
+
+def _above(track: Track, row: Row) -> str | None:
+    place = next((i for i, one in enumerate(track.ranked) if one is row), 0)
+    return track.ranked[place - 1].record.name if place else None
+
+
+def _safety(record: Record) -> list[dict[str, Any]]:
+    """A row a lung: highest pressure, longest time above the limit, whether the gate is passed."""
+    highest, steps = record.peak.max(axis=(0, 2)), record.steps_above.max(axis=(0, 2))
+    return [
+        {
+            "name": name,
+            "peak": text.figure(float(highest[i]), 1),
+            "above": int(steps[i]),
+            "safe": record.content["safe"][i],
+        }
+        for i, name in enumerate(record.lungs)
+    ]
+
+
+def _setting(name: str) -> tuple[str, str]:
+    found = parse_lung(name)
+    return f"{found.R:g}", f"{found.C:g}"
+
+
+def _provenance(content: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
+    submission = content["submission"]
+    groups = (
+        ("Training, as the authors state it", content["submission"]["manifest"]["training"]),
+        ("Where it came from", content["provenance"]),
+        ("Files of the submission, SHA-256", submission["files"]),
+        ("Simulators", content["simulators"]),
+        ("Draws", content["draws"]),
+        ("Sandbox", content["sandbox"] or {"layers": "none: scored in the scorer's process"}),
+        ("Machine", content["machine"]),
+        ("Versions", content["versions"]),
+        ("Timing", content["timing"]),
+    )
+    found = [(title, text.flatten(values)) for title, values in groups]
+    return [(title, rows) for title, rows in found if rows]
+
+
+def _history(row: Row) -> list[dict[str, Any]]:
+    """All records of the entry, newest first, and what became of each."""
+    counts = row.record.sha256
+    lines = []
+    for event in row.entry.history:
+        item = event.record
+        state = "counts" if item.sha256 == counts else "superseded"
+        if not item.official and state != "counts":
+            state = "not official"
+        if event.withdrawn is not None:
+            state = "withdrawn"
+        lines.append(
+            {
+                "sha256": item.sha256,
+                "created": item.content["created"],
+                "official": item.official,
+                "state": state,
+                "reason": event.withdrawn or item.content["reason"],
+            }
+        )
+    return lines

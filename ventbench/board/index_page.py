@@ -1,0 +1,127 @@
+"""The page of one version: both tracks as sortable tables, and who is not ranked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from ventbench import protocol
+from ventbench.board import pages, text
+from ventbench.board.board import Track
+from ventbench.board.ranking import BASELINES, Row
+from ventbench.board.store import Store
+from ventbench.views.runs import number
+
+if TYPE_CHECKING:
+    import jinja2
+
+#: Size of the small plot of an interval; the entry's dot never touches its edge.
+WIDTH, MARGIN = 120, 6
+
+
+def render(
+    environment: jinja2.Environment,
+    found: Store,
+    version: int,
+    versions: Sequence[int],
+    tracks: Sequence[Track],
+) -> str:
+    """Return the page of a version.
+
+    Args:
+        environment: from :func:`ventbench.board.pages.environment`.
+        found: the leaderboard.
+        version: of the protocol.
+        versions: all of them, newest first.
+        tracks: of the version.
+    """
+    first = next((x for track in tracks for _, x in track.rows), None)
+    return environment.get_template("index.html.j2").render(
+        version=version,
+        versions=[
+            {"number": v, "path": pages.version_path(v, versions), "here": v == version}
+            for v in versions
+        ],
+        tracks=[_track(track) for track in tracks],
+        aside=[_aside(track, status, row) for track in tracks for status, row in track.rows],
+        simulators=text.flatten(first.record.content["simulators"]) if first else [],
+        draws=first.record.content["draws"] if first else None,
+        head=found.head,
+        records=len(found.records),
+        protocol=protocol,
+    )
+
+
+def _track(track: Track) -> dict[str, Any]:
+    scores = [row.score for row in track.ranked if row.score is not None]
+    low = min((x.low for x in scores), default=1.0)
+    high = max((x.high for x in scores), default=1.0)
+    return {
+        "name": track.name,
+        "title": pages.TITLES[track.name],
+        "baseline": BASELINES[track.name],
+        "rows": [_row(track, row, low, high) for row in track.ranked],
+    }
+
+
+def _row(track: Track, row: Row, low: float, high: float) -> dict[str, Any]:
+    record = row.record
+    worst, lung, pip = row.worst
+    step = text.step_time(record.content["timing"])
+    return {
+        "rank": row.rank,
+        "ranks": row.ranks,
+        "name": record.name,
+        "path": pages.entry_path(track.version, track.name, record.name),
+        "family": record.manifest["family"],
+        "baseline": record.name == BASELINES[track.name],
+        "score": text.interval(row.score),
+        "plot": _plot(row, low, high),
+        "to_pid": text.difference(row.to_baseline),
+        "to_above": text.difference(row.to_above),
+        "nominal": _figure(row.nominal),
+        "worst": {**_figure(worst), "where": f"{lung}, {pip:g}"},
+        "exploitation": _figure(record.exploitation),
+        "clipped": _figure(100.0 * record.clipped_share, 1),
+        "step": _figure(step, 0),
+    }
+
+
+def _aside(track: Track, status: str, row: Row) -> dict[str, Any] | None:
+    """A line of the list of entries that are not ranked."""
+    if status == "ranked":
+        return None
+    reasons = list(row.entry.reasons)
+    if status == "not official":
+        reasons.insert(0, "not official: its sandbox lacked a layer, or there was none")
+    return {
+        "name": row.record.name,
+        "track": track.name,
+        "path": pages.entry_path(track.version, track.name, row.record.name),
+        "official": status != "not official",
+        "score": text.interval(row.score),
+        "reasons": reasons,
+    }
+
+
+def _plot(row: Row, low: float, high: float) -> dict[str, str] | None:
+    """Positions of a score and its interval on an axis that all rows of a track share."""
+    if row.score is None:
+        return None
+    # A logarithm, so that one bad entry does not press all others together.
+    span = math.log(high / low) if high > low > 0.0 else 0.0
+
+    def x(value: float) -> float:
+        share = math.log(max(value, low) / low) / span if span else 0.5
+        return MARGIN + (WIDTH - 2 * MARGIN) * share
+
+    left, dot, right = (x(v) for v in (row.score.low, row.score.value, row.score.high))
+    return {"x": f"{left:.1f}", "width": f"{max(right - left, 1.0):.1f}", "dot": f"{dot:.1f}"}
+
+
+def _figure(value: float, digits: int = 3) -> dict[str, str]:
+    """Text of a number and what it is sorted by; empty if it does not exist."""
+    if not math.isfinite(value):
+        return {"text": text.NONE, "value": ""}
+    return {"text": number(value, digits), "value": f"{value:.9g}"}

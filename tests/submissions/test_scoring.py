@@ -66,7 +66,7 @@ def test_robust_pid(plants):
         found, _ = score(open_submission("pid_robust"), plants, track=track)
         with precision.float64():
             cells = scenario.nominal(np.array(protocol.PIPS))
-        expected = pure_errors(plants, cells, [(1.0, 10.0, 6.0)] * 6)
+        expected = pure_errors(plants, cells, [(6.0, 6.0, 0.3)] * 6)
         np.testing.assert_allclose(found.nominal, expected, rtol=0, atol=1e-9)
 
 

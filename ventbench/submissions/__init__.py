@@ -7,5 +7,9 @@
 - :mod:`~ventbench.submissions.runner`: who runs the controllers (in this process, or a sandbox);
 - :mod:`~ventbench.submissions.stepping`: the loop between plants and runner;
 - :mod:`~ventbench.submissions.scoring`: the score, and :mod:`~ventbench.submissions.result` its
-  form.
+  form;
+- :mod:`~ventbench.submissions.scaffold`: a new submission that scores at once;
+- :mod:`~ventbench.submissions.contract`: everything that must hold before it is submitted, by
+  reading (``folder_check``, ``weights_check``, ``manifest_check``, ``source_check``) and by running
+  (``contract_runs``, ``dry_run``, ``judgement``); :mod:`~ventbench.submissions.findings` its form.
 """

@@ -21,7 +21,13 @@ TRACKS = ("performance", "robustness")
 
 _MAX_BYTES = 64_000
 _MAX_TEXT = 2000
-_NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
+
+#: What an entry may be called, and the same in words.
+NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
+NAME_RULE = (
+    "must be lower-case letters, digits and underscores, "
+    "begin with a letter and have at most 40 characters"
+)
 
 
 @dataclass(frozen=True)
@@ -83,11 +89,8 @@ def _text(value: Any) -> str:
 
 
 def _name(value: Any) -> str:
-    if not _NAME.fullmatch(_text(value)):
-        raise ValueError(
-            f"{value!r} must be lower-case letters, digits and underscores, "
-            "begin with a letter and have at most 40 characters"
-        )
+    if not NAME.fullmatch(_text(value)):
+        raise ValueError(f"{value!r} {NAME_RULE}")
     return value
 
 

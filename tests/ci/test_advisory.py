@@ -1,0 +1,66 @@
+"""What the author of a pull request is told."""
+
+import pytest
+
+from ventbench.ci import advisory
+from ventbench.ci.errors import TakeError
+from ventbench.sandbox.runner import SandboxRunner
+from ventbench.submissions.runner import InProcessRunner
+
+from .conftest import PATH
+
+
+@pytest.fixture
+def advise(repository, simulators):
+    def run(commit, runner=None):
+        pull = repository.url, repository.base, commit
+        return advisory.advise(*pull, "demo", simulators.plants, runner or SandboxRunner())
+
+    return run
+
+
+def test_which_submissions_a_pull_request_changes(repository, demo):
+    def of(commit, base=repository.base):
+        return advisory.submissions(repository.url, base, commit)
+
+    good = repository.commit(demo, repository.base)
+    assert of(good) == ["demo"]
+    assert of(repository.commit({"submissions/README.md": b"x"}, repository.base)) == []
+    assert of(repository.commit({"docs/x.md": b"x"}, good), good) == []
+    both = repository.commit({"submissions/other/a.py": b"", f"{PATH}/a.py": b""}, good)
+    assert of(both, good) == ["demo", "other"]
+    later = repository.commit({"submissions/other/a.py": b""}, repository.base)
+    assert of(good, later) == ["demo"], "what the base has got since is not theirs"
+    with pytest.raises(TakeError, match="40 lower-case"):
+        of("HEAD")
+
+
+def test_a_good_one_is_scored_in_the_sandbox(repository, demo, advise):
+    ready, lines = advise(repository.commit(demo, repository.base))
+    assert ready
+    text = "\n".join(lines)
+    assert "demo: no problems; ready to submit" in text
+    assert "demo: robustness: " in text
+    assert "demo: performance: " in text
+    assert "/tmp" not in text
+
+
+def test_problems_of_the_folder_and_of_the_code(repository, demo, advise):
+    outside = demo | {"ventbench/protocol.py": b"PIPS = ()"}
+    ready, lines = advise(repository.commit(outside, repository.base))
+    assert not ready
+    assert "ventbench is changed as well" in lines[0]
+    broken = demo | {f"{PATH}/controller.py": b"import torch\n", f"{PATH}/README.md": b""}
+    ready, lines = advise(repository.commit(broken, repository.base))
+    assert not ready
+    assert any("imports torch" in line for line in lines)
+    assert any("README.md: is empty" in line for line in lines)
+    assert not any("cmH2O" in line for line in lines)
+
+
+def test_another_name_is_refused(repository, demo, advise):
+    manifest = f"{PATH}/submission.toml"
+    renamed = demo | {manifest: demo[manifest].replace(b'"demo"', b'"other"')}
+    ready, lines = advise(repository.commit(renamed, repository.base), InProcessRunner())
+    assert not ready
+    assert lines[-1] == "demo: submission.toml calls it other"

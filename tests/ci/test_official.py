@@ -1,0 +1,214 @@
+"""From a commit to a record, from the record to the leaderboard's branch, from there to pages."""
+
+import json
+import subprocess
+
+import pytest
+
+from ventbench.board import canonical, record, store
+from ventbench.ci import official, propose, publish, values
+from ventbench.ci.errors import TakeError
+from ventbench.ci.git import Git, GitError, environment
+from ventbench.ci.take import take
+from ventbench.errors import InputError
+from ventbench.sandbox.runner import SandboxRunner
+from ventbench.submissions.runner import InProcessRunner
+from ventbench.submissions.scaffold import contents
+
+from .conftest import PATH
+
+
+def checked_out(repository, folder):
+    subprocess.run(
+        ["git", "clone", "--quiet", repository.url, str(folder)],
+        check=True,
+        capture_output=True,
+        env=environment(),
+    )
+    return folder
+
+
+def test_from_a_commit_to_the_pages(repository, simulators, tmp_path):
+    """Everything in one, as scoring takes its time."""
+    files = {f"{PATH}/{name}": content for name, content in contents("demo", "pid").items()}
+    commit = repository.commit(files, repository.base)
+    taken = take(repository.url, repository.base, commit, "demo", tmp_path / "taken")
+    out, runner = tmp_path / "records", SandboxRunner()
+    lines = official.score_taken(taken, repository.url, "robustness", simulators, runner, out)
+    path = check_record(repository, commit, out, lines)
+
+    leaderboard = checked_out(repository, tmp_path / "checkout") / "leaderboard"
+    with pytest.raises(InputError, match="does not replay"):
+        propose.add(forged(path, tmp_path / "forged"), leaderboard, simulators)
+    assert not (leaderboard / "records").exists()
+    added = propose.add(out, leaderboard, simulators)
+    assert [item.name for item in store.load(leaderboard).scores] == ["demo"]
+    check_branch_and_pages(leaderboard.parent, added)
+    with pytest.raises(InputError):
+        propose.add(out, leaderboard, simulators)  # a second time
+
+
+def check_record(repository, commit, out, lines):
+    (path,) = propose.records(out)
+    found = record.load(path)
+    assert isinstance(found, record.Record)
+    assert (found.name, found.track) == ("demo", "robustness")
+    assert found.official == SandboxRunner().sandbox["official"]
+    assert found.content["provenance"] == {
+        "repository": repository.url,
+        "commit": commit,
+        "tree": repository.git("rev-parse", f"{commit}:{PATH}"),
+    }
+    assert path.name in lines[-1]
+    assert not any("/tmp" in line for line in lines)
+    return path
+
+
+def forged(path, folder):
+    """The same record with a better score, under the name that its content now has."""
+    content = json.loads(path.read_text())
+    content["errors"]["nominal"][0][0] *= 0.5
+    changed = canonical.canonical(content)
+    folder.mkdir()
+    (folder / f"{canonical.digest(changed)}.json").write_bytes(changed)
+    for other in set(path.parent.iterdir()) - {path}:
+        (folder / other.name).write_bytes(other.read_bytes())
+    return folder
+
+
+def check_branch_and_pages(checkout, added):
+    branch = propose.commit(checkout, added)
+    assert branch == f"record/demo-{added[0].sha256[:12]}"
+    git = Git(checkout)
+    assert git.text("rev-parse", "--abbrev-ref", "HEAD") == branch
+    changed = git.text("diff-tree", "-r", "--name-only", "origin/main", "HEAD").splitlines()
+    assert changed
+    assert all(path.startswith("leaderboard/") for path in changed)
+    assert git.text("status", "--porcelain") == ""
+    head = git.text("rev-parse", "HEAD")
+    pages = publish.pages(git, head)
+    assert pages is not None
+    listed = set(git.text("ls-tree", "-r", "--name-only", pages).splitlines())
+    assert listed == {path.removeprefix("leaderboard/") for path in changed} | {".nojekyll"}
+    assert publish.pages(git, head, pages) is None, "nothing new"
+
+
+def test_downloads_that_are_no_records(tmp_path):
+    folder = tmp_path / "records"
+    folder.mkdir()
+    with pytest.raises(InputError, match="holds 0 records"):
+        propose.records(folder)
+    for k in range(3):
+        (folder / f"{k}{'0' * 63}.json").write_text("{}")
+    with pytest.raises(InputError, match="holds 3 records"):
+        propose.records(folder)
+    (folder / "link").symlink_to("/etc/passwd")
+    with pytest.raises(InputError, match="link is no plain file"):
+        propose.records(folder)
+
+
+@pytest.fixture
+def score_demo(repository, simulators, tmp_path):
+    def run(files, wanted="all"):
+        commit = repository.commit(files, repository.base)
+        taken = take(repository.url, repository.base, commit, "demo", tmp_path / "taken")
+        out = tmp_path / "out"
+        try:
+            runner = InProcessRunner()
+            return official.score_taken(taken, "url", wanted, simulators, runner, out)
+        finally:
+            assert not out.exists()
+
+    return run
+
+
+def test_what_is_not_ready_is_not_scored(demo, score_demo):
+    with pytest.raises(TakeError, match="imports torch"):
+        score_demo(demo | {f"{PATH}/controller.py": b"import torch\n"})
+
+
+def test_another_name_is_not_scored(demo, score_demo):
+    manifest = f"{PATH}/submission.toml"
+    with pytest.raises(TakeError, match="calls it other, not demo"):
+        score_demo(demo | {manifest: demo[manifest].replace(b'"demo"', b'"other"')})
+
+
+def test_tracks():
+    assert official.tracks("all", ("robustness", "performance")) == ["robustness", "performance"]
+    assert official.tracks("robustness", ("robustness",)) == ["robustness"]
+    for wanted in ("performance", "x; id", ""):
+        with pytest.raises(InputError, match="the submission enters robustness"):
+            official.tracks(wanted, ("robustness",))
+
+
+def test_main_reads_the_environment(repository, demo, simulators, tmp_path, monkeypatch, capsys):
+    """As the workflow calls it, with a commit that is refused."""
+    commit = repository.commit(demo | {"ventbench/x.py": b""}, repository.base)
+    given = {
+        "SOURCE": repository.url,
+        "BASE": repository.base,
+        "COMMIT": commit,
+        "NAME": "demo",
+        "TRACK": "all",
+        "OUT": str(tmp_path / "out"),
+    }
+    for key, value in given.items():
+        monkeypatch.setenv(key, value)
+    assert values.run(official.TITLE, official.main) == 2
+    assert "| stopped: ventbench is changed as well" in capsys.readouterr().out
+    assert not (tmp_path / "out").exists()
+
+
+def test_pages_hold_plain_files_only(repository):
+    git = Git(repository.folder)
+    with pytest.raises(InputError, match="holds no leaderboard/"):
+        publish.pages(git, repository.base)
+    empty = repository.commit({"leaderboard/x.txt": b""}, repository.base)
+    with pytest.raises(InputError, match=r"index\.html is missing"):
+        publish.pages(git, empty)
+    link = "leaderboard/entries"
+    files = {"leaderboard/index.html": b"", link: b"/etc"}
+    linked = repository.commit(files, repository.base, modes={link: "120000"})
+    with pytest.raises(InputError, match="entries is no plain file"):
+        publish.pages(git, linked)
+
+
+def test_pages_grow_upon_those_before(repository):
+    git = Git(repository.folder)
+    one = repository.commit({"leaderboard/index.html": b"1"}, repository.base)
+    first = publish.pages(git, one)
+    two = repository.commit({"leaderboard/index.html": b"2"}, one)
+    second = publish.pages(git, two, first)
+    assert second is not None
+    assert repository.git("rev-parse", f"{second}^") == first
+    assert repository.git("show", f"{second}:index.html") == "2"
+
+
+def test_publish_main(repository, monkeypatch, tmp_path, capsys):
+    commit = repository.commit({"leaderboard/index.html": b"1"}, repository.base)
+    monkeypatch.chdir(repository.folder)
+    monkeypatch.setenv("GITHUB_OUTPUT", str(tmp_path / "output"))
+    monkeypatch.setenv("COMMIT", commit)
+    assert publish.main() == 0
+    made = (tmp_path / "output").read_text().strip().removeprefix("commit=")
+    assert repository.git("cat-file", "-t", made) == "commit"
+    repository.git("update-ref", "refs/remotes/origin/gh-pages", made)
+    assert publish.main() == 0
+    assert (tmp_path / "output").read_text().endswith("commit=\n")
+    monkeypatch.setenv("COMMIT", "HEAD")
+    with pytest.raises(InputError, match="not the full name"):
+        publish.main()
+    assert "up to date" in capsys.readouterr().out
+
+
+def test_a_branch_is_not_overwritten(repository, tmp_path):
+    checkout = checked_out(repository, tmp_path / "checkout")
+
+    class One:
+        name, sha256, track = "demo", "a" * 64, "robustness"
+
+    (checkout / "leaderboard").mkdir()
+    (checkout / "leaderboard" / "x").write_text("x")
+    propose.commit(checkout, [One()])  # type: ignore[list-item]
+    with pytest.raises(GitError, match="already exists"):
+        propose.commit(checkout, [One()])  # type: ignore[list-item]

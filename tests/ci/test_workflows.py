@@ -1,0 +1,116 @@
+"""What the workflows may and may not do."""
+
+import importlib.util
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+FOLDER = Path(__file__).resolve().parents[2] / ".github" / "workflows"
+FILES = sorted(FOLDER.glob("*.yml")) if FOLDER.is_dir() else []
+
+pytestmark = pytest.mark.skipif(not FILES, reason="not a checkout of the repository")
+
+#: Values that nobody outside can choose, besides those of `matrix`.
+TRUSTED = {
+    "github.server_url",
+    "github.repository",
+    "github.sha",
+    "github.ref",
+    "github.token",
+    "github.event_name == 'pull_request'",
+    "github.event.repository.default_branch",
+    "github.event.pull_request.number",
+    "github.event.pull_request.base.sha",
+    "github.event.pull_request.head.sha",
+    "runner.temp",
+    "matrix.python",
+}
+#: Texts of a maintainer, and outputs of our own scripts: as environment variables only.
+ONLY_ENV = {
+    "inputs.commit",
+    "inputs.name",
+    "inputs.track",
+    "steps.record.outputs.branch",
+    "steps.record.outputs.name",
+    "steps.pages.outputs.commit",
+}
+
+
+def read(path: Path) -> dict[Any, Any]:
+    return yaml.safe_load(path.read_text())
+
+
+def steps(path: Path) -> list[dict[str, Any]]:
+    return [step for job in read(path)["jobs"].values() for step in job["steps"]]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+class TestEach:
+    def test_nothing_is_expanded_in_a_script(self, path):
+        assert not [step["run"] for step in steps(path) if "${{" in step.get("run", "")]
+
+    def test_only_known_values_are_expanded_anywhere(self, path):
+        found = set(re.findall(r"\$\{\{\s*(.*?)\s*\}\}", path.read_text()))
+        assert found <= TRUSTED | ONLY_ENV
+        for step in steps(path):
+            elsewhere = {key: value for key, value in step.items() if key != "env"}
+            assert not [name for name in ONLY_ENV if f"{{{{ {name}" in str(elsewhere)]
+
+    def test_actions_are_pinned(self, path):
+        used = re.findall(r"uses: (.*)", path.read_text())
+        for line in used:
+            assert re.fullmatch(r"actions/[a-z-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+", line), line
+
+    def test_rights_are_named_and_few(self, path):
+        content = read(path)
+        assert content["permissions"] == {}
+        for job in content["jobs"].values():
+            extra = {key for key, value in job["permissions"].items() if value != "read"}
+            assert extra <= {"contents", "pull-requests"}
+            assert not extra or content[True].keys() <= {"push", "workflow_dispatch"}
+
+    def test_no_secret_and_no_foreign_pull_request_with_rights(self, path):
+        text = path.read_text()
+        assert not re.search(r"\bsecrets\b *[.\[]", text.replace("no secrets.", ""))
+        assert "pull_request_target" not in text
+        assert "workflow_run" not in text
+
+    def test_checkouts_keep_no_token_and_are_never_of_the_pull_request(self, path):
+        for step in steps(path):
+            if "checkout" in step.get("uses", ""):
+                assert step["with"]["persist-credentials"] is False
+                assert "head" not in str(step["with"])
+
+    def test_jobs_end(self, path):
+        assert all(job["timeout-minutes"] <= 60 for job in read(path)["jobs"].values())
+
+    def test_called_modules_are_there(self, path):
+        for name in re.findall(r"-m (ventbench\.[\w.]+)", path.read_text()):
+            assert importlib.util.find_spec(name) is not None
+
+
+def test_expected_workflows_are_there():
+    assert {path.stem for path in FILES} >= {"test", "score-pr", "score-official", "publish"}
+
+
+def test_the_advisory_job_can_only_read():
+    content = read(FOLDER / "score-pr.yml")
+    assert list(content[True]) == ["pull_request"]
+    (job,) = content["jobs"].values()
+    assert job["permissions"] == {"contents": "read"}
+
+
+def test_where_a_submission_runs_nothing_can_be_written():
+    jobs = read(FOLDER / "score-official.yml")["jobs"]
+    assert jobs["score"]["permissions"] == {"contents": "read"}
+    assert "GH_TOKEN" not in str(jobs["score"])
+    assert "ci.official" not in str(jobs["propose"])
+    assert jobs["propose"]["needs"] == "score"
+
+
+def test_exploits_may_not_be_skipped():
+    (job,) = read(FOLDER / "test.yml")["jobs"].values()
+    assert job["env"]["VENTBENCH_REQUIRE_SANDBOX"] == "1"

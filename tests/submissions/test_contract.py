@@ -1,0 +1,306 @@
+"""`ventbench check` by running: what the contract asks of a controller, in the sandbox."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from ventbench.cli import app
+from ventbench.submissions import contract, judgement
+from ventbench.submissions.contract_runs import STEPS
+from ventbench.submissions.errors import SubmissionError
+from ventbench.submissions.runner import InProcessRunner
+
+from .conftest import MANIFEST
+
+
+@pytest.fixture
+def check(make):
+    """Check a submission of this source, or of this body of act."""
+
+    def run(source=None, runner=None, **options):
+        folder = make(source, **options)
+        (folder / "README.md").write_text("A test.")
+        return contract.check(str(folder), runner)
+
+    return run
+
+
+def only(report, group):
+    (finding,) = report.problems
+    assert finding.group == group
+    return finding
+
+
+def test_a_good_one(check):
+    report = check(act="return observation.target")
+    assert report.ok
+    assert report.findings == ()
+    assert report.left_out == ()
+    assert report.sandbox is not None
+    assert report.act_us is not None
+    assert 0 < report.act_us[0] < 10_000
+
+
+@pytest.mark.parametrize("name", ["pid_best", "pid_robust"])
+def test_our_own_are_ready(name):
+    contract.assert_ready(name)
+
+
+def test_assert_ready_says_all(make):
+    folder = make(act="return 'a'")
+    with pytest.raises(AssertionError) as caught:
+        contract.assert_ready(str(folder))
+    text = str(caught.value)
+    assert "README.md: is missing" in text
+    assert "act returned a str ('a'); it must return one number" in text
+    assert "2 problems; not ready to submit" in text
+
+
+def test_no_such_folder(tmp_path):
+    with pytest.raises(SubmissionError, match="no such folder"):
+        contract.check(str(tmp_path / "none"))
+
+
+def test_a_failure_everywhere_is_said_once_with_its_place(check):
+    finding = only(check(act="x = 1\nreturn observation.nothing"), "run")
+    assert (finding.file, finding.line) == ("controller.py", 6)
+    assert "raised AttributeError at step 1 of breath 1 (lung hidden)" in finding.what
+    assert finding.what.endswith("(and in 16 other runs)")
+
+
+def test_failing_on_one_lung_names_it(check):
+    source = """
+        class Controller:
+            def reset(self, task):
+                self.gain = {None: 1.0, "R5C10": 1.0, "R5C20": 1.0, "R5C50": 1.0,
+                             "R20C10": 1.0, "R20C20": 1.0}[task.lung]
+            def act(self, observation):
+                return self.gain
+        """
+    finding = only(check(source), "run")
+    assert "KeyError in reset (lung R20C50): 'R20C50'" in finding.what
+    assert finding.line == 4
+
+
+@pytest.mark.parametrize(
+    ("act", "said"),
+    [
+        ("return float('nan')", "act returned nan at step 1 of breath 1"),
+        ("return 1e308 * 10", "act returned inf"),
+        ("return None", "act returned None"),
+        ("return True", "act returned a bool (True)"),
+        ("import numpy\nreturn numpy.zeros(1)", "act returned an array of shape (1,)"),
+        ("return 10 ** 400", "act returned an integer too large"),
+        ("import os\nos._exit(3)\nreturn 1.0", "the controller ended its process (exit code 3)"),
+    ],
+)
+def test_answers_that_are_no_numbers(check, act, said):
+    assert only(check(act=act), "run").what.startswith(said)
+
+
+@pytest.mark.parametrize(
+    ("act", "said"),
+    [
+        ("return 1 / (observation.pressure + 20)", "ZeroDivisionError with a pressure of -20"),
+        ("return observation.pressure ** 0.5 + 0.0", "with a pressure of -20 cmH2O"),
+        ("assert observation.dt < 0.05\nreturn 1.0", "with a control step of 60 ms"),
+        ("assert observation.dt > 0.02\nreturn 1.0", "with a control step of 10 ms"),
+        ("return 5 / observation.target", "with a pressure and a target of 0 cmH2O"),
+        ("return [1.0][round(observation.time / observation.dt) - round(observation.time / 0.03)]",
+         "with a control step of 10 ms"),
+    ],
+)  # fmt: skip
+def test_unusual_inputs_are_tried_and_named(check, act, said):
+    report = check(act=act)
+    assert {finding.group for finding in report.problems} == {"run"}
+    assert said in report.problems[0].what
+
+
+def test_chance_is_found(check):
+    finding = only(
+        check("""
+            import random
+            class Controller:
+                def reset(self, task): pass
+                def act(self, observation): return random.Random().random()
+            """),
+        "repeat",
+    )
+    assert "the same run in another process gave" in finding.what
+    assert "seed" in finding.advice
+
+
+def test_a_seed_is_enough(check):
+    report = check("""
+        import random
+        class Controller:
+            def reset(self, task): self.random = random.Random(1)
+            def act(self, observation): return self.random.random()
+        """)
+    assert report.ok
+
+
+def test_a_reset_that_forgets_something_is_found(check):
+    finding = only(
+        check("""
+            class Controller:
+                def __init__(self): self.sum = 0.0
+                def reset(self, task): pass
+                def act(self, observation):
+                    self.sum += 0.01 * (observation.target - observation.pressure)
+                    return self.sum
+            """),
+        "repeat",
+    )
+    assert finding.what.startswith("reset does not clear what it keeps: it gave ")
+    assert finding.what.endswith("at step 1 of breath 1")
+
+
+@pytest.mark.parametrize("keep", ["Controller.count", "STATE[0]"])
+def test_memory_beyond_one_controller_is_found(check, keep):
+    finding = only(
+        check(f"""
+            STATE = [0]
+            class Controller:
+                count = 0
+                def reset(self, task): pass
+                def act(self, observation):
+                    {keep} += 1
+                    return {keep} / 100
+            """),
+        "repeat",
+    )
+    assert finding.what.startswith("a second Controller() remembers the first")
+
+
+def test_a_failure_while_repeating_leaves_that_out(check):
+    report = check("""
+        class Controller:
+            count = 0
+            def reset(self, task):
+                Controller.count += 1
+                if Controller.count > 1:
+                    raise RuntimeError("again?")
+            def act(self, observation): return 1.0
+        """)
+    assert "again?" in only(report, "run").what
+    assert report.left_out == ("repeat", "time")
+
+
+def test_an_import_that_fails(check):
+    report = check("import helper\n" + "class Controller: pass", helper="1 / 0\n")
+    # The class is empty, but what is read comes first.
+    assert {finding.group for finding in report.problems} == {"source"}
+    report = check(
+        """
+        import helper
+        class Controller:
+            def reset(self, task): pass
+            def act(self, observation): return 1.0
+        """,
+        helper="x = 1\n1 / 0\n",
+    )
+    finding = only(report, "run")
+    assert (finding.file, finding.line) == ("helper.py", 2)
+    assert "ZeroDivisionError while it was imported" in finding.what
+    assert report.left_out == ("repeat", "time")
+
+
+def test_a_class_that_comes_from_elsewhere_is_asked_in_the_run(check):
+    finding = only(check("from helper import Controller", helper="Controller = 3"), "run")
+    assert "Controller in controller.py is a int, no class" in finding.what
+
+
+def test_clipping_is_noted(check):
+    report = check(act="return 120.0")
+    assert report.ok
+    (note,) = report.notes
+    assert note.what.startswith("asked for 120 to 120 %, outside of 0 to 100 % at 476 of 476")
+
+
+def test_slowness_is_found(check):
+    finding = only(check(act="import time\ntime.sleep(0.02)\nreturn 1.0"), "time")
+    assert "times faster: 450 s are the limit" in finding.advice
+
+
+def test_time_limits():
+    assert judgement.ACTS == 756 * 102
+    assert list(judgement.time(np.full(9, 1e-3))) == []
+    (note,) = judgement.time(np.full(9, 10e-3))
+    assert not note.problem
+    (problem,) = judgement.time(np.full(9, 20e-3))
+    assert problem.problem
+    assert problem.what == (
+        "act takes 20 ms on average, the 77112 calls of a score 771 s on 2 cores"
+    )
+
+
+def test_repetition_is_exact():
+    run = np.linspace(0.0, 50.0, STEPS)
+    between = np.zeros(1)
+    thrice = np.concatenate([run, between, run, between, run])
+    assert list(judgement.repetition(run, run, thrice)) == []
+    (finding,) = judgement.repetition(run, np.nextafter(run, 100.0), thrice)
+    assert "another process" in finding.what
+
+
+def test_the_lines_of_the_author_keep_their_numbers(check):
+    source = (
+        "class Controller:\n    def reset(self, task): pass\n    def act(self, o): return 1 / 0"
+    )
+    assert only(check(source), "run").line == 3
+
+
+def test_the_submission_itself_is_not_touched(make):
+    folder = make(act="open(__file__, 'a')\nreturn 1.0")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    contract.check(str(folder))
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_cheats_meet_the_same_sandbox(check):
+    finding = only(check(act="open('/etc/passwd')\nreturn 1.0"), "run")
+    assert "PermissionError" in finding.what or "FileNotFoundError" in finding.what
+
+
+def test_in_process_finds_the_same(check):
+    report = check(act="return observation.nothing", runner=InProcessRunner())
+    assert "AttributeError" in only(report, "run").what
+    assert report.sandbox is None
+
+
+def command(*words):
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def test_command_line(make, tmp_path):
+    folder = make(act="return 1.0")
+    (folder / "README.md").write_text("A test.")
+    good = command("check", folder, "--json", tmp_path / "r.json")
+    assert good.exit_code == 0, good.output
+    assert "no problems; ready to submit" in good.output
+    assert json.loads((tmp_path / "r.json").read_text())["ok"] is True
+    (folder / "submission.toml").write_text(MANIFEST + "x = 1\n")
+    bad = command("check", folder, "--json", tmp_path / "r.json")
+    assert bad.exit_code == 1
+    assert "submission.toml line 8: key x is not known" in bad.output
+    (problem,) = json.loads((tmp_path / "r.json").read_text())["problems"]
+    assert problem == {
+        "group": "manifest",
+        "file": "submission.toml",
+        "line": 8,
+        "column": None,
+        "what": "key x is not known",
+        "advice": "remove or rename it",
+    }
+    none = command("check", tmp_path / "none")
+    assert isinstance(none.exception, SubmissionError)
+
+
+def test_command_new(tmp_path):
+    made = command("new", "demo", "--family", "dqn", "--dir", tmp_path)
+    assert made.exit_code == 0, made.output
+    assert "network.py, submission.toml, weights.npz" in made.output
+    assert command("new", "demo", "--family", "nothing").exit_code == 2

@@ -1,0 +1,116 @@
+"""What the author of a pull request is told: every problem, and the nominal score.
+
+Not official, whatever it says: it runs beside the pull request, which might change this file.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ventbench.ci import values
+from ventbench.ci.changes import changed_submissions
+from ventbench.ci.errors import TakeError, commit_name
+from ventbench.ci.git import fetched
+from ventbench.ci.take import take
+from ventbench.lungs import LUNGS, Lung
+from ventbench.submissions import contract
+from ventbench.submissions.folder import MAX_BYTES, open_submission
+from ventbench.submissions.runner import Runner
+from ventbench.submissions.scoring import score
+
+TITLE = "Advisory score (not official)"
+#: Submissions looked at in one pull request.
+MOST = 3
+
+
+def submissions(source: str, base: str, commit: str) -> list[str]:
+    """Names of the submissions that a pull request changes.
+
+    Args:
+        source: URL or path of the repository.
+        base: commit that it is meant for.
+        commit: its last one.
+
+    Raises:
+        InputError: if it cannot be fetched.
+    """
+    commits = commit_name(base, "base"), commit_name(commit)
+    with tempfile.TemporaryDirectory() as folder:
+        git = fetched(Path(folder), source, commits, MAX_BYTES)
+        return changed_submissions(git, *commits)
+
+
+def advise(
+    source: str,
+    base: str,
+    commit: str,
+    name: str,
+    plants: Any,
+    runner: Runner,
+    *,
+    lungs: Sequence[Lung] = LUNGS,
+) -> tuple[bool, list[str]]:
+    """Say what is wrong with a submission, and its score if nothing is.
+
+    Args:
+        source: URL or path of the repository.
+        base: commit that the pull request is meant for.
+        commit: its last one.
+        name: of the submission.
+        plants: stacked over the lungs.
+        runner: of the controller.
+        lungs: of the plants.
+
+    Returns:
+        Whether it is ready, and lines for its author.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            taken = take(source, base, commit, name, Path(folder))
+        except TakeError as error:
+            return False, [f"{name}: {problem}" for problem in error.problems]
+        report = contract.check(str(taken.folder), runner)
+        lines = [line.replace(str(taken.folder), name) for line in report.lines()]
+        if not report.ok:
+            return False, lines
+        submission = open_submission(str(taken.folder))
+        if submission.manifest.name != name:
+            return False, [*lines, f"{name}: submission.toml calls it {submission.manifest.name}"]
+        for track in submission.manifest.tracks:
+            result, _ = score(submission, plants, track=track, runner=runner, lungs=lungs)
+            by_lung = zip(result.lungs, result.by_lung, strict=True)
+            each = ", ".join(f"{lung} {value:.3f}" for lung, value in by_lung)
+            lines.append(f"{name}: {track}: {result.score:.3f} cmH2O nominal ({each})")
+            failed = [failure.message for failure in result.failures[:3]]
+            lines += [message.replace(str(taken.folder), name) for message in failed]
+    return True, lines
+
+
+def main() -> int:
+    """Look at the pull request that the environment names; see ``score-pr.yml``."""
+    from ventbench.plants import frozen
+    from ventbench.sandbox.runner import SandboxRunner
+
+    pull = values.required("SOURCE"), values.required("BASE"), values.required("COMMIT")
+    names = submissions(*pull)
+    if not names:
+        values.summary(TITLE, ["this pull request changes no submission"])
+        return 0
+    plants, runner = frozen.load().plants, SandboxRunner(require_official=True)
+    ready = len(names) <= MOST
+    if not ready:
+        text = f"{len(names)} submissions are changed; one pull request, one submission"
+        values.summary(TITLE, [text])
+    for name in names[:MOST]:
+        good, lines = advise(*pull, name, plants, runner)
+        ready = ready and good
+        values.summary(TITLE, lines)
+    return 0 if ready else 1
+
+
+if __name__ == "__main__":
+    sys.exit(values.run(TITLE, main))

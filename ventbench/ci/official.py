@@ -1,0 +1,107 @@
+"""The official score: a maintainer names a submission and a commit, and gets records.
+
+Scorer and simulators are those of the branch that this file lies on; of the commit, only the plain
+files of ``submissions/NAME/`` are taken, and their code runs in the sandbox alone.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from ventbench import draws
+from ventbench.board import create
+from ventbench.board.replay import Simulators
+from ventbench.ci import values
+from ventbench.ci.errors import TakeError
+from ventbench.ci.take import Taken, take
+from ventbench.errors import InputError
+from ventbench.submissions import contract
+from ventbench.submissions.folder import open_submission
+from ventbench.submissions.manifest import TRACKS
+from ventbench.submissions.runner import Runner
+from ventbench.submissions.scoring import score
+
+TITLE = "Official score"
+
+
+def tracks(wanted: str, entered: Sequence[str]) -> list[str]:
+    """Tracks to score.
+
+    Args:
+        wanted: ``"all"`` or one of them.
+        entered: by the manifest.
+
+    Raises:
+        InputError: if the submission does not enter it.
+    """
+    if wanted == "all":
+        return list(entered)
+    if wanted not in TRACKS or wanted not in entered:
+        raise InputError(f"track {wanted!r}: the submission enters {', '.join(entered)}")
+    return [wanted]
+
+
+def score_taken(
+    taken: Taken, source: str, wanted: str, simulators: Simulators, runner: Runner, out: Path
+) -> list[str]:
+    """Check and score a submission, and write a record for each track.
+
+    Args:
+        taken: from its commit.
+        source: URL of the repository, for the record.
+        wanted: track, or ``"all"``.
+        simulators: the frozen ones.
+        runner: the sandbox.
+        out: folder for the records and their commands.
+
+    Returns:
+        Lines for the maintainer.
+
+    Raises:
+        InputError: if it is not ready, or a score does not replay.
+    """
+    report = contract.check(str(taken.folder), runner)
+    lines = [line.replace(str(taken.folder), taken.name) for line in report.lines()]
+    if not report.ok:
+        raise TakeError(*lines)
+    submission = open_submission(str(taken.folder))
+    if submission.manifest.name != taken.name:
+        raise TakeError(f"submission.toml calls it {submission.manifest.name}, not {taken.name}")
+    where = {"repository": source, "commit": taken.commit, "tree": taken.tree}
+    for track in tracks(wanted, submission.manifest.tracks):
+        result, _ = score(
+            submission,
+            simulators.plants,
+            track=track,
+            draws=draws.COUNT,
+            runner=runner,
+            simulators=simulators.about(),
+        )
+        path = create.create(result, simulators, source=where).save(out)
+        lines.append(f"{taken.name}: {track}: {result.score:.3f} cmH2O nominal; {path.name}")
+        failed = [failure.message for failure in result.failures[:3]]
+        lines += [message.replace(str(taken.folder), taken.name) for message in failed]
+    return lines
+
+
+def main() -> int:
+    """Score what the environment names; see ``score-official.yml``."""
+    from ventbench.plants import frozen
+    from ventbench.sandbox.runner import SandboxRunner
+
+    source, out = values.required("SOURCE"), Path(values.required("OUT"))
+    wanted = values.required("TRACK")
+    base, commit, name = (values.required(key) for key in ("BASE", "COMMIT", "NAME"))
+    runner = SandboxRunner(require_official=True)
+    with tempfile.TemporaryDirectory() as folder:
+        taken = take(source, base, commit, name, Path(folder))
+        lines = score_taken(taken, source, wanted, frozen.load(), runner, out)
+    values.summary(TITLE, lines)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(values.run(TITLE, main))

@@ -1,0 +1,97 @@
+"""Records, as data, into the leaderboard of a checkout, and from there onto a branch.
+
+This job may write to the repository, so nothing of a submission is here but numbers and text of a
+record: checked, replayed through the frozen simulators, and escaped on the pages.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+from ventbench.board import build, record, store
+from ventbench.board.replay import Simulators
+from ventbench.ci import values
+from ventbench.ci.errors import submission_name
+from ventbench.ci.git import AUTHOR, Git
+from ventbench.errors import InputError
+
+TITLE = "Record"
+
+#: Most records of one run: one a track.
+MOST = 2
+_MOST_BYTES = 20_000_000
+_RECORD = re.compile(rf"[0-9a-f]{{64}}{re.escape(record.SUFFIX)}")
+
+
+def records(folder: Path) -> list[Path]:
+    """Records among downloaded files.
+
+    Args:
+        folder: of the download.
+
+    Raises:
+        InputError: if there is none, or anything unexpected.
+    """
+    for path in folder.rglob("*"):
+        if path.is_symlink() or not path.is_file() or path.stat().st_size > _MOST_BYTES:
+            raise InputError(f"{path.name} is no plain file of less than {_MOST_BYTES} bytes")
+    found = sorted(path for path in folder.iterdir() if _RECORD.fullmatch(path.name))
+    if not 1 <= len(found) <= MOST:
+        raise InputError(f"{folder} holds {len(found)} records; 1 to {MOST} are expected")
+    return found
+
+
+def add(folder: Path, leaderboard: Path, simulators: Simulators) -> list[record.Record]:
+    """Add records to a leaderboard, each replayed, and build its pages.
+
+    Args:
+        folder: of the download.
+        leaderboard: to add them to.
+        simulators: the frozen ones.
+
+    Raises:
+        InputError: if a record is not what it must be.
+    """
+    added = [store.add(leaderboard, path, simulators) for path in records(folder)]
+    build.build(leaderboard)
+    return added
+
+
+def commit(checkout: Path, added: list[record.Record]) -> str:
+    """Commit the leaderboard to a new branch.
+
+    Args:
+        checkout: of the repository.
+        added: records.
+
+    Returns:
+        Name of the branch.
+
+    Raises:
+        GitError: if the branch exists, or nothing has changed.
+    """
+    branch = f"record/{submission_name(added[0].name)}-{added[0].sha256[:12]}"
+    git = Git(checkout)
+    git.output("switch", "--quiet", "--create", branch)
+    git.output("add", "--all", "--", "leaderboard")
+    what = f"Record {added[0].name}: {', '.join(sorted(item.track for item in added))}"
+    git.output("commit", "--quiet", "--message", what, more=AUTHOR)
+    return branch
+
+
+def main() -> int:
+    """Add what was downloaded to ``RECORDS``; see ``score-official.yml``."""
+    from ventbench.plants import frozen
+
+    checkout = Path.cwd()
+    added = add(Path(values.required("RECORDS")), checkout / "leaderboard", frozen.load())
+    branch = commit(checkout, added)
+    values.output(branch=branch, name=added[0].name)
+    values.summary(TITLE, [f"{item.name} ({item.track}): record {item.sha256}" for item in added])
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(values.run(TITLE, main))

@@ -12,7 +12,8 @@ PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 
 # What `make demo` does, once it is set up.
-DEMO := $(VENV)/bin/ventbench score submissions/pid_best submissions/pid_robust --out runs/demo
+DEMO := $(VENV)/bin/ventbench score submissions/pid_best submissions/pid_robust \
+	--out runs/demo --report
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-slow lint format lock bench wheel clean

@@ -11,7 +11,7 @@ import sys
 import typer
 
 from ventbench import __version__
-from ventbench.cli import data, run, score, simulators, view
+from ventbench.cli import board, data, run, score, simulators, submit, view
 from ventbench.errors import InputError
 
 app = typer.Typer(
@@ -40,9 +40,11 @@ def _root(
 
 
 score.register(app)
+submit.register(app)
 run.register(app)
 simulators.register(app)
 view.register(app)
+board.register(app)
 app.add_typer(data.app)
 
 

@@ -12,7 +12,7 @@ from ventbench.cli.options import JsonFile, emit
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from ventbench.submissions.result import Score
+    from ventbench.submissions.runner import Runner
 
 Track = Literal["performance", "robustness"]
 
@@ -34,11 +34,20 @@ def score(
     report: Annotated[
         bool, typer.Option("--report", help="Also write report.html and scores.rrd to DIR.")
     ] = False,
+    record: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Keep a record here, for `board add`; needs --draws 20."),
+    ] = None,
+    in_process: Annotated[
+        bool,
+        typer.Option("--in-process", help="Run without the sandbox: only for code that you trust."),
+    ] = False,
     json: JsonFile = None,
 ) -> None:
     """Score controllers on the six frozen lung simulators.
 
-    Lower is better: mean |pressure - target| over the inspirations, cmH2O.
+    Lower is better: mean |pressure - target| over the inspirations, cmH2O. Every controller runs in
+    locked-down processes that see nothing of the simulators.
 
     Example: `ventbench score submissions/pid_best --json score.json`
     """
@@ -49,6 +58,8 @@ def score(
     from ventbench.submissions.folder import open_submission
     from ventbench.submissions.scoring import score as run
 
+    if record is not None and draws < 20:
+        raise InputError("--record needs all published draws: add --draws 20")
     if report and out is None:
         raise InputError("--report needs --out DIR to write to")
     opened = [open_submission(name) for name in submissions]
@@ -57,6 +68,9 @@ def score(
         raise InputError(f"two submissions have the same name: {', '.join(sorted(names))}")
     progress = Console(stderr=True)
     simulators = frozen.load()
+    runner = _runner(in_process)
+    if not (runner.sandbox or {}).get("official"):
+        progress.print("These scores are not official: no full sandbox.", style="yellow")
     results = []
     for submission in opened:
         with progress.status(f"scoring {submission.label}"):
@@ -66,37 +80,60 @@ def score(
                     simulators.plants,
                     track=track,
                     draws=draws,
+                    runner=runner,
                     simulators=simulators.about(),
                 )
             )
     plain = [result.to_json() for result, _ in results]
     emit(plain[0] if len(plain) == 1 else {"submissions": plain}, json)
     console = Console(stderr=str(json) == "-")
-    console.print(_table([result for result, _ in results]))
+    console.print(_table(plain))
     for result, _ in results:
         for failure in result.failures[:3]:
             progress.print(failure.message, style="red", markup=False)
     if out is not None:
         for path in _keep(out, results, plain, report):
             console.print(f"wrote {path}", markup=False, highlight=False)
+    if record is not None:
+        from ventbench.board import create
+
+        for path in create.keep(record, [result for result, _ in results], simulators):
+            console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
     if any(result.failures for result, _ in results):
         raise typer.Exit(1)
 
 
-def _table(scores: list[Score]) -> Table:
+def _runner(in_process: bool) -> Runner:
+    if in_process:
+        from ventbench.submissions.runner import InProcessRunner
+
+        return InProcessRunner()
+    from ventbench.sandbox.runner import SandboxRunner
+
+    return SandboxRunner()
+
+
+def _table(scores: list[dict[str, Any]]) -> Table:
+    """One row a lung, one column a submission; from their JSON values."""
     from rich.table import Table
 
     from ventbench.lungs import LUNG_IDS
 
-    table = Table(title="Mean |pressure - target| of the inspirations, cmH2O (lower is better)")
-    table.add_column("submission")
-    table.add_column("track")
-    for name in (*LUNG_IDS, "mean"):
-        table.add_column(name, justify="right")
+    def show(value: float | None) -> str:
+        return "failed" if value is None else f"{value:.3f}"
+
+    table = Table(title="Mean |pressure - target|, cmH2O (lower is better)")
+    table.add_column("lung")
     for one in scores:
-        cells = [f"{value:.3f}" if value == value else "failed" for value in one.by_lung]
-        mean = f"{one.score:.3f}" if one.score == one.score else "failed"
-        table.add_row(one.submission.manifest.name, one.track, *cells, mean)
+        table.add_column(f"{one['name']}\n{one['track']}", justify="right")
+    for lung in LUNG_IDS:
+        table.add_row(lung, *(show(one["lungs"][lung]["score"]) for one in scores))
+    table.add_section()
+    table.add_row("mean", *(show(one["score"]) for one in scores), style="bold")
+    if scores[0]["draws"]:
+        drawn = [one["draws"] for one in scores]
+        table.add_row("mean of the draws", *(show(draws["score"]) for draws in drawn))
+        table.add_row("95 % interval", *("..".join(map(show, draws["ci95"])) for draws in drawn))
     return table
 
 

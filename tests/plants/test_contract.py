@@ -1,6 +1,7 @@
 """What every plant must hold. Add a plant by one line in PLANTS; sizes as in the protocol.
 
-Physics plants promise more (CLAIMS): a learned one gives what its training gave.
+Physics plants promise more: a network gives what its training gave. Of the frozen simulators two
+stand here; what all six hold is in ``test_frozen_physics.py``.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from numpy.typing import ArrayLike
 
 from ventbench import protocol
 from ventbench.controllers import expiratory
-from ventbench.lungs import lung
+from ventbench.lungs import LUNG_IDS, lung
+from ventbench.plants import frozen
 from ventbench.plants.base import Plant
 from ventbench.plants.learned import Architecture, learned
 from ventbench.plants.single_compartment import single_compartment
@@ -28,23 +30,36 @@ from ventbench.rollout import open_loop
 
 SMALL = Architecture(pressures=3, controls=4, width=16, depth=3, boundaries=2, boundary_width=8)
 SELU = Architecture(width=24, depth=4, boundaries=0, activation="selu")
+
+
+def official(lung_id: str) -> Plant:
+    """Make one of the frozen simulators, in the precision in force."""
+    plants = frozen.load().plants
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf[LUNG_IDS.index(lung_id)]), plants)
+
+
 #: The two ends of the scored settings.
 STIFF_AND_SOFT = ("R5C10", "R20C50")
 #: Built anew in each precision.
 PLANTS = {
     **{f"single_compartment-{x}": partial(single_compartment, lung(x)) for x in STIFF_AND_SOFT},
     **{f"two_balloon-{x}": partial(two_balloon, lung(x)) for x in STIFF_AND_SOFT},
+    **{f"frozen-{x}": partial(official, x) for x in STIFF_AND_SOFT},
     "learned-tanh": lambda: learned(jax.random.key(0), SMALL),
     "learned-selu": lambda: learned(jax.random.key(1), SELU),
 }
-PHYSICS = [name for name in PLANTS if not name.startswith("learned")]
-#: Plants whose two half steps under a held command are one step; the tolerance, cmH2O.
-REAL_DT = {name: 2e-4 for name in PHYSICS}
+TEXTBOOK = [name for name in PLANTS if name.startswith(("single", "two"))]
+FROZEN = [name for name in PLANTS if name.startswith("frozen")]
+PHYSICS = TEXTBOOK + FROZEN
+#: Commands that hold PEEP while the expiratory valve is open, %: in the recordings, and so in what
+#: has learned from them, PEEP is held by a resting flow of about 5 %, the protocol's own bias.
+HOLDING = dict.fromkeys(PLANTS, 0.0) | dict.fromkeys(FROZEN, float(expiratory.u_in(99)))
 
 T = 40
 DT = np.full((1, T), protocol.DT)
 every_plant = pytest.mark.parametrize("name", PLANTS)
 physics_plant = pytest.mark.parametrize("name", PHYSICS)
+textbook_plant = pytest.mark.parametrize("name", TEXTBOOK)
 
 
 def pressures(
@@ -67,7 +82,26 @@ def breaths(count: int, u_in: float) -> tuple[np.ndarray, np.ndarray]:
     return np.tile(command, count)[None], np.tile(opened, count)[None]
 
 
-@physics_plant
+@jax.jit
+def expire(plant: Plant, start, u_in):
+    """Pressure after 12 s of expiration from ``start`` to a PEEP of 5 cmH2O."""
+    step = jnp.asarray(1.0), jnp.asarray(0.03)
+    state = plant.init(start, jnp.asarray(5.0))
+    return jax.lax.scan(lambda s, _: plant.step(s, u_in, *step), state, length=400)[1][-1]
+
+
+@jax.jit
+def gradients(plant: Plant, u_in):
+    """By plant and command, of the mean pressure of an inspiration."""
+
+    def mean(plant, u_in):
+        dt = jnp.full((1, T), 0.03)
+        return jnp.mean(open_loop(plant, jnp.full(1, 5.0), u_in, jnp.zeros((1, T)), dt))
+
+    return jax.grad(mean, argnums=(0, 1))(plant, u_in)
+
+
+@textbook_plant
 def test_pressure_never_falls_as_the_valve_opens(name):
     levels = np.arange(0.0, 101.0)
     p = pressures(PLANTS[name](), np.repeat(levels[:, None], T, axis=1))
@@ -77,14 +111,13 @@ def test_pressure_never_falls_as_the_valve_opens(name):
 
 @physics_plant
 def test_settles_when_the_valve_closes(name):
-    command = np.where(np.arange(2 * T) < 10, 30.0, 0.0)
-    p = pressures(PLANTS[name](), command, dt=protocol.DT)
+    p = pressures(PLANTS[name](), np.where(np.arange(T) < 10, 30.0, 0.0))
     assert np.ptp(p[0, 15:]) < 1e-3
     assert p[0, -1] > protocol.PEEP
 
 
 @every_plant
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(
     u_in=hnp.arrays(np.float32, (T,), elements=st.floats(0, 100, width=32)),
     u_out=hnp.arrays(np.int8, (T,), elements=st.integers(0, 1)),
@@ -94,9 +127,9 @@ def test_stays_finite_for_any_commands(name, u_in, u_out):
 
 
 @every_plant
-def test_stays_finite_through_a_minute_of_noise(name):
-    u_in = np.random.default_rng(0).uniform(0, 100, (3, 2000))
-    opened = (np.arange(2000) % 100) >= 34
+def test_stays_finite_through_300_breaths_of_noise(name):
+    _, opened = breaths(300, 0.0)
+    u_in = np.random.default_rng(0).uniform(0, 100, opened.shape)
     p = pressures(PLANTS[name](), u_in, opened, dt=protocol.DT)
     assert np.all(np.isfinite(p))
 
@@ -104,12 +137,8 @@ def test_stays_finite_through_a_minute_of_noise(name):
 @every_plant
 @pytest.mark.parametrize("start", [0.0, 12.0, 35.0])
 def test_expiration_returns_to_peep(name, start):
-    plant = PLANTS[name]()
-    state = plant.init(jnp.asarray(start), jnp.asarray(5.0))
-    step = jax.jit(lambda s: plant.step(s, jnp.asarray(0.0), jnp.asarray(1.0), jnp.asarray(0.03)))
-    for _ in range(400):
-        state, pressure = step(state)
-    assert float(pressure) == pytest.approx(5.0, abs=0.05)
+    pressure = expire(PLANTS[name](), jnp.asarray(start), jnp.asarray(HOLDING[name]))
+    assert float(pressure) == pytest.approx(5.0, abs=0.1 if name in FROZEN else 0.05)
 
 
 @every_plant
@@ -159,21 +188,16 @@ def test_float32_agrees_with_float64(name):
 
 @every_plant
 def test_gradients_are_finite(name):
-    plant = PLANTS[name]()
-
-    def mean(plant, u_in):
-        return jnp.mean(
-            open_loop(plant, jnp.full(1, 5.0), u_in, jnp.zeros((1, T)), jnp.full((1, T), 0.03))
-        )
-
-    by_plant, by_command = jax.grad(mean, argnums=(0, 1))(plant, jnp.full((1, T), 8.0))
+    by_plant, by_command = gradients(PLANTS[name](), jnp.full((1, T), 8.0))
     assert all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(by_plant))
     assert bool(jnp.all(jnp.isfinite(by_command)))
-    if name in PHYSICS:
+    # The real valve answers to a change and partly takes it back, so that there one command alone
+    # may lower the mean.
+    if name in TEXTBOOK:
         assert bool(jnp.all(by_command[:, :-1] > 0))
 
 
-@pytest.mark.parametrize("name", REAL_DT)
+@textbook_plant
 def test_half_steps_agree_with_whole_ones(name):
     rng = np.random.default_rng(3)
     u_in = rng.uniform(0, 15, (1, T))
@@ -182,7 +206,7 @@ def test_half_steps_agree_with_whole_ones(name):
         plant = PLANTS[name]()
         whole = pressures(plant, u_in, u_out)
         halves = pressures(plant, *(np.repeat(x, 2, axis=1) for x in (u_in, u_out)), dt=0.015)
-    np.testing.assert_allclose(halves[:, ::2], whole, atol=REAL_DT[name])
+    np.testing.assert_allclose(halves[:, ::2], whole, atol=2e-4)
 
 
 @every_plant

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ventbench.recordings import Breaths, make_breaths, recordings_dir
+from ventbench.recordings import Breaths, make_breaths
 
 HEADER = "id,breath_id,R,C,time_step,u_in,u_out,pressure"
 Write = Callable[..., Path]
@@ -73,12 +73,3 @@ def make() -> Callable[..., Breaths]:
         )
 
     return build
-
-
-@pytest.fixture(scope="session")
-def public() -> Path:
-    """The folder of public recordings."""
-    folder = recordings_dir()
-    if folder is None:
-        pytest.skip("the public recordings are not here; name them by VENTBENCH_RECORDINGS")
-    return folder

@@ -8,8 +8,8 @@ from ventbench.recordings import check, iter_breaths, load, load_respiraworks, s
 from ventbench.recordings.times import interval_table
 
 
-def test_the_measured_breaths(public):
-    path = public / "pvp_quicklung.csv"
+def test_the_measured_breaths(public_recordings):
+    path = public_recordings / "pvp_quicklung.csv"
     breaths, report = load(path), check(path)
     assert report.ok
     assert not report.warnings
@@ -28,8 +28,8 @@ def test_the_measured_breaths(public):
     np.testing.assert_array_equal(np.concatenate([p.time for p in parts]), breaths.time)
 
 
-def test_inferred_intervals_are_good(public):
-    breaths = load(public / "pvp_quicklung.csv")
+def test_inferred_intervals_are_good(public_recordings):
+    breaths = load(public_recordings / "pvp_quicklung.csv")
     known = ~breaths.time_inferred
     interval = breaths.time[known, -1] / 79
     count = breaths.inspiratory[known].sum(axis=1)
@@ -43,8 +43,8 @@ def test_inferred_intervals_are_good(public):
     assert np.quantile(off, 0.9) < 0.4e-3
 
 
-def test_the_reconstructed_breaths(public):
-    path = public / "pvp_quicklung_reconstructed.csv"
+def test_the_reconstructed_breaths(public_recordings):
+    path = public_recordings / "pvp_quicklung_reconstructed.csv"
     breaths, report = load(path), check(path)
     assert len(breaths) == 599
     assert int(np.isfinite(breaths.pressure).sum()) == 13_013
@@ -52,8 +52,8 @@ def test_the_reconstructed_breaths(public):
     assert not breaths.time_inferred.any()
 
 
-def test_a_split_of_the_measured_breaths(public):
-    breaths = load(public / "pvp_quicklung.csv")
+def test_a_split_of_the_measured_breaths(public_recordings):
+    breaths = load(public_recordings / "pvp_quicklung.csv")
     split = split_by_breath(breaths)
     assert 141 * 0.15 < len(split.held_out_ids) < 141 * 0.25
     train, held_out = split.apply(breaths)
@@ -61,8 +61,8 @@ def test_a_split_of_the_measured_breaths(public):
     assert len(set(held_out.lung_ids)) == 9
 
 
-def test_respiraworks(public):
-    path = public / "respiraworks_quicklung.parquet"
+def test_respiraworks(public_recordings):
+    path = public_recordings / "respiraworks_quicklung.parquet"
     assert "missing columns id, breath_id, u_in, u_out" in str(check(path).problems[0])
     runs = load_respiraworks(path)
     assert len(runs) == 48

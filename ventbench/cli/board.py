@@ -190,7 +190,8 @@ def _table(track: Track) -> Table:
 
     found = Table(title=f"{track.name}, version {track.version}: score over draws, cmH2O")
     for name in ("rank", "entry", "score", "95 %", "to PID", "nominal", "worst cell", "state"):
-        found.add_column(name, justify="left" if name in ("entry", "state") else "right")
+        left = name in ("entry", "state")
+        found.add_column(name, justify="left" if left else "right", no_wrap=name == "entry")
     for status, row in track.rows:
         worst, lung, pip = row.worst
         found.add_row(

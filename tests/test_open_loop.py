@@ -1,0 +1,207 @@
+"""The open-loop test of a recording, as a function and as ``ventbench open-loop``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from ventbench import evaluation, open_loop_test
+from ventbench.cli import app
+from ventbench.errors import InputError
+from ventbench.lungs import LUNG_IDS, lung
+from ventbench.plants import frozen
+from ventbench.plants.labelled import single_compartments
+from ventbench.precision import float64
+from ventbench.recordings import Breaths, load, make_breaths, write
+from ventbench.rollout import open_loop
+from ventbench.training.freeze import MEASURED
+
+FIGURES = ("mae", "median_mae", "ci95", "breaths")
+PREFIXES = ("", "held_out_", "official_held_out_")
+SAMPLES, INSPIRATORY = 40, 30
+
+
+def answered(plants_for, lungs: list[str], seed: int = 0, noise: float = 0.3) -> Breaths:
+    """Breaths whose pressures are some plants' own, with errors of known mean."""
+    rng = np.random.default_rng(seed)
+    n = len(lungs)
+    time = np.tile(0.034 * np.arange(SAMPLES), (n, 1))
+    u_in = np.repeat(rng.uniform(3.0, 12.0, (n, SAMPLES // 5)), 5, axis=1)
+    u_out = np.broadcast_to(np.arange(SAMPLES) >= INSPIRATORY, u_in.shape) * 1.0
+    settings = [lung(name) for name in lungs]
+    R, C = [x.R for x in settings], [x.C for x in settings]
+    breaths = make_breaths(np.arange(n) + 1, R, C, time, u_in, u_out, np.full(u_in.shape, 5.0))
+    with float64():
+        columns = (breaths.pressure[:, 0], u_in, u_out, breaths.dt)
+        pressure = np.array(open_loop(plants_for(breaths), *columns))  # type: ignore[arg-type]
+    # The same error up and down: a breath's mean is `noise` exactly.
+    error = noise * np.where(rng.uniform(size=pressure.shape) < 0.5, -1.0, 1.0)
+    error[:, 0] = 0.0
+    return replace(breaths, pressure=pressure + error)
+
+
+@pytest.fixture(scope="module")
+def simulators():
+    return frozen.load()
+
+
+@pytest.fixture(scope="module")
+def breaths(simulators):
+    """Three breaths of each of two lungs, answered by the official simulators."""
+    return answered(simulators.for_breaths, ["R5C20"] * 3 + ["R20C50"] * 3)
+
+
+def test_the_error_is_the_one_that_was_put_in(breaths):
+    result = open_loop_test.run(breaths)
+    assert list(result["lungs"]) == ["R5C20", "R20C50"]
+    for one in result["lungs"].values():
+        for prefix in PREFIXES:  # new breaths: the official simulators judge them
+            assert one[f"{prefix}mae"] == pytest.approx(0.3, abs=1e-9)
+            assert one[f"{prefix}median_mae"] == pytest.approx(0.3, abs=1e-9)
+            assert one[f"{prefix}breaths"] == 3
+            low, high = one[f"{prefix}ci95"]
+            assert low <= one[f"{prefix}mae"] + 1e-12
+            assert high >= one[f"{prefix}mae"] - 1e-12
+        assert one["fitting_label"] == {k: v for k, v in one.items() if k != "fitting_label"}
+    assert result["misfits"] == result["not_judged"] == []
+    assert open_loop_test.misfit_lines(result) == []
+    assert json.loads(json.dumps(result, allow_nan=False)) == result
+
+
+@pytest.mark.parametrize("kind", ["frozen", "hybrid", "learned", "physics"])
+def test_each_kind_is_what_it_says(simulators, breaths, kind):
+    kinds = {"physics": single_compartments, "learned": frozen.load_learned().for_breaths}
+    error = evaluation.errors(kinds.get(kind, simulators.for_breaths), breaths)
+    result = open_loop_test.run(breaths, kind)
+    assert result["plant"] == kind
+    assert result["simulators"] == simulators.about()
+    for name, index in breaths.by_lung_index.items():
+        one = result["lungs"][name]
+        assert one["mae"] == pytest.approx(error[index].mean(), abs=1e-6)
+        assert one["held_out_breaths"] == 3
+    # 0.3 is the noise; only the official simulators have no error of their own.
+    assert (error.mean() > 0.35) == (kind in kinds)
+
+
+def test_a_wrong_label_or_valve_is_noticed_and_named(simulators):
+    lungs = ["R5C50"] * 2 + ["R5C10"] * 2
+    breaths = answered(simulators.for_breaths, lungs, noise=0.1)
+    C = breaths.C.copy()
+    C[0] = 20.0  # breath 1 is of R5C50, says R5C20
+
+    def stronger(part):
+        plants = simulators.for_breaths(part)
+        gain = np.where(part.breath_id == 4, 1.25, 1.0)[:, None]
+        return replace(plants, slopes=plants.slopes * gain)
+
+    pressure = answered(stronger, lungs, noise=0.1).pressure
+    result = open_loop_test.run(replace(breaths, C=C, pressure=pressure))
+    found = {one["breath_id"]: one["explanation"] for one in result["misfits"]}
+    assert found == {1: "lung R5C50", 4: "valve gain x 1.25"}
+    mislabelled = result["lungs"]["R5C20"]
+    assert (mislabelled["breaths"], mislabelled["fitting_label"]["breaths"]) == (1, 0)
+    assert mislabelled["mae"] > 1.0
+    assert mislabelled["fitting_label"]["mae"] is None
+    stiff = result["lungs"]["R5C10"]
+    assert stiff["mae"] > 0.5 > 0.2 > stiff["fitting_label"]["mae"]
+    lines = open_loop_test.misfit_lines(result)
+    assert "2 breaths are explained far better" in lines[0]
+    assert "breath 1 (R5C20)" in lines[1]
+    assert lines[1].endswith("as lung R5C50")
+
+
+def test_breaths_without_a_first_pressure_are_not_judged(breaths):
+    pressure = breaths.pressure.copy()
+    pressure[1, 0] = np.nan
+    pressure[5, 1:INSPIRATORY] = np.nan
+    result = open_loop_test.run(replace(breaths, pressure=pressure))
+    assert result["not_judged"] == [2, 6]
+    assert [one["breaths"] for one in result["lungs"].values()] == [2, 2]
+    assert "2 breaths have no first pressure" in open_loop_test.misfit_lines(result)[-1]
+
+
+def test_many_misfits_are_told_in_few_lines():
+    one = {"lung": "R5C10", "mae": 3.0, "mae_explained": 0.5, "explanation": "lung R5C20"}
+    misfits = [one | {"breath_id": i} for i in range(25)]
+    lines = open_loop_test.misfit_lines({"misfits": misfits, "not_judged": []})
+    assert len(lines) == 22
+    assert lines[-1].endswith("5 more; --json lists all")
+
+
+def run(*arguments: object, code: int = 0) -> str:
+    found = CliRunner().invoke(app, [*map(str, arguments)])
+    if isinstance(found.exception, InputError | OSError):  # main() prints it and exits with 2
+        assert code == 2
+        message = str(found.exception)
+        assert "\n" not in message.strip()
+        return message
+    assert found.exit_code == code, found.output
+    return found.output
+
+
+def test_the_command_writes_what_the_function_finds(breaths, tmp_path):
+    for name in ("lab.csv", "lab.parquet"):
+        write(breaths, tmp_path / name)
+        out = tmp_path / "out.json"
+        text = run("open-loop", tmp_path / name, "--json", out)
+        result = json.loads(out.read_text())
+        assert result == open_loop_test.run(load(tmp_path / name))
+        for lung_id in ("R5C20", "R20C50"):
+            assert lung_id in text
+            assert set(result["lungs"][lung_id]) == {"fitting_label"} | {
+                prefix + figure for prefix in PREFIXES for figure in FIGURES
+            }
+            assert len(result["lungs"][lung_id]["ci95"]) == 2
+
+
+@pytest.mark.parametrize("kind", ["frozen", "hybrid", "learned", "physics"])
+def test_the_command_knows_all_kinds(breaths, tmp_path, kind):
+    write(breaths, tmp_path / "lab.csv")
+    text = run("open-loop", tmp_path / "lab.csv", "--plant", kind, "--json", "-")
+    result = json.loads(text[text.index("{") : text.rindex("\n}") + 2])
+    assert result["plant"] == kind
+    assert f"of the {kind} simulators" in text
+
+
+def test_the_command_names_misfits(simulators, tmp_path):
+    breaths = answered(simulators.for_breaths, ["R5C50"] * 2)
+    write(replace(breaths, C=np.array([20.0, 50.0])), tmp_path / "lab.csv")
+    assert "breath 1 (R5C20)" in run("open-loop", tmp_path / "lab.csv")
+
+
+def test_bad_recordings_are_refused_in_one_line(breaths, tmp_path):
+    text = tmp_path / "text.csv"
+    text.write_text("a,b\n1,2\n")
+    assert "missing columns" in run("open-loop", text, code=2)
+    assert "no such file" in run("open-loop", tmp_path / "none.csv", code=2)
+    write(replace(breaths, C=np.full(6, 30.0)), tmp_path / "lab.csv")
+    message = run("open-loop", tmp_path / "lab.csv", code=2)
+    assert "lung R5C30, for which there is no simulator; known are R5C10" in message
+    u_in = breaths.u_in.copy()
+    u_in[2, 7] = 104.2
+    write(replace(breaths, u_in=u_in), tmp_path / "lab.csv")
+    message = run("open-loop", tmp_path / "lab.csv", code=2)
+    assert "line 89, column u_in: 104.2 is outside 0..100" in message
+    assert "R5C20" in run("open-loop", tmp_path / "lab.csv", "--clip")
+    assert "'magic'" in run("open-loop", tmp_path / "lab.csv", "--plant", "magic", code=2)
+
+
+def test_the_public_recordings_give_the_held_out_errors_of_the_manifest(
+    simulators, public_recordings, tmp_path
+):
+    out = tmp_path / "out.json"
+    run("open-loop", public_recordings / MEASURED, "--json", out)
+    result = json.loads(out.read_text())
+    assert len(result["lungs"]) == 9
+    for name in LUNG_IDS:
+        one, known = result["lungs"][name], simulators.lungs()[name]
+        assert one["held_out_breaths"] == one["breaths"] == known["held_out_breaths"]
+        assert one["official_held_out_breaths"] == known["official_breaths"]
+        for figure in ("held_out_mae", "held_out_median_mae", "held_out_ci95"):
+            assert one[figure] == pytest.approx(known[figure], abs=2e-6)
+        assert one["official_held_out_mae"] == pytest.approx(known["official_mae"], abs=2e-6)
+        assert one["mae"] < one["held_out_mae"]

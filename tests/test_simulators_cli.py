@@ -1,0 +1,145 @@
+"""``ventbench lungs``, ``simulate`` and ``train simulator``, and the exit codes of the program."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import ventbench
+from ventbench import controls, protocol
+from ventbench.cli import app
+from ventbench.errors import InputError
+from ventbench.lungs import LUNG_IDS
+from ventbench.plants import frozen
+from ventbench.plants.stack import take
+from ventbench.simulate import simulate
+from ventbench.training import freeze
+
+
+def run(*arguments: object, code: int = 0) -> str:
+    found = CliRunner().invoke(app, [*map(str, arguments)])
+    if isinstance(found.exception, InputError | OSError):  # main() prints it and exits with 2
+        assert code == 2
+        return str(found.exception)
+    assert found.exit_code == code, found.output
+    return found.stdout
+
+
+def program(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """The real program, in its own process."""
+    root = Path(ventbench.__file__).resolve().parents[1]
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    return subprocess.run(
+        [sys.executable, "-c", "from ventbench.cli import main; main()", *map(str, arguments)],
+        env=environment | {"PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.fixture
+def commands(tmp_path):
+    """A breath: 10 % for a second, then the expiratory valve opens."""
+    path = tmp_path / "commands.csv"
+    rows = [f"{10 if i < 30 else 5},{int(i >= 30)},{0.033 * i:.3f}" for i in range(60)]
+    path.write_text("\n".join(["u_in,u_out,time_step", *rows]) + "\n")
+    return path
+
+
+def columns(text: str) -> dict[str, np.ndarray]:
+    rows = list(csv.DictReader(io.StringIO(text)))
+    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+
+
+def test_lungs_lists_the_six_with_their_errors():
+    text = run("lungs")
+    for name, about in frozen.load().lungs().items():
+        (line,) = [line for line in text.splitlines() if f" {name} " in line]
+        assert f"{about['held_out_mae']:.2f}" in line
+
+
+def test_lungs_as_json():
+    assert json.loads(run("lungs", "--json", "-")) == frozen.load().lungs()
+
+
+@pytest.mark.parametrize("name", ["R5C10", "R20C50"])
+def test_simulate_answers_commands_with_the_official_pressures(commands, tmp_path, name):
+    text = run("simulate", "--lung", name, "--controls", commands, "--start", "6")
+    found = columns(text)
+    assert list(found) == ["time_step", "u_in", "u_out", "pressure"]
+    np.testing.assert_allclose(found["time_step"], 0.033 * np.arange(60), atol=1e-6)
+    plant = take(frozen.load().plants, LUNG_IDS.index(name))
+    wanted = simulate(plant, controls.read(commands), start=6.0)
+    np.testing.assert_allclose(found["pressure"], wanted, atol=1e-6)
+    assert found["pressure"][0] == 6.0
+    assert found["pressure"][29] > 8.0 > found["pressure"][-1]
+    out = tmp_path / "out.csv"
+    assert run("simulate", "--lung", name, "--controls", commands, "--start", 6, "--out", out) == ""
+    assert out.read_text() == text
+
+
+def test_simulate_without_times_takes_the_protocols(tmp_path):
+    path = tmp_path / "commands.csv"
+    path.write_text("u_in\n" + "8\n" * 5)
+    found = columns(run("simulate", "--lung", "R5C20", "--controls", path))
+    np.testing.assert_allclose(found["time_step"], protocol.DT * np.arange(5))
+    assert found["pressure"][0] == protocol.PEEP
+    assert not found["u_out"].any()
+
+
+def test_simulate_refuses_bad_input(commands, tmp_path):
+    message = run("simulate", "--lung", "R9", "--controls", commands, code=2)
+    assert "'R9' is not a lung id" in message
+    message = run("simulate", "--lung", "R5C30", "--controls", commands, code=2)
+    assert f"choose one of {', '.join(LUNG_IDS)}" in message
+    bad = tmp_path / "bad.csv"
+    bad.write_text("u_in\n5\n120\n")
+    message = run("simulate", "--lung", "R5C10", "--controls", bad, code=2)
+    assert "line 3, column u_in: 120 is outside" in message
+
+
+def test_train_needs_recordings(tmp_path, monkeypatch):
+    message = run("train", "simulator", "--recordings", tmp_path / "nowhere", code=2)
+    assert "nowhere holds no recordings; give --recordings DIR" in message
+    monkeypatch.setenv("VENTBENCH_RECORDINGS", str(tmp_path / "gone"))
+    assert "no folder holds no recordings" in run("train", "simulator", code=2)
+    message = run("train", "simulator", "--recordings", tmp_path, "--out", tmp_path / "x", code=2)
+    assert f"{freeze.MEASURED}: there is no such file" in message
+    assert not (tmp_path / "x").exists()
+
+
+def test_train_hands_over_folder_target_and_progress(tmp_path, monkeypatch):
+    called = []
+
+    def train(folder, out, *, progress):
+        progress("half", 0.5)
+        called.append((folder, out))
+
+    monkeypatch.setattr(freeze, "train", train)
+    out = tmp_path / "out"
+    text = run("train", "simulator", "--recordings", tmp_path, "--out", out)
+    assert called == [(tmp_path, out)]
+    assert f"wrote {out}" in text
+
+
+def test_the_program_ends_with_2_and_one_line(tmp_path):
+    for arguments, message in (
+        (("open-loop", tmp_path / "none.csv"), "no such file"),
+        (("train", "simulator", "--recordings", tmp_path / "nowhere"), "holds no recordings"),
+    ):
+        found = program(*arguments)
+        assert found.returncode == 2
+        assert found.stdout == ""
+        assert found.stderr.startswith("ventbench: ")
+        assert message in found.stderr
+        assert len(found.stderr.splitlines()) == 1

@@ -1,0 +1,160 @@
+"""From recordings to the files of the simulators: the same bytes, also after Ctrl-C."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from ventbench import evaluation
+from ventbench.errors import InputError
+from ventbench.lungs import LUNG_IDS
+from ventbench.plants import frozen
+from ventbench.plants.learned import Architecture
+from ventbench.recordings import load, write
+from ventbench.training import freeze
+from ventbench.training import learned as networks
+from ventbench.training.hybrid.fit import Recipe
+
+RECIPE = Recipe(iterations=20)
+NETWORK_RECIPE = networks.Recipe(steps=2, batch=2)
+TINY = Architecture(pressures=2, controls=2, width=4, depth=2, boundaries=1, boundary_width=4)
+NAMES = (frozen.MANIFEST, frozen.MEMBERS, frozen.LEARNED, frozen.SEEN)
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory, make_synthetic):
+    """Both files of the public recordings, of synthetic breaths."""
+    folder = tmp_path_factory.mktemp("recordings")
+    write(make_synthetic(each=4), folder / freeze.MEASURED)
+    more = make_synthetic(each=2, seed=1, first_id=1000)
+    pressure = np.where(more.inspiratory, more.pressure, np.nan)
+    pressure[:, 0] = np.nan
+    write(replace(more, pressure=pressure), folder / freeze.RECONSTRUCTED)
+    return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small():
+    """Two members and tiny networks: what is tested is how the parts come together."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(freeze, "MEMBERS", 2)
+        patch.setattr(freeze, "ARCHITECTURE", TINY)
+        yield
+
+
+def train(recordings, out, progress=None, recipe=RECIPE):
+    return freeze.train(
+        recordings, out, recipe=recipe, network_recipe=NETWORK_RECIPE, progress=progress
+    )
+
+
+@pytest.fixture(scope="module")
+def trained(recordings, tmp_path_factory):
+    told = []
+    out = tmp_path_factory.mktemp("trained")
+    simulators = train(recordings, out, lambda *x: told.append(x))
+    return out, simulators, told
+
+
+@pytest.mark.slow
+def test_writes_all_files_and_nothing_else(trained):
+    out, simulators, _ = trained
+    assert sorted(path.name for path in out.iterdir()) == sorted(NAMES)
+    assert simulators.about() == frozen.load(path=out).about()
+    assert jax.tree.leaves(simulators.members)[0].shape[:2] == (2, 9)
+    assert simulators.plants.R.shape == (6,)
+    assert frozen.load_learned(path=out).seen.key.shape == simulators.seen.key.shape
+
+
+@pytest.mark.slow
+def test_tells_how_far_it_is(trained):
+    _, _, told = trained
+    shares = [share for _, share in told]
+    assert shares == sorted(shares)
+    assert (shares[0], shares[-1]) == (0.0, 1.0)
+    texts = [what for what, _ in told]
+    assert {"hybrid, member 1", "network R50C50, member 1", "done"} <= set(texts)
+
+
+@pytest.mark.slow
+def test_the_manifest_tells_data_split_recipes_and_packages(trained, recordings):
+    _, simulators, _ = trained
+    manifest = simulators.manifest
+    measured = load(recordings / freeze.MEASURED)
+    assert manifest["recordings"][freeze.MEASURED] == {"sha256": measured.sha256, "breaths": 36}
+    assert manifest["recordings"][freeze.RECONSTRUCTED]["breaths"] == 18
+    assert manifest["recipe"]["hybrid"]["iterations"] == 20
+    assert manifest["recipe"]["learned"]["batch"] == 2
+    assert manifest["recipe"]["learned_architecture"]["width"] == 4
+    assert set(manifest["packages"]) == {"flax", "jax", "jaxlib", "numpy", "optax"}
+    first, second = manifest["split"]["held_out"]
+    assert sorted(first + second) == measured.breath_id.tolist()
+    fold = simulators.seen.folds(measured)
+    assert sorted(measured.breath_id[fold == 1].tolist()) == second
+
+
+@pytest.mark.slow
+def test_the_errors_it_writes_are_those_of_the_simulators_it_writes(trained, recordings):
+    _, simulators, _ = trained
+    measured = load(recordings / freeze.MEASURED)
+    held_out = evaluation.errors(simulators.cross_fitted, measured)
+    official = evaluation.errors(simulators.for_breaths, measured)
+    for name in LUNG_IDS:
+        index = measured.by_lung_index[name]
+        about = simulators.lungs()[name]
+        assert about["held_out_mae"] == pytest.approx(held_out[index].mean(), abs=1e-5)
+        assert about["held_out_breaths"] == about["official_breaths"] + about["training_breaths"]
+        new = simulators.unseen(measured)[index]
+        assert about["official_mae"] == pytest.approx(official[index][new].mean(), abs=1e-5)
+    assert set(simulators.manifest["comparison"]) == {
+        "hybrid", "learned", "single_compartment", "two_balloon",
+    }  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stop_at", ["hybrid, member 1", "network R20C20, member 1"])
+def test_goes_on_after_ctrl_c_to_the_same_bytes(trained, recordings, tmp_path, stop_at):
+    whole = trained[0]
+
+    def stop(what, share):
+        if what == stop_at:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(recordings, tmp_path, stop)
+    assert [path.name for path in tmp_path.iterdir()] == ["parts"]
+    done = {path.name for path in (tmp_path / "parts").iterdir()}
+    assert "hybrid-0.npz" in done
+    assert ("hybrid-1.npz" in done) == stop_at.startswith("network")
+    train(recordings, tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(NAMES)
+    for name in NAMES:
+        assert (tmp_path / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+def test_parts_of_another_training_are_refused_before_anything_is_done(recordings, tmp_path):
+    def stop(what, share):
+        if what.startswith("hybrid"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(recordings, tmp_path, stop)
+    with pytest.raises(InputError, match=r"parts holds parts of a training with other .*delete it"):
+        train(recordings, tmp_path, recipe=replace(RECIPE, learning_rate=0.04))
+    other = shutil.copytree(recordings, tmp_path / "other")
+    breaths = load(other / freeze.MEASURED)
+    pressure = breaths.pressure.copy()
+    pressure[0, 3] += 0.001
+    write(replace(breaths, pressure=pressure), other / freeze.MEASURED)
+    with pytest.raises(InputError, match="with other recordings"):
+        train(other, tmp_path)
+
+
+def test_a_missing_recording_is_an_error(tmp_path):
+    with pytest.raises(InputError, match=rf"{freeze.MEASURED}: there is no such file"):
+        train(tmp_path, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -28,7 +28,7 @@ demo: setup ## score the PID submissions on the six lungs: table, report, rerun 
 	$(DEMO)
 
 test: lint ## lint, type check and the fast tests
-	$(PY) -m pytest -n auto $(PYTEST_ARGS)
+	$(PY) -m pytest -n auto --dist loadfile $(PYTEST_ARGS)
 	@echo "The fast tests passed. 'make test-slow' runs the proofs that take minutes."
 
 test-slow: setup ## the tests that take minutes

@@ -36,7 +36,7 @@ def test_is_ready_and_scores(family, tmp_path, one_lung):
     folder = create("demo", family, tmp_path)
     report = contract.check(str(folder))
     assert report.ok, "\n".join(report.lines())
-    assert [note.what for note in report.notes] == ["key authors still says Your Name"]
+    assert report.notes[0].what == "key authors still says Your Name"
     result, _ = score(
         open_submission(str(folder)), one_lung, lungs=LUNGS[:1], pips=(20.0,), track="robustness"
     )

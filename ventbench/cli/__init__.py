@@ -11,7 +11,7 @@ import sys
 import typer
 
 from ventbench import __version__
-from ventbench.cli import board, data, run, score, simulators, submit, view
+from ventbench.cli import board, data, rl, run, score, simulators, submit, train, tune, view
 from ventbench.errors import InputError
 
 app = typer.Typer(
@@ -43,6 +43,9 @@ score.register(app)
 submit.register(app)
 run.register(app)
 simulators.register(app)
+tune.register(app)
+train.register(simulators.train)
+rl.register(app, simulators.train)
 view.register(app)
 board.register(app)
 app.add_typer(data.app)

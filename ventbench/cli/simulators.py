@@ -11,7 +11,7 @@ from ventbench.cli.options import Clip, JsonFile, Pad, emit
 
 Kind = Literal["frozen", "learned", "physics", "hybrid"]
 
-train = typer.Typer(name="train", help="Learn simulators.", no_args_is_help=True)
+train = typer.Typer(name="train", help="Learn simulators and controllers.", no_args_is_help=True)
 
 
 def open_loop(

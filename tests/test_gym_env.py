@@ -1,0 +1,86 @@
+"""The Gymnasium environment: its checker's opinion, and the same score as the benchmark's."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+from ventbench.errors import InputError
+
+gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
+
+from ventbench import gym_env, precision, protocol, rollout, scenario  # noqa: E402
+from ventbench.controllers.script import Script  # noqa: E402
+from ventbench.lungs import LUNG_IDS  # noqa: E402
+from ventbench.metrics.waveform import run_error  # noqa: E402
+from ventbench.plants import frozen  # noqa: E402
+
+NAME = "ventbench.gym_env:ventbench/Ventilator-v1"
+
+
+def test_the_checker_of_gymnasium_has_no_complaint():
+    from gymnasium.utils.env_checker import check_env
+
+    made = gymnasium.make(NAME)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(made.unwrapped, skip_render_check=True)
+
+
+def test_registered_by_name():
+    made = gymnasium.make("ventbench/Ventilator-v1", lung="R5C10")
+    assert isinstance(made.unwrapped, gym_env.Ventilator)
+    assert made.spec is not None
+    assert made.spec.id == "ventbench/Ventilator-v1"
+
+
+def test_a_breath_scores_as_the_benchmark_does():
+    made = gym_env.Ventilator(lung="R20C50", pip=25.0, noise=False)
+    actions = np.random.default_rng(0).uniform(-1.0, -0.4, 33).astype(np.float32)
+    seen, info = made.reset(seed=1)
+    assert info["pip"] == 25.0
+    np.testing.assert_allclose(seen[:2], [5 / 40, 25 / 40], rtol=1e-6)
+    rewards = []
+    for k, action in enumerate(actions):
+        seen, reward, ended, cut, info = made.step(action[None])
+        rewards.append(reward)
+        assert (ended, cut) == (k == 32, False)
+        assert seen in made.observation_space
+        np.testing.assert_allclose(seen[-3], action, rtol=1e-5)
+    with precision.float64():
+        u_in = np.tile(np.append(50.0 + 50.0 * actions, 0.0), protocol.BREATHS)
+        plants = frozen.load().plants
+        import jax
+        import jax.numpy as jnp
+
+        plant = jax.tree.map(lambda x: jnp.asarray(x[LUNG_IDS.index("R20C50")]), plants)
+        run, _ = rollout.closed_loop(plant, Script(jnp.asarray(u_in)), scenario.nominal(25.0))
+    wanted = float(run_error(run.pressure, 25.0))
+    assert info["error"] == pytest.approx(wanted, rel=1e-4)
+    assert (20.0 - 10.0 * sum(rewards)) / 34 == pytest.approx(wanted, rel=1e-4)
+
+
+def test_seeds_repeat_and_lungs_and_pips_vary():
+    made = gym_env.Ventilator()
+    kinds = set()
+    for seed in range(20):
+        first, info = made.reset(seed=seed)
+        again, _ = made.reset(seed=seed)
+        np.testing.assert_array_equal(first, again)
+        kinds.add((info["lung"], round(info["pip"] / 5)))
+    assert len(kinds) > 10
+
+
+def test_what_cannot_be_done_is_said():
+    with pytest.raises(InputError, match="R7C7 is not a scored lung"):
+        gym_env.Ventilator(lung="R7C7")
+    with pytest.raises(InputError, match="PIP 80 cmH2O"):
+        gym_env.Ventilator(pip=80.0)
+    made = gym_env.Ventilator(lung="R5C10")
+    with pytest.raises(InputError, match="call reset"):
+        made.step(np.zeros(1, np.float32))
+    made.reset(seed=0)
+    with pytest.raises(InputError, match="the action is nan"):
+        made.step(np.array([np.nan], np.float32))

@@ -1,0 +1,199 @@
+"""A PID and a network that corrects it, which looks back at this breath and at the one before."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ventbench import protocol
+from ventbench.controllers.base import Observation
+from ventbench.controllers.expiratory import BIAS
+from ventbench.controllers.pid import PID, PIDState
+
+#: Scales that bring the features to the order of 1: cmH2O of errors and of targets, % of commands,
+#: shares of the control step.
+ERROR, TARGET, COMMAND, STEP = 10.0, 40.0, 100.0, 0.1
+
+#: One dense layer: weights ``(inputs, outputs)`` and biases ``(outputs,)``.
+Layer = tuple[Array, Array]
+
+_STEPS = protocol.INSPIRATION_STEPS
+
+
+@flax.struct.dataclass
+class ResidualState:
+    """What the controller remembers; every array has shape ``(...)`` unless it says otherwise.
+
+    Attributes:
+        pid: of the PID.
+        begun: 0 before the first breath, then 1.
+        known: whether there was a breath before this one, 0/1.
+        errors: of the last steps of this breath, the latest first, cmH2O, ``(..., pressures)``.
+        commands: likewise as applied, %, ``(..., commands)``.
+        error_trace: errors of the last 34 steps, the latest last, cmH2O, ``(..., 34)``.
+        command_trace: likewise, %; the command of a step is known one step later, so that the
+            first entry is the bias flow before the breath.
+        error_before: errors of the breath before from this step on, ``(..., 34 + ahead)``.
+        command_before: likewise.
+    """
+
+    pid: PIDState
+    begun: Array
+    known: Array
+    errors: Array
+    commands: Array
+    error_trace: Array
+    command_trace: Array
+    error_before: Array
+    command_before: Array
+
+
+@flax.struct.dataclass
+class Residual:
+    """``u_in = PID + limit tanh(network(features))``, %.
+
+    Features: the PID's error, integral and derivative; the target; time in breath and control step;
+    errors and applied commands of the last steps; errors and commands of the breath before at this
+    step and at the next ones, zero in the first breath.
+
+    Attributes:
+        pid: gains of shape ``()``.
+        layers: of the network, tanh between them; the last has one output.
+        pressures: how many errors before the present one it sees.
+        commands: how many commands.
+        ahead: how many steps of the breath before; 0 for a network without that memory.
+        limit: the largest correction, %.
+    """
+
+    pid: PID
+    layers: tuple[Layer, ...]
+    pressures: int = flax.struct.field(pytree_node=False, default=5)
+    commands: int = flax.struct.field(pytree_node=False, default=6)
+    ahead: int = flax.struct.field(pytree_node=False, default=6)
+    limit: float = flax.struct.field(pytree_node=False, default=100.0)
+
+    def init(self, shape: tuple[int, ...]) -> ResidualState:
+        """State before the first breath."""
+        zero = jnp.zeros(shape)
+        long = jnp.zeros((*shape, _STEPS + self.ahead))
+        return ResidualState(
+            pid=self.pid.init(shape),
+            begun=zero,
+            known=zero,
+            errors=jnp.zeros((*shape, self.pressures)),
+            commands=jnp.zeros((*shape, self.commands)),
+            error_trace=long[..., :_STEPS],
+            command_trace=long[..., :_STEPS],
+            error_before=long,
+            command_before=long,
+        )
+
+    def step(self, state: ResidualState, observation: Observation) -> tuple[ResidualState, Array]:
+        """One control step."""
+        state, base, correction = self.parts(state, observation)
+        return state, base + correction
+
+    def parts(
+        self, state: ResidualState, observation: Observation
+    ) -> tuple[ResidualState, Array, Array]:
+        """Like :meth:`step`, with the PID's command and its correction, %, apart."""
+        error = observation.target - observation.pressure
+        state = self._begin(state, observation, error)
+        pid, base = self.pid.step(state.pid, observation)
+        previous, zero = observation.previous_u_in, jnp.zeros_like(error)
+        state = state.replace(  # type: ignore[attr-defined]
+            pid=pid,
+            commands=_push(previous, state.commands),
+            error_trace=_append(state.error_trace, error),
+            command_trace=_append(state.command_trace, previous),
+        )
+        errors = [
+            jnp.stack([error, pid.integral, pid.derivative], axis=-1),
+            state.errors,
+            state.error_before[..., : self.ahead],
+        ]
+        rest = [
+            observation.target / TARGET,
+            observation.time + zero,
+            (observation.dt / protocol.DT - 1.0) / STEP + zero,
+            state.known,
+        ]
+        commands = [state.commands, state.command_before[..., : self.ahead]]
+        features = jnp.concatenate(
+            [
+                jnp.concatenate(errors, axis=-1) / ERROR,
+                jnp.stack(rest, axis=-1),
+                jnp.concatenate(commands, axis=-1) / COMMAND,
+            ],
+            axis=-1,
+        )
+        correction = self.limit * jnp.tanh(apply(self.layers, features)[..., 0])
+        state = state.replace(  # type: ignore[attr-defined]
+            errors=_push(error, state.errors),
+            error_before=_append(state.error_before, zero),
+            command_before=_append(state.command_before, zero),
+        )
+        return state, base, correction
+
+    def _begin(self, state: ResidualState, seen: Observation, error: Array) -> ResidualState:
+        """Where a breath begins, the trace of the last one becomes what is known of it."""
+        restart = seen.time + jnp.zeros_like(error) == 0
+        wide = restart[..., None]
+        room = jnp.zeros((*error.shape, self.ahead), error.dtype)
+
+        def turned(trace: Array, before: Array) -> Array:
+            return jnp.where(wide, jnp.concatenate([trace, room], axis=-1), before)
+
+        return state.replace(  # type: ignore[attr-defined]
+            begun=jnp.where(restart, 1.0, state.begun),
+            known=jnp.where(restart, state.begun, state.known),
+            errors=jnp.where(wide, error[..., None], state.errors),
+            commands=jnp.where(wide, BIAS, state.commands),
+            error_before=turned(state.error_trace, state.error_before),
+            command_before=turned(state.command_trace, state.command_before),
+        )
+
+
+def inputs(controller: Residual) -> int:
+    """How many features the network has."""
+    return 7 + controller.pressures + controller.commands + 2 * controller.ahead
+
+
+def apply(layers: tuple[Layer, ...], x: Array) -> Array:
+    """Outputs of the network, shape ``(..., outputs)``, from inputs ``(..., inputs)``."""
+    for weights, biases in layers[:-1]:
+        x = jnp.tanh(x @ weights + biases)
+    weights, biases = layers[-1]
+    return x @ weights + biases
+
+
+def untrained(key: Array, like: Residual, widths: tuple[int, ...]) -> Residual:
+    """The controller with a new network that corrects nothing yet: its last layer is zero.
+
+    Args:
+        key: of the hidden layers' weights.
+        like: whose PID, windows and limit it has.
+        widths: of the hidden layers.
+    """
+    sizes = [inputs(like), *widths]
+    layers = []
+    for number, (fan_in, fan_out) in enumerate(pairwise(sizes)):
+        drawn = jax.random.normal(jax.random.fold_in(key, number), (fan_in, fan_out))
+        layers.append((drawn / np.sqrt(fan_in), jnp.zeros(fan_out)))
+    layers.append((jnp.zeros((sizes[-1], 1)), jnp.zeros(1)))
+    return like.replace(layers=tuple(layers))  # type: ignore[attr-defined]
+
+
+def _push(value: Array, before: Array) -> Array:
+    """Latest first."""
+    return jnp.concatenate([value[..., None], before], axis=-1)[..., : before.shape[-1]]
+
+
+def _append(trace: Array, value: Array) -> Array:
+    """Latest last."""
+    return jnp.concatenate([trace, value[..., None]], axis=-1)[..., 1:]

@@ -1,0 +1,167 @@
+"""``ventbench/Ventilator-v1``: the benchmark as a Gymnasium environment, one breath an episode.
+
+Importing this module registers it; so does Gymnasium itself, ``gymnasium.make`` by the name
+``"ventbench.gym_env:ventbench/Ventilator-v1"``. Needs the extra ``ventbench[gym]``.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, ClassVar
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from jax import Array
+from numpy.typing import NDArray
+
+from ventbench import environment as env
+from ventbench import precision, protocol
+from ventbench.errors import InputError
+from ventbench.lungs import LUNG_IDS, scored_lung
+from ventbench.plants import frozen
+from ventbench.plants.base import Plant
+from ventbench.scenario import Scenario
+from ventbench.training.rl import breaths
+
+#: What an observation holds, in order, each of the order of 1: pressure / 40, target / 40, the
+#: next ten targets / 40, command before / 50 - 1, time in s, control step / 0.03.
+OBSERVATION = 5 + protocol.TARGETS_AHEAD
+
+Floats = NDArray[np.float32]
+
+
+@jax.jit
+def _start(plant: Plant, cell: Scenario) -> tuple[env.Bench, Array]:
+    bench = env.start_breath(env.vary(plant, cell), cell)
+    return bench, _seen(cell, bench, 0)
+
+
+@jax.jit
+def _step(
+    plant: Plant, cell: Scenario, bench: env.Bench, u_in: Array, step: Array
+) -> tuple[env.Bench, Array, Array]:
+    bench, _ = env.inspire(env.vary(plant, cell), cell, bench, u_in)
+    # The target holds to the last step; the observation after it is of the same kind.
+    after = jnp.minimum(step + 1, protocol.INSPIRATION_STEPS - 1)
+    return bench, _seen(cell, bench, after), jnp.abs(bench.pressure - cell.pip)
+
+
+@partial(jax.jit, static_argnames="vary")
+def _cell(key: Array, pip: Array, vary: bool) -> Scenario:
+    cells = breaths.sample(key, 1, first=pip, vary=vary)
+    return jax.tree.map(lambda leaf: leaf[0], cells)
+
+
+def _seen(cell: Scenario, bench: env.Bench, step: Array | int) -> Array:
+    seen = env.observe(cell, bench, 0, step)
+    values = [
+        seen.pressure / 40.0,
+        seen.target / 40.0,
+        *(seen.targets_ahead[k] / 40.0 for k in range(protocol.TARGETS_AHEAD)),
+        seen.previous_u_in / 50.0 - 1.0,
+        seen.time,
+        seen.dt / protocol.DT,
+    ]
+    return jnp.stack([jnp.asarray(value, jnp.float32) for value in values])
+
+
+class Ventilator(gymnasium.Env[Floats, Floats]):
+    """One inspiration from rest: 33 commands that move the pressure that is scored.
+
+    Action: ``u_in`` as ``50 + 50 a``, %, with ``a`` in -1..1. Reward: minus the absolute error
+    that follows, cmH2O, over 10. ``info`` holds ``lung``, ``pip``, ``pressure`` (true) and, at the
+    end, ``error``: the mean absolute error of the breath as the score counts it, cmH2O.
+
+    Args:
+        lung: id of the lung; a lung at random for each breath if not given.
+        pip: peak pressure, cmH2O; one of the six at random if not given.
+        noise: deviations and sensor noise drawn anew from the distributions of the published
+            draws; else nominal breaths.
+        render_mode: must be None.
+
+    Raises:
+        InputError: if there is no such lung, or the PIP is outside 6..60 cmH2O.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+
+    def __init__(
+        self,
+        lung: str | None = None,
+        pip: float | None = None,
+        noise: bool = True,
+        render_mode: str | None = None,
+    ):
+        if render_mode is not None:
+            raise InputError("this environment draws nothing; leave render_mode out")
+        if pip is not None and not protocol.PEEP < pip <= protocol.SAFETY_PRESSURE:
+            raise InputError(f"PIP {pip:g} cmH2O is outside of 5..60 cmH2O")
+        self.render_mode = None
+        self._lungs = LUNG_IDS if lung is None else (scored_lung(lung).id,)
+        self._pip, self._noise = pip, noise
+        with precision.float32():
+            plants = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), frozen.load().plants)
+            self._plants = [jax.tree.map(lambda x, i=i: x[i], plants) for i in range(len(LUNG_IDS))]
+        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        low, high = np.full(OBSERVATION, -5.0, np.float32), np.full(OBSERVATION, 5.0, np.float32)
+        self.observation_space = spaces.Box(low, high, dtype=np.float32)
+        self._bench: env.Bench | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Floats, dict[str, Any]]:
+        """Begin a breath; see :meth:`gymnasium.Env.reset`. No options are known."""
+        super().reset(seed=seed)
+        self._lung = self._lungs[int(self.np_random.integers(len(self._lungs)))]
+        which, number = self.np_random.integers([len(protocol.PIPS), 2**32])
+        with precision.float32():
+            key = jax.random.key(jnp.asarray(number, jnp.uint32))
+            cell = _cell(key, jnp.asarray(which), self._noise)
+            if self._pip is not None:
+                shift = cell.pip - jnp.asarray(protocol.PIPS, jnp.float32)[int(which)]
+                cell = cell.replace(pip=self._pip + shift)  # type: ignore[attr-defined]
+            self._cell: Scenario = cell
+            self._plant = self._plants[LUNG_IDS.index(self._lung)]
+            self._bench, seen = _start(self._plant, cell)
+        self._count = 0
+        self._total = abs(float(cell.start) - float(cell.pip))
+        return np.asarray(seen), self._info()
+
+    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        """Apply a command; see :meth:`gymnasium.Env.step`.
+
+        Raises:
+            InputError: if no breath is under way, or the action is not finite.
+        """
+        if self._bench is None or self._count >= breaths.STEPS:
+            raise InputError("no breath is under way: call reset() first")
+        value = float(np.asarray(action, np.float32).reshape(-1)[0])
+        if not np.isfinite(value):
+            raise InputError(f"the action is {value}; it must be a number from -1 to 1")
+        with precision.float32():
+            u_in, step = jnp.asarray(50.0 + 50.0 * value), jnp.asarray(self._count)
+            self._bench, seen, error = _step(self._plant, self._cell, self._bench, u_in, step)
+        self._count += 1
+        self._total += float(error)
+        ended = self._count == breaths.STEPS
+        info = self._info()
+        if ended:
+            info["error"] = self._total / protocol.INSPIRATION_STEPS
+        return np.asarray(seen), -float(error) / breaths.REWARD_SCALE, ended, False, info
+
+    def _info(self) -> dict[str, Any]:
+        assert self._bench is not None
+        pressure = float(self._bench.pressure)
+        return {"lung": self._lung, "pip": float(self._cell.pip), "pressure": pressure}
+
+
+def register() -> None:
+    """Make the environment known to Gymnasium, once."""
+    if "ventbench/Ventilator-v1" not in gymnasium.registry:
+        gymnasium.register("ventbench/Ventilator-v1", "ventbench.gym_env:Ventilator")
+
+
+register()

@@ -1,0 +1,123 @@
+"""Where jobs run: in this process, in processes beside it, or on a Dask cluster.
+
+All three are a :class:`concurrent.futures.Executor`. What is run must be a function of a module,
+its arguments small and made of numpy arrays.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Iterator, Mapping
+from concurrent import futures
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+from ventbench.errors import InputError
+
+ResultT = TypeVar("ResultT")
+
+#: How long a cluster may take to answer, s.
+PATIENCE = "15s"
+
+
+class InProcess(futures.Executor):
+    """Runs each job at once, where it is handed in."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> futures.Future[Any]:
+        """Run the job; its exception, unless it ends the program, is kept for who asks."""
+        future: futures.Future[Any] = futures.Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@contextmanager
+def executor(workers: int = 0, scheduler: str | None = None) -> Iterator[futures.Executor]:
+    """Open an executor; what has not begun when the block is left by an error never runs.
+
+    Args:
+        workers: processes on this machine; 0 for none but this one.
+        scheduler: address of a Dask scheduler instead, such as ``tcp://host:8786``.
+
+    Raises:
+        InputError: if both are given, or the scheduler cannot be reached, or Dask is missing.
+    """
+    if scheduler is not None:
+        if workers:
+            raise InputError(
+                f"--workers {workers} and --scheduler {scheduler}: give one of the two"
+            )
+        with _dask(scheduler) as pool:
+            yield pool
+        return
+    if workers < 0:
+        raise InputError(f"--workers {workers} must not be negative")
+    if workers == 0:
+        yield InProcess()
+        return
+    # Not forked: JAX has threads, whose locks a fork would leave closed.
+    pool = futures.ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _dask(scheduler: str) -> Iterator[futures.Executor]:
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise InputError(
+            "--scheduler needs Dask: install ventbench[dask] (pip install 'ventbench[dask]'); "
+            f"import failed with: {error}"
+        ) from error
+    try:
+        client = Client(scheduler, timeout=PATIENCE)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"no Dask scheduler answers at {scheduler}: {error}; start one with `dask scheduler`"
+        ) from error
+    with client:
+        pool = client.get_executor(pure=False)
+        try:
+            yield pool
+        finally:
+            pool.shutdown(wait=False)
+
+
+def results(
+    pool: futures.Executor,
+    function: Callable[..., ResultT],
+    jobs: Mapping[str, tuple[Any, ...]],
+) -> Iterator[tuple[str, ResultT]]:
+    """Run jobs and tell each one's result once, as they end.
+
+    Args:
+        pool: where.
+        function: what.
+        jobs: arguments of each, by name.
+
+    Raises:
+        InputError: if a worker process has died.
+        Exception: whatever a job raises.
+    """
+    # One at a time where a job runs as it is handed in, so that its result is told before the next.
+    window = 1 if isinstance(pool, InProcess) else max(len(jobs), 1)
+    waiting, running = list(jobs.items())[::-1], {}
+    while waiting or running:
+        while waiting and len(running) < window:
+            name, arguments = waiting.pop()
+            running[pool.submit(function, *arguments)] = name
+        done, _ = futures.wait(running, return_when=futures.FIRST_COMPLETED)
+        for future in done:
+            try:
+                result = future.result()
+            except futures.BrokenExecutor as error:
+                raise InputError(
+                    "a worker process died (out of memory?); what was finished is kept: run the "
+                    "same command again, with fewer --workers"
+                ) from error
+            yield running.pop(future), result

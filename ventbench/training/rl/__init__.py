@@ -1,0 +1,1 @@
+"""Learning a correction of the PID: policy gradient through the simulator, PPO, DQN."""

@@ -1,0 +1,86 @@
+"""Policy gradient through the simulator: the error of whole breaths, differentiated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+
+from ventbench.plants.base import Plant
+from ventbench.training.rl import breaths, networks
+from ventbench.training.rl.policies import SCALE, Corrected
+
+
+@flax.struct.dataclass
+class State:
+    """One training: parameters, the optimiser's state, key, number of the iteration."""
+
+    parameters: networks.Parameters
+    optimiser: Any
+    key: Array
+    iteration: Array
+
+
+@dataclass(frozen=True)
+class PolicyGradient:
+    """Recipe; one iteration is one update.
+
+    Attributes:
+        breaths: in an update, PIPs in turn.
+        iterations: of the whole training; the learning rate falls to zero over them.
+        learning_rate: of Adam, at the start.
+        vary: draw cells with noise and deviations; false for nominal ones.
+        widths: hidden layers of the network.
+    """
+
+    breaths: int = 6
+    iterations: int = 1600
+    learning_rate: float = 3e-3
+    vary: bool = True
+    widths: tuple[int, ...] = (32, 32)
+
+    @property
+    def network(self) -> networks.Dense:
+        """One output."""
+        return networks.Dense(self.widths, 1)
+
+    @property
+    def _optimiser(self) -> optax.GradientTransformation:
+        schedule = optax.cosine_decay_schedule(self.learning_rate, self.iterations)
+        return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
+
+    def init(self, key: Array) -> State:
+        """Start one training."""
+        network_key, key = jax.random.split(key)
+        parameters = networks.start(self.network, network_key)
+        return State(parameters, self._optimiser.init(parameters), key, jnp.zeros((), jnp.int32))
+
+    def iterate(self, state: State, plants: Plant) -> State:
+        """One update on lungs with leaves ``(L, ...)``."""
+        cells_key, roll_key, key = jax.random.split(state.key, 3)
+        lungs = jax.tree.leaves(plants)[0].shape[0]
+        cells = breaths.sample(
+            cells_key, self.breaths, lungs, state.iteration * (self.breaths // lungs), self.vary
+        )
+        each = breaths.of_cells(plants, self.breaths)
+
+        def loss(parameters: networks.Parameters) -> Array:
+            def act(key: Array, x: Array, base: Array) -> tuple[Array, None]:
+                mean: Array = self.network.apply(parameters, x)  # type: ignore[assignment]
+                return base + SCALE * mean[..., 0], None
+
+            return -jnp.mean(breaths.roll(each, cells, act, roll_key)[2])
+
+        gradient = jax.grad(loss)(state.parameters)
+        updates, optimiser = self._optimiser.update(gradient, state.optimiser, state.parameters)
+        parameters = optax.apply_updates(state.parameters, updates)
+        return State(parameters, optimiser, key, state.iteration + 1)
+
+    def policy(self, state: State) -> Corrected:
+        """What has been learned."""
+        return Corrected(state.parameters, self.network)

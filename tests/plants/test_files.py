@@ -12,6 +12,7 @@ import pytest
 from ventbench import files as whole_files
 from ventbench.errors import InputError
 from ventbench.lungs import LUNGS
+from ventbench.physics import physics
 from ventbench.plants import files, frozen, registry
 from ventbench.plants.learned import Architecture, learned
 from ventbench.plants.single_compartment import single_compartment
@@ -24,6 +25,7 @@ PLANTS = {
     "TwoBalloon": lambda: two_balloon(LUNGS[0]),
     "Learned": lambda: learned(jax.random.key(0), SMALL),
     "Hybrid": lambda: frozen.load().ensemble,
+    "Physics": lambda: physics(LUNGS[0], {"leak": {"conductance": 8.0}}),
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ventbench.physics.model import Physics
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.learned import Learned
 from ventbench.plants.learned.boundary import Boundary
@@ -11,5 +12,6 @@ from ventbench.plants.two_balloon import TwoBalloon
 
 #: By the name that stands in the files. Parts of plants are types too.
 TYPES: dict[str, type] = {
-    kind.__name__: kind for kind in (Boundary, Hybrid, Learned, MLP, SingleCompartment, TwoBalloon)
+    kind.__name__: kind
+    for kind in (Boundary, Hybrid, Learned, MLP, Physics, SingleCompartment, TwoBalloon)
 }

@@ -1,0 +1,146 @@
+"""The same physics written anew: ordinary differential equations for scipy, one breath at a time.
+
+No code, no discretisation and no state is shared with the package: between all edges of the delayed
+commands an adaptive solver integrates, and the airway's pressure, where it has no state of its own,
+comes from a root finder.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+
+def valve_positions(u_in, m):
+    """What reaches the valve's orifice, as the command of a linear valve, %."""
+    out, stands = [], 0.0
+    for u in u_in:
+        if "command_rounding" in m:
+            u = float(np.floor(u))
+        if "valve_hysteresis" in m:
+            play = m["valve_hysteresis"]["width"] / 2
+            if u - stands > play:
+                stands = u - play
+            elif stands - u > play:
+                stands = u + play
+            u = stands
+        if "valve_dead_band" in m:
+            u = max(0.0, u - m["valve_dead_band"]["width"])
+        if "valve_curve" in m:
+            u = u / (1 + u / 100 * m["valve_curve"]["loss"] / (1 - m["valve_curve"]["loss"]))
+        out.append(u)
+    return out
+
+
+def recoil(volume, C, m):
+    linear = volume / (C / 1000)
+    k = m.get("nonlinear_compliance", {}).get("stiffening", 0.0)
+    return -np.log(1 - k * linear) / k if k else linear
+
+
+class Breath:
+    """Right-hand side; the state is volume, valve, supply, stress, airway, flow and sensor."""
+
+    def __init__(self, R, C, m, R_ex, peep):
+        self.R, self.C, self.m, self.R_ex, self.peep = R, C, m, R_ex, peep
+        self.K2 = self.get("turbulent_resistance", "quadratic")
+        self.tank = self.get("circuit_compliance", "compliance") / 1000
+        self.mass = self.get("inertance", "inertance")
+        self.lag = self.get("valve_lag", "tau")
+        self.slow = self.get("sensor_lag", "tau")
+        self.ratio, self.relax = self.get("viscoelasticity", "ratio"), 1.0
+        if self.ratio:
+            self.relax = m["viscoelasticity"]["time"]
+        assert not self.mass or self.tank, "a gas with mass needs somewhere to go"
+
+    def get(self, mechanism, name):
+        return self.m.get(mechanism, {}).get(name, 0.0)
+
+    def muscle(self, t):
+        if "patient_effort" not in self.m:
+            return 0.0
+        e = self.m["patient_effort"]
+        x = (t - e["onset"]) / e["duration"]
+        return e["amplitude"] * np.sin(np.pi * x) if 0 < x < 1 else 0.0
+
+    def lost(self, p):
+        """Leak, L/s: by an orifice that is rounded off at 0.2 cmH2O."""
+        return self.get("leak", "conductance") / 1000 * p / np.sqrt(np.hypot(p, 0.2))
+
+    def balance(self, t, y, wanted, opened):
+        """Flow of the valve, flow into the lung, flow out, airway pressure."""
+        volume, valve, supply, stress, airway, flow, _ = y
+        q = valve if self.lag else wanted
+        d = self.get("supply_droop", "drop")
+        q = q / (1 + d / (1 - d) * supply / 0.5)
+        inside = recoil(volume, self.C, self.m) + stress - self.muscle(t)
+
+        def into(p):
+            if self.mass:
+                return flow
+            x = p - inside
+            if not self.K2:
+                return x / self.R
+            root = np.sqrt(self.R**2 + 4 * self.K2 * abs(x))
+            return np.sign(x) * (root - self.R) / 2 / self.K2
+
+        def out(p):
+            return opened * max(p - self.peep, 0.0) / self.R_ex
+
+        if not self.tank:
+            airway = brentq(lambda p: q - self.lost(p) - out(p) - into(p), -2000, 3000, xtol=1e-11)
+        return q, into(airway), out(airway), airway, inside
+
+    def slope(self, t, y, wanted, opened):
+        _, valve, supply, stress, _, _, sensor = y
+        q, flow, out, p, inside = self.balance(t, y, wanted, opened)
+        drop = self.R * flow + self.K2 * flow * abs(flow)
+        return [
+            flow,
+            (wanted - valve) / self.lag if self.lag else 0.0,
+            (q - supply) / 1.0,
+            self.ratio / (self.C / 1000) * flow - stress / self.relax,
+            (q - flow - out - self.lost(p)) / self.tank if self.tank else 0.0,
+            (p - inside - drop) / self.mass if self.mass else 0.0,
+            (p - sensor) / self.slow if self.slow else 0.0,
+        ]
+
+
+def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, position=0.0):
+    """Pressure, cmH2O, flow, mL/s, and volume, mL, at each sample, ``(3, T)``."""
+    drift = m.get("sensor_drift", {}).get("drift", 0.0) * position
+    rig, p0 = Breath(R, C, m, R_ex, peep), start - drift
+    v0 = brentq(lambda v: recoil(v, C, m) - p0, -0.01, 0.0239 * C, xtol=1e-14)
+    times = np.concatenate([[0.0], np.cumsum(dt[:-1])])
+    asked = [gain / 1000 * u for u in valve_positions(u_in, m)]
+    late, late_out = rig.get("valve_delay", "delay"), rig.get("exhalation_valve_delay", "opening")
+    edges = set(times) | set(times + late) | set(times + late_out)
+    if "patient_effort" in m:
+        e = m["patient_effort"]
+        edges |= {e["onset"], e["onset"] + e["duration"]}
+    edges = sorted(t for t in edges if t <= times[-1])
+
+    def held(values, before, t):
+        i = int(np.searchsorted(times, t, side="right")) - 1
+        return before if i < 0 else values[i]
+
+    y = np.array([v0, 0.0, 0.0, 0.0, p0, 0.0, p0])
+    rows = [(start, 0.0, 0.0)]
+    for a, b in pairwise(edges):
+        if b - a < 1e-12:
+            continue
+        middle = (a + b) / 2
+        wanted = held(asked, 0.0, middle - late)
+        opened = held(u_out, 0.0, middle - late_out) and held(u_out, 0.0, middle)
+        found = solve_ivp(
+            rig.slope, (a, b), y, "LSODA", rtol=1e-8, atol=1e-10, args=(wanted, opened)
+        )
+        y = found.y[:, -1]
+        if np.any(np.abs(times - b) < 1e-12):
+            _, flow, _, p, _ = rig.balance(b, y, wanted, opened)
+            reading = y[6] if rig.slow else p
+            rows.append((reading + drift, 1000 * flow, 1000 * (y[0] - v0)))
+    return np.array(rows).T

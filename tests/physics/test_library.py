@@ -1,0 +1,90 @@
+"""What every mechanism promises, whatever it is."""
+
+from __future__ import annotations
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ventbench.errors import InputError
+from ventbench.lungs import Lung
+from ventbench.physics import library, mechanism, parameter, paths, physics, strength_path
+from ventbench.precision import float64
+from ventbench.rollout import open_loop
+
+from . import cases
+
+NAMES = """
+valve_delay valve_lag valve_dead_band valve_curve valve_hysteresis command_rounding supply_droop
+leak circuit_compliance inertance turbulent_resistance nonlinear_compliance viscoelasticity
+sensor_lag sensor_drift exhalation_valve_delay patient_effort
+"""
+
+
+@pytest.fixture(scope="module")
+def breaths():
+    return cases.recording(3, {})
+
+
+def test_the_public_names_are_there():
+    assert set(NAMES.split()) <= set(library())
+
+
+@pytest.mark.parametrize("name", library())
+def test_description_is_complete(name):
+    described = mechanism(name).description
+    for text in (described.title, described.equation, described.source, described.signature):
+        assert len(text) > 8
+    assert described.confusable
+    # What is written as a name of the library must be one.
+    assert {x for x in described.confusable if "_" in x} <= set(library()) - {name}
+    assert json.loads(json.dumps(described.as_dict()))["name"] == name
+    assert not described.strength.shape
+    for item in described.parameters:
+        assert item.unit
+        assert item.meaning
+    assert described.strength.mild != described.strength.neutral
+
+
+@pytest.mark.parametrize("name", library())
+def test_neutral_is_off_exactly_and_strong_is_not(name, breaths, predicted):
+    shapes = {p.name: p.strong for p in mechanism(name).description.parameters[1:]}
+    if name == "exhalation_valve_delay":
+        shapes = {"closing": 0.0}  # a second delay, an effect of its own
+    strength = mechanism(name).description.strength
+    # Beside others, of which none may be moved by it.
+    others = {
+        "valve_lag": {"tau": 0.03},
+        "viscoelasticity": {"ratio": 0.3},
+        "circuit_compliance": {"compliance": 1.0},
+        "turbulent_resistance": {"quadratic": 3.0},
+    }
+    others.pop(name, None)
+    without = predicted(breaths, others)
+    off = predicted(breaths, others | {name: shapes | {strength.name: strength.neutral}})
+    np.testing.assert_allclose(off, without, atol=1e-9, rtol=0)
+    on = predicted(breaths, others | {name: shapes | {strength.name: strength.strong}})
+    assert np.abs(on - without).max() > 0.05
+
+
+def test_absent_is_neutral(breaths, predicted):
+    """A plant that does not name a mechanism equals one that has it at neutral."""
+    with float64():
+        plant = physics(Lung(10.0, 25.0), PEEP=5.0)
+        arrays = (breaths.pressure[:, 0], breaths.u_in, breaths.u_out * 1.0, breaths.dt)
+        lean = open_loop(plant, *(jnp.asarray(x) for x in arrays))
+    np.testing.assert_allclose(predicted(breaths, {}), lean, atol=1e-9, rtol=0)
+
+
+def test_names_are_checked():
+    with pytest.raises(InputError, match="choose of circuit_compliance"):
+        mechanism("gremlins")
+    with pytest.raises(InputError, match=r"no parameter 'leak\.size'; leak has conductance"):
+        parameter("leak.size")
+    with pytest.raises(InputError, match="the base has R, C"):
+        parameter("Q")
+    assert strength_path("leak") == "leak.conductance"
+    assert "valve_lag.tau" in paths()
+    assert "valve_lag.tau" not in paths(("leak",))

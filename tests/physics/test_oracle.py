@@ -1,0 +1,67 @@
+"""Each mechanism against its differential equation, written anew and solved by scipy."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ventbench.lungs import Lung
+from ventbench.physics import library, physics
+from ventbench.precision import float64
+
+from . import cases
+
+#: Largest and root mean square difference, cmH2O. Dead times are averages over a substep: a sample
+#: that falls within that time after an edge of the expiratory valve differs.
+TOLERANCE = {
+    "circuit_compliance": (0.04, 0.004),
+    "exhalation_valve_delay": (0.04, 0.008),
+    "inertance": (0.1, 0.02),
+}
+EXACT = (0.004, 0.001)
+
+
+def assert_close(found, solved, tolerance):
+    error = np.abs(found - solved)
+    assert error.max() < tolerance[0]
+    assert np.sqrt(np.mean(error**2)) < tolerance[1]
+
+
+@pytest.mark.parametrize("level", ["mild", "strong"])
+@pytest.mark.parametrize("name", library())
+def test_each_mechanism(name, level, predicted):
+    m = cases.strengths(name, level)
+    breaths = cases.recording(2, m)
+    assert_close(predicted(breaths, m), breaths.pressure, TOLERANCE.get(name, EXACT))
+
+
+@pytest.mark.parametrize(("R", "C"), [(5.0, 10.0), (20.0, 50.0), (50.0, 20.0)])
+def test_base(R, C, predicted):
+    breaths = cases.recording(2, {}, R=R, C=C, gain=15.0, R_ex=8.0)
+    assert_close(predicted(breaths, {}, gain=15.0, R_ex=8.0), breaths.pressure, EXACT)
+
+
+def test_all_together(predicted):
+    m = {}
+    for name in library():
+        m |= cases.strengths(name, "mild")
+    breaths = cases.recording(2, m)
+    assert_close(predicted(breaths, m), breaths.pressure, (0.15, 0.02))
+
+
+def test_flow_and_volume():
+    m = cases.strengths("leak") | cases.strengths("viscoelasticity")
+    breaths = cases.recording(2, m)
+    assert breaths.flow is not None
+    assert breaths.volume is not None
+    with float64():
+        plant = physics(Lung(10.0, 25.0), m, PEEP=5.0)
+        commands = [jnp.asarray(x.T[:-1] * 1.0) for x in (breaths.u_in, breaths.u_out, breaths.dt)]
+        state = plant.init(jnp.asarray(breaths.pressure[:, 0]))
+        _, seen = jax.lax.scan(lambda s, c: plant.observe(s, *c), state, commands)
+    pressure, flow, volume = (np.asarray(x).T for x in seen)
+    np.testing.assert_allclose(pressure, breaths.pressure[:, 1:], atol=0.01)
+    np.testing.assert_allclose(flow, breaths.flow[:, 1:], atol=1.0)
+    np.testing.assert_allclose(volume, breaths.volume[:, 1:], atol=0.3)

@@ -1,0 +1,114 @@
+"""What a fit is made to: commands, times, and what was measured, as plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ventbench.errors import InputError
+from ventbench.recordings.breaths import Breaths
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """n breaths of T samples, c = 1 (pressure) or 2 (pressure and flow) channels.
+
+    Attributes:
+        u_in: inspiratory valve, %, ``(n, T)``.
+        u_out: expiratory valve, 0/1, ``(n, T)``.
+        dt: time to the next sample, s, ``(n, T)``.
+        seen: pressure, cmH2O, and flow, mL/s, zero where not measured, ``(n, c, T)``.
+        weight: 1 where measured, else 0, ``(n, c, T)``.
+        R: labels, cmH2O s/L, ``(n,)``.
+        C: labels, mL/cmH2O, ``(n,)``.
+        position: of each breath in its recording, 0..1, ``(n,)``.
+    """
+
+    u_in: Floats
+    u_out: Floats
+    dt: Floats
+    seen: Floats
+    weight: Floats
+    R: Floats
+    C: Floats
+    position: Floats
+
+    def __len__(self) -> int:
+        """Number of breaths n."""
+        return len(self.u_in)
+
+    @property
+    def lung(self) -> NDArray[np.int64]:
+        """Index of each breath's lung label, from 0, ``(n,)``."""
+        pairs = np.stack([self.R, self.C], axis=1)
+        return np.unique(pairs, axis=0, return_inverse=True)[1].reshape(-1)
+
+    def select(self, which: ArrayLike | slice) -> Data:
+        """Some of the breaths, by mask, index or slice; they keep their positions."""
+        index = which if isinstance(which, slice) else np.asarray(which)
+        return Data(**{name: array[index] for name, array in self._arrays().items()})
+
+    def answered(self, pressure: ArrayLike) -> Data:
+        """The same commands with other pressures, cmH2O, ``(n, T)``: a simulator's answer.
+
+        Where the recording has no pressure the answer does not count either.
+
+        Raises:
+            InputError: if the shape is another, or a pressure that counts is not finite.
+        """
+        pressure = np.asarray(pressure, float)
+        if pressure.shape != self.u_in.shape:
+            raise InputError(
+                f"pressures of shape {pressure.shape} for commands of shape {self.u_in.shape}"
+            )
+        weight = self.weight[:, :1]
+        if not np.all(np.isfinite(pressure[weight[:, 0] > 0])):
+            raise InputError("a pressure of the answer is not finite; use a stable simulator")
+        seen = np.where(weight > 0, pressure[:, None], 0.0)
+        return replace(self, seen=seen, weight=weight)
+
+    def padded(self, count: int) -> Data:
+        """The same with breaths of weight zero behind, so that sizes repeat."""
+        index = np.concatenate([np.arange(len(self)), np.zeros(count - len(self), int)])
+        longer = self.select(index)
+        weight = longer.weight.copy()
+        weight[len(self) :] = 0.0
+        return replace(longer, weight=weight)
+
+    def _arrays(self) -> dict[str, Floats]:
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+
+def recorded(breaths: Breaths, *, flow: bool = False, position: ArrayLike | None = None) -> Data:
+    """Make the data of a fit out of a recording.
+
+    Args:
+        breaths: at least one.
+        flow: use the recorded flow too.
+        position: of each breath in its recording; evenly from 0 to 1 if not given.
+
+    Raises:
+        InputError: if there is no breath, no pressure or, when asked for, no flow.
+    """
+    if len(breaths) == 0:
+        raise InputError("no breaths to fit; choose a recording with at least one")
+    if flow and breaths.flow is None:
+        raise InputError("the recording has no flow; fit its pressure alone")
+    channels = [breaths.pressure] + ([breaths.flow] if flow and breaths.flow is not None else [])
+    seen = np.stack(channels, axis=1)
+    weight = (np.isfinite(seen) & breaths.valid[:, None]).astype(float)
+    if flow:
+        weight[:, 1, 0] = 0.0  # a breath starts at rest
+    if not weight[:, 0].any():
+        raise InputError("no pressure is measured in these breaths")
+    if position is None:
+        position = np.linspace(0.0, 1.0, len(breaths)) if len(breaths) > 1 else np.zeros(1)
+    return Data(
+        breaths.u_in.astype(float), breaths.u_out.astype(float), breaths.dt.astype(float),
+        np.where(weight > 0, seen, 0.0), weight, breaths.R.astype(float), breaths.C.astype(float),
+        np.asarray(position, float),
+    )  # fmt: skip

@@ -1,0 +1,115 @@
+"""The one compiled function of all fits: pressures, and their derivatives along directions.
+
+Every parameter of every mechanism is an input, at its neutral value where a hypothesis leaves it
+out, and a hypothesis only chooses directions: one compilation for all of them.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ventbench.physics.fits.data import Data, Floats
+from ventbench.physics.model import Physics
+from ventbench.physics.times import resolution
+from ventbench.precision import float64
+
+#: Name of what is not a parameter of a plant: the reading that a breath starts from, cmH2O.
+START = "start"
+
+_STATIC = ("names", "substeps", "memory", "flow")
+
+
+def _run(
+    values: Array, commands: tuple[Array, Array, Array], names: tuple[str, ...], substeps: int,
+    memory: int, flow: bool,
+) -> Array:  # fmt: skip
+    plant = Physics(tuple(values.T[:-1]), names, substeps, memory)
+
+    def step(state: object, command: tuple[Array, Array, Array]) -> tuple[object, Array]:
+        state, (pressure, flow_in, _) = plant.observe(state, *command)  # type: ignore[arg-type]
+        return state, jnp.stack([pressure, flow_in] if flow else [pressure])
+
+    start = values[:, -1]
+    held = jax.tree.map(lambda x: jnp.moveaxis(x[:, :-1], 1, 0), commands)
+    _, seen = jax.lax.scan(step, plant.init(start), held)
+    first = jnp.stack([start, 0.0 * start] if flow else [start])
+    return jnp.moveaxis(jnp.concatenate([first[None], seen]), (0, 1, 2), (2, 1, 0))
+
+
+@partial(jax.jit, static_argnames=_STATIC)
+def _predict(values: Array, commands: tuple[Array, Array, Array], **static: object) -> Array:
+    return _run(values, commands, **static)  # type: ignore[arg-type]
+
+
+@partial(jax.jit, static_argnames=_STATIC)
+def _along(
+    values: Array, basis: Array, commands: tuple[Array, Array, Array], **static: object
+) -> tuple[Array, Array]:
+    def run(values: Array) -> Array:
+        return _run(values, commands, **static)  # type: ignore[arg-type]
+
+    def slope(direction: Array) -> Array:
+        return jax.jvp(run, (values,), (jnp.broadcast_to(direction, values.shape),))[1]
+
+    return run(values), jax.vmap(slope)(basis)
+
+
+def _next(count: int, sizes: tuple[int, ...]) -> int:
+    return next((size for size in sizes if size >= count), -(-count // sizes[-1]) * sizes[-1])
+
+
+class Simulator:
+    """All breaths of some data at once, at any parameters; compiled once for each size.
+
+    Attributes:
+        names: paths of the parameters, the columns of ``values``; the last column is the start.
+        substeps: of a sample.
+        memory: samples that dead times can reach back over.
+    """
+
+    def __init__(self, data: Data, names: tuple[str, ...], substeps: int | None = None) -> None:
+        """Pad and place the data.
+
+        Args:
+            data: to simulate.
+            names: paths of the parameters in the order of the columns.
+            substeps: of a sample; enough for most purposes if not given. An edge that a dead time
+                shifts is smoothed over one substep, and the dead time is uncertain by part of it.
+        """
+        self.names = names
+        self._count = len(data)
+        self._padded = data.padded(_next(len(data), (4, 8, 16, 32, 64)))
+        enough, memory = resolution(float(np.median(data.dt)))
+        self.substeps, self.memory = substeps or enough, memory
+        flow = data.seen.shape[1] > 1
+        self._static = {
+            "names": names, "substeps": self.substeps, "memory": memory, "flow": flow
+        }  # fmt: skip
+        with float64():
+            arrays = (self._padded.u_in, self._padded.u_out, self._padded.dt)
+            self._commands = tuple(jnp.asarray(x) for x in arrays)
+
+    def predict(self, values: Floats) -> Floats:
+        """What would be measured, ``(n, c, T)``, at physical values ``(n, P + 1)``."""
+        with float64():
+            seen = _predict(self._pad(values), self._commands, **self._static)
+        return np.asarray(seen)[: self._count]
+
+    def derivatives(self, values: Floats, columns: tuple[int, ...]) -> tuple[Floats, Floats]:
+        """Also its derivatives with respect to k columns of ``values``, ``(n, k, c, T)``."""
+        basis = np.zeros((_next(len(columns), (8, 16, 24, 32)), len(self.names) + 1))
+        basis[np.arange(len(columns)), list(columns)] = 1.0
+        with float64():
+            arrays = self._pad(values), jnp.asarray(basis)
+            seen, slopes = _along(*arrays, self._commands, **self._static)
+        slopes = np.moveaxis(np.asarray(slopes), 0, 1)
+        return np.asarray(seen)[: self._count], slopes[: self._count, : len(columns)]
+
+    def _pad(self, values: Floats) -> Array:
+        extra = len(self._padded) - self._count
+        return jnp.asarray(np.concatenate([values, np.repeat(values[:1], extra, axis=0)]))

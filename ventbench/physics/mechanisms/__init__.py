@@ -1,0 +1,1 @@
+"""One module a mechanism: its description and its physics, as ``MECHANISM``."""

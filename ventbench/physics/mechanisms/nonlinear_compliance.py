@@ -1,0 +1,69 @@
+"""The lung has a capacity: it stiffens as it fills."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from ventbench.physics.mechanism import Description, Mechanism, Values
+from ventbench.physics.network import Network, View
+from ventbench.physics.parameters import Parameter
+
+#: Share of the capacity up to which the curve is followed.
+_FULL = 0.9
+
+
+class NonlinearCompliance(Mechanism):
+    """A recoil that rises faster than volume."""
+
+    description = Description(
+        name="nonlinear_compliance",
+        title="lung that stiffens as it fills",
+        site="alveolus",
+        equation="P_elastic = -ln(1 - stiffening V / C) / stiffening",
+        parameters=(
+            Parameter(
+                "stiffening",
+                "1/cmH2O",
+                "1 over (capacity / C); negative: the lung softens",
+                -0.05,
+                0.08,
+                0.0,
+                1 / 40,
+                1 / 24,
+            ),
+        ),
+        source=(
+            "Exponential pressure-volume curve of Salazar and Knowles (J. Appl. Physiol. "
+            "19, 1964, 97), the upper half of the sigmoid of Venegas, Harris and Simon (J. "
+            "Appl. Physiol. 84, 1998, 389). 5 to 50 % of the volume missing at 30 cmH2O."
+        ),
+        signature=(
+            "Pressure rises faster at high volume: end of inspiration of big breaths; "
+            "expiration begins faster."
+        ),
+        confusable=("valve_curve", "leak"),
+        detectable=0.01,
+    )
+
+    def network(self, values: Values, network: Network, view: View) -> Network:
+        """Tangent of the curve at the last volume, less the linear lung's."""
+        k = values["stiffening"]
+        linear = view.elastance * view.volume  # cmH2O
+        full = k * linear > _FULL  # from here on the curve goes on as its tangent
+        within = jnp.where(full, _FULL / jnp.where(full, k, 1.0), linear)
+        x = k * within
+        slope = 1.0 / (1.0 - x)
+        recoil = within * _log_ratio(x) + (linear - within) * slope
+        return network.plus(recoil=recoil - linear, elastance=(slope - 1.0) * view.elastance)
+
+
+def _log_ratio(x: Array) -> Array:
+    """Return ``-ln(1 - x) / x``, for any ``x`` below 1 and with its derivatives at zero."""
+    small = jnp.abs(x) < 1e-2
+    safe = jnp.where(small, 0.5, x)
+    series = 1.0 + x * (1 / 2 + x * (1 / 3 + x * (1 / 4 + x * (1 / 5 + x * (1 / 6 + x / 7)))))
+    return jnp.where(small, series, -jnp.log1p(-safe) / safe)
+
+
+MECHANISM = NonlinearCompliance()

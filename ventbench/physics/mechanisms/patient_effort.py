@@ -1,0 +1,66 @@
+"""The patient breathes in."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from ventbench.physics.mechanism import Description, Mechanism, Values
+from ventbench.physics.network import Network, View
+from ventbench.physics.parameters import Parameter
+
+
+class PatientEffort(Mechanism):
+    """A pressure source at the alveolus, half a sine long."""
+
+    description = Description(
+        name="patient_effort",
+        title="effort of the patient's muscles",
+        site="alveolus",
+        equation="P_alveolus = ... - amplitude sin(pi (t - onset) / duration) during the effort",
+        parameters=(
+            Parameter(
+                "amplitude",
+                "cmH2O",
+                "highest pressure of the muscles, positive if inspiratory",
+                -20.0,
+                20.0,
+                0.0,
+                2.0,
+                5.0,
+                scope="breath",
+                scan=(2.0, -2.0),
+            ),
+            Parameter(
+                "onset",
+                "s",
+                "after the first sample",
+                0.0,
+                2.5,
+                0.3,
+                0.3,
+                0.3,
+                scope="breath",
+                scan=(0.05, 0.3, 0.6, 0.9, 1.2, 1.6),
+            ),
+            Parameter("duration", "s", "of the effort", 0.2, 2.0, 0.8, 0.8, 0.8),
+        ),
+        source=(
+            "Half-sine muscle pressure, as active lung simulators "
+            "take it: 1 to 15 cmH2O for 0.4 to 1.2 s."
+        ),
+        signature=(
+            "A dent in pressure that the commands do not explain and that differs from "
+            "breath to breath: absent in some, early or late in others."
+        ),
+        confusable=("a source at the alveolus that repeats in every breath",),
+        detectable=0.3,
+    )
+
+    def network(self, values: Values, network: Network, view: View) -> Network:
+        """Muscles pull at the alveolus."""
+        phase = (view.time - values["onset"]) / values["duration"]
+        pull = values["amplitude"] * jnp.sin(jnp.pi * jnp.clip(phase, 0.0, 1.0))
+        return network.plus(recoil=-pull)
+
+
+MECHANISM = PatientEffort()

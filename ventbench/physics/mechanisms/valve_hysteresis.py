@@ -1,0 +1,46 @@
+"""The inspiratory valve stands higher when closing than when opening."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from ventbench.physics.mechanism import Description, Mechanism, Values
+from ventbench.physics.parameters import Parameter
+
+
+class ValveHysteresis(Mechanism):
+    """Rate-independent memory of the command."""
+
+    description = Description(
+        name="valve_hysteresis",
+        title="play of the inspiratory valve",
+        site="inspiratory valve",
+        equation="u_effective = clip(u_effective before, u - width / 2, u + width / 2)",
+        parameters=(
+            Parameter("width", "%", "command lost at every reversal", 0.0, 15.0, 0.0, 2.0, 5.0),
+        ),
+        source=(
+            "Play (backlash) operator: friction and slack between driver and seat, or "
+            "opening and closing tables that differ. 3.8 % of full scale was measured on "
+            "the PVP's valve."
+        ),
+        signature=(
+            "After each reversal of the command flow stays where it was; error of one sign "
+            "while the command rises and of the other while it falls."
+        ),
+        confusable=("valve_dead_band", "valve_delay"),
+        detectable=0.1,
+    )
+
+    rank = 1
+    remembers = True
+
+    def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
+        """Where the valve stands, %, and that it is remembered."""
+        half = 0.5 * values["width"]
+        stands = jnp.minimum(jnp.maximum(memory, u_in - half), u_in + half)
+        return stands, stands
+
+
+MECHANISM = ValveHysteresis()

@@ -1,0 +1,193 @@
+"""The lung on its ventilator, with any set of mechanisms: a plant that can be fitted.
+
+Between samples the commands are held. Dead times are exact for held commands (see ``times``).
+Everything else is integrated by the two-stage SDIRK method of Alexander (SIAM J. Numer. Anal. 14,
+1977, 1006): second order and L-stable, so that a circuit without compliance and a gas without
+inertance, whose equations are algebraic, need no case of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax import Array
+from numpy.typing import ArrayLike
+
+from ventbench.errors import InputError
+from ventbench.lungs import Lung
+from ventbench.physics import stage, times
+from ventbench.physics.catalogue import library, parameter, paths
+from ventbench.physics.stage import Parts, Stage
+
+
+@flax.struct.dataclass
+class PhysicsState:
+    """State between two samples; every array has shape ``(...)`` unless it says otherwise.
+
+    Attributes:
+        now: continuous states: see :class:`~ventbench.physics.stage.Stage`.
+        memory: what mechanisms remember from sample to sample, by name.
+        commanded: flows that the last commands ask for, the latest first, L/s, ``(..., memory)``.
+        opened: expiratory valve during the last samples, likewise, 0/1.
+        past: durations of the last samples, likewise, s.
+        time: since the start of the breath, s.
+        first: volume of the lung at the start, L.
+        peep: pressure behind the expiratory valve, cmH2O.
+    """
+
+    now: Stage
+    memory: dict[str, Array]
+    commanded: Array
+    opened: Array
+    past: Array
+    time: Array
+    first: Array
+    peep: Array
+
+
+@flax.struct.dataclass
+class Physics:
+    """Base model and mechanisms; parameters that are not named stand at their neutral values.
+
+    Attributes:
+        values: one array ``()`` or ``(...)`` a name.
+        names: paths of parameters, such as ``R`` or ``valve_delay.delay``. A mechanism acts if any
+            of its parameters is named; one at its neutral strength changes nothing.
+        substeps: of a sample.
+        memory: samples that dead times can reach back over.
+    """
+
+    values: tuple[Array, ...]
+    names: tuple[str, ...] = flax.struct.field(pytree_node=False)
+    substeps: int = flax.struct.field(pytree_node=False, default=times.SUBSTEPS)
+    memory: int = flax.struct.field(pytree_node=False, default=times.MEMORY)
+
+    def init(self, pressure: Array, peep: Array | None = None) -> PhysicsState:
+        """Lung at rest, expiratory valve open; see :class:`~ventbench.plants.base.Plant`.
+
+        Without ``peep``, the parameter ``PEEP`` is taken, and without that the pressure.
+        """
+        parts = self._parts()
+        pressure = jnp.asarray(pressure) * 1.0
+        shape = jnp.broadcast_shapes(pressure.shape, *(jnp.shape(v) for v in self.values))
+        shown = jnp.broadcast_to(pressure, shape)
+        if peep is None:
+            peep = parts.base["PEEP"] if "PEEP" in self.names else shown
+        u_in = parts.base["rest"] + 0.0 * shown
+        memory = {name: u_in for name, item in parts.mechanisms.items() if item.remembers}
+        flow, memory = stage.commanded(parts, u_in, memory)
+        now, one = stage.at_rest(parts, shown, flow), jnp.ones_like(flow)
+        return PhysicsState(
+            now, memory, _repeat(flow, self.memory + 1), _repeat(one, self.memory + 1),
+            _repeat(0.03 * one, self.memory), 0.0 * one, now.volume, peep * one,
+        )  # fmt: skip
+
+    def step(
+        self, state: PhysicsState, u_in: Array, u_out: Array, dt: Array
+    ) -> tuple[PhysicsState, Array]:
+        """Hold one command; see :class:`~ventbench.plants.base.Plant`."""
+        after, seen = self.observe(state, u_in, u_out, dt)
+        return after, seen[0]
+
+    def observe(
+        self, state: PhysicsState, u_in: Array, u_out: Array, dt: Array
+    ) -> tuple[PhysicsState, tuple[Array, Array, Array]]:
+        """Hold one command, and see more than pressure.
+
+        Args:
+            state: from ``init``, ``step`` or ``observe``.
+            u_in: inspiratory valve, 0..100 %.
+            u_out: expiratory valve, 0 closed, 1 open.
+            dt: time for which the command is held, s.
+
+        Returns:
+            The next state; measured airway pressure, cmH2O, flow into the lung, mL/s, and volume
+            above that of the first sample, mL, all at the end of ``dt``.
+        """
+        parts = self._parts()
+        zero = jnp.zeros_like(state.time)
+        flow, memory = stage.commanded(parts, u_in + zero, state.memory)
+        commanded = _push(flow, state.commanded)
+        opened = _push(u_out + zero, state.opened)
+        late = parts.total(lambda item, own: item.dead_time(own))
+        late_out = parts.total(lambda item, own: item.outlet_dead_time(own, u_out))
+        lengths = times.lengths(dt + zero, state.past, (late_out, late), self.substeps)
+        wanted = times.held(late, lengths, state.past, commanded)
+        open_for = times.held(late_out, lengths, state.past, opened)
+
+        def substep(carry: tuple[Any, Array], held: tuple[Array, ...]) -> tuple[Any, None]:
+            (now, time), (wanted, opened, h) = carry, held
+            now = stage.substep(parts, now, wanted, opened, time, h, state.peep)
+            return (now, time + h), None
+
+        # A loop, since unrolled XLA compiles for minutes and computes the same thing many times.
+        held = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), (wanted, open_for, lengths))
+        (now, time), _ = jax.lax.scan(substep, (state.now, state.time), held)
+        after = PhysicsState(
+            now, memory, commanded[..., :-1], opened[..., :-1],
+            _push(dt + zero, state.past)[..., :-1], time, state.first, state.peep,
+        )  # fmt: skip
+        volume = 1000.0 * (now.volume - state.first)
+        return after, (stage.shown(parts, now.reading), 1000.0 * now.flow, volume)
+
+    def vary(self, r_scale: Array, c_scale: Array) -> Physics:
+        """Return the same lung with another resistance and compliance."""
+        scales = {"R": r_scale, "C": c_scale}
+        varied = [
+            value * scales.get(parameter(name).follows or "", 1.0)
+            for name, value in zip(self.names, self.values, strict=True)
+        ]
+        return self.replace(values=tuple(varied))  # type: ignore[attr-defined]
+
+    def get(self, name: str) -> Array:
+        """Value of a parameter, named or not."""
+        if name in self.names:
+            return self.values[self.names.index(name)]
+        return jnp.asarray(parameter(name).neutral)
+
+    def having(self, **values: Any) -> Physics:
+        """Return a copy with other parameters; ``having(**{"valve_delay.delay": 0.04})``.
+
+        Raises:
+            InputError: if there is no such parameter.
+        """
+        named = dict(zip(self.names, self.values, strict=True))
+        named |= {name: jnp.asarray(value, float) for name, value in values.items()}
+        names = tuple(name for name in paths() if name in named)
+        if unknown := set(named) - set(names):
+            raise InputError(f"no parameter {sorted(unknown)} in the physics; see `paths()`")
+        return self.replace(  # type: ignore[attr-defined]
+            names=names, values=tuple(named[name] for name in names)
+        )
+
+    def _parts(self) -> Parts:
+        return stage.parts(dict(zip(self.names, self.values, strict=True)), library())
+
+
+def physics(
+    lung: Lung, mechanisms: Mapping[str, Mapping[str, ArrayLike]] | None = None, **base: ArrayLike
+) -> Physics:
+    """Build a lung on its ventilator.
+
+    Args:
+        lung: R, cmH2O/(L/s), and C, mL/cmH2O.
+        mechanisms: parameters by mechanism, ``{"valve_delay": {"delay": 0.04}}``.
+        base: other base parameters, ``gain=20.0``.
+
+    Raises:
+        InputError: if there is no such mechanism or parameter.
+    """
+    own = {f"{m}.{p}": x for m, given in (mechanisms or {}).items() for p, x in given.items()}
+    return Physics((), ()).having(R=lung.R, C=lung.C, **base, **own)
+
+
+def _repeat(value: Array, count: int) -> Array:
+    return jnp.repeat(value[..., None], count, axis=-1)
+
+
+def _push(value: Array, before: Array) -> Array:
+    return jnp.concatenate([value[..., None], before], axis=-1)

@@ -1,0 +1,116 @@
+"""One number of the physics: what it means, in which unit, between which bounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ventbench.errors import InputError
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A scalar parameter, and how a fit is to treat it.
+
+    Attributes:
+        name: short, such as ``delay``.
+        unit: of its values, ``1`` if there is none.
+        meaning: what it is, in words.
+        low: plausible and permitted from here,
+        high: to here.
+        neutral: value at which its mechanism does nothing; of a shape parameter, the default.
+        mild: a small effect that occurs, and where a fit starts.
+        strong: a large one.
+        scale: ``"log"`` for what is positive and known to a factor; else ``"linear"``.
+        scope: ``"shared"`` by all breaths, or one for each ``"breath"``.
+        shape: True for what only shapes the effect (an exponent, a recovery time): it stays at
+            ``neutral`` unless a fit is asked to free it.
+        follows: ``"R"`` or ``"C"`` if it scales with the lung's R or C.
+        scan: values that a search must also try, as it may end in the wrong minimum.
+        kinked: True for a dead time: the likelihood is flat between two samples and falls off
+            steeply where an edge passes one, so that its interval is a profile's.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    low: float
+    high: float
+    neutral: float
+    mild: float
+    strong: float
+    scale: Literal["linear", "log"] = "linear"
+    scope: Literal["shared", "breath"] = "shared"
+    shape: bool = False
+    follows: str | None = None
+    scan: tuple[float, ...] = ()
+    kinked: bool = False
+
+    def __post_init__(self) -> None:
+        """Check what the transforms rely on.
+
+        Raises:
+            ValueError: if the bounds are out of order or the scale does not fit.
+        """
+        values = (self.neutral, self.mild, self.strong)
+        if not self.low < self.high or not all(self.low <= x <= self.high for x in values):
+            raise ValueError(f"{self.name}: {values} must lie within {self.low}..{self.high}")
+        if self.scale == "log" and self.low <= 0:
+            raise ValueError(f"{self.name}: a log scale needs a positive lower bound")
+
+    def coordinate(self, value: ArrayLike) -> NDArray[np.float64]:
+        """Where a fit sees a physical value: its logarithm on a log scale, else itself.
+
+        A linear scale lets a fit reach ``neutral`` at a bound, with a derivative that is not zero.
+        """
+        value = np.asarray(value, float)
+        return np.log(value) if self.scale == "log" else value
+
+    def physical(self, coordinate: ArrayLike) -> NDArray[np.float64]:
+        """Inverse of :meth:`coordinate`."""
+        coordinate = np.asarray(coordinate, float)
+        return np.exp(coordinate) if self.scale == "log" else coordinate
+
+    def slope(self, value: ArrayLike) -> NDArray[np.float64]:
+        """Derivative of the physical value with respect to the coordinate."""
+        value = np.asarray(value, float)
+        return value if self.scale == "log" else np.ones_like(value)
+
+    def unconstrain(self, value: ArrayLike) -> NDArray[np.float64]:
+        """Any real number for a value within the bounds: logit of where it lies between them.
+
+        For samplers and optimisers without bounds; on a log scale it is the logarithm that lies
+        between. The bounds themselves are at minus and plus infinity.
+
+        Raises:
+            InputError: if a value is outside.
+        """
+        value = np.asarray(value, float)
+        if np.any((value < self.low) | (value > self.high)):
+            raise InputError(
+                f"{self.name} = {value} is outside {self.low}..{self.high} {self.unit}"
+            )
+        low, high = self.coordinate(self.low), self.coordinate(self.high)
+        share = (self.coordinate(value) - low) / (high - low)
+        with np.errstate(divide="ignore"):
+            return np.log(share) - np.log1p(-share)
+
+    def constrain(self, real: ArrayLike) -> NDArray[np.float64]:
+        """Inverse of :meth:`unconstrain`."""
+        real = np.asarray(real, float)
+        low, high = self.coordinate(self.low), self.coordinate(self.high)
+        return self.physical(low + (high - low) * 0.5 * (1.0 + np.tanh(0.5 * real)))
+
+    def prior(self) -> tuple[float, float]:
+        """Mean and standard deviation, in coordinates, of what is plausible before any data.
+
+        On a log scale the bounds are two standard deviations off; on a linear one, values are
+        likeliest near ``neutral``, and half the range off is one standard deviation.
+        """
+        low, high = float(self.coordinate(self.low)), float(self.coordinate(self.high))
+        if self.scale == "log":
+            return 0.5 * (low + high), 0.25 * (high - low)
+        return self.neutral, 0.5 * (high - low)

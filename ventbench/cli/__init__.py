@@ -11,7 +11,20 @@ import sys
 import typer
 
 from ventbench import __version__
-from ventbench.cli import board, data, rl, run, score, simulators, submit, train, tune, view
+from ventbench.cli import (
+    board,
+    challenge,
+    data,
+    diagnose,
+    rl,
+    run,
+    score,
+    simulators,
+    submit,
+    train,
+    tune,
+    view,
+)
 from ventbench.errors import InputError
 
 app = typer.Typer(
@@ -48,6 +61,8 @@ train.register(simulators.train)
 rl.register(app, simulators.train)
 view.register(app)
 board.register(app)
+diagnose.register(app)
+challenge.register(app)
 app.add_typer(data.app)
 
 

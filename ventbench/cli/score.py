@@ -38,6 +38,13 @@ def score(
         Path | None,
         typer.Option(metavar="DIR", help="Keep a record here, for `board add`; needs --draws 20."),
     ] = None,
+    plant: Annotated[
+        str,
+        typer.Option(
+            metavar="frozen|physics|hybrid|FILE",
+            help="Simulators: the official ones, R-C lungs, or a corrected.json of `diagnose`.",
+        ),
+    ] = "frozen",
     in_process: Annotated[
         bool,
         typer.Option("--in-process", help="Run without the sandbox: only for code that you trust."),
@@ -47,14 +54,15 @@ def score(
     """Score controllers on the six frozen lung simulators.
 
     Lower is better: mean |pressure - target| over the inspirations, cmH2O. Every controller runs in
-    locked-down processes that see nothing of the simulators.
+    locked-down processes that see nothing of the simulators. With another --plant the lungs are
+    its own, and the score is not official.
 
     Example: `ventbench score submissions/pid_best --json score.json`
     """
     from rich.console import Console
 
+    from ventbench.cli.plants import choose
     from ventbench.errors import InputError
-    from ventbench.plants import frozen
     from ventbench.submissions.folder import open_submission
     from ventbench.submissions.scoring import score as run
 
@@ -67,9 +75,13 @@ def score(
     if len(set(names)) < len(names):
         raise InputError(f"two submissions have the same name: {', '.join(sorted(names))}")
     progress = Console(stderr=True)
-    simulators = frozen.load()
+    simulators = choose(plant)
+    if record is not None and simulators.official is None:
+        raise InputError("--record is for the official simulators: leave --plant out")
     runner = _runner(in_process)
-    if not (runner.sandbox or {}).get("official"):
+    if simulators.official is None:
+        progress.print(f"These scores are not official: simulators of {plant}.", style="yellow")
+    elif not (runner.sandbox or {}).get("official"):
         progress.print("These scores are not official: no full sandbox.", style="yellow")
     results = []
     for submission in opened:
@@ -80,11 +92,14 @@ def score(
                     simulators.plants,
                     track=track,
                     draws=draws,
+                    lungs=simulators.lungs,
                     runner=runner,
-                    simulators=simulators.about(),
+                    simulators=simulators.about,
                 )
             )
     plain = [result.to_json() for result, _ in results]
+    if simulators.official is None:
+        plain = [one | {"official": False} for one in plain]
     emit(plain[0] if len(plain) == 1 else {"submissions": plain}, json)
     console = Console(stderr=str(json) == "-")
     console.print(_table(plain))
@@ -94,10 +109,11 @@ def score(
     if out is not None:
         for path in _keep(out, results, plain, report):
             console.print(f"wrote {path}", markup=False, highlight=False)
-    if record is not None:
+    if record is not None and simulators.official is not None:
         from ventbench.board import create
 
-        for path in create.keep(record, [result for result, _ in results], simulators):
+        kept = create.keep(record, [result for result, _ in results], simulators.official)
+        for path in kept:
             console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
     if any(result.failures for result, _ in results):
         raise typer.Exit(1)
@@ -117,8 +133,6 @@ def _table(scores: list[dict[str, Any]]) -> Table:
     """One row a lung, one column a submission; from their JSON values."""
     from rich.table import Table
 
-    from ventbench.lungs import LUNG_IDS
-
     def show(value: float | None) -> str:
         return "failed" if value is None else f"{value:.3f}"
 
@@ -126,7 +140,7 @@ def _table(scores: list[dict[str, Any]]) -> Table:
     table.add_column("lung")
     for one in scores:
         table.add_column(f"{one['name']}\n{one['track']}", justify="right")
-    for lung in LUNG_IDS:
+    for lung in scores[0]["lungs"]:
         table.add_row(lung, *(show(one["lungs"][lung]["score"]) for one in scores))
     table.add_section()
     table.add_row("mean", *(show(one["score"]) for one in scores), style="bold")

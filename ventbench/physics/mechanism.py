@@ -72,6 +72,8 @@ class Mechanism:
     stateful: bool = False
     #: True if it remembers something from sample to sample; it starts as the resting command.
     remembers: bool = False
+    #: True if it looks at the breath's position in the recording.
+    positioned: bool = False
 
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
         """What opens the inspiratory valve, %, and what is remembered, once a sample."""
@@ -86,7 +88,10 @@ class Mechanism:
         return 0.0
 
     def rest(self, values: Values, flow: Array, pressure: Array) -> Array:
-        """Its state at the start of a breath, from the resting inflow, L/s, and cmH2O."""
+        """Its state at the start of a breath, from the resting inflow, L/s, and cmH2O.
+
+        One that keeps several states stacks them along a first axis, ``(K, ...)``.
+        """
         return flow * 0.0
 
     def inflow(

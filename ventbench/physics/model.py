@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from ventbench.errors import InputError
 from ventbench.lungs import Lung
 from ventbench.physics import stage, times
-from ventbench.physics.catalogue import library, parameter, paths
+from ventbench.physics.catalogue import everything, parameter, paths
 from ventbench.physics.stage import Parts, Stage
 
 
@@ -157,7 +157,7 @@ class Physics:
         """
         named = dict(zip(self.names, self.values, strict=True))
         named |= {name: jnp.asarray(value, float) for name, value in values.items()}
-        names = tuple(name for name in paths() if name in named)
+        names = tuple(name for name in paths(tuple(everything())) if name in named)
         if unknown := set(named) - set(names):
             raise InputError(f"no parameter {sorted(unknown)} in the physics; see `paths()`")
         return self.replace(  # type: ignore[attr-defined]
@@ -165,7 +165,7 @@ class Physics:
         )
 
     def _parts(self) -> Parts:
-        return stage.parts(dict(zip(self.names, self.values, strict=True)), library())
+        return stage.parts(dict(zip(self.names, self.values, strict=True)), everything())
 
 
 def physics(

@@ -16,11 +16,15 @@ class View:
         volume: of the lung before the step, L; ``volume / C`` is its recoil if it is linear.
         pressure: at the airway, the last one known, cmH2O.
         flow: into the lung, likewise, L/s.
-        state: what the mechanism itself keeps, before the step (0 if it keeps nothing).
+        state: what the mechanism itself keeps, before the step (0 if it keeps nothing); one that
+            keeps several has them along a first axis, ``(K, ...)``.
         length: of the implicit step, s.
         elastance: 1/C of the lung, cmH2O/L.
         peep: pressure behind the expiratory valve, cmH2O.
         position: of the breath in the recording, 0..1.
+        resistance: R of the airway, cmH2O s/L.
+        outlet: conductance of the open expiratory valve, 1 / R_ex, L/s per cmH2O.
+        opened: expiratory valve, 0 closed, 1 open.
     """
 
     time: Array
@@ -32,6 +36,9 @@ class View:
     elastance: Array
     peep: Array
     position: Array
+    resistance: Array
+    outlet: Array
+    opened: Array
 
 
 @flax.struct.dataclass

@@ -32,6 +32,8 @@ class Parameter:
         scan: values that a search must also try, as it may end in the wrong minimum.
         kinked: True for a dead time: the likelihood is flat between two samples and falls off
             steeply where an edge passes one, so that its interval is a profile's.
+        spread: standard deviation before any data, in coordinates, around ``neutral``; given for
+            what must stay there where no data bear on it, be it a strength.
     """
 
     name: str
@@ -48,6 +50,7 @@ class Parameter:
     follows: str | None = None
     scan: tuple[float, ...] = ()
     kinked: bool = False
+    spread: float | None = None
 
     def __post_init__(self) -> None:
         """Check what the transforms rely on.
@@ -108,8 +111,11 @@ class Parameter:
         """Mean and standard deviation, in coordinates, of what is plausible before any data.
 
         On a log scale the bounds are two standard deviations off; on a linear one, values are
-        likeliest near ``neutral``, and half the range off is one standard deviation.
+        likeliest near ``neutral``, and half the range off is one standard deviation. ``spread``, if
+        it is given, overrules both.
         """
+        if self.spread is not None:
+            return float(self.coordinate(self.neutral)), self.spread
         low, high = float(self.coordinate(self.low)), float(self.coordinate(self.high))
         if self.scale == "log":
             return 0.5 * (low + high), 0.25 * (high - low)

@@ -29,7 +29,7 @@ class Stage:
         flow: into the lung, L/s.
         pressure: at the airway, cmH2O.
         reading: pressure at the sensor's output, cmH2O.
-        own: states of mechanisms, by name.
+        own: states of mechanisms, by name; of one that keeps several, ``(K, ...)``.
     """
 
     volume: Array
@@ -54,6 +54,8 @@ class Parts:
 
 def parts(named: Mapping[str, Array], library: Mapping[str, Mechanism]) -> Parts:
     """Sort parameters, given by path, and fill in what is not named."""
+    # Arrays of numpy, as a file gives them, become what dead times are told by.
+    named = {path: jnp.asarray(value) for path, value in named.items()}
     owners = {path.rpartition(".")[0] for path in named}
     acting = sorted((n for n in library if n in owners), key=lambda n: (library[n].rank, n))
     own = {}
@@ -146,17 +148,18 @@ def _implicit(
         values = parts.own[name]
         reading, kept = item.reading(values, reading, own.get(name, reading), length)
         if item.stateful:
-            view = _view(parts, start, guess, kept, time, length, peep)
+            view = _view(parts, start, guess, kept, opened, time, length, peep)
             own[name] = item.settle(values, kept, flow, view)
     return Stage(start.volume + flow * length, flow, pressure, reading, own)
 
 
 def _view(
-    parts: Parts, start: Stage, guess: Stage, own: Array, time: Array, length: Array, peep: Array
-) -> View:
+    parts: Parts, start: Stage, guess: Stage, own: Array, opened: Array, time: Array, length: Array,
+    peep: Array,
+) -> View:  # fmt: skip
     return View(
         time, start.volume, guess.pressure, guess.flow, own, length, 1e3 / parts.base["C"], peep,
-        parts.base["position"],
+        parts.base["position"], parts.base["R"], 1.0 / parts.base["R_ex"], opened,
     )  # fmt: skip
 
 
@@ -179,6 +182,6 @@ def _network(
     )  # fmt: skip
     for name, item in parts.mechanisms.items():
         own = start.own.get(name, zero)
-        view = _view(parts, start, guess, own, time, length, peep)
+        view = _view(parts, start, guess, own, opened, time, length, peep)
         network = item.network(parts.own[name], network, view)
     return network

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ventbench.physics.model import Physics
+from ventbench.plants.corrected import Corrected
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.learned import Learned
 from ventbench.plants.learned.boundary import Boundary
@@ -13,5 +14,14 @@ from ventbench.plants.two_balloon import TwoBalloon
 #: By the name that stands in the files. Parts of plants are types too.
 TYPES: dict[str, type] = {
     kind.__name__: kind
-    for kind in (Boundary, Hybrid, Learned, MLP, Physics, SingleCompartment, TwoBalloon)
+    for kind in (
+        Boundary,
+        Corrected,
+        Hybrid,
+        Learned,
+        MLP,
+        Physics,
+        SingleCompartment,
+        TwoBalloon,
+    )
 }

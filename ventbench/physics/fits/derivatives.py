@@ -83,7 +83,7 @@ class Simulator:
         """
         self.names = names
         self._count = len(data)
-        self._padded = data.padded(_next(len(data), (4, 8, 16, 32, 64)))
+        self._padded = data.padded(_next(len(data), (4, 8, 16, 24, 32, 40, 48, 64)))
         enough, memory = resolution(float(np.median(data.dt)))
         self.substeps, self.memory = substeps or enough, memory
         flow = data.seen.shape[1] > 1

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ventbench.physics.catalogue import paths
+from ventbench.physics.catalogue import mechanism, paths
 from ventbench.physics.fits import starts
 from ventbench.physics.fits.data import Data, Floats
 from ventbench.physics.fits.derivatives import START, Simulator
@@ -72,7 +72,7 @@ class Fit:
     def plant(self, breath: int | slice = slice(None)) -> Physics:
         """The fitted plant, in float64: one breath's, or a stack over breaths."""
         names = [name for name in paths(self.mechanisms) if name != "position"]
-        names += ["position"] if "sensor_drift" in self.mechanisms else []
+        names += ["position"] if any(mechanism(m).positioned for m in self.mechanisms) else []
         simulator = self.problem.simulator
         with float64():
             given = {name: self.column(name)[breath] for name in names}

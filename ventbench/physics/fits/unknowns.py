@@ -75,14 +75,15 @@ class Unknowns:
     def prior(self, given: Mapping[str, tuple[float, float]]) -> tuple[Floats, Floats]:
         """Means and precisions (1 / variance) in coordinates, ``(U,)``; precision 0 if none.
 
-        What shapes an effect has its own prior, as no data bear on it while the effect is off.
+        What shapes an effect has its own prior, as no data bear on it while the effect is off, and
+        so has a strength with a ``spread``.
         """
         mean, precision = np.zeros(len(self.path_of)), np.zeros(len(self.path_of))
         for path in self.paths:
             owner = path.rpartition(".")[0]
             if path in given:
                 centre, width = given[path]
-            elif owner and path != strength_path(owner):
+            elif owner and (path != strength_path(owner) or parameter(path).spread is not None):
                 centre, width = parameter(path).prior()
             else:
                 continue

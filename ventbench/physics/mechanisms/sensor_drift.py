@@ -51,6 +51,7 @@ class SensorDrift(Mechanism):
     )
 
     rank = 1
+    positioned = True
 
     def shown(self, values: Values, pressure: Array, position: Array) -> Array:
         """Drifted pressure."""

@@ -1,0 +1,183 @@
+"""``ventbench challenge``: recordings with concealed effects, answers, and scores."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from ventbench.cli.options import JsonFile, emit
+
+challenge = typer.Typer(
+    name="challenge",
+    help="Prove the diagnosis on recordings whose effects are concealed.",
+    no_args_is_help=True,
+)
+
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the challenge.")]
+Seed = Annotated[str, typer.Option(help="The secret that the challenge is drawn from; any text.")]
+Round = Annotated[
+    int, typer.Option("--round", min=1, max=2, help="2: with the breaths that were asked for.")
+]
+Kind = Literal["single", "null", "pair", "four", "outside", "form", "masked", "all"]
+
+
+@challenge.command()
+def make(
+    seed: Seed,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write.")],
+    cases: Annotated[int, typer.Option(min=1, help="How many recordings.")] = 200,
+    kind: Annotated[
+        Kind,
+        typer.Option(
+            help="one effect, none, two, four, one outside the library, one in another form, "
+            "one in few closed-loop breaths; or some of each."
+        ),
+    ] = "all",
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+) -> None:
+    """Write recordings with concealed effects, and the answers under seal.
+
+    DIR/recordings and DIR/cases.json are for everyone; commitment.txt is the SHA-256 of the
+    answers: publish it before anyone looks. The same seed, kind and number give the same files.
+
+    Example: `ventbench challenge make --seed "$SECRET" --out runs/challenge --cases 200`
+    """
+    from ventbench.cli.study import bars
+    from ventbench.mismatch.challenge.make import make as work
+
+    with bars() as shown:
+        task = shown.add_task("recording", total=cases)
+        hashed = work(
+            seed, out, kind, cases, jobs=jobs,
+            progress=lambda done: shown.update(task, completed=done),
+        )  # fmt: skip
+    typer.echo(f"wrote {cases} recordings to {out}; commitment {hashed}")
+
+
+@challenge.command()
+def answer(
+    folder: Folder,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes, of one thread each.")] = 2,
+    round_: Round = 1,
+) -> None:
+    """Diagnose every recording; the answers under seal are not read.
+
+    Ctrl-C keeps what is answered; the same command goes on from there.
+
+    Example: `ventbench challenge answer runs/challenge --jobs 2`
+    """
+    from ventbench.cli.study import bars
+    from ventbench.mismatch.challenge import folder as files
+    from ventbench.mismatch.challenge.answer import answer as work
+
+    with bars() as shown:
+        task = shown.add_task("diagnosing", total=None)
+
+        def progress(done: int, total: int) -> None:
+            shown.update(task, completed=done, total=total)
+
+        failed = work(files.Folder(folder, round_), jobs=jobs, progress=progress)
+    for name, problem in sorted(failed.items()):
+        typer.echo(f"{name}: no answer: {problem}", err=True)
+    if failed:
+        raise typer.Exit(1)
+    typer.echo(f"answered; now `ventbench challenge reveal {folder} --seed ...`")
+
+
+@challenge.command()
+def record(folder: Folder, seed: Seed) -> None:
+    """Record the breaths that answers asked for, each on its own concealed rig.
+
+    Then `answer` and `reveal` with `--round 2` judge all breaths together.
+
+    Example: `ventbench challenge record runs/challenge --seed "$SECRET"`
+    """
+    from ventbench.mismatch.challenge import folder as files
+    from ventbench.mismatch.challenge import requests
+
+    names = requests.record(files.Folder(folder), seed)
+    typer.echo(f"recorded what was asked for in {len(names)} cases")
+
+
+@challenge.command()
+def reveal(
+    folder: Folder,
+    seed: Seed,
+    round_: Round = 1,
+    oracle: Annotated[
+        bool, typer.Option("--oracle", help="Compare with fits that know the truth; slow.")
+    ] = False,
+    json: JsonFile = None,
+) -> None:
+    """Open the seal, check all hashes, and score the answers.
+
+    Exit code 1 if a goal is missed.
+
+    Example: `ventbench challenge reveal runs/challenge --seed "$SECRET" --json scores.json`
+    """
+    from rich.console import Console
+
+    from ventbench.cli.study import bars
+    from ventbench.mismatch.challenge import folder as files
+    from ventbench.mismatch.challenge.reveal import reveal as work
+
+    with bars() as shown:
+        task = shown.add_task("oracle" if oracle else "scoring", total=None)
+
+        def progress(done: int, total: int) -> None:
+            shown.update(task, completed=done, total=total)
+
+        found = work(files.Folder(folder, round_), seed, with_oracle=oracle, progress=progress)
+    emit(found.as_dict(), json)
+    console = Console(stderr=str(json) == "-")
+    _show(found, console)
+    if any(item.met is False for item in found.figures):
+        raise typer.Exit(1)
+
+
+def _show(found: Any, console: Any) -> None:
+    console.print(f"commitment {found.commitment}: kept", highlight=False)
+    console.print(_confusion(found))
+    console.print(_figures(found))
+    if found.unanswered:
+        console.print(f"{len(found.unanswered)} cases have no answer and are left out")
+
+
+def _confusion(found: Any) -> Any:
+    from rich.table import Table
+
+    table = Table(title="What was answered to what")
+    table.add_column("truth", no_wrap=True)
+    table.add_column("n", justify="right")
+    table.add_column("answers")
+    for truth, counts in found.confusion.items():
+        said = ", ".join(f"{answer} {count}" for answer, count in counts.items())
+        table.add_row(truth, str(sum(counts.values())), said)
+    return table
+
+
+def _figures(found: Any) -> Any:
+    from rich.table import Table
+
+    table = Table(title="Figures to reach")
+    table.add_column("figure")
+    for name in ("value", "95 %", "goal", "n", ""):
+        table.add_column(name, justify="right", no_wrap=True)
+    words = {True: "met", False: "missed", None: ""}
+    for item in found.figures:
+        if item.value is None:
+            value, span = "-", ""
+        elif item.ci95 is None:
+            value, span = f"{item.value:.3g}", ""
+        else:
+            value = f"{item.value:.1%}"
+            span = f"{item.ci95[0]:.1%}..{item.ci95[1]:.1%}"
+        table.add_row(item.what, value, span, item.goal, str(item.count), words[item.met])
+    return table
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.add_typer(challenge)

@@ -1,0 +1,183 @@
+"""A whole diagnosis: what a simulator lacks, by a recording."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.mismatch import estimates, flows, shapes, simulators, split
+from ventbench.mismatch.compare import Lack, lacking
+from ventbench.mismatch.distances import distances
+from ventbench.mismatch.locate import locate
+from ventbench.mismatch.naming.bench import Bench, Side, Solved, bench
+from ventbench.mismatch.naming.conclude import Conclusion, conclude
+from ventbench.mismatch.naming.places import all_paths
+from ventbench.mismatch.naming.rivals import Alternatives
+from ventbench.mismatch.next_breath import request
+from ventbench.mismatch.result import Diagnosis, Named, Request, Traces, Verdict
+from ventbench.mismatch.simulators import Given
+from ventbench.physics.catalogue import paths
+from ventbench.physics.fits import Fit, Noise, Simulator, recorded
+from ventbench.physics.fits.data import Data, Floats
+from ventbench.plants.base import Plant
+from ventbench.plants.corrected import Corrected
+from ventbench.recordings.breaths import Breaths
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A conclusion about breaths, with its final fit."""
+
+    bench: Bench
+    conclusion: Conclusion
+    fit: Fit
+
+
+def diagnose(
+    breaths: Breaths,
+    *,
+    plant: Given = "physics",
+    lung: str | None = None,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Find what a simulator lacks.
+
+    The same language is fitted to the recording and, unless the simulator is the base model itself,
+    to its answers to the same commands: what only the recording needs is missing.
+
+    Args:
+        breaths: n recorded breaths; every third one of a lung is held out.
+        plant: see :data:`~ventbench.mismatch.simulators.Given`.
+        lung: use only the breaths of this label.
+        progress: is told what is done and which share of the whole is behind.
+
+    Raises:
+        InputError: if there are too few breaths, or no simulator for their lung.
+    """
+    began = time.perf_counter()
+    tell = progress or (lambda what, share: None)
+    if lung is not None:
+        breaths = breaths.select(np.flatnonzero(breaths.lung_ids == lung))
+    breaths, notes = split.usable(breaths)
+    held = split.held_out(breaths)
+    tell("simulating", 0.02)
+    before = simulators.answers(plant, breaths)
+    data = recorded(breaths)
+    found = _conclude(data, held, lambda what: tell(what, 0.3))
+    had = None
+    if plant != "physics":
+        tell("the same questions to the simulator", 0.6)
+        answered = simulators.measured(data, before, found.conclusion.noise)
+        had = _conclude(answered, held, lambda what: tell(f"simulator: {what}", 0.7))
+    tell("drawing conclusions", 0.9)
+    return _diagnosis(breaths, held, before, found, had, plant, notes, began)
+
+
+def _conclude(data: Data, held: NDArray[np.bool_], tell: Callable[[str], None]) -> _Found:
+    narrow = bench(data, held, paths())
+    wide: list[Bench] = []
+
+    def wider() -> Bench:
+        wide.append(bench(data, held, all_paths()))
+        return wide[0]
+
+    found = conclude(narrow, wider, tell)
+    side = Side(data, Simulator(data, paths()))
+    if found.place is not None and found.place.element is not None:
+        # With a slot, the training breaths alone: all of them would be one more compilation.
+        return _Found(wide[0], found, estimates.estimated(found.full, wide[0].training))
+    return _Found(narrow, found, estimates.estimated(found.named, side))
+
+
+def _diagnosis(
+    breaths: Breaths, held: NDArray[np.bool_], before: Floats, found: _Found, had: _Found | None,
+    plant: Given, notes: list[str], began: float,
+) -> Diagnosis:  # fmt: skip
+    conclusion = found.conclusion
+    names, removed = lacking(found.fit, conclusion, had and had.fit, had and had.conclusion)
+    notes += removed
+    answers = {"before": before} | _answers(breaths, held, before, found, had)
+    noise = conclusion.noise
+    lungs = estimates.lungs(found.fit)
+    flow, volume = flows.of_fit(breaths, found.fit, answers["refit"])
+    here = ~np.isnan(answers["refit"]).all(axis=1)
+    place = shapes.slot(conclusion)
+    own = had.conclusion.place if had is not None else None
+    if own is not None and place is not None and own.name == place.name:
+        notes.append(f"The simulator has something without a name at {place.name} as well.")
+    verdict: Verdict = "named" if names else "unnamed" if place else "nothing_missing"
+    return Diagnosis(
+        verdict=verdict,
+        mechanisms=tuple(_named(one, conclusion, found.fit) for one in names),
+        slot=place,
+        location=locate(breaths.select(here), answers["refit"][here], noise.sigma[0],
+                        flow[here], volume[here]),
+        open_loop=distances(breaths, held, answers, float(noise.sigma[0])),
+        lungs=lungs,
+        request=_request(conclusion),
+        traces=Traces(breaths, held, answers["before"], answers["refit"], answers["after"], flow,
+                      volume),
+        plants=_plants(breaths, found, had, plant),
+        plant=plant if isinstance(plant, str) else "given",
+        noise=(float(noise.sigma[0]), float(noise.ar[0])),
+        notes=tuple(notes),
+        seconds=time.perf_counter() - began,
+    )  # fmt: skip
+
+
+def _answers(
+    breaths: Breaths, held: NDArray[np.bool_], before: Floats, found: _Found, had: _Found | None
+) -> dict[str, Floats]:
+    """Pressures of the refitted and of the corrected simulator, ``(n, T)``."""
+
+    def of(bench_: Bench, solved: Solved) -> Floats:
+        pressure = np.empty(before.shape)
+        pressure[~held] = bench_.predict(solved, bench_.training)[:, 0]
+        pressure[held] = bench_.predict(solved, bench_.judging)[:, 0]
+        return pressure
+
+    after = of(found.bench, found.conclusion.full)
+    if had is None:
+        return {"refit": of(found.bench, found.conclusion.null), "after": after}
+    # Its own physics, then the same with the recording's R, C, R_ex and PEEP.
+    own = had.conclusion.full
+    base = of(had.bench, own)
+    again = found.bench if own.hypothesis.names == () else had.bench
+    training = Side(found.bench.training.data, again.training.simulator)
+    refit = again.solve(own.hypothesis, found.conclusion.noise, own, side=training)
+    return {"refit": before + of(again, refit) - base, "after": before + after - base}
+
+
+def _named(one: Lack, conclusion: Conclusion, fit: Fit) -> Named:
+    other = conclusion.alternatives.get(one.name, Alternatives((), 1.0, ()))
+    return Named(
+        one.name, estimates.parameters(fit, one.name), other.confidence, other.names,
+        conclusion.nats.get(one.name, 0.0), one.changed,
+    )  # fmt: skip
+
+
+def _request(conclusion: Conclusion) -> Request | None:
+    rivals = [one.solved for other in conclusion.alternatives.values() for one in other.rivals]
+    return request(conclusion.named, rivals, noise=Noise((conclusion.noise.sigma[0],), (0.0,)))
+
+
+def _plants(breaths: Breaths, found: _Found, had: _Found | None, plant: Given) -> dict[str, Plant]:
+    wanted = estimates.plants(found.fit)
+    if had is None:
+        return wanted
+    own = estimates.plants(had.fit)
+    make = simulators.plants_for(plant)
+    import jax
+
+    result: dict[str, Plant] = {}
+    for name, index in breaths.by_lung_index.items():
+        stacked = make(breaths.select(index[:1]))
+        one = jax.tree.map(lambda leaf: leaf[0], stacked)
+        result[name] = Corrected(one, wanted[name], own[name])
+    return result

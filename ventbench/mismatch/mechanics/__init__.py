@@ -1,0 +1,20 @@
+"""Lung mechanics from pressure with flow or volume, and whether a lung is what its label says."""
+
+from ventbench.mismatch.mechanics.identify import Mechanics, Term, identify
+from ventbench.mismatch.mechanics.labels import label, labels, match, matching, settings_of
+from ventbench.mismatch.mechanics.respiraworks import Surveyed, breaths_of, survey, table
+
+__all__ = [
+    "Mechanics",
+    "Surveyed",
+    "Term",
+    "breaths_of",
+    "identify",
+    "label",
+    "labels",
+    "match",
+    "matching",
+    "settings_of",
+    "survey",
+    "table",
+]

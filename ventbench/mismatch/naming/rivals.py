@@ -1,0 +1,87 @@
+"""Which other names the recording cannot tell from the ones that were chosen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ventbench.mismatch.naming.bench import Bench, Solved
+from ventbench.mismatch.naming.candidates import screen
+from ventbench.mismatch.naming.search import Rival, Step, believed, step
+
+#: Criterion (twice the nats) within which a name is an alternative, and most that are listed.
+_CLOSE, _LISTED = 10.0, 2
+
+#: What pressure alone can never tell from a mechanism: the same impedance under another name.
+SAME = {"viscoelasticity": ("second_compartment",)}
+
+
+@dataclass(frozen=True, eq=False)
+class Alternatives:
+    """To one name.
+
+    Attributes:
+        names: the likeliest first.
+        confidence: share of the posterior of equal priors that falls on the name itself.
+        rivals: fitted, of mechanisms of the library.
+    """
+
+    names: tuple[str, ...]
+    confidence: float
+    rivals: tuple[Rival, ...]
+
+
+def alternatives(
+    bench: Bench, named: Solved, steps: list[Step], *, swap: bool = True
+) -> tuple[Solved, dict[str, Alternatives]]:
+    """Replace each name by every other one, and keep what is better.
+
+    Returns:
+        The best set of names, and for each the alternatives.
+    """
+    for _ in range(2 if swap else 1):
+        found: dict[str, Alternatives] = {}
+        better = None
+        for name in named.hypothesis.names:
+            criterion = bench.criterion(named)
+            rivals = _rivals(bench, named, name, steps)
+            if swap and rivals and rivals[0].criterion < criterion:
+                better = rivals[0].solved
+                break
+            found[name] = _close(name, rivals, criterion)
+        if better is None:
+            return named, found
+        named, steps = better, []
+    found = {
+        name: _close(name, _rivals(bench, named, name, steps), bench.criterion(named))
+        for name in named.hypothesis.names
+    }
+    return named, found
+
+
+def _rivals(bench: Bench, named: Solved, name: str, steps: list[Step]) -> list[Rival]:
+    if len(named.hypothesis.names) == 1 and steps and steps[0].rivals[0].name == name:
+        first = steps[0]
+        # Those that stayed far behind were not fitted to the end.
+        return [
+            Rival(one.name, one.solved, bench.criterion(one.solved, named.noise))
+            for one in first.rivals[1:4]
+        ]
+    base = bench.solve(named.hypothesis.without(name), named.noise, named)
+    candidates = [one for one in screen(base) if one.name != name]
+    found = step(bench, base, candidates)
+    if found is None or not believed(found.gained):
+        return []
+    rivals = [
+        Rival(one.name, one.solved, bench.criterion(one.solved, named.noise))
+        for one in found.rivals[:3]
+    ]
+    return sorted(rivals, key=lambda one: one.criterion)
+
+
+def _close(name: str, rivals: list[Rival], criterion: float) -> Alternatives:
+    near = [one for one in rivals if one.criterion < criterion + _CLOSE][:_LISTED]
+    odds = np.exp(-0.5 * np.array([max(one.criterion - criterion, 0.0) for one in near]))
+    names = tuple(one.name for one in near) + SAME.get(name, ())
+    return Alternatives(names[:_LISTED], float(1.0 / (1.0 + odds.sum())), tuple(near))

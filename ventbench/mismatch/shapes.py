@@ -1,0 +1,78 @@
+"""The slot of a conclusion as it is shown: what it explains, and its drawn shape."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ventbench.mismatch.naming.bench import Solved
+from ventbench.mismatch.naming.conclude import Conclusion, Place
+from ventbench.mismatch.naming.moving import Moving
+from ventbench.mismatch.naming.sources import ALVEOLUS, MEASUREMENT, SUPPLY
+from ventbench.mismatch.result import Slot
+from ventbench.physics.catalogue import mechanism
+from ventbench.physics.slots import SLOTS
+
+_MEANINGS = {
+    ALVEOLUS: "a pressure at the alveolus that moves in time and that no command explains",
+    SUPPLY: "a flow of the supply that moves in time and that no command explains",
+    MEASUREMENT: "a pressure at the sensor that moves in time and that is not in the airway",
+}
+
+
+def slot(conclusion: Conclusion) -> Slot | None:
+    """Slot of a conclusion, or None."""
+    place = conclusion.place
+    if place is None:
+        return None
+    explains = _share(conclusion)
+    if place.source is not None:
+        return _moving(place, place.source, explains)
+    assert place.element is not None
+    x, y, x_unit, y_unit = _curve(conclusion.full, place.element)
+    meaning = SLOTS[place.name].meaning
+    return Slot(place.name, meaning, explains, place.nats, x, x_unit, y, y_unit)
+
+
+def _share(conclusion: Conclusion) -> float:
+    """Share of the squared error above the noise that goes with the slot, 0..1."""
+    named = conclusion.named
+    weight = named.problem.data.weight
+    before = float(np.sum(named.residual**2) / weight.sum())
+    floor = float(conclusion.noise.sigma[0] ** 2)
+    if conclusion.place is not None and conclusion.place.source is not None:
+        after = floor
+    else:
+        after = float(np.sum(conclusion.full.residual**2) / weight.sum())
+    return float(np.clip((before - after) / max(before - min(floor, after), 1e-9), 0.0, 1.0))
+
+
+def _moving(place: Place, source: Moving, explains: float) -> Slot:
+    size = np.sqrt(np.mean(source.shape**2, axis=1))
+    course = source.shape[int(np.argmax(size))]
+    unit = "share of the flow, 1" if place.name == SUPPLY else "pressure, cmH2O"
+    meaning = _MEANINGS[place.name]
+    if source.periodic:
+        meaning += f", {source.scale:.1f} times a second"
+    x = np.arange(len(course), dtype=float)
+    return Slot(
+        place.name, meaning, explains, place.nats, x, "sample of the breath where it is largest",
+        course, unit,
+    )  # fmt: skip
+
+
+def _curve(full: Solved, element: str) -> tuple[np.ndarray, np.ndarray, str, str]:
+    item = mechanism(element)
+    values = {
+        p.name: float(np.median(full.column(f"{element}.{p.name}")))
+        for p in item.description.parameters
+    }
+    base = {
+        name: float(np.median(full.column(name))) for name in ("R", "C", "gain", "R_ex", "PEEP")
+    }
+    drawn = max(item.shapes(values, base), key=lambda one: one.size)  # type: ignore[attr-defined]
+    x, y = np.asarray(drawn.x, float), np.asarray(drawn.y, float)
+    if drawn.absorbed:
+        # What base parameters could take over says nothing: it is taken out of the drawing.
+        powers = np.stack([x**power for power in drawn.absorbed], axis=1)
+        y = y - powers @ np.linalg.lstsq(powers, y, rcond=None)[0]
+    return x, y, drawn.x_unit, drawn.y_unit

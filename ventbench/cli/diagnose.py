@@ -118,8 +118,10 @@ def _diagnose(breaths: Breaths, plant: str, lung: str | None) -> Diagnosis:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+    from ventbench import compilation
     from ventbench.mismatch.diagnose import diagnose as find
 
+    compilation.keep()
     simulator: Any = plant if plant in KINDS else _plants(plant, breaths)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bars:

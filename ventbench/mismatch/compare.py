@@ -60,4 +60,4 @@ def _differs(recorded: Fit, simulated: Fit, name: str) -> bool:
     ends = [estimates.parameters(one, name)[strength.name] for one in (recorded, simulated)]
     gap = abs(ends[0].value - ends[1].value)
     reach = [0.5 * (one.ci95[1] - one.ci95[0]) for one in ends]
-    return bool(gap > np.hypot(*reach))
+    return bool(gap > np.hypot(reach[0], reach[1]))

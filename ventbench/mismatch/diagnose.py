@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.errors import InputError
 from ventbench.mismatch import estimates, flows, shapes, simulators, split
 from ventbench.mismatch.compare import Lack, lacking
 from ventbench.mismatch.distances import distances
@@ -18,7 +19,7 @@ from ventbench.mismatch.naming.conclude import Conclusion, conclude
 from ventbench.mismatch.naming.places import all_paths
 from ventbench.mismatch.naming.rivals import Alternatives
 from ventbench.mismatch.next_breath import request
-from ventbench.mismatch.result import Diagnosis, Named, Request, Traces, Verdict
+from ventbench.mismatch.result import Diagnosis, LungMatch, Named, Request, Traces, Verdict
 from ventbench.mismatch.simulators import Given
 from ventbench.physics.catalogue import paths
 from ventbench.physics.fits import Fit, Noise, Simulator, recorded
@@ -104,9 +105,10 @@ def _diagnosis(
     notes += removed
     answers = {"before": before} | _answers(breaths, held, before, found, had)
     noise = conclusion.noise
-    lungs = estimates.lungs(found.fit)
+    lungs, more = _lungs(breaths, found.fit)
+    notes += more
     flow, volume = flows.of_fit(breaths, found.fit, answers["refit"])
-    here = ~np.isnan(answers["refit"]).all(axis=1)
+    here = np.flatnonzero(~np.isnan(answers["refit"]).all(axis=1))
     place = shapes.slot(conclusion)
     own = had.conclusion.place if had is not None else None
     if own is not None and place is not None and own.name == place.name:
@@ -129,6 +131,17 @@ def _diagnosis(
         notes=tuple(notes),
         seconds=time.perf_counter() - began,
     )  # fmt: skip
+
+
+def _lungs(breaths: Breaths, fit: Fit) -> tuple[tuple[LungMatch, ...], list[str]]:
+    """The lungs: by flow or volume where they are recorded, which needs no model of the valve."""
+    if breaths.flow is not None or breaths.volume is not None:
+        try:
+            matches, notes = estimates.lungs_by_flow(breaths)
+            return matches, list(notes)
+        except InputError as error:
+            return estimates.lungs(fit), [f"R and C are from pressure alone: {error}."]
+    return estimates.lungs(fit), []
 
 
 def _answers(

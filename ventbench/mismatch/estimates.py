@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from ventbench.mismatch import mechanics
 from ventbench.mismatch.naming.bench import Side, Solved, has_own
 from ventbench.mismatch.result import Estimate, LungMatch
 from ventbench.physics.catalogue import library, mechanism
 from ventbench.physics.fits import Fit, fit, interval
 from ventbench.physics.fits.derivatives import START
 from ventbench.plants.base import Plant
+from ventbench.recordings.breaths import Breaths
 
 #: Shapes whose default is a guess: the interval of a strength must allow for it.
 _UNCERTAIN = ("supply_droop.recovery",)
-
-#: How far a label's R and C may be off: tolerances of test lungs and of the valve's gain.
-_TOLERANCE_R, _TOLERANCE_C = 0.30, 0.20
 
 
 def estimated(solved: Solved, side: Side) -> Fit:
@@ -57,26 +58,37 @@ def parameters(found: Fit, name: str) -> dict[str, Estimate]:
 
 
 def lungs(found: Fit) -> tuple[LungMatch, ...]:
-    """Fitted R and C of each label, and whether the label can be right."""
-    data, matches = found.problem.data, []
-    labels = np.unique(np.stack([data.R, data.C], axis=1), axis=0)
-    for group, (R, C) in enumerate(labels):
-        fitted_R, fitted_C = (float(found.value(path)[group]) for path in ("R", "C"))
-        ci = {path: _ends(found, path, group) for path in ("R", "C")}
-        near = _near(ci["R"], R, _TOLERANCE_R) and _near(ci["C"], C, _TOLERANCE_C)
+    """R and C of each label as the model has them, and whether the label can be right.
+
+    Judged as :func:`~ventbench.mismatch.mechanics.labels` does, at the flow that labels hold for.
+    """
+    settings, matches = mechanics.settings_of(found), []
+    for group, one in enumerate(mechanics.labels(found)):
+        ends = {path: found.ci95(path)[group] for path in ("R", "C")}
         matches.append(
-            LungMatch(f"R{R:g}C{C:g}", fitted_R, fitted_C, ci["R"], ci["C"], near, "pressure")
+            replace(
+                one,
+                fitted_R=float(found.value("R")[group]),
+                fitted_C=float(found.value("C")[group]),
+                ci95_R=(float(ends["R"][0]), float(ends["R"][1])),
+                ci95_C=(float(ends["C"][0]), float(ends["C"][1])),
+                settings=tuple(item.id for item in settings[one.label]),
+            )
         )
     return tuple(matches)
 
 
-def _ends(found: Fit, path: str, group: int) -> tuple[float, float]:
-    low, high = found.ci95(path)[group]
-    return float(low), float(high)
+def lungs_by_flow(breaths: Breaths) -> tuple[tuple[LungMatch, ...], tuple[str, ...]]:
+    """The same from pressure and flow or volume, whatever the valve did; and what to know of it.
 
-
-def _near(ci95: tuple[float, float], label: float, tolerance: float) -> bool:
-    return ci95[0] <= label * (1.0 + tolerance) and ci95[1] >= label * (1.0 - tolerance)
+    Raises:
+        InputError: if too little of them is recorded.
+    """
+    found = mechanics.identify(breaths)
+    matches = [
+        replace(one.match, settings=tuple(item.id for item in one.settings)) for one in found
+    ]
+    return tuple(matches), tuple(note for one in found for note in one.notes)
 
 
 def plants(found: Fit) -> dict[str, Plant]:

@@ -136,6 +136,7 @@ class LungMatch:
     ci95_C: tuple[float, float]
     label_matches: bool
     source: str  # "pressure" (given the valve's gain) or "pressure and flow"
+    settings: tuple[str, ...] = ()  # known settings that it may be, the nearest first
 
 
 @dataclass(frozen=True, eq=False)

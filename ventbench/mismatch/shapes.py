@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ventbench.mismatch.naming.bench import Solved
-from ventbench.mismatch.naming.conclude import Conclusion, Place
+from ventbench.mismatch.naming.beside import Place
+from ventbench.mismatch.naming.conclude import Conclusion
 from ventbench.mismatch.naming.moving import Moving
 from ventbench.mismatch.naming.sources import ALVEOLUS, MEASUREMENT, SUPPLY
 from ventbench.mismatch.result import Slot

@@ -179,7 +179,8 @@ def lung(match: LungMatch) -> str:
     fits = f"{' and '.join(values)}, from {match.source}" if values else "R and C unknown"
     if match.label_matches:
         return f"The lung matches its label {match.label}: {fits}."
-    return f"The lung is not what its label {match.label} says: the recording fits {fits}."
+    known = f" It may be {' or '.join(match.settings[:2])}." if match.settings else ""
+    return f"The lung is not what its label {match.label} says: the recording fits {fits}.{known}"
 
 
 def _error(place: Place, noise: float) -> str:

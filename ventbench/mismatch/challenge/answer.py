@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Protocol
 
-from ventbench import files
+from ventbench import compilation, files
 from ventbench.errors import InputError
 from ventbench.mismatch.challenge import requests
 from ventbench.mismatch.challenge.folder import Folder
@@ -119,6 +119,7 @@ def _one(folder: Folder, name: str, lung: str, diagnose: Diagnose | None) -> str
 def _own(breaths: Breaths, lung: str) -> Found:
     from importlib import import_module
 
+    compilation.keep()
     diagnosing = import_module("ventbench.mismatch.diagnose")
     return diagnosing.diagnose(breaths, plant="physics", lung=lung)
 

@@ -1,6 +1,7 @@
 """Lung mechanics from pressure with flow or volume, and whether a lung is what its label says."""
 
-from ventbench.mismatch.mechanics.identify import Mechanics, Term, identify
+from ventbench.mismatch.mechanics.fitted import Term
+from ventbench.mismatch.mechanics.identify import Mechanics, identify
 from ventbench.mismatch.mechanics.labels import label, labels, match, matching, settings_of
 from ventbench.mismatch.mechanics.respiraworks import Surveyed, breaths_of, survey, table
 

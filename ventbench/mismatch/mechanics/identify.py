@@ -2,51 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ventbench.errors import InputError
 from ventbench.lungs import Lung
 from ventbench.mismatch.mechanics import labels
-from ventbench.mismatch.mechanics.regression import (
-    GRID,
-    Solution,
-    Table,
-    covariance,
-    effect,
-    solve,
-    table,
-)
-from ventbench.mismatch.mechanics.segments import Segment, segments
-from ventbench.mismatch.mechanics.select import Chosen, select
-from ventbench.mismatch.mechanics.terms import BASE, COLUMNS
+from ventbench.mismatch.mechanics.circuit import Circuit, behind, circuit
+from ventbench.mismatch.mechanics.fitted import Fitted, Term
+from ventbench.mismatch.mechanics.regression import GRID, Table, covariance, solve, table
+from ventbench.mismatch.mechanics.segments import Segment, clipped, segments
+from ventbench.mismatch.mechanics.select import FEWEST, Chosen, select
+from ventbench.mismatch.mechanics.terms import BASE, columns_of
 from ventbench.mismatch.result import Estimate, LungMatch
-from ventbench.physics.fits.intervals import quantile
 from ventbench.recordings.breaths import Breaths
 
-Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Term:
-    """What a lung needs beyond R and C.
-
-    Attributes:
-        name: of the effect.
-        parameters: by short name.
-        nats: held-out evidence, natural logarithm of a likelihood ratio.
-        effect: what it alone explains, root mean square, cmH2O.
-        alternatives: names that would do nearly as well.
-    """
-
-    name: str
-    parameters: dict[str, Estimate]
-    nats: float
-    effect: float
-    alternatives: tuple[str, ...]
+#: Share of clipped pressures, and size of what is left, cmH2O, that the reader must be told of.
+_CLIPPED, _LARGE = 0.02, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,20 +69,62 @@ def _one(name: str, breaths: Breaths) -> Mechanics:
             f"{name}: no piece of a breath has pressure with flow or volume for about a second; "
             "record longer pieces"
         )
+    tube = circuit(pieces)
+    pieces = tuple(behind(s, tube.compliance.value if tube else 0.0) for s in pieces)
     known = table(pieces)
     chosen = select(known)
+    full = _fitted(known, chosen, pieces, breaths)
+    plain = _fitted(known, _bent(known), pieces, breaths)
+    label = Lung(float(breaths.R[0]), float(breaths.C[0]))
+    best = _best(full, plain, label)
+    source = "pressure and flow" if breaths.flow is not None else "pressure and volume"
+    noise = float(full.solution.sigma / np.sqrt(1.0 - GRID[full.solution.grid] ** 2))
+    return Mechanics(
+        name, best.resistance(0.0), best.compliance(), full.offset(),
+        (*_circuit(tube), *(full.term(item) for item in chosen)),
+        labels.match(label, best.resistance, best.compliance(), source),
+        labels.matching(best.resistance, best.compliance()),
+        noise, len(known), sum(len(piece) for piece in pieces),
+        tuple(_notes(breaths, pieces, known, noise)),
+    )  # fmt: skip
+
+
+def _fitted(
+    known: Table, chosen: tuple[Chosen, ...], pieces: tuple[Segment, ...], breaths: Breaths
+) -> Fitted:
     columns = (*range(len(BASE)), *(item.column for item in chosen))
     found = solve(known, np.ones(len(known), bool), columns)
-    lung = _Fitted(found, covariance(known, found), known, pieces, _blur(breaths))
-    label = Lung(float(breaths.R[0]), float(breaths.C[0]))
-    C = lung.compliance()
-    source = "pressure and flow" if breaths.flow is not None else "pressure and volume"
-    return Mechanics(
-        name, lung.resistance(0.0), C, lung.offset(), tuple(lung.term(item) for item in chosen),
-        labels.match(label, lung.resistance, C, source), labels.matching(lung.resistance, C),
-        float(found.sigma / np.sqrt(1.0 - GRID[found.grid] ** 2)), len(known),
-        sum(len(piece) for piece in pieces), tuple(_notes(breaths, pieces, known)),
-    )  # fmt: skip
+    return Fitted(found, covariance(known, found), known, pieces, _blur(breaths))
+
+
+def _bent(known: Table) -> tuple[Chosen, ...]:
+    """The quadratic part of a resistor, unless it comes out negative: labels leave it open."""
+    (column,) = columns_of("turbulent_resistance")
+    found = solve(known, np.ones(len(known), bool), (*range(len(BASE)), column))
+    return (Chosen("turbulent_resistance", column, 0.0, ()),) if found.x[-1] > 0.0 else ()
+
+
+def _best(full: Fitted, plain: Fitted, label: Lung) -> Fitted:
+    """The description to judge the label by.
+
+    Further terms take part of R and C over, rightly (creep) or not (what only looks like creep), so
+    that a plain lung is tried too: what counts is whether either is a setting.
+    """
+    for one in (full, plain):
+        if labels.fits(one.resistance, one.compliance(), label):
+            return one
+    for one in (full, plain):
+        if labels.matching(one.resistance, one.compliance()):
+            return one
+    return plain
+
+
+def _circuit(tube: Circuit | None) -> tuple[Term, ...]:
+    if tube is None:
+        return ()
+    others = ("sensor_lag",)
+    parameters = {"compliance": tube.compliance}
+    return (Term("circuit_compliance", parameters, tube.nats, tube.effect, others),)
 
 
 def _blur(breaths: Breaths) -> float:
@@ -117,127 +132,24 @@ def _blur(breaths: Breaths) -> float:
     return 0.0 if breaths.volume is not None else 0.25 * float(np.median(breaths.dt))
 
 
-def _notes(breaths: Breaths, pieces: tuple[Segment, ...], known: Table) -> list[str]:
+def _notes(breaths: Breaths, pieces: tuple[Segment, ...], known: Table, noise: float) -> list[str]:
     notes = []
-    if len(known) < 4:
-        notes.append("Fewer than 4 breaths: R and C alone, nothing else could be tested.")
+    if len(known) < FEWEST:
+        notes.append(f"Fewer than {FEWEST} breaths: R and C alone, nothing else could be tested.")
     if lost := len(breaths) - len(known):
         notes.append(f"{lost} of {len(breaths)} breaths have no piece long enough to be used.")
+    share = clipped(breaths)
+    if share > _CLIPPED:
+        notes.append(
+            f"{100 * share:.0f} % of the pressures stand at the end of the sensor's range and are "
+            "left out."
+        )
     top = max(float(piece.flow.max()) for piece in pieces)
     if top < 0.2:
         notes.append(f"The flow stays below {1000 * top:.0f} mL/s: R is known at small flow only.")
+    if noise > _LARGE:
+        notes.append(
+            f"{noise:.1f} cmH2O are left unexplained, such as a valve that chatters: R and C are "
+            "rough."
+        )
     return notes
-
-
-@dataclass(frozen=True, eq=False)
-class _Fitted:
-    """Coefficients with covariance, and what follows from them."""
-
-    solution: Solution
-    covariance: Floats
-    table: Table
-    pieces: tuple[Segment, ...]
-    blur: float
-
-    def resistance(self, flow: float) -> Estimate:
-        """During inspiration, at half of the volume that is inspired."""
-        half = 0.5 * self._tidal()
-
-        def value(x: Callable[[str], float]) -> float:
-            bent = x("turbulent_resistance") * flow
-            return x("resistance") + bent + x("volume_resistance") * half
-
-        found = self._derived(value, "cmH2O s/L")
-        more = self.blur * self._x("elastance")
-        reach = np.hypot(0.5 * (found.ci95[1] - found.ci95[0]), more)
-        return Estimate(found.value, found.unit, (found.value - reach, found.value + reach))
-
-    def compliance(self) -> Estimate:
-        """From the start of a breath to the whole of what is inspired."""
-        tidal = self._tidal()
-        stiff = self._derived(lambda x: x("elastance") + x("nonlinear_compliance") * tidal, "")
-        low, high = (max(end, 1e-3) for end in stiff.ci95)
-        return Estimate(1000.0 / stiff.value, "mL/cmH2O", (1000.0 / high, 1000.0 / low))
-
-    def offset(self) -> Estimate:
-        """Mean over the breaths that are there from their start."""
-        values = []
-        for piece in (p for p in self.pieces if p.first):
-            rows = np.stack([COLUMNS[c].values(piece) for c in self.solution.columns], axis=1)
-            left = piece.pressure - rows @ self.solution.x
-            values.append(float(np.polyval(np.polyfit(piece.time, left, 1), 0.0)))
-        if not values:
-            return Estimate(float("nan"), "cmH2O", (float("nan"), float("nan")))
-        mean, count = float(np.mean(values)), len(values)
-        spread = float(np.std(values, ddof=1)) / np.sqrt(count) if count > 1 else np.inf
-        reach = quantile(max(count - 1, 4)) * spread
-        return Estimate(mean, "cmH2O", (mean - reach, mean + reach))
-
-    def term(self, item: Chosen) -> Term:
-        """Parameters of an effect, in the units of the library where it has it."""
-        name = item.name
-        if name == "inertance" and self._x(name) < 0.0:
-            name = "sensor_lag"
-        others = item.alternatives + (("flow_sensor_lag",) if name == "inertance" else ())
-        size = effect(self.table, self.solution, item.column)
-        return Term(name, self._parameters(name, item.column), item.nats, size, others)
-
-    def _parameters(self, name: str, column: int) -> dict[str, Estimate]:
-        simple = {
-            "turbulent_resistance": ("quadratic", "cmH2O s2/L2"),
-            "inertance": ("inertance", "cmH2O s2/L"),
-            "direction_resistance": ("difference", "cmH2O s/L"),
-            "volume_resistance": ("slope", "cmH2O s/L2"),
-            "expiratory_flow": ("quadratic", "cmH2O s2/L2"),
-        }
-        if name in simple:
-            short, unit = simple[name]
-            return {short: self._derived(lambda x: x(name), unit)}
-        if name == "nonlinear_compliance":
-            made = self._derived(lambda x: 2.0 * x(name) / x("elastance") ** 2, "1/cmH2O")
-            return {"stiffening": made}
-        if name == "leak":
-            made = self._derived(lambda x: 1000.0 * x(name) / x("elastance"), "mL/s per cmH2O")
-            return {"conductance": made}
-        if name == "sensor_lag":
-            return {"tau": self._derived(lambda x: -x("inertance") / x("resistance"), "s")}
-        time = COLUMNS[column].time
-        assert time is not None
-        near = [t for t in _times() if t != time]
-        low = max((t for t in near if t < time), default=time)
-        high = min((t for t in near if t > time), default=time)
-        return {
-            "ratio": self._derived(lambda x: x(name) / x("elastance"), "1"),
-            "time": Estimate(time, "s", (low, high)),
-        }
-
-    def _derived(self, value: Callable[[Callable[[str], float]], float], unit: str) -> Estimate:
-        """A function of the coefficients, with its interval by linear propagation."""
-        x = self.solution.x
-
-        def at(point: Floats) -> float:
-            named = {
-                COLUMNS[c].term: float(v) for c, v in zip(self.solution.columns, point, strict=True)
-            }
-            return float(value(lambda name: named.get(name, 0.0)))
-
-        step = 1e-4 * np.maximum(np.abs(x), 1e-6)
-        slopes = [
-            (at(x + h * unit_) - at(x - h * unit_)) / (2.0 * h)
-            for h, unit_ in zip(step, np.eye(len(x)), strict=True)
-        ]
-        sd = float(np.sqrt(max(np.array(slopes) @ self.covariance @ np.array(slopes), 0.0)))
-        reach, centre = quantile(max(len(self.table) - 1, 4)) * sd, at(x)
-        return Estimate(centre, unit, (centre - reach, centre + reach))
-
-    def _x(self, term: str) -> float:
-        names = [COLUMNS[c].term for c in self.solution.columns]
-        return float(self.solution.x[names.index(term)]) if term in names else 0.0
-
-    def _tidal(self) -> float:
-        """Volume between start and fullest, median over the breaths, L."""
-        return float(np.median([np.ptp(piece.volume) for piece in self.pieces]))
-
-
-def _times() -> tuple[float, ...]:
-    return tuple(sorted({c.time for c in COLUMNS if c.time is not None}))

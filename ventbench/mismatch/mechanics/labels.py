@@ -15,22 +15,19 @@ from ventbench.physics.fits import Fit
 
 #: Factors by which R and C may differ from the label, beyond their intervals: what calibration of
 #: lung and sensors allows.
-TOLERANCE_R, TOLERANCE_C = 1.25, 1.15
+TOLERANCE_R, TOLERANCE_C = 1.3, 1.2
+
+#: Resistance of tubes and filters between pressure sensor and lung, cmH2O s/L: R may be more by it.
+APPARATUS = 2.0
+
+#: Flow at which a parabolic resistor is taken to have its nominal resistance, L/s.
+REFERENCE_FLOW = 1.0
 
 #: Factor by which the gain of the valve may be off where flow was not measured.
 GAIN = 1.2
 
 #: Resistance, cmH2O s/L, at a flow, L/s.
 Resistance = Callable[[float], Estimate]
-
-
-def reference_flow(resistance: float) -> float:
-    """Flow at which a parabolic resistor has its nominal resistance, L/s.
-
-    Args:
-        resistance: nominal, cmH2O s/L.
-    """
-    return 1.0 if resistance < 35.0 else 0.5
 
 
 def fits(resistance: Resistance, compliance: Estimate, setting: Lung, scale: float = 1.0) -> bool:
@@ -42,8 +39,9 @@ def fits(resistance: Resistance, compliance: Estimate, setting: Lung, scale: flo
         setting: to compare with.
         scale: factor by which R and 1/C may be wrong together.
     """
-    low, high = resistance(reference_flow(setting.R)).ci95
-    from_R = [_log(end / setting.R) for end in (low / TOLERANCE_R, high * TOLERANCE_R)]
+    low, high = resistance(REFERENCE_FLOW).ci95
+    ends = (low - APPARATUS) / TOLERANCE_R, high * TOLERANCE_R
+    from_R = [_log(end / setting.R) for end in ends]
     low, high = compliance.ci95
     from_C = [_log(setting.C / end) for end in (high * TOLERANCE_C, low / TOLERANCE_C)]
     reach = math.log(scale)
@@ -54,7 +52,7 @@ def matching(resistance: Resistance, compliance: Estimate, scale: float = 1.0) -
     """The known settings that a lung may be, the nearest first."""
 
     def distance(setting: Lung) -> float:
-        value = resistance(reference_flow(setting.R)).value
+        value = resistance(REFERENCE_FLOW).value
         away = _log(value / setting.R) / math.log(TOLERANCE_R)
         return away**2 + (_log(compliance.value / setting.C) / math.log(TOLERANCE_C)) ** 2
 
@@ -66,7 +64,7 @@ def match(
     label: Lung, resistance: Resistance, compliance: Estimate, source: str, scale: float = 1.0
 ) -> LungMatch:
     """Compare a lung with its label."""
-    at = resistance(reference_flow(label.R))
+    at = resistance(REFERENCE_FLOW)
     same = fits(resistance, compliance, label, scale)
     return LungMatch(
         label.id, at.value, compliance.value, at.ci95, compliance.ci95, same, source

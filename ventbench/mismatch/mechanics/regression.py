@@ -30,7 +30,8 @@ class Table:
     """Cross products of all columns and the pressure, of b breaths.
 
     Attributes:
-        products: ``(b, len(GRID), K + 1, K + 1)``; the last row belongs to the pressure.
+        products: ``(b, len(GRID), K + 1, K + 1)`` for K columns; the last row belongs to the
+            pressure.
         freedom: samples less offsets and drifts, ``(b,)``.
         constant: terms of the log-likelihood that depend on the autocorrelation, ``(b, grid)``.
         breaths: index of each breath in the recording, ``(b,)``.
@@ -63,15 +64,16 @@ class Solution:
     grid: int
 
 
-def table(segments: Sequence[Segment]) -> Table:
-    """Cross products of all breaths that have a piece."""
+def table(segments: Sequence[Segment], columns: Sequence[int] | None = None) -> Table:
+    """Cross products of all breaths that have a piece, of some columns or of all."""
+    chosen = COLUMNS if columns is None else [COLUMNS[c] for c in columns]
     indices = sorted({segment.breath for segment in segments})
-    size = len(COLUMNS) + 1
+    size = len(chosen) + 1
     products = np.zeros((len(indices), len(GRID), size, size))
     freedom, constant = np.zeros(len(indices)), np.zeros((len(indices), len(GRID)))
     for segment in segments:
         row = indices.index(segment.breath)
-        full = np.stack([c.values(segment) for c in COLUMNS] + [segment.pressure], axis=1)
+        full = np.stack([c.values(segment) for c in chosen] + [segment.pressure], axis=1)
         own = np.stack([np.ones(len(segment)), segment.time - segment.time.mean()], axis=1)
         freedom[row] += len(segment) - own.shape[1]
         for k, rho in enumerate(GRID):

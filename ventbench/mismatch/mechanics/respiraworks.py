@@ -12,8 +12,9 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.build import FILL, stack, stack_times, valid_mask
 from ventbench.recordings.respiraworks import Run, load_respiraworks
 
-#: Shortest breath that is kept, s.
-_SHORTEST = 0.5
+#: Shortest breath that is kept, s, and how long before its inspiration a breath is cut, so that the
+#: steep rise lies within.
+_SHORTEST, _BEFORE = 0.5, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +32,9 @@ def breaths_of(run: Run) -> Breaths:
     half of its range. What was never logged is None.
     """
     edges = np.flatnonzero(np.diff(run.breath)) + 1
+    edges = np.searchsorted(run.time, run.time[edges] - _BEFORE)
     pieces = np.split(np.arange(len(run.time)), edges)
-    pieces = [p for p in pieces if run.time[p[-1]] - run.time[p[0]] >= _SHORTEST]
+    pieces = [p for p in pieces if len(p) and run.time[p[-1]] - run.time[p[0]] >= _SHORTEST]
     lengths = np.array([len(p) for p in pieces])
     rows = np.concatenate(pieces)
     target = run.signals["target"]
@@ -47,10 +49,10 @@ def breaths_of(run: Run) -> Breaths:
     time, dt = stack_times(starts, lengths)
     n = len(pieces)
     return Breaths(
-        breath_id=np.array([run.breath[p[0]] for p in pieces]), R=np.full(n, run.R),
+        breath_id=np.array([run.breath[p[-1]] for p in pieces]), R=np.full(n, run.R),
         C=np.full(n, run.C), time=time, dt=dt, valid=valid_mask(lengths),
-        time_inferred=np.zeros(n, bool), flow=arrays.pop("flow", None),
-        volume=arrays.pop("volume", None), **arrays,
+        time_inferred=np.zeros(n, bool), u_in=arrays["u_in"], u_out=arrays["u_out"],
+        pressure=arrays["pressure"], flow=arrays.get("flow"), volume=arrays.get("volume"),
     )  # fmt: skip
 
 

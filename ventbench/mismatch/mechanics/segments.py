@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.errors import InputError
+from ventbench.mismatch.mechanics.windows import differentiated, dot, integral, view, weights
 from ventbench.recordings.breaths import Breaths
 
 Floats = NDArray[np.float64]
 
 #: Half the width of the window, s, and the fewest smoothed samples of a piece that is used.
-WINDOW, FEWEST = 0.06, 12
+WINDOW, FEWEST = 0.04, 12
 
 #: Samples in a row at the very end of the range from which on a sensor is taken to be clipped.
-_STUCK = 4
+_STUCK = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,8 @@ class Segment:
         flow: L/s, ``(n,)``.
         slope: of the flow, L/s2, ``(n,)``.
         dose: pressure integrated since the start of the piece, cmH2O s, ``(n,)``.
+        rise: of the pressure, cmH2O/s, ``(n,)``.
+        bend: its second derivative, cmH2O/s2, ``(n,)``.
     """
 
     breath: int
@@ -49,6 +52,8 @@ class Segment:
     flow: Floats
     slope: Floats
     dose: Floats
+    rise: Floats
+    bend: Floats
 
     def __len__(self) -> int:
         """Number of samples n."""
@@ -99,78 +104,51 @@ def clipped(breaths: Breaths) -> float:
 
 def _smoothed(
     time: Floats, pressure: Floats, flow: Floats | None, volume: Floats | None
-) -> tuple[NDArray[np.bool_], Floats, Floats, Floats, Floats, Floats, Floats] | None:
+) -> tuple[NDArray[np.bool_], *tuple[Floats, ...]] | None:
     """What a segment has after ``first``, or None if that would be too short."""
     if len(time) < 3:
         return None
     half = max(1, round(WINDOW / float(np.median(np.diff(time)))))
-    if volume is None:
-        assert flow is not None
-        volume = _integral(time, flow)
-    known = np.isfinite(pressure) & np.isfinite(volume)
+    filled = _volume(time, flow, volume)
+    known = np.isfinite(pressure) & np.isfinite(filled)
     known &= True if flow is None else np.isfinite(flow)
-    # The slope of a differentiated volume needs the window twice.
-    reach = 2 * half if flow is None else half
-    centres, begins = _centres(known, half, reach)
+    centres, begins = _centres(known, half)
     if len(centres) < FEWEST:
         return None
-    value, change = _window(time, half, centres)
-    volume = volume - volume[np.isfinite(volume)][0]
+    value, change = weights(time, half, centres)
+    filled = filled - filled[np.isfinite(filled)][0]
     at = np.isfinite(pressure)
-    dose = _integral(time, np.interp(time, time[at], pressure[at]))
-    own = np.stack([time, pressure, volume, dose])
+    unbroken = np.interp(time, time[at], pressure[at])
+    dose = integral(time, unbroken)
+    own = np.stack([time, pressure, filled, dose])
     seen = np.lib.stride_tricks.sliding_window_view(own, 2 * half + 1, axis=1)[:, centres - half]
     t, p, v, dose = np.einsum("kcw,cw->kc", seen, value)
-    if flow is not None:
-        near = _view(flow, half)[centres - half]
-        return begins, t, p, v, _dot(near, value), _dot(near, change), dose
-    fine = np.arange(half, len(time) - half)
-    flow = np.full(len(time), np.nan)
-    flow[fine] = _dot(_view(volume, half), _window(time, half, fine)[1])
-    return begins, t, p, v, flow[centres], _dot(_view(flow, half)[centres - half], change), dose
+    rise = dot(seen[1], change)
+    bend = dot(view(differentiated(time, unbroken, half), half)[centres - half], change)
+    if flow is None:
+        flow = differentiated(time, filled, half)
+        q = flow[centres]
+    else:
+        q = dot(view(flow, half)[centres - half], value)
+    slope = dot(view(flow, half)[centres - half], change)
+    return begins, t, p, v, q, slope, dose, rise, bend
 
 
-def _centres(
-    known: NDArray[np.bool_], half: int, reach: int
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def _volume(time: Floats, flow: Floats | None, volume: Floats | None) -> Floats:
+    if volume is not None:
+        return volume
+    assert flow is not None
+    return integral(time, flow)
+
+
+def _centres(known: NDArray[np.bool_], half: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Middles of windows of known samples, a window apart; and which come after a gap."""
-    runs = [np.arange(start + reach, stop - reach, half + 1) for start, stop in _runs(known)]
+    runs = [np.arange(start + half, stop - half, half + 1) for start, stop in _runs(known)]
     runs = [run for run in runs if len(run)]
     if not runs:
         return np.zeros(0, np.intp), np.zeros(0, bool)
     begins = np.concatenate([np.arange(len(run)) == 0 for run in runs])
     return np.concatenate(runs), begins
-
-
-def _dot(near: Floats, weights: Floats) -> Floats:
-    return np.einsum("cw,cw->c", near, weights)
-
-
-def _window(time: Floats, half: int, centres: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Weights of a smoothed value and of a smoothed derivative, each ``(c, 2 half + 1)``.
-
-    Hann's window and its derivative at the true times, then made exact for straight lines.
-    """
-    near = _view(time, half)[centres - half]
-    away = near - time[centres][:, None]
-    width = (half + 1) * float(np.median(np.diff(time)))
-    angle = np.clip(0.5 * np.pi * away / width, -0.5 * np.pi, 0.5 * np.pi)
-    span = np.gradient(near, axis=1)
-    value = span * np.cos(angle) ** 2
-    value /= value.sum(axis=1, keepdims=True)
-    change = span * np.sin(2.0 * angle)
-    change -= value * change.sum(axis=1, keepdims=True)
-    change /= np.sum(change * away, axis=1, keepdims=True)
-    return value, change
-
-
-def _view(values: Floats, half: int) -> Floats:
-    return np.lib.stride_tricks.sliding_window_view(values, 2 * half + 1)
-
-
-def _integral(time: Floats, values: Floats) -> Floats:
-    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(time)
-    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def _runs(known: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -13,7 +13,7 @@ from ventbench.mismatch.mechanics.segments import Segment
 Floats = NDArray[np.float64]
 
 #: Relaxation times that are tried, s.
-TIMES = tuple(float(x) for x in np.geomspace(0.3, 3.0, 7))
+TIMES = tuple(float(x) for x in np.geomspace(0.3, 3.0, 11))
 
 
 @dataclass(frozen=True)

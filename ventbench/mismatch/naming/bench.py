@@ -251,6 +251,7 @@ class Bench:
         self, side: Side, free: tuple[str, ...], noise: Noise, fixed: Mapping[str, ArrayLike]
     ) -> Problem:
         groups = {"gain": np.arange(len(side.data))} if self.spread else {}
+        groups |= by_label(side.data, free)
         layout = unknowns(side.data, free, groups)
         base = settings(side.data, side.simulator.names, fixed)
         gain = float(np.log(described("gain").neutral))
@@ -279,6 +280,17 @@ def bench(data: Data, held_out: NDArray[np.bool_], names: tuple[str, ...]) -> Be
     return Bench(
         Side(training, Simulator(training, names)), Side(judging, Simulator(judging, names))
     )
+
+
+def by_label(data: Data, free: tuple[str, ...]) -> dict[str, NDArray[np.int64]]:
+    """Groups of parameters that belong to the lung's R or C: one for each label."""
+    groups = {}
+    for path in free:
+        follows = described(path).follows if "." in path else None
+        if follows:
+            label = data.R if follows == "R" else data.C
+            groups[path] = np.unique(label, return_inverse=True)[1].reshape(-1)
+    return groups
 
 
 def has_own(name: str) -> bool:

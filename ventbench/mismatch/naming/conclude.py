@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-
-import numpy as np
+from dataclasses import dataclass, replace
 
 from ventbench.mismatch.naming import moving, places
 from ventbench.mismatch.naming.bench import Bench, Hypothesis, Solved
-from ventbench.mismatch.naming.effort import EFFORT
+from ventbench.mismatch.naming.beside import Place, Shape, beside, beside_source, effortless
 from ventbench.mismatch.naming.moving import Moving
 from ventbench.mismatch.naming.rivals import Alternatives, alternatives
 from ventbench.mismatch.naming.search import (
@@ -17,36 +15,18 @@ from ventbench.mismatch.naming.search import (
     Progress,
     believed,
     forward,
-    noise_of,
     settle,
     step,
 )
-from ventbench.mismatch.naming.sources import MEASUREMENT
+from ventbench.mismatch.naming.sources import GAIN, MEASUREMENT, SOURCES
+from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.noise import Noise
-
-#: Share of what a slot of the same kind explains from which a name stands, its form apart; and
-#: share below which a name beside a slot is only its trimming.
-_FAMILY, _TRIMMING = 0.5, 0.15
 
 #: A source at the sensor is noise unless it is of one frequency and this large, cmH2O.
 _HUM = 0.3
 
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """Where something without a name sits.
-
-    Attributes:
-        name: public name of the slot.
-        element: of the physics that has its shape, or None for a source that moves in time.
-        source: that source, or None.
-        nats: held-out log-likelihood that it gains.
-    """
-
-    name: str
-    element: str | None
-    source: Moving | None
-    nats: float
+#: Share of what sources explain from which it is the gain that differs between breaths.
+_SCATTERED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +41,7 @@ class Conclusion:
         noise: that is left.
         nats: held-out log-likelihood that is lost without each name.
         alternatives: to each name.
+        spread: standard deviation of the logarithm of the breaths' valve gains, 0 if all are one.
     """
 
     null: Solved
@@ -70,6 +51,7 @@ class Conclusion:
     noise: Noise
     nats: dict[str, float]
     alternatives: dict[str, Alternatives]
+    spread: float = 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -88,15 +70,57 @@ def conclude(bench: Bench, wider: Callable[[], Bench], tell: Progress) -> Conclu
     null = settle(bench, Hypothesis())
     named, steps = forward(bench, null, tell)
     tell("looking for what has no name")
-    place, named, full = _place(bench, wider, named)
-    tell("comparing alternatives")
-    if place is None:
-        named, other = alternatives(bench, named, steps)
+    wide = wider()
+    shape = _shape(wide, named)
+    found = moving.moving(bench, effortless(bench, named), (GAIN, *SOURCES))
+    reference = moving.without(bench, named)[1]
+    gain = found.pop(GAIN)
+    if not bench.spread and _scattered(gain, found, reference, shape):
+        # Everything is asked anew, with a valve whose gain may differ between breaths.
+        size = gain.size
+        return conclude(replace(bench, spread=size), lambda: replace(wide, spread=size), tell)
+    source = _source(found, reference)
+    place, full = None, named
+    if source is not None and source.nats > (shape.nats if shape else 0.0):
+        place, named = source, beside_source(bench, named, source)
         full = named
-    else:
-        named, other = alternatives(bench, named, steps, swap=False)
+    elif shape is not None:
+        named, shape = beside(bench, wide, named, shape)
+        place, full = (
+            Place(places.public(shape.element), shape.element, None, shape.nats),
+            shape.full,
+        )
+    tell("comparing alternatives")
+    named, other = alternatives(bench, named, steps, swap=place is None)
+    full = named if place is None else full
     noise = place.source.noise if place and place.source else full.noise
-    return Conclusion(null, named, full, place, noise, _losses(bench, named), other)
+    return Conclusion(null, named, full, place, noise, _losses(bench, named), other, bench.spread)
+
+
+def _shape(wide: Bench, named: Solved) -> Shape | None:
+    """The element that explains most of what the names leave, if held-out breaths ask for it."""
+    here = wide.solve(named.hypothesis, named.noise, named, iterations=3)
+    found = step(wide, here, places.scan(here))
+    if found is None or not believed(found.gained):
+        return None
+    best = found.rivals[0]
+    nats = float((wide.judged(best.solved) - wide.judged(here)).sum())
+    return Shape(best.name, best.solved, nats)
+
+
+def _scattered(
+    gain: Moving, sources: dict[str, Moving], reference: Floats, shape: Shape | None
+) -> bool:
+    """Whether the breaths' valve gains differ.
+
+    That must explain more than any shape, and most of what sources do that move within breaths.
+    """
+    gained = gain.judged - reference
+    nats = float(gained.sum())
+    others = [float((one.judged - reference).sum()) for one in sources.values()]
+    if not believed(gained) or (shape is not None and shape.nats > nats):
+        return False
+    return nats > _SCATTERED * max(others)
 
 
 def _losses(bench: Bench, named: Solved) -> dict[str, float]:
@@ -107,34 +131,11 @@ def _losses(bench: Bench, named: Solved) -> dict[str, float]:
     return found
 
 
-def _place(
-    bench: Bench, wider: Callable[[], Bench], named: Solved
-) -> tuple[Place | None, Solved, Solved]:
-    source = _source(bench, named)
-    wide = wider()
-    here = wide.solve(named.hypothesis, named.noise, named, iterations=3)
-    found = step(wide, here, places.scan(here))
-    gained = 0.0
-    if found is not None and believed(found.gained):
-        best = found.rivals[0]
-        gained = float((wide.judged(best.solved) - wide.judged(here)).sum())
-    if source is not None and source.nats > max(gained, 0.0):
-        return source, _beside_source(bench, named, source), named
-    if found is None or not believed(found.gained):
-        return None, named, named
-    element, full = found.rivals[0].name, found.rivals[0].solved
-    return _beside(bench, wide, named, element, full, gained)
-
-
-def _source(bench: Bench, named: Solved) -> Place | None:
+def _source(found: dict[str, Moving], reference: Floats) -> Place | None:
     """A source that moves in time and explains more than the names and than coloured noise."""
-    base = named
-    if EFFORT in named.hypothesis.names:
-        base = bench.solve(named.hypothesis.without(EFFORT), named.noise, named)
-    found = moving.moving(bench, base)
-    reference = moving.without(bench, named)[1]
-    sensor = found.pop(MEASUREMENT)
-    best = max(found.values(), key=lambda one: one.training)
+    others = dict(found)
+    sensor = others.pop(MEASUREMENT)
+    best = max(others.values(), key=lambda one: one.training)
     gained = best.judged - reference
     ahead = float((best.judged - sensor.judged).sum())
     if believed(gained) and ahead > GATE:
@@ -143,55 +144,3 @@ def _source(bench: Bench, named: Solved) -> Place | None:
     if believed(gained) and sensor.periodic and sensor.size >= _HUM:
         return Place(MEASUREMENT, None, sensor, float(gained.sum()))
     return None
-
-
-def _beside_source(bench: Bench, named: Solved, place: Place) -> Solved:
-    """Keep the names that are needed beside a source."""
-    assert place.source is not None
-    current = named
-    if EFFORT in current.hypothesis.names:
-        current = bench.solve(current.hypothesis.without(EFFORT), current.noise, current)
-    here = place.source
-    for name in current.hypothesis.names:
-        left = bench.solve(current.hypothesis.without(name), current.noise, current)
-        other = moving.moving(bench, left, (place.name,))[place.name]
-        if not believed(here.judged - other.judged):
-            current, here = left, other
-    return current
-
-
-def _beside(
-    bench: Bench, wide: Bench, named: Solved, element: str, full: Solved, nats: float
-) -> tuple[Place | None, Solved, Solved]:
-    """Keep the names that are needed beside a slot, and those whose form it only trims."""
-    kept = named.hypothesis
-    for name in named.hypothesis.names:
-        left = wide.solve(full.hypothesis.without(name), full.noise, full)
-        if name in places.holds(element):
-            least = settle(bench, kept.without(name), named)
-            whole = _quiet(least) - _quiet(full)
-            if _quiet(least) - _quiet(named) >= _FAMILY * whole:
-                continue
-        share = (_quiet(left) - _quiet(full)) / max(_total(bench, named, full), 1e-9)
-        if not believed(wide.judged(full) - wide.judged(left)) or share < _TRIMMING:
-            full, kept = settle(wide, left.hypothesis, left), kept.without(name)
-    if kept != named.hypothesis:
-        named = settle(bench, kept, named)
-    if not kept.names:
-        # Chosen anew, without names that took part of the effect.
-        null = wide.solve(Hypothesis(), named.noise, named)
-        again = step(wide, null, places.scan(null))
-        if again is not None and believed(again.gained):
-            element, full = again.rivals[0].name, again.rivals[0].solved
-            nats = float(again.gained.sum())
-    return Place(places.public(element), element, None, nats), named, full
-
-
-def _total(bench: Bench, named: Solved, full: Solved) -> float:
-    return _quiet(settle(bench, Hypothesis(), named)) - _quiet(full)
-
-
-def _quiet(solved: Solved) -> float:
-    """Logarithm of what is new in each sample of the residual, cmH2O."""
-    noise = noise_of(solved)
-    return float(np.log(noise.sigma[0] * np.sqrt(1.0 - noise.ar[0] ** 2)))

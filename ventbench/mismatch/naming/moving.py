@@ -14,7 +14,7 @@ import numpy as np
 from ventbench.mismatch.naming.bench import Bench, Side, Solved
 from ventbench.mismatch.naming.effort import EFFORT, evidence
 from ventbench.mismatch.naming.linear import Local, local
-from ventbench.mismatch.naming.sources import SOURCES, SUPPLY, responses
+from ventbench.mismatch.naming.sources import GAIN, SOURCES, SUPPLY, responses
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.noise import Noise, estimate
 from ventbench.physics.fits.problem import Problem
@@ -112,9 +112,10 @@ def _at(
 def _search(
     place: Local, side: Side, source: str, answers: Floats
 ) -> tuple[float, bool, float, float]:
-    sizes = [0.1 * size if source == SUPPLY else size for size in _SIZES]
+    sizes = [0.1 * size if source in (SUPPLY, GAIN) else size for size in _SIZES]
     best = (-np.inf, False, 1.0, 1.0)
-    for periodic, scales in ((True, FREQUENCIES), (False, LENGTHS)):
+    kinds = ((True, FREQUENCIES), (False, LENGTHS))
+    for periodic, scales in ((False, (1.0,)),) if source == GAIN else kinds:
         for scale in scales:
             kernel = _Kernel(place, side, answers, periodic, float(scale))
             for size in sizes:
@@ -130,7 +131,9 @@ class _Kernel:
         self, place: Local, side: Side, answers: Floats, periodic: bool, scale: float
     ) -> None:
         time = np.cumsum(side.data.dt, axis=1) - side.data.dt
-        if periodic:
+        if answers.shape[1] == 1:  # one number a breath
+            self.root = np.ones((len(time), 1, 1))
+        elif periodic:
             angle = 2.0 * np.pi * scale * time
             self.root = np.stack([np.cos(angle), np.sin(angle)], axis=1)  # (n, 2, K)
         else:

@@ -11,9 +11,14 @@ from ventbench.physics.fits.data import Floats
 ALVEOLUS, SUPPLY, MEASUREMENT = "f(t) at the alveolus", "f(t) at the supply", "measurement"
 SOURCES = (ALVEOLUS, SUPPLY, MEASUREMENT)
 
+#: Not a place but a scatter: each breath has its own valve gain.
+GAIN = "gain of each breath"
+
 
 def responses(side: Side, values: Floats, source: str) -> Floats:
     """Pressures that answer to a unit source at one sample, ``(n, T, T)``: source, then pressure.
+
+    Of a gain, ``(n, 1, T)``, to its logarithm.
 
     Resistance and compliance as fitted, all else left out: a source is drawn to about 10 %.
 
@@ -25,6 +30,10 @@ def responses(side: Side, values: Floats, source: str) -> Floats:
     """
     data, names = side.data, side.simulator.names
     n, samples = data.u_in.shape
+    if source == GAIN:
+        column = (side.simulator.names.index("gain"),)
+        slopes = side.simulator.derivatives(values, column)[1][:, :, 0]
+        return slopes * values[:, column[0], None, None]
     if source == MEASUREMENT:
         return np.broadcast_to(np.eye(samples), (n, samples, samples)).copy()
     R, C, out, gain = (values[:, names.index(name)] for name in ("R", "C", "R_ex", "gain"))

@@ -35,7 +35,7 @@ class CommandPlays(Element):
         signature="Error of one sign while the command rises and of the other while it falls.",
         confusable=("valve_hysteresis", "valve_dead_band"),
     )  # fmt: skip
-    rank = 2
+    rank = 4
     remembers = True
 
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:

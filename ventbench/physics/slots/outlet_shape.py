@@ -14,7 +14,7 @@ from ventbench.physics.slots._curves import Hats, beside
 from ventbench.physics.slots._element import Element, Shape, coefficients
 
 #: p - PEEP where the factor bends, cmH2O; where it is 1, the conductance is 1 / R_ex.
-_KNOTS = (0.0, 2.0, 5.0, 10.0, 20.0, 30.0)
+_KNOTS = (0.0, 2.0, 5.0, 10.0, 20.0)
 _FIXED = 5.0
 _FREE = tuple(d for d in _KNOTS if d != _FIXED)
 
@@ -50,7 +50,7 @@ class OutletShape(Element):
         ),
         source="Straight lines between fixed knots, as of a diaphragm on a spring; exponentials.",
         signature="Error during expiration only, whatever the inspiration was.",
-        confusable=("exhalation_valve_delay", "direction_resistance", "inertance"),
+        confusable=("exhalation_valve_delay", "inertance"),
     )  # fmt: skip
     stateful = True
 
@@ -81,11 +81,11 @@ class OutletShape(Element):
         shut = np.minimum(np.exp(-t[:, None] / np.array(_TAUS)) @ late, 1.0)
         curve = Shape(d, y, "p - PEEP, cmH2O", "extra conductance, mL/s per cmH2O", (0,))
         opening = Shape(t, shut, "time after the command to open, s", "share that is still shut")
-        slow = np.abs(late).max() / 2.0 >= max(abs(float(values[f"c{k}"])) for k in range(1, 6))
+        slow = np.abs(late).max() / 2.0 >= max(abs(float(values[f"c{k}"])) for k in range(1, 5))
         return (opening, curve) if slow else (curve, opening)
 
     def _excess(self, values: Values, above: Array) -> Array:
-        free = iter([values[f"c{k}"] for k in range(1, 6)])
+        free = iter([values[f"c{k}"] for k in range(1, 5)])
         return Hats(_KNOTS)(above, [0.0 if d == _FIXED else next(free) for d in _KNOTS])
 
 

@@ -45,7 +45,7 @@ class ValveShape(Element):
         signature="Error that follows the command, whatever flow and pressure are.",
         confusable=("valve_curve", "valve_dead_band", "command_rounding"),
     )
-    rank = 4
+    rank = 5
 
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
         """Add the curve."""

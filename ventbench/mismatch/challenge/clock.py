@@ -81,5 +81,8 @@ def _snap(nodes: Floats, edges: Floats, steps: int) -> None:
         if nearest % steps == 0:
             nearest += 1 if edge >= nodes[nearest] else -1
         nearest = max(nearest, free)
+        nearest += nearest % steps == 0  # pushed on by the edge before
+        if nearest >= len(nodes) - 1:
+            break  # no step is left before the last sample
         nodes[nearest] = np.clip(edge, nodes[nearest - 1] + _GAP, nodes[nearest + 1] - _GAP)
         free = nearest + 1

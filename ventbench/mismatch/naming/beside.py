@@ -15,6 +15,9 @@ from ventbench.mismatch.naming.sources import ALVEOLUS
 #: share below which a name beside a slot is only its trimming.
 _FAMILY, _TRIMMING = 0.5, 0.1
 
+#: Elements of slots that are refitted: the first-order ranking has the right one near its top.
+PROMISING = 5
+
 
 @dataclass(frozen=True, eq=False)
 class Place:
@@ -101,7 +104,7 @@ def beside(bench: Bench, wide: Bench, named: Solved, shape: Shape) -> tuple[Solv
     if not kept.names:
         # Chosen anew, without names that took part of the effect.
         null = wide.solve(Hypothesis(), named.noise, named)
-        again = step(wide, null, places.scan(null))
+        again = step(wide, null, places.scan(null)[:PROMISING])
         if again is not None and believed(again.gained):
             element, full = again.rivals[0].name, again.rivals[0].solved
             nats = float(again.gained.sum())

@@ -7,7 +7,14 @@ from dataclasses import dataclass, replace
 
 from ventbench.mismatch.naming import moving, places
 from ventbench.mismatch.naming.bench import Bench, Hypothesis, Solved
-from ventbench.mismatch.naming.beside import Place, Shape, beside, beside_source, effortless
+from ventbench.mismatch.naming.beside import (
+    PROMISING,
+    Place,
+    Shape,
+    beside,
+    beside_source,
+    effortless,
+)
 from ventbench.mismatch.naming.moving import Moving
 from ventbench.mismatch.naming.rivals import Alternatives, alternatives
 from ventbench.mismatch.naming.search import (
@@ -100,7 +107,7 @@ def conclude(bench: Bench, wider: Callable[[], Bench], tell: Progress) -> Conclu
 def _shape(wide: Bench, named: Solved) -> Shape | None:
     """The element that explains most of what the names leave, if held-out breaths ask for it."""
     here = wide.solve(named.hypothesis, named.noise, named, iterations=3)
-    found = step(wide, here, places.scan(here))
+    found = step(wide, here, places.scan(here)[:PROMISING])
     if found is None or not believed(found.gained):
         return None
     best = found.rivals[0]

@@ -1,0 +1,118 @@
+"""``ventbench proof``: the diagnosis proved on real recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ventbench.cli.options import JsonFile, emit
+
+if TYPE_CHECKING:
+    from ventbench.mismatch.proof import Proof
+
+
+def proof(
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Where to write: a folder a part, and proof.json.")
+    ],
+    recordings: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder with pvp_quicklung.csv; by default $VENTBENCH_RECORDINGS.",
+        ),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Only this part (may be repeated): rc, two_balloon, removed, injected, frozen.",
+        ),
+    ] = None,
+    json: JsonFile = None,
+) -> None:
+    """Find what physics models lack on the real rig, and find again what was taken or put there.
+
+    rc and two_balloon: R-C and the paper's two-balloon lungs at their labels, against the six ISO
+    lungs as recorded. removed: the corrected R-C lungs with their most important mechanism taken
+    out again, which must be named. injected: the frozen simulators against recordings that got a
+    sensor lag of 80 ms, which must be named; frozen: the same before. Takes half an hour to an
+    hour of one core. Ctrl-C keeps the parts that are finished; the same command goes on from there.
+
+    Exit code 1 if a claim fails.
+
+    Example: `ventbench proof --recordings recordings --out runs/proof`
+    """
+    from rich.console import Console
+
+    from ventbench import compilation
+    from ventbench.cli.diagnose import keep
+    from ventbench.cli.study import bars
+    from ventbench.mismatch.proof import prove
+    from ventbench.views import extras
+
+    extras.require("jinja2", "rerun")
+    folder = _folder(recordings)
+    compilation.keep()
+    with bars() as shown:
+        tasks: dict[str, Any] = {}
+
+        def progress(part: str, what: str, share: float) -> None:
+            if part not in tasks:
+                tasks[part] = shown.add_task(part, total=1.0)
+            shown.update(tasks[part], completed=share, description=f"{part}: {what}")
+
+        found = prove(folder, out, keep, only or (), progress)
+    emit(found.as_dict(), json)
+    _show(Console(stderr=str(json) == "-"), found)
+    if not found.met:
+        raise typer.Exit(1)
+
+
+def _folder(given: Path | None) -> Path:
+    from ventbench import recordings
+    from ventbench.errors import InputError
+
+    folder = given or recordings.recordings_dir()
+    if folder is None:
+        raise InputError("no folder of recordings: give --recordings DIR, with pvp_quicklung.csv")
+    return folder
+
+
+def _show(console: Any, found: Proof) -> None:
+    console.print(_table(found))
+    for name, reason in found.impossible.items():
+        console.print(f"{name}: {reason}", markup=False, highlight=False)
+    for claim in found.claims:
+        verdict = "met" if claim.met else "missed"
+        console.print(
+            f"{claim.part}: {claim.what}: {verdict} ({claim.value})", markup=False, highlight=False
+        )
+
+
+def _table(found: Proof) -> Any:
+    from rich.table import Table
+
+    table = Table(title="Open-loop MAE on held-out real breaths, cmH2O")
+    table.add_column("part", no_wrap=True)
+    for name in ("n", "before", "refit", "after", "cut"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name in ("named", "without a name", "label misfits"):
+        table.add_column(name)
+    for name, part in found.parts.items():
+        errors = (f"{part['mae'][k] or float('nan'):.2f}" for k in ("before", "refit", "after"))
+        share = part["cut_percent"]
+        table.add_row(
+            name, str(part["held_out"]), *errors, "-" if share is None else f"{share:.0f} %",
+            ", ".join(item["name"] for item in part["mechanisms"]) or "-",
+            part["slot"]["name"] if part["slot"] else "-",
+            ", ".join(item["label"] for item in part["misfitting_labels"]) or "-",
+        )  # fmt: skip
+    return table
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(proof)

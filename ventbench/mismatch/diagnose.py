@@ -14,7 +14,7 @@ from ventbench.mismatch import estimates, flows, shapes, simulators, split
 from ventbench.mismatch.compare import Lack, lacking
 from ventbench.mismatch.distances import distances
 from ventbench.mismatch.locate import locate
-from ventbench.mismatch.naming.bench import Bench, Side, Solved, bench
+from ventbench.mismatch.naming.bench import Bench, Side, Solved, bench, simulator
 from ventbench.mismatch.naming.conclude import Conclusion, conclude
 from ventbench.mismatch.naming.places import all_paths
 from ventbench.mismatch.naming.rivals import Alternatives
@@ -22,7 +22,7 @@ from ventbench.mismatch.next_breath import request
 from ventbench.mismatch.result import Diagnosis, LungMatch, Named, Request, Traces, Verdict
 from ventbench.mismatch.simulators import Given
 from ventbench.physics.catalogue import paths
-from ventbench.physics.fits import Fit, Noise, Simulator, recorded
+from ventbench.physics.fits import Fit, Noise, recorded
 from ventbench.physics.fits.data import Data, Floats
 from ventbench.plants.base import Plant
 from ventbench.plants.corrected import Corrected
@@ -89,7 +89,7 @@ def _conclude(data: Data, held: NDArray[np.bool_], tell: Callable[[str], None]) 
         return wide[0]
 
     found = conclude(narrow, wider, tell)
-    side = Side(data, Simulator(data, paths()))
+    side = Side(data, simulator(data, paths()))
     if found.place is not None and found.place.element is not None:
         # With a slot, the training breaths alone: all of them would be one more compilation.
         return _Found(wide[0], found, estimates.estimated(found.full, wide[0].training))

@@ -21,6 +21,9 @@ from ventbench.precision import float64
 #: Name of what is not a parameter of a plant: the reading that a breath starts from, cmH2O.
 START = "start"
 
+#: Numbers of breaths that are compiled for, unless told otherwise.
+SIZES = (4, 8, 16, 32, 64)
+
 _STATIC = ("names", "substeps", "memory", "flow")
 
 
@@ -72,7 +75,13 @@ class Simulator:
         memory: samples that dead times can reach back over.
     """
 
-    def __init__(self, data: Data, names: tuple[str, ...], substeps: int | None = None) -> None:
+    def __init__(
+        self,
+        data: Data,
+        names: tuple[str, ...],
+        substeps: int | None = None,
+        sizes: tuple[int, ...] = SIZES,
+    ) -> None:
         """Pad and place the data.
 
         Args:
@@ -80,10 +89,12 @@ class Simulator:
             names: paths of the parameters in the order of the columns.
             substeps: of a sample; enough for most purposes if not given. An edge that a dead time
                 shifts is smoothed over one substep, and the dead time is uncertain by part of it.
+            sizes: to which the number of breaths is padded, or to multiples of the last: each is
+                compiled once.
         """
         self.names = names
         self._count = len(data)
-        self._padded = data.padded(_next(len(data), (4, 8, 16, 24, 32, 40, 48, 64)))
+        self._padded = data.padded(_next(len(data), sizes))
         enough, memory = resolution(float(np.median(data.dt)))
         self.substeps, self.memory = substeps or enough, memory
         flow = data.seen.shape[1] > 1

@@ -9,6 +9,7 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+import pytest
 
 from ventbench.mismatch.challenge.cases import Base, Case, Effect
 from ventbench.mismatch.challenge.rig import record
@@ -21,7 +22,7 @@ from ventbench.recordings.breaths import Breaths
 #: The lung as it is labelled, and the rig as it is.
 LABEL, RIG = "R20C20", Base(21.0, 19.5)
 
-#: Eight breaths to train on and eight to judge by: one size of array.
+#: One size of array for training, judging and all breaths.
 BREATHS, SAMPLES = 16, 40
 HELD = np.arange(BREATHS) % 2 == 1
 
@@ -50,7 +51,12 @@ def with_few() -> tuple[str, ...]:
     return paths((*library(), *FEW))
 
 
-def limit_slots(monkeypatch: Any) -> None:
+def one_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compile for these breaths alone."""
+    monkeypatch.setattr("ventbench.mismatch.naming.bench._SIZES", (BREATHS,))
+
+
+def limit_slots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave a few slots to choose from."""
     few = {name: slots()[name] for name in FEW}
     monkeypatch.setattr("ventbench.mismatch.naming.places.slots", lambda: few)

@@ -105,6 +105,6 @@ def test_the_runs_of_the_other_ventilator(public_recordings, tmp_path):
     known, unknown = sorted(json.loads(target.read_text()), key=lambda item: item["run"])
     assert known["mechanics"]["settings"][0] == "R5C50"
     assert unknown["mechanics"] is None
-    two[two["run"] == days[1]].to_parquet(tmp_path / "mute.parquet")
+    two.loc[two["run"] == days[1]].to_parquet(tmp_path / "mute.parquet")
     message = run(tmp_path / "mute.parquet", code=2)
     assert "no run has flow or volume" in message

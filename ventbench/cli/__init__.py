@@ -16,6 +16,8 @@ from ventbench.cli import (
     challenge,
     data,
     diagnose,
+    mechanics,
+    proof,
     rl,
     run,
     score,
@@ -63,6 +65,8 @@ view.register(app)
 board.register(app)
 diagnose.register(app)
 challenge.register(app)
+mechanics.register(app)
+proof.register(app)
 app.add_typer(data.app)
 
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +27,7 @@ from ventbench.physics.fits import Fit, Noise, recorded
 from ventbench.physics.fits.data import Data, Floats
 from ventbench.plants.base import Plant
 from ventbench.plants.corrected import Corrected
+from ventbench.precision import float64
 from ventbench.recordings.breaths import Breaths
 
 Progress = Callable[[str, float], None]
@@ -186,11 +188,10 @@ def _plants(breaths: Breaths, found: _Found, had: _Found | None, plant: Given) -
         return wanted
     own = estimates.plants(had.fit)
     make = simulators.plants_for(plant)
-    import jax
-
     result: dict[str, Plant] = {}
     for name, index in breaths.by_lung_index.items():
-        stacked = make(breaths.select(index[:1]))
-        one = jax.tree.map(lambda leaf: leaf[0], stacked)
+        with float64():
+            stacked = make(breaths.select(index[:1]))
+            one = jax.tree.map(lambda leaf: leaf[0], stacked)
         result[name] = Corrected(one, wanted[name], own[name])
     return result

@@ -8,9 +8,11 @@ from ventbench.mismatch.naming.bench import Solved
 from ventbench.mismatch.naming.beside import Place
 from ventbench.mismatch.naming.conclude import Conclusion
 from ventbench.mismatch.naming.moving import Moving
+from ventbench.mismatch.naming.places import public
 from ventbench.mismatch.naming.sources import ALVEOLUS, MEASUREMENT, SUPPLY
 from ventbench.mismatch.result import Slot
 from ventbench.physics.catalogue import mechanism
+from ventbench.physics.shapes import drawn
 from ventbench.physics.slots import SLOTS
 
 _MEANINGS = {
@@ -62,18 +64,16 @@ def _moving(place: Place, source: Moving, explains: float) -> Slot:
 
 
 def _curve(full: Solved, element: str) -> tuple[np.ndarray, np.ndarray, str, str]:
-    item = mechanism(element)
+    own = [f"{element}.{p.name}" for p in mechanism(element).description.parameters]
     values = {
-        p.name: float(np.median(full.column(f"{element}.{p.name}")))
-        for p in item.description.parameters
+        name: float(np.median(full.column(name)))
+        for name in (*own, "R", "C", "gain", "R_ex", "PEEP")
     }
-    base = {
-        name: float(np.median(full.column(name))) for name in ("R", "C", "gain", "R_ex", "PEEP")
-    }
-    drawn = max(item.shapes(values, base), key=lambda one: one.size)  # type: ignore[attr-defined]
-    x, y = np.asarray(drawn.x, float), np.asarray(drawn.y, float)
-    if drawn.absorbed:
+    # The slot's other elements are neutral; the strongest curve is the first.
+    curve = drawn(public(element), values)[0]
+    x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
+    if curve.absorbed:
         # What base parameters could take over says nothing: it is taken out of the drawing.
-        powers = np.stack([x**power for power in drawn.absorbed], axis=1)
+        powers = np.stack([x**power for power in curve.absorbed], axis=1)
         y = y - powers @ np.linalg.lstsq(powers, y, rcond=None)[0]
-    return x, y, drawn.x_unit, drawn.y_unit
+    return x, y, curve.x_unit, curve.y_unit

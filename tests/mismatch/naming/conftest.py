@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import pytest
@@ -17,6 +18,13 @@ class Plain(NamedTuple):
 
     bench: Bench
     null: Solved
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_size() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        small.one_size(patch)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -110,11 +110,11 @@ def test_nothing_is_worth_a_look_if_nothing_is_promising(plain):
 
 
 def test_a_step_orders_candidates_at_one_noise():
-    bench = small.split(small.made(small.effect("sensor_lag", tau=0.12)))
+    bench = small.split(small.made(small.effect("turbulent_resistance", quadratic=10.0)))
     null = settle(bench, Hypothesis())
     found = step(bench, null, screen(null))
     assert found is not None
-    assert found.rivals[0].name == "sensor_lag"
+    assert found.rivals[0].name == "turbulent_resistance"
     criteria = [one.criterion for one in found.rivals]
     assert criteria == sorted(criteria)
     assert len({one.name for one in found.rivals}) == len(found.rivals)
@@ -131,8 +131,9 @@ def test_one_strong_effect_is_named_and_nothing_else(name):
     named, steps = forward(bench, settle(bench, Hypothesis()), quiet)
     assert named.hypothesis.names == (name,)
     assert believed(steps[0].gained)
-    assert named.noise.sigma[0] == pytest.approx(0.2, rel=0.2)
-    assert noise_of(named).ar[0] == pytest.approx(0.0, abs=0.2)
+    if name != "patient_effort":  # of which each breath has its own, some of them beside the best
+        assert named.noise.sigma[0] == pytest.approx(0.2, rel=0.2)
+        assert noise_of(named).ar[0] == pytest.approx(0.0, abs=0.2)
 
 
 def test_two_strong_effects_are_both_named():
@@ -163,14 +164,15 @@ def test_a_term_that_another_replaces_is_dropped():
     assert dropped(bench, kept).hypothesis.names == ("sensor_lag", "sensor_drift")
 
 
-def test_a_shape_is_freed_if_the_recording_asks_for_it():
-    noise, name = Noise((0.2,), (0.0,)), "viscoelasticity"
-    for time, wanted in ((0.3, True), (1.0, False)):
-        effect = small.effect(name, ratio=0.7, time=time)
-        bench = small.split(small.made(effect, seed=5))
-        named = bench.solve(Hypothesis((name,)), noise, start={f"{name}.time": 1.0})
-        free = shaped(bench, named)
-        assert (f"{name}.time" in free.hypothesis.free) == wanted
+@pytest.mark.parametrize("form", ["linear", "library"])
+def test_a_shape_is_freed_if_the_recording_asks_for_it(form):
+    effect = small.effect("leak", form, conductance=20.0)
+    bench = small.split(small.made(effect, noise=0.1, seed=5))
+    found = shaped(bench, bench.solve(Hypothesis(("leak",)), Noise((0.1,), (0.0,))))
+    # The library's is an orifice.
+    assert found.hypothesis.free == (("leak.exponent",) if form == "linear" else ())
+    wanted = 1.0 if form == "linear" else 0.5
+    assert found.column("leak.exponent")[0] == pytest.approx(wanted, abs=0.05)
 
 
 @pytest.fixture(scope="module")

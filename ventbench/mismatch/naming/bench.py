@@ -238,16 +238,18 @@ class Bench:
     def carried(self, solved: Solved, side: Side) -> Floats:
         """Physical values of breaths, ``(n, P + 1)``: what those of a label share.
 
-        What is a breath's own is neutral, and its start the first reading.
+        What is a breath's own, or unknown to the fit's simulator, is neutral, and its start the
+        first reading.
         """
         data, known = side.data, solved.problem.data
+        names = solved.problem.simulator.names
         values = settings(data, side.simulator.names, {})
         same = (data.R[:, None] == known.R) & (data.C[:, None] == known.C)
         same |= ~same.any(axis=1, keepdims=True)
         first = np.argmax(same, axis=1)
         for column, name in enumerate(side.simulator.names):
-            if name != "position" and not self._own(name):
-                values[:, column] = solved.values[first, column]
+            if name != "position" and name in names and not self._own(name):
+                values[:, column] = solved.values[first, names.index(name)]
         return values
 
     def _problem(

@@ -14,6 +14,7 @@ from ventbench.errors import InputError
 from ventbench.lungs import LUNGS
 from ventbench.physics import physics
 from ventbench.plants import files, frozen, registry
+from ventbench.plants.corrected import Corrected
 from ventbench.plants.learned import Architecture, learned
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stack import stack, take
@@ -25,8 +26,12 @@ PLANTS = {
     "TwoBalloon": lambda: two_balloon(LUNGS[0]),
     "Learned": lambda: learned(jax.random.key(0), SMALL),
     "Hybrid": lambda: frozen.load().ensemble,
+    "Corrected": lambda: Corrected(
+        single_compartment(LUNGS[0]), physics(LUNGS[0], {"valve_lag": {"tau": 0.04}}),
+        physics(LUNGS[0]),
+    ),
     "Physics": lambda: physics(LUNGS[0], {"leak": {"conductance": 8.0}}),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", PLANTS)

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ventbench.errors import InputError
 from ventbench.evaluation import PlantsFor, pressures
 from ventbench.physics.fits.data import Data, Floats
 from ventbench.physics.fits.noise import Noise
+from ventbench.plants import alike
 from ventbench.plants.base import Plant
 from ventbench.plants.labelled import single_compartments
 from ventbench.recordings.breaths import Breaths
@@ -46,7 +45,7 @@ def _stacked(plants: Mapping[str, Plant], breaths: Breaths) -> Plant:
     if missing:
         raise InputError(f"the simulator has no lung {missing[0]}; it has {', '.join(plants)}")
     chosen = [plants[name] for name in breaths.lung_ids.tolist()]
-    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x) for x in leaves]), *chosen)
+    return alike.stacked(chosen)
 
 
 def answers(plant: Given, breaths: Breaths) -> Floats:

@@ -24,7 +24,7 @@ def usable(breaths: Breaths) -> tuple[Breaths, list[str]]:
     """Breaths that can be diagnosed, and what to say of the others.
 
     Raises:
-        InputError: if fewer than four are left.
+        InputError: if fewer than four are left, or no lung has two.
     """
     pressure = np.isfinite(breaths.pressure)
     good = pressure[:, 0] & (np.sum(pressure & breaths.inspiratory, axis=1) > 3)
@@ -41,4 +41,10 @@ def usable(breaths: Breaths) -> tuple[Breaths, list[str]]:
             f"{int(good.sum())} usable breaths; a diagnosis needs at least {FEWEST} of a lung with "
             "pressures and commands"
         )
-    return breaths.select(good), notes
+    breaths = breaths.select(good)
+    if not held_out(breaths).any():
+        raise InputError(
+            "no lung has two usable breaths, so that none can be held out; record at least "
+            f"{FEWEST} of a lung"
+        )
+    return breaths, notes

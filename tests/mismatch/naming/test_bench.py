@@ -11,7 +11,7 @@ from ventbench.mismatch.naming.bench import Bench, Hypothesis, Side, bench, by_l
 from ventbench.mismatch.naming.effort import _ONSETS, _SHARE, _WIDTH
 from ventbench.mismatch.naming.search import settle
 from ventbench.physics import paths
-from ventbench.physics.fits import Data, Noise, START, recorded, settings
+from ventbench.physics.fits import START, Data, Noise, recorded, settings
 
 from .. import small
 

@@ -15,7 +15,8 @@ def test_samples_stay_and_time_goes_on_whatever_the_dead_times(seed):
     u_out[:, 31:] = 1
     for _ in range(25):
         time = sampling(3, 80, 3e-4, rng)
-        found = clock(time, u_out, *rng.uniform(0.0, 0.12, 2), 8)
+        late, late_out = (float(x) for x in rng.uniform(0.0, 0.12, 2))
+        found = clock(time, u_out, late, late_out, 8)
         nodes = found.nodes
         assert np.all(np.diff(nodes, axis=1) > 0)
         np.testing.assert_allclose(nodes[:, ::8], time, atol=0)

@@ -33,8 +33,8 @@ from ventbench.physics.fits.noise import Noise
 _HUM = 0.3
 
 #: Share of what sources explain from which it is the gain that differs between breaths. At 0.5 the
-#: public recordings of the PVP were explained by scattered gains and by efforts that a test lung has
-#: not, and the corrected simulator was worse on held-out breaths.
+#: public recordings of the PVP were explained by scattered gains and by efforts, which a test lung
+#: does not make, and the corrected simulator was worse on held-out breaths.
 _SCATTERED = 1.0
 
 

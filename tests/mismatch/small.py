@@ -27,7 +27,7 @@ BREATHS, SAMPLES = 16, 40
 HELD = np.arange(BREATHS) % 2 == 1
 
 #: A few elements of slots, whose derivatives take a quarter of the time to compile.
-FEW = ("volume_resistance", "direction_resistance", "flow_shape", "recoil_shape")
+FEW = ("volume_resistance", "flow_shape")
 
 
 def effect(name: str, form: str = "library", /, **parameters: float) -> Effect:

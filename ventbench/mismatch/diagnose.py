@@ -153,8 +153,9 @@ def _answers(
 
     def of(bench_: Bench, solved: Solved) -> Floats:
         pressure = np.empty(before.shape)
-        pressure[~held] = bench_.predict(solved, bench_.training)[:, 0]
-        pressure[held] = bench_.predict(solved, bench_.judging)[:, 0]
+        # Where every simulation starts, be it the recording's or the simulator's own physics.
+        for which, side in ((~held, bench_.training), (held, bench_.judging)):
+            pressure[which] = bench_.predict(solved, side, breaths.pressure[which, 0])[:, 0]
         return pressure
 
     after = of(found.bench, found.conclusion.full)

@@ -66,6 +66,7 @@ def test_resistance_that_follows_volume_has_no_name_but_a_place():
     assert np.polyfit(shown.x, shown.y, 1)[0] * np.ptp(shown.x) > 3.0
 
 
+@pytest.mark.slow  # many refits
 @pytest.mark.usefixtures("few_slots")
 def test_a_beating_heart_is_at_the_alveolus():
     beats = small.effect("cardiogenic", "oscillation", amplitude=1.3, frequency=1.4)
@@ -84,6 +85,7 @@ def test_a_beating_heart_is_at_the_alveolus():
     assert np.ptp(shown.y) == pytest.approx(2.6, rel=0.4)
 
 
+@pytest.mark.slow  # many refits
 @pytest.mark.usefixtures("few_slots")
 def test_a_name_stands_beside_a_place():
     beats = small.effect("pulsating_supply", "oscillation", amplitude=0.175, frequency=5.0)
@@ -99,11 +101,11 @@ def test_a_name_stands_beside_a_place():
 
 @pytest.mark.usefixtures("few_slots")
 def test_breaths_whose_valves_differ_are_no_physics():
-    rng = np.random.default_rng(3)
+    rng = np.random.default_rng(4)
     rows = []
     for i in range(small.BREATHS):
         rig = dataclasses.replace(small.RIG, gain=22.8 * np.exp(0.08 * rng.standard_normal()))
-        rows.append(small.numbered(small.made(seed=i, base=rig, breaths=1), i + 1))
+        rows.append(small.numbered(small.made(seed=100 + i, base=rig, breaths=1), i + 1))
     found = concluded(join(rows))
     assert found.names == ()
     assert found.place is None

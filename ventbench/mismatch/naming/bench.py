@@ -231,9 +231,18 @@ class Bench:
         count = float(self.training.data.weight.sum())
         return -2.0 * likelihood + solved.shared * float(np.log(count))
 
-    def predict(self, solved: Solved, side: Side) -> Floats:
-        """Open-loop answers to breaths' commands from their first readings, ``(n, c, T)``."""
-        return side.simulator.predict(self.carried(solved, side))
+    def predict(self, solved: Solved, side: Side, first: Floats | None = None) -> Floats:
+        """Open-loop answers to breaths' commands, ``(n, c, T)``.
+
+        Args:
+            solved: a hypothesis.
+            side: the breaths.
+            first: pressures that they start from, cmH2O, ``(n,)``; their first readings if None.
+        """
+        values = self.carried(solved, side)
+        if first is not None:
+            values[:, -1] = first
+        return side.simulator.predict(values)
 
     def carried(self, solved: Solved, side: Side) -> Floats:
         """Physical values of breaths, ``(n, P + 1)``: what those of a label share.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -91,6 +91,11 @@ def _conclude(data: Data, held: NDArray[np.bool_], tell: Callable[[str], None]) 
         return wide[0]
 
     found = conclude(narrow, wider, tell)
+    # Gains that differ between breaths are each breath's own, and unknown of held-out ones.
+    narrow, wide = (
+        replace(narrow, spread=found.spread),
+        [replace(one, spread=found.spread) for one in wide],
+    )
     side = Side(data, simulator(data, paths()))
     if found.place is not None and found.place.element is not None:
         # With a slot, the training breaths alone: all of them would be one more compilation.

@@ -32,9 +32,7 @@ from ventbench.physics.fits.noise import Noise
 #: A source at the sensor is noise unless it is of one frequency and this large, cmH2O.
 _HUM = 0.3
 
-#: Share of what sources explain from which it is the gain that differs between breaths. At 0.5 the
-#: public recordings of the PVP were explained by scattered gains and by efforts, which a test lung
-#: does not make, and the corrected simulator was worse on held-out breaths.
+#: Share of what sources explain from which it is the gain that differs between breaths.
 _SCATTERED = 1.0
 
 

@@ -53,7 +53,7 @@ def with_few() -> tuple[str, ...]:
 
 def one_size(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compile for these breaths alone."""
-    monkeypatch.setattr("ventbench.mismatch.naming.bench._SIZES", (BREATHS,))
+    monkeypatch.setattr("ventbench.mismatch.naming.solved._SIZES", (BREATHS,))
 
 
 def limit_slots(monkeypatch: pytest.MonkeyPatch) -> None:

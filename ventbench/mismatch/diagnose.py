@@ -15,10 +15,11 @@ from ventbench.mismatch import estimates, flows, shapes, simulators, split
 from ventbench.mismatch.compare import Lack, lacking
 from ventbench.mismatch.distances import distances
 from ventbench.mismatch.locate import locate
-from ventbench.mismatch.naming.bench import Bench, Side, Solved, bench, simulator
+from ventbench.mismatch.naming.bench import Bench, bench
 from ventbench.mismatch.naming.conclude import Conclusion, conclude
 from ventbench.mismatch.naming.places import all_paths
 from ventbench.mismatch.naming.rivals import Alternatives
+from ventbench.mismatch.naming.solved import Side, Solved, simulator
 from ventbench.mismatch.next_breath import request
 from ventbench.mismatch.result import Diagnosis, LungMatch, Named, Request, Traces, Verdict
 from ventbench.mismatch.simulators import Given

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from ventbench.mismatch import mechanics
-from ventbench.mismatch.naming.bench import Side, Solved, has_own
+from ventbench.mismatch.naming.hypothesis import has_own
+from ventbench.mismatch.naming.solved import Side, Solved
 from ventbench.mismatch.result import Estimate, LungMatch
 from ventbench.physics.catalogue import library, mechanism
 from ventbench.physics.fits import Fit, fit, interval

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from ventbench.mismatch.naming.bench import Solved
 from ventbench.mismatch.naming.beside import Place
 from ventbench.mismatch.naming.conclude import Conclusion
 from ventbench.mismatch.naming.moving import Moving
 from ventbench.mismatch.naming.places import public
+from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.sources import ALVEOLUS, MEASUREMENT, SUPPLY
 from ventbench.mismatch.result import Slot
 from ventbench.physics.catalogue import mechanism
-from ventbench.physics.shapes import drawn
+from ventbench.physics.shapes import drawn, without_absorbed
 from ventbench.physics.slots import SLOTS
 
 _MEANINGS = {
@@ -70,10 +70,5 @@ def _curve(full: Solved, element: str) -> tuple[np.ndarray, np.ndarray, str, str
         for name in (*own, "R", "C", "gain", "R_ex", "PEEP")
     }
     # The slot's other elements are neutral; the strongest curve is the first.
-    curve = drawn(public(element), values)[0]
-    x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
-    if curve.absorbed:
-        # What base parameters could take over says nothing: it is taken out of the drawing.
-        powers = np.stack([x**power for power in curve.absorbed], axis=1)
-        y = y - powers @ np.linalg.lstsq(powers, y, rcond=None)[0]
-    return x, y, curve.x_unit, curve.y_unit
+    curve = without_absorbed(drawn(public(element), values)[0])
+    return np.asarray(curve.x, float), np.asarray(curve.y, float), curve.x_unit, curve.y_unit

@@ -61,7 +61,12 @@ def _cut(shape: Shape, low: float, high: float) -> Shape:
             f"{shape.x_unit} from {low:g} to {high:g}: the curve goes from {shape.x[0]:g} to "
             f"{shape.x[-1]:g}; give a range within that"
         )
-    if shape.absorbed:
-        powers = np.stack([x**power for power in shape.absorbed], axis=1)
-        y = y - powers @ np.linalg.lstsq(powers, y, rcond=None)[0]
-    return replace(shape, x=x, y=y)
+    return without_absorbed(replace(shape, x=x, y=y))
+
+
+def without_absorbed(shape: Shape) -> Shape:
+    """Take away what base parameters could take over: it says nothing."""
+    if not shape.absorbed:
+        return shape
+    powers = np.stack([shape.x**power for power in shape.absorbed], axis=1)
+    return replace(shape, y=shape.y - powers @ np.linalg.lstsq(powers, shape.y, rcond=None)[0])

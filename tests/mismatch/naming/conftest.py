@@ -7,8 +7,10 @@ from typing import NamedTuple
 
 import pytest
 
-from ventbench.mismatch.naming.bench import Bench, Hypothesis, Solved
+from ventbench.mismatch.naming.bench import Bench
+from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.search import settle
+from ventbench.mismatch.naming.solved import Solved
 
 from .. import small
 

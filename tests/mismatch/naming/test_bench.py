@@ -7,9 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.mismatch.naming.bench import Bench, Hypothesis, Side, bench, by_label
+from ventbench.mismatch.naming.bench import Bench, bench, by_label
 from ventbench.mismatch.naming.effort import _ONSETS, _SHARE, _WIDTH
+from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.search import settle
+from ventbench.mismatch.naming.solved import Side
 from ventbench.physics import paths
 from ventbench.physics.fits import START, Data, Noise, recorded, settings
 

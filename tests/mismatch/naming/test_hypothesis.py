@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ventbench.mismatch.naming.bench import Hypothesis, has_own
+from ventbench.mismatch.naming.hypothesis import Hypothesis, has_own
 from ventbench.physics import library
 from ventbench.physics.fits import START
 

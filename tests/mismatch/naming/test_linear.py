@@ -8,8 +8,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from ventbench.mismatch.naming.bench import Bench, Hypothesis, Solved
+from ventbench.mismatch.naming.bench import Bench
+from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.linear import Local, gain, local
+from ventbench.mismatch.naming.solved import Solved
 from ventbench.physics.fits import START, Noise
 
 from .. import small

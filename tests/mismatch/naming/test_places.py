@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ventbench.mismatch.naming import places
-from ventbench.mismatch.naming.bench import Hypothesis
+from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.search import settle
 from ventbench.physics import library, parameter
 from ventbench.physics.catalogue import slots

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ventbench.mismatch.naming.bench import Hypothesis
 from ventbench.mismatch.naming.candidates import screen, strengths
+from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.rivals import SAME, alternatives
 from ventbench.mismatch.naming.search import (
     GATE,

@@ -1,125 +1,24 @@
-"""One recording on the bench: training and held-out breaths, and hypotheses fitted to them.
-
-All hypotheses use one simulator of all breaths, so that nothing is compiled or placed twice;
-training and held-out breaths differ by their weights alone.
-"""
+"""One recording on the bench: training and held-out breaths, and hypotheses fitted to them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench.physics.catalogue import mechanism
+from ventbench.mismatch.naming.hypothesis import Hypothesis, has_own
+from ventbench.mismatch.naming.solved import Side, Solved, simulator
 from ventbench.physics.fits.data import Data, Floats
-from ventbench.physics.fits.derivatives import START, Simulator
-from ventbench.physics.fits.least_squares import Minimum, minimise
+from ventbench.physics.fits.derivatives import START
+from ventbench.physics.fits.least_squares import minimise
 from ventbench.physics.fits.noise import Noise
 from ventbench.physics.fits.problem import Problem, settings
-from ventbench.physics.fits.unknowns import described, freed, unknowns
+from ventbench.physics.fits.unknowns import described, unknowns
 
 #: Expected fall of the cost, nats, at which a comparison's search ends, and its most steps.
 _TOLERANCE, _ITERATIONS = 0.02, 14
-
-#: Numbers of breaths that are compiled for: those of 60 breaths, split, and few.
-_SIZES = (24, 40, 64)
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """What is taken to act.
-
-    Attributes:
-        names: mechanisms, and elements of slots.
-        free: shape parameters that are fitted too, by path.
-        fixed: parameters that stand at a value other than their neutral one, by path.
-    """
-
-    names: tuple[str, ...] = ()
-    free: tuple[str, ...] = ()
-    fixed: tuple[tuple[str, float], ...] = ()
-
-    def plus(self, other: Hypothesis) -> Hypothesis:
-        """Both together."""
-        return Hypothesis(
-            tuple(dict.fromkeys(self.names + other.names)),
-            tuple(dict.fromkeys(self.free + other.free)),
-            tuple(dict(self.fixed + other.fixed).items()),
-        )
-
-    def without(self, *names: str) -> Hypothesis:
-        """The same without some mechanisms and what is theirs."""
-
-        def kept(path: str) -> bool:
-            return path.rpartition(".")[0] not in names
-
-        return Hypothesis(
-            tuple(name for name in self.names if name not in names),
-            tuple(path for path in self.free if kept(path)),
-            tuple((path, value) for path, value in self.fixed if kept(path)),
-        )
-
-    @cached_property
-    def paths(self) -> tuple[str, ...]:
-        """Of everything that is fitted."""
-        fixed = dict(self.fixed)
-        return tuple(p for p in dict.fromkeys((*freed(self.names), *self.free)) if p not in fixed)
-
-
-@dataclass(frozen=True, eq=False)
-class Side:
-    """Some breaths and the simulator of their commands."""
-
-    data: Data
-    simulator: Simulator
-
-
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """A hypothesis fitted to some breaths.
-
-    Attributes:
-        hypothesis: what acts.
-        problem: of the breaths.
-        minimum: of the cost.
-        log_likelihood: of the breaths, sum.
-    """
-
-    hypothesis: Hypothesis
-    problem: Problem
-    minimum: Minimum
-    log_likelihood: float
-
-    @cached_property
-    def values(self) -> Floats:
-        """Physical values of everything, ``(n, P + 1)``."""
-        return self.problem.values(self.minimum.x)
-
-    @cached_property
-    def residual(self) -> Floats:
-        """Simulated minus measured, ``(n, c, T)``."""
-        return self.problem.residual(self.minimum.x)
-
-    @property
-    def noise(self) -> Noise:
-        """Noise at which it was fitted."""
-        return self.problem.noise
-
-    @property
-    def shared(self) -> int:
-        """Unknowns that are not one breath's own."""
-        return int(self.problem.unknowns.shared.sum())
-
-    def column(self, path: str) -> Floats:
-        """Physical value of a parameter in each breath, ``(n,)``."""
-        return self.values[:, (*self.problem.simulator.names, START).index(path)]
-
-    def likelihood_at(self, noise: Noise) -> float:
-        """Log-likelihood of its residuals if the noise is another."""
-        return float(noise.log_likelihood(self.residual, self.problem.data.weight).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,11 +195,6 @@ def bench(data: Data, held_out: NDArray[np.bool_], names: tuple[str, ...]) -> Be
     )
 
 
-def simulator(data: Data, names: tuple[str, ...]) -> Simulator:
-    """Place some breaths in one of few sizes, so that little is compiled."""
-    return Simulator(data, names, sizes=_SIZES)
-
-
 def by_label(data: Data, free: tuple[str, ...]) -> dict[str, NDArray[np.int64]]:
     """Groups of parameters that belong to the lung's R or C: one for each label."""
     groups = {}
@@ -310,8 +204,3 @@ def by_label(data: Data, free: tuple[str, ...]) -> dict[str, NDArray[np.int64]]:
             label = data.R if follows == "R" else data.C
             groups[path] = np.unique(label, return_inverse=True)[1].reshape(-1)
     return groups
-
-
-def has_own(name: str) -> bool:
-    """Whether a mechanism has parameters that are each breath's own."""
-    return any(item.scope == "breath" for item in mechanism(name).description.parameters)

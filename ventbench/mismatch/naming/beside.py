@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ventbench.mismatch.naming import moving, places
-from ventbench.mismatch.naming.bench import Bench, Hypothesis, Solved
+from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.effort import EFFORT
+from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.moving import Moving
 from ventbench.mismatch.naming.search import believed, settle, step
+from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.sources import ALVEOLUS
 
 #: Share of what a slot of the same kind explains from which a name stands, its form apart; and

@@ -7,9 +7,10 @@ from itertools import product
 
 import numpy as np
 
-from ventbench.mismatch.naming.bench import Hypothesis, Solved
 from ventbench.mismatch.naming.effort import EFFORT, evidence
+from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.linear import Local, gain, local
+from ventbench.mismatch.naming.solved import Solved
 from ventbench.physics.catalogue import library, parameter
 from ventbench.physics.parameters import Parameter
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from ventbench.mismatch.naming import moving, places
-from ventbench.mismatch.naming.bench import Bench, Hypothesis, Solved
+from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.beside import (
     PROMISING,
     Place,
@@ -15,6 +15,7 @@ from ventbench.mismatch.naming.beside import (
     beside_source,
     effortless,
 )
+from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.moving import Moving
 from ventbench.mismatch.naming.rivals import Alternatives, alternatives
 from ventbench.mismatch.naming.search import (
@@ -25,6 +26,7 @@ from ventbench.mismatch.naming.search import (
     settle,
     step,
 )
+from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.sources import GAIN, MEASUREMENT, SOURCES
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.noise import Noise

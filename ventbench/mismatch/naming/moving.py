@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ventbench.mismatch.naming.bench import Bench, Side, Solved
+from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.effort import EFFORT, evidence
 from ventbench.mismatch.naming.linear import Local, local
+from ventbench.mismatch.naming.solved import Side, Solved
 from ventbench.mismatch.naming.sources import GAIN, SOURCES, SUPPLY, responses
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.noise import Noise, estimate

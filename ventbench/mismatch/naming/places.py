@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ventbench.mismatch.naming.bench import Hypothesis, Solved
 from ventbench.mismatch.naming.candidates import Candidate
+from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.linear import Local, local
+from ventbench.mismatch.naming.solved import Solved
 from ventbench.physics.catalogue import library, mechanism, parameter, paths, slots
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.slots import SLOTS

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ventbench.mismatch.naming.bench import Bench, Solved
+from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.candidates import screen
 from ventbench.mismatch.naming.search import Rival, Step, believed, step
+from ventbench.mismatch.naming.solved import Solved
 
 #: Criterion (twice the nats) within which a name is an alternative, and most that are listed.
 _CLOSE, _LISTED = 10.0, 2

@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ventbench.mismatch.naming.bench import Bench, Hypothesis, Solved
+from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.candidates import HELD, Candidate, screen
+from ventbench.mismatch.naming.hypothesis import Hypothesis
+from ventbench.mismatch.naming.solved import Solved
 from ventbench.physics.catalogue import mechanism
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.noise import Noise, estimate

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ventbench.mismatch.naming.bench import Side
+from ventbench.mismatch.naming.solved import Side
 from ventbench.physics.fits.data import Floats
 
 #: Public names of the slots whose shape is a function of time, of each breath its own.

@@ -1,0 +1,74 @@
+"""Breaths with their simulator, and a hypothesis fitted to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from ventbench.mismatch.naming.hypothesis import Hypothesis
+from ventbench.physics.fits.data import Data, Floats
+from ventbench.physics.fits.derivatives import START, Simulator
+from ventbench.physics.fits.least_squares import Minimum
+from ventbench.physics.fits.noise import Noise
+from ventbench.physics.fits.problem import Problem
+
+#: Numbers of breaths that are compiled for: those of 60 breaths, split, and few.
+_SIZES = (24, 40, 64)
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """Some breaths and the simulator of their commands."""
+
+    data: Data
+    simulator: Simulator
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A hypothesis fitted to some breaths.
+
+    Attributes:
+        hypothesis: what acts.
+        problem: of the breaths.
+        minimum: of the cost.
+        log_likelihood: of the breaths, sum.
+    """
+
+    hypothesis: Hypothesis
+    problem: Problem
+    minimum: Minimum
+    log_likelihood: float
+
+    @cached_property
+    def values(self) -> Floats:
+        """Physical values of everything, ``(n, P + 1)``."""
+        return self.problem.values(self.minimum.x)
+
+    @cached_property
+    def residual(self) -> Floats:
+        """Simulated minus measured, ``(n, c, T)``."""
+        return self.problem.residual(self.minimum.x)
+
+    @property
+    def noise(self) -> Noise:
+        """Noise at which it was fitted."""
+        return self.problem.noise
+
+    @property
+    def shared(self) -> int:
+        """Unknowns that are not one breath's own."""
+        return int(self.problem.unknowns.shared.sum())
+
+    def column(self, path: str) -> Floats:
+        """Physical value of a parameter in each breath, ``(n,)``."""
+        return self.values[:, (*self.problem.simulator.names, START).index(path)]
+
+    def likelihood_at(self, noise: Noise) -> float:
+        """Log-likelihood of its residuals if the noise is another."""
+        return float(noise.log_likelihood(self.residual, self.problem.data.weight).sum())
+
+
+def simulator(data: Data, names: tuple[str, ...]) -> Simulator:
+    """Place some breaths in one of few sizes, so that little is compiled."""
+    return Simulator(data, names, sizes=_SIZES)

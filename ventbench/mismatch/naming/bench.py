@@ -157,7 +157,9 @@ class Bench:
         first = np.argmax(same, axis=1)
         for column, name in enumerate(side.simulator.names):
             if name != "position" and name in names and not self._own(name):
-                values[:, column] = solved.values[first, names.index(name)]
+                item = described(name)  # rounding must not carry a value beyond its bound
+                found = solved.values[first, names.index(name)]
+                values[:, column] = np.clip(found, item.low, item.high)
         return values
 
     def _problem(

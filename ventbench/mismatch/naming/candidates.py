@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from ventbench.mismatch.naming.effort import EFFORT, evidence
+from ventbench.mismatch.naming.effort import EFFORT, of_all
 from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.linear import Local, gain, local
 from ventbench.mismatch.naming.solved import Solved
@@ -101,7 +101,7 @@ def _best(solved: Solved, places: list[Local], name: str) -> Candidate:
 
 
 def _effort(places: list[Local]) -> Candidate:
-    found = [evidence(place) for place in places]
+    found = of_all(places)
     nats = [max(float(one.nats.sum()), 0.0) for one in found]
     start = {f"{EFFORT}.duration": found[0].duration}
     return Candidate(EFFORT, Hypothesis((EFFORT,)), start, *nats)

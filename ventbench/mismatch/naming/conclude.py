@@ -15,6 +15,7 @@ from ventbench.mismatch.naming.beside import (
     beside_source,
     effortless,
 )
+from ventbench.mismatch.naming.forms import without_trimmings
 from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.moving import Moving
 from ventbench.mismatch.naming.rivals import Alternatives, alternatives
@@ -80,6 +81,7 @@ def conclude(bench: Bench, wider: Callable[[], Bench], tell: Progress) -> Conclu
     named, steps = forward(bench, null, tell)
     tell("looking for what has no name")
     wide = wider()
+    named = without_trimmings(bench, wide, named, tell)
     shape = _shape(wide, named)
     found = moving.moving(bench, effortless(bench, named), (GAIN, *SOURCES))
     reference = moving.without(bench, named)[1]

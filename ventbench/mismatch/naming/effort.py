@@ -45,24 +45,41 @@ def evidence(place: Local, duration: float | None = None) -> Evidence:
         place: of the breaths.
         duration: of the efforts, s; the best of a grid if not given.
     """
-    best: Evidence | None = None
+    return of_all([place], duration)[0]
+
+
+def of_all(places: list[Local], duration: float | None = None) -> list[Evidence]:
+    """The same of one hypothesis at several noises, which share what is predicted."""
+    best: list[Evidence] = []
     for length in _DURATIONS if duration is None else (duration,):
-        found = _at(place, length)
-        if best is None or found.nats.sum() > best.nats.sum():
-            best = found
-    assert best is not None
+        found = _at(places, length)
+        best = best or found
+        best = [new if new.nats.sum() > old.nats.sum() else old
+                for new, old in zip(found, best, strict=True)]  # fmt: skip
     return best
 
 
-def _at(place: Local, duration: float) -> Evidence:
+def _at(places: list[Local], duration: float) -> list[Evidence]:
+    answers = _answers(places[0], duration)
+    return [_of(place, duration, answers) for place in places]
+
+
+def _answers(place: Local, duration: float) -> list[Floats]:
+    """What an effort at each onset changes, ``(n, c, T)``."""
     simulator = place.problem.simulator
     columns = [simulator.names.index(f"{EFFORT}.{p}") for p in ("amplitude", "onset", "duration")]
-    base = place.values
-    logs, means = [], []
+    answers = []
     for onset in _ONSETS:
-        trial = base.copy()
+        trial = place.values.copy()
         trial[:, columns] = (_AMPLITUDE, onset, duration)
-        white = place.whitened(simulator.predict(trial) - place.seen)
+        answers.append(simulator.predict(trial) - place.seen)
+    return answers
+
+
+def _of(place: Local, duration: float, answers: list[Floats]) -> Evidence:
+    logs, means = [], []
+    for answer in answers:
+        white = place.whitened(answer)
         template = place.without_own(white[:, None])[:, 0]
         power = np.sum(template**2, axis=1)
         match = -np.sum(place.residual * template, axis=1)

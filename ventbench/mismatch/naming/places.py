@@ -15,7 +15,7 @@ from ventbench.physics.fits.data import Floats
 from ventbench.physics.slots import SLOTS
 
 #: Directions whose derivatives are taken at once.
-_TOGETHER = 32
+_TOGETHER = 16
 
 
 def all_paths() -> tuple[str, ...]:

@@ -62,23 +62,25 @@ def alternatives(
 
 
 def _rivals(bench: Bench, named: Solved, name: str, steps: list[Step]) -> list[Rival]:
-    if len(named.hypothesis.names) == 1 and steps and steps[0].rivals[0].name == name:
-        first = steps[0]
+    rest = named.hypothesis.without(name)
+    known = [s for s in steps if s.before.hypothesis == rest and s.rivals[0].name == name]
+    if known:
         # Those that stayed far behind were not fitted to the end.
-        return [
-            Rival(one.name, one.solved, bench.criterion(one.solved, named.noise))
-            for one in first.rivals[1:4]
-        ]
-    base = bench.solve(named.hypothesis.without(name), named.noise, named)
+        return _again(bench, known[-1].rivals[1:4], named)
+    base = bench.solve(rest, named.noise, named)
     candidates = [one for one in screen(base) if one.name != name]
     found = step(bench, base, candidates)
     if found is None or not believed(found.gained):
         return []
-    rivals = [
-        Rival(one.name, one.solved, bench.criterion(one.solved, named.noise))
-        for one in found.rivals[:3]
+    return _again(bench, found.rivals[:3], named)
+
+
+def _again(bench: Bench, rivals: tuple[Rival, ...], named: Solved) -> list[Rival]:
+    """The same at the noise of the names, the best first."""
+    again = [
+        Rival(one.name, one.solved, bench.criterion(one.solved, named.noise)) for one in rivals
     ]
-    return sorted(rivals, key=lambda one: one.criterion)
+    return sorted(again, key=lambda one: one.criterion)
 
 
 def _close(name: str, rivals: list[Rival], criterion: float) -> Alternatives:

@@ -21,8 +21,14 @@ GATE = 4.6
 #: Most terms; candidates that are refitted; nats below which a candidate is not looked at.
 _MOST, _REFITTED, _FAINT, _MUCH = 6, 6, 3.0, 100.0
 
+#: Candidates that are tried where the best one is not believed.
+_OTHERS = 3
+
 #: Steps of a first fit; nats of criterion, and share of the gain, within which one may still win.
-_FEW, _NEAR, _SHARE = 7, 60.0, 0.1
+_FEW, _NEAR, _SHARE = 12, 60.0, 0.1
+
+#: Criterion that another noise must gain.
+_LIKELIER = 2.0
 
 #: Nats from which a shape is freed; and how far the sum over breaths must exceed its own scatter.
 _SHAPE, _CONSISTENT = 2.0, 1.3
@@ -64,12 +70,6 @@ def noise_of(solved: Solved) -> Noise:
     return estimate(solved.residual, solved.problem.data.weight)
 
 
-def quieter(noise: Noise, than: Noise) -> bool:
-    """Whether what is new in each sample is clearly less than with another noise."""
-    size = [x.sigma[0] * np.sqrt(1.0 - x.ar[0] ** 2) for x in (noise, than)]
-    return bool(size[0] < 0.98 * size[1])
-
-
 def settle(bench: Bench, hypothesis: Hypothesis, near: Solved | None = None) -> Solved:
     """Fit a hypothesis and its noise in turn."""
     solved = bench.solve(hypothesis, near.problem.noise if near else Noise(), near)
@@ -88,41 +88,58 @@ def step(bench: Bench, current: Solved, candidates: list[Candidate]) -> Step | N
         found = found[:_REFITTED]
     # Whitened by what an effect leaves in the residual, its own fit would hardly see it.
     white = replace(current.noise, ar=(0.0, 0.0))
-    rivals = []
-    for one in found:
-        hypothesis = current.hypothesis.plus(one.hypothesis)
-        rivals.append(
-            bench.solve(hypothesis, white, current, one.start, iterations=_FEW, tolerance=0.1)
+    rivals = [
+        bench.solve(
+            current.hypothesis.plus(one.hypothesis), white, current, one.start,
+            iterations=_FEW, tolerance=0.1,
         )
-    noise = current.noise
-    own = [bench.criterion(one, noise_of(one)) for one in rivals]
-    least = noise_of(rivals[int(np.argmin(own))])
-    noise = least if quieter(least, noise) else noise
-    order = _order(bench, rivals, noise)
+        for one in found
+    ]  # fmt: skip
+    criterion = _Criteria(bench)
+    own = [criterion(one, noise_of(one)) for one in rivals]
+    noise = criterion.likelier(rivals[int(np.argmin(own))], current.noise)
+    order = criterion.order(rivals, noise)
     for _ in range(3):
         # At the noise of the best, all that may still win is fitted further.
-        order[0][1] = bench.solve(order[0][1].hypothesis, noise, order[0][1])
-        least = noise_of(order[0][1])
-        noise = least if quieter(least, noise) else noise
-        near = _order(bench, [one for _, one in order], noise)
-        margin = max(_NEAR, _SHARE * (bench.criterion(current, noise) - near[0][0]))
+        order[0] = bench.solve(order[0].hypothesis, noise, order[0])
+        noise = criterion.likelier(order[0], noise)
+        order = criterion.order(order, noise)
+        best = criterion(order[0], noise)
+        limit = best + max(_NEAR, _SHARE * (criterion(current, noise) - best))
         order = [
-            [c, bench.solve(one.hypothesis, noise, one) if c < near[0][0] + margin else one]
-            for c, one in near
+            bench.solve(one.hypothesis, noise, one) if criterion(one, noise) < limit else one
+            for one in order
         ]
-        order = _order(bench, [one for _, one in order], noise)
-        if not quieter(noise_of(order[0][1]), noise):
+        order = criterion.order(order, noise)
+        if criterion.likelier(order[0], noise) is noise:
             break
     if noise is not current.noise:
         current = bench.solve(current.hypothesis, noise, current)
-    best = tuple(Rival(one.hypothesis.names[-1], one, c) for c, one in order)
-    return Step(current, best, bench.judged(best[0].solved) - bench.judged(current))
+    listed = tuple(Rival(x.hypothesis.names[-1], x, criterion(x, noise)) for x in order)
+    return Step(current, listed, bench.judged(order[0]) - bench.judged(current))
 
 
-def _order(bench: Bench, rivals: list[Solved], noise: Noise) -> list[list]:
-    """Criteria at one noise, with the rivals, best first."""
-    pairs = [[bench.criterion(one, noise), one] for one in rivals]
-    return sorted(pairs, key=lambda pair: pair[0])
+class _Criteria:
+    """Criteria of fits at several noises, each computed once."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+        self._known: dict[tuple[int, Noise], tuple[Solved, float]] = {}
+
+    def __call__(self, solved: Solved, noise: Noise) -> float:
+        key = (id(solved), noise)
+        if key not in self._known:  # which keeps the fit, and thereby its identity
+            self._known[key] = (solved, self._bench.criterion(solved, noise))
+        return self._known[key][1]
+
+    def likelier(self, solved: Solved, noise: Noise) -> Noise:
+        """The noise that a fit leaves, if it makes the fit clearly likelier than another one."""
+        own = noise_of(solved)
+        return own if self(solved, own) < self(solved, noise) - _LIKELIER else noise
+
+    def order(self, rivals: list[Solved], noise: Noise) -> list[Solved]:
+        """The best first."""
+        return sorted(rivals, key=lambda one: self(one, noise))
 
 
 def believed(gained: Floats) -> bool:
@@ -144,11 +161,34 @@ def forward(bench: Bench, start: Solved, tell: Progress) -> tuple[Solved, list[S
         if found is None:
             break
         steps.append(found)
-        if not believed(found.gained):
+        best = _settled(bench, found.rivals[0]) if believed(found.gained) else _other(bench, found)
+        if best is None:
             break
-        current = shaped(bench, found.rivals[0].solved)
-        current = dropped(bench, current)
+        current = dropped(bench, shaped(bench, best))
     return current, steps
+
+
+def _settled(bench: Bench, rival: Rival) -> Solved:
+    """Fitted at its own noise: that of a step still holds much of the effect."""
+    return settle(bench, rival.solved.hypothesis, rival.solved)
+
+
+def _other(bench: Bench, found: Step) -> Solved | None:
+    """Another candidate that explains much and is believed, where the best one is not.
+
+    So does a sum of several effects look to what is free in each breath: large, and never twice
+    alike.
+    """
+    least = bench.criterion(found.before) - _MUCH
+    own = [(bench.criterion(x.solved, noise_of(x.solved)), x) for x in found.rivals[1:]]
+    promising = sorted((pair for pair in own if pair[0] < least), key=lambda pair: pair[0])
+    for _, rival in promising[:_OTHERS]:
+        with_it = _settled(bench, rival)
+        without = bench.solve(found.before.hypothesis, with_it.noise, found.before)
+        much = bench.criterion(without) - bench.criterion(with_it) > _MUCH
+        if much and believed(bench.judged(with_it) - bench.judged(without)):
+            return with_it
+    return None
 
 
 def shaped(bench: Bench, current: Solved) -> Solved:

@@ -12,8 +12,8 @@ from ventbench.physics.fits.least_squares import Minimum
 from ventbench.physics.fits.noise import Noise
 from ventbench.physics.fits.problem import Problem
 
-#: Numbers of breaths that are compiled for: those of 60 breaths, split, and few.
-_SIZES = (24, 40, 64)
+#: Breaths that are simulated at once: one number, so that little is compiled and held in memory.
+_SIZES = (40,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,5 +70,5 @@ class Solved:
 
 
 def simulator(data: Data, names: tuple[str, ...]) -> Simulator:
-    """Place some breaths in one of few sizes, so that little is compiled."""
+    """Place some breaths in parts of one size."""
     return Simulator(data, names, sizes=_SIZES)

@@ -6,6 +6,7 @@ out, and a hypothesis only chooses directions: one compilation for all of them.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 
 import jax
@@ -21,8 +22,11 @@ from ventbench.precision import float64
 #: Name of what is not a parameter of a plant: the reading that a breath starts from, cmH2O.
 START = "start"
 
-#: Numbers of breaths that are compiled for, unless told otherwise.
+#: Numbers of breaths that are compiled for, unless told otherwise; more are done in parts.
 SIZES = (4, 8, 16, 32, 64)
+
+#: Numbers of directions that are compiled for.
+_WIDTHS = (8, 16, 24, 32)
 
 _STATIC = ("names", "substeps", "memory", "flow")
 
@@ -62,10 +66,6 @@ def _along(
     return run(values), jax.vmap(slope)(basis)
 
 
-def _next(count: int, sizes: tuple[int, ...]) -> int:
-    return next((size for size in sizes if size >= count), -(-count // sizes[-1]) * sizes[-1])
-
-
 class Simulator:
     """All breaths of some data at once, at any parameters; compiled once for each size.
 
@@ -89,12 +89,14 @@ class Simulator:
             names: paths of the parameters in the order of the columns.
             substeps: of a sample; enough for most purposes if not given. An edge that a dead time
                 shifts is smoothed over one substep, and the dead time is uncertain by part of it.
-            sizes: to which the number of breaths is padded, or to multiples of the last: each is
-                compiled once.
+            sizes: to which the number of breaths is padded, each compiled once; more than the last
+                are done in parts of it.
         """
         self.names = names
         self._count = len(data)
-        self._padded = data.padded(_next(len(data), sizes))
+        self._part = next((size for size in sizes if size >= len(data)), sizes[-1])
+        parts = max(-(-len(data) // self._part), 1)
+        padded = data.padded(parts * self._part)
         enough, memory = resolution(float(np.median(data.dt)))
         self.substeps, self.memory = substeps or enough, memory
         flow = data.seen.shape[1] > 1
@@ -102,25 +104,38 @@ class Simulator:
             "names": names, "substeps": self.substeps, "memory": memory, "flow": flow
         }  # fmt: skip
         with float64():
-            arrays = (self._padded.u_in, self._padded.u_out, self._padded.dt)
-            self._commands = tuple(jnp.asarray(x) for x in arrays)
+            self._commands = [
+                tuple(jnp.asarray(x[i * self._part : (i + 1) * self._part])
+                      for x in (padded.u_in, padded.u_out, padded.dt))
+                for i in range(parts)
+            ]  # fmt: skip
 
     def predict(self, values: Floats) -> Floats:
         """What would be measured, ``(n, c, T)``, at physical values ``(n, P + 1)``."""
         with float64():
-            seen = _predict(self._pad(values), self._commands, **self._static)
-        return np.asarray(seen)[: self._count]
+            seen = [
+                np.asarray(_predict(part, commands, **self._static))
+                for part, commands in self._parts(values)
+            ]
+        return np.concatenate(seen)[: self._count]
 
     def derivatives(self, values: Floats, columns: tuple[int, ...]) -> tuple[Floats, Floats]:
         """Also its derivatives with respect to k columns of ``values``, ``(n, k, c, T)``."""
-        basis = np.zeros((_next(len(columns), (8, 16, 24, 32)), len(self.names) + 1))
+        width = next((width for width in _WIDTHS if width >= len(columns)), len(columns))
+        basis = np.zeros((width, len(self.names) + 1))
         basis[np.arange(len(columns)), list(columns)] = 1.0
+        seen, slopes = [], []
         with float64():
-            arrays = self._pad(values), jnp.asarray(basis)
-            seen, slopes = _along(*arrays, self._commands, **self._static)
-        slopes = np.moveaxis(np.asarray(slopes), 0, 1)
-        return np.asarray(seen)[: self._count], slopes[: self._count, : len(columns)]
+            directions = jnp.asarray(basis)
+            for part, commands in self._parts(values):
+                here, along = _along(part, directions, commands, **self._static)
+                seen.append(np.asarray(here))
+                slopes.append(np.moveaxis(np.asarray(along), 0, 1)[:, : len(columns)])
+        return np.concatenate(seen)[: self._count], np.concatenate(slopes)[: self._count]
 
-    def _pad(self, values: Floats) -> Array:
-        extra = len(self._padded) - self._count
-        return jnp.asarray(np.concatenate([values, np.repeat(values[:1], extra, axis=0)]))
+    def _parts(self, values: Floats) -> Iterator[tuple[Array, tuple[Array, ...]]]:
+        """Values of equally many breaths, with their commands; the last ones are made up."""
+        extra = len(self._commands) * self._part - self._count
+        filled = np.concatenate([values, np.repeat(values[:1], extra, axis=0)])
+        for i, commands in enumerate(self._commands):
+            yield jnp.asarray(filled[i * self._part : (i + 1) * self._part]), commands

@@ -61,13 +61,17 @@ def interval(fit: Fit, path: str, group: int = 0) -> Interval:
 
     Usually where the search ended and what its curvature says. Of a dead time it is mean and
     central 95 % of the profile likelihood over the whole plateau: in the narrow wall where an edge
-    passes a sample a model fits that one sample's noise, a dip of some nats that means nothing.
+    passes a sample a model fits that one sample's noise, a dip of some nats that means nothing. Its
+    interval is wider by half a substep at either end.
     """
-    if described(path).kinked:
-        found = _plateau(fit, path, group)
-        if found is not None:
-            return found
-        return Interval(float(fit.value(path)[group]), *profile(fit, path, group))
+    item = described(path)
+    if item.kinked:
+        value = float(fit.value(path)[group])
+        found = _plateau(fit, path, group) or Interval(value, *profile(fit, path, group))
+        # The simulator smooths an edge over a substep, and knows its time to half of it.
+        reach = 0.5 * float(np.median(fit.problem.data.dt)) / fit.problem.simulator.substeps
+        ends = np.clip([found.low - reach, found.high + reach], item.low, item.high)
+        return Interval(found.value, float(ends[0]), float(ends[1]))
     low, high = fit.ci95(path)[group]
     return Interval(float(fit.value(path)[group]), float(low), float(high))
 

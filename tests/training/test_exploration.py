@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from ventbench import precision, protocol
+from ventbench.cli import app
 from ventbench.controllers import expiratory
 from ventbench.controllers.base import Observation
 from ventbench.controllers.pid import PID
@@ -162,3 +164,27 @@ def test_unknown_lungs_and_no_breaths_are_errors():
         explore(bench(), "R50C10", 1)
     with pytest.raises(InputError, match="ask for one at least"):
         explore(bench(), "R5C10", 0)
+
+
+@pytest.mark.parametrize("plant", ["frozen", "physics"])
+def test_the_command_line_explores_a_simulator(tmp_path, plant):
+    out = tmp_path / "explored.csv"
+    given = ["data", "explore", str(out), "--plant", plant, "--lung", "R5C20", "--noise", "0.2"]
+    said = CliRunner().invoke(app, [*given, "--breaths", "7"])
+    assert said.exit_code == 0, said.output
+    found = load(out)
+    assert f"wrote 7 breaths of R5C20 to {out}" in said.stdout
+    assert found.lung_ids.tolist() == ["R5C20"] * 7
+    # The PIPs take turns, and exploring is no constant.
+    assert np.ptp(found.pressure.max(axis=1)) > 5.0
+    CliRunner().invoke(app, [*given, "--breaths", "7", "--seed", "1"])
+    assert np.abs(load(out).u_in - found.u_in).max() > 1.0
+
+
+def test_the_command_line_says_what_cannot_be_explored(tmp_path):
+    none = CliRunner().invoke(app, ["data", "explore", str(tmp_path / "x.csv"), "--lung", "R9C9"])
+    assert isinstance(none.exception, InputError)
+    assert "--lung R9C9: frozen has R5C10" in str(none.exception)
+    other = CliRunner().invoke(app, ["data", "explore", str(tmp_path / "x.txt")])
+    assert isinstance(other.exception, InputError)
+    assert not list(tmp_path.iterdir())

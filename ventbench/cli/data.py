@@ -1,4 +1,4 @@
-"""``ventbench data``: recordings on disk."""
+"""``ventbench data``: recordings on disk, checked or explored."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ import typer
 
 from ventbench.cli.options import Clip, JsonFile, Pad, emit
 
-app = typer.Typer(name="data", help="Check recordings.", no_args_is_help=True)
+#: Breaths that are explored side by side.
+_TOGETHER = 60
+
+app = typer.Typer(
+    name="data", help="Check recordings, or explore simulators for new ones.", no_args_is_help=True
+)
 
 
 @app.callback()
@@ -40,3 +45,41 @@ def check(
         typer.echo(line, err=str(json) == "-")
     if not report.ok:
         raise typer.Exit(2)
+
+
+@app.command()
+def explore(
+    out: Annotated[Path, typer.Argument(help="CSV, CSV.GZ or Parquet to write.")],
+    lung: Annotated[str, typer.Option(help="Lung setting, such as R20C50.")] = "R20C50",
+    plant: Annotated[
+        str, typer.Option(help="frozen, physics, or a file of plants such as corrected.json.")
+    ] = "frozen",
+    breaths: Annotated[int, typer.Option(min=1, help="Breaths; the PIPs take turns.")] = 60,
+    noise: Annotated[float, typer.Option(min=0.0, help="Of the sensor, cmH2O.")] = 0.0,
+    seed: Annotated[int, typer.Option(min=0, help="Of disturbances and noise.")] = 0,
+) -> None:
+    """Record breaths to learn from: a safe PID, disturbed as the paper explores.
+
+    The valve closes above min(60, PIP + 15) cmH2O, the expiratory valve opens above 60, and
+    exploring stops after three breaths that ended so.
+
+    Example: `ventbench data explore explored.csv --lung R5C20 --breaths 120 --noise 0.2`
+    """
+    from ventbench import recordings
+    from ventbench.cli.plants import choose
+    from ventbench.errors import InputError
+    from ventbench.plants.stack import take
+    from ventbench.training import exploration
+
+    chosen = choose(plant)
+    names = [item.id for item in chosen.lungs]
+    if lung not in names:
+        raise InputError(f"--lung {lung}: {plant} has {', '.join(names)}")
+    one = take(chosen.plants, names.index(lung))
+    bench = exploration.PlantBench(one, min(breaths, _TOGETHER), noise=noise, seed=seed)
+    made = exploration.explore(bench, lung, breaths, seed=seed)
+    recordings.write(made, out)
+    for note in made.notes:
+        typer.echo(f"note: {note}", err=True)
+    highest = float(made.pressure[made.valid].max())
+    typer.echo(f"wrote {len(made)} breaths of {lung} to {out}; highest {highest:.1f} cmH2O")

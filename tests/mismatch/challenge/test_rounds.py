@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -14,6 +15,7 @@ from ventbench.mismatch.challenge.answer import answer
 from ventbench.mismatch.challenge.folder import Folder
 from ventbench.mismatch.challenge.make import make
 from ventbench.mismatch.challenge.reveal import reveal
+from ventbench.mismatch.challenge.rig import record
 from ventbench.recordings import load
 
 from .truths import Found, mechanism, request
@@ -84,6 +86,35 @@ def test_answers_go_on_where_they_stopped(made):
     waiting = 3 - len(folder.answers())
     assert len(seen) == len(problems) == waiting
     assert all(text == "ValueError: no idea" for text in problems.values())
+
+
+def test_a_recording_that_cannot_be_read_does_not_stop_the_others(tmp_path):
+    folder = Folder(tmp_path / "c")
+    make(SECRET, folder.path, "null", 2)
+    text = folder.recording("case_0001").read_text().splitlines()
+    text[5] = text[5].rpartition(",")[0] + ",259.2"
+    folder.recording("case_0001").write_text("\n".join(text) + "\n")
+    problems = answer(folder, jobs=0, diagnose=lambda breaths, lung: Found({"ok": True}))
+    assert list(problems) == ["case_0001"]
+    assert "column pressure: 259.2 is outside -20..120 cmH2O" in problems["case_0001"]
+    assert list(folder.answers()) == ["case_0002"]
+
+
+def test_a_recording_beyond_the_sensors_range_is_made_anew(tmp_path, monkeypatch):
+    drawn = []
+
+    def too_much_at_first(case, rng):
+        breaths = record(dataclasses.replace(case, breaths=4), rng)
+        drawn.append(breaths)
+        high = np.where(len(drawn) == 1, 200.0, breaths.pressure)
+        return dataclasses.replace(breaths, pressure=high)
+
+    monkeypatch.setattr("ventbench.mismatch.challenge.make.record", too_much_at_first)
+    make(SECRET, tmp_path / "c", "null", 1)
+    assert len(drawn) == 2
+    assert np.any(drawn[0].u_in != drawn[1].u_in)
+    kept = load(Folder(tmp_path / "c").recording("case_0001"))
+    np.testing.assert_array_equal(kept.u_in, drawn[1].u_in)
 
 
 def test_the_one_who_knows_is_right(answered):

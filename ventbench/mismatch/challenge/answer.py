@@ -91,9 +91,9 @@ def answer(
 def _one(folder: Folder, name: str, lung: str, diagnose: Diagnose | None) -> str:
     """Answer one case; returns what went wrong, or nothing."""
     global _answered
-    breaths = load(folder.recording(name))
     began = time.perf_counter()
     try:
+        breaths = load(folder.recording(name))
         found = (diagnose or _own)(breaths, lung)
         value = found.as_dict()
     except Exception as error:

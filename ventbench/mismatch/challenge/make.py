@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from ventbench import files
 from ventbench.errors import InputError
 from ventbench.mismatch.challenge import seal
@@ -14,8 +16,14 @@ from ventbench.mismatch.challenge.detect import nats
 from ventbench.mismatch.challenge.folder import Folder
 from ventbench.mismatch.challenge.plan import Drawn, Kind, draw
 from ventbench.mismatch.challenge.rig import record
+from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.schema import COLUMNS
 from ventbench.recordings.write import write
 from ventbench.training.executor import executor, results
+
+#: What a recording's pressure may be, and how often a case is recorded anew that leaves it.
+PRESSURE = COLUMNS["pressure"]
+_ATTEMPTS = 10
 
 
 def make(
@@ -71,6 +79,17 @@ def make(
 
 def _one(secret: str, folder: Folder, item: Drawn) -> list[float]:
     """Record one case; returns what each of its effects is worth."""
-    breaths = record(item.case, seal.generator(secret, "recording", item.case.name))
+    breaths = _recorded(secret, item)
     write(breaths, folder.recording(item.case.name))
     return [round(nats(item.case, breaths, k), 1) for k in range(len(item.case.effects))]
+
+
+def _recorded(secret: str, item: Drawn) -> Breaths:
+    """A recording within a sensor's range: with other commands, if those of before left it."""
+    name = item.case.name
+    for attempt in range(_ATTEMPTS):
+        more = () if attempt == 0 else (f"again {attempt}",)
+        breaths = record(item.case, seal.generator(secret, "recording", name, *more))
+        if np.all((breaths.pressure >= PRESSURE.low) & (breaths.pressure <= PRESSURE.high)):
+            return breaths
+    raise InputError(f"{name} leaves {PRESSURE.low:g}..{PRESSURE.high:g} cmH2O at every attempt")

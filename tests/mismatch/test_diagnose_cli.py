@@ -44,9 +44,9 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """Arguments of each diagnosis, which is the same made-up one every time."""
     seen: list[dict[str, Any]] = []
 
-    def diagnose(breaths, *, plant, lung, progress):
+    def diagnose(breaths, *, plant, lung, passive, progress):
         progress("fitting", 0.5)
-        seen.append({"breaths": breaths, "plant": plant, "lung": lung})
+        seen.append({"breaths": breaths, "plant": plant, "lung": lung, "passive": passive})
         return made.diagnosis(12)
 
     module = types.ModuleType("ventbench.mismatch.diagnose")
@@ -73,6 +73,7 @@ def test_four_files_and_the_words(recording, tmp_path, calls):
     assert sorted(item.name for item in out.iterdir()) == FILES
     assert len(calls[0]["breaths"]) == 6
     assert (calls[0]["plant"], calls[0]["lung"]) == ("physics", "R20C50")
+    assert not calls[0]["passive"]
     words = " ".join(text.split())
     assert words.startswith("Missing in the physics simulator: dead time of the inspiratory valve")
     assert "41 ms [38, 44] of dead time" in words
@@ -83,6 +84,9 @@ def test_four_files_and_the_words(recording, tmp_path, calls):
     again = run(recording, "--out", out)
     assert again.splitlines()[0] == text.splitlines()[0]
     assert calls[1]["lung"] is None
+    assert not calls[1]["passive"]
+    run(recording, "--passive", "--out", out)
+    assert calls[2]["passive"]
     assert len(calls[1]["breaths"]) == 10
     assert sorted(item.name for item in out.iterdir()) == FILES, "written over, nothing left behind"
 

@@ -55,7 +55,8 @@ class Diagnoses:
         self.names = names
         self.asked: list[dict[str, Any]] = []
 
-    def __call__(self, breaths, *, plant, progress) -> Diagnosis:
+    def __call__(self, breaths, *, plant, passive, progress) -> Diagnosis:
+        assert passive  # nobody breathed on the rig
         self.asked.append({"breaths": breaths, "plant": plant})
         progress("fitting", 0.5)
         one = made.diagnosis(12)
@@ -190,7 +191,7 @@ def test_what_changed_is_done_again(recordings, tmp_path, diagnoses):
 
 
 def test_a_part_that_was_stopped_does_not_count(recordings, tmp_path, monkeypatch):
-    def stopped(breaths, *, plant, progress):
+    def stopped(breaths, *, plant, passive, progress):
         raise KeyboardInterrupt
 
     fake = Diagnoses()

@@ -30,6 +30,9 @@ def diagnose(
     lung: Annotated[
         str | None, typer.Option(metavar="R20C50", help="Only the breaths of this lung.")
     ] = None,
+    passive: Annotated[
+        bool, typer.Option("--passive", help="A test lung: nobody breathes, no efforts are named.")
+    ] = False,
     clip: Clip = False,
     pad: Pad = False,
     json: JsonFile = None,
@@ -57,7 +60,7 @@ def diagnose(
         progress.print(f"note: {note}", markup=False, highlight=False)
     if lung is not None:
         lung, breaths = _only(recordings, breaths, lung)
-    found = _diagnose(breaths, plant, lung)
+    found = _diagnose(breaths, plant, lung, passive)
     out.mkdir(parents=True, exist_ok=True)
     written = keep(out, found)
     emit(found.as_dict(), json)
@@ -111,7 +114,7 @@ def _only(recordings: Path, breaths: Breaths, name: str) -> tuple[str, Breaths]:
     return name, breaths.select(there[name])
 
 
-def _diagnose(breaths: Breaths, plant: str, lung: str | None) -> Diagnosis:
+def _diagnose(breaths: Breaths, plant: str, lung: str | None, passive: bool) -> Diagnosis:
     """Run it under a bar of progress."""
     import dataclasses
 
@@ -130,7 +133,7 @@ def _diagnose(breaths: Breaths, plant: str, lung: str | None) -> Diagnosis:
         def progress(what: str, share: float) -> None:
             bars.update(task, description=what, completed=share)
 
-        found = find(breaths, plant=simulator, lung=lung, progress=progress)
+        found = find(breaths, plant=simulator, lung=lung, passive=passive, progress=progress)
     return found if plant in KINDS else dataclasses.replace(found, plant=Path(plant).name)
 
 

@@ -48,6 +48,7 @@ def diagnose(
     *,
     plant: Given = "physics",
     lung: str | None = None,
+    passive: bool = False,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Find what a simulator lacks.
@@ -59,6 +60,7 @@ def diagnose(
         breaths: n recorded breaths; every third one of a lung is held out.
         plant: see :data:`~ventbench.mismatch.simulators.Given`.
         lung: use only the breaths of this label.
+        passive: nobody breathes, as in a test lung: efforts are out of the question.
         progress: is told what is done and which share of the whole is behind.
 
     Raises:
@@ -73,22 +75,25 @@ def diagnose(
     tell("simulating", 0.02)
     before = simulators.answers(plant, breaths)
     data = recorded(breaths)
-    found = _conclude(data, held, lambda what: tell(what, 0.3))
+    excluded = ("patient_effort",) if passive else ()
+    found = _conclude(data, held, excluded, lambda what: tell(what, 0.3))
     had = None
     if plant != "physics":
         tell("the same questions to the simulator", 0.6)
         answered = simulators.measured(data, before, found.conclusion.noise)
-        had = _conclude(answered, held, lambda what: tell(f"simulator: {what}", 0.7))
+        had = _conclude(answered, held, excluded, lambda what: tell(f"simulator: {what}", 0.7))
     tell("drawing conclusions", 0.9)
     return _diagnosis(breaths, held, before, found, had, plant, notes, began)
 
 
-def _conclude(data: Data, held: NDArray[np.bool_], tell: Callable[[str], None]) -> _Found:
-    narrow = bench(data, held, paths())
+def _conclude(
+    data: Data, held: NDArray[np.bool_], excluded: tuple[str, ...], tell: Callable[[str], None]
+) -> _Found:
+    narrow = bench(data, held, paths(), excluded)
     wide: list[Bench] = []
 
     def wider() -> Bench:
-        wide.append(bench(data, held, all_paths()))
+        wide.append(bench(data, held, all_paths(), excluded))
         return wide[0]
 
     found = conclude(narrow, wider, tell)

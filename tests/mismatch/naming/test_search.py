@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -67,6 +69,16 @@ def test_screening_leaves_out_what_is_there_and_looks_only_at_what_it_is_told(pl
     assert {one.name for one in screen(plain.null, ("leak", "inertance"))} == {"leak", "inertance"}
 
 
+def test_what_cannot_act_is_not_looked_at():
+    active = small.split(small.made(small.effect("turbulent_resistance", quadratic=10.0)))
+    without = dataclasses.replace(active, excluded=("turbulent_resistance", "patient_effort"))
+    assert set(active.known) - set(without.known) == set(without.excluded)
+    null = settle(without, Hypothesis())
+    named, steps = forward(without, null, quiet)
+    assert not set(named.hypothesis.names) & set(without.excluded)
+    assert not {one.name for one in steps[0].rivals} & set(without.excluded)
+
+
 @pytest.mark.parametrize("name", sorted(library()))
 def test_strengths_that_are_looked_at_are_possible(name):
     item = library()[name].description.strength
@@ -86,6 +98,10 @@ def test_gate_needs_much_and_from_more_than_one_breath():
     assert not believed(one)
     assert not believed(one + 0.1)
     assert believed(one + 200.0)
+    # Two breaths of another rig do not outvote the others, nor carry them.
+    mixed = np.array([20.0, 25.0, 18.0, -150.0, 30.0, 22.0, 24.0, -60.0, 28.0, 26.0, 33.0, 19.0])
+    assert believed(mixed)
+    assert not believed(np.array([0.1, -0.2, 0.1, 150.0, -0.3, 0.2, 60.0, 0.1, 0.1, -0.1]))
     # A total that loses in half of the breaths is scatter.
     mixed = np.array([40.0, -30.0] * 4)
     assert mixed.sum() > GATE

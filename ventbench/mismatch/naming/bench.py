@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ventbench.mismatch.naming.hypothesis import Hypothesis, has_own
 from ventbench.mismatch.naming.solved import Side, Solved, simulator
+from ventbench.physics.catalogue import library
 from ventbench.physics.fits.data import Data, Floats
 from ventbench.physics.fits.derivatives import START
 from ventbench.physics.fits.least_squares import minimise
@@ -30,11 +31,18 @@ class Bench:
         judging: breaths that they are judged by.
         spread: prior standard deviation of each breath's own valve gain (of its logarithm), 0 if
             all breaths have the same.
+        excluded: mechanisms that cannot act, as efforts in a passive test lung.
     """
 
     training: Side
     judging: Side
     spread: float = 0.0
+    excluded: tuple[str, ...] = ()
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        """Mechanisms of the library that may act."""
+        return tuple(name for name in library() if name not in self.excluded)
 
     def solve(
         self,
@@ -183,18 +191,22 @@ class Bench:
         return tuple(dict.fromkeys((*hypothesis.paths, *extra)))
 
 
-def bench(data: Data, held_out: NDArray[np.bool_], names: tuple[str, ...]) -> Bench:
+def bench(
+    data: Data, held_out: NDArray[np.bool_], names: tuple[str, ...], excluded: tuple[str, ...] = ()
+) -> Bench:
     """Split a recording.
 
     Args:
         data: all n breaths.
         held_out: those to judge by, bool, ``(n,)``.
         names: parameters that hypotheses may have.
+        excluded: mechanisms that cannot act.
     """
     training, judging = data.select(~held_out), data.select(held_out)
     return Bench(
-        Side(training, simulator(training, names)), Side(judging, simulator(judging, names))
-    )
+        Side(training, simulator(training, names)), Side(judging, simulator(judging, names)),
+        excluded=excluded,
+    )  # fmt: skip
 
 
 def by_label(data: Data, free: tuple[str, ...]) -> dict[str, NDArray[np.int64]]:

@@ -66,14 +66,26 @@ def beside_source(bench: Bench, named: Solved, place: Place) -> Solved:
     current, here = effortless(bench, named), place.source
     if _is_effort(bench, named, current, here):
         current = named
-    for name in current.hypothesis.names:
-        if name == EFFORT:
-            continue
-        left = bench.solve(current.hypothesis.without(name), current.noise, current)
-        other = moving.moving(bench, effortless(bench, left), (place.name,))[place.name]
-        if not believed(here.judged - other.judged):
-            current, here = left, other
-    return current
+    while True:
+        idle = [
+            found
+            for name in current.hypothesis.names
+            if name != EFFORT and (found := _idle(bench, current, here, name)) is not None
+        ]
+        if not idle:
+            return current
+        # The least needed one first: others may be needed once it has gone.
+        _, current, here = min(idle, key=lambda found: found[0])
+
+
+def _idle(
+    bench: Bench, current: Solved, here: Moving, name: str
+) -> tuple[float, Solved, Moving] | None:
+    """Nats that are lost without a name beside a source, and what is left, if it is not needed."""
+    left = bench.solve(current.hypothesis.without(name), current.noise, current)
+    other = moving.moving(bench, effortless(bench, left), (here.source,))[here.source]
+    lost = here.judged - other.judged
+    return None if believed(lost) else (float(lost.sum()), left, other)
 
 
 def _is_effort(bench: Bench, named: Solved, without: Solved, source: Moving) -> bool:

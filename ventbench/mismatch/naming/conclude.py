@@ -81,18 +81,20 @@ def conclude(bench: Bench, wider: Callable[[], Bench], tell: Progress) -> Conclu
     named, steps = forward(bench, null, tell)
     tell("looking for what has no name")
     wide = wider()
-    named = without_trimmings(bench, wide, named, tell)
-    shape = _shape(wide, named)
-    found = moving.moving(bench, effortless(bench, named), (GAIN, *SOURCES))
-    reference = moving.without(bench, named)[1]
-    gain = found.pop(GAIN)
-    if not bench.spread and _scattered(gain, found, reference, shape):
+    trimmed = without_trimmings(bench, wide, named, tell)
+    left = _left(bench, wide, trimmed)
+    if trimmed is not named and not left.shaped:
+        # What explains the names away must be there in their place.
+        left = _left(bench, wide, named)
+    else:
+        named = trimmed
+    if not bench.spread and left.scatter:
         # Everything is asked anew, with a valve whose gain may differ between breaths.
-        size = gain.size
+        size = left.scatter
         return conclude(replace(bench, spread=size), lambda: replace(wide, spread=size), tell)
-    source = _source(found, reference)
+    source, shape = left.source, left.shape
     place, full = None, named
-    if source is not None and source.nats > (shape.nats if shape else 0.0):
+    if source is not None and not left.shaped:
         place, named = source, beside_source(bench, named, source)
         full = named
     elif shape is not None:
@@ -106,6 +108,36 @@ def conclude(bench: Bench, wider: Callable[[], Bench], tell: Progress) -> Conclu
     full = named if place is None else full
     noise = place.source.noise if place and place.source else full.noise
     return Conclusion(null, named, full, place, noise, _losses(bench, named), other, bench.spread)
+
+
+@dataclass(frozen=True, eq=False)
+class _Left:
+    """What names leave unexplained.
+
+    Attributes:
+        shape: best element of a slot, or None.
+        source: best source that moves in time, or None.
+        scatter: standard deviation of the logarithm of the breaths' gains, 0 if all are one.
+    """
+
+    shape: Shape | None
+    source: Place | None
+    scatter: float
+
+    @property
+    def shaped(self) -> bool:
+        """Whether a shape explains the most."""
+        nats = 0.0 if self.source is None else self.source.nats
+        return self.shape is not None and self.shape.nats >= nats
+
+
+def _left(bench: Bench, wide: Bench, named: Solved) -> _Left:
+    shape = _shape(wide, named)
+    found = moving.moving(bench, effortless(bench, named), (GAIN, *SOURCES))
+    reference = moving.without(bench, named)[1]
+    gain = found.pop(GAIN)
+    scatter = gain.size if _scattered(gain, found, reference, shape) else 0.0
+    return _Left(shape, _source(found, reference), scatter)
 
 
 def _shape(wide: Bench, named: Solved) -> Shape | None:

@@ -68,7 +68,7 @@ def _rivals(bench: Bench, named: Solved, name: str, steps: list[Step]) -> list[R
         # Those that stayed far behind were not fitted to the end.
         return _again(bench, known[-1].rivals[1:4], named)
     base = bench.solve(rest, named.noise, named)
-    candidates = [one for one in screen(base) if one.name != name]
+    candidates = [one for one in screen(base, bench.known) if one.name != name]
     found = step(bench, base, candidates)
     if found is None or not believed(found.gained):
         return []

@@ -33,6 +33,9 @@ _LIKELIER = 2.0
 #: Nats from which a shape is freed; and how far the sum over breaths must exceed its own scatter.
 _SHAPE, _CONSISTENT = 2.0, 1.3
 
+#: Quantile of the gains' sizes that is usual, and times that beyond which they are cut off.
+_USUAL, _FAR = 0.8, 1.5
+
 Progress = Callable[[str], None]
 
 
@@ -146,10 +149,16 @@ def believed(gained: Floats) -> bool:
     """Whether held-out breaths ask for a term, by the log-likelihood that it gains in each.
 
     A split likelihood ratio: whatever the term, and however it was chosen, it exceeds the gate by
-    chance in at most 1 % of the recordings. It must not hang on one or two breaths either.
+    chance in at most 1 % of the recordings. It must not hang on a few breaths either, nor may a few
+    that fit nothing, as those of another rig, outvote the rest: with what is far from the others
+    cut off, half of the gate must be left, and more than the sum's own scatter.
     """
-    total = float(gained.sum())
-    return total > GATE and total > _CONSISTENT * float(np.sqrt(np.sum(gained**2)))
+    if float(gained.sum()) <= GATE:
+        return False
+    far = _FAR * float(np.quantile(np.abs(gained), _USUAL))
+    usual = np.clip(gained, -far, far)
+    total, scatter = float(usual.sum()), float(np.sqrt(np.sum(usual**2)))
+    return total > 0.5 * GATE and total > _CONSISTENT * scatter
 
 
 def forward(bench: Bench, start: Solved, tell: Progress) -> tuple[Solved, list[Step]]:
@@ -157,7 +166,7 @@ def forward(bench: Bench, start: Solved, tell: Progress) -> tuple[Solved, list[S
     current, steps = start, []
     while len(current.hypothesis.names) < _MOST:
         tell(f"comparing mechanisms ({len(current.hypothesis.names)} named)")
-        found = step(bench, current, screen(current))
+        found = step(bench, current, screen(current, bench.known))
         if found is None:
             break
         steps.append(found)

@@ -9,8 +9,8 @@ import pytest
 
 from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.hypothesis import Hypothesis
-from ventbench.mismatch.naming.search import settle
 from ventbench.mismatch.naming.solved import Solved
+from ventbench.mismatch.naming.steps import settle
 
 from .. import small
 

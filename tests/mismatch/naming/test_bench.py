@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from ventbench.mismatch.naming.bench import Bench, bench, by_label
-from ventbench.mismatch.naming.effort import _ONSETS, _SHARE, _WIDTH
+from ventbench.mismatch.naming.effort import ONSETS, SHARE, WIDTH
 from ventbench.mismatch.naming.hypothesis import Hypothesis
-from ventbench.mismatch.naming.search import settle
 from ventbench.mismatch.naming.solved import Side
+from ventbench.mismatch.naming.steps import settle
 from ventbench.physics import paths
 from ventbench.physics.fits import START, Data, Noise, recorded, settings
 
@@ -161,12 +161,12 @@ def brute_force(made: Bench, values: np.ndarray, duration: float, which: int) ->
         return float(-0.5 * np.sum((error / size) ** 2 + np.log(2 * np.pi * size**2)))
 
     grid = np.linspace(-4.0, 4.0, 33)
-    prior = np.exp(-0.5 * (grid / _WIDTH) ** 2) / (_WIDTH * np.sqrt(2 * np.pi))
-    logs = np.array([[likelihood(a, onset) for a in grid] for onset in _ONSETS])
+    prior = np.exp(-0.5 * (grid / WIDTH) ** 2) / (WIDTH * np.sqrt(2 * np.pi))
+    logs = np.array([[likelihood(a, onset) for a in grid] for onset in ONSETS])
     top = logs.max()
     mixed = np.mean(np.sum(np.exp(logs - top) * prior, axis=1)) * (grid[1] - grid[0])
     return float(
-        np.logaddexp(np.log1p(-_SHARE) + likelihood(0.0, 0.0), np.log(_SHARE * mixed) + top)
+        np.logaddexp(np.log1p(-SHARE) + likelihood(0.0, 0.0), np.log(SHARE * mixed) + top)
     )
 
 

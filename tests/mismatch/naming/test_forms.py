@@ -6,7 +6,7 @@ import pytest
 
 from ventbench.mismatch.naming.forms import without_trimmings
 from ventbench.mismatch.naming.hypothesis import Hypothesis
-from ventbench.mismatch.naming.search import settle
+from ventbench.mismatch.naming.steps import settle
 from ventbench.physics import library, paths
 from ventbench.physics.catalogue import slots
 

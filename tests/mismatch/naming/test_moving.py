@@ -9,9 +9,9 @@ import pytest
 
 from ventbench.mismatch.naming import moving
 from ventbench.mismatch.naming.hypothesis import Hypothesis
-from ventbench.mismatch.naming.search import settle
 from ventbench.mismatch.naming.solved import Side
 from ventbench.mismatch.naming.sources import ALVEOLUS, GAIN, MEASUREMENT, SUPPLY, responses
+from ventbench.mismatch.naming.steps import settle
 from ventbench.physics.fits import Simulator
 
 from .. import small

@@ -9,7 +9,7 @@ import pytest
 
 from ventbench.mismatch.naming import places
 from ventbench.mismatch.naming.hypothesis import Hypothesis
-from ventbench.mismatch.naming.search import settle
+from ventbench.mismatch.naming.steps import settle
 from ventbench.physics import library, parameter
 from ventbench.physics.catalogue import slots
 from ventbench.physics.fits import Noise

@@ -8,18 +8,11 @@ import numpy as np
 import pytest
 
 from ventbench.mismatch.naming.candidates import screen, strengths
+from ventbench.mismatch.naming.gate import GATE, believed
 from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.rivals import SAME, alternatives
-from ventbench.mismatch.naming.search import (
-    GATE,
-    believed,
-    dropped,
-    forward,
-    noise_of,
-    settle,
-    shaped,
-    step,
-)
+from ventbench.mismatch.naming.search import dropped, forward, shaped
+from ventbench.mismatch.naming.steps import noise_of, settle, step, whitened
 from ventbench.physics import library, parameter
 from ventbench.physics.fits import Noise
 
@@ -51,7 +44,7 @@ def quiet(what: str) -> None:
 def test_screening_ranks_a_mild_effect_among_the_first(name):
     bench = small.split(small.made(small.effect(name, **MILD[name]), seed=3))
     null = settle(bench, Hypothesis())
-    found = screen(null)
+    found = screen(null, whitened(bench, null))
     assert {one.name for one in found} == set(library())
     place = [one.name for one in found].index(name)
     assert place < 5, [one.name for one in found]
@@ -65,8 +58,9 @@ def test_screening_ranks_a_mild_effect_among_the_first(name):
 
 def test_screening_leaves_out_what_is_there_and_looks_only_at_what_it_is_told(plain):
     named = plain.bench.solve(Hypothesis(("leak",)), plain.null.noise, plain.null, iterations=1)
-    assert "leak" not in {one.name for one in screen(named)}
-    assert {one.name for one in screen(plain.null, ("leak", "inertance"))} == {"leak", "inertance"}
+    assert "leak" not in {one.name for one in screen(named, whitened(plain.bench, named))}
+    some = screen(plain.null, whitened(plain.bench, plain.null), ("leak", "inertance"))
+    assert {one.name for one in some} == {"leak", "inertance"}
 
 
 def test_what_cannot_act_is_not_looked_at():
@@ -111,7 +105,8 @@ def test_gate_needs_much_and_from_more_than_one_breath():
 
 
 def test_nothing_is_worth_a_look_if_nothing_is_promising(plain):
-    faint = [one for one in screen(plain.null) if max(one.nats, one.white) <= 3.0]
+    found = screen(plain.null, whitened(plain.bench, plain.null))
+    faint = [one for one in found if max(one.nats, one.white) <= 3.0]
     assert faint
     assert step(plain.bench, plain.null, faint) is None
     assert step(plain.bench, plain.null, []) is None
@@ -120,7 +115,7 @@ def test_nothing_is_worth_a_look_if_nothing_is_promising(plain):
 def test_a_step_orders_candidates_at_one_noise():
     bench = small.split(small.made(small.effect("turbulent_resistance", quadratic=10.0)))
     null = settle(bench, Hypothesis())
-    found = step(bench, null, screen(null))
+    found = step(bench, null, screen(null, whitened(bench, null)))
     assert found is not None
     assert found.rivals[0].name == "turbulent_resistance"
     criteria = [one.criterion for one in found.rivals]

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench.mismatch.naming.hypothesis import Hypothesis, has_own
+from ventbench.mismatch.naming.effort import EFFORT
+from ventbench.mismatch.naming.hypothesis import Hypothesis
+from ventbench.mismatch.naming.leaps import leapt
+from ventbench.mismatch.naming.pulled import (
+    AMPLITUDE,
+    DURATION,
+    ONSET,
+    integrated,
+    restarted,
+    settled,
+)
 from ventbench.mismatch.naming.solved import Side, Solved, simulator
 from ventbench.physics.catalogue import library
 from ventbench.physics.fits.data import Data, Floats
@@ -32,12 +43,18 @@ class Bench:
         spread: prior standard deviation of each breath's own valve gain (of its logarithm), 0 if
             all breaths have the same.
         excluded: mechanisms that cannot act, as efforts in a passive test lung.
+        folds: other splits of the same breaths, training and judging, so that with this one every
+            breath judges once.
     """
 
     training: Side
     judging: Side
     spread: float = 0.0
     excluded: tuple[str, ...] = ()
+    folds: tuple[tuple[Side, Side], ...] = ()
+    _known: WeakKeyDictionary[Solved, Floats] = field(
+        init=False, repr=False, default_factory=WeakKeyDictionary
+    )
 
     @property
     def known(self) -> tuple[str, ...]:
@@ -52,6 +69,7 @@ class Bench:
         start: Mapping[str, ArrayLike] | None = None,
         *,
         side: Side | None = None,
+        anew: bool = False,
         iterations: int = _ITERATIONS,
         tolerance: float = _TOLERANCE,
     ) -> Solved:
@@ -63,6 +81,7 @@ class Bench:
             near: another hypothesis, fitted to the same breaths, to start from.
             start: physical values to start from, by path; before those of ``near``.
             side: breaths; the training ones if not given.
+            anew: look for dead times and each breath's effort beyond the next minimum.
             iterations: most steps.
             tolerance: expected fall of the cost, nats, at which the search ends.
         """
@@ -77,27 +96,29 @@ class Bench:
             first |= {p: near.column(p) for p in layout.paths if p in known}
         first |= {p: value for p, value in (start or {}).items() if p in layout.paths}
         low, high = layout.bounds()
+        x = layout.pack(first)
+        if anew:
+            x = leapt(problem, x)
+        if EFFORT in hypothesis.names and (anew or near is None or EFFORT not in near.names):
+            x = restarted(problem, x, refined=anew)
         found = minimise(
-            problem.cost, problem.normal, layout.pack(first), low, high, tolerance=tolerance,
-            iterations=iterations,
-        )  # fmt: skip
+            problem.cost, problem.normal, x, low, high, tolerance=tolerance, iterations=iterations
+        )
         return Solved(hypothesis, problem, found, float(problem.log_likelihood(found.x).sum()))
 
-    def judged(self, solved: Solved, side: Side | None = None) -> Floats:
-        """Log-likelihood of each judging breath, or of those of another side, ``(n,)``.
+    def judged(self, solved: Solved) -> Floats:
+        """Log-likelihood of each judging breath, ``(n,)``.
 
         Starts (and valve gains, where each breath has its own) are fitted to the breaths
         themselves; efforts are integrated out.
         """
-        from ventbench.mismatch.naming.effort import EFFORT, evidence
-        from ventbench.mismatch.naming.linear import local
-
-        problem, x = self.judge(solved, side)
-        found = problem.log_likelihood(x)
-        if EFFORT in solved.hypothesis.names:
-            duration = float(solved.column(f"{EFFORT}.duration")[0])
-            found = found + evidence(local(problem, x), duration).nats
-        return found
+        if solved not in self._known:
+            problem, x = self.judge(solved)
+            found = problem.log_likelihood(x)
+            if EFFORT in solved.names:
+                found = found + integrated(problem, x, float(solved.column(DURATION)[0]))
+            self._known[solved] = found
+        return self._known[solved]
 
     def judge(self, solved: Solved, side: Side | None = None) -> tuple[Problem, Floats]:
         """Put what some breaths gave to others; see :meth:`judged`."""
@@ -117,6 +138,17 @@ class Bench:
         )  # fmt: skip
         return problem, found.x
 
+    def likelihood(self, solved: Solved, noise: Noise | None = None) -> float:
+        """Log-likelihood of the training breaths, efforts of the patient integrated out.
+
+        Args:
+            solved: fitted to the training breaths.
+            noise: at which it is judged, if not its own.
+        """
+        if EFFORT in solved.names:
+            return float(settled(solved, noise or solved.noise).sum())
+        return solved.log_likelihood if noise is None else solved.likelihood_at(noise)
+
     def criterion(self, solved: Solved, noise: Noise | None = None) -> float:
         """Bayesian information criterion on the training breaths; less is better.
 
@@ -126,20 +158,15 @@ class Bench:
             solved: fitted to the training breaths.
             noise: at which it is judged, if not its own.
         """
-        if any(map(has_own, solved.hypothesis.names)):
-            at = (
-                solved
-                if noise is None
-                else replace(solved, problem=replace(solved.problem, noise=noise))
-            )
-            likelihood = float(self.judged(at, self.training).sum())
-        else:
-            likelihood = solved.log_likelihood if noise is None else solved.likelihood_at(noise)
+        likelihood = self.likelihood(solved, noise)
         count = float(self.training.data.weight.sum())
         return -2.0 * likelihood + solved.shared * float(np.log(count))
 
     def predict(self, solved: Solved, side: Side, first: Floats | None = None) -> Floats:
         """Open-loop answers to breaths' commands, ``(n, c, T)``.
+
+        Of a breath to come nobody knows the patient's effort: what is expected is the mean over the
+        efforts of the breaths that were fitted.
 
         Args:
             solved: a hypothesis.
@@ -149,7 +176,14 @@ class Bench:
         values = self.carried(solved, side)
         if first is not None:
             values[:, -1] = first
-        return side.simulator.predict(values)
+        if EFFORT not in solved.names:
+            return side.simulator.predict(values)
+        columns = [side.simulator.names.index(path) for path in (AMPLITUDE, ONSET)]
+        total, efforts = 0.0, zip(solved.column(AMPLITUDE), solved.column(ONSET), strict=True)
+        for effort in efforts:
+            values[:, columns] = effort
+            total = total + side.simulator.predict(values)
+        return np.asarray(total) / len(solved.column(AMPLITUDE))
 
     def carried(self, solved: Solved, side: Side) -> Floats:
         """Physical values of breaths, ``(n, P + 1)``: what those of a label share.
@@ -202,11 +236,17 @@ def bench(
         names: parameters that hypotheses may have.
         excluded: mechanisms that cannot act.
     """
-    training, judging = data.select(~held_out), data.select(held_out)
-    return Bench(
-        Side(training, simulator(training, names)), Side(judging, simulator(judging, names)),
-        excluded=excluded,
-    )  # fmt: skip
+
+    def split(judging: NDArray[np.bool_]) -> tuple[Side, Side]:
+        parts = data.select(~judging), data.select(judging)
+        return Side(parts[0], simulator(parts[0], names)), Side(
+            parts[1], simulator(parts[1], names)
+        )
+
+    order = np.cumsum(~held_out)
+    folds = [~held_out & (order % 2 == k) for k in range(2)]
+    others = tuple(split(fold) for fold in folds if fold.any() and not fold.all())
+    return Bench(*split(held_out), excluded=excluded, folds=others)
 
 
 def by_label(data: Data, free: tuple[str, ...]) -> dict[str, NDArray[np.int64]]:

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from ventbench.mismatch.naming import moving, places
 from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.effort import EFFORT
+from ventbench.mismatch.naming.gate import believed, needed
 from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.moving import Moving
-from ventbench.mismatch.naming.search import believed, settle, step
 from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.sources import ALVEOLUS
+from ventbench.mismatch.naming.steps import settle, step
 
 #: Share of what a slot of the same kind explains from which a name stands, its form apart; and
 #: share below which a name beside a slot is only its trimming.
@@ -111,7 +112,7 @@ def beside(bench: Bench, wide: Bench, named: Solved, shape: Shape) -> tuple[Solv
             if by_name >= _FAMILY * by_both:
                 continue
         share = (full.log_likelihood - left.log_likelihood) / max(whole, 1e-9)
-        if not believed(wide.judged(full) - wide.judged(left)) or share < _TRIMMING:
+        if not needed(wide, full, left) or share < _TRIMMING:
             full, kept = settle(wide, left.hypothesis, left), kept.without(name)
     if kept != named.hypothesis:
         named = settle(bench, kept, named)

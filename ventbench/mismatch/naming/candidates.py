@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
-from ventbench.mismatch.naming.effort import EFFORT, of_all
+from ventbench.mismatch.naming.effort import EFFORT, evidence
 from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.linear import Local, gain, local
 from ventbench.mismatch.naming.solved import Solved
 from ventbench.physics.catalogue import library, parameter
+from ventbench.physics.fits.derivatives import Simulator
 from ventbench.physics.parameters import Parameter
 
 #: A multiple of a template beyond these is not believed.
@@ -48,7 +49,9 @@ class Candidate:
     white: float
 
 
-def screen(solved: Solved, known: tuple[str, ...] | None = None) -> list[Candidate]:
+def screen(
+    solved: Solved, whitened: Solved, known: tuple[str, ...] | None = None
+) -> list[Candidate]:
     """All mechanisms that a hypothesis lacks, the most promising first.
 
     A strong effect makes the residual look like coloured noise, and whitening that takes out most
@@ -56,54 +59,51 @@ def screen(solved: Solved, known: tuple[str, ...] | None = None) -> list[Candida
 
     Args:
         solved: the hypothesis, fitted.
+        whitened: the same at white noise.
         known: mechanisms to look at; the whole library if not given.
     """
-    problem, x = solved.problem, solved.minimum.x
-    white = replace(problem, noise=replace(problem.noise, ar=(0.0, 0.0)))
-    places = [local(problem, x), local(white, x)]
-    found = []
+    places = [local(one.problem, one.minimum.x) for one in (solved, whitened)]
+    simulator, found = solved.problem.simulator, []
     for name in known or library():
         if name in solved.hypothesis.names:
             continue
-        found.append(_effort(places) if name == EFFORT else _best(solved, places, name))
+        found.append(_effort(places) if name == EFFORT else _best(simulator, places, name))
     by_nats = sorted(found, key=lambda one: -one.nats)
     by_white = sorted(found, key=lambda one: -one.white)
     mixed = [one for pair in zip(by_nats, by_white, strict=True) for one in pair]
     return list({one.name: one for one in mixed}.values())
 
 
-def _best(solved: Solved, places: list[Local], name: str) -> Candidate:
-    values = solved.values
-    order = solved.problem.simulator.names
+def _best(simulator: Simulator, places: list[Local], name: str) -> Candidate:
+    order = simulator.names
     first, *others = library()[name].description.parameters
     best, start = np.zeros(len(places)), {}
     paths = [f"{name}.{first.name}", *(f"{name}.{p.name}" for p in others)]
     choices = [strengths(first), *(_ALSO.get(path, ()) or (None,) for path in paths[1:])]
-    for setting in product(*choices):
-        trial = values.copy()
+    for setting, (k, place) in product(product(*choices), enumerate(places)):
+        trial = place.values.copy()
         given = {p: v for p, v in zip(paths, setting, strict=True) if v is not None}
         for path, value in given.items():
             trial[:, order.index(path)] = value
-        seen = solved.problem.simulator.predict(trial)
+        seen = simulator.predict(trial)
         if not np.all(np.isfinite(seen)):
             continue
-        for k, place in enumerate(places):
-            nats, share = gain(place, place.template(seen))
-            if share <= 0 or nats <= best[k]:
-                continue
-            if nats > best.max():
-                scale = 1.0 if first.kinked else float(np.clip(share, _LEAST, _MOST))
-                strength = float(np.clip(given[paths[0]] * scale, first.low, first.high))
-                start = given | {paths[0]: strength}
-            best[k] = nats
+        nats, share = gain(place, place.template(seen))
+        if share <= 0 or nats <= best[k]:
+            continue
+        if nats > best.max():
+            scale = 1.0 if first.kinked else float(np.clip(share, _LEAST, _MOST))
+            strength = float(np.clip(given[paths[0]] * scale, first.low, first.high))
+            start = given | {paths[0]: strength}
+        best[k] = nats
     held = {p: v for p, v in start.items() if p in HELD and v != parameter(p).neutral}
     return Candidate(name, Hypothesis((name,), (), tuple(held.items())), start, *map(float, best))
 
 
 def _effort(places: list[Local]) -> Candidate:
-    found = of_all(places)
+    found = [evidence(place) for place in places]
     nats = [max(float(one.nats.sum()), 0.0) for one in found]
-    start = {f"{EFFORT}.duration": found[0].duration}
+    start = {f"{EFFORT}.duration": found[int(np.argmax(nats))].duration}
     return Candidate(EFFORT, Hypothesis((EFFORT,)), start, *nats)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 from ventbench.mismatch.naming import moving, places
 from ventbench.mismatch.naming.bench import Bench
@@ -16,24 +17,23 @@ from ventbench.mismatch.naming.beside import (
     effortless,
 )
 from ventbench.mismatch.naming.forms import without_trimmings
+from ventbench.mismatch.naming.gate import GATE, believed
 from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.moving import Moving
 from ventbench.mismatch.naming.rivals import Alternatives, alternatives
-from ventbench.mismatch.naming.search import (
-    GATE,
-    Progress,
-    believed,
-    forward,
-    settle,
-    step,
-)
+from ventbench.mismatch.naming.search import Progress, forward
+from ventbench.mismatch.naming.simpler import OneShape
 from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.sources import GAIN, MEASUREMENT, SOURCES
+from ventbench.mismatch.naming.steps import settle, step
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.noise import Noise
 
 #: A source at the sensor is noise unless it is of one frequency and this large, cmH2O.
 _HUM = 0.3
+
+#: Nats on held-out breaths from which a source is believed: places, scales and sizes are searched.
+_SOURCE = 8.0
 
 #: Share of what sources explain from which it is the gain that differs between breaths.
 _SCATTERED = 1.0
@@ -78,7 +78,8 @@ def conclude(bench: Bench, wider: Callable[[], Bench], tell: Progress) -> Conclu
         tell: is told what is done.
     """
     null = settle(bench, Hypothesis())
-    named, steps = forward(bench, null, tell)
+    wider = cache(wider)
+    named, steps = forward(bench, null, tell, OneShape(bench, wider, null))
     tell("looking for what has no name")
     wide = wider()
     trimmed = without_trimmings(bench, wide, named, tell)
@@ -147,6 +148,8 @@ def _shape(wide: Bench, named: Solved) -> Shape | None:
     if found is None or not believed(found.gained):
         return None
     best = found.rivals[0]
+    if wide.criterion(best.solved) > wide.criterion(found.before):
+        return None
     nats = float((wide.judged(best.solved) - wide.judged(here)).sum())
     return Shape(best.name, best.solved, nats)
 
@@ -181,7 +184,7 @@ def _source(found: dict[str, Moving], reference: Floats) -> Place | None:
     best = max(others.values(), key=lambda one: one.training)
     gained = best.judged - reference
     ahead = float((best.judged - sensor.judged).sum())
-    if believed(gained) and ahead > GATE:
+    if believed(gained, _SOURCE) and ahead > GATE:
         return Place(best.source, None, best, float(gained.sum()))
     gained = sensor.judged - reference
     if believed(gained) and sensor.periodic and sensor.size >= _HUM:

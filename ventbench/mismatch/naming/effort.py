@@ -17,9 +17,9 @@ EFFORT = "patient_effort"
 
 #: Onsets, s, durations, s, amplitude of a template and its prior standard deviation, cmH2O, and
 #: the share of breaths that have an effort.
-_ONSETS = tuple(0.1 * k for k in range(0, 17))
+ONSETS = tuple(0.1 * k for k in range(0, 17))
 _DURATIONS = (0.4, 0.6, 0.8, 1.0, 1.3)
-_AMPLITUDE, _WIDTH, _SHARE = 1.0, 3.0, 0.6
+_AMPLITUDE, WIDTH, SHARE = 1.0, 3.0, 0.6
 
 
 class Evidence(NamedTuple):
@@ -69,7 +69,7 @@ def _answers(place: Local, duration: float) -> list[Floats]:
     simulator = place.problem.simulator
     columns = [simulator.names.index(f"{EFFORT}.{p}") for p in ("amplitude", "onset", "duration")]
     answers = []
-    for onset in _ONSETS:
+    for onset in ONSETS:
         trial = place.values.copy()
         trial[:, columns] = (_AMPLITUDE, onset, duration)
         answers.append(simulator.predict(trial) - place.seen)
@@ -83,12 +83,12 @@ def _of(place: Local, duration: float, answers: list[Floats]) -> Evidence:
         template = place.without_own(white[:, None])[:, 0]
         power = np.sum(template**2, axis=1)
         match = -np.sum(place.residual * template, axis=1)
-        precision = (_AMPLITUDE / _WIDTH) ** 2
+        precision = (_AMPLITUDE / WIDTH) ** 2
         logs.append(0.5 * match**2 / (power + precision) - 0.5 * np.log1p(power / precision))
         means.append(match / (power + precision) * _AMPLITUDE)
     log_factors, amplitudes = np.stack(logs, 1), np.stack(means, 1)
-    mixed = np.logaddexp.reduce(log_factors, axis=1) - np.log(len(_ONSETS)) + np.log(_SHARE)
+    mixed = np.logaddexp.reduce(log_factors, axis=1) - np.log(len(ONSETS)) + np.log(SHARE)
     top = np.argmax(log_factors, axis=1)
-    nats = np.logaddexp(np.log(1.0 - _SHARE), mixed)
+    nats = np.logaddexp(np.log(1.0 - SHARE), mixed)
     rows = np.arange(len(top))
-    return Evidence(nats, duration, amplitudes[rows, top], np.asarray(_ONSETS)[top])
+    return Evidence(nats, duration, amplitudes[rows, top], np.asarray(ONSETS)[top])

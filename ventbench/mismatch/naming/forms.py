@@ -8,11 +8,15 @@ acts passes the test: no element of another's kind explains it away.
 
 from __future__ import annotations
 
+from operator import itemgetter
+
 from ventbench.mismatch.naming import places
 from ventbench.mismatch.naming.bench import Bench
+from ventbench.mismatch.naming.gate import GATE, believed
 from ventbench.mismatch.naming.hypothesis import Hypothesis
-from ventbench.mismatch.naming.search import GATE, Progress, believed, settle
+from ventbench.mismatch.naming.search import Progress
 from ventbench.mismatch.naming.solved import Solved
+from ventbench.mismatch.naming.steps import settle
 from ventbench.physics.fits.data import Floats
 
 #: Share of all that is explained up to which a name may be a trimming.
@@ -47,23 +51,24 @@ def without_trimmings(bench: Bench, wide: Bench, named: Solved, tell: Progress) 
 def _first(wide: Bench, named: Solved) -> str | None:
     """The least of the names that trim another one."""
     null = wide.solve(Hypothesis(), named.noise)
-    whole = max(named.log_likelihood - null.log_likelihood, 1e-9)
+    here = wide.likelihood(named)
+    whole = max(here - null.log_likelihood, 1e-9)
     base = wide.judged(named)
     lefts = [
         wide.solve(named.hypothesis.without(name), named.noise, named)
         for name in named.hypothesis.names
     ]
-    pairs = list(zip(named.hypothesis.names, lefts, strict=True))
-    for name, left in sorted(pairs, key=lambda pair: -pair[1].log_likelihood):
-        gained = named.log_likelihood - left.log_likelihood
-        if gained < _TRIMMING * whole and _explained_away(wide, named, left, name, base):
+    lost = [here - wide.likelihood(left) for left in lefts]
+    for name, left, nats in sorted(zip(named.names, lefts, lost, strict=True), key=itemgetter(2)):
+        if nats < _TRIMMING * whole and _explained_away(wide, named, left, name, nats, base):
             return name
     return None
 
 
-def _explained_away(wide: Bench, named: Solved, left: Solved, name: str, base: Floats) -> bool:
+def _explained_away(
+    wide: Bench, named: Solved, left: Solved, name: str, nats: float, base: Floats
+) -> bool:
     gained = float((base - wide.judged(left)).sum())
-    nats = named.log_likelihood - left.log_likelihood
     for candidate in places.scan(left):
         element = candidate.name
         kin = places.holds(element)

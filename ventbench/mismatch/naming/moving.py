@@ -13,9 +13,10 @@ import numpy as np
 
 from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.effort import EFFORT, evidence
+from ventbench.mismatch.naming.gate import GATE
 from ventbench.mismatch.naming.linear import Local, local
 from ventbench.mismatch.naming.solved import Side, Solved
-from ventbench.mismatch.naming.sources import GAIN, SOURCES, SUPPLY, responses
+from ventbench.mismatch.naming.sources import GAIN, MEASUREMENT, SOURCES, SUPPLY, responses
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.noise import Noise, estimate
 from ventbench.physics.fits.problem import Problem
@@ -73,6 +74,20 @@ def without(bench: Bench, solved: Solved) -> tuple[float, Floats]:
             likelihood = likelihood + evidence(place, duration).nats
         found.append(likelihood)
     return float(found[0].sum()), found[1]
+
+
+def beats_noise(bench: Bench, pulled: Solved) -> bool:
+    """Whether efforts explain more than noise of the sensor that wanders slowly.
+
+    Args:
+        bench: of the recording.
+        pulled: a hypothesis with efforts.
+    """
+    passive = bench.solve(pulled.hypothesis.without(EFFORT), pulled.noise, pulled)
+    by_efforts = float((bench.judged(pulled) - bench.judged(passive)).sum())
+    sensor = moving(bench, passive, (MEASUREMENT,))[MEASUREMENT]
+    by_noise = float((sensor.judged - without(bench, passive)[1]).sum())
+    return by_efforts > by_noise + GATE
 
 
 def moving(bench: Bench, solved: Solved, sources: tuple[str, ...] = SOURCES) -> dict[str, Moving]:

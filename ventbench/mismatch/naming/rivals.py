@@ -8,8 +8,9 @@ import numpy as np
 
 from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.candidates import screen
-from ventbench.mismatch.naming.search import Rival, Step, believed, step
+from ventbench.mismatch.naming.gate import believed
 from ventbench.mismatch.naming.solved import Solved
+from ventbench.mismatch.naming.steps import Rival, Step, step, whitened
 
 #: Criterion (twice the nats) within which a name is an alternative, and most that are listed.
 _CLOSE, _LISTED = 10.0, 2
@@ -68,8 +69,9 @@ def _rivals(bench: Bench, named: Solved, name: str, steps: list[Step]) -> list[R
         # Those that stayed far behind were not fitted to the end.
         return _again(bench, known[-1].rivals[1:4], named)
     base = bench.solve(rest, named.noise, named)
-    candidates = [one for one in screen(base, bench.known) if one.name != name]
-    found = step(bench, base, candidates)
+    white = whitened(bench, base)
+    candidates = [one for one in screen(base, white, bench.known) if one.name != name]
+    found = step(bench, base, candidates, white)
     if found is None or not believed(found.gained):
         return []
     return _again(bench, found.rivals[:3], named)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+from ventbench.mismatch.naming.effort import EFFORT
 from ventbench.mismatch.naming.hypothesis import Hypothesis
+from ventbench.physics.catalogue import strength_path
 from ventbench.physics.fits.data import Data, Floats
 from ventbench.physics.fits.derivatives import START, Simulator
 from ventbench.physics.fits.least_squares import Minimum
@@ -49,6 +51,23 @@ class Solved:
     def residual(self) -> Floats:
         """Simulated minus measured, ``(n, c, T)``."""
         return self.problem.residual(self.minimum.x)
+
+    @cached_property
+    def jacobian(self) -> tuple[Floats, Floats]:
+        """Residual and its derivatives by the coordinates of each path; see :class:`Problem`."""
+        return self.problem.jacobian(self.minimum.x)
+
+    @cached_property
+    def quiet(self) -> Floats:
+        """Residual if the patient were passive, ``(n, c, T)``."""
+        values = self.values.copy()
+        values[:, self.problem.simulator.names.index(strength_path(EFFORT))] = 0.0
+        return self.problem.residual_of(values)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Mechanisms, and elements of slots."""
+        return self.hypothesis.names
 
     @property
     def noise(self) -> Noise:

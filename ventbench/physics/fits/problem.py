@@ -58,7 +58,11 @@ class Problem:
 
     def residual(self, x: Floats) -> Floats:
         """Simulated minus measured, 0 where not measured, ``(n, c, T)``."""
-        return self._residual(self.predict(x))
+        return self.residual_of(self.values(x))
+
+    def residual_of(self, values: Floats) -> Floats:
+        """The same at physical values of everything, ``(n, P + 1)``."""
+        return self._residual(self.simulator.predict(values))
 
     def jacobian(self, x: Floats) -> tuple[Floats, Floats]:
         """Residual, and its derivative by the coordinates of each free path, ``(n, k, c, T)``.

@@ -62,21 +62,33 @@ def effortless(bench: Bench, named: Solved) -> Solved:
 
 
 def beside_source(bench: Bench, named: Solved, place: Place) -> Solved:
-    """Keep the names that are needed beside a source."""
+    """Keep the names that are needed beside a source, and those that explain more than it does.
+
+    A source is each breath's own and takes over what is the same in all breaths as well.
+    """
     assert place.source is not None
     current, here = effortless(bench, named), place.source
+    firm = {name for name in current.names if _gain(bench, current, name) > place.nats}
     if _is_effort(bench, named, current, here):
         current = named
     while True:
         idle = [
             found
-            for name in current.hypothesis.names
-            if name != EFFORT and (found := _idle(bench, current, here, name)) is not None
+            for name in current.names
+            if name != EFFORT
+            and name not in firm
+            and (found := _idle(bench, current, here, name)) is not None
         ]
         if not idle:
             return current
         # The least needed one first: others may be needed once it has gone.
         _, current, here = min(idle, key=lambda found: found[0])
+
+
+def _gain(bench: Bench, named: Solved, name: str) -> float:
+    """Held-out log-likelihood that a name gains beside the others."""
+    left = bench.solve(named.hypothesis.without(name), named.noise, named)
+    return float((bench.judged(named) - bench.judged(left)).sum())
 
 
 def _idle(

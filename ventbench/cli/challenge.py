@@ -109,6 +109,9 @@ def reveal(
     oracle: Annotated[
         bool, typer.Option("--oracle", help="Compare with fits that know the truth; slow.")
     ] = False,
+    jobs: Annotated[
+        int, typer.Option(min=0, help="Processes for that; 0 for none but this one.")
+    ] = 0,
     json: JsonFile = None,
 ) -> None:
     """Open the seal, check all hashes, and score the answers.
@@ -129,7 +132,9 @@ def reveal(
         def progress(done: int, total: int) -> None:
             shown.update(task, completed=done, total=total)
 
-        found = work(files.Folder(folder, round_), seed, with_oracle=oracle, progress=progress)
+        found = work(
+            files.Folder(folder, round_), seed, with_oracle=oracle, jobs=jobs, progress=progress
+        )
     emit(found.as_dict(), json)
     console = Console(stderr=str(json) == "-")
     _show(found, console)

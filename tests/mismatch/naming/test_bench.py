@@ -165,9 +165,7 @@ def brute_force(made: Bench, values: np.ndarray, duration: float, which: int) ->
     logs = np.array([[likelihood(a, onset) for a in grid] for onset in ONSETS])
     top = logs.max()
     mixed = np.mean(np.sum(np.exp(logs - top) * prior, axis=1)) * (grid[1] - grid[0])
-    return float(
-        np.logaddexp(np.log1p(-SHARE) + likelihood(0.0, 0.0), np.log(SHARE * mixed) + top)
-    )
+    return float(np.logaddexp(np.log1p(-SHARE) + likelihood(0.0, 0.0), np.log(SHARE * mixed) + top))
 
 
 @pytest.mark.parametrize("which", [2, 3])

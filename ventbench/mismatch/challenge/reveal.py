@@ -15,7 +15,7 @@ from ventbench.mismatch.challenge.figures import Figure, figures, number, second
 from ventbench.mismatch.challenge.folder import Folder
 from ventbench.mismatch.challenge.judge import Judged, judge
 from ventbench.mismatch.challenge.plan import Drawn
-from ventbench.recordings.read import load
+from ventbench.training.executor import executor, results
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Revealed:
 
 
 def reveal(
-    folder: Folder, secret: str, *, with_oracle: bool = False,
+    folder: Folder, secret: str, *, with_oracle: bool = False, jobs: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Revealed:  # fmt: skip
     """Check hashes and score.
@@ -60,6 +60,7 @@ def reveal(
         folder: of the challenge; of its second round, the first is read too.
         secret: that it was made with.
         with_oracle: compare with fits that know the true structure, which takes seconds a case.
+        jobs: processes that fit oracles; 0 for none but this one.
         progress: told how many oracles are fitted, of how many.
 
     Raises:
@@ -74,7 +75,7 @@ def reveal(
     if folder.round == 2:
         found.append(second(_judged(Folder(folder.path), known), cases))
     if with_oracle:
-        found += _against_oracle(folder, known, cases, progress)
+        found += _against_oracle(folder, known, cases, jobs, progress)
     return Revealed(
         folder.commitment.read_text().split()[0],
         tuple(drawn.case.name for drawn, _ in known if drawn.case.name not in cases),
@@ -101,17 +102,23 @@ def _judged(folder: Folder, known: list[tuple[Drawn, list[float]]]) -> dict[str,
 
 def _against_oracle(
     folder: Folder, known: list[tuple[Drawn, list[float]]], cases: dict[str, Judged],
-    progress: Callable[[int, int], None],
+    jobs: int, progress: Callable[[int, int], None],
 ) -> list[Figure]:  # fmt: skip
     """Ratios of the held-out RMSE to that of a fit with the true names."""
     answers, ratios = folder.answers(), []
-    could = [d for d, _ in known if d.case.name in cases and d.kind != "outside"]
-    for count, drawn in enumerate(could, start=1):
-        name = drawn.case.name
-        held_out = answers[name]["diagnosis"]["open_loop"]["held_out_breaths"]
-        best = oracle.rmse(load(folder.recording(name)), held_out, truth.names(drawn.case))
-        ratios.append(cases[name].after / best)
-        progress(count, len(could))
+    could = {
+        d.case.name: (
+            folder.recording(d.case.name),
+            answers[d.case.name]["diagnosis"]["open_loop"]["held_out_breaths"],
+            truth.names(d.case),
+        )
+        for d, _ in known
+        if d.case.name in cases and d.kind != "outside"
+    }
+    with executor(jobs) as pool:
+        for name, best in results(pool, oracle.of_recording, could):
+            ratios.append(cases[name].after / best)
+            progress(len(ratios), len(could))
     return [
         number("held-out RMSE over the oracle's, median", ratios, np.median, 1.02),
         number("held-out RMSE over the oracle's, 95th percentile", ratios,

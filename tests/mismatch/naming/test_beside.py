@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -34,5 +35,5 @@ def test_a_source_takes_over_only_what_explains_less_than_itself(named, monkeypa
         return 0.0, bench.solve(current.hypothesis.without(name), current.noise, current), here
 
     monkeypatch.setattr(beside, "_idle", idle)
-    place = SimpleNamespace(nats=nats, source=SimpleNamespace(source="f(t) at the supply"))
+    place: Any = SimpleNamespace(nats=nats, source=SimpleNamespace(source="f(t) at the supply"))
     assert beside.beside_source(bench, solved, place).names == kept

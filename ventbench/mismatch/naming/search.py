@@ -14,8 +14,8 @@ from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.steps import MUCH, Rival, Step, noise_of, settle, step, whitened
 from ventbench.physics.catalogue import mechanism
 
-#: Most terms.
-_MOST = 6
+#: Most terms, and comparisons: a term that was dropped may come back, but not for ever.
+_MOST, _ROUNDS = 6, 14
 
 #: Share of what efforts explain from which an effect that all breaths share goes first.
 _MOSTLY = 0.5
@@ -42,7 +42,9 @@ def forward(
         simpler: gives what ends the search if something else does better than all terms.
     """
     current, steps = start, []
-    while len(current.hypothesis.names) < _MOST:
+    for _ in range(_ROUNDS):
+        if len(current.hypothesis.names) == _MOST:
+            break
         tell(f"comparing mechanisms ({len(current.hypothesis.names)} named)")
         white = whitened(bench, current)
         found = step(bench, current, screen(current, white, bench.known), white)

@@ -21,12 +21,13 @@ def valve_positions(u_in, m):
         if "command_rounding" in m:
             u = float(np.floor(u))
         if "valve_hysteresis" in m:
-            play = m["valve_hysteresis"]["width"] / 2
+            play, give = m["valve_hysteresis"]["width"] / 2, m["valve_hysteresis"].get("give", 0.0)
+            soft = u - play * np.tanh((u - stands) / play)
             if u - stands > play:
                 stands = u - play
             elif stands - u > play:
                 stands = u + play
-            u = stands
+            u = stands = give * soft + (1 - give) * stands
         if "valve_dead_band" in m:
             u = max(0.0, u - m["valve_dead_band"]["width"])
         if "valve_curve" in m:
@@ -42,14 +43,15 @@ def recoil(volume, C, m):
 
 
 class Breath:
-    """Right-hand side; the state is volume, valve, supply, stress, airway, flow and sensor."""
+    """Right-hand side; states: volume, valve, supply, stress, airway, flow, sensor, second lag."""
 
     def __init__(self, R, C, m, R_ex, peep):
         self.R, self.C, self.m, self.R_ex, self.peep = R, C, m, R_ex, peep
         self.K2 = self.get("turbulent_resistance", "quadratic")
+        self.power = m.get("turbulent_resistance", {}).get("exponent", 2.0)
         self.tank = self.get("circuit_compliance", "compliance") / 1000
         self.mass = self.get("inertance", "inertance")
-        self.lag = self.get("valve_lag", "tau")
+        self.lag, self.second = self.get("valve_lag", "tau"), self.get("valve_lag", "second")
         self.slow = self.get("sensor_lag", "tau")
         self.ratio, self.relax = self.get("viscoelasticity", "ratio"), 1.0
         if self.ratio:
@@ -72,8 +74,8 @@ class Breath:
 
     def balance(self, t, y, wanted, opened):
         """Flow of the valve, flow into the lung, flow out, airway pressure."""
-        volume, valve, supply, stress, airway, flow, _ = y
-        q = valve if self.lag else wanted
+        volume, valve, supply, stress, airway, flow, _, behind = y
+        q = behind if self.second else valve if self.lag else wanted
         d = self.get("supply_droop", "drop")
         q = q / (1 + d / (1 - d) * supply / 0.5)
         inside = recoil(volume, self.C, self.m) + stress - self.muscle(t)
@@ -84,8 +86,14 @@ class Breath:
             x = p - inside
             if not self.K2:
                 return x / self.R
-            root = np.sqrt(self.R**2 + 4 * self.K2 * abs(x))
-            return np.sign(x) * (root - self.R) / 2 / self.K2
+            if self.power == 2:
+                root = np.sqrt(self.R**2 + 4 * self.K2 * abs(x))
+                return np.sign(x) * (root - self.R) / 2 / self.K2
+            size = abs(x)
+            return np.sign(x) * brentq(
+                lambda q: self.R * q + self.K2 * q**self.power - size, 0.0, size / self.R + 1e-9,
+                xtol=1e-13,
+            )  # fmt: skip
 
         def out(p):
             return opened * max(p - self.peep, 0.0) / self.R_ex
@@ -95,9 +103,9 @@ class Breath:
         return q, into(airway), out(airway), airway, inside
 
     def slope(self, t, y, wanted, opened):
-        _, valve, supply, stress, _, _, sensor = y
+        _, valve, supply, stress, _, _, sensor, behind = y
         q, flow, out, p, inside = self.balance(t, y, wanted, opened)
-        drop = self.R * flow + self.K2 * flow * abs(flow)
+        drop = self.R * flow + self.K2 * flow * abs(flow) ** (self.power - 1)
         return [
             flow,
             (wanted - valve) / self.lag if self.lag else 0.0,
@@ -106,12 +114,16 @@ class Breath:
             (q - flow - out - self.lost(p)) / self.tank if self.tank else 0.0,
             (p - inside - drop) / self.mass if self.mass else 0.0,
             (p - sensor) / self.slow if self.slow else 0.0,
+            (valve - behind) / self.second if self.second else 0.0,
         ]
 
 
 def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, position=0.0):
     """Pressure, cmH2O, flow, mL/s, and volume, mL, at each sample, ``(3, T)``."""
-    drift = m.get("sensor_drift", {}).get("drift", 0.0) * position
+    drifted = m.get("sensor_drift", {})
+    fading = drifted.get("warming", 0.0)
+    grown = (1 - np.exp(-fading * position)) / (1 - np.exp(-fading)) if fading else position
+    drift = drifted.get("drift", 0.0) * grown
     rig, p0 = Breath(R, C, m, R_ex, peep), start - drift
     v0 = brentq(lambda v: recoil(v, C, m) - p0, -0.01, 0.0239 * C, xtol=1e-14)
     times = np.concatenate([[0.0], np.cumsum(dt[:-1])])
@@ -127,7 +139,7 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
         i = int(np.searchsorted(times, t, side="right")) - 1
         return before if i < 0 else values[i]
 
-    y = np.array([v0, 0.0, 0.0, 0.0, p0, 0.0, p0])
+    y = np.array([v0, 0.0, 0.0, 0.0, p0, 0.0, p0, 0.0])
     rows = [(start, 0.0, 0.0)]
     for a, b in pairwise(edges):
         if b - a < 1e-12:

@@ -37,6 +37,24 @@ def test_each_mechanism(name, level, predicted):
     assert_close(predicted(breaths, m), breaths.pressure, TOLERANCE.get(name, EXACT))
 
 
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("valve_lag.second", 0.06),
+        ("turbulent_resistance.exponent", 1.75),
+        ("turbulent_resistance.exponent", 1.5),
+        ("valve_hysteresis.give", 1.0),
+        ("valve_hysteresis.give", 0.4),
+        ("sensor_drift.warming", 3.0),
+    ],
+)
+def test_each_shape(path, value, predicted):
+    name, _, parameter = path.partition(".")
+    m = {name: cases.strengths(name)[name] | {parameter: value}}
+    breaths = cases.recording(2, m)
+    assert_close(predicted(breaths, m), breaths.pressure, EXACT)
+
+
 @pytest.mark.parametrize(("R", "C"), [(5.0, 10.0), (20.0, 50.0), (50.0, 20.0)])
 def test_base(R, C, predicted):
     breaths = cases.recording(2, {}, R=R, C=C, gain=15.0, R_ex=8.0)

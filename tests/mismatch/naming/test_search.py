@@ -187,6 +187,26 @@ def test_a_shape_is_freed_if_the_recording_asks_for_it(form):
     assert found.column("leak.exponent")[0] == pytest.approx(wanted, abs=0.05)
 
 
+@pytest.mark.parametrize(
+    ("effect", "path", "wanted"),
+    [
+        (small.effect("valve_lag", "two lags", tau=0.1), "valve_lag.second", 0.05),
+        (small.effect("valve_hysteresis", "soft play", width=5.0), "valve_hysteresis.give", 1.0),
+        (
+            small.effect("turbulent_resistance", "exponent 1.75", quadratic=10.0),
+            "turbulent_resistance.exponent",
+            1.75,
+        ),
+        (small.effect("sensor_drift", "warming", drift=3.0), "sensor_drift.warming", 3.0),
+    ],
+)
+def test_another_form_is_found_by_the_shape_of_its_name(effect, path, wanted):
+    bench = small.split(small.made(effect, noise=0.03, seed=5))
+    found = shaped(bench, settle(bench, Hypothesis((effect.name,))))
+    assert found.hypothesis.free == (path,)
+    assert found.column(path)[0] == pytest.approx(wanted, rel=0.15)
+
+
 @pytest.fixture(scope="module")
 def alike():
     """A recording from which a lag of the valve and a compliant circuit look the same."""

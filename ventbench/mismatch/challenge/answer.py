@@ -24,6 +24,7 @@ _THREADS = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
+    "VENTBENCH_THREADS": "1",
 }
 
 #: Cases that this process has answered.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 from ventbench.mismatch.naming import moving, places
 from ventbench.mismatch.naming.bench import Bench
@@ -13,6 +14,7 @@ from ventbench.mismatch.naming.moving import Moving
 from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.sources import ALVEOLUS
 from ventbench.mismatch.naming.steps import settle, step
+from ventbench.mismatch.naming.together import each
 
 #: Share of what a slot of the same kind explains from which a name stands, its form apart; and
 #: share below which a name beside a slot is only its trimming.
@@ -68,17 +70,13 @@ def beside_source(bench: Bench, named: Solved, place: Place) -> Solved:
     """
     assert place.source is not None
     current, here = effortless(bench, named), place.source
-    firm = {name for name in current.names if _gain(bench, current, name) > place.nats}
+    gains = each(partial(_gain, bench, current), current.names)
+    firm = {name for name, gain in zip(current.names, gains, strict=True) if gain > place.nats}
     if _is_effort(bench, named, current, here):
         current = named
     while True:
-        idle = [
-            found
-            for name in current.names
-            if name != EFFORT
-            and name not in firm
-            and (found := _idle(bench, current, here, name)) is not None
-        ]
+        asked = [name for name in current.names if name != EFFORT and name not in firm]
+        idle = [x for x in each(partial(_idle, bench, current, here), asked) if x is not None]
         if not idle:
             return current
         # The least needed one first: others may be needed once it has gone.

@@ -11,6 +11,7 @@ from ventbench.mismatch.naming.effort import EFFORT, evidence
 from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.linear import Local, gain, local
 from ventbench.mismatch.naming.solved import Solved
+from ventbench.mismatch.naming.together import each
 from ventbench.physics.catalogue import library, parameter
 from ventbench.physics.fits.derivatives import Simulator
 from ventbench.physics.parameters import Parameter
@@ -63,11 +64,11 @@ def screen(
         known: mechanisms to look at; the whole library if not given.
     """
     places = [local(one.problem, one.minimum.x) for one in (solved, whitened)]
-    simulator, found = solved.problem.simulator, []
-    for name in known or library():
-        if name in solved.hypothesis.names:
-            continue
-        found.append(_effort(places) if name == EFFORT else _best(simulator, places, name))
+    simulator = solved.problem.simulator
+    missing = [name for name in known or library() if name not in solved.names]
+    found = each(
+        lambda name: _effort(places) if name == EFFORT else _best(simulator, places, name), missing
+    )
     by_nats = sorted(found, key=lambda one: -one.nats)
     by_white = sorted(found, key=lambda one: -one.white)
     mixed = [one for pair in zip(by_nats, by_white, strict=True) for one in pair]

@@ -26,6 +26,7 @@ from ventbench.mismatch.naming.simpler import OneShape
 from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.sources import GAIN, MEASUREMENT, SOURCES
 from ventbench.mismatch.naming.steps import settle, step
+from ventbench.mismatch.naming.together import each
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.noise import Noise
 
@@ -170,11 +171,13 @@ def _scattered(
 
 
 def _losses(bench: Bench, named: Solved) -> dict[str, float]:
-    found = {}
-    for name in named.hypothesis.names:
+    here = bench.judged(named)
+
+    def lost(name: str) -> float:
         left = bench.solve(named.hypothesis.without(name), named.noise, named)
-        found[name] = float((bench.judged(named) - bench.judged(left)).sum())
-    return found
+        return float((here - bench.judged(left)).sum())
+
+    return dict(zip(named.names, each(lost, named.names), strict=True))
 
 
 def _source(found: dict[str, Moving], reference: Floats) -> Place | None:

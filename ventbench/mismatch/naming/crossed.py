@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
 from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.solved import Side, Solved
+from ventbench.mismatch.naming.together import each
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.derivatives import START
 
@@ -20,12 +22,15 @@ def crossed(bench: Bench, current: Solved, without: Solved) -> Floats:
         current: with the term, fitted to the training breaths.
         without: the same hypothesis without it, at the same noise.
     """
-    gains = [bench.judged(current) - bench.judged(without)]
-    for training, judging in bench.folds:
+
+    def judged(work: tuple[tuple[Side, Side], Solved]) -> Floats:
+        (training, judging), solved = work
         fold = replace(bench, training=training, judging=judging, folds=())
-        new, old = (_again(fold, one, training) for one in (current, without))
-        gains.append(fold.judged(new) - fold.judged(old))
-    return np.concatenate(gains)
+        return fold.judged(_again(fold, solved, training))
+
+    found = each(judged, product(bench.folds, (current, without)))
+    gains = [new - old for new, old in zip(found[::2], found[1::2], strict=True)]
+    return np.concatenate([bench.judged(current) - bench.judged(without), *gains])
 
 
 def _again(fold: Bench, solved: Solved, training: Side) -> Solved:

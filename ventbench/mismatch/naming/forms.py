@@ -17,6 +17,7 @@ from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.search import Progress
 from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.steps import settle
+from ventbench.mismatch.naming.together import each
 from ventbench.physics.fits.data import Floats
 
 #: Share of all that is explained up to which a name may be a trimming.
@@ -54,10 +55,10 @@ def _first(wide: Bench, named: Solved) -> str | None:
     here = wide.likelihood(named)
     whole = max(here - null.log_likelihood, 1e-9)
     base = wide.judged(named)
-    lefts = [
-        wide.solve(named.hypothesis.without(name), named.noise, named)
-        for name in named.hypothesis.names
-    ]
+    lefts = each(
+        lambda name: wide.solve(named.hypothesis.without(name), named.noise, named),
+        named.hypothesis.names,
+    )
     lost = [here - wide.likelihood(left) for left in lefts]
     for name, left, nats in sorted(zip(named.names, lefts, lost, strict=True), key=itemgetter(2)):
         if nats < _TRIMMING * whole and _explained_away(wide, named, left, name, nats, base):

@@ -6,7 +6,9 @@ import numpy as np
 
 from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.crossed import crossed
+from ventbench.mismatch.naming.hypothesis import Hypothesis, has_own
 from ventbench.mismatch.naming.solved import Solved
+from ventbench.physics.catalogue import mechanism
 from ventbench.physics.fits.data import Floats
 
 #: Nats on held-out breaths from which a term is believed: log(1 / 0.01).
@@ -21,6 +23,9 @@ _USUAL, _FAR = 0.8, 1.5
 #: Criterion from which the training breaths plainly ask for a term, and times the gate that it then
 #: has to pass, as judgements of several splits hang together.
 _PLAIN, _CROSSED = 20.0, 1.5
+
+#: Share of a mild strength, and of all that is explained, below both of which a term is a trace.
+_WEAK, _LITTLE = 0.2, 0.1
 
 
 def believed(gained: Floats, gate: float = GATE) -> bool:
@@ -56,3 +61,24 @@ def needed(bench: Bench, current: Solved, without: Solved) -> bool:
     if believed(bench.judged(current) - bench.judged(without)):
         return True
     return gained > _PLAIN and believed(crossed(bench, current, without), _CROSSED * GATE)
+
+
+def is_trace(bench: Bench, current: Solved, without: Solved, name: str) -> bool:
+    """Whether a term is far weaker than a mild one and explains little beside the others.
+
+    What another term's form or the integrator leaves, a tiny effect of almost any kind can trim,
+    and enough breaths will believe it: a valve that is late by 1 ms beside four strong effects.
+
+    Args:
+        bench: of the recording.
+        current: a hypothesis.
+        without: with the term less, at the same noise.
+        name: of the term.
+    """
+    item = mechanism(name).description.strength
+    strength = float(np.max(np.abs(current.column(f"{name}.{item.name}") - item.neutral)))
+    if has_own(name) or strength > _WEAK * abs(item.mild - item.neutral):
+        return False
+    here = bench.criterion(current)
+    nothing = bench.criterion(bench.solve(Hypothesis(), current.noise, current))
+    return bench.criterion(without) - here < _LITTLE * (nothing - here)

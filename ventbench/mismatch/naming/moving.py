@@ -17,6 +17,7 @@ from ventbench.mismatch.naming.gate import GATE
 from ventbench.mismatch.naming.linear import Local, local
 from ventbench.mismatch.naming.solved import Side, Solved
 from ventbench.mismatch.naming.sources import GAIN, MEASUREMENT, SOURCES, SUPPLY, responses
+from ventbench.mismatch.naming.together import each
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.noise import Noise, estimate
 from ventbench.physics.fits.problem import Problem
@@ -84,20 +85,24 @@ def beats_noise(bench: Bench, pulled: Solved) -> bool:
         pulled: a hypothesis with efforts.
     """
     passive = bench.solve(pulled.hypothesis.without(EFFORT), pulled.noise, pulled)
-    by_efforts = float((bench.judged(pulled) - bench.judged(passive)).sum())
     sensor = moving(bench, passive, (MEASUREMENT,))[MEASUREMENT]
-    by_noise = float((sensor.judged - without(bench, passive)[1]).sum())
-    return by_efforts > by_noise + GATE
+    # On one scale: a source's likelihood leaves out what does not depend on residuals.
+    weight = bench.judging.data.weight
+    _, scale, kept = sensor.noise._chain(weight)
+    constant = sensor.noise.log_likelihood(np.zeros_like(weight), weight)
+    constant += np.sum(kept * np.log(scale), axis=(1, 2))
+    return float((bench.judged(pulled) - sensor.judged - constant).sum()) > GATE
 
 
 def moving(bench: Bench, solved: Solved, sources: tuple[str, ...] = SOURCES) -> dict[str, Moving]:
     """Best source at each place, its size and scale chosen by the training breaths."""
     problem, x = bench.judge(solved, bench.training)
     values = problem.values(x)
-    return {
-        source: _at(bench, solved, problem, x, source, responses(bench.training, values, source))
-        for source in sources
-    }
+
+    def at(source: str) -> Moving:
+        return _at(bench, solved, problem, x, source, responses(bench.training, values, source))
+
+    return dict(zip(sources, each(at, sources), strict=True))
 
 
 def _at(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from ventbench.mismatch.naming.candidates import screen
 from ventbench.mismatch.naming.gate import believed
 from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.steps import Rival, Step, step, whitened
+from ventbench.mismatch.naming.together import each
 
 #: Criterion (twice the nats) within which a name is an alternative, and most that are listed.
 _CLOSE, _LISTED = 10.0, 2
@@ -42,27 +44,19 @@ def alternatives(
     Returns:
         The best set of names, and for each the alternatives.
     """
-    for _ in range(2 if swap else 1):
-        found: dict[str, Alternatives] = {}
-        better = None
-        for name in named.hypothesis.names:
-            criterion = bench.criterion(named)
-            rivals = _rivals(bench, named, name, steps)
-            if swap and rivals and rivals[0].criterion < criterion:
-                better = rivals[0].solved
-                break
-            found[name] = _close(name, rivals, criterion)
-        if better is None:
-            return named, found
-        named, steps = better, []
-    found = {
-        name: _close(name, _rivals(bench, named, name, steps), bench.criterion(named))
-        for name in named.hypothesis.names
+    for last in (False, False, True):
+        criterion, names = bench.criterion(named), named.names
+        rivals = each(partial(_rivals, bench, named, steps), names)
+        better = [one[0].solved for one in rivals if one and one[0].criterion < criterion]
+        if last or not swap or not better:
+            break
+        named, steps = better[0], []
+    return named, {
+        name: _close(name, others, criterion) for name, others in zip(names, rivals, strict=True)
     }
-    return named, found
 
 
-def _rivals(bench: Bench, named: Solved, name: str, steps: list[Step]) -> list[Rival]:
+def _rivals(bench: Bench, named: Solved, steps: list[Step], name: str) -> list[Rival]:
     rest = named.hypothesis.without(name)
     known = [s for s in steps if s.before.hypothesis == rest and s.rivals[0].name == name]
     if known:

@@ -8,7 +8,7 @@ from ventbench.mismatch.naming import moving
 from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.candidates import HELD, screen
 from ventbench.mismatch.naming.effort import EFFORT
-from ventbench.mismatch.naming.gate import believed, needed
+from ventbench.mismatch.naming.gate import believed, is_trace, needed
 from ventbench.mismatch.naming.hypothesis import Hypothesis, has_own
 from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.steps import MUCH, Rival, Step, noise_of, settle, step, whitened
@@ -16,6 +16,10 @@ from ventbench.physics.catalogue import mechanism
 
 #: Most terms, and comparisons: a term that was dropped may come back, but not for ever.
 _MOST, _ROUNDS = 6, 14
+
+#: Names from which it is asked whether something else does better; of fewer, the next may be what
+#: is missing.
+_SEVERAL = 4
 
 #: Share of what efforts explain from which an effect that all breaths share goes first.
 _MOSTLY = 0.5
@@ -55,10 +59,13 @@ def forward(
         if best is None:
             break
         current = dropped(bench, shaped(bench, best))
+        if len(current.names) < _SEVERAL:
+            continue
         instead = simpler(current)
         if instead is not None:
             return instead, []
-    return current, steps
+    instead = simpler(current)
+    return (current, steps) if instead is None else (instead, [])
 
 
 def _best(bench: Bench, found: Step) -> Solved | None:
@@ -78,6 +85,8 @@ def _best(bench: Bench, found: Step) -> Solved | None:
     if not believed(found.gained) and not needed(bench, first.solved, found.before):
         return _other(bench, found)
     best = _settled(bench, first)
+    if is_trace(bench, best, _without(bench, found, best), first.name):
+        return _other(bench, found)
     if first.name != EFFORT or moving.beats_noise(bench, best):
         return best
     return _beyond(bench, found, next((x for x in found.rivals if not has_own(x.name)), None))
@@ -88,8 +97,15 @@ def _beyond(bench: Bench, found: Step, rival: Rival | None) -> Solved | None:
     if rival is None:
         return None
     with_it = _settled(bench, rival)
-    without = bench.solve(found.before.hypothesis, with_it.noise, found.before)
-    return with_it if needed(bench, with_it, without) else None
+    without = _without(bench, found, with_it)
+    if not needed(bench, with_it, without) or is_trace(bench, with_it, without, rival.name):
+        return None
+    return with_it
+
+
+def _without(bench: Bench, found: Step, with_it: Solved) -> Solved:
+    """What a step added to, at the noise of what it gives."""
+    return bench.solve(found.before.hypothesis, with_it.noise, found.before)
 
 
 def _settled(bench: Bench, rival: Rival) -> Solved:
@@ -134,6 +150,6 @@ def dropped(bench: Bench, current: Solved) -> Solved:
     """Leave out terms that are not needed any more."""
     for name in current.hypothesis.names[:-1]:
         without = bench.solve(current.hypothesis.without(name), current.noise, current)
-        if not needed(bench, current, without):
+        if not needed(bench, current, without) or is_trace(bench, current, without, name):
             current = without
     return current

@@ -10,6 +10,7 @@ from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.candidates import Candidate
 from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.solved import Solved
+from ventbench.mismatch.naming.together import each
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.noise import Noise, estimate
 
@@ -102,15 +103,15 @@ def step(
         found = found[:_REFITTED]
     # Whitened by what an effect leaves in the residual, its own fit would hardly see it.
     white = replace(current.noise, ar=(0.0, 0.0))
-    rivals = [
-        bench.solve(
+    rivals = each(
+        lambda one: bench.solve(
             current.hypothesis.plus(one.hypothesis), white, near or current, one.start,
             iterations=_FEW, tolerance=0.1,
-        )
-        for one in found
-    ]  # fmt: skip
+        ),
+        found,
+    )  # fmt: skip
     criterion = _Criteria(bench)
-    own = [criterion(one, noise_of(one)) for one in rivals]
+    own = each(lambda one: criterion(one, noise_of(one)), rivals)
     noise = criterion.likelier(rivals[int(np.argmin(own))], current.noise)
     order = criterion.order(rivals, noise)
     for _ in range(3):
@@ -120,17 +121,24 @@ def step(
         order = criterion.order(order, noise)
         best = criterion(order[0], noise)
         limit = best + max(_NEAR, _SHARE * (criterion(current, noise) - best))
-        order = [
-            bench.solve(one.hypothesis, noise, one) if criterion(one, noise) < limit else one
-            for one in order
-        ]
-        order = criterion.order(order, noise)
+        order = criterion.order(_further(bench, order, noise, criterion, limit), noise)
         if criterion.likelier(order[0], noise) is noise:
             break
     if noise is not current.noise:
         current = bench.solve(current.hypothesis, noise, current)
     listed = tuple(Rival(x.hypothesis.names[-1], x, criterion(x, noise)) for x in order)
     return Step(current, listed, bench.judged(order[0]) - bench.judged(current))
+
+
+def _further(
+    bench: Bench, order: list[Solved], noise: Noise, criterion: _Criteria, limit: float
+) -> list[Solved]:
+    """The same, those below a limit fitted on at a noise."""
+
+    def further(one: Solved) -> Solved:
+        return bench.solve(one.hypothesis, noise, one) if criterion(one, noise) < limit else one
+
+    return each(further, order)
 
 
 class _Criteria:

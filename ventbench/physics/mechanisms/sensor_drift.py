@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Mechanism, Values
 from ventbench.physics.parameters import Parameter
+
+#: Added to the fading, so that a steady drift is no division by zero.
+_STEADY = 1e-4
 
 
 class SensorDrift(Mechanism):
@@ -15,7 +19,10 @@ class SensorDrift(Mechanism):
         name="sensor_drift",
         title="drift of the pressure sensor",
         site="sensor",
-        equation="y = p (1 + gain x) + drift x, x = position of the breath in the recording, 0..1",
+        equation=(
+            "y = p (1 + gain g) + drift g, g = (1 - exp(-warming x)) / (1 - exp(-warming)), "
+            "x = position of the breath in the recording, 0..1"
+        ),
         parameters=(
             Parameter(
                 "drift",
@@ -38,6 +45,17 @@ class SensorDrift(Mechanism):
                 0.0,
                 shape=True,
             ),
+            Parameter(
+                "warming",
+                "1",
+                "times that the drift fades by e in the recording; 0: it is steady",
+                0.0,
+                10.0,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+            ),
         ),
         source=(
             "Temperature and ageing of piezoresistive sensors between two zeroings: up to 3 "
@@ -55,11 +73,19 @@ class SensorDrift(Mechanism):
 
     def shown(self, values: Values, pressure: Array, position: Array) -> Array:
         """Drifted pressure."""
-        return pressure * (1.0 + values["gain"] * position) + values["drift"] * position
+        grown = _grown(values, position)
+        return pressure * (1.0 + values["gain"] * grown) + values["drift"] * grown
 
     def meant(self, values: Values, shown: Array, position: Array) -> Array:
         """True pressure of a reading."""
-        return (shown - values["drift"] * position) / (1.0 + values["gain"] * position)
+        grown = _grown(values, position)
+        return (shown - values["drift"] * grown) / (1.0 + values["gain"] * grown)
+
+
+def _grown(values: Values, position: Array) -> Array:
+    """Share of the drift that there is."""
+    fading = values["warming"] + _STEADY
+    return jnp.expm1(-fading * position) / jnp.expm1(-fading)
 
 
 MECHANISM = SensorDrift()

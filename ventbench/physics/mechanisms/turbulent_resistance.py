@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
+
 from ventbench.physics.mechanism import Description, Mechanism, Values
 from ventbench.physics.network import Network, View
 from ventbench.physics.parameters import Parameter
 
+#: The slope of the power by flow is rounded off below this flow, L/s.
+_ROUND = 0.02
+
 
 class TurbulentResistance(Mechanism):
-    """A pressure drop that grows with the square of flow."""
+    """A pressure drop that grows with the square of flow, or nearly."""
 
     description = Description(
         name="turbulent_resistance",
         title="resistance that grows with flow",
         site="airway",
-        equation="p = ... + R Q + quadratic Q |Q|",
+        equation="p = ... + R Q + quadratic Q |Q| (Q^2 + e^2)^(exponent / 2 - 1), e = 0.02 L/s",
         parameters=(
             Parameter(
                 "quadratic",
                 "cmH2O s2/L2",
-                "second coefficient of Rohrer",
+                "second coefficient of Rohrer; drop at 1 L/s",
                 0.0,
                 80.0,
                 0.0,
@@ -27,11 +32,22 @@ class TurbulentResistance(Mechanism):
                 10.0,
                 follows="R",
             ),
+            Parameter(
+                "exponent",
+                "1",
+                "2 for an orifice, 1.75 for a smooth tube",
+                1.5,
+                2.0,
+                2.0,
+                2.0,
+                2.0,
+                shape=True,
+            ),
         ),
         source=(
             "Rohrer's equation (Otis, Fenn and Rahn, J. Appl. Physiol. 2, 1950, 592); "
             "parabolic resistors of test lungs hold their label at one flow only. 1 to 30 "
-            "cmH2O s2/L2."
+            "cmH2O s2/L2. In a smooth tube the exponent is 1.75 (Blasius)."
         ),
         signature=(
             "Pressure drop grows faster than flow: error at high flow, in inspiration and "
@@ -43,8 +59,9 @@ class TurbulentResistance(Mechanism):
     )
 
     def network(self, values: Values, network: Network, view: View) -> Network:
-        """Add it to the airway."""
-        return network.plus(quadratic=values["quadratic"])
+        """Add it to the airway; what differs from a square, at the last flow."""
+        milder = jnp.log(view.flow**2 + _ROUND**2) * (0.5 * values["exponent"] - 1.0)
+        return network.plus(quadratic=values["quadratic"] * jnp.exp(milder))
 
 
 MECHANISM = TurbulentResistance()

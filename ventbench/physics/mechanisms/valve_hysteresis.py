@@ -8,6 +8,9 @@ from jax import Array
 from ventbench.physics.mechanism import Description, Mechanism, Values
 from ventbench.physics.parameters import Parameter
 
+#: Width, %, so that none is no division by zero.
+_THIN = 1e-6
+
 
 class ValveHysteresis(Mechanism):
     """Rate-independent memory of the command."""
@@ -16,9 +19,23 @@ class ValveHysteresis(Mechanism):
         name="valve_hysteresis",
         title="play of the inspiratory valve",
         site="inspiratory valve",
-        equation="u_effective = clip(u_effective before, u - width / 2, u + width / 2)",
+        equation=(
+            "u_effective = u - h ((1 - give) clip(x, -1, 1) + give tanh x), h = width / 2, "
+            "x = (u - u_effective before) / h"
+        ),
         parameters=(
             Parameter("width", "%", "command lost at every reversal", 0.0, 15.0, 0.0, 2.0, 5.0),
+            Parameter(
+                "give",
+                "1",
+                "0 for slack, 1 for a drive that gives before it moves the seat",
+                0.0,
+                1.0,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+            ),
         ),
         source=(
             "Play (backlash) operator: friction and slack between driver and seat, or "
@@ -39,7 +56,9 @@ class ValveHysteresis(Mechanism):
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
         """Where the valve stands, %, and that it is remembered."""
         half = 0.5 * values["width"]
-        stands = jnp.minimum(jnp.maximum(memory, u_in - half), u_in + half)
+        hard = jnp.minimum(jnp.maximum(memory, u_in - half), u_in + half)
+        soft = u_in - half * jnp.tanh((u_in - memory) / (half + _THIN))
+        stands = hard + values["give"] * (soft - hard)
         return stands, stands
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Mechanism, Values
@@ -9,14 +10,27 @@ from ventbench.physics.parameters import Parameter
 
 
 class ValveLag(Mechanism):
-    """Flow of the valve follows what is asked for, through a first-order lag."""
+    """Flow of the valve follows what is asked for, through one lag or two."""
 
     description = Description(
         name="valve_lag",
-        title="first-order lag of the inspiratory valve",
+        title="lag of the inspiratory valve",
         site="inspiratory valve",
-        equation="tau dq/dt = q_commanded - q",
-        parameters=(Parameter("tau", "s", "time constant", 0.0, 0.2, 0.0, 0.04, 0.1),),
+        equation="tau dx/dt = q_commanded - x, second dq/dt = x - q",
+        parameters=(
+            Parameter("tau", "s", "time constant", 0.0, 0.2, 0.0, 0.04, 0.1),
+            Parameter(
+                "second",
+                "s",
+                "time constant of a lag behind the first, as of a pilot stage",
+                0.0,
+                0.2,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+            ),
+        ),
         source=(
             "First-order actuator; time constants of 5 to 100 ms are usual for proportional "
             "solenoid valves."
@@ -31,15 +45,16 @@ class ValveLag(Mechanism):
     stateful = True
 
     def rest(self, values: Values, flow: Array, pressure: Array) -> Array:
-        """The resting flow, L/s."""
-        return flow
+        """The resting flow behind both lags, L/s."""
+        return jnp.stack([flow + 0.0 * pressure] * 2)
 
     def inflow(
         self, values: Values, flow: Array, state: Array, length: Array
     ) -> tuple[Array, Array]:
-        """Implicit step towards the commanded flow; at ``tau`` = 0 there at once."""
-        after = (values["tau"] * state + length * flow) / (values["tau"] + length)
-        return after, after
+        """Implicit step towards the commanded flow; a lag of 0 s is there at once."""
+        first = (values["tau"] * state[0] + length * flow) / (values["tau"] + length)
+        after = (values["second"] * state[1] + length * first) / (values["second"] + length)
+        return after, jnp.stack([first, after])
 
 
 MECHANISM = ValveLag()

@@ -61,3 +61,21 @@ def test_all_breaths_are_asked_only_where_the_training_ones_plainly_are(
     assert len(asked) == 1
     assert not gate.needed(turbulent, *reversed(both))
     assert len(asked) == 1
+
+
+def test_a_trace_is_far_weaker_than_mild_and_explains_little(turbulent, both):
+    named, _ = both
+    two = turbulent.solve(Hypothesis(("turbulent_resistance", "sensor_drift")), named.noise, named)
+    assert abs(two.column("sensor_drift.drift")[0]) < 0.2 * 1.2
+    assert gate.is_trace(turbulent, two, named, "sensor_drift")
+    without = turbulent.solve(two.hypothesis.without("turbulent_resistance"), two.noise, two)
+    assert not gate.is_trace(turbulent, two, without, "turbulent_resistance")
+
+
+def test_a_weak_term_that_explains_nearly_all_is_no_trace():
+    bench = small.split(small.made(small.effect("valve_dead_band", width=0.28), noise=0.02))
+    weak = settle(bench, Hypothesis(("valve_dead_band",)))
+    assert weak.column("valve_dead_band.width")[0] < 0.2 * 1.5
+    without = bench.solve(Hypothesis(), weak.noise, weak)
+    assert bench.criterion(without) - bench.criterion(weak) > 100.0
+    assert not gate.is_trace(bench, weak, without, "valve_dead_band")

@@ -92,4 +92,5 @@ def _recorded(secret: str, item: Drawn) -> Breaths:
         breaths = record(item.case, seal.generator(secret, "recording", name, *more))
         if np.all((breaths.pressure >= PRESSURE.low) & (breaths.pressure <= PRESSURE.high)):
             return breaths
-    raise InputError(f"{name} leaves {PRESSURE.low:g}..{PRESSURE.high:g} cmH2O at every attempt")
+    span = f"{PRESSURE.low:g}..{PRESSURE.high:g} cmH2O"
+    raise InputError(f"{name} leaves {span} at every attempt; take another seed")

@@ -19,6 +19,8 @@ TOLERANCE = {
     "circuit_compliance": (0.04, 0.004),
     "exhalation_valve_delay": (0.04, 0.008),
     "inertance": (0.1, 0.02),
+    # The power is rounded off at small flow, where one below 1.75 is steep.
+    "turbulent_resistance.exponent": (0.008, 0.003),
 }
 EXACT = (0.004, 0.001)
 
@@ -52,7 +54,7 @@ def test_each_shape(path, value, predicted):
     name, _, parameter = path.partition(".")
     m = {name: cases.strengths(name)[name] | {parameter: value}}
     breaths = cases.recording(2, m)
-    assert_close(predicted(breaths, m), breaths.pressure, EXACT)
+    assert_close(predicted(breaths, m), breaths.pressure, TOLERANCE.get(path, EXACT))
 
 
 @pytest.mark.parametrize(("R", "C"), [(5.0, 10.0), (20.0, 50.0), (50.0, 20.0)])

@@ -31,7 +31,8 @@ ALL = paths((*library(), *slots()))
 TOGETHER = (
     ("valve_shape",), ("leak_shape",), ("flow_shape",), ("recoil_shape",), ("volume_resistance",),
     ("direction_resistance", "recoil_memory"), ("command_memory",),
-    ("command_plays", "supply_memory"), ("outlet_shape",), ("sensor_shape",),
+    ("command_plays", "supply_memory"), ("outlet_shape", "outlet_memory"),
+    ("sensor_shape",),
     ("sensor_memory", "drift_shape"),
 )  # fmt: skip
 
@@ -290,7 +291,7 @@ def test_the_strongest_element_is_drawn_first():
     assert shapes[0].x_unit == "position in the recording, 0..1"
     assert shapes[0].y[-1] == pytest.approx(3.0)
     assert len(shapes) == 3
-    late = drawn("exhalation path", {"outlet_shape.late2": 1.0, "outlet_shape.c1": 0.1})
+    late = drawn("exhalation path", {"outlet_memory.c2": 1.0, "outlet_shape.c1": 0.1})
     assert late[0].y[0] == pytest.approx(1.0)
     for slot in SLOTS:
         for shape in drawn(slot, {}):

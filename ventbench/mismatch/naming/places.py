@@ -30,7 +30,10 @@ def public(element: str) -> str:
 
 def holds(element: str) -> tuple[str, ...]:
     """Mechanisms of the library that an element holds as special cases, or nearly."""
-    own = {"sensor_memory": ("sensor_lag",), "drift_shape": ("sensor_drift",), "sensor_shape": ()}
+    own = {
+        "sensor_memory": ("sensor_lag",), "drift_shape": ("sensor_drift",), "sensor_shape": (),
+        "outlet_shape": (),
+    }  # fmt: skip
     return own.get(element, SLOTS[public(element)].holds)
 
 

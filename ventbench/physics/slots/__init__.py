@@ -67,7 +67,7 @@ SLOTS = {
             "the recoil of the lung depends on what its volume was before", "time after a step, s",
         ),
         Slot(
-            "exhalation path", ("outlet_shape",), ("exhalation_valve_delay",),
+            "exhalation path", ("outlet_shape", "outlet_memory"), ("exhalation_valve_delay",),
             "the expiratory valve conducts in another way, or opens slowly", "p - PEEP, cmH2O",
         ),
         Slot(

@@ -65,9 +65,9 @@ class Element(Mechanism):
 def coefficients(
     at: Iterable[str], unit: str, meaning: str, low: float | Iterable[float],
     high: float | Iterable[float], spread: float | Iterable[float], *,
-    follows: str | None = None, prefix: str = "c", scan: tuple[float, ...] = (),
+    follows: str | None = None, scan: tuple[float, ...] = (),
 ) -> tuple[Parameter, ...]:  # fmt: skip
-    """Parameters ``c1``, ``c2`` and so on (or another prefix), which start at zero and tend to it.
+    """Parameters ``c1``, ``c2`` and so on, which start at zero and tend to it.
 
     Args:
         at: where each acts, in words.
@@ -77,7 +77,6 @@ def coefficients(
         high: likewise.
         spread: standard deviation before any data, likewise.
         follows: ``"R"`` or ``"C"`` if they scale with it.
-        prefix: of the names.
         scan: values that a search must also try.
     """
     at = list(at)
@@ -88,7 +87,7 @@ def coefficients(
     rows = zip(at, each(low), each(high), each(spread), strict=True)
     return tuple(
         Parameter(
-            f"{prefix}{k}", unit, f"{meaning} {place}", bottom, top, 0.0, 0.0, 0.5 * width,
+            f"c{k}", unit, f"{meaning} {place}", bottom, top, 0.0, 0.0, 0.5 * width,
             follows=follows, scan=scan, spread=width,
         )
         for k, (place, bottom, top, width) in enumerate(rows, 1)

@@ -11,48 +11,21 @@ published draws, with 95 % bootstrap intervals: below zero the residual is bette
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from ventbench import precision, protocol, rollout
-from ventbench.board.replay import spread
+from ventbench import precision
 from ventbench.controllers.pid import PID
 from ventbench.files import write_json
 from ventbench.lungs import LUNG_IDS
-from ventbench.metrics import bootstrap, safety
-from ventbench.metrics.waveform import run_error
+from ventbench.metrics import bootstrap
 from ventbench.plants import frozen
-from ventbench.plants.stack import take
 from ventbench.submissions.folder import open_submission
-from ventbench.submissions.scoring import protocol_cells
 from ventbench.training import pid_grid
 from ventbench.training.residual import ALL, bound, load
-
-DRAWS = 20
-
-
-def measure(
-    simulators: frozen.Frozen, controllers: Sequence[Any]
-) -> tuple[np.ndarray, float, bool]:
-    """Errors ``(6, 1 + DRAWS, P)``, cmH2O, the exploitation index, and whether all was safe."""
-    errors, requested, safe = [], [], True
-    with precision.float64():
-        cells = jax.tree.map(jnp.asarray, protocol_cells(protocol.PIPS, DRAWS))
-        pip, dt = np.asarray(cells.pip)[..., None], np.asarray(cells.dt)[..., None]
-        for index, controller in enumerate(controllers):
-            plant = jax.tree.map(jnp.asarray, take(simulators.plants, index))
-            wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), controller)
-            found, _ = rollout.closed_loop(plant, wide, cells)
-            errors.append(run_error(found.pressure, pip[..., None]))
-            requested.append(np.asarray(found.requested))
-            safe &= bool(np.all(safety.safe(found.pressure, pip, dt)))
-    nominal = np.stack(requested)[None][:, :, 0]
-    return np.stack(errors), float(spread(simulators, protocol.PIPS, nominal).mean()), safe
+from ventbench.training.residual.measure import measure
 
 
 def row(name: str, one: np.ndarray, other: np.ndarray) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from ventbench.cli import ablation
 from ventbench.cli.options import JsonFile, emit
 from ventbench.cli.study import bars, study
 
@@ -121,4 +122,5 @@ def register(app: typer.Typer, train: typer.Typer) -> None:
     """Add the commands to the program and to its group ``train``."""
     train.command()(ppo)
     train.command()(dqn)
+    ablation.register(study)
     app.add_typer(study)

@@ -175,15 +175,27 @@ def _networks(
             )
 
             def make(lung: Lung = lung, name: str = name, number: int = number) -> Learned:
-                return _network(data, lung, number, recipe, parts.checkpoint(name))
+                return network(data, lung, number, ARCHITECTURE, recipe, parts.checkpoint(name))
 
             nets.append(parts.get(name, make))
         yield _stack(nets)
 
 
-def _network(
-    data: Recordings, lung: Lung, number: int, recipe: networks.Recipe, checkpoint: Path
-) -> Learned:
+def network(
+    data: Recordings, lung: Lung, number: int, architecture: Architecture,
+    recipe: networks.Recipe, checkpoint: Path,
+) -> Learned:  # fmt: skip
+    """Train one of the paper's networks.
+
+    Args:
+        data: all recordings.
+        lung: one of the recorded settings.
+        number: of the network: that of the setting among all, plus their count times the member;
+            also the seed. A member does not see the measured breaths of the fold of its number.
+        architecture: of the network.
+        recipe: of the training.
+        checkpoint: see :func:`~ventbench.training.learned.fit`.
+    """
     member = number // len(RECORDED_LUNGS)
     measured = data.measured.select((data.measured.lung_ids == lung.id) & (data.fold != member))
     more = data.reconstructed.select(data.reconstructed.lung_ids == lung.id)
@@ -194,7 +206,7 @@ def _network(
         breaths.u_out,
         breaths.dt,
         breaths.pressure,
-        architecture=ARCHITECTURE,
+        architecture=architecture,
         recipe=recipe,
         seed=number,
         weight=weight,

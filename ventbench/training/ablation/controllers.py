@@ -1,0 +1,180 @@
+"""Parts of the residual controller: what is left when one is taken away or changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pandas as pd
+
+from ventbench import files, precision, protocol
+from ventbench.lungs import LUNG_IDS
+from ventbench.plants import frozen
+from ventbench.training import pid_grid
+from ventbench.training.ablation.rows import Rows
+from ventbench.training.residual import Recipe, fit
+from ventbench.training.residual.measure import DRAWS, measure
+
+#: What the others are compared with.
+BASE = "base"
+
+#: Figures of one training.
+FIGURES = ("nominal", "draws", "exploitation")
+
+#: Called with what is trained and the share of all that is done.
+Progress = Callable[[str, float], None]
+
+Gains = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to train.
+
+    Attributes:
+        meaning: in words.
+        recipe: of the training.
+        direct: whether the network commands alone, without a PID to correct.
+    """
+
+    meaning: str
+    recipe: Recipe
+    direct: bool = False
+
+
+def variants(recipe: Recipe) -> dict[str, Variant]:
+    """Variants of a recipe by name, each other in one thing than the base."""
+
+    def changed(meaning: str, **fields: Any) -> Variant:
+        return Variant(meaning, replace(recipe, **fields))
+
+    wide = max(recipe.widths)
+    return {
+        BASE: Variant("as the submission is trained", recipe),
+        "direct": Variant("no PID: the network commands alone", recipe, direct=True),
+        "one simulator": changed("the official simulator of each lung alone", members=1),
+        "no deviations": changed("benches without noise, delay or other R and C", spread=0.0),
+        "no agreement": changed("what the simulators disagree about is free", agreement=0.0),
+        "no breath before": changed("it sees nothing of the breath before", ahead=0),
+        "no errors before": changed("it sees no earlier errors of this breath", pressures=0),
+        "no commands before": changed("it sees no earlier commands of this breath", commands=0),
+        "twice as far back": changed(
+            "twice as many errors and commands",
+            pressures=2 * recipe.pressures, commands=2 * recipe.commands,
+        ),
+        "narrow": changed("a quarter of the width", widths=(wide // 4,) * len(recipe.widths)),
+        "wide": changed("twice the width", widths=(2 * wide,) * len(recipe.widths)),
+        "shallow": changed("one hidden layer", widths=(wide,)),
+        "deep": changed("four hidden layers", widths=(wide,) * 4),
+    }  # fmt: skip
+
+
+def compare(
+    simulators: frozen.Frozen,
+    out: Path,
+    seeds: Sequence[int],
+    *,
+    recipe: Recipe,
+    only: Sequence[str] | None = None,
+    draws: int = DRAWS,
+    gains: Gains | None = None,
+    progress: Progress = lambda *_: None,
+) -> pd.DataFrame:
+    """Train one network for all six lungs by each variant with each seed.
+
+    What is finished is read from ``out``, where ``runs.csv`` and ``summary.csv`` are written.
+
+    Args:
+        simulators: to train through and to score on.
+        out: folder.
+        seeds: of the trainings.
+        recipe: of the base.
+        only: names of variants; all if not given. The base is always there.
+        draws: published draws to score on.
+        gains: P, I, D of the PID; the best single set of the paper's grid if not given.
+        progress: see :data:`Progress`.
+
+    Returns:
+        A row for each training: ``variant``, ``seed`` and :data:`FIGURES`, cmH2O.
+
+    Raises:
+        InputError: if ``out`` holds other trainings.
+        FloatingPointError: if a training diverges.
+    """
+    chosen = {k: v for k, v in variants(recipe).items() if only is None or k in (BASE, *only)}
+    gains = gains or best_single(simulators)
+    rows, found = Rows(out / "rows"), []
+    todo = [(name, seed) for name in chosen for seed in seeds]
+    for number, (name, seed) in enumerate(todo):
+        variant = chosen[name]
+        own = (0.0, 0.0, 0.0) if variant.direct else gains
+        part = f"{name.replace(' ', '-')}-{seed}"
+
+        def tell(share: float, name: str = name, number: int = number) -> None:
+            progress(name, (number + share) / len(todo))
+
+        def make(
+            variant: Variant = variant, own: Gains = own, seed: int = seed, part: str = part,
+            tell: Callable[[float], None] = tell,
+        ) -> dict[str, float]:  # fmt: skip
+            checkpoint = out / "rows" / f"{part}.npz"
+            return _trained(simulators, own, variant.recipe, seed, draws, checkpoint, tell)
+
+        tell(0.0)
+        identity = {
+            "recipe": asdict(variant.recipe), "gains": list(own), "seed": seed, "draws": draws,
+            "simulators": simulators.about(),
+        }  # fmt: skip
+        found.append({"variant": name, "seed": seed} | rows.get(part, identity, make))
+    runs = pd.DataFrame(found)
+    files.write_text(out / "runs.csv", runs.round(5).to_csv(index=False))
+    files.write_text(out / "summary.csv", summary(runs).round(4).to_csv(index=False))
+    return runs
+
+
+def best_single(simulators: frozen.Frozen) -> Gains:
+    """P, I, D of the paper's grid with the lowest mean error over the six lungs."""
+    grid = pid_grid.gains()
+    error = pid_grid.errors(simulators.plants, grid).mean(axis=(0, 2))
+    P, I, D = (float(x) for x in grid[int(np.argmin(error))])  # noqa: E741
+    return P, I, D
+
+
+def summary(runs: pd.DataFrame) -> pd.DataFrame:
+    """A row a variant: mean over seeds, and the range of its difference to the base's same seed."""
+    base: Any = runs[runs["variant"] == BASE].set_index("seed")
+    rows = []
+    group: Any
+    for name, group in runs.groupby("variant", sort=False):
+        row: dict[str, Any] = {"variant": name, "seeds": len(group)}
+        apart = group.set_index("seed")[list(FIGURES)] - base[list(FIGURES)]
+        for figure in FIGURES:
+            row[figure] = group[figure].mean()
+            row[f"{figure}_change_low"] = apart[figure].min()
+            row[f"{figure}_change_high"] = apart[figure].max()
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _trained(
+    simulators: frozen.Frozen, gains: Gains, recipe: Recipe, seed: int, draws: int,
+    checkpoint: Path, tell: Callable[[float], None],
+) -> dict[str, float]:  # fmt: skip
+    checkpoint.parent.mkdir(parents=True, exist_ok=True)
+    with precision.float32():
+        controller = fit(
+            jax.tree.map(np.asarray, simulators.ensemble), gains, recipe=recipe, seed=seed,
+            checkpoint=checkpoint, progress=lambda told: tell(told.update / told.updates),
+            keep=True,
+        )  # fmt: skip
+    error, exploitation, _ = measure(simulators, [controller] * len(LUNG_IDS), protocol.PIPS, draws)
+    checkpoint.unlink()
+    return {
+        "nominal": float(error[:, 0].mean()),
+        "draws": float(error[:, 1:].mean()) if draws else float("nan"),
+        "exploitation": exploitation,
+    }

@@ -1,0 +1,150 @@
+"""Parts of the paper's simulator: windows, width, depth and boundary networks, on real breaths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from ventbench import evaluation, files
+from ventbench.lungs import LUNG_IDS, RECORDED_LUNGS
+from ventbench.metrics import bootstrap
+from ventbench.plants.each import Each
+from ventbench.plants.learned import Architecture
+from ventbench.recordings import Breaths
+from ventbench.training import freeze
+from ventbench.training import learned as networks
+from ventbench.training.ablation.rows import Rows
+
+#: What the others are compared with.
+BASE = "base"
+
+#: Called with what is trained and the share of all that is done.
+Progress = Callable[[str, float], None]
+
+
+def variants(base: Architecture) -> dict[str, Architecture]:
+    """Architectures by name, each other in one thing than the base."""
+    changes: list[tuple[str, dict[str, int]]] = [
+        *((f"H_p {n}", {"pressures": n}) for n in (1, 2, 10)),
+        *((f"H_c {n}", {"controls": n}) for n in (1, 3, 20)),
+        *((f"N_B {n}", {"boundaries": n}) for n in (0, 3)),
+        *((f"width {n}", {"width": n}) for n in (12, 24, 150)),
+        *((f"depth {n}", {"depth": n}) for n in (2, 3, 9)),
+    ]
+    return {BASE: base} | {name: replace(base, **change) for name, change in changes}
+
+
+def compare(
+    folder: Path,
+    out: Path,
+    *,
+    base: Architecture = freeze.ARCHITECTURE,
+    recipe: networks.Recipe | None = None,
+    only: Sequence[str] | None = None,
+    progress: Progress = lambda *_: None,
+) -> pd.DataFrame:
+    """Train each variant on each scored lung, once for each fold of the measured breaths.
+
+    Each breath is judged by the network that has not seen it. What is finished is read from
+    ``out``, where ``breaths.csv`` and ``summary.csv`` are written.
+
+    Args:
+        folder: of the public recordings.
+        out: folder.
+        base: architecture that the others differ from in one thing.
+        recipe: of all trainings.
+        only: names of variants; all if not given. The base is always there.
+        progress: see :data:`Progress`.
+
+    Returns:
+        A row for each breath and variant: ``variant``, ``breath_id``, ``lung``, ``error``, cmH2O.
+
+    Raises:
+        InputError: if a recording is malformed, or ``out`` is of other trainings.
+        OSError: if a file cannot be read or written.
+    """
+    recipe = recipe or networks.Recipe()
+    data = freeze.recordings(folder)
+    scored = np.isin(data.measured.lung_ids, LUNG_IDS)
+    judged, fold = data.measured.select(scored), data.fold[scored]
+    hashes = {name: files.sha256(folder / name) for name in (freeze.MEASURED, freeze.RECONSTRUCTED)}
+    chosen = {k: v for k, v in variants(base).items() if only is None or k in (BASE, *only)}
+    rows, found = Rows(out / "rows"), []
+    for number, (name, architecture) in enumerate(chosen.items()):
+
+        def tell(share: float, name: str = name, number: int = number) -> None:
+            progress(name, (number + share) / len(chosen))
+
+        def make(
+            architecture: Architecture = architecture, tell: Callable[[float], None] = tell
+        ) -> list[float]:
+            nets = _nets(data, architecture, recipe, out / "rows" / "network.npz", tell)
+            return _errors(nets, judged, fold).tolist()
+
+        tell(0.0)
+        identity = {
+            "architecture": asdict(architecture), "recipe": asdict(recipe), "recordings": hashes,
+            "members": freeze.MEMBERS,
+        }  # fmt: skip
+        errors = rows.get(name.replace(" ", "-"), identity, make)
+        columns = {"breath_id": judged.breath_id, "lung": judged.lung_ids, "error": errors}
+        found.append(pd.DataFrame({"variant": name} | columns))
+    breaths = pd.concat(found, ignore_index=True)
+    files.write_text(out / "breaths.csv", breaths.round(5).to_csv(index=False))
+    files.write_text(out / "summary.csv", summary(breaths).round(4).to_csv(index=False))
+    return breaths
+
+
+def summary(breaths: pd.DataFrame) -> pd.DataFrame:
+    """A row a variant: errors, and the mean difference to the base, paired by breath, 95 %."""
+    table: Any = breaths.pivot(index="breath_id", columns="variant", values="error")
+    lungs: Any = breaths.drop_duplicates("breath_id").set_index("breath_id")["lung"]
+    rows = []
+    for name in breaths["variant"].unique():
+        apart = bootstrap.summary((table[name] - table[BASE]).to_numpy())
+        mean: Any = table[name].groupby(lungs).mean()
+        rows.append(
+            {"variant": name, "mean": table[name].mean(), "median": table[name].median()}
+            | {"change": apart.mean, "low95": apart.ci95[0], "high95": apart.ci95[1]}
+            | {lung: mean[lung] for lung in LUNG_IDS if lung in mean}
+        )
+    return pd.DataFrame(rows)
+
+
+def _nets(
+    data: freeze.Recordings, architecture: Architecture, recipe: networks.Recipe,
+    checkpoint: Path, tell: Callable[[float], None],
+) -> Any:  # fmt: skip
+    """Networks of the scored lungs, leaves ``(members, 6, ...)``."""
+    ids = [lung.id for lung in RECORDED_LUNGS]
+    checkpoint.parent.mkdir(parents=True, exist_ok=True)
+    members = []
+    for member in range(freeze.MEMBERS):
+        nets = []
+        for name in LUNG_IDS:
+            at = ids.index(name)
+            number = member * len(ids) + at
+            net = freeze.network(data, RECORDED_LUNGS[at], number, architecture, recipe, checkpoint)
+            nets.append(net)
+            tell((member + len(nets) / len(LUNG_IDS)) / freeze.MEMBERS)
+        members.append(jax.tree.map(lambda *leaves: np.stack(leaves), *nets))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *members)
+
+
+def _errors(nets: Any, breaths: Breaths, fold: np.ndarray) -> np.ndarray:
+    """Open-loop error of each breath by the network that has not seen it, cmH2O, ``(n,)``."""
+    of = {int(k): int(f) for k, f in zip(breaths.breath_id, fold, strict=True)}
+
+    def plants_for(some: Breaths) -> Each:
+        at = np.array([LUNG_IDS.index(name) for name in some.lung_ids.tolist()])
+        member = np.array([of[int(k)] for k in some.breath_id])
+        return Each(jax.tree.map(lambda leaf: jnp.asarray(leaf[member, at]), nets))
+
+    return evaluation.errors(plants_for, breaths)

@@ -60,7 +60,7 @@ def limit_slots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave a few slots to choose from."""
     few = {name: slots()[name] for name in FEW}
     monkeypatch.setattr("ventbench.mismatch.naming.places.slots", lambda: few)
-    monkeypatch.setattr("ventbench.mismatch.diagnose.all_paths", with_few)
+    monkeypatch.setattr("ventbench.mismatch.found.all_paths", with_few)
 
 
 def numbered(breaths: Breaths, first: int) -> Breaths:

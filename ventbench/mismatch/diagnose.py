@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -12,35 +11,24 @@ from numpy.typing import NDArray
 
 from ventbench.errors import InputError
 from ventbench.mismatch import estimates, flows, shapes, simulators, split
+from ventbench.mismatch.against import against, refitted
 from ventbench.mismatch.compare import Lack, lacking
 from ventbench.mismatch.distances import distances
+from ventbench.mismatch.found import Found, found_in
 from ventbench.mismatch.locate import locate
-from ventbench.mismatch.naming.bench import Bench, bench
-from ventbench.mismatch.naming.conclude import Conclusion, conclude
-from ventbench.mismatch.naming.places import all_paths
+from ventbench.mismatch.naming.conclude import Conclusion
 from ventbench.mismatch.naming.rivals import Alternatives
-from ventbench.mismatch.naming.solved import Side, Solved, simulator
 from ventbench.mismatch.next_breath import request
 from ventbench.mismatch.result import Diagnosis, LungMatch, Named, Request, Traces, Verdict
 from ventbench.mismatch.simulators import Given
-from ventbench.physics.catalogue import paths
 from ventbench.physics.fits import Fit, Noise, recorded
-from ventbench.physics.fits.data import Data, Floats
+from ventbench.physics.fits.data import Floats
 from ventbench.plants.base import Plant
 from ventbench.plants.corrected import Corrected
 from ventbench.precision import float64
 from ventbench.recordings.breaths import Breaths
 
 Progress = Callable[[str, float], None]
-
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """A conclusion about breaths, with its final fit."""
-
-    bench: Bench
-    conclusion: Conclusion
-    fit: Fit
 
 
 def diagnose(
@@ -76,49 +64,25 @@ def diagnose(
     before = simulators.answers(plant, breaths)
     data = recorded(breaths)
     excluded = ("patient_effort",) if passive else ()
-    found = _conclude(data, held, excluded, lambda what: tell(what, 0.3))
-    had = None
+    alone = found_in(data, held, excluded, lambda what: tell(what, 0.3))
+    found, had = alone, None
     if plant != "physics":
         tell("the same questions to the simulator", 0.6)
-        answered = simulators.measured(data, before, found.conclusion.noise)
-        had = _conclude(answered, held, excluded, lambda what: tell(f"simulator: {what}", 0.7))
+        found, had = against(data, held, before, alone, excluded, lambda what: tell(what, 0.7))
     tell("drawing conclusions", 0.9)
-    return _diagnosis(breaths, held, before, found, had, plant, notes, began)
-
-
-def _conclude(
-    data: Data, held: NDArray[np.bool_], excluded: tuple[str, ...], tell: Callable[[str], None]
-) -> _Found:
-    narrow = bench(data, held, paths(), excluded)
-    wide: list[Bench] = []
-
-    def wider() -> Bench:
-        wide.append(bench(data, held, all_paths(), excluded))
-        return wide[0]
-
-    found = conclude(narrow, wider, tell)
-    # Gains that differ between breaths are each breath's own, and unknown of held-out ones.
-    narrow, wide = (
-        replace(narrow, spread=found.spread),
-        [replace(one, spread=found.spread) for one in wide],
-    )
-    side = Side(data, simulator(data, paths()))
-    if found.place is not None and found.place.element is not None:
-        # With a slot, the training breaths alone: all of them would be one more compilation.
-        return _Found(wide[0], found, estimates.estimated(found.full, wide[0].training))
-    return _Found(narrow, found, estimates.estimated(found.named, side))
+    return _diagnosis(breaths, held, before, found, had, alone.fit, plant, notes, began)
 
 
 def _diagnosis(
-    breaths: Breaths, held: NDArray[np.bool_], before: Floats, found: _Found, had: _Found | None,
-    plant: Given, notes: list[str], began: float,
+    breaths: Breaths, held: NDArray[np.bool_], before: Floats, found: Found, had: Found | None,
+    alone: Fit, plant: Given, notes: list[str], began: float,
 ) -> Diagnosis:  # fmt: skip
     conclusion = found.conclusion
     names, removed = lacking(found.fit, conclusion, had and had.fit, had and had.conclusion)
     notes += removed
     answers = {"before": before} | _answers(breaths, held, before, found, had)
     noise = conclusion.noise
-    lungs, more = _lungs(breaths, found.fit)
+    lungs, more = _lungs(breaths, alone)
     notes += more
     flow, volume = flows.of_fit(breaths, found.fit, answers["refit"])
     here = np.flatnonzero(~np.isnan(answers["refit"]).all(axis=1))
@@ -158,27 +122,20 @@ def _lungs(breaths: Breaths, fit: Fit) -> tuple[tuple[LungMatch, ...], list[str]
 
 
 def _answers(
-    breaths: Breaths, held: NDArray[np.bool_], before: Floats, found: _Found, had: _Found | None
+    breaths: Breaths, held: NDArray[np.bool_], before: Floats, found: Found, had: Found | None
 ) -> dict[str, Floats]:
     """Pressures of the refitted and of the corrected simulator, ``(n, T)``."""
-
-    def of(bench_: Bench, solved: Solved) -> Floats:
-        pressure = np.empty(before.shape)
-        # Where every simulation starts, be it the recording's or the simulator's own physics.
-        for which, side in ((~held, bench_.training), (held, bench_.judging)):
-            pressure[which] = bench_.predict(solved, side, breaths.pressure[which, 0])[:, 0]
-        return pressure
-
-    after = of(found.bench, found.conclusion.full)
+    first = breaths.pressure[:, 0]  # where every simulation starts
+    after = found.pressures(found.conclusion.full, held, first)
     if had is None:
-        return {"refit": of(found.bench, found.conclusion.null), "after": after}
+        return {"refit": found.pressures(found.conclusion.null, held, first), "after": after}
     # Its own physics, then the same with the recording's R, C, R_ex and PEEP.
-    own = had.conclusion.full
-    base = of(had.bench, own)
-    again = found.bench if own.hypothesis.names == () else had.bench
-    training = Side(found.bench.training.data, again.training.simulator)
-    refit = again.solve(own.hypothesis, found.conclusion.noise, own, side=training)
-    return {"refit": before + of(again, refit) - base, "after": before + after - base}
+    base = had.pressures(had.conclusion.full, held, first)
+    refit = refitted(had, found.bench.training.data, found)
+    return {
+        "refit": before + had.pressures(refit, held, first) - base,
+        "after": before + after - base,
+    }
 
 
 def _named(one: Lack, conclusion: Conclusion, fit: Fit) -> Named:
@@ -194,7 +151,7 @@ def _request(conclusion: Conclusion) -> Request | None:
     return request(conclusion.named, rivals, noise=Noise((conclusion.noise.sigma[0],), (0.0,)))
 
 
-def _plants(breaths: Breaths, found: _Found, had: _Found | None, plant: Given) -> dict[str, Plant]:
+def _plants(breaths: Breaths, found: Found, had: Found | None, plant: Given) -> dict[str, Plant]:
     wanted = estimates.plants(found.fit)
     if had is None:
         return wanted

@@ -1,0 +1,70 @@
+"""A recording against a simulator that has physics of its own, whatever it is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.mismatch import simulators
+from ventbench.mismatch.found import Found, found_in
+from ventbench.mismatch.naming.solved import Side, Solved
+from ventbench.physics.fits.data import Data, Floats
+
+#: Share of the error of everything that is found in the recording alone below which the recording
+#: beside the simulator says more.
+_CLEARER = 0.9
+
+
+def against(
+    data: Data, held: NDArray[np.bool_], before: Floats, alone: Found,
+    excluded: tuple[str, ...], tell: Callable[[str], None],
+) -> tuple[Found, Found]:  # fmt: skip
+    """Ask a simulator the questions that its recording was asked.
+
+    What neither the language nor its names can say of a simulator may be true of the recording as
+    well: valves that differ from breath to breath, shapes that were learned. Where the simulator
+    errs less by it than the language does, it is taken out of the recording, and the recording is
+    asked anew: what is then found is what the simulator lacks, and nothing else.
+
+    Args:
+        data: of n recorded breaths.
+        held: which of them are held out, ``(n,)``.
+        before: the simulator's answers, cmH2O, ``(n, T)``.
+        alone: what was found in the recording.
+        excluded: mechanisms that cannot act.
+        tell: is told what is done.
+
+    Returns:
+        What was found in the recording, and in the simulator.
+    """
+    answered = simulators.measured(data, before, alone.conclusion.noise)
+    had = found_in(answered, held, excluded, lambda what: tell(f"simulator: {what}"))
+    own = had.pressures(had.conclusion.full, held, before[:, 0])
+    beside = data.answered(data.seen[:, 0] - np.nan_to_num(before - own))
+    least = refitted(had, beside.select(~held))
+    if _error(least) >= _CLEARER * _error(alone.conclusion.full):
+        return alone, had
+    return found_in(beside, held, excluded, lambda what: tell(f"beside the simulator: {what}")), had
+
+
+def refitted(had: Found, data: Data, like: Found | None = None) -> Solved:
+    """The simulator's own physics with R, C, R_ex, PEEP of other breaths.
+
+    Args:
+        had: what was found in the simulator.
+        data: the breaths.
+        like: whose noise is taken; the simulator's if not given.
+    """
+    own = had.conclusion.full
+    bench = had.bench
+    noise = (like or had).conclusion.noise
+    side = Side(data, bench.training.simulator)
+    return bench.solve(own.hypothesis, noise, own, side=side)
+
+
+def _error(solved: Solved) -> float:
+    """Mean absolute residual where pressure was measured, cmH2O."""
+    weight = solved.problem.data.weight[:, 0]
+    return float(np.sum(np.abs(solved.residual[:, 0]) * weight) / np.sum(weight))

@@ -29,7 +29,7 @@ from ventbench.training.residual.measure import measure
 
 
 def row(name: str, one: np.ndarray, other: np.ndarray) -> dict[str, Any]:
-    """Print and return paired differences; errors of shape ``(1 + DRAWS, P)``."""
+    """Print and return paired differences; errors of shape ``(1 + draws, P)``."""
     nominal = bootstrap.summary(one[0] - other[0])
     drawn = bootstrap.summary((one[1:] - other[1:]).mean(axis=1))
     print(f"{name:8} {one[0].mean():7.3f} {other[0].mean():7.3f}", end="")

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ventbench.cli.options import JsonFile, emit
+from ventbench.cli.options import JsonFile, RecordingsDir, emit, recordings_folder
 from ventbench.cli.study import bars
 
 Only = Annotated[
@@ -62,12 +62,7 @@ def controllers(
 
 
 def networks(
-    recordings: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", help="Folder of the public recordings; VENTBENCH_RECORDINGS by default."
-        ),
-    ] = None,
+    recordings: RecordingsDir = None,
     only: Only = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write.")] = Path(
         "runs/networks"
@@ -82,17 +77,10 @@ def networks(
 
     Example: `ventbench study networks --recordings ../shared/recordings`
     """
-    from ventbench.errors import InputError
-    from ventbench.recordings import recordings_dir
     from ventbench.training import freeze
     from ventbench.training.ablation import networks as work
 
-    folder = recordings or recordings_dir()
-    if folder is None or not folder.is_dir():
-        raise InputError(
-            f"{folder or 'no folder'} holds no recordings; give --recordings DIR or set "
-            "VENTBENCH_RECORDINGS"
-        )
+    folder = recordings_folder(recordings)
     _check(only, work.variants(freeze.ARCHITECTURE))
     with bars() as shown:
         task = shown.add_task("networks", total=1.0)

@@ -13,6 +13,30 @@ JsonFile = Annotated[
 ]
 Clip = Annotated[bool, typer.Option("--clip", help="Bring u_in into 0..100 % instead of refusing.")]
 Pad = Annotated[bool, typer.Option("--pad", help="Accept breaths of unequal length.")]
+RecordingsDir = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR", help="Folder of the public recordings; VENTBENCH_RECORDINGS by default."
+    ),
+]
+
+
+def recordings_folder(given: Path | None) -> Path:
+    """The folder of the public recordings.
+
+    Raises:
+        InputError: if there is none.
+    """
+    from ventbench.errors import InputError
+    from ventbench.recordings import recordings_dir
+
+    folder = given or recordings_dir()
+    if folder is None or not folder.is_dir():
+        raise InputError(
+            f"{folder or 'no folder'} holds no recordings; give --recordings DIR or set "
+            "VENTBENCH_RECORDINGS"
+        )
+    return folder
 
 
 def emit(value: object, target: Path | None) -> None:

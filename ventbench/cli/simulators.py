@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from ventbench.cli.options import Clip, JsonFile, Pad, emit
+from ventbench.cli.options import Clip, JsonFile, Pad, RecordingsDir, emit, recordings_folder
 
 Kind = Literal["frozen", "learned", "physics", "hybrid"]
 
@@ -85,12 +85,7 @@ def _group() -> None:
 
 @train.command()
 def simulator(
-    recordings: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", help="Folder of the public recordings; VENTBENCH_RECORDINGS by default."
-        ),
-    ] = None,
+    recordings: RecordingsDir = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write them.")] = Path(
         "runs/simulators"
     ),
@@ -101,17 +96,9 @@ def simulator(
 
     Example: `ventbench train simulator --recordings ../shared/recordings --out runs/simulators`
     """
-    from ventbench.errors import InputError
-    from ventbench.recordings import recordings_dir
     from ventbench.training import freeze
 
-    folder = recordings or recordings_dir()
-    if folder is None or not folder.is_dir():
-        raise InputError(
-            f"{folder or 'no folder'} holds no recordings; give --recordings DIR or set "
-            "VENTBENCH_RECORDINGS"
-        )
-    _train(freeze.train, folder, out)
+    _train(freeze.train, recordings_folder(recordings), out)
 
 
 def _train(run: Any, folder: Path, out: Path) -> None:

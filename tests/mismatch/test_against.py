@@ -13,6 +13,7 @@ from ventbench.lungs import lung
 from ventbench.mismatch import simulators, split
 from ventbench.mismatch.against import against, refitted
 from ventbench.mismatch.found import found_in
+from ventbench.mismatch.steady import steadied
 from ventbench.physics import physics
 from ventbench.physics.fits import recorded
 from ventbench.recordings.breaths import Breaths
@@ -59,6 +60,11 @@ def test_what_recording_and_simulator_share_is_no_mismatch():
     # The noise is the sensor's again.
     assert found.conclusion.noise.sigma[0] < 0.5 * alone.conclusion.noise.sigma[0]
     assert found.conclusion.noise.sigma[0] == pytest.approx(0.2, rel=0.2)
+    steady = steadied(found, had, [NAME])
+    assert steady is not None, "nothing but the effect asks for another lung"
+    found = steady
+    assert float(found.fit.value(f"{NAME}.quadratic")[0]) == pytest.approx(10.0, rel=0.1)
+    np.testing.assert_allclose(found.fit.column("R"), had.conclusion.full.column("R")[0])
     first = breaths.pressure[:, 0]
     own = had.pressures(had.conclusion.full, held, first)
     after = before + found.pressures(found.conclusion.full, held, first) - own

@@ -182,6 +182,11 @@ def test_a_simulator_that_lacks_nothing_is_not_made_worse(own):
     np.testing.assert_allclose(own.traces.after[:, 0], own.traces.before[:, 0], atol=1e-9)
 
 
+def test_the_corrected_plant_answers_as_the_report_says(own, breaths):
+    answer = simulators.answers(own.plants, breaths)
+    np.testing.assert_allclose(answer, own.traces.after, atol=1e-3)
+
+
 @pytest.mark.slow  # two more conclusions
 def test_another_strength_than_the_simulators_is_missing(breaths):
     much = diagnose(breaths, plant=turbulent(20.0))

@@ -143,11 +143,17 @@ def test_by_names_alone_leaves_the_names():
     alone = remove.by_names_alone(both)
     assert float(alone.get("valve_shape.c1")) == 0.0  # type: ignore[attr-defined]
     assert float(alone.get("valve_delay.delay")) == 0.04  # type: ignore[attr-defined]
-    corrected = Corrected(named, both, both)
+    with precision.float64():
+        own = named.having(**{"valve_shape.c1": 0.2, "supply_memory.c1": 0.3})
+    corrected = Corrected(named, both, own)
     assert remove.has_unnamed(corrected)
     less: Any = remove.by_names_alone(corrected)
-    assert float(less.wanted.get("valve_shape.c1")) == 0.0
-    assert float(less.had.get("valve_shape.c1")) == 0.5, "that is the simulator's own"
+    assert float(less.wanted.get("valve_delay.delay")) == 0.04
+    for path, value in {"valve_shape.c1": 0.2, "supply_memory.c1": 0.3}.items():
+        assert float(less.wanted.get(path)) == pytest.approx(value), "it is the simulator's own"
+        assert less.had.get(path) == less.wanted.get(path), "and makes no difference"
+    none: Any = remove.by_names_alone(Corrected(named, both, named))
+    assert float(none.wanted.get("valve_shape.c1")) == 0.0
 
 
 def test_all_parts_and_once_only(recordings, tmp_path, diagnoses):

@@ -85,6 +85,20 @@ def test_the_effect_of_what_is_missing():
     assert words.effect(dataclasses.replace(found, location=())) == ""
 
 
+def test_a_simulator_that_is_left_as_it_is_was_not_refitted():
+    found = made.unnamed(12)
+    assert words.effect(found).startswith("With R and C refitted, ")
+    loop = found.open_loop
+    same = dataclasses.replace(loop, refit=loop.before, after=loop.before)
+    left = dataclasses.replace(found, open_loop=same, slot=None)
+    assert words.effect(left).startswith("The simulated pressure is ")
+    assert f"{loop.before.rmse:.2f} as given, noise" in words.distances(left)
+    nothing = dataclasses.replace(left, verdict="nothing_missing")
+    assert words.verdict(nothing) == (
+        "Nothing is missing: the physics simulator explains the recording."
+    )
+
+
 @pytest.mark.parametrize(
     ("place", "text"),
     [

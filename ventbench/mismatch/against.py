@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.mismatch import simulators
+from ventbench.mismatch import estimates, simulators
 from ventbench.mismatch.found import Found, found_in
 from ventbench.mismatch.naming.solved import Side, Solved
+from ventbench.physics.fits import Fit
 from ventbench.physics.fits.data import Data, Floats
 
 #: Share of the error of everything that is found in the recording alone below which the recording
@@ -52,7 +54,19 @@ def against(
     errs = min(_error(seen, before[~held]), _error(seen, least[~held]))
     if errs >= _CLEARER * _error(seen, most[~held]):
         return alone, had
-    return found_in(beside, held, excluded, lambda what: tell(f"beside the simulator: {what}")), had
+    found = found_in(beside, held, excluded, lambda what: tell(f"beside the simulator: {what}"))
+    return found, replace(had, fit=_exactly(had, data.answered(own), held, found))
+
+
+def _exactly(had: Found, own: Data, held: NDArray[np.bool_], like: Found) -> Fit:
+    """Fit of the simulator's own physics to its answers without what the language cannot say.
+
+    Its parameters are what it was taken to have; their reach is what such breaths tell of them.
+    """
+    solved = had.conclusion.full
+    side = Side(own.select(~held), had.bench.training.simulator)
+    problem = replace(solved.problem, noise=like.conclusion.noise)
+    return estimates.estimated(replace(solved, problem=problem), side)
 
 
 def refitted(had: Found, data: Data, like: Found | None = None) -> Solved:

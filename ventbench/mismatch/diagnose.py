@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.errors import InputError
 from ventbench.mismatch import estimates, flows, shapes, simulators, split
-from ventbench.mismatch.against import against, refitted
+from ventbench.mismatch.against import against
 from ventbench.mismatch.compare import Lack, lacking
+from ventbench.mismatch.corrected import Correction, corrected
 from ventbench.mismatch.distances import distances
 from ventbench.mismatch.found import Found, found_in
 from ventbench.mismatch.locate import locate
@@ -21,11 +21,9 @@ from ventbench.mismatch.naming.rivals import Alternatives
 from ventbench.mismatch.next_breath import request
 from ventbench.mismatch.result import Diagnosis, LungMatch, Named, Request, Traces, Verdict
 from ventbench.mismatch.simulators import Given
+from ventbench.mismatch.steady import steadied
 from ventbench.physics.fits import Fit, Noise, recorded
 from ventbench.physics.fits.data import Floats
-from ventbench.plants.base import Plant
-from ventbench.plants.corrected import Corrected
-from ventbench.precision import float64
 from ventbench.recordings.breaths import Breaths
 
 Progress = Callable[[str, float], None]
@@ -77,37 +75,54 @@ def _diagnosis(
     breaths: Breaths, held: NDArray[np.bool_], before: Floats, found: Found, had: Found | None,
     alone: Fit, plant: Given, notes: list[str], began: float,
 ) -> Diagnosis:  # fmt: skip
+    names, removed = lacking(found.fit, found.conclusion, had and had.fit, had and had.conclusion)
+    steady = None if had is None else steadied(found, had, [one.name for one in names])
+    if steady is not None:  # of what the recording does not show nothing is taken away
+        found, removed = steady, []
     conclusion = found.conclusion
-    names, removed = lacking(found.fit, conclusion, had and had.fit, had and had.conclusion)
-    notes += removed
-    answers = {"before": before} | _answers(breaths, held, before, found, had)
-    noise = conclusion.noise
-    lungs, more = _lungs(breaths, alone)
-    notes += more
-    flow, volume = flows.of_fit(breaths, found.fit, answers["refit"])
-    here = np.flatnonzero(~np.isnan(answers["refit"]).all(axis=1))
+    correction = corrected(breaths, held, before, found, had, plant)
+    answers = correction.answers
     place = shapes.slot(conclusion)
     own = had.conclusion.place if had is not None else None
     if own is not None and place is not None and own.name == place.name:
-        notes.append(f"The simulator has something without a name at {place.name} as well.")
-    verdict: Verdict = "named" if names else "unnamed" if place else "nothing_missing"
+        removed.append(f"The simulator has something without a name at {place.name} as well.")
+    useless = correction.left and (bool(names) or place is not None)
+    if useless:
+        names, place, removed = [], None, [_left(correction)]
+    noise = conclusion.noise
+    lungs, more = _lungs(breaths, alone)
+    flow, volume = flows.of_fit(breaths, found.fit, answers["refit"])
+    here = np.flatnonzero(~np.isnan(answers["refit"]).all(axis=1))
+    location = locate(
+        breaths.select(here), answers["refit"][here], noise.sigma[0], flow[here], volume[here]
+    )
+    unnamed = place is not None or (useless and location)
+    verdict: Verdict = "named" if names else "unnamed" if unnamed else "nothing_missing"
     return Diagnosis(
         verdict=verdict,
         mechanisms=tuple(_named(one, conclusion, found.fit) for one in names),
         slot=place,
-        location=locate(breaths.select(here), answers["refit"][here], noise.sigma[0],
-                        flow[here], volume[here]),
+        location=location,
         open_loop=distances(breaths, held, answers, float(noise.sigma[0])),
         lungs=lungs,
-        request=_request(conclusion),
+        request=None if useless else _request(conclusion),
         traces=Traces(breaths, held, answers["before"], answers["refit"], answers["after"], flow,
                       volume),
-        plants=_plants(breaths, found, had, plant),
+        plants=correction.plants,
         plant=plant if isinstance(plant, str) else "given",
         noise=(float(noise.sigma[0]), float(noise.ar[0])),
-        notes=tuple(notes),
+        notes=(*notes, *removed, *more),
         seconds=time.perf_counter() - began,
     )  # fmt: skip
+
+
+def _left(correction: Correction) -> str:
+    """Why a simulator is left as it is."""
+    before, after = correction.errs
+    return (
+        "What could be found would make the simulator err more on the breaths that were fitted "
+        f"({after:.2f} instead of {before:.2f} cmH2O, mean), so it is left as it is."
+    )
 
 
 def _lungs(breaths: Breaths, fit: Fit) -> tuple[tuple[LungMatch, ...], list[str]]:
@@ -121,23 +136,6 @@ def _lungs(breaths: Breaths, fit: Fit) -> tuple[tuple[LungMatch, ...], list[str]
     return estimates.lungs(fit), []
 
 
-def _answers(
-    breaths: Breaths, held: NDArray[np.bool_], before: Floats, found: Found, had: Found | None
-) -> dict[str, Floats]:
-    """Pressures of the refitted and of the corrected simulator, ``(n, T)``."""
-    first = breaths.pressure[:, 0]  # where every simulation starts
-    after = found.pressures(found.conclusion.full, held, first)
-    if had is None:
-        return {"refit": found.pressures(found.conclusion.null, held, first), "after": after}
-    # Its own physics, then the same with the recording's R, C, R_ex and PEEP.
-    base = had.pressures(had.conclusion.full, held, first)
-    refit = refitted(had, found.bench.training.data, found)
-    return {
-        "refit": before + had.pressures(refit, held, first) - base,
-        "after": before + after - base,
-    }
-
-
 def _named(one: Lack, conclusion: Conclusion, fit: Fit) -> Named:
     other = conclusion.alternatives.get(one.name, Alternatives((), 1.0, ()))
     return Named(
@@ -149,18 +147,3 @@ def _named(one: Lack, conclusion: Conclusion, fit: Fit) -> Named:
 def _request(conclusion: Conclusion) -> Request | None:
     rivals = [one.solved for other in conclusion.alternatives.values() for one in other.rivals]
     return request(conclusion.named, rivals, noise=Noise((conclusion.noise.sigma[0],), (0.0,)))
-
-
-def _plants(breaths: Breaths, found: Found, had: Found | None, plant: Given) -> dict[str, Plant]:
-    wanted = estimates.plants(found.fit)
-    if had is None:
-        return wanted
-    own = estimates.plants(had.fit)
-    make = simulators.plants_for(plant)
-    result: dict[str, Plant] = {}
-    for name, index in breaths.by_lung_index.items():
-        with float64():
-            stacked = make(breaths.select(index[:1]))
-            one = jax.tree.map(lambda leaf: leaf[0], stacked)
-        result[name] = Corrected(one, wanted[name], own[name])
-    return result

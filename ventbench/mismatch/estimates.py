@@ -5,15 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ventbench.mismatch import mechanics
+from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.hypothesis import has_own
 from ventbench.mismatch.naming.solved import Side, Solved
 from ventbench.mismatch.result import Estimate, LungMatch
-from ventbench.physics.catalogue import library, mechanism
+from ventbench.physics.catalogue import library, mechanism, paths
 from ventbench.physics.fits import Fit, fit, interval
-from ventbench.physics.fits.derivatives import START
+from ventbench.physics.fits.data import Data, Floats
+from ventbench.physics.fits.derivatives import START, Simulator
+from ventbench.physics.model import Physics
 from ventbench.plants.base import Plant
+from ventbench.precision import float64
 from ventbench.recordings.breaths import Breaths
 
 #: Shapes whose default is a guess: the interval of a strength must allow for it.
@@ -29,12 +34,14 @@ def estimated(solved: Solved, side: Side) -> Fit:
     """
     hypothesis = solved.hypothesis
     free = [p for p in _UNCERTAIN if p.rpartition(".")[0] in hypothesis.names]
-    start = {}
+    start: dict[str, ArrayLike] = {}
     for path in solved.problem.unknowns.paths:
         if path != START and not ("." in path and has_own(path.rpartition(".")[0])):
             start[path] = float(np.median(solved.column(path)))
-    if len(np.unique(side.data.lung)) > 1:
-        start = {path: value for path, value in start.items() if path not in ("R", "C")}
+    known = solved.problem.data
+    if len(np.unique(known.lung)) > 1:
+        same = (side.data.R[:, None] == known.R) & (side.data.C[:, None] == known.C)
+        start |= {path: solved.column(path)[np.argmax(same, axis=1)] for path in ("R", "C")}
     return fit(
         side.data, hypothesis.names, free=dict.fromkeys((*hypothesis.free, *free)),
         fixed=dict(hypothesis.fixed), start=start, noise=solved.noise, simulator=side.simulator,
@@ -94,17 +101,28 @@ def lungs_by_flow(breaths: Breaths) -> tuple[tuple[LungMatch, ...], tuple[str, .
 
 def plants(found: Fit) -> dict[str, Plant]:
     """The fitted plant of each lung, by label, without what each breath has of its own."""
-    data, result = found.problem.data, {}
+    problem = found.problem
+    return _by_label(problem.data, problem.simulator, found.mechanisms, found.values)
+
+
+def plants_of(solved: Solved, bench: Bench) -> dict[str, Plant]:
+    """The same of a hypothesis as it was fitted to the training breaths of a bench."""
+    side = bench.training
+    return _by_label(side.data, side.simulator, solved.names, bench.carried(solved, side))
+
+
+def _by_label(
+    data: Data, simulator: Simulator, mechanisms: tuple[str, ...], values: Floats
+) -> dict[str, Plant]:
+    own = [name for name in library() if has_own(name)]
+    names = [path for path in paths(mechanisms) if path.rpartition(".")[0] not in own]
+    names.remove("position")
+    columns = [simulator.names.index(name) for name in names]
+    result: dict[str, Plant] = {}
     for R, C in np.unique(np.stack([data.R, data.C], axis=1), axis=0):
         breath = int(np.flatnonzero((data.R == R) & (data.C == C))[0])
-        plant = found.plant(breath)
-        own = [name for name in library() if has_own(name)]
-        kept = {
-            name: value
-            for name, value in zip(plant.names, plant.values, strict=True)
-            if name.rpartition(".")[0] not in own and name != "position"
-        }
-        result[f"R{R:g}C{C:g}"] = plant.replace(  # type: ignore[attr-defined]
-            names=tuple(kept), values=tuple(kept.values())
-        )
+        with float64():
+            given = dict(zip(names, values[breath, columns], strict=True))
+            plant = Physics((), (), simulator.substeps, simulator.memory).having(**given)
+        result[f"R{R:g}C{C:g}"] = plant
     return result

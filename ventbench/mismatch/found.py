@@ -16,6 +16,7 @@ from ventbench.mismatch.naming.solved import Side, Solved, simulator
 from ventbench.physics.catalogue import paths
 from ventbench.physics.fits import Fit
 from ventbench.physics.fits.data import Data, Floats
+from ventbench.plants.base import Plant
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,10 @@ class Found:
         for which, side in ((~held, self.bench.training), (held, self.bench.judging)):
             pressure[which] = self.bench.predict(solved, side, first[which])[:, 0]
         return pressure
+
+    def plants(self) -> dict[str, Plant]:
+        """What the conclusion says of each lung, by label: answers as :meth:`pressures` has."""
+        return estimates.plants_of(self.conclusion.full, self.bench)
 
 
 def found_in(

@@ -35,7 +35,8 @@ def verdict(found: Diagnosis) -> str:
     """The answer in one sentence."""
     what = f"the {found.plant} simulator"
     if found.verdict == "nothing_missing":
-        return f"Nothing is missing: with R and C refitted, {what} explains the recording."
+        how = "" if _as_given(found) else "with R and C refitted, "
+        return f"Nothing is missing: {how}{what} explains the recording."
     if found.verdict == "unnamed":
         return (
             f"Something is missing in {what} that the library has no name for"
@@ -83,6 +84,8 @@ def effect(found: Diagnosis) -> str:
     if found.verdict == "named":
         without = "Without it" if len(found.mechanisms) == 1 else "Without them"
         return f"{without} {_error(place, found.noise[0])}, even with R and C refitted."
+    if _as_given(found):
+        return location(place, found.noise[0])
     return f"With R and C refitted, {_error(place, found.noise[0])}."
 
 
@@ -159,11 +162,18 @@ def distances(found: Diagnosis) -> str:
     given, refit, after, noise = (
         rounded(x, 2) for x in (one.before.rmse, one.refit.rmse, one.after.rmse, one.noise_floor)
     )
-    corrected = "" if found.verdict == "nothing_missing" else f", {after} corrected"
+    refitted = "" if _as_given(found) else f", {refit} refitted"
+    if found.verdict != "nothing_missing" and one.after != one.refit:
+        refitted += f", {after} corrected"
     return (
-        f"Open-loop error on {held} held-out breaths (root mean square): {given} as given, "
-        f"{refit} refitted{corrected}, noise {noise} cmH2O."
+        f"Open-loop error on {held} held-out breaths (root mean square): {given} as given"
+        f"{refitted}, noise {noise} cmH2O."
     )
+
+
+def _as_given(found: Diagnosis) -> bool:
+    """Whether the simulator is left as it is, without a refit."""
+    return found.open_loop.refit == found.open_loop.before
 
 
 def lung(match: LungMatch) -> str:

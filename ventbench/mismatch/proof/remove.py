@@ -35,10 +35,17 @@ def without(plant: Physics, names: Collection[str]) -> Physics:
 
 
 def by_names_alone(plant: Plant) -> Plant:
-    """Return a corrected plant without what has no name: elements of slots do nothing."""
-    if isinstance(plant, Corrected):
-        return dataclasses.replace(plant, wanted=without(plant.wanted, slots()))
-    return without(plant, slots()) if isinstance(plant, Physics) else plant
+    """Return a corrected plant without what has no name: no element of a slot changes anything.
+
+    Those of a simulator that has them itself stay what they are there.
+    """
+    if not isinstance(plant, Corrected):
+        return without(plant, slots()) if isinstance(plant, Physics) else plant
+    had, wanted = plant.had, plant.wanted
+    elements = [path for path in (*wanted.names, *had.names) if _owner(path) in slots()]
+    with precision.float64():
+        same = wanted.having(**{path: had.get(path) for path in elements})
+    return dataclasses.replace(plant, wanted=same)
 
 
 def has_unnamed(plant: Plant) -> bool:

@@ -1,0 +1,74 @@
+"""What becomes of a simulator: answers of the plant, and simulators that are left as they are."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ventbench import precision
+from ventbench.lungs import lung
+from ventbench.mismatch import corrected as module
+from ventbench.mismatch import simulators, split
+from ventbench.mismatch.corrected import corrected
+from ventbench.physics import physics
+from ventbench.plants.base import Plant
+from ventbench.recordings.breaths import Breaths
+
+from . import small
+
+
+@pytest.fixture(scope="module")
+def breaths() -> Breaths:
+    return small.made()
+
+
+def plants(**base: float) -> dict[str, Plant]:
+    with precision.float64():
+        return {small.LABEL: physics(lung(small.LABEL), {}).having(**base)}
+
+
+def something(pressure: np.ndarray, plant: dict[str, Plant]) -> Any:
+    """What is asked of something found: pressures and plants."""
+    return SimpleNamespace(
+        conclusion=SimpleNamespace(full=None, null=None),
+        bench=SimpleNamespace(training=SimpleNamespace(data=None)),
+        pressures=lambda solved, held, first: pressure,
+        plants=lambda: plant,
+    )
+
+
+@pytest.mark.parametrize("worse", [False, True], ids=["better", "worse"])
+def test_a_simulator_that_would_err_more_is_left_as_it_is(breaths, monkeypatch, worse):
+    given, own, other = plants(R=10.0), plants(R=20.0), plants(R=30.0)
+    before = simulators.answers(given, breaths)
+    # The found physics is the simulator's own plus the whole error, or minus it.
+    error = breaths.pressure - before
+    after = before - error if worse else before + 0.9 * error
+    monkeypatch.setattr(module, "refitted", lambda *_: None)
+    held = split.held_out(breaths)
+    found, had = something(after, other), something(before, own)
+    one = corrected(breaths, held, before, found, had, given)
+    assert one.left is worse
+    np.testing.assert_allclose(one.answers["after"], before if worse else after)
+    assert one.errs[1] == pytest.approx((2.0 if worse else 0.1) * one.errs[0])
+    plant: Any = one.plants[small.LABEL]
+    assert float(plant.simulator.get("R")) == 10.0
+    assert float(plant.had.get("R")) == 20.0
+    assert float(plant.wanted.get("R")) == (20.0 if worse else 30.0)
+    if worse:  # the plant too
+        np.testing.assert_allclose(simulators.answers(one.plants, breaths), before, atol=1e-9)
+
+
+def test_held_out_breaths_do_not_decide(breaths, monkeypatch):
+    given = plants(R=10.0)
+    before = simulators.answers(given, breaths)
+    held = split.held_out(breaths)
+    error = breaths.pressure - before
+    after = before + np.where(held[:, None], -9.0, 0.5) * error
+    monkeypatch.setattr(module, "refitted", lambda *_: None)
+    one = corrected(breaths, held, before, something(after, given), something(before, given), given)
+    assert not one.left
+    assert one.errs[1] == pytest.approx(0.5 * one.errs[0])

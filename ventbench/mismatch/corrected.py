@@ -1,0 +1,96 @@
+"""The corrected simulator: what it answers to the recorded commands, and as a plant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.mismatch import estimates, simulators
+from ventbench.mismatch.against import refitted
+from ventbench.mismatch.distances import distance
+from ventbench.mismatch.found import Found
+from ventbench.mismatch.simulators import Given
+from ventbench.physics.fits.data import Floats
+from ventbench.plants.base import Plant
+from ventbench.plants.corrected import Corrected
+from ventbench.precision import float64
+from ventbench.recordings.breaths import Breaths
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """What is made of a simulator.
+
+    Attributes:
+        answers: pressures ``before``, ``refit`` and ``after``, cmH2O, ``(n, T)`` each.
+        errs: open-loop distance of ``before`` and ``after`` on the training breaths: mean absolute
+            error over inspirations, cmH2O.
+        plants: the corrected simulator of each lung, by label.
+        left: whether the simulator was left as it is, as it errs more by what was found.
+    """
+
+    answers: dict[str, Floats]
+    errs: tuple[float, float]
+    plants: dict[str, Plant]
+    left: bool = False
+
+
+def corrected(
+    breaths: Breaths, held: NDArray[np.bool_], before: Floats, found: Found, had: Found | None,
+    plant: Given,
+) -> Correction:  # fmt: skip
+    """Correct a simulator by the difference of what was found in the recording and in itself.
+
+    One that has physics of its own and errs more by that on the breaths that were fitted is left
+    as it is. Likelihoods of coloured noise excuse slow errors, which a learned simulator may not
+    make; the open-loop distance does not.
+
+    Args:
+        breaths: n recorded ones.
+        held: which of them are held out, ``(n,)``.
+        before: the simulator's answers, cmH2O, ``(n, T)``.
+        found: in the recording.
+        had: found in the simulator; None for the base model.
+        plant: the simulator.
+    """
+    first = breaths.pressure[:, 0]  # where every simulation starts
+    after = found.pressures(found.conclusion.full, held, first)
+    seen = breaths.inspiratory & (breaths.time > 0) & ~held[:, None]
+    if had is None:
+        refit = found.pressures(found.conclusion.null, held, first)
+        answers = {"before": before, "refit": refit, "after": after}
+        return Correction(answers, _errs(breaths, answers, seen), estimates.plants(found.fit))
+    # Its own physics, then the same with the recording's R, C, R_ex and PEEP.
+    own = had.pressures(had.conclusion.full, held, first)
+    refit = had.pressures(refitted(had, found.bench.training.data, found), held, first)
+    answers = {"before": before, "refit": before + refit - own, "after": before + after - own}
+    errs, wanted = _errs(breaths, answers, seen), found.plants()
+    if left := bool(errs[1] >= errs[0]):
+        answers, wanted = dict.fromkeys(answers, before), had.plants()
+    return Correction(answers, errs, _beside(breaths, plant, wanted, had.plants()), left)
+
+
+def _errs(
+    breaths: Breaths, answers: dict[str, Floats], seen: NDArray[np.bool_]
+) -> tuple[float, float]:
+    before, after = (
+        distance(breaths.pressure, answers[key], seen).mae for key in ("before", "after")
+    )
+    return before, after
+
+
+def _beside(
+    breaths: Breaths, plant: Given, wanted: dict[str, Plant], own: dict[str, Plant]
+) -> dict[str, Plant]:
+    """The given plant of each lung plus the difference of two physics."""
+    make = simulators.plants_for(plant)
+    result: dict[str, Plant] = {}
+    for name, index in breaths.by_lung_index.items():
+        with float64():
+            stacked = make(breaths.select(index[:1]))
+            one = jax.tree.map(lambda leaf: leaf[0], stacked)
+        result[name] = Corrected(one, wanted[name], own[name])
+    return result

@@ -1,0 +1,87 @@
+"""A simulator whose own physics stay what they are, but for what it lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ventbench.mismatch.found import Found
+from ventbench.mismatch.naming.bench import Bench, by_label
+from ventbench.mismatch.naming.gate import believed
+from ventbench.mismatch.naming.hypothesis import Hypothesis, has_own
+from ventbench.mismatch.naming.solved import Side, Solved
+from ventbench.physics.fits import Fit, fit
+from ventbench.physics.fits.unknowns import described, freed
+
+
+def steadied(found: Found, had: Found, missing: Sequence[str]) -> Found | None:
+    """Fit what a simulator lacks beside the rest of its physics as they are.
+
+    What is refitted in every hypothesis, so that names can be believed, is not what must be wrong
+    with a simulator: on a few breaths each R and C goes somewhere, and held-out breaths pay for it.
+
+    Args:
+        found: in the recording.
+        had: in the simulator.
+        missing: mechanisms that the simulator lacks, or has with other parameters.
+
+    Returns:
+        The same conclusion with the simulator's own R, C, R_ex, PEEP and other mechanisms; None if
+        held-out breaths ask for others.
+    """
+    full, own = found.conclusion.full, had.conclusion.full
+    if any(has_own(name) for name in (*full.names, *own.names)):
+        return None
+    place = found.conclusion.place
+    asked = (*missing, *((place.element,) if place is not None and place.element else ()))
+    bench = _widest(found.bench, had.bench)
+    hypothesis = _of(full.hypothesis, own.hypothesis, asked)
+    one = _fitted(bench, hypothesis, asked, full, own)
+    likelihood = float(one.problem.log_likelihood(one.minimum.x).sum())
+    solved = Solved(hypothesis, one.problem, one.minimum, likelihood)
+    if believed(found.bench.judged(full) - bench.judged(solved)):
+        return None
+    return Found(bench, replace(found.conclusion, full=solved), one)
+
+
+def _of(full: Hypothesis, own: Hypothesis, asked: tuple[str, ...]) -> Hypothesis:
+    """What is asked for as the recording has it, and the rest as the simulator has it."""
+    needless = [name for name in full.names if name not in asked]
+    return own.without(*asked).plus(full.without(*needless))
+
+
+def _fitted(
+    bench: Bench, hypothesis: Hypothesis, asked: tuple[str, ...], full: Solved, own: Solved
+) -> Fit:
+    side = bench.training
+    names = side.simulator.names
+    values = bench.carried(own, side)
+    free = [p for p in (*freed(asked), *hypothesis.free) if p.rpartition(".")[0] in asked]
+    fixed: dict[str, ArrayLike] = {
+        name: values[:, k] for k, name in enumerate(names) if name not in (*free, "position")
+    }
+    given = {p: x for p, x in hypothesis.fixed if p.rpartition(".")[0] in asked}
+    loose = ("gain",) if bench.spread else ()
+    neutral = float(np.log(described("gain").neutral))
+    return fit(
+        side.data, hypothesis.names, free=(*free, *loose),
+        fixed={p: x for p, x in (fixed | given).items() if p not in loose},
+        start={p: float(np.median(full.column(p))) for p in free},
+        groups=by_label(side.data, tuple(free)) | {p: np.arange(len(side.data)) for p in loose},
+        prior={p: (neutral, bench.spread) for p in loose},
+        noise=full.noise, simulator=side.simulator,
+    )  # fmt: skip
+
+
+def _widest(found: Bench, had: Bench) -> Bench:
+    """The recording on the bench whose simulator knows everything that either needs."""
+    if len(found.training.simulator.names) >= len(had.training.simulator.names):
+        return found
+    return replace(
+        found,
+        training=Side(found.training.data, had.training.simulator),
+        judging=Side(found.judging.data, had.judging.simulator),
+    )

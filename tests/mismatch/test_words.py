@@ -69,6 +69,8 @@ def test_a_named_mechanism():
     assert said[-1] == found.notes[0]
     changed = dataclasses.replace(found.mechanisms[0], changed=True)
     assert "needs another: dead time of the inspiratory valve: 41 ms" in words.named(changed)
+    both = dataclasses.replace(changed, had={"delay": 0.0123})
+    assert "inspiratory valve: 41 ms [38, 44] instead of 12 ms" in words.named(both)
 
 
 def test_the_effect_of_what_is_missing():

@@ -57,6 +57,7 @@ def _named(item: Named) -> dict[str, Any]:
         "alternatives": list(item.alternatives),
         "nats": item.nats,
         "changed": item.changed,
+        "simulator_has": item.had,
     }
 
 

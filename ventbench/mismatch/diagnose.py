@@ -100,7 +100,7 @@ def _diagnosis(
     verdict: Verdict = "named" if names else "unnamed" if unnamed else "nothing_missing"
     return Diagnosis(
         verdict=verdict,
-        mechanisms=tuple(_named(one, conclusion, found.fit) for one in names),
+        mechanisms=tuple(_named(one, conclusion, found.fit, had) for one in names),
         slot=place,
         location=location,
         open_loop=distances(breaths, held, answers, float(noise.sigma[0])),
@@ -136,11 +136,12 @@ def _lungs(breaths: Breaths, fit: Fit) -> tuple[tuple[LungMatch, ...], list[str]
     return estimates.lungs(fit), []
 
 
-def _named(one: Lack, conclusion: Conclusion, fit: Fit) -> Named:
+def _named(one: Lack, conclusion: Conclusion, fit: Fit, had: Found | None) -> Named:
     other = conclusion.alternatives.get(one.name, Alternatives((), 1.0, ()))
+    own = estimates.parameters(had.fit, one.name) if had is not None and one.changed else {}
     return Named(
         one.name, estimates.parameters(fit, one.name), other.confidence, other.names,
-        conclusion.nats.get(one.name, 0.0), one.changed,
+        conclusion.nats.get(one.name, 0.0), one.changed, {key: x.value for key, x in own.items()},
     )  # fmt: skip
 
 

@@ -29,6 +29,13 @@ def quantity(estimate: Estimate, path: str = "") -> str:
     return f"{rounded(value, places)}{name} [{rounded(low, places)}, {rounded(high, places)}]"
 
 
+def like(value: float, estimate: Estimate, path: str = "") -> str:
+    """Another value of the same parameter, in the same unit and with as many digits."""
+    factor, unit = _scale(estimate, path)
+    places = decimals(*(factor * x for x in (estimate.value, *estimate.ci95)))
+    return f"{rounded(factor * value, places)}{f' {unit}' if unit else ''}"
+
+
 def decimals(value: float, low: float, high: float) -> int:
     """Digits after the point, so that half the interval shows one or two digits."""
     half = 0.5 * (high - low)

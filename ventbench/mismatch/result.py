@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -38,6 +38,7 @@ class Named:
         alternatives: names that the recording cannot tell from it, the likeliest first.
         nats: held-out log-likelihood that is lost without it.
         changed: True if the simulator has it too, with other parameters.
+        had: those that it has, by short name; empty if it is not changed.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Named:
     alternatives: tuple[str, ...]
     nats: float
     changed: bool = False
+    had: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ventbench.mismatch.quantity import quantity, rounded, span
+from ventbench.mismatch.quantity import like, quantity, rounded, span
 from ventbench.mismatch.result import Diagnosis, Estimate, LungMatch, Named, Place, Slot
 from ventbench.physics import mechanism
 
@@ -59,7 +59,7 @@ def named(item: Named) -> str:
     needs = "The recording needs"
     if item.changed:
         needs = f"The simulator has {about.title} too, but the recording needs another:"
-    values = [(key, quantity(x, f"{item.name}.{key}")) for key, x in item.parameters.items()]
+    values = [(key, _value(item, key, x)) for key, x in item.parameters.items()]
     if not values:
         return f"{needs} {about.title}."
     (first, value), *others = values
@@ -73,6 +73,13 @@ def named(item: Named) -> str:
     for key, more in others:
         text += f"; {meanings.get(key, key)}: {more}"
     return f"{text}. Confidence in the name: {100 * item.confidence:.0f} %."
+
+
+def _value(item: Named, key: str, estimate: Estimate) -> str:
+    """A value, and which one the simulator has in its place."""
+    path = f"{item.name}.{key}"
+    other = f" instead of {like(item.had[key], estimate, path)}" if key in item.had else ""
+    return f"{quantity(estimate, path)}{other}"
 
 
 def effect(found: Diagnosis) -> str:

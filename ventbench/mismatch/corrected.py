@@ -26,8 +26,8 @@ class Correction:
 
     Attributes:
         answers: pressures ``before``, ``refit`` and ``after``, cmH2O, ``(n, T)`` each.
-        errs: open-loop distance of ``before`` and ``after`` on the training breaths: mean absolute
-            error over inspirations, cmH2O.
+        errs: mean absolute error of ``before`` and ``after`` on the training breaths, inspirations
+            and expirations, cmH2O.
         plants: the corrected simulator of each lung, by label.
         left: whether the simulator was left as it is, as it errs more by what was found.
     """
@@ -46,7 +46,7 @@ def corrected(
 
     One that has physics of its own and errs more by that on the breaths that were fitted is left
     as it is. Likelihoods of coloured noise excuse slow errors, which a learned simulator may not
-    make; the open-loop distance does not.
+    make; the mean error does not.
 
     Args:
         breaths: n recorded ones.
@@ -58,7 +58,7 @@ def corrected(
     """
     first = breaths.pressure[:, 0]  # where every simulation starts
     after = found.pressures(found.conclusion.full, held, first)
-    seen = breaths.inspiratory & (breaths.time > 0) & ~held[:, None]
+    seen = breaths.valid & (breaths.time > 0) & ~held[:, None]
     if had is None:
         refit = found.pressures(found.conclusion.null, held, first)
         answers = {"before": before, "refit": refit, "after": after}

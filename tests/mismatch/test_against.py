@@ -60,9 +60,10 @@ def test_what_recording_and_simulator_share_is_no_mismatch():
     # The noise is the sensor's again.
     assert found.conclusion.noise.sigma[0] < 0.5 * alone.conclusion.noise.sigma[0]
     assert found.conclusion.noise.sigma[0] == pytest.approx(0.2, rel=0.2)
-    steady = steadied(found, had, [NAME])
+    steady = steadied(found, had, [NAME, "circuit_compliance"])
     assert steady is not None, "nothing but the effect asks for another lung"
-    found = steady
+    found, names = steady
+    assert names == (NAME,), "what is idle beside the simulator's own lung is not missing"
     assert float(found.fit.value(f"{NAME}.quadratic")[0]) == pytest.approx(10.0, rel=0.1)
     np.testing.assert_allclose(found.fit.column("R"), had.conclusion.full.column("R")[0])
     first = breaths.pressure[:, 0]

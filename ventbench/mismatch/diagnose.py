@@ -78,7 +78,8 @@ def _diagnosis(
     names, removed = lacking(found.fit, found.conclusion, had and had.fit, had and had.conclusion)
     steady = None if had is None else steadied(found, had, [one.name for one in names])
     if steady is not None:  # of what the recording does not show nothing is taken away
-        found, removed = steady, []
+        (found, kept), removed = steady, []
+        names = [one for one in names if one.name in kept]
     conclusion = found.conclusion
     correction = corrected(breaths, held, before, found, had, plant)
     answers = correction.answers

@@ -10,14 +10,17 @@ from numpy.typing import ArrayLike
 
 from ventbench.mismatch.found import Found
 from ventbench.mismatch.naming.bench import Bench, by_label
-from ventbench.mismatch.naming.gate import believed
+from ventbench.mismatch.naming.gate import LITTLE, WEAK, believed
 from ventbench.mismatch.naming.hypothesis import Hypothesis, has_own
 from ventbench.mismatch.naming.solved import Side, Solved
+from ventbench.physics.catalogue import mechanism
 from ventbench.physics.fits import Fit, fit
 from ventbench.physics.fits.unknowns import described, freed
 
 
-def steadied(found: Found, had: Found, missing: Sequence[str]) -> Found | None:
+def steadied(
+    found: Found, had: Found, missing: Sequence[str]
+) -> tuple[Found, tuple[str, ...]] | None:
     """Fit what a simulator lacks beside the rest of its physics as they are.
 
     What is refitted in every hypothesis, so that names can be believed, is not what must be wrong
@@ -29,22 +32,48 @@ def steadied(found: Found, had: Found, missing: Sequence[str]) -> Found | None:
         missing: mechanisms that the simulator lacks, or has with other parameters.
 
     Returns:
-        The same conclusion with the simulator's own R, C, R_ex, PEEP and other mechanisms; None if
-        held-out breaths ask for others.
+        The same conclusion with the simulator's own R, C, R_ex, PEEP and other mechanisms, and the
+        mechanisms that are missing then; None if held-out breaths ask for others.
     """
     full, own = found.conclusion.full, had.conclusion.full
     if any(has_own(name) for name in (*full.names, *own.names)):
         return None
     place = found.conclusion.place
-    asked = (*missing, *((place.element,) if place is not None and place.element else ()))
+    element = (place.element,) if place is not None and place.element else ()
     bench = _widest(found.bench, had.bench)
-    hypothesis = _of(full.hypothesis, own.hypothesis, asked)
-    one = _fitted(bench, hypothesis, asked, full, own)
-    likelihood = float(one.problem.log_likelihood(one.minimum.x).sum())
-    solved = Solved(hypothesis, one.problem, one.minimum, likelihood)
+
+    def having(names: Sequence[str]) -> tuple[Fit, Solved]:
+        asked = (*names, *element)
+        hypothesis = _of(full.hypothesis, own.hypothesis, asked)
+        one = _fitted(bench, hypothesis, asked, full, own)
+        likelihood = float(one.problem.log_likelihood(one.minimum.x).sum())
+        return one, Solved(hypothesis, one.problem, one.minimum, likelihood)
+
+    names, (one, solved) = tuple(missing), having(missing)
     if believed(found.bench.judged(full) - bench.judged(solved)):
         return None
-    return Found(bench, replace(found.conclusion, full=solved), one)
+    nothing = bench.judged(having(())[1])
+    while names:
+        # What only trimmed another R or C is idle beside the simulator's own.
+        fewer = [(name, *having([other for other in names if other != name])) for name in names]
+        lost = [bench.judged(solved) - bench.judged(less) for _, _, less in fewer]
+        least = int(np.argmin([nats.sum() for nats in lost]))
+        name, one_less, less = fewer[least]
+        whole = float((bench.judged(solved) - nothing).sum())
+        trace = is_faint(solved, own, name) and lost[least].sum() < LITTLE * whole
+        if believed(lost[least]) and not trace:
+            break
+        one, solved = one_less, less
+        names = tuple(other for other in names if other != name)
+    return Found(bench, replace(found.conclusion, full=solved), one), names
+
+
+def is_faint(solved: Solved, own: Solved, name: str) -> bool:
+    """Whether a mechanism is by far less than a mild one beyond what the simulator has of it."""
+    item = mechanism(name).description.strength
+    path = f"{name}.{item.name}"
+    beyond = np.abs(solved.column(path) - own.column(path)[0])
+    return bool(beyond.max() < WEAK * abs(item.mild - item.neutral))
 
 
 def _of(full: Hypothesis, own: Hypothesis, asked: tuple[str, ...]) -> Hypothesis:

@@ -25,7 +25,7 @@ _USUAL, _FAR = 0.8, 1.5
 _PLAIN, _CROSSED = 20.0, 1.5
 
 #: Share of a mild strength, and of all that is explained, below both of which a term is a trace.
-_WEAK, _LITTLE = 0.2, 0.1
+WEAK, LITTLE = 0.2, 0.1
 
 
 def believed(gained: Floats, gate: float = GATE) -> bool:
@@ -77,8 +77,8 @@ def is_trace(bench: Bench, current: Solved, without: Solved, name: str) -> bool:
     """
     item = mechanism(name).description.strength
     strength = float(np.max(np.abs(current.column(f"{name}.{item.name}") - item.neutral)))
-    if has_own(name) or strength > _WEAK * abs(item.mild - item.neutral):
+    if has_own(name) or strength > WEAK * abs(item.mild - item.neutral):
         return False
     here = bench.criterion(current)
     nothing = bench.criterion(bench.solve(Hypothesis(), current.noise, current))
-    return bench.criterion(without) - here < _LITTLE * (nothing - here)
+    return bench.criterion(without) - here < LITTLE * (nothing - here)

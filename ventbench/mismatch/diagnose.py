@@ -97,7 +97,7 @@ def _diagnosis(
     location = locate(
         breaths.select(here), answers["refit"][here], noise.sigma[0], flow[here], volume[here]
     )
-    unnamed = place is not None or (useless and location)
+    unnamed = place is not None or conclusion.hidden or (useless and location)
     verdict: Verdict = "named" if names else "unnamed" if unnamed else "nothing_missing"
     return Diagnosis(
         verdict=verdict,

@@ -39,8 +39,10 @@ def verdict(found: Diagnosis) -> str:
         return f"Nothing is missing: {how}{what} explains the recording."
     if found.verdict == "unnamed":
         return (
-            f"Something is missing in {what} that the library has no name for"
-            f"{'' if found.slot is None else f'; it acts as {_acts(found.slot)}'}."
+            f"Something is missing in {what}, but no name and no place is certain."
+            if found.slot is None
+            else f"Something is missing in {what} that the library has no name for; it acts as "
+            f"{_acts(found.slot)}."
         )
     names = _and([f"{title(item.name)} ({item.name})" for item in found.mechanisms])
     rest = "" if found.slot is None else "; something without a name is missing too"

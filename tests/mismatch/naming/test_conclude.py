@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from ventbench.mismatch.naming.conclude import conclude
+from ventbench.mismatch.naming.conclude import conclude, is_hidden
 from ventbench.mismatch.naming.places import all_paths
 from ventbench.mismatch.naming.sources import ALVEOLUS, SUPPLY
 from ventbench.mismatch.shapes import slot
@@ -30,10 +32,43 @@ def test_nothing_is_missing():
     found = concluded(small.made(seed=1))
     assert found.names == ()
     assert found.place is None
+    assert not found.hidden
     assert found.full is found.named
     assert (found.nats, found.alternatives, found.spread) == ({}, {}, 0.0)
     assert found.noise.sigma[0] == pytest.approx(0.2, rel=0.15)
     assert slot(found) is None
+
+
+def compared(nats: dict[str, tuple[float, float]]) -> tuple[Any, list[Any]]:
+    """A bench, and a last comparison of names with what they gain in training and held out."""
+
+    def solved(name: str, train: float, held: float) -> SimpleNamespace:
+        return SimpleNamespace(name=name, criterion=-train, judged=np.full(4, held / 4))
+
+    bench = SimpleNamespace(criterion=lambda one: one.criterion, judged=lambda one: one.judged)
+    rivals = [
+        SimpleNamespace(name=name, solved=solved(name, *gain), criterion=-gain[0])
+        for name, gain in nats.items()
+    ]
+    return bench, [SimpleNamespace(before=solved("", 0.0, 0.0), rivals=rivals)]
+
+
+@pytest.mark.parametrize(
+    ("nats", "hidden"),
+    [
+        ({"valve_curve": (500.0, 40.0)}, True),
+        ({"valve_curve": (500.0, -40.0)}, False),  # held-out breaths are against it
+        ({"valve_curve": (50.0, 40.0)}, False),  # little is missing
+        ({"patient_effort": (2500.0, 500.0)}, False),  # which coloured noise looks like
+        ({"patient_effort": (2500.0, 500.0), "leak": (101.0, 5.0)}, True),
+    ],
+)
+def test_what_explains_much_and_is_not_believed_is_not_nothing(nats, hidden):
+    assert is_hidden(*compared(nats)) is hidden
+
+
+def test_without_a_comparison_nothing_is_hidden():
+    assert not is_hidden(compared({})[0], [])
 
 
 @pytest.mark.usefixtures("few_slots")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -18,14 +18,14 @@ from ventbench.mismatch.naming.beside import (
 )
 from ventbench.mismatch.naming.forms import without_trimmings
 from ventbench.mismatch.naming.gate import GATE, believed
-from ventbench.mismatch.naming.hypothesis import Hypothesis
+from ventbench.mismatch.naming.hypothesis import Hypothesis, has_own
 from ventbench.mismatch.naming.moving import Moving
 from ventbench.mismatch.naming.rivals import Alternatives, alternatives
 from ventbench.mismatch.naming.search import Progress, forward
 from ventbench.mismatch.naming.simpler import OneShape
 from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.sources import GAIN, MEASUREMENT, SOURCES
-from ventbench.mismatch.naming.steps import settle, step
+from ventbench.mismatch.naming.steps import MUCH, Step, settle, step
 from ventbench.mismatch.naming.together import each
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.noise import Noise
@@ -53,6 +53,7 @@ class Conclusion:
         nats: held-out log-likelihood that is lost without each name.
         alternatives: to each name.
         spread: standard deviation of the logarithm of the breaths' valve gains, 0 if all are one.
+        hidden: whether much is missing, and neither a name nor a place is believed.
     """
 
     null: Solved
@@ -63,6 +64,7 @@ class Conclusion:
     nats: dict[str, float]
     alternatives: dict[str, Alternatives]
     spread: float = 0.0
+    hidden: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -109,7 +111,28 @@ def conclude(bench: Bench, wider: Callable[[], Bench], tell: Progress) -> Conclu
     named, other = alternatives(bench, named, steps, swap=place is None)
     full = named if place is None else full
     noise = place.source.noise if place and place.source else full.noise
-    return Conclusion(null, named, full, place, noise, _losses(bench, named), other, bench.spread)
+    hidden = place is None and not named.names and is_hidden(bench, steps)
+    return Conclusion(
+        null, named, full, place, noise, _losses(bench, named), other, bench.spread, hidden
+    )
+
+
+def is_hidden(bench: Bench, steps: Sequence[Step]) -> bool:
+    """Whether something explains much in training, and a little of held-out breaths, unbelieved.
+
+    So do effects that hide each other, each of which alone helps some breaths and harms others.
+    What is each breath's own does not count: it explains coloured noise as well.
+    """
+    if not steps:
+        return False
+    last = steps[-1]
+    least = bench.criterion(last.before) - MUCH
+    return any(
+        one.criterion < least
+        and float((bench.judged(one.solved) - bench.judged(last.before)).sum()) > GATE
+        for one in last.rivals
+        if not has_own(one.name)
+    )
 
 
 @dataclass(frozen=True, eq=False)

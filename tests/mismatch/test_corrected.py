@@ -62,6 +62,34 @@ def test_a_simulator_that_would_err_more_is_left_as_it_is(breaths, monkeypatch, 
         np.testing.assert_allclose(simulators.answers(one.plants, breaths), before, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("full", "named", "kept"),
+    [(0.1, 0.2, "full"), (0.6, 0.2, "named"), (0.6, 0.7, "null")],
+)
+def test_of_the_base_model_is_kept_what_does_not_throw_breaths_far_off(
+    breaths, monkeypatch, full, named, kept
+):
+    before = simulators.answers(plants(R=10.0), breaths)
+    error = breaths.pressure - before
+    gains = {"null": 0.5, "full": 1.0 - full, "named": 1.0 - named}
+
+    def pressures(solved: Any, held: Any, first: Any) -> np.ndarray:
+        return before + gains[solved.which] * error
+
+    solved = {key: SimpleNamespace(which=key, names=("leak",)) for key in gains}
+    found: Any = SimpleNamespace(
+        conclusion=SimpleNamespace(**solved, place=object()), bench=None, pressures=pressures,
+        fit=solved["full"],
+    )  # fmt: skip
+    monkeypatch.setattr(module.estimates, "plants", lambda fit: fit.which)
+    monkeypatch.setattr(module.estimates, "plants_of", lambda one, bench: one.which)
+    one = corrected(breaths, split.held_out(breaths), before, found, None, "physics")
+    assert one.plants == kept
+    np.testing.assert_allclose(one.answers["after"], before + gains[kept] * error)
+    assert bool(one.notes) is (kept != "full")
+    assert not one.left
+
+
 def test_held_out_breaths_do_not_decide(breaths, monkeypatch):
     given = plants(R=10.0)
     before = simulators.answers(given, breaths)

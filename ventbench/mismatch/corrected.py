@@ -19,6 +19,10 @@ from ventbench.plants.corrected import Corrected
 from ventbench.precision import float64
 from ventbench.recordings.breaths import Breaths
 
+#: Times the refitted error beyond which a few breaths must be far off: what is mild may change less
+#: than coloured noise excuses.
+_FAR = 1.05
+
 
 @dataclass(frozen=True, eq=False)
 class Correction:
@@ -30,12 +34,14 @@ class Correction:
             and expirations, cmH2O.
         plants: the corrected simulator of each lung, by label.
         left: whether the simulator was left as it is, as it errs more by what was found.
+        notes: what the reader should know of it, a sentence each.
     """
 
     answers: dict[str, Floats]
     errs: tuple[float, float]
     plants: dict[str, Plant]
     left: bool = False
+    notes: tuple[str, ...] = ()
 
 
 def corrected(
@@ -62,7 +68,7 @@ def corrected(
     if had is None:
         refit = found.pressures(found.conclusion.null, held, first)
         answers = {"before": before, "refit": refit, "after": after}
-        return Correction(answers, _errs(breaths, answers, seen), estimates.plants(found.fit))
+        return _physics(breaths, found, held, answers, seen)
     # Its own physics, then the same with the recording's R, C, R_ex and PEEP.
     own = had.pressures(had.conclusion.full, held, first)
     refit = had.pressures(refitted(had, found.bench.training.data, found), held, first)
@@ -71,6 +77,40 @@ def corrected(
     if left := bool(errs[1] >= errs[0]):
         answers, wanted = dict.fromkeys(answers, before), had.plants()
     return Correction(answers, errs, _beside(breaths, plant, wanted, had.plants()), left)
+
+
+def _physics(
+    breaths: Breaths, found: Found, held: NDArray[np.bool_], answers: dict[str, Floats],
+    seen: NDArray[np.bool_],
+) -> Correction:  # fmt: skip
+    """The base model with all that was found, or with less if that makes it err more.
+
+    Robust likelihoods excuse breaths that a shape throws far off; who uses the plant does not.
+    """
+
+    def error(pressure: Floats) -> float:
+        return distance(breaths.pressure, pressure, seen).mae
+
+    least = _FAR * error(answers["refit"])
+    if error(answers["after"]) <= least:
+        return Correction(answers, _errs(breaths, answers, seen), estimates.plants(found.fit))
+    conclusion, kept, what = found.conclusion, found.conclusion.null, "what was found"
+    if conclusion.place is not None and conclusion.named.names:
+        pressure = found.pressures(conclusion.named, held, breaths.pressure[:, 0])
+        if error(pressure) <= least:
+            kept, what, answers = (
+                conclusion.named,
+                "what has no name",
+                answers | {"after": pressure},
+            )
+    if kept is conclusion.null:
+        answers = answers | {"after": answers["refit"]}
+    note = (
+        f"With {what} the simulator would err more on the breaths that were fitted than with R "
+        "and C refitted, so the corrected simulator is without it."
+    )
+    plants = estimates.plants_of(kept, found.bench)
+    return Correction(answers, _errs(breaths, answers, seen), plants, notes=(note,))
 
 
 def _errs(

@@ -112,7 +112,7 @@ def _diagnosis(
         plants=correction.plants,
         plant=plant if isinstance(plant, str) else "given",
         noise=(float(noise.sigma[0]), float(noise.ar[0])),
-        notes=(*notes, *removed, *more),
+        notes=(*notes, *removed, *correction.notes, *more),
         seconds=time.perf_counter() - began,
     )  # fmt: skip
 

@@ -88,6 +88,9 @@ def test_of_the_base_model_is_kept_what_does_not_throw_breaths_far_off(
     np.testing.assert_allclose(one.answers["after"], before + gains[kept] * error)
     assert bool(one.notes) is (kept != "full")
     assert not one.left
+    solved["full"].names = ("patient_effort",)  # the mean of all breaths' is no breath's
+    one = corrected(breaths, split.held_out(breaths), before, found, None, "physics")
+    assert (one.plants, one.notes) == ("full", ())
 
 
 def test_held_out_breaths_do_not_decide(breaths, monkeypatch):

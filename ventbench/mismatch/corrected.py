@@ -12,6 +12,7 @@ from ventbench.mismatch import estimates, simulators
 from ventbench.mismatch.against import refitted
 from ventbench.mismatch.distances import distance
 from ventbench.mismatch.found import Found
+from ventbench.mismatch.naming.hypothesis import has_own
 from ventbench.mismatch.simulators import Given
 from ventbench.physics.fits.data import Floats
 from ventbench.plants.base import Plant
@@ -86,23 +87,23 @@ def _physics(
     """The base model with all that was found, or with less if that makes it err more.
 
     Robust likelihoods excuse breaths that a shape throws far off; who uses the plant does not.
+    Efforts of a patient are each breath's own: their mean, which is what others are expected to
+    have, may be off in all of them.
     """
 
     def error(pressure: Floats) -> float:
         return distance(breaths.pressure, pressure, seen).mae
 
     least = _FAR * error(answers["refit"])
-    if error(answers["after"]) <= least:
+    own = any(has_own(name) for name in found.conclusion.full.names)
+    if own or error(answers["after"]) <= least:
         return Correction(answers, _errs(breaths, answers, seen), estimates.plants(found.fit))
     conclusion, kept, what = found.conclusion, found.conclusion.null, "what was found"
     if conclusion.place is not None and conclusion.named.names:
         pressure = found.pressures(conclusion.named, held, breaths.pressure[:, 0])
         if error(pressure) <= least:
-            kept, what, answers = (
-                conclusion.named,
-                "what has no name",
-                answers | {"after": pressure},
-            )
+            kept, what = conclusion.named, "what has no name"
+            answers = answers | {"after": pressure}
     if kept is conclusion.null:
         answers = answers | {"after": answers["refit"]}
     note = (

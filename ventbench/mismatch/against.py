@@ -66,7 +66,7 @@ def _exactly(had: Found, own: Data, held: NDArray[np.bool_], like: Found) -> Fit
     solved = had.conclusion.full
     side = Side(own.select(~held), had.bench.training.simulator)
     problem = replace(solved.problem, noise=like.conclusion.noise)
-    return estimates.estimated(replace(solved, problem=problem), side)
+    return estimates.estimated(replace(solved, problem=problem), side, had.bench)
 
 
 def refitted(had: Found, data: Data, like: Found | None = None) -> Solved:

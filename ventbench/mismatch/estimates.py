@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from ventbench.mismatch import mechanics
 from ventbench.mismatch.naming.bench import Bench
+from ventbench.mismatch.naming.effort import EFFORT
 from ventbench.mismatch.naming.hypothesis import has_own
 from ventbench.mismatch.naming.solved import Side, Solved
 from ventbench.mismatch.result import Estimate, LungMatch
@@ -25,12 +26,13 @@ from ventbench.recordings.breaths import Breaths
 _UNCERTAIN = ("supply_droop.recovery",)
 
 
-def estimated(solved: Solved, side: Side) -> Fit:
+def estimated(solved: Solved, side: Side, bench: Bench) -> Fit:
     """Fit a conclusion's hypothesis to a side's breaths, with covariance.
 
     Args:
         solved: the conclusion, on some of the breaths.
         side: breaths to fit.
+        bench: that it was found on.
     """
     hypothesis = solved.hypothesis
     free = [p for p in _UNCERTAIN if p.rpartition(".")[0] in hypothesis.names]
@@ -42,6 +44,9 @@ def estimated(solved: Solved, side: Side) -> Fit:
     if len(np.unique(known.lung)) > 1:
         same = (side.data.R[:, None] == known.R) & (side.data.C[:, None] == known.C)
         start |= {path: solved.column(path)[np.argmax(same, axis=1)] for path in ("R", "C")}
+    if EFFORT in hypothesis.names:  # each breath's own are looked for where it is likeliest
+        near = bench.solve(hypothesis, solved.noise, start=start, side=side, anew=True)
+        start |= {path: near.column(path) for path in near.problem.unknowns.paths}
     return fit(
         side.data, hypothesis.names, free=dict.fromkeys((*hypothesis.free, *free)),
         fixed=dict(hypothesis.fixed), start=start, noise=solved.noise, simulator=side.simulator,

@@ -78,5 +78,5 @@ def found_in(
     side = Side(data, simulator(data, paths()))
     if found.place is not None and found.place.element is not None:
         # With a slot, the training breaths alone: all of them would be one more compilation.
-        return Found(wide[0], found, estimates.estimated(found.full, wide[0].training))
-    return Found(narrow, found, estimates.estimated(found.named, side))
+        return Found(wide[0], found, estimates.estimated(found.full, wide[0].training, wide[0]))
+    return Found(narrow, found, estimates.estimated(found.named, side, narrow))

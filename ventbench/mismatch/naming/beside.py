@@ -14,7 +14,7 @@ from ventbench.mismatch.naming.moving import Moving
 from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.sources import ALVEOLUS
 from ventbench.mismatch.naming.steps import settle, step
-from ventbench.mismatch.naming.together import each
+from ventbench.physics.fits.together import each
 
 #: Share of what a slot of the same kind explains from which a name stands, its form apart; and
 #: share below which a name beside a slot is only its trimming.

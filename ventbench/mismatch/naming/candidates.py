@@ -11,9 +11,9 @@ from ventbench.mismatch.naming.effort import EFFORT, evidence
 from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.linear import Local, gain, local
 from ventbench.mismatch.naming.solved import Solved
-from ventbench.mismatch.naming.together import each
 from ventbench.physics.catalogue import library, parameter
 from ventbench.physics.fits.derivatives import Simulator
+from ventbench.physics.fits.together import each
 from ventbench.physics.parameters import Parameter
 
 #: A multiple of a template beyond these is not believed.

@@ -26,9 +26,9 @@ from ventbench.mismatch.naming.simpler import OneShape
 from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.sources import GAIN, MEASUREMENT, SOURCES
 from ventbench.mismatch.naming.steps import MUCH, Step, settle, step
-from ventbench.mismatch.naming.together import each
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.noise import Noise
+from ventbench.physics.fits.together import each
 
 #: A source at the sensor is noise unless it is of one frequency and this large, cmH2O.
 _HUM = 0.3

@@ -9,9 +9,9 @@ import numpy as np
 
 from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.solved import Side, Solved
-from ventbench.mismatch.naming.together import each
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.derivatives import START
+from ventbench.physics.fits.together import each
 
 
 def crossed(bench: Bench, current: Solved, without: Solved) -> Floats:

@@ -17,8 +17,8 @@ from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.search import Progress
 from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.steps import settle
-from ventbench.mismatch.naming.together import each
 from ventbench.physics.fits.data import Floats
+from ventbench.physics.fits.together import each
 
 #: Share of all that is explained up to which a name may be a trimming.
 _TRIMMING = 0.5

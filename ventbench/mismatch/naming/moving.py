@@ -17,10 +17,10 @@ from ventbench.mismatch.naming.gate import GATE
 from ventbench.mismatch.naming.linear import Local, local
 from ventbench.mismatch.naming.solved import Side, Solved
 from ventbench.mismatch.naming.sources import GAIN, MEASUREMENT, SOURCES, SUPPLY, responses
-from ventbench.mismatch.naming.together import each
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.noise import Noise, estimate
 from ventbench.physics.fits.problem import Problem
+from ventbench.physics.fits.together import each
 
 #: Frequencies, Hz, lengths over which a smooth source is correlated, s, and standard deviations,
 #: cmH2O at the alveolus and the sensor; a tenth of that, as a share of the flow, at the supply.

@@ -12,7 +12,7 @@ from ventbench.mismatch.naming.candidates import screen
 from ventbench.mismatch.naming.gate import believed
 from ventbench.mismatch.naming.solved import Solved
 from ventbench.mismatch.naming.steps import Rival, Step, step, whitened
-from ventbench.mismatch.naming.together import each
+from ventbench.physics.fits.together import each
 
 #: Criterion (twice the nats) within which a name is an alternative, and most that are listed.
 _CLOSE, _LISTED = 10.0, 2

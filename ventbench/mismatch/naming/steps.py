@@ -10,9 +10,9 @@ from ventbench.mismatch.naming.bench import Bench
 from ventbench.mismatch.naming.candidates import Candidate
 from ventbench.mismatch.naming.hypothesis import Hypothesis
 from ventbench.mismatch.naming.solved import Solved
-from ventbench.mismatch.naming.together import each
 from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.noise import Noise, estimate
+from ventbench.physics.fits.together import each
 
 #: Nats from which a hypothesis explains much.
 MUCH = 100.0

@@ -6,7 +6,6 @@ out, and a hypothesis only chooses directions: one compilation for all of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 
 import jax
@@ -15,6 +14,7 @@ import numpy as np
 from jax import Array
 
 from ventbench.physics.fits.data import Data, Floats
+from ventbench.physics.fits.together import each
 from ventbench.physics.model import Physics
 from ventbench.physics.times import resolution
 from ventbench.precision import float64
@@ -33,9 +33,12 @@ _FEW, _APART = 2, 1e-5
 
 _STATIC = ("names", "substeps", "memory", "flow")
 
+#: Both valves, %, 0/1, and the time for which they are held, s, each ``(n, T)``.
+Commands = tuple[Array, Array, Array]
+
 
 def _run(
-    values: Array, commands: tuple[Array, Array, Array], names: tuple[str, ...], substeps: int,
+    values: Array, commands: Commands, names: tuple[str, ...], substeps: int,
     memory: int, flow: bool,
 ) -> Array:  # fmt: skip
     plant = Physics(tuple(values.T[:-1]), names, substeps, memory)
@@ -52,13 +55,13 @@ def _run(
 
 
 @partial(jax.jit, static_argnames=_STATIC)
-def _predict(values: Array, commands: tuple[Array, Array, Array], **static: object) -> Array:
+def _predict(values: Array, commands: Commands, **static: object) -> Array:
     return _run(values, commands, **static)  # type: ignore[arg-type]
 
 
 @partial(jax.jit, static_argnames=_STATIC)
 def _along(
-    values: Array, basis: Array, commands: tuple[Array, Array, Array], **static: object
+    values: Array, basis: Array, commands: Commands, **static: object
 ) -> tuple[Array, Array]:
     def run(values: Array) -> Array:
         return _run(values, commands, **static)  # type: ignore[arg-type]
@@ -70,7 +73,9 @@ def _along(
 
 
 class Simulator:
-    """All breaths of some data at once, at any parameters; compiled once for each size.
+    """All breaths of some data, at any parameters; compiled once for each size.
+
+    Parts of equally many breaths run side by side; see :func:`~.together.each`.
 
     Attributes:
         names: paths of the parameters, the columns of ``values``; the last column is the start.
@@ -107,20 +112,20 @@ class Simulator:
             "names": names, "substeps": self.substeps, "memory": memory, "flow": flow
         }  # fmt: skip
         with float64():
-            self._commands = [
-                tuple(jnp.asarray(x[i * self._part : (i + 1) * self._part])
-                      for x in (padded.u_in, padded.u_out, padded.dt))
-                for i in range(parts)
-            ]  # fmt: skip
+            u_in, u_out, dt = (
+                [jnp.asarray(part) for part in np.split(x, parts)]
+                for x in (padded.u_in, padded.u_out, padded.dt)
+            )
+        self._commands: list[Commands] = list(zip(u_in, u_out, dt, strict=True))
 
     def predict(self, values: Floats) -> Floats:
         """What would be measured, ``(n, c, T)``, at physical values ``(n, P + 1)``."""
-        with float64():
-            seen = [
-                np.asarray(_predict(part, commands, **self._static))
-                for part, commands in self._parts(values)
-            ]
-        return np.concatenate(seen)[: self._count]
+
+        def predicted(place: tuple[Array, Commands]) -> Floats:
+            with float64():
+                return np.asarray(_predict(*place, **self._static))
+
+        return np.concatenate(each(predicted, self._parts(values)))[: self._count]
 
     def derivatives(self, values: Floats, columns: tuple[int, ...]) -> tuple[Floats, Floats]:
         """Also its derivatives with respect to k columns of ``values``, ``(n, k, c, T)``."""
@@ -135,13 +140,14 @@ class Simulator:
         width = next(width for width in _WIDTHS if width >= len(columns))
         basis = np.zeros((width, len(self.names) + 1))
         basis[np.arange(len(columns)), list(columns)] = 1.0
-        seen, slopes = [], []
-        with float64():
-            directions = jnp.asarray(basis)
-            for part, commands in self._parts(values):
-                here, along = _along(part, directions, commands, **self._static)
-                seen.append(np.asarray(here))
-                slopes.append(np.moveaxis(np.asarray(along), 0, 1)[:, : len(columns)])
+
+        def followed(place: tuple[Array, Commands]) -> tuple[Floats, Floats]:
+            part, commands = place
+            with float64():
+                here, along = _along(part, jnp.asarray(basis), commands, **self._static)
+            return np.asarray(here), np.moveaxis(np.asarray(along), 0, 1)[:, : len(columns)]
+
+        seen, slopes = zip(*each(followed, self._parts(values)), strict=True)
         return np.concatenate(seen)[: self._count], np.concatenate(slopes)[: self._count]
 
     def _differences(self, values: Floats, columns: tuple[int, ...]) -> tuple[Floats, Floats]:
@@ -154,9 +160,10 @@ class Simulator:
             slopes.append((self.predict(moved) - seen) / by)
         return seen, np.stack(slopes, axis=1)
 
-    def _parts(self, values: Floats) -> Iterator[tuple[Array, tuple[Array, ...]]]:
+    def _parts(self, values: Floats) -> list[tuple[Array, Commands]]:
         """Values of equally many breaths, with their commands; the last ones are made up."""
         extra = len(self._commands) * self._part - self._count
         filled = np.concatenate([values, np.repeat(values[:1], extra, axis=0)])
-        for i, commands in enumerate(self._commands):
-            yield jnp.asarray(filled[i * self._part : (i + 1) * self._part]), commands
+        with float64():
+            parts = [jnp.asarray(x) for x in np.split(filled, len(self._commands))]
+        return list(zip(parts, self._commands, strict=True))

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from ventbench.mismatch.naming.together import THREADS, each, threads
+from ventbench.physics.fits.together import THREADS, each, threads
 
 
 @pytest.mark.parametrize("count", ["1", "3"])

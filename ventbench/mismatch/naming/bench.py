@@ -27,7 +27,6 @@ from ventbench.physics.fits.derivatives import START
 from ventbench.physics.fits.least_squares import minimise
 from ventbench.physics.fits.noise import Noise
 from ventbench.physics.fits.problem import Problem, settings
-from ventbench.physics.fits.secant import Secant
 from ventbench.physics.fits.unknowns import described, unknowns
 
 #: Expected fall of the cost, nats, at which a comparison's search ends, and its most steps.
@@ -102,11 +101,9 @@ class Bench:
             x = leapt(problem, x)
         if EFFORT in hypothesis.names and (anew or near is None or EFFORT not in near.names):
             x = restarted(problem, x, refined=anew)
-        carry = Secant(problem)
         found = minimise(
-            carry.cost, carry.normal, x, low, high, near=carry.near, tolerance=tolerance,
-            iterations=iterations,
-        )  # fmt: skip
+            problem.cost, problem.normal, x, low, high, tolerance=tolerance, iterations=iterations
+        )
         return Solved(hypothesis, problem, found, float(problem.log_likelihood(found.x).sum()))
 
     def judged(self, solved: Solved) -> Floats:

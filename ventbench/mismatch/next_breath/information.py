@@ -103,8 +103,7 @@ def forecast(
     white = noise.whiten(seen, data.weight).reshape(len(data), -1)
     mine = np.array([_own(problem, column) for column in range(len(layout.paths))])
     index = layout.index[lung[0]]
-    hessian = problem.normal(fitted.minimum.x)[2]  # that of the minimum may be approximate
-    known = _information(hessian, index[~mine])
+    known = _information(fitted.minimum.hessian, index[~mine])
     return Forecast(white, rows[:, ~mine], rows[:, mine], problem.precision[index[mine]], known)
 
 

@@ -83,7 +83,7 @@ def minimise(
             step = _step(gradient, hessian, damping, pinned, low - x, high - x)
             trial = np.clip(x + step, low, high)
             expected = -float(gradient @ step + 0.5 * step @ hessian @ step)
-            over = abs(expected) < tolerance and damping <= 1e-2  # a bound can make it negative
+            over = expected < tolerance and damping <= 1e-2
             if over:
                 break
             reached = cost(trial)
@@ -92,7 +92,9 @@ def minimise(
                 break
             damping *= 8.0
         if not moved:  # no smaller value to be found, to rounding, unless the slopes are wrong
-            if not carried or (over and carried == 1 and _TRUSTED < gain < 1.0 / _TRUSTED):
+            trusted = carried == 1 and _TRUSTED < gain < 1.0 / _TRUSTED
+            # Where bounds cut a step short the slopes may expect a rise: they are wrong, then.
+            if not carried or (over and trusted and expected > -tolerance):
                 return Minimum(x, value, gradient, hessian, iteration, True)
             value, gradient, hessian = normal(x)
             iteration, carried = iteration + 1, 0

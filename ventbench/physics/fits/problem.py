@@ -80,58 +80,43 @@ class Problem:
 
     def cost(self, x: Floats) -> float:
         """Minus the logarithm of likelihood and prior, up to a constant; infinite if unstable."""
-        return self.cost_of(self.white(x), x)
-
-    def cost_of(self, white: Floats, x: Floats) -> float:
-        """The same, of whitened residuals that are known."""
-        prior = 0.5 * np.sum(self.precision * (x - self.mean) ** 2)
-        cost = float(np.sum(self.noise.loss(white)) + prior)
-        return cost if np.isfinite(cost) else np.inf
-
-    def white(self, x: Floats) -> Floats:
-        """Whitened residuals, ``(n, m)``."""
-        return self._flat(self.noise.whiten(self.residual(x), self.data.weight))
-
-    def linear(self, x: Floats) -> tuple[Floats, Floats]:
-        """Whitened residuals, and their derivatives by the coordinates, ``(n, k, m)``."""
-        residual, slopes = self.jacobian(x)
-        rows = self.noise.whiten(slopes, self.data.weight)
-        white = self._flat(self.noise.whiten(residual, self.data.weight))
-        return white, rows.reshape(*rows.shape[:2], -1)
+        return self._cost(self._white(self.residual(x)), x)
 
     def scores(self, x: Floats) -> tuple[float, Floats, Floats]:
         """Cost; its gradient by breath, ``(n, k)``; its Gauss-Newton Hessian, ``(n, k, k)``.
 
         Of the likelihood alone; the cost has the prior in it.
         """
-        white, rows = self.linear(x)
-        return (self.cost_of(white, x), *self._by_breath(white, rows))
+        residual, slopes = self.jacobian(x)
+        white = self._white(residual)
+        rows = self.noise.whiten(slopes, self.data.weight)
+        rows = rows.reshape(*rows.shape[:2], -1)
+        flat = white.reshape(len(white), -1)
+        weight = self.noise.influence(flat)
+        weighted = rows * weight[:, None]
+        gradient = np.matmul(weighted, flat[:, :, None])[:, :, 0]
+        return self._cost(white, x), gradient, np.matmul(weighted, rows.swapaxes(1, 2))
 
     def normal(self, x: Floats) -> tuple[float, Floats, Floats]:
         """Cost, gradient ``(U,)`` and Gauss-Newton Hessian ``(U, U)``."""
-        white, rows = self.linear(x)
-        return (self.cost_of(white, x), *self.equations(white, rows, x))
-
-    def equations(self, white: Floats, rows: Floats, x: Floats) -> tuple[Floats, Floats]:
-        """Gradient and Hessian of what :meth:`linear` gives at ``x``, or of what stands for it."""
-        by_breath, curvature = self._by_breath(white, rows)
+        cost, by_breath, curvature = self.scores(x)
         index = self.unknowns.index
         gradient = self.precision * (x - self.mean)
         np.add.at(gradient, index, by_breath)
         hessian = np.diag(self.precision)
         np.add.at(hessian, (index[:, :, None], index[:, None, :]), curvature)
-        return gradient, hessian
-
-    def _by_breath(self, white: Floats, rows: Floats) -> tuple[Floats, Floats]:
-        weighted = rows * self.noise.influence(white)[:, None]
-        gradient = np.matmul(weighted, white[:, :, None])[:, :, 0]
-        return gradient, np.matmul(weighted, rows.swapaxes(1, 2))
+        return cost, gradient, hessian
 
     def _residual(self, seen: Floats) -> Floats:
         return np.where(self.data.weight > 0, seen - self.data.seen, 0.0)
 
-    def _flat(self, white: Floats) -> Floats:
-        return white.reshape(len(white), -1)
+    def _white(self, residual: Floats) -> Floats:
+        return self.noise.whiten(residual, self.data.weight)
+
+    def _cost(self, white: Floats, x: Floats) -> float:
+        prior = 0.5 * np.sum(self.precision * (x - self.mean) ** 2)
+        cost = float(np.sum(self.noise.loss(white)) + prior)
+        return cost if np.isfinite(cost) else np.inf
 
 
 def settings(data: Data, names: tuple[str, ...], given: Mapping[str, ArrayLike]) -> Floats:

@@ -10,7 +10,6 @@ from ventbench.physics.fits.data import Floats
 from ventbench.physics.fits.fit import Fit
 from ventbench.physics.fits.intervals import quantile
 from ventbench.physics.fits.least_squares import minimise
-from ventbench.physics.fits.secant import Secant
 from ventbench.physics.fits.unknowns import described
 
 #: Refits towards either end, first to pass it and then to halve the distance.
@@ -84,10 +83,10 @@ def _plateau(fit: Fit, path: str, group: int) -> Interval | None:
     nearest = int(np.argmin(np.abs(grid - fit.value(path)[group])))
     costs = np.full(_GRID, np.inf)
     for side in (range(nearest, _GRID), range(nearest - 1, -1, -1)):
-        point, carry = fit.minimum.x, Secant(fit.problem)
+        point = fit.minimum.x
         beyond = 0
         for k in side:
-            costs[k], point = _pinned(carry, point, unknown, float(item.coordinate(grid[k])))
+            costs[k], point = _pinned(fit, point, unknown, float(item.coordinate(grid[k])))
             beyond = (
                 beyond + 1 if costs[k] > min(costs.min(), fit.minimum.cost + _DIP) + _FAR else 0
             )
@@ -110,10 +109,10 @@ def _end(fit: Fit, unknown: int, stride: float, allowed: float) -> float:
     low, high = fit.problem.unknowns.bounds()
     bound = low[unknown] if stride < 0 else high[unknown]
     inside, point = fit.minimum.x[unknown], fit.minimum.x
-    outside, carry = None, Secant(fit.problem)
+    outside = None
     for _ in range(_OUT):
         trial = float(np.clip(inside + stride, low[unknown], high[unknown]))
-        cost, end = _pinned(carry, point, unknown, trial)
+        cost, end = _pinned(fit, point, unknown, trial)
         if cost > allowed:
             outside = trial
             break
@@ -124,7 +123,7 @@ def _end(fit: Fit, unknown: int, stride: float, allowed: float) -> float:
         return float(inside)
     for _ in range(_IN):
         middle = 0.5 * (inside + outside)
-        cost, end = _pinned(carry, point, unknown, middle)
+        cost, end = _pinned(fit, point, unknown, middle)
         if cost > allowed:
             outside = middle
         else:
@@ -132,12 +131,9 @@ def _end(fit: Fit, unknown: int, stride: float, allowed: float) -> float:
     return float(0.5 * (inside + outside))
 
 
-def _pinned(carry: Secant, x: Floats, unknown: int, value: float) -> tuple[float, Floats]:
+def _pinned(fit: Fit, x: Floats, unknown: int, value: float) -> tuple[float, Floats]:
     """Lowest cost with one unknown held, searched from ``x``, and where it is."""
-    low, high = carry.problem.unknowns.bounds()
+    low, high = fit.problem.unknowns.bounds()
     low[unknown] = high[unknown] = value
-    end = minimise(
-        carry.cost, carry.normal, x, low, high, near=carry.near, warm=carry.known, tolerance=0.02,
-        iterations=8,
-    )  # fmt: skip
+    end = minimise(fit.problem.cost, fit.problem.normal, x, low, high, tolerance=0.02, iterations=8)
     return end.cost, end.x

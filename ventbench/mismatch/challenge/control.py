@@ -20,6 +20,9 @@ _LOOP = 1.3
 #: The valve closes above this pressure, cmH2O.
 _HIGH = 45.0
 
+#: PEEP that rigs are about, cmH2O.
+_PEEP = 5.0
+
 #: End of inspiration, s.
 INSPIRED = 1.0
 
@@ -31,9 +34,12 @@ class Controller:
         case: what is recorded.
         time: of the samples, s, ``(n, T)``.
         rng: what gains, targets and programmes are drawn from.
+        share: of the usual pressures above PEEP and commands.
     """
 
-    def __init__(self, case: Case, time: Floats, rng: np.random.Generator) -> None:
+    def __init__(
+        self, case: Case, time: Floats, rng: np.random.Generator, share: float = 1.0
+    ) -> None:
         n = len(time)
         self._time = time
         jump = 0.0228 * (case.lung_R + 32.0 / case.lung_C)  # cmH2O at the next sample per %
@@ -41,13 +47,13 @@ class Controller:
         gains = _GRID[np.less_equal(_GRID, highest)]
         self._kp = rng.choice(gains, n)
         self._ki = rng.choice(_GRID, n)
-        self._target = rng.uniform(10.0, 35.0, n)
+        self._target = share * rng.uniform(10.0, 35.0, n) + (1.0 - share) * _PEEP
         self._sum = np.zeros(n)
         explores = (rng.uniform(size=n) < 0.5) & (case.style == "mixed")
         programmed = explores & (rng.uniform(size=n) < 0.5)
-        added = _disturbance(case, time, rng)
+        added = share * _disturbance(case, time, rng)
         self._added = np.where((explores & ~programmed)[:, None], added, 0.0)
-        self._programme = np.where(programmed[:, None], _programme(case, time, rng), np.nan)
+        self._programme = np.where(programmed[:, None], share * _programme(case, time, rng), np.nan)
         kind = rng.integers(0, 3, n)
         self._bias = np.where(explores, np.where(kind == 0, 0.0, rng.uniform(0.0, 6.0, n)), 5.0)
         self._soft = ~explores

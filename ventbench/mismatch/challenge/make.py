@@ -21,9 +21,10 @@ from ventbench.recordings.schema import COLUMNS
 from ventbench.recordings.write import write
 from ventbench.training.executor import executor, results
 
-#: What a recording's pressure may be, and how often a case is recorded anew that leaves it.
+#: What a recording's pressure may be, and how often a case is recorded anew that leaves it: first
+#: with other commands, then with gentler ones, each time this share of those before.
 PRESSURE = COLUMNS["pressure"]
-_ATTEMPTS = 10
+_ATTEMPTS, _MORE, _GENTLER = 10, 10, 0.85
 
 
 def make(
@@ -85,11 +86,16 @@ def _one(secret: str, folder: Folder, item: Drawn) -> list[float]:
 
 
 def _recorded(secret: str, item: Drawn) -> Breaths:
-    """A recording within a sensor's range: with other commands, if those of before left it."""
+    """A recording within a sensor's range: with other commands, if those of before left it.
+
+    Lungs that stiffen steeply leave it with all of the usual ones.
+    """
     name = item.case.name
-    for attempt in range(_ATTEMPTS):
+    for attempt in range(_ATTEMPTS + _MORE):
         more = () if attempt == 0 else (f"again {attempt}",)
-        breaths = record(item.case, seal.generator(secret, "recording", name, *more))
+        share = _GENTLER ** max(attempt - _ATTEMPTS + 1, 0)
+        rng = seal.generator(secret, "recording", name, *more)
+        breaths = record(item.case, rng, share=share)
         if np.all((breaths.pressure >= PRESSURE.low) & (breaths.pressure <= PRESSURE.high)):
             return breaths
     span = f"{PRESSURE.low:g}..{PRESSURE.high:g} cmH2O"

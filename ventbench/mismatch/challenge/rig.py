@@ -32,17 +32,20 @@ def draw_base(lung_R: float, lung_C: float, rng: np.random.Generator) -> Base:
     )
 
 
-def record(case: Case, rng: np.random.Generator, *, steps: int | None = None) -> Breaths:
+def record(
+    case: Case, rng: np.random.Generator, *, steps: int | None = None, share: float = 1.0
+) -> Breaths:
     """Record a case, closed loop and explored; the labels are the lung setting's.
 
     Args:
         case: what is in it.
         rng: what times, gains, noise and efforts are drawn from, and the rig if the case has none.
         steps: of the integration between two samples; as many as it needs if None.
+        share: of the usual pressures above PEEP and commands.
     """
     base = case.base or draw_base(case.lung_R, case.lung_C, rng)
     time = sampling(case.breaths, case.samples, case.jitter, rng)
-    controller = Controller(case, time, rng)
+    controller = Controller(case, time, rng, share)
     return _run(case, base, time, expiratory(time), controller, np.arange(len(time)), rng, steps)
 
 

@@ -103,8 +103,8 @@ def test_a_recording_that_cannot_be_read_does_not_stop_the_others(tmp_path):
 def test_a_recording_beyond_the_sensors_range_is_made_anew(tmp_path, monkeypatch):
     drawn = []
 
-    def too_much_at_first(case, rng):
-        breaths = record(dataclasses.replace(case, breaths=4), rng)
+    def too_much_at_first(case, rng, *, share):
+        breaths = record(dataclasses.replace(case, breaths=4), rng, share=share)
         drawn.append(breaths)
         high = np.where(len(drawn) == 1, 200.0, breaths.pressure)
         return dataclasses.replace(breaths, pressure=high)

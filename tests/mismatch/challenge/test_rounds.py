@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from ventbench.mismatch.challenge.reveal import reveal
 from ventbench.mismatch.challenge.rig import record
 from ventbench.recordings import load
 
-from .truths import Found, mechanism, request
+from .truths import Found, mechanism, request, sees_nothing
 from .truths import answer as made_up
 
 SECRET = "for the test"
@@ -86,6 +87,18 @@ def test_answers_go_on_where_they_stopped(made):
     waiting = 3 - len(folder.answers())
     assert len(seen) == len(problems) == waiting
     assert all(text == "ValueError: no idea" for text in problems.values())
+
+
+def test_processes_make_room_for_new_ones(made, tmp_path, monkeypatch):
+    folder = Folder(tmp_path / "c")
+    shutil.copytree(made[0], folder.path, ignore=shutil.ignore_patterns("answers", "requests"))
+    monkeypatch.setattr("ventbench.mismatch.challenge.answer._CASES", 2)
+    told = []
+    found = answer(folder, jobs=1, diagnose=sees_nothing, progress=lambda *done: told.append(done))
+    assert found == {}
+    assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    firsts = [value["first_in_process"] for value in folder.answers().values()]
+    assert firsts == [True, False, True]
 
 
 def test_a_recording_that_cannot_be_read_does_not_stop_the_others(tmp_path):

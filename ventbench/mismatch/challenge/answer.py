@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import islice
 from typing import Any, Protocol
 
 from ventbench import compilation, files
@@ -26,6 +27,9 @@ _THREADS = {
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
     "VENTBENCH_THREADS": "1",
 }
+
+#: Cases a process, on average, before it makes room for a new one: it grows by a MiB or two a case.
+_CASES = 25
 
 #: Cases that this process has answered.
 _answered = 0
@@ -80,13 +84,24 @@ def answer(
     }
     done, failed = len(entries) - len(work), {}
     progress(done, len(entries))
-    with _one_thread(), executor(jobs) as pool:
-        for name, problem in results(pool, _one, work):
-            done += 1
-            progress(done, len(entries))
-            if problem:
-                failed[name] = problem
+    for part in _parts(work, _CASES * max(jobs, 1)):
+        with _one_thread(), executor(jobs) as pool:
+            for name, problem in results(pool, _one, part):
+                done += 1
+                progress(done, len(entries))
+                if problem:
+                    failed[name] = problem
     return failed
+
+
+def _parts(work: Mapping[str, tuple[Any, ...]], size: int) -> Iterator[dict[str, tuple[Any, ...]]]:
+    """In order, so many at a time.
+
+    ``max_tasks_per_child`` of an executor would do, but hangs in Python 3.11.
+    """
+    rest = iter(work.items())
+    while part := dict(islice(rest, size)):
+        yield part
 
 
 def _one(folder: Folder, name: str, lung: str, diagnose: Diagnose | None) -> str:

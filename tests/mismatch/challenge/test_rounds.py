@@ -165,9 +165,14 @@ def test_more_breaths_resolve(answered):
         return Found(made_up("named", *named)["diagnosis"])
 
     assert answer(second, jobs=0, diagnose=knows) == {}
-    found = reveal(second, SECRET).figures
-    resolved = next(f for f in found if f.what.startswith("confusable"))
+    found = reveal(second, SECRET)
+    resolved = next(f for f in found.figures if f.what.startswith("confusable"))
     assert (resolved.value, resolved.count) == (1.0, 3)
+    assert found.unanswered == ()
+    second.answer(names[0]).unlink()
+    assert reveal(second, SECRET).unanswered == (names[0],)
+    answered.request(names[0]).unlink()  # as if it had asked for nothing
+    assert reveal(second, SECRET).unanswered == ()
 
 
 def test_an_answer_to_another_recording_is_refused(answered):

@@ -24,7 +24,7 @@ class Revealed:
 
     Attributes:
         commitment: hash of the answers, checked.
-        unanswered: cases without an answer.
+        unanswered: cases without an answer; in the second round, of those that asked for breaths.
         cases: the others.
         figures: measured values with their goals.
         confusion: see :func:`~.confusion.confusion`.
@@ -78,12 +78,18 @@ def reveal(
         found += _against_oracle(folder, known, cases, jobs, progress)
     return Revealed(
         folder.commitment.read_text().split()[0],
-        tuple(drawn.case.name for drawn, _ in known if drawn.case.name not in cases),
+        tuple(name for name in _asked(folder) if name not in cases),
         tuple(cases.values()),
         tuple(found),
         confusion(list(cases.values())),
         by_effect(list(cases.values())),
     )
+
+
+def _asked(folder: Folder) -> list[str]:
+    """Cases that should have an answer: in the second round those that asked for breaths."""
+    first = Folder(folder.path)
+    return [n for n in folder.cases() if folder.round == 1 or first.request(n).is_file()]
 
 
 def _judged(folder: Folder, known: list[tuple[Drawn, list[float]]]) -> dict[str, Judged]:

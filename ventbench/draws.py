@@ -81,6 +81,9 @@ def build() -> dict[str, Floats]:
 def write(path: Path) -> str:
     """Write the file of :func:`build` and return its SHA-256.
 
+    It is :data:`SHA256` from Python 3.11.4 on. Older versions write the same arrays, with other
+    headers of the archive around them.
+
     Raises:
         OSError: if it cannot be written.
     """

@@ -12,6 +12,9 @@ from collections.abc import Callable, Mapping
 from ventbench.sandbox.child import wire
 from ventbench.sandbox.child.wire import Reply, WireError
 
+#: Of bytes that nothing had asked for, whether they are found with the reply or before the next.
+_UNASKED = "bytes came after the reply"
+
 #: What became of a cell: its reply, a breach of the wire's rules, or None: its pipe has ended.
 Outcome = Reply | WireError | None
 
@@ -71,7 +74,7 @@ class Pipes:
         found: dict[int, Outcome] = {}
         for key, _ in self._selector.select(0):
             data = self._read(key.fd)
-            found[key.data] = WireError("a reply came before its observation") if data else None
+            found[key.data] = WireError(_UNASKED) if data else None
         return found
 
     def send(self, frames: Mapping[int, bytes]) -> None:
@@ -107,7 +110,7 @@ class Pipes:
                 cell, data = key.data, self._read(key.fd)
                 try:
                     if cell not in due and data:
-                        raise WireError("bytes came after the reply")
+                        raise WireError(_UNASKED)
                     data = partial[cell] + data if data and cell in partial else data
                     outcome = wire.unpack_reply(data, sequence, (kind,)) if data else None
                 except WireError as error:

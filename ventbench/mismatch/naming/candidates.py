@@ -81,12 +81,15 @@ def _best(simulator: Simulator, places: list[Local], name: str) -> Candidate:
     best, start = np.zeros(len(places)), {}
     paths = [f"{name}.{first.name}", *(f"{name}.{p.name}" for p in others)]
     choices = [strengths(first), *(_ALSO.get(path, ()) or (None,) for path in paths[1:])]
+    work, points = [], []
     for setting, (k, place) in product(product(*choices), enumerate(places)):
         trial = place.values.copy()
         given = {p: v for p, v in zip(paths, setting, strict=True) if v is not None}
         for path, value in given.items():
             trial[:, order.index(path)] = value
-        seen = simulator.predict(trial)
+        work.append((k, place, given))
+        points.append(trial)
+    for (k, place, given), seen in zip(work, simulator.predict_all(np.stack(points)), strict=True):
         if not np.all(np.isfinite(seen)):
             continue
         nats, share = gain(place, place.template(seen))

@@ -68,12 +68,10 @@ def _answers(place: Local, duration: float) -> list[Floats]:
     """What an effort at each onset changes, ``(n, c, T)``."""
     simulator = place.problem.simulator
     columns = [simulator.names.index(f"{EFFORT}.{p}") for p in ("amplitude", "onset", "duration")]
-    answers = []
-    for onset in ONSETS:
-        trial = place.values.copy()
-        trial[:, columns] = (_AMPLITUDE, onset, duration)
-        answers.append(simulator.predict(trial) - place.seen)
-    return answers
+    points = np.repeat(place.values[None], len(ONSETS), axis=0)
+    for point, onset in zip(points, ONSETS, strict=True):
+        point[:, columns] = (_AMPLITUDE, onset, duration)
+    return list(simulator.predict_all(points) - place.seen)
 
 
 def _of(place: Local, duration: float, answers: list[Floats]) -> Evidence:

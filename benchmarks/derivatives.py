@@ -1,0 +1,97 @@
+"""Derivatives of a fit: by differences, as they are computed, and by forward-mode differentiation.
+
+Both of the same compiled model with all mechanisms, 20 made-up breaths of 80 samples, by the first
+parameters of the library. Usage:
+
+    python benchmarks/derivatives.py [--columns 8] [--repeats 5]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ventbench.physics import paths
+from ventbench.physics.fits import Simulator, derivatives, recorded, settings
+from ventbench.precision import float64
+from ventbench.recordings import Breaths
+
+BREATHS, SAMPLES, DT = 20, 80, 0.03
+
+
+def breaths() -> Breaths:
+    """Commands that step every 120 ms, then an open expiratory valve; pressures do not matter."""
+    shape = (BREATHS, SAMPLES)
+    steps = np.random.default_rng(0).uniform(0.0, 60.0, (BREATHS, SAMPLES // 4))
+    inspired = np.arange(SAMPLES) < SAMPLES // 2
+    return Breaths(
+        breath_id=np.arange(BREATHS), R=np.full(BREATHS, 20.0), C=np.full(BREATHS, 20.0),
+        time=np.broadcast_to(DT * np.arange(SAMPLES), shape), dt=np.full(shape, DT),
+        u_in=np.where(inspired, np.repeat(steps, 4, axis=1), 0.0),
+        u_out=np.broadcast_to(~inspired, shape).astype(np.int8), pressure=np.full(shape, 5.0),
+        valid=np.ones(shape, bool), time_inferred=np.zeros(BREATHS, bool),
+    )  # fmt: skip
+
+
+def exact(simulator: Simulator, values: np.ndarray, columns: int) -> Callable[[], object]:
+    """Forward mode along each column of ``values``, compiled."""
+    ((u_in, u_out, dt),) = simulator._commands
+    basis = np.eye(values.shape[1])[:columns]
+
+    @jax.jit
+    def slopes(values: jax.Array, basis: jax.Array) -> jax.Array:
+        run = partial(derivatives._run, commands=(u_in, u_out, dt), **simulator._static)
+
+        def along(direction: jax.Array) -> jax.Array:
+            return jax.jvp(run, (values,), (jnp.broadcast_to(direction, values.shape),))[1]
+
+        return jax.vmap(along)(basis)
+
+    def call() -> object:
+        with float64():
+            return np.asarray(slopes(jnp.asarray(values), jnp.asarray(basis)))
+
+    return call
+
+
+def seconds(call: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Of the first call, which compiles, and the least of the others."""
+    times = []
+    for _ in range(1 + repeats):
+        begun = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - begun)
+    return times[0], min(times[1:])
+
+
+def main() -> None:
+    """Print both times and their ratio."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--columns", type=int, default=8)
+    parser.add_argument("--repeats", type=int, default=5)
+    arguments = parser.parse_args()
+    data = recorded(breaths())
+    simulator = Simulator(data, paths(), sizes=(BREATHS,))
+    values = settings(data, paths(), {"PEEP": 5.0})
+    columns = tuple(range(arguments.columns))
+    ways = {
+        "pressures alone": lambda: simulator.predict(values),
+        "derivatives by differences": lambda: simulator.derivatives(values, columns),
+        "derivatives by forward mode": exact(simulator, values, arguments.columns),
+    }
+    found = {name: seconds(call, arguments.repeats) for name, call in ways.items()}
+    print(f"{BREATHS} breaths, {arguments.columns} parameters")
+    for name, (first, other) in found.items():
+        print(f"{name:28} {1e3 * other:6.1f} ms, the first time {first:5.1f} s")
+    _, differences, forward = (other for _, other in found.values())
+    print(f"differences take {differences / forward:.2f} of the time of forward mode")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,7 +1,7 @@
 """Derivatives of a fit: by differences, as they are computed, and by forward-mode differentiation.
 
-Both of the same compiled model with all mechanisms, 20 made-up breaths of 80 samples, by the first
-parameters of the library. Usage:
+Both of the same compiled model with all mechanisms, and with all slots too, on one core: 20 made-up
+breaths of 80 samples, by the first parameters of the model. Usage:
 
     python benchmarks/derivatives.py [--columns 8] [--repeats 5]
 """
@@ -9,6 +9,7 @@ parameters of the library. Usage:
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from collections.abc import Callable
 from functools import partial
@@ -17,7 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ventbench.physics import paths
+from ventbench.physics import library, paths
+from ventbench.physics.catalogue import slots
 from ventbench.physics.fits import Simulator, derivatives, recorded, settings
 from ventbench.precision import float64
 from ventbench.recordings import Breaths
@@ -70,27 +72,32 @@ def seconds(call: Callable[[], object], repeats: int) -> tuple[float, float]:
     return times[0], min(times[1:])
 
 
+def compare(names: tuple[str, ...], columns: int, repeats: int) -> None:
+    """Print times and their ratio for a model with some parameters."""
+    simulator = Simulator(recorded(breaths()), names, sizes=(BREATHS,))
+    values = settings(recorded(breaths()), names, {"PEEP": 5.0})
+    ways = {
+        "pressures alone": lambda: simulator.predict(values),
+        "derivatives by differences": lambda: simulator.derivatives(values, tuple(range(columns))),
+        "derivatives by forward mode": exact(simulator, values, columns),
+    }
+    found = {name: seconds(call, repeats) for name, call in ways.items()}
+    print(f"{BREATHS} breaths, {columns} of {len(names)} parameters")
+    for name, (first, other) in found.items():
+        print(f"  {name:28} {1e3 * other:6.1f} ms, the first time {first:5.1f} s")
+    _, differences, forward = (other for _, other in found.values())
+    print(f"  differences take {differences / forward:.2f} of the time of forward mode")
+
+
 def main() -> None:
-    """Print both times and their ratio."""
+    """Compare for the library, and for the library and all slots."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--columns", type=int, default=8)
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
-    data = recorded(breaths())
-    simulator = Simulator(data, paths(), sizes=(BREATHS,))
-    values = settings(data, paths(), {"PEEP": 5.0})
-    columns = tuple(range(arguments.columns))
-    ways = {
-        "pressures alone": lambda: simulator.predict(values),
-        "derivatives by differences": lambda: simulator.derivatives(values, columns),
-        "derivatives by forward mode": exact(simulator, values, arguments.columns),
-    }
-    found = {name: seconds(call, arguments.repeats) for name, call in ways.items()}
-    print(f"{BREATHS} breaths, {arguments.columns} parameters")
-    for name, (first, other) in found.items():
-        print(f"{name:28} {1e3 * other:6.1f} ms, the first time {first:5.1f} s")
-    _, differences, forward = (other for _, other in found.values())
-    print(f"differences take {differences / forward:.2f} of the time of forward mode")
+    os.environ["VENTBENCH_THREADS"] = "1"
+    for names in (paths(), paths((*library(), *slots()))):
+        compare(names, arguments.columns, arguments.repeats)
 
 
 if __name__ == "__main__":

@@ -144,10 +144,11 @@ class Simulator:
     def derivatives(self, values: Floats, columns: tuple[int, ...]) -> tuple[Floats, Floats]:
         """Also its derivatives with respect to k columns of ``values``, ``(n, k, c, T)``.
 
-        By differences, since a point takes half the time of an exact derivative in one direction,
-        and its compilation half the memory. Everything is continuous in the parameters that
-        are fitted; those that are not, such as the bias of a rounding, are tried one by one. Where
-        an effect of either sign is off there may be a kink: it is the mean of both sides' slopes.
+        By differences, since a point takes two thirds of the time of an exact derivative in one
+        direction, and half to compile (``benchmarks/derivatives.py``). Pressures are continuous in
+        all that is fitted; what they are not, such as the bias of a rounding, is tried value by
+        value. Where an effect of either sign is off there may be a kink: it is the mean of both
+        sides' slopes.
         """
         moves = np.stack([self._move(values[:, column], column) for column in columns])
         off = [k for k, column in enumerate(columns) if self._is_off(values[:, column], column)]

@@ -1,7 +1,8 @@
 """Derivatives of a fit: by differences, as they are computed, and by forward-mode differentiation.
 
-Both of the same compiled model with all mechanisms, and with all slots too, on one core: 20 made-up
-breaths of 80 samples, by the first parameters of the model. Usage:
+Both of the same model with all mechanisms, and with all slots too, on one core: 40 made-up breaths
+of 80 samples, by the first parameters of the model. Differences skip mechanisms that are off;
+forward mode cannot, since they have slopes. Usage:
 
     python benchmarks/derivatives.py [--columns 8] [--repeats 5]
 """
@@ -18,13 +19,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ventbench.physics import library, paths
+from ventbench.physics import library, parameter, paths
 from ventbench.physics.catalogue import slots
 from ventbench.physics.fits import Simulator, derivatives, recorded, settings
 from ventbench.precision import float64
 from ventbench.recordings import Breaths
 
-BREATHS, SAMPLES, DT = 20, 80, 0.03
+BREATHS, SAMPLES, DT = 40, 80, 0.03
 
 
 def breaths() -> Breaths:
@@ -48,7 +49,8 @@ def exact(simulator: Simulator, values: np.ndarray, columns: int) -> Callable[[]
 
     @jax.jit
     def slopes(values: jax.Array, basis: jax.Array) -> jax.Array:
-        run = partial(derivatives._run, commands=(u_in, u_out, dt), **simulator._static)
+        static = simulator._static | {"skip_idle": False}
+        run = partial(derivatives._run, commands=(u_in, u_out, dt), **static)
 
         def along(direction: jax.Array) -> jax.Array:
             return jax.jvp(run, (values,), (jnp.broadcast_to(direction, values.shape),))[1]
@@ -75,18 +77,25 @@ def seconds(call: Callable[[], object], repeats: int) -> tuple[float, float]:
 def compare(names: tuple[str, ...], columns: int, repeats: int) -> None:
     """Print times and their ratio for a model with some parameters."""
     simulator = Simulator(recorded(breaths()), names, sizes=(BREATHS,))
-    values = settings(recorded(breaths()), names, {"PEEP": 5.0})
-    ways = {
-        "pressures alone": lambda: simulator.predict(values),
-        "derivatives by differences": lambda: simulator.derivatives(values, tuple(range(columns))),
-        "derivatives by forward mode": exact(simulator, values, columns),
-    }
-    found = {name: seconds(call, repeats) for name, call in ways.items()}
-    print(f"{BREATHS} breaths, {columns} of {len(names)} parameters")
-    for name, (first, other) in found.items():
-        print(f"  {name:28} {1e3 * other:6.1f} ms, the first time {first:5.1f} s")
-    _, differences, forward = (other for _, other in found.values())
-    print(f"  differences take {differences / forward:.2f} of the time of forward mode")
+    few = {"PEEP": 5.0, "valve_lag.tau": 0.03, "leak.conductance": 5.0}
+    mild = {name: parameter(name).mild for name in names if "." in name}
+    off = {"command_rounding.amount": 0.0}  # has no slope
+    print(f"{BREATHS} breaths, {columns} of {len(names)} parameters, ms")
+    print(f"  {'':12}{'pressures':>12}{'differences':>14}{'forward mode':>14}{'ratio':>8}")
+    firsts = []
+    for label, given in (("none acts", {}), ("two act", few), ("all act", mild | off)):
+        values = settings(recorded(breaths()), names, given)
+        ways = (
+            partial(simulator.predict, values),
+            partial(simulator.derivatives, values, tuple(range(columns))),
+            exact(simulator, values, columns),
+        )
+        found = [seconds(way, repeats) for way in ways]
+        alone, differences, forward = (1e3 * least for _, least in found)
+        ratio = differences / forward
+        print(f"  {label:12}{alone:12.1f}{differences:14.1f}{forward:14.1f}{ratio:8.2f}")
+        firsts.append([first for first, _ in found])
+    print("  to compile, s: {:.1f}, {:.1f}, {:.1f}".format(*firsts[0]))
 
 
 def main() -> None:

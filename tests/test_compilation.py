@@ -43,3 +43,48 @@ def test_a_folder_that_cannot_be_made_is_no_reason_to_fail(monkeypatch, tmp_path
     before = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     compilation.keep()
     assert jax.config.jax_compilation_cache_dir == before  # type: ignore[attr-defined]
+
+
+class Library:
+    """What a C library answers, and what it was asked."""
+
+    def __init__(self):
+        self.asked = []
+
+    def mallopt(self, option, value):
+        self.asked.append(("mallopt", option, value))
+
+    def malloc_trim(self, pad):
+        self.asked.append(("malloc_trim", pad))
+
+
+@pytest.fixture
+def anew():
+    compilation._hand_back.cache_clear()
+    yield
+    compilation._hand_back.cache_clear()
+
+
+def test_memory_goes_back_after_each_long_compilation(monkeypatch, anew):
+    library = Library()
+    monkeypatch.setattr(compilation.ctypes, "CDLL", lambda name: library)
+    monkeypatch.setenv("VENTBENCH_CACHE", "")
+    compilation.keep()
+    compilation.keep()
+    assert [name for name, *_ in library.asked] == ["mallopt"]
+    for event, seconds in ((compilation._COMPILED, 3.0), (compilation._COMPILED, 0.1), ("/x", 3.0)):
+        jax.monitoring.record_event_duration_secs(event, seconds)
+    assert library.asked[1:] == [("malloc_trim", 0)]
+
+
+def test_jax_still_tells_when_it_has_compiled():
+    told = []
+    jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: told.append(event))
+    jax.jit(lambda x: 3.25 * x)(1.0)
+    assert compilation._COMPILED in told
+
+
+def test_another_c_library_is_left_alone(monkeypatch, anew):
+    monkeypatch.setattr(compilation.ctypes, "CDLL", lambda name: object())
+    monkeypatch.setenv("VENTBENCH_CACHE", "")
+    compilation.keep()

@@ -57,7 +57,8 @@ def exact(simulator):
     @jax.jit
     def slope(values, direction):
         def run(values):
-            return derivatives._run(values, commands, **simulator._static)
+            static = simulator._static | {"skip_idle": False}
+            return derivatives._run(values, commands, **static)
 
         return jax.jvp(run, (values,), (jnp.broadcast_to(direction, values.shape),))[1]
 

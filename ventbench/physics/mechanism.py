@@ -62,7 +62,8 @@ class Mechanism:
     """Base of all mechanisms: does nothing. A mechanism overrides what it changes.
 
     All methods are pure and elementwise over arrays ``(...)``; at the neutral strength each must
-    return what the base class returns. Mechanisms at the same place act in the order of ``rank``.
+    return what the base class returns, as fits skip it where all its parameters are neutral.
+    Mechanisms at the same place act in the order of ``rank``.
     """
 
     description: Description

@@ -9,6 +9,7 @@ inertance, whose equations are algebraic, need no case of their own.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import flax.struct
@@ -21,7 +22,8 @@ from ventbench.errors import InputError
 from ventbench.lungs import Lung
 from ventbench.physics import stage, times
 from ventbench.physics.catalogue import everything, parameter, paths
-from ventbench.physics.stage import Parts, Stage
+from ventbench.physics.parts import Parts, sort
+from ventbench.physics.stage import Stage
 
 
 @flax.struct.dataclass
@@ -59,12 +61,15 @@ class Physics:
             of its parameters is named; one at its neutral strength changes nothing.
         substeps: of a sample.
         memory: samples that dead times can reach back over.
+        skip_idle: skip mechanisms whose parameters are neutral in all elements. Much faster where
+            few of many act; derivatives by the parameters of the others come out as zero.
     """
 
     values: tuple[Array, ...]
     names: tuple[str, ...] = flax.struct.field(pytree_node=False)
     substeps: int = flax.struct.field(pytree_node=False, default=times.SUBSTEPS)
     memory: int = flax.struct.field(pytree_node=False, default=times.MEMORY)
+    skip_idle: bool = flax.struct.field(pytree_node=False, default=False)
 
     def init(self, pressure: Array, peep: Array | None = None) -> PhysicsState:
         """Lung at rest, expiratory valve open; see :class:`~ventbench.plants.base.Plant`.
@@ -79,7 +84,8 @@ class Physics:
             peep = parts.base["PEEP"] if "PEEP" in self.names else shown
         u_in = parts.base["rest"] + 0.0 * shown
         memory = {name: u_in for name, item in parts.mechanisms.items() if item.remembers}
-        flow, memory = stage.commanded(parts, u_in, memory)
+        # Idle ones too: what they remember takes its shape here.
+        flow, memory = stage.commanded(replace(parts, acting={}), u_in, memory)
         now, one = stage.at_rest(parts, shown, flow), jnp.ones_like(flow)
         return PhysicsState(
             now, memory, _repeat(flow, self.memory + 1), _repeat(one, self.memory + 1),
@@ -115,9 +121,9 @@ class Physics:
         opened = _push(u_out + zero, state.opened)
         late = parts.total(lambda item, own: item.dead_time(own))
         late_out = parts.total(lambda item, own: item.outlet_dead_time(own, u_out))
-        lengths = times.lengths(dt + zero, state.past, (late_out, late), self.substeps)
-        wanted = times.held(late, lengths, state.past, commanded)
-        open_for = times.held(late_out, lengths, state.past, opened)
+        lengths, open_for, wanted = times.windows(
+            dt, state.past, (late_out, late), (opened, commanded), self.substeps, self.skip_idle
+        )
 
         def substep(carry: tuple[Any, Array], held: tuple[Array, ...]) -> tuple[Any, None]:
             (now, time), (wanted, opened, h) = carry, held
@@ -165,7 +171,8 @@ class Physics:
         )
 
     def _parts(self) -> Parts:
-        return stage.parts(dict(zip(self.names, self.values, strict=True)), everything())
+        named = dict(zip(self.names, self.values, strict=True))
+        return sort(named, everything(), self.skip_idle)
 
 
 def physics(

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.physics import base
 from ventbench.physics.mechanism import Mechanism, Values
 from ventbench.physics.network import Network, View
+from ventbench.physics.parts import Parts
 
 #: Share of a substep after which the first stage of the SDIRK method lies.
 GAMMA = 1.0 - 0.5**0.5
 
-_BASE = {item.name: item.neutral for item in base.PARAMETERS}
+Pair = tuple[Array, Array]
 
 
 @flax.struct.dataclass
@@ -39,40 +40,13 @@ class Stage:
     own: dict[str, Array]
 
 
-@dataclass(frozen=True)
-class Parts:
-    """Parameters sorted by owner, and the mechanisms that act, in order of rank."""
-
-    base: Values
-    mechanisms: dict[str, Mechanism]
-    own: dict[str, Values]
-
-    def total(self, term: Callable[[Mechanism, Values], Array | float]) -> Array | float:
-        """Sum over mechanisms."""
-        return sum(term(item, self.own[name]) for name, item in self.mechanisms.items())
-
-
-def parts(named: Mapping[str, Array], library: Mapping[str, Mechanism]) -> Parts:
-    """Sort parameters, given by path, and fill in what is not named."""
-    # Arrays of numpy, as a file gives them, become what dead times are told by.
-    named = {path: jnp.asarray(value) for path, value in named.items()}
-    owners = {path.rpartition(".")[0] for path in named}
-    acting = sorted((n for n in library if n in owners), key=lambda n: (library[n].rank, n))
-    own = {}
-    for name in acting:
-        items = library[name].description.parameters
-        own[name] = {p.name: named.get(f"{name}.{p.name}", jnp.asarray(p.neutral)) for p in items}
-    given = {name: named.get(name, jnp.asarray(value)) for name, value in _BASE.items()}
-    return Parts(given, {name: library[name] for name in acting}, own)
-
-
 def commanded(
     parts: Parts, u_in: Array, memory: dict[str, Array]
 ) -> tuple[Array, dict[str, Array]]:
     """Flow that a command asks for once the valve has settled, L/s, and what is remembered."""
     memory = dict(memory)
     for name, item in parts.mechanisms.items():
-        u_in, kept = item.command(parts.own[name], u_in, memory.get(name, u_in))
+        u_in, kept = parts.change(name, _command, (u_in, memory.get(name, u_in)))
         if item.remembers:
             memory[name] = kept
     return parts.base["gain"] * 1e-3 * u_in, memory
@@ -95,11 +69,16 @@ def at_rest(parts: Parts, shown: Array, flow: Array) -> Stage:
     now = Stage(zero, zero, pressure + zero, pressure + zero, own)
     goal = pressure + parts.base["offset"]
     volume = goal * 1e-3 * parts.base["C"] + zero
-    for _ in range(6):
+
+    def closer(volume: Array, _: None) -> tuple[Array, None]:
         still = now.replace(volume=volume)  # type: ignore[attr-defined]
         # A long step, in which stresses relax; before the breath, so that no muscle pulls.
-        network = _network(parts, still, still, flow, zero, zero - 1e3, zero + 1e6, pressure)
-        volume = volume - (network.recoil - goal) / network.elastance
+        view = _view(parts, still, still, zero, zero - 1e3, zero + 1e6, pressure)
+        network = _network(parts, still, flow, view, lambda name: own.get(name, zero))
+        return volume - (network.recoil - goal) / network.elastance, None
+
+    # A loop, as unrolled it would be most of what is to be compiled.
+    volume, _ = jax.lax.scan(closer, volume, None, length=6)
     return now.replace(volume=volume)  # type: ignore[attr-defined]
 
 
@@ -110,9 +89,8 @@ def substep(
 
     def advance(guess: Stage, place: tuple[Array, Array]) -> tuple[Stage, None]:
         ahead, share = place
-        start = jax.tree.map(lambda a, b: a + ahead * (b - a), now, guess)
         end = time + share * h
-        return _implicit(parts, start, guess, wanted, opened, end, GAMMA * h, peep), None
+        return _implicit(parts, now, guess, ahead, wanted, opened, end, GAMMA * h, peep), None
 
     places = jnp.asarray([[0.0, GAMMA], [(1.0 - GAMMA) / GAMMA, 1.0]], h.dtype)
     return jax.lax.scan(advance, now, (places[:, 0], places[:, 1]))[0]
@@ -127,61 +105,98 @@ def shown(parts: Parts, reading: Array) -> Array:
 
 def _implicit(
     parts: Parts,
-    start: Stage,
+    now: Stage,
     guess: Stage,
+    ahead: Array,
     wanted: Array,
     opened: Array,
     time: Array,
     length: Array,
     peep: Array,
 ) -> Stage:
-    """Backward step of ``length`` seconds that ends at ``time``; ``guess`` is near its end."""
-    own, flow = dict(start.own), wanted
+    """Backward step of ``length`` seconds that ends at ``time``.
+
+    It starts ``ahead`` of the way from ``now`` to ``guess``, which is near its end.
+    """
+
+    def between(before: Any, after: Any) -> Any:
+        return jax.tree.map(lambda a, b: a + ahead * (b - a), before, after)
+
+    def state(name: str) -> Array:  # called by hooks alone: nothing is computed for idle ones
+        return between(now.own[name], guess.own[name]) if name in now.own else 0.0 * now.volume
+
+    start = between(now.replace(own={}), guess.replace(own={}))  # type: ignore[attr-defined]
+    own, flow = dict(guess.own), wanted
     for name, item in parts.mechanisms.items():
-        flow, kept = item.inflow(parts.own[name], flow, start.own.get(name, flow), length)
-        if item.stateful:
-            own[name] = kept
-    network = _network(parts, start, guess, flow, opened, time, length, peep)
+        if _has(item, "inflow"):
+            before = (flow, own.get(name, flow))
+            flow, kept = parts.change(name, _inflow, before, partial(state, name), length)
+            own |= {name: kept} if item.stateful else {}
+    view = _view(parts, start, guess, opened, time, length, peep)
+    network = _network(parts, start, flow, view, state)
     pressure, flow = network.solve(start.pressure, start.flow, length)
     reading = pressure
     for name, item in parts.mechanisms.items():
-        values = parts.own[name]
-        reading, kept = item.reading(values, reading, own.get(name, reading), length)
-        if item.stateful:
-            view = _view(parts, start, guess, kept, opened, time, length, peep)
-            own[name] = item.settle(values, kept, flow, view)
+        if _has(item, "reading") or _has(item, "settle"):
+            before = (reading, own.get(name, reading))
+            first = None if _has(item, "inflow") else partial(state, name)
+            reading, kept = parts.change(name, _after, before, first, flow, view)
+            own |= {name: kept} if item.stateful else {}
     return Stage(start.volume + flow * length, flow, pressure, reading, own)
 
 
-def _view(
-    parts: Parts, start: Stage, guess: Stage, own: Array, opened: Array, time: Array, length: Array,
-    peep: Array,
-) -> View:  # fmt: skip
-    return View(
-        time, start.volume, guess.pressure, guess.flow, own, length, 1e3 / parts.base["C"], peep,
-        parts.base["position"], parts.base["R"], 1.0 / parts.base["R_ex"], opened,
-    )  # fmt: skip
-
-
 def _network(
-    parts: Parts,
-    start: Stage,
-    guess: Stage,
-    inflow: Array,
-    opened: Array,
-    time: Array,
-    length: Array,
-    peep: Array,
+    parts: Parts, start: Stage, inflow: Array, view: View, state: Callable[[str], Array]
 ) -> Network:
     zero = jnp.zeros_like(start.volume)
-    elastance = 1e3 / parts.base["C"]
     network = Network(
-        inflow=inflow, circuit=zero, leak=zero, leak_flow=zero,
-        outlet=opened / parts.base["R_ex"], behind=peep, resistance=parts.base["R"] + zero,
-        quadratic=zero, inertance=zero, recoil=elastance * start.volume, elastance=elastance + zero,
+        inflow=inflow, circuit=zero, leak=zero, leak_flow=zero, outlet=view.opened * view.outlet,
+        behind=view.peep, resistance=view.resistance + zero, quadratic=zero, inertance=zero,
+        recoil=view.elastance * start.volume, elastance=view.elastance + zero,
     )  # fmt: skip
     for name, item in parts.mechanisms.items():
-        own = start.own.get(name, zero)
-        view = _view(parts, start, guess, own, opened, time, length, peep)
-        network = item.network(parts.own[name], network, view)
+        if _has(item, "network"):
+            network = parts.change(name, _joined, network, partial(state, name), view)
     return network
+
+
+def _view(
+    parts: Parts, start: Stage, guess: Stage, opened: Array, time: Array, length: Array, peep: Array
+) -> View:
+    base = parts.base
+    return View(
+        time, start.volume, guess.pressure, guess.flow, jnp.zeros_like(start.volume), length,
+        1e3 / base["C"], peep, base["position"], base["R"], 1.0 / base["R_ex"], opened,
+    )  # fmt: skip
+
+
+def _command(item: Mechanism, own: Values, before: Pair) -> Pair:
+    return item.command(own, *before)
+
+
+def _inflow(
+    item: Mechanism, own: Values, before: Pair, state: Callable[[], Array], length: Array
+) -> Pair:
+    return item.inflow(own, before[0], state() if item.stateful else before[1], length)
+
+
+def _joined(
+    item: Mechanism, own: Values, network: Network, state: Callable[[], Array], view: View
+) -> Network:
+    return item.network(own, network, view.replace(state=state()))  # type: ignore[attr-defined]
+
+
+def _after(
+    item: Mechanism, own: Values, before: Pair, state: Callable[[], Array] | None, flow: Array,
+    view: View,
+) -> Pair:  # fmt: skip
+    reading, kept = before
+    if item.stateful and state is not None:
+        kept = state()
+    reading, kept = item.reading(own, reading, kept, view.length)
+    view = view.replace(state=kept)  # type: ignore[attr-defined]
+    return reading, item.settle(own, kept, flow, view) if item.stateful else kept
+
+
+def _has(item: Mechanism, hook: str) -> bool:
+    return getattr(type(item), hook) is not getattr(Mechanism, hook)

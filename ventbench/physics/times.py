@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ventbench.physics.idle import unless_idle
 from ventbench.plants.delay import shares
 
 #: Substeps of a sample of about 30 ms, and samples that a dead time may reach back over.
@@ -25,7 +27,40 @@ def resolution(dt: float) -> tuple[int, int]:
     return max(4, round(dt / LONGEST_SUBSTEP + 0.4)), math.ceil(LONGEST_DEAD_TIME / dt) + 1
 
 
-def lengths(dt: Array, past: Array, late: tuple[Array | float, ...], count: int) -> Array:
+def windows(
+    dt: Array, past: Array, late: tuple[Array | float, ...], held: tuple[Array, ...], count: int,
+    skip_idle: bool = False,
+) -> tuple[Array, ...]:  # fmt: skip
+    """Cut a sample into substeps, and see what delayed commands are during each of them.
+
+    Args:
+        dt: length of the sample, s, ``(...)``.
+        past: durations of the samples before, the latest first, s, ``(..., P)``.
+        late: dead times, s, the most important first; numbers where no mechanism has one.
+        held: the command that each of them delays, the latest first, ``(..., P + 1)``.
+        count: of substeps, at least 3.
+        skip_idle: spare what dead times cost if they are zero in all elements.
+
+    Returns:
+        Lengths, s, and the mean of each command, ``(..., count)`` each.
+    """
+    dt = dt + 0.0 * held[0][..., 0]
+    delays = [delay for delay in late if isinstance(delay, jax.Array)]
+    cut = lengths(dt, past, (), count)
+    if delays:
+        some = _some(delays) if skip_idle else None
+        cut = unless_idle(some, lambda _: lengths(dt, past, tuple(delays), count), cut)
+    means = []
+    for delay, values in zip(late, held, strict=True):
+        mean = values[..., :1] + 0.0 * cut
+        if isinstance(delay, jax.Array):
+            delayed = partial(_mean, late=delay, lengths=cut, past=past, values=values)
+            mean = unless_idle(_some([delay]) if skip_idle else None, delayed, mean)
+        means.append(mean)
+    return cut, *means
+
+
+def lengths(dt: Array, past: Array, late: tuple[Array, ...], count: int) -> Array:
     """Cut a sample into substeps.
 
     A valve that opens within a substep is not the same as one that is half open throughout, so that
@@ -46,9 +81,7 @@ def lengths(dt: Array, past: Array, late: tuple[Array | float, ...], count: int)
     cuts = room * (jnp.arange(1, count - 1) / (count - 1)).astype(dt.dtype)
     free = jnp.ones_like(cuts)
     for delay in late[: count - 2]:
-        if not isinstance(delay, jax.Array):
-            continue
-        behind = jnp.concatenate([jnp.zeros_like(room), jnp.cumsum(past, axis=-1)], axis=-1)
+        behind = jnp.concatenate([jnp.zeros_like(room), _sums(past)], axis=-1)
         arrives = (delay + 0.0 * dt)[..., None] - behind
         here = (arrives > 0.0) & (arrives < room)
         edge = jnp.sum(jnp.where(here, arrives, 0.0) * _first(here), axis=-1, keepdims=True)
@@ -57,20 +90,44 @@ def lengths(dt: Array, past: Array, late: tuple[Array | float, ...], count: int)
         nearest = nearest * jnp.any(here, axis=-1, keepdims=True)
         cuts = jnp.where(nearest > 0, edge, cuts)
         free = free * (1.0 - nearest)
-    ends = jnp.concatenate([jnp.zeros_like(room), jnp.sort(cuts, axis=-1), room, dt[..., None]], -1)
+    ends = jnp.concatenate([jnp.zeros_like(room), _sorted(cuts), room, dt[..., None]], -1)
     # Two cuts may coincide; nothing may be divided by zero.
     return jnp.maximum(jnp.diff(ends, axis=-1), 1e-6 * dt[..., None])
 
 
-def held(late: Array | float, lengths: Array, past: Array, values: Array) -> Array:
+def _mean(_: Array, late: Array, lengths: Array, past: Array, values: Array) -> Array:
     """Mean over each substep of what was commanded ``late`` seconds before, ``(..., K)``."""
-    if not isinstance(late, jax.Array):  # no mechanism has a dead time
-        return values[..., :1] + 0.0 * lengths
-    starts = jnp.cumsum(lengths, axis=-1) - lengths - (late + 0.0 * lengths[..., 0])[..., None]
+    starts = _sums(lengths) - lengths - (late + 0.0 * lengths[..., 0])[..., None]
     weights = shares(starts, lengths, past[..., None, :])
     return jnp.sum(weights * values[..., None, :], axis=-1)
 
 
+def _some(delays: list[Array]) -> Array:
+    """Whether any dead time is not zero in any element, ``()``."""
+    return jnp.any(jnp.stack([jnp.any(delay != 0.0) for delay in delays]))
+
+
 def _first(mask: Array) -> Array:
     """One at the first True along the last axis, zero elsewhere."""
-    return (mask & (jnp.cumsum(mask, axis=-1) == 1)).astype(float)
+    return (mask & (_sums(mask.astype(float)) == 1.0)).astype(float)
+
+
+def _sums(values: Array) -> Array:
+    """Running sums along a short last axis."""
+    total, sums = jnp.zeros_like(values[..., 0]), []
+    for k in range(values.shape[-1]):
+        total = total + values[..., k]
+        sums.append(total)
+    return jnp.stack(sums, axis=-1)
+
+
+def _sorted(values: Array) -> Array:
+    """Sorted along a short last axis, by exchanges of neighbours."""
+    rows = [values[..., k] for k in range(values.shape[-1])]
+    for end in range(len(rows) - 1, 0, -1):
+        for k in range(end):
+            rows[k], rows[k + 1] = (
+                jnp.minimum(rows[k], rows[k + 1]),
+                jnp.maximum(rows[k], rows[k + 1]),
+            )
+    return jnp.stack(rows, axis=-1)

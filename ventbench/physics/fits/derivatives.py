@@ -40,7 +40,7 @@ _APART_START = 1e-6
 #: its edge: what is left of that error, up to 0.03 cmH2O, must not make a slope.
 _APART_LATE = 1e-3
 
-_STATIC = ("names", "substeps", "memory", "flow")
+_STATIC = ("names", "substeps", "memory", "flow", "skip_idle")
 
 #: Both valves, %, 0/1, and the time for which they are held, s, each ``(n, T)``.
 Commands = tuple[Array, Array, Array]
@@ -48,24 +48,26 @@ Commands = tuple[Array, Array, Array]
 
 def _run(
     values: Array, commands: Commands, names: tuple[str, ...], substeps: int,
-    memory: int, flow: bool,
+    memory: int, flow: bool, skip_idle: bool,
 ) -> Array:  # fmt: skip
-    plant = Physics(tuple(values.T[:-1]), names, substeps, memory)
+    plant = Physics(
+        tuple(jnp.moveaxis(values[..., :-1], -1, 0)), names, substeps, memory, skip_idle
+    )
 
     def step(state: object, command: tuple[Array, Array, Array]) -> tuple[object, Array]:
         state, (pressure, flow_in, _) = plant.observe(state, *command)  # type: ignore[arg-type]
         return state, jnp.stack([pressure, flow_in] if flow else [pressure])
 
-    start = values[:, -1]
+    start = values[..., -1]
     held = jax.tree.map(lambda x: jnp.moveaxis(x[:, :-1], 1, 0), commands)
     _, seen = jax.lax.scan(step, plant.init(start), held)
     first = jnp.stack([start, 0.0 * start] if flow else [start])
-    return jnp.moveaxis(jnp.concatenate([first[None], seen]), (0, 1, 2), (2, 1, 0))
+    return jnp.moveaxis(jnp.concatenate([first[None], seen]), (0, 1), (-1, -2))
 
 
 @partial(jax.jit, static_argnames=_STATIC)
 def _predict(points: Array, commands: Commands, **static: object) -> Array:
-    return jax.vmap(lambda values: _run(values, commands, **static))(points)  # type: ignore[arg-type]
+    return _run(points, commands, **static)  # type: ignore[arg-type]
 
 
 class Simulator:
@@ -105,7 +107,8 @@ class Simulator:
         self.substeps, self.memory = substeps or enough, memory
         flow = data.seen.shape[1] > 1
         self._static = {
-            "names": names, "substeps": self.substeps, "memory": memory, "flow": flow
+            "names": names, "substeps": self.substeps, "memory": memory, "flow": flow,
+            "skip_idle": True,
         }  # fmt: skip
         with float64():
             u_in, u_out, dt = (

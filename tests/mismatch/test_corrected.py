@@ -93,6 +93,29 @@ def test_of_the_base_model_is_kept_what_does_not_throw_breaths_far_off(
     assert (one.plants, one.notes) == ("full", ())
 
 
+def test_a_few_breaths_far_off_are_enough(breaths, monkeypatch):
+    """Though most are better than refitted, and the mean error with them."""
+    before = simulators.answers(plants(R=10.0), breaths)
+    error, held = breaths.pressure - before, split.held_out(breaths)
+    left = np.full((len(breaths), 1), 0.1)
+    left[np.flatnonzero(~held)[0]] = 2.5
+
+    def pressures(solved: Any, held: Any, first: Any) -> np.ndarray:
+        return breaths.pressure - {"null": 0.5, "full": left, "named": 0.3}[solved.which] * error
+
+    solved = {k: SimpleNamespace(which=k, names=("leak",)) for k in ("null", "full", "named")}
+    found: Any = SimpleNamespace(
+        conclusion=SimpleNamespace(**solved, place=object()), bench=None, pressures=pressures,
+        fit=solved["full"],
+    )  # fmt: skip
+    fitted = ~held[:, None] & breaths.valid & (breaths.time > 0)
+    means = [np.abs(x * error)[fitted].mean() for x in (left, 0.5)]
+    assert means[0] < means[1]
+    monkeypatch.setattr(module.estimates, "plants_of", lambda one, bench: one.which)
+    one = corrected(breaths, held, before, found, None, "physics")
+    assert (one.plants, len(one.notes)) == ("named", 1)
+
+
 def test_held_out_breaths_do_not_decide(breaths, monkeypatch):
     given = plants(R=10.0)
     before = simulators.answers(given, breaths)

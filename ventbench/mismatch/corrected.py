@@ -90,18 +90,19 @@ def _physics(
     Efforts of a patient are each breath's own: their mean, which is what others are expected to
     have, may be off in all of them.
     """
+    least = distance(breaths.pressure, answers["refit"], seen)
 
-    def error(pressure: Floats) -> float:
-        return distance(breaths.pressure, pressure, seen).mae
+    def serves(pressure: Floats) -> bool:
+        errs = distance(breaths.pressure, pressure, seen)  # the square sees what few breaths hide
+        return errs.mae <= _FAR * least.mae and errs.rmse <= _FAR * least.rmse
 
-    least = _FAR * error(answers["refit"])
     own = any(has_own(name) for name in found.conclusion.full.names)
-    if own or error(answers["after"]) <= least:
+    if own or serves(answers["after"]):
         return Correction(answers, _errs(breaths, answers, seen), estimates.plants(found.fit))
     conclusion, kept, what = found.conclusion, found.conclusion.null, "what was found"
     if conclusion.place is not None and conclusion.named.names:
         pressure = found.pressures(conclusion.named, held, breaths.pressure[:, 0])
-        if error(pressure) <= least:
+        if serves(pressure):
             kept, what = conclusion.named, "what has no name"
             answers = answers | {"after": pressure}
     if kept is conclusion.null:

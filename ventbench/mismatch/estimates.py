@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ventbench.mismatch import mechanics
 from ventbench.mismatch.naming.bench import Bench
@@ -25,6 +25,9 @@ from ventbench.recordings.breaths import Breaths
 #: Shapes whose default is a guess: the interval of a strength must allow for it.
 _UNCERTAIN = ("supply_droop.recovery",)
 
+#: Pairs that change nothing when they change places, as two lags in a row: the larger comes first.
+_ALIKE = (("valve_lag.tau", "valve_lag.second"),)
+
 
 def estimated(solved: Solved, side: Side, bench: Bench) -> Fit:
     """Fit a conclusion's hypothesis to a side's breaths, with covariance.
@@ -36,10 +39,13 @@ def estimated(solved: Solved, side: Side, bench: Bench) -> Fit:
     """
     hypothesis = solved.hypothesis
     free = [p for p in _UNCERTAIN if p.rpartition(".")[0] in hypothesis.names]
-    start: dict[str, ArrayLike] = {}
+    start: dict[str, Any] = {}
     for path in solved.problem.unknowns.paths:
         if path != START and not ("." in path and has_own(path.rpartition(".")[0])):
             start[path] = float(np.median(solved.column(path)))
+    for first, second in _ALIKE:
+        if {first, second} <= set(start) and start[second] > start[first]:
+            start[first], start[second] = start[second], start[first]
     known = solved.problem.data
     if len(np.unique(known.lung)) > 1:
         same = (side.data.R[:, None] == known.R) & (side.data.C[:, None] == known.C)

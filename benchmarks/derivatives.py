@@ -104,6 +104,8 @@ def main() -> None:
     parser.add_argument("--columns", type=int, default=8)
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
+    if arguments.columns < 1 or arguments.repeats < 1:
+        parser.error("--columns and --repeats must be at least 1")
     os.environ["VENTBENCH_THREADS"] = "1"
     for names in (paths(), paths((*library(), *slots()))):
         compare(names, arguments.columns, arguments.repeats)

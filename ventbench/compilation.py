@@ -53,10 +53,10 @@ def _hand_back() -> None:
     """
     try:
         libc = ctypes.CDLL(None)
-        libc.mallopt(_ARENA_MAX, 2)
-        trim = libc.malloc_trim
+        limit, trim = libc.mallopt, libc.malloc_trim
     except (AttributeError, OSError, TypeError):
         return
+    limit(_ARENA_MAX, 2)
     from jax import monitoring
 
     def compiled(event: str, duration_secs: float, **_: object) -> None:

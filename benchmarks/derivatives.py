@@ -21,9 +21,9 @@ import numpy as np
 
 from ventbench.physics import library, parameter, paths
 from ventbench.physics.catalogue import slots
-from ventbench.physics.fits import Simulator, derivatives, recorded, settings
 from ventbench.precision import float64
 from ventbench.recordings import Breaths
+from ventbench.system_id import Simulator, derivatives, recorded, settings
 
 BREATHS, SAMPLES, DT = 40, 80, 0.03
 

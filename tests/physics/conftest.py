@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ventbench.physics import paths
-from ventbench.physics.fits import Simulator, recorded, settings
+from ventbench.system_id import Simulator, recorded, settings
 
 
 @pytest.fixture(scope="session")

@@ -9,9 +9,9 @@ import pytest
 
 from ventbench.physics import library, mechanism, parameter, paths
 from ventbench.physics.catalogue import slots
-from ventbench.physics.fits import START, Simulator, recorded, settings
 from ventbench.physics.idle import acts, unless_idle
 from ventbench.physics.model import Physics
+from ventbench.system_id import START, Simulator, recorded, settings
 
 from . import cases
 

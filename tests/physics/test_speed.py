@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ventbench.physics import paths
-from ventbench.physics.fits import Simulator, fit, recorded
+from ventbench.system_id import Simulator, fit, recorded
 
 from . import cases
 

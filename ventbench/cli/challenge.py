@@ -45,7 +45,7 @@ def make(
     Example: `ventbench challenge make --seed "$SECRET" --out runs/challenge --cases 200`
     """
     from ventbench.cli.study import bars
-    from ventbench.mismatch.challenge.make import make as work
+    from ventbench.validation.challenge.make import make as work
 
     with bars() as shown:
         task = shown.add_task("recording", total=cases)
@@ -69,8 +69,8 @@ def answer(
     Example: `ventbench challenge answer runs/challenge --jobs 2`
     """
     from ventbench.cli.study import bars
-    from ventbench.mismatch.challenge import folder as files
-    from ventbench.mismatch.challenge.answer import answer as work
+    from ventbench.validation.challenge import folder as files
+    from ventbench.validation.challenge.answer import answer as work
 
     with bars() as shown:
         task = shown.add_task("diagnosing", total=None)
@@ -94,8 +94,8 @@ def record(folder: Folder, seed: Seed) -> None:
 
     Example: `ventbench challenge record runs/challenge --seed "$SECRET"`
     """
-    from ventbench.mismatch.challenge import folder as files
-    from ventbench.mismatch.challenge import requests
+    from ventbench.validation.challenge import folder as files
+    from ventbench.validation.challenge import requests
 
     names = requests.record(files.Folder(folder), seed)
     typer.echo(f"recorded what was asked for in {len(names)} cases")
@@ -123,8 +123,8 @@ def reveal(
     from rich.console import Console
 
     from ventbench.cli.study import bars
-    from ventbench.mismatch.challenge import folder as files
-    from ventbench.mismatch.challenge.reveal import reveal as work
+    from ventbench.validation.challenge import folder as files
+    from ventbench.validation.challenge.reveal import reveal as work
 
     with bars() as shown:
         task = shown.add_task("oracle" if oracle else "scoring", total=None)

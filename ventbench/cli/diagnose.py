@@ -10,7 +10,7 @@ import typer
 from ventbench.cli.options import Clip, JsonFile, Pad, emit
 
 if TYPE_CHECKING:
-    from ventbench.mismatch.result import Diagnosis
+    from ventbench.diagnosis.result import Diagnosis
     from ventbench.recordings.breaths import Breaths
 
 #: Simulators that need no file.
@@ -83,7 +83,7 @@ def keep(out: Path, found: Diagnosis) -> list[Path]:
     import ventbench
     from ventbench import files
     from ventbench.plants import text_files
-    from ventbench.views.mismatch import write_report, write_rerun
+    from ventbench.views.diagnosis import write_report, write_rerun
 
     recorded = found.traces.breaths
     about = {
@@ -122,7 +122,7 @@ def _diagnose(breaths: Breaths, plant: str, lung: str | None, passive: bool) -> 
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from ventbench import compilation
-    from ventbench.mismatch.diagnose import diagnose as find
+    from ventbench.diagnosis.diagnose import diagnose as find
 
     compilation.keep()
     simulator: Any = plant if plant in KINDS else _plants(plant, breaths)
@@ -153,7 +153,7 @@ def _plants(plant: str, breaths: Breaths) -> Any:
 
 
 def _say(console: Any, found: Diagnosis) -> None:
-    from ventbench.mismatch import words
+    from ventbench.diagnosis import words
 
     verdict, *others = words.sentences(found)
     console.print(verdict, style="bold", markup=False, highlight=False)

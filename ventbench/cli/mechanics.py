@@ -10,7 +10,7 @@ import typer
 from ventbench.cli.options import Clip, JsonFile, Pad, emit
 
 if TYPE_CHECKING:
-    from ventbench.mismatch.mechanics import Mechanics, Surveyed
+    from ventbench.mechanics import Mechanics, Surveyed
 
 
 def mechanics(
@@ -66,7 +66,7 @@ def _is_respiraworks(path: Path) -> bool:
 
 def _survey(path: Path) -> tuple[Surveyed, ...]:
     from ventbench.errors import InputError
-    from ventbench.mismatch.mechanics import survey
+    from ventbench.mechanics import survey
 
     found = survey(path)
     if all(item.mechanics is None for item in found):
@@ -77,7 +77,7 @@ def _survey(path: Path) -> tuple[Surveyed, ...]:
 def _identify(path: Path, *, clip: bool, pad: bool) -> tuple[Mechanics, ...]:
     from ventbench import recordings
     from ventbench.errors import InputError
-    from ventbench.mismatch.mechanics import identify
+    from ventbench.mechanics import identify
 
     breaths = recordings.load(path, clip=clip, pad=pad)
     if breaths.flow is None and breaths.volume is None:
@@ -95,7 +95,7 @@ def _lung(one: Mechanics) -> dict[str, Any]:
     """JSON values; what is not finite becomes null."""
     import dataclasses
 
-    from ventbench.mismatch.as_json import _finite
+    from ventbench.diagnosis.as_json import _finite
 
     plain = dataclasses.asdict(one) | {"settings": [lung.id for lung in one.settings]}
     return _finite(plain)
@@ -108,7 +108,7 @@ def _run(item: Surveyed) -> dict[str, Any]:
 
 
 def _say_runs(console: Any, runs: tuple[Surveyed, ...]) -> None:
-    from ventbench.mismatch.mechanics import table
+    from ventbench.mechanics import table
 
     # Lines of a Markdown table must not be broken.
     console.print(table(runs), markup=False, highlight=False, soft_wrap=True)

@@ -10,7 +10,7 @@ import typer
 from ventbench.cli.options import JsonFile, emit
 
 if TYPE_CHECKING:
-    from ventbench.mismatch.proof import Proof
+    from ventbench.validation.proof import Proof
 
 
 def proof(
@@ -50,7 +50,7 @@ def proof(
     from ventbench import compilation
     from ventbench.cli.diagnose import keep
     from ventbench.cli.study import bars
-    from ventbench.mismatch.proof import prove
+    from ventbench.validation.proof import prove
     from ventbench.views import extras
 
     extras.require("jinja2", "rerun")

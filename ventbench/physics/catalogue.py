@@ -10,7 +10,7 @@ from types import ModuleType
 
 from ventbench.errors import InputError
 from ventbench.physics import base, mechanisms
-from ventbench.physics import slots as places
+from ventbench.physics import nonparametric as places
 from ventbench.physics.mechanism import Mechanism
 from ventbench.physics.parameters import Parameter
 

@@ -11,8 +11,8 @@ import numpy as np
 from ventbench.errors import InputError
 from ventbench.physics import base
 from ventbench.physics.catalogue import slots
-from ventbench.physics.slots import SLOTS
-from ventbench.physics.slots._element import Element, Shape
+from ventbench.physics.nonparametric import SLOTS
+from ventbench.physics.nonparametric._element import Element, Shape
 from ventbench.precision import float64
 
 

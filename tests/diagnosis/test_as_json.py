@@ -1,0 +1,72 @@
+"""``diagnosis.json`` has the promised keys and is strict JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from ventbench.diagnosis.result import Distance, Estimate
+
+from . import made
+
+
+def test_the_interface():
+    found = made.diagnosis(12)
+    plain = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert plain["verdict"] == "named"
+    (mechanism,) = plain["mechanisms"]
+    assert mechanism["name"] == "valve_delay"
+    assert mechanism["parameters"] == {
+        "delay": {"value": 0.041, "unit": "s", "ci95": [0.038, 0.044]}
+    }
+    assert mechanism["confidence"] == 0.97
+    assert mechanism["alternatives"] == ["valve_lag"]
+    assert plain["slot"] is None
+    assert len(plain["location"]) == len(found.location) > 0
+    for place, wanted in zip(plain["location"], found.location, strict=True):
+        assert set(place) >= {"axis", "range", "unit", "mean_error", "p_value"}
+        assert place["range"] == [wanted.low, wanted.high]
+    one = plain["open_loop"]
+    assert one["unit"] == "cmH2O"
+    assert one["held_out_breaths"] == [3, 6, 9, 12]
+    for stage in ("before", "refit", "after"):
+        assert set(one[stage]) == {"mae", "rmse"}
+    assert one["noise_floor"] == made.NOISE
+    assert one["groups"]["first 0.2 s"]["refit"]["rmse"] > 1.0
+    assert plain["lung"] == plain["lungs"][0]
+    assert set(plain["lung"]) >= {"label", "fitted_R", "fitted_C", "label_matches"}
+    assert plain["lung"]["label_matches"] is False
+    request = plain["request"]
+    assert np.shape(request["u_in"]) == np.shape(request["u_out"]) == np.shape(request["dt"])
+    assert plain["sentences"][0].startswith("Missing in the physics simulator")
+
+
+def test_a_slot_and_nothing():
+    slot = made.unnamed(12).as_dict()["slot"]
+    assert (slot["name"], slot["explains"]) == ("R(V)", 0.83)
+    assert len(slot["shape"]["x"]) == len(slot["shape"]["y"]) == 25
+    plain = made.nothing(12).as_dict()
+    assert (plain["mechanisms"], plain["location"], plain["request"]) == ([], [], None)
+
+
+def test_what_is_not_finite_becomes_null_and_numpy_numbers_are_numbers():
+    found = made.diagnosis(12)
+    nan = float("nan")
+    named = dataclasses.replace(
+        found.mechanisms[0],
+        parameters={"delay": Estimate(np.float64(0.04), "s", (-np.inf, nan))},
+        nats=np.float32(2.5),
+        changed=np.bool_(True),
+    )
+    distances = dataclasses.replace(found.open_loop, noise_floor=nan, before=Distance(nan, 1.0))
+    found = dataclasses.replace(found, mechanisms=(named,), open_loop=distances, lungs=())
+    plain = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert plain["mechanisms"][0]["parameters"]["delay"]["ci95"] == [None, None]
+    assert plain["mechanisms"][0]["nats"] == pytest.approx(2.5)
+    assert plain["mechanisms"][0]["changed"] is True
+    assert plain["open_loop"]["noise_floor"] is None
+    assert plain["open_loop"]["before"] == {"mae": None, "rmse": 1.0}
+    assert plain["lung"] is None

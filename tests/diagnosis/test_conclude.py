@@ -1,0 +1,175 @@
+"""From a recording to names, a place, or neither."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ventbench.diagnosis.conclude import conclude, is_hidden
+from ventbench.diagnosis.places import all_paths
+from ventbench.diagnosis.shapes import slot
+from ventbench.diagnosis.sources import ALVEOLUS, SUPPLY
+from ventbench.recordings import join
+
+from . import small
+
+
+def concluded(breaths, names=small.with_few):
+    said: list[str] = []
+    found = conclude(
+        small.split(breaths), lambda: small.split(breaths, names()), said.append
+    )  # fmt: skip
+    assert said
+    return found
+
+
+@pytest.mark.usefixtures("few_slots")
+def test_nothing_is_missing():
+    found = concluded(small.made(seed=1))
+    assert found.names == ()
+    assert found.place is None
+    assert not found.hidden
+    assert found.full is found.named
+    assert (found.nats, found.alternatives, found.spread) == ({}, {}, 0.0)
+    assert found.noise.sigma[0] == pytest.approx(0.2, rel=0.15)
+    assert slot(found) is None
+
+
+def compared(nats: dict[str, tuple[float, float]]) -> tuple[Any, list[Any]]:
+    """A bench, and a last comparison of names with what they gain in training and held out."""
+
+    def solved(name: str, train: float, held: float) -> SimpleNamespace:
+        return SimpleNamespace(name=name, criterion=-train, judged=np.full(4, held / 4))
+
+    bench = SimpleNamespace(criterion=lambda one: one.criterion, judged=lambda one: one.judged)
+    rivals = [
+        SimpleNamespace(name=name, solved=solved(name, *gain), criterion=-gain[0])
+        for name, gain in nats.items()
+    ]
+    return bench, [SimpleNamespace(before=solved("", 0.0, 0.0), rivals=rivals)]
+
+
+@pytest.mark.parametrize(
+    ("nats", "hidden"),
+    [
+        ({"valve_curve": (500.0, 40.0)}, True),
+        ({"valve_curve": (500.0, -40.0)}, False),  # held-out breaths are against it
+        ({"valve_curve": (50.0, 40.0)}, False),  # little is missing
+        ({"patient_effort": (2500.0, 500.0)}, False),  # which coloured noise looks like
+        ({"patient_effort": (2500.0, 500.0), "leak": (101.0, 5.0)}, True),
+    ],
+)
+def test_what_explains_much_and_is_not_believed_is_not_nothing(nats, hidden):
+    assert is_hidden(*compared(nats)) is hidden
+
+
+def test_without_a_comparison_nothing_is_hidden():
+    assert not is_hidden(compared({})[0], [])
+
+
+@pytest.mark.usefixtures("few_slots")
+def test_a_name_is_enough():
+    found = concluded(small.made(small.effect("turbulent_resistance", quadratic=10.0)))
+    assert found.names == ("turbulent_resistance",)
+    assert found.place is None
+    assert found.nats["turbulent_resistance"] > 50.0
+    assert set(found.alternatives) == {"turbulent_resistance"}
+    # The noise is what the name leaves, not what the base model does.
+    assert found.noise.sigma[0] == pytest.approx(0.2, rel=0.15)
+    assert found.null.hypothesis.names == ()
+
+
+@pytest.mark.usefixtures("few_slots")
+def test_resistance_that_follows_volume_has_no_name_but_a_place():
+    found = concluded(small.made(small.effect("volume_resistance", "R(V)", change=0.65)))
+    assert found.names == ()
+    assert found.place is not None
+    assert (found.place.name, found.place.element) == ("R(V)", "volume_resistance")
+    assert found.place.source is None
+    assert found.place.nats > 20.0
+    assert found.full.hypothesis.names == ("volume_resistance",)
+    shown = slot(found)
+    assert shown is not None
+    assert shown.name == "R(V)"
+    assert 0.5 < shown.explains <= 1.0
+    assert shown.x_unit.endswith("mL")
+    # The rig's resistance grows with volume; what R could absorb is taken out.
+    assert np.polyfit(shown.x, shown.y, 1)[0] * np.ptp(shown.x) > 3.0
+
+
+@pytest.mark.slow  # many refits
+@pytest.mark.usefixtures("few_slots")
+def test_a_beating_heart_is_at_the_alveolus():
+    beats = small.effect("cardiogenic", "oscillation", amplitude=1.3, frequency=1.4)
+    found = concluded(small.made(beats))
+    assert found.names == ()
+    assert found.place is not None
+    assert (found.place.name, found.place.element) == (ALVEOLUS, None)
+    assert found.place.source is not None
+    assert found.place.source.scale == pytest.approx(1.4, abs=0.2)
+    assert found.place.nats > 20.0
+    assert found.full is found.named
+    shown = slot(found)
+    assert shown is not None
+    assert "1.4 times a second" in shown.meaning
+    assert shown.explains > 0.5
+    assert np.ptp(shown.y) == pytest.approx(2.6, rel=0.4)
+
+
+@pytest.mark.slow  # many refits
+@pytest.mark.usefixtures("few_slots")
+def test_a_name_stands_beside_a_place():
+    beats = small.effect("pulsating_supply", "oscillation", amplitude=0.175, frequency=5.0)
+    name = small.effect("turbulent_resistance", quadratic=10.0)
+    found = concluded(small.made(beats, name, noise=0.1))
+    assert found.names == ("turbulent_resistance",)
+    assert found.place is not None
+    assert found.place.name == SUPPLY
+    shown = slot(found)
+    assert shown is not None
+    assert shown.y_unit.startswith("share of the flow")
+
+
+@pytest.mark.usefixtures("few_slots")
+def test_breaths_whose_valves_differ_are_no_physics():
+    rng = np.random.default_rng(4)
+    rows = []
+    for i in range(small.BREATHS):
+        rig = dataclasses.replace(small.RIG, gain=22.8 * np.exp(0.08 * rng.standard_normal()))
+        rows.append(small.numbered(small.made(seed=100 + i, base=rig, breaths=1), i + 1))
+    found = concluded(join(rows))
+    assert found.names == ()
+    assert found.place is None
+    assert 0.03 < found.spread < 0.2
+    assert found.noise.sigma[0] == pytest.approx(0.2, rel=0.2)
+
+
+@pytest.mark.slow  # all slots take minutes to compile
+@pytest.mark.parametrize(
+    ("name", "form", "parameters", "place"),
+    [
+        ("volume_resistance", "R(V)", {"change": 0.65}, "R(V)"),
+        ("cardiogenic", "oscillation", {"amplitude": 1.3, "frequency": 1.4}, ALVEOLUS),
+        ("direction_resistance", "R(direction)", {"ratio": 2.0}, "R(direction)"),
+    ],
+)
+def test_places_are_found_among_all(name, form, parameters, place):
+    breaths = small.made(small.effect(name, form, **parameters), samples=60)
+    found = concluded(breaths, all_paths)
+    assert found.names == ()
+    assert found.place is not None
+    assert found.place.name == place
+
+
+@pytest.mark.slow  # all slots take minutes to compile
+def test_a_name_or_nothing_is_enough_among_all_places():
+    named = concluded(small.made(small.effect("viscoelasticity", ratio=0.7, time=1.0)), all_paths)
+    assert named.names == ("viscoelasticity",)
+    assert named.place is None
+    nothing = concluded(small.made(seed=1), all_paths)
+    assert nothing.names == ()
+    assert nothing.place is None

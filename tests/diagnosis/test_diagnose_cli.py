@@ -1,0 +1,130 @@
+"""``ventbench diagnose`` around a diagnosis that is made up, and ``--plant FILE`` everywhere."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from ventbench.cli import diagnose as command
+from ventbench.errors import InputError
+from ventbench.plants import text_files
+from ventbench.recordings import write
+
+from . import made
+
+pytest.importorskip("jinja2", reason="needs the extra ventbench[view]")
+pytest.importorskip("rerun", reason="needs the extra ventbench[view]")
+
+FILES = ["corrected.json", "diagnosis.json", "diagnosis.rrd", "report.html"]
+
+app = typer.Typer()
+command.register(app)
+
+
+def run(*arguments: object, code: int = 0) -> str:
+    found = CliRunner().invoke(app, [*map(str, arguments)])
+    if isinstance(found.exception, InputError | OSError):  # main() prints it and exits with 2
+        assert code == 2
+        return str(found.exception)
+    assert found.exit_code == code, found.output
+    return found.stdout
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """Arguments of each diagnosis, which is the same made-up one every time."""
+    seen: list[dict[str, Any]] = []
+
+    def diagnose(breaths, *, plant, lung, passive, progress):
+        progress("fitting", 0.5)
+        seen.append({"breaths": breaths, "plant": plant, "lung": lung, "passive": passive})
+        return made.diagnosis(12)
+
+    module = types.ModuleType("ventbench.diagnosis.diagnose")
+    module.diagnose = diagnose  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    return seen
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """Breaths of two lungs."""
+    from ventbench.recordings import join
+
+    path = tmp_path / "lab.csv"
+    other = made.breaths("R5C10", n=4, seed=3)
+    other = dataclasses.replace(other, breath_id=other.breath_id + 100)
+    write(join([made.breaths(n=6), other]), path)
+    return path
+
+
+def test_four_files_and_the_words(recording, tmp_path, calls):
+    out = tmp_path / "deep" / "out"
+    text = run(recording, "--lung", "R20C50", "--out", out)
+    assert sorted(item.name for item in out.iterdir()) == FILES
+    assert len(calls[0]["breaths"]) == 6
+    assert (calls[0]["plant"], calls[0]["lung"]) == ("physics", "R20C50")
+    assert not calls[0]["passive"]
+    words = " ".join(text.split())
+    assert words.startswith("Missing in the physics simulator: dead time of the inspiratory valve")
+    assert "41 ms [38, 44] of dead time" in words
+    for name in FILES:
+        assert str(out / name) in text.replace("\n", "")
+    plain = json.loads((out / "diagnosis.json").read_text())
+    assert plain["verdict"] == "named"
+    again = run(recording, "--out", out)
+    assert again.splitlines()[0] == text.splitlines()[0]
+    assert calls[1]["lung"] is None
+    assert not calls[1]["passive"]
+    run(recording, "--passive", "--out", out)
+    assert calls[2]["passive"]
+    assert len(calls[1]["breaths"]) == 10
+    assert sorted(item.name for item in out.iterdir()) == FILES, "written over, nothing left behind"
+
+
+def test_json_to_stdout_is_nothing_else(recording, tmp_path, calls):
+    out = tmp_path / "out"
+    plain = json.loads(run(recording, "--out", out, "--json", "-"))
+    assert plain == json.loads((out / "diagnosis.json").read_text())
+
+
+def test_bad_input(recording, tmp_path, calls):
+    out = tmp_path / "out"
+    message = run(recording, "--lung", "R50C20", "--out", out, code=2)
+    assert "has no breath of lung R50C20; choose one of R5C10, R20C50" in message
+    assert "is not a lung id" in run(recording, "--lung", "big", "--out", out, code=2)
+    assert "no such file" in run(tmp_path / "none.csv", "--out", out, code=2).lower()
+    message = run(recording, "--plant", "phisics", "--out", out, code=2)
+    assert "--plant phisics: there is no such file" in message
+    other = tmp_path / "other.json"
+    other.write_text("{}")
+    assert "is not a file of plants" in run(recording, "--plant", other, "--out", out, code=2)
+    assert calls == []
+    assert not out.exists()
+    assert "Missing option" in CliRunner().invoke(app, [str(recording)]).output
+
+
+def test_the_corrected_plant_can_be_diagnosed_itself(recording, tmp_path, calls):
+    out = tmp_path / "out"
+    run(recording, "--lung", "R20C50", "--out", out)
+    corrected = out / "corrected.json"
+    found = text_files.load(corrected)
+    assert list(found) == ["R20C50"]
+    message = run(recording, "--plant", corrected, "--out", out, code=2)
+    assert "has no lung R5C10 of the recording; it has R20C50" in message
+    run(recording, "--lung", "R20C50", "--plant", corrected, "--out", tmp_path / "again")
+    given = calls[-1]["plant"]
+    assert list(given) == ["R20C50"]
+    assert float(given["R20C50"].get("valve_delay.delay")) == 0.041
+    plain = json.loads((tmp_path / "again" / "diagnosis.json").read_text())
+    assert plain["plant"] == "corrected.json"
+    np.testing.assert_array_equal(found["R20C50"].get("R"), 22.1)  # type: ignore[attr-defined]

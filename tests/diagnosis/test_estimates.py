@@ -1,0 +1,47 @@
+"""What a conclusion's parameters are fitted from."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ventbench.diagnosis import estimates
+from ventbench.physics.catalogue import paths
+from ventbench.system_id import recorded, settings
+from ventbench.system_id.derivatives import START, Simulator
+
+from . import small
+
+LAGS = ("valve_lag.tau", "valve_lag.second")
+
+
+@pytest.mark.parametrize("found", [(0.08, 0.01), (0.01, 0.08), (0.08, None)])
+def test_the_larger_of_two_lags_comes_first(monkeypatch, found):
+    """A search may end in either order: they are the same simulator."""
+    values = {path: value for path, value in zip(LAGS, found, strict=True) if value is not None}
+    hypothesis = SimpleNamespace(names=("valve_lag",), free=LAGS[1:], fixed=())
+    unknowns = SimpleNamespace(paths=("R", *values, START))
+    solved: Any = SimpleNamespace(
+        hypothesis=hypothesis, noise=None, column=lambda path: np.full(3, values.get(path, 20.0)),
+        problem=SimpleNamespace(unknowns=unknowns, data=SimpleNamespace(lung=np.zeros(3))),
+    )  # fmt: skip
+    monkeypatch.setattr(estimates, "fit", lambda *_, start, **__: start)
+    side: Any = SimpleNamespace(data=None, simulator=None)
+    start: Any = estimates.estimated(solved, side, side)
+    assert start["R"] == 20.0
+    assert start[LAGS[0]] == 0.08
+    assert start.get(LAGS[1]) == (None if found[1] is None else 0.01)
+
+
+def test_two_lags_may_change_places():
+    data = recorded(small.made())
+    simulator = Simulator(data, paths(("valve_lag",)))
+    order = [settings(data, simulator.names, dict(zip(LAGS, pair, strict=True)))
+             for pair in ((0.09, 0.03), (0.03, 0.09))]  # fmt: skip
+    one, other = simulator.predict_all(np.stack(order))
+    np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)
+    off = simulator.predict(settings(data, simulator.names, {}))
+    assert np.abs(one - off).max() > 1.0

@@ -1,0 +1,133 @@
+"""What the unknowns absorb is taken out, and what is left counts what a refit would gain."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from ventbench.diagnosis.bench import Bench
+from ventbench.diagnosis.hypothesis import Hypothesis
+from ventbench.diagnosis.linear import Local, gain, local
+from ventbench.diagnosis.solved import Solved
+from ventbench.system_id import START, Noise
+
+from . import small
+
+#: Coloured, and without tails.
+NOISE = Noise((0.2,), (0.5,), np.inf)
+
+
+class Linear(NamedTuple):
+    bench: Bench
+    null: Solved
+    place: Local
+
+
+@pytest.fixture(scope="module")
+def bent() -> Linear:
+    """Fitted without the little turbulence that is there."""
+    bench = small.split(small.made(small.effect("turbulent_resistance", quadratic=1.0), noise=0.1))
+    null = bench.solve(Hypothesis(), NOISE, tolerance=1e-6, iterations=30)
+    return Linear(bench, null, local(null.problem, null.minimum.x, np.inf))
+
+
+def whitened(difference: np.ndarray) -> np.ndarray:
+    """By the definition of the noise: each sample given the one before, ``(n, T)``."""
+    sigma, ar = NOISE.sigma[0], NOISE.ar[0]
+    white = difference / sigma
+    white[:, 1:] = (difference[:, 1:] - ar * difference[:, :-1]) / (sigma * np.sqrt(1 - ar**2))
+    return white
+
+
+def changed(found: Linear, path: str, breath: int | None = None) -> np.ndarray:
+    """Whitened change of the prediction by a small change of a parameter, by a difference."""
+    problem = found.null.problem
+    column = (*problem.simulator.names, START).index(path)
+    rows = slice(None) if breath is None else slice(breath, breath + 1)
+    ends = []
+    for sign in (1.0, -1.0):
+        values = found.null.values.copy()
+        values[rows, column] *= 1.0 + 1e-5 * sign
+        ends.append(problem.simulator.predict(values)[:, 0])
+    return whitened((ends[0] - ends[1]) * 1e4)
+
+
+@pytest.mark.parametrize("path", ["R", "C", "R_ex", "PEEP"])
+def test_residual_and_templates_are_orthogonal_to_what_is_refitted(bent, path):
+    slope = changed(bent, path)
+    scale = np.linalg.norm(slope) * np.linalg.norm(bent.place.residual)
+    assert abs(np.sum(slope * bent.place.residual)) < 1e-4 * scale
+    # A template of the same change is absorbed nearly whole.
+    values = bent.null.values.copy()
+    values[:, bent.null.problem.simulator.names.index(path)] *= 1.001
+    seen = bent.null.problem.simulator.predict(values)
+    raw = bent.place.whitened(seen - bent.place.seen)
+    assert np.linalg.norm(bent.place.template(seen)) < 0.01 * np.linalg.norm(raw)
+
+
+@pytest.mark.parametrize("breath", [0, 5])
+def test_each_breath_absorbs_its_own_start(bent, breath):
+    slope = changed(bent, START, breath)
+    assert np.count_nonzero(np.abs(slope).sum(axis=1)) == 1
+    scale = np.linalg.norm(slope) * np.linalg.norm(bent.place.residual)
+    assert abs(np.sum(slope * bent.place.residual)) < 1e-4 * scale
+
+
+def test_bases_are_orthonormal(bent):
+    own, shared = bent.place.own, bent.place.shared
+    np.testing.assert_allclose(own @ own.swapaxes(1, 2), np.ones((8, 1, 1)), atol=1e-6)
+    np.testing.assert_allclose(shared @ shared.T, np.eye(4), atol=1e-6)
+    again = bent.place.without_shared(bent.place.without_own(bent.place.residual[:, None]))
+    np.testing.assert_allclose(again[:, 0], bent.place.residual, atol=1e-6)
+
+
+def test_gain_is_the_fall_of_the_cost_after_a_refit(bent):
+    values = bent.null.values.copy()
+    names = bent.null.problem.simulator.names
+    values[:, names.index("turbulent_resistance.quadratic")] = 0.2
+    seen = bent.null.problem.simulator.predict(values)
+    nats, share = gain(bent.place, bent.place.template(seen))
+    refitted = bent.bench.solve(
+        Hypothesis(("turbulent_resistance",)), NOISE, bent.null, tolerance=1e-6, iterations=30
+    )
+    fallen = bent.null.minimum.cost - refitted.minimum.cost
+    assert fallen > 8.0
+    assert nats == pytest.approx(fallen, rel=0.1)
+    found = refitted.column("turbulent_resistance.quadratic")[0]
+    assert 0.2 * share == pytest.approx(found, rel=0.1)
+
+
+def test_gain_of_the_wrong_sign_and_of_nothing(bent):
+    template = np.random.default_rng(0).normal(size=bent.place.residual.shape)
+    nats, share = gain(bent.place, template)
+    other = gain(bent.place, -2.0 * template)
+    assert other[0] == pytest.approx(nats)
+    assert other[1] == pytest.approx(-0.5 * share)
+    assert gain(bent.place, 0.0 * template) == (0.0, 0.0)
+    # A template that is the residual, turned round, explains it whole.
+    nats, share = gain(bent.place, -bent.place.residual)
+    assert share == pytest.approx(1.0)
+    assert nats == pytest.approx(0.5 * np.sum(bent.place.residual**2))
+
+
+def test_far_samples_are_cut_off(bent):
+    seen = bent.null.problem.data.seen.copy()
+    seen[2, 0, 10] += 5.0  # 25 standard deviations
+    problem = dataclasses.replace(
+        bent.null.problem, data=dataclasses.replace(bent.null.problem.data, seen=seen)
+    )
+    at = bent.null.minimum.x
+    free, cut = (local(problem, at, clip).residual for clip in (np.inf, 4.0))
+    assert np.abs(free).max() > 15.0
+    assert np.abs(cut).max() < 5.0
+
+
+def test_a_gain_of_each_breath_is_its_own(bent):
+    bench = dataclasses.replace(bent.bench, spread=0.1)
+    solved = bench.solve(Hypothesis(), NOISE, iterations=2)
+    place = local(solved.problem, solved.minimum.x)
+    assert place.own.shape[1] == 2
+    assert place.shared.shape[0] == 4

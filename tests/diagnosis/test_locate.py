@@ -1,0 +1,212 @@
+"""Where errors are: found in the right range, and by chance no more often than promised."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ventbench.diagnosis import significance
+from ventbench.diagnosis.axes import axes, before, nice, since_edge
+from ventbench.diagnosis.locate import MATERIAL, locate, profiles
+from ventbench.recordings.breaths import Breaths
+
+SD = 0.2
+
+
+def coloured(rng: np.random.Generator, shape: tuple[int, int], rho: float) -> np.ndarray:
+    """AR(1) noise of standard deviation SD, each breath anew."""
+    noise = SD * np.sqrt(1.0 - rho**2) * rng.standard_normal(shape)
+    noise[:, 0] /= np.sqrt(1.0 - rho**2)
+    for i in range(1, shape[1]):
+        noise[:, i] += rho * noise[:, i - 1]
+    return noise
+
+
+def exact(seed: int, n: int = 60, samples: int = 80, lungs: int = 1):
+    """Breaths that a simulator explains without any error, its pressure, flow and volume."""
+    rng = np.random.default_rng(seed)
+    dt = 0.032 + rng.uniform(-0.001, 0.001, (n, samples))
+    time = np.concatenate([np.zeros((n, 1)), np.cumsum(dt[:, :-1], axis=1)], axis=1)
+    u_out = (time >= 1.0).astype(np.int8)
+    fall = rng.uniform(5.0, 60.0, (n, 1)) * np.exp(-2.0 * time)
+    u_in = np.where(u_out == 0, fall + rng.uniform(0.0, 10.0, (n, 1)), 0.0)
+    R = np.where(np.arange(n) < n // lungs, 20.0, 5.0)
+    flow = 22.8 * before(u_in) * (before(u_out) == 0)
+    volume = np.cumsum(flow * dt, axis=1) * (u_out == 0)
+    pressure = 5.0 + volume / 50.0 + 0.02 * flow
+    recorded = Breaths(
+        np.arange(n), R, np.full(n, 50.0), time, dt, u_in, u_out, pressure.copy(),
+        np.ones((n, samples), bool), np.zeros(n, bool),
+    )  # fmt: skip
+    return recorded, pressure, flow, volume
+
+
+def with_error(seed: int, error, rho: float = 0.3, **more):
+    """Places of breaths with an error, which is a function of them, on top of noise."""
+    recorded, pressure, flow, volume = exact(seed, **more)
+    noise = coloured(np.random.default_rng(1000 + seed), pressure.shape, rho)
+    seen = dataclasses.replace(recorded, pressure=pressure + noise + error(recorded))
+    return locate(seen, pressure, SD, flow, volume)
+
+
+@pytest.mark.parametrize(("n", "lungs", "rho"), [(60, 1, 0.0), (60, 2, 0.7), (12, 1, 0.5)])
+def test_chance_alone_gives_a_place_as_often_as_promised(n, lungs, rho):
+    """Of 300 recordings without any mismatch, 2 to 9 % have a place (5 % are allowed)."""
+    found = sum(bool(with_error(k, lambda b: 0.0, rho, n=n, lungs=lungs)) for k in range(300))
+    assert 0.02 * 300 <= found <= 0.09 * 300
+
+
+def test_a_bump_after_the_start_of_inspiration_is_found_there():
+    for seed in range(5):
+        places = with_error(seed, lambda b: -0.3 * (b.time < 0.2))
+        (place,) = [p for p in places if p.axis == "time since inspiration"]
+        assert (place.low, place.high) == (0.0, 0.2)
+        assert place.mean_error == pytest.approx(-0.3, abs=0.05)
+        assert place.p_value < 0.01
+        assert place.share > 0.8
+        assert places[0] == place, "it explains most"
+
+
+def test_an_error_of_changing_sign_is_found_by_its_square():
+    def effort(breaths: Breaths) -> np.ndarray:
+        sign = np.where(np.arange(len(breaths)) % 2, 1.0, -1.0)[:, None]
+        return 0.6 * sign * ((breaths.time > 0.4) & (breaths.time < 0.8))
+
+    places = with_error(3, effort)
+    (place,) = [p for p in places if p.axis == "time since inspiration"]
+    assert (place.low, place.high) == (0.4, 0.8)
+    assert abs(place.mean_error) < 0.05
+    assert place.share > 0.8
+
+
+def test_a_drift_is_found_over_the_breaths():
+    places = with_error(4, lambda b: np.linspace(-0.6, 0.6, len(b))[:, None] * np.ones((1, 80)))
+    early, late = sorted((p for p in places if p.axis == "breath number"), key=lambda p: p.low)
+    assert early.low == 1
+    assert late.high == 60
+    assert early.mean_error < -0.2 < 0.2 < late.mean_error
+
+
+def test_an_error_of_one_lung_is_found_on_it():
+    places = with_error(5, lambda b: 0.5 * (b.R == 5.0)[:, None] * (b.u_out == 0), lungs=2)
+    lungs = {p.axis: p for p in places if p.axis.startswith("lung")}
+    assert list(lungs) == ["lung R5C50"]
+    assert lungs["lung R5C50"].share > 0.9
+
+
+def test_an_error_of_volume_is_found_along_it():
+    recorded, pressure, flow, volume = exact(6)
+    noise = coloured(np.random.default_rng(7), pressure.shape, 0.3)
+    seen = dataclasses.replace(recorded, pressure=pressure + noise + 0.5 * (volume > 400.0))
+    places = locate(seen, pressure, SD, flow, volume)
+    place = max((p for p in places if p.axis == "volume"), key=lambda p: p.share)
+    assert (place.low, place.unit) == (400.0, "mL")
+    assert place.mean_error == pytest.approx(0.5, abs=0.1)
+    assert "volume" not in {p.axis for p in locate(seen, pressure, SD)}, "if it is not told"
+
+
+def test_noise_that_differs_a_little_from_place_to_place_is_no_place():
+    """A quarter more variance in expiration stays below what is material; three times do not."""
+    assert MATERIAL > 0.25
+    for seed, times, wanted in ((8, 1.25, False), (9, 3.0, True)):
+        recorded, pressure, *_ = exact(seed, n=200)
+        noise = SD * np.random.default_rng(seed).standard_normal(pressure.shape)
+        noise *= np.where(recorded.u_out == 1, np.sqrt(times), 1.0)
+        seen = dataclasses.replace(recorded, pressure=pressure + noise)
+        assert bool(locate(seen, pressure, SD)) == wanted
+
+
+def test_gaps_and_few_breaths():
+    recorded, pressure, flow, volume = exact(10)
+    holes = pressure - 0.4 * (recorded.time < 0.2)
+    holes[::3, 40:] = np.nan
+    valid = np.ones(holes.shape, bool)
+    valid[5, 60:] = False
+    seen = dataclasses.replace(recorded, pressure=holes, valid=valid)
+    noisy = dataclasses.replace(
+        seen, pressure=holes + coloured(np.random.default_rng(0), holes.shape, 0.0)
+    )
+    places = locate(noisy, pressure, float("nan"), flow, volume)
+    (place,) = [p for p in places if p.axis == "time since inspiration"]
+    assert (place.low, place.high) == (0.0, 0.2)
+    few = noisy.select(np.arange(4))
+    assert locate(few, pressure[:4], SD) == (), "four breaths are too few"
+    nothing = dataclasses.replace(seen, pressure=np.full(holes.shape, np.nan))
+    assert locate(nothing, pressure, SD) == ()
+
+
+def test_equal_input_gives_equal_places():
+    one, two = (with_error(11, lambda b: 0.2 * (b.u_out == 1)) for _ in range(2))
+    assert one == two
+    assert one
+
+
+def test_p_values_against_all_flips_of_few_breaths():
+    """Five breaths have 32 sign patterns: the exact probability can be counted."""
+    values = np.random.default_rng(1).standard_normal((5, 3)) + 0.5
+    signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * 5)).reshape(5, -1).T
+    scale = np.sqrt((values**2).sum(axis=0))
+    largest = np.abs(signs @ values / scale).max(axis=1)
+    seen = np.abs(values.sum(axis=0) / scale)
+    exact_p = (largest[:, None] >= seen - 1e-12).mean(axis=0)
+    found = significance.p_values(values, two_sided=True, seed=0)
+    np.testing.assert_allclose(found, exact_p, atol=0.03)
+
+
+def test_the_statistic_rises_with_students_t():
+    rng = np.random.default_rng(2)
+    values = rng.standard_normal((12, 50)) + rng.standard_normal(50)
+    t = values.mean(axis=0) / (values.std(axis=0, ddof=1) / np.sqrt(12))
+    z = significance.statistic(values)
+    np.testing.assert_allclose(t, z * np.sqrt(11.0) / np.sqrt(12.0 - z**2))
+    values[:8, 0] = np.nan
+    assert significance.statistic(values)[0] == 0.0, "four breaths are too few"
+
+
+def test_samples_are_sorted_by_what_acted_before_them():
+    recorded, pressure, flow, volume = exact(12, n=6)
+    by_name = {axis.name: axis for axis in axes(recorded, pressure, flow, volume)}
+    inspired = by_name["time since inspiration"]
+    ends = np.argmax(recorded.u_out == 1, axis=1)
+    for i, end in enumerate(ends):
+        assert inspired.bins[i, end] == 10, "the first sample of expiration ends inspiration"
+        assert inspired.bins[i, end + 1] == -1
+        assert by_name["time since expiration"].bins[i, end + 1] == 0
+    opening = by_name["valve opening"]
+    i, j = 2, 5
+    k = opening.bins[i, j]
+    assert opening.edges[k] <= recorded.u_in[i, j - 1] < opening.edges[k + 1]
+    assert by_name["flow"].bins[i, j] >= 0
+    assert by_name["breath number"].edges.tolist() == [0, 1, 2, 4, 5, 6]
+
+
+def test_time_since_an_edge():
+    recorded, *_ = exact(13, n=2)
+    u_in = np.zeros((2, 80))
+    u_in[:, 10:20] = 30.0
+    u_in[1] += np.linspace(0.0, 40.0, 80)  # half a percent a sample is no edge
+    since = since_edge(dataclasses.replace(recorded, u_in=u_in, u_out=np.zeros((2, 80), np.int8)))
+    assert np.isnan(since[:, :11]).all()
+    time = recorded.time
+    np.testing.assert_allclose(since[:, 11:21], time[:, 11:21] - time[:, [10]])
+    np.testing.assert_allclose(since[:, 21:], time[:, 21:] - time[:, [20]])
+
+
+def test_ranges_end_at_round_numbers():
+    values = np.linspace(3.0, 41.0, 500)[None]
+    np.testing.assert_allclose(nice(values, np.ones((1, 500), bool)), np.arange(0.0, 46.0, 5.0))
+    assert len(nice(np.full((1, 9), 5.0), np.ones((1, 9), bool))) >= 2
+    assert len(nice(np.full((1, 9), np.nan), np.ones((1, 9), bool))) == 2
+
+
+def test_profiles_judge_one_simulator_along_the_ranges_of_another():
+    recorded, pressure, flow, volume = exact(14)
+    judged = pressure - 0.5 * (recorded.time < 0.2)
+    for mine, wanted in ((None, 0.0), (judged, 0.5)):
+        found = profiles(recorded, pressure, flow, volume, judged=mine)
+        (start,) = [p for p in found if p.axis.name == "time since inspiration"]
+        np.testing.assert_allclose(start.mean[:2], wanted, atol=1e-9)
+        np.testing.assert_allclose(start.mean[2:10], 0.0, atol=1e-9)
+        assert start.breaths[:10].tolist() == [60] * 10

@@ -1,0 +1,87 @@
+"""Slots as candidates, and the gain that each is expected to bring."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ventbench.diagnosis import places
+from ventbench.diagnosis.hypothesis import Hypothesis
+from ventbench.diagnosis.steps import settle
+from ventbench.physics import library, parameter
+from ventbench.physics.catalogue import slots
+from ventbench.physics.nonparametric import SLOTS
+from ventbench.system_id import Noise
+
+from . import small
+
+#: Without tails, so that sums of squares are all there is.
+NOISE = Noise((0.2,), (0.0,), np.inf)
+
+
+def test_every_element_has_a_place_and_holds_what_is_in_the_library():
+    for name in slots():
+        assert name in SLOTS[places.public(name)].elements
+        assert set(places.holds(name)) <= set(library())
+        assert set(places.holds(name)) <= set(SLOTS[places.public(name)].holds)
+    # Elements of one place that hold different things.
+    assert places.public("sensor_memory") == places.public("drift_shape") == "measurement"
+    assert places.holds("sensor_memory") == ("sensor_lag",)
+    assert places.holds("drift_shape") == ("sensor_drift",)
+    assert places.holds("sensor_shape") == ()
+    assert places.holds("volume_resistance") == ()
+    assert places.holds("flow_shape") == ("turbulent_resistance",)
+
+
+def test_all_paths_are_those_of_the_library_and_of_all_slots():
+    found = places.all_paths()
+    owners = {path.rpartition(".")[0] for path in found} - {""}
+    assert owners == set(library()) | set(slots())
+    assert len(set(found)) == len(found)
+
+
+def scanned(*effects, seed=0, **changed):
+    bench = small.split(small.made(*effects, seed=seed, **changed), small.with_few())
+    null = settle(bench, Hypothesis())
+    return bench, null, places.scan(null)
+
+
+@pytest.mark.usefixtures("few_slots")
+@pytest.mark.parametrize("change", [0.65, -0.65])
+def test_resistance_that_follows_volume_is_found(change):
+    effect = small.effect("volume_resistance", "R(V)", change=change)
+    _, null, found = scanned(effect)
+    assert {one.name for one in found} == set(small.FEW)
+    assert found[0].name == "volume_resistance"
+    assert max(found[0].nats, found[0].white) > 20.0
+    best = [max(one.nats, one.white) for one in found]
+    assert best == sorted(best, reverse=True)
+    assert all(one.hypothesis == Hypothesis((one.name,)) for one in found)
+    again = dataclasses.replace(null, hypothesis=Hypothesis((found[0].name,)))
+    assert {one.name for one in places.scan(again)} == set(small.FEW) - {found[0].name}
+
+
+@pytest.mark.usefixtures("few_slots")
+def test_nothing_is_promised_where_nothing_is():
+    *_, found = scanned(seed=3)
+    # A slot has up to ten coefficients, each worth half a nat by chance.
+    assert max(max(one.nats, one.white) for one in found) < 10.0
+
+
+@pytest.mark.usefixtures("few_slots")
+def test_promised_nats_are_what_a_refit_gains():
+    effect = small.effect("turbulent_resistance", quadratic=1.0)
+    bench = small.split(small.made(effect), small.with_few())
+    null = bench.solve(Hypothesis(), NOISE, tolerance=1e-4, iterations=30)
+    found = {one.name: one.nats for one in places.scan(null)}
+    assert max(found, key=lambda name: found[name]) == "flow_shape"
+    refitted = bench.solve(Hypothesis(("flow_shape",)), NOISE, null, iterations=30, tolerance=1e-4)
+    # The cost has the prior of the coefficients in it, as the promise has.
+    fallen = null.minimum.cost - refitted.minimum.cost
+    assert fallen > 5.0
+    assert found["flow_shape"] == pytest.approx(fallen, rel=0.15)
+    first = next(path for path in refitted.problem.unknowns.paths if path.startswith("flow_shape"))
+    assert np.ptp(refitted.column(first)) == 0.0
+    assert refitted.column(first)[0] != parameter(first).neutral

@@ -1,0 +1,124 @@
+"""Efforts of each breath, whose likelihood has many peaks."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ventbench.diagnosis import moving
+from ventbench.diagnosis.bench import Bench
+from ventbench.diagnosis.hypothesis import Hypothesis
+from ventbench.diagnosis.pulled import (
+    AMPLITUDE,
+    DURATION,
+    ONSET,
+    integrated,
+    restarted,
+    settled,
+)
+from ventbench.diagnosis.solved import Solved
+from ventbench.diagnosis.steps import settle
+from ventbench.system_id import Noise
+
+from . import small
+
+EFFORT = Hypothesis(("patient_effort",))
+NOISE = Noise((0.1,), (0.0,), np.inf)
+
+
+@pytest.fixture(scope="module")
+def active() -> Bench:
+    one = small.effect("patient_effort", amplitude=5.0, duration=0.6)
+    return small.split(small.made(one, noise=0.1))
+
+
+@pytest.fixture(scope="module")
+def fitted(active) -> Solved:
+    return settle(active, EFFORT)
+
+
+def misplaced(solved: Solved, onset: float) -> np.ndarray:
+    """Its unknowns with all efforts begun elsewhere."""
+    x = solved.minimum.x.copy()
+    x[solved.problem.unknowns.of(ONSET)] = onset
+    return x
+
+
+def test_all_efforts_are_found_from_a_poor_start(active, fitted):
+    assert np.std(fitted.residual) == pytest.approx(0.1, rel=0.2)
+    assert fitted.column(DURATION)[0] == pytest.approx(0.6, rel=0.05)
+    strong = np.abs(fitted.column(AMPLITUDE)) > 2.0
+    assert strong.any()
+    assert not strong.all()
+
+
+@pytest.mark.parametrize("refined", [False, True])
+def test_efforts_that_begin_elsewhere_are_moved_back(fitted, refined):
+    problem = fitted.problem
+    wrong = misplaced(fitted, 1.7)
+    mended = restarted(problem, wrong, refined=refined)
+    gained = problem.log_likelihood(mended) - problem.log_likelihood(wrong)
+    strong = np.abs(fitted.column(AMPLITUDE)) > 2.0
+    assert np.all(gained[strong] > 100.0)
+    assert np.all(gained >= 0.0)
+    assert np.array_equal(wrong, misplaced(fitted, 1.7))
+
+
+def test_efforts_that_are_the_likeliest_stay(fitted):
+    x = fitted.minimum.x
+    assert restarted(fitted.problem, x, refined=False) == pytest.approx(x)
+
+
+def test_evidence_of_a_breath_is_the_integral_over_its_efforts(active, fitted):
+    """Against a sum over a fine grid of amplitudes and onsets, at the fitted parameters."""
+    still, x = active.judge(fitted)
+    still = dataclasses.replace(still, noise=NOISE)
+    duration = float(fitted.column(DURATION)[0])
+    found = integrated(still, x, duration)
+    names = still.simulator.names
+    columns = [names.index(path) for path in (AMPLITUDE, ONSET)]
+    amplitudes, onsets = np.arange(-8.0, 8.01, 0.25), np.arange(0.0, 1.7, 0.04)
+    total = np.full(len(found), -np.inf)
+    for amplitude in amplitudes:
+        for onset in onsets:
+            values = still.values(x)
+            values[:, columns] = amplitude, onset
+            residual = still.residual_of(values)
+            likelihood = NOISE.log_likelihood(residual, still.data.weight)
+            total = np.logaddexp(total, likelihood - 0.5 * (amplitude / 3.0) ** 2)
+    total += np.log(0.25 / (np.sqrt(2.0 * np.pi) * 3.0) * 0.04 / 1.7)
+    quiet = still.log_likelihood(x)
+    exact = np.logaddexp(np.log(0.4), np.log(0.6) + total - quiet)
+    clear = exact > 20.0
+    assert clear.any()
+    # Starts are fitted as well, but not in the sum; a large effort is between points of the grid.
+    assert found[clear] == pytest.approx(exact[clear], rel=0.1, abs=6.0)
+    assert np.all(found[~clear] < 20.0)
+
+
+def test_what_a_fit_found_is_integrated_alike(active, fitted):
+    training = dataclasses.replace(active, judging=active.training)
+    anew = training.judged(fitted)
+    assert settled(fitted, fitted.noise) == pytest.approx(anew, abs=4.0)
+
+
+def test_a_patient_who_pulls_is_told_from_noise_that_wanders(active, fitted):
+    assert moving.beats_noise(active, fitted)
+    wandering = small.split(small.made(noise=0.3, coloured=0.9, correlation=0.9, seed=4))
+    assert not moving.beats_noise(wandering, settle(wandering, EFFORT))
+
+
+def test_of_breaths_to_come_the_mean_over_efforts_is_expected(active, fitted):
+    passive = active.solve(Hypothesis(), fitted.noise, fitted)
+    values = active.carried(fitted, active.judging)
+    simulator = active.judging.simulator
+    columns = [simulator.names.index(path) for path in (AMPLITUDE, ONSET)]
+    answers = []
+    for effort in zip(fitted.column(AMPLITUDE), fitted.column(ONSET), strict=True):
+        values[:, columns] = effort
+        answers.append(simulator.predict(values))
+    expected = active.predict(fitted, active.judging)
+    assert expected == pytest.approx(np.mean(answers, axis=0))
+    assert np.abs(expected - active.predict(passive, active.judging)).max() > 0.2

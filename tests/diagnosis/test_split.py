@@ -1,0 +1,73 @@
+"""Which breaths can be used, and which no fit may see."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ventbench.diagnosis.split import EVERY, FEWEST, held_out, usable
+from ventbench.errors import InputError
+
+from . import made
+
+
+@given(st.lists(st.sampled_from([5.0, 20.0, 50.0]), min_size=1, max_size=40))
+def test_every_third_breath_of_each_lung_is_held_out(R):
+    one = made.breaths(n=1, samples=6)
+    breaths = dataclasses.replace(one.select(np.zeros(len(R), int)), R=np.array(R))
+    held = held_out(breaths)
+    for value in set(R):
+        own = held[np.array(R) == value]
+        assert np.array_equal(own, np.arange(len(own)) % EVERY == 1)
+
+
+def test_all_good_breaths_are_used_as_they_are():
+    breaths = made.breaths(n=5)
+    found, notes = usable(breaths)
+    assert notes == []
+    assert np.array_equal(found.breath_id, breaths.breath_id)
+    assert np.array_equal(found.pressure, breaths.pressure)
+
+
+def test_breaths_without_a_start_an_inspiration_or_a_command_are_left_out():
+    breaths = made.breaths(n=9)
+    pressure, u_in = breaths.pressure.copy(), breaths.u_in.copy()
+    pressure[1, 0] = np.nan
+    pressure[2, 4:] = np.nan  # four are one too many
+    pressure[3, 3:] = np.nan
+    u_in[5] = 0.0
+    breaths = dataclasses.replace(breaths, pressure=pressure, u_in=u_in)
+    found, notes = usable(breaths)
+    assert found.breath_id.tolist() == [1, 3, 5, 7, 8, 9]
+    assert len(notes) == 1
+    assert notes[0].startswith("3 breaths without a first pressure")
+    assert "breath_id 2, 4, 6" in notes[0]
+
+
+def test_gaps_elsewhere_do_no_harm():
+    breaths = made.breaths(n=5)
+    pressure = breaths.pressure.copy()
+    pressure[:, 5:9] = np.nan
+    found, notes = usable(dataclasses.replace(breaths, pressure=pressure))
+    assert len(found) == 5
+    assert notes == []
+
+
+def test_too_few_breaths_are_refused():
+    with pytest.raises(InputError, match=rf"{FEWEST - 1} usable breaths; .* at least {FEWEST}"):
+        usable(made.breaths(n=FEWEST - 1))
+    assert len(usable(made.breaths(n=FEWEST))[0]) == FEWEST
+    with pytest.raises(InputError, match=r"^0 usable breaths"):
+        usable(made.breaths(n=3).select(np.zeros(0, int)))
+
+
+def test_one_breath_of_each_lung_is_not_enough():
+    breaths = dataclasses.replace(made.breaths(n=4), R=np.array([5.0, 10.0, 20.0, 50.0]))
+    with pytest.raises(InputError, match=r"no lung has two usable breaths"):
+        usable(breaths)
+    twice = dataclasses.replace(breaths, R=np.array([5.0, 10.0, 20.0, 20.0]))
+    assert held_out(usable(twice)[0]).tolist() == [False, False, False, True]

@@ -1,0 +1,264 @@
+"""Mechanics from pressure with flow or volume: closed-form breaths, whose answer is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from ventbench import mechanics
+from ventbench.errors import InputError
+from ventbench.recordings import Breaths, make_breaths
+
+SENSORS = ("flow", "volume")
+
+
+def noise(rng, shape, sigma=0.2, rho=0.6):
+    """First-order autoregressive."""
+    out = rng.normal(0, sigma, shape)
+    for t in range(1, shape[1]):
+        out[:, t] = rho * out[:, t - 1] + np.sqrt(1 - rho**2) * out[:, t]
+    return out
+
+
+def recording(
+    R=20.0, C=20.0, extra=None, *, n=10, seed=0, dt=0.01, jitter=0.0, sensors=SENSORS, peep=5.0,
+    label=None, sigma=0.2, tube=0.0,
+) -> Breaths:  # fmt: skip
+    """Breaths of 3 s: volume rises and falls as Gaussians in time, so that flow is exact.
+
+    ``extra(V, Q, slope, t, p)`` adds to the pressure, cmH2O; volumes in L. With a ``tube``, of
+    mL/cmH2O, the sensor's flow has what that takes up too.
+    """
+    rng = np.random.default_rng(seed)
+    steps = rng.uniform(dt - jitter, dt + jitter, (n, round(3.0 / dt)))
+    t = np.concatenate([np.zeros((n, 1)), np.cumsum(steps, axis=1)], axis=1)
+    size, a, b = (rng.uniform(*x, (n, 1)) for x in ((0.25, 0.5), (0.25, 0.45), (0.35, 0.55)))
+    late = np.maximum(t - 1.2, 0.0)
+    full = size * (1 - np.exp(-((np.minimum(t, 1.2) / a) ** 2)))
+    falls = np.exp(-((late / b) ** 2))
+    V = full * falls
+    into, out = 2 * t / a**2, -2 * late / b**2
+    Q = np.where(t < 1.2, into * (size - V), out * V)
+    slope = np.where(
+        t < 1.2, (2 / a**2 - into**2) * (size - V), (-2 / b**2 + out**2) * V
+    )  # fmt: skip
+    pressure = peep + R * Q + 1000.0 / C * V
+    if extra is not None:
+        pressure = pressure + extra(V, Q, slope, t, pressure)
+    swallowed = tube / 1000.0 * (pressure - pressure[:, :1])
+    shown = {
+        "flow": 1000 * (Q + np.gradient(swallowed, axis=1) / np.gradient(t, axis=1)),
+        "volume": 1000 * (V + swallowed),
+    }
+    shown = {name: x + rng.normal(0, 1.0, x.shape) for name, x in shown.items() if name in sensors}
+    label = label or (R, C)
+    return make_breaths(
+        np.arange(n), np.full(n, label[0]), np.full(n, label[1]), t, np.zeros(t.shape), t >= 1.2,
+        pressure + noise(rng, t.shape, sigma), flow=shown.get("flow"), volume=shown.get("volume"),
+    )  # fmt: skip
+
+
+def creep(ratio, time, C=20.0):
+    """Stress of a Maxwell element, integrated in steps of a sample's hundredth."""
+
+    def extra(V, Q, slope, t, p):
+        out = np.zeros_like(V)
+        for i in range(V.shape[1] - 1):
+            h = t[:, i + 1] - t[:, i]
+            rate = (V[:, i + 1] - V[:, i]) / h * ratio * 1000.0 / C
+            decay = np.exp(-h / time)
+            out[:, i + 1] = out[:, i] * decay + rate * time * (1 - decay)
+        return out
+
+    return extra
+
+
+def only(breaths):
+    (found,) = mechanics.identify(breaths)
+    return found
+
+
+def near(estimate, truth, share):
+    assert estimate.value == pytest.approx(truth, rel=share)
+    assert estimate.ci95[0] < estimate.ci95[1]
+
+
+@pytest.mark.parametrize("sensors", [("flow",), ("volume",), SENSORS], ids="+".join)
+@pytest.mark.parametrize("lung", [(5.0, 10.0), (20.0, 50.0), (50.0, 20.0)])
+def test_R_and_C_of_a_plain_lung(lung, sensors):
+    found = only(recording(*lung, sensors=sensors, seed=3))
+    near(found.R, lung[0], 0.02)
+    near(found.C, lung[1], 0.02)
+    assert found.terms == ()
+    assert found.match.label_matches
+    assert found.settings[0].id == found.label
+    assert found.offset.ci95[0] - 0.1 < 5.0 < found.offset.ci95[1] + 0.1
+    if "flow" in sensors:  # else the noise of the differentiated volume is in it
+        assert found.noise == pytest.approx(0.2, rel=0.4)
+
+
+def test_thirty_samples_a_second_with_jitter():
+    found = only(recording(20.0, 20.0, dt=0.033, jitter=0.001, n=30, seed=2))
+    near(found.R, 20.0, 0.02)
+    near(found.C, 20.0, 0.02)
+    assert found.terms == ()
+
+
+def test_intervals_hold_the_truth():
+    inside = np.zeros(2)
+    for seed in range(60):
+        found = only(recording(20.0, 20.0, n=8, seed=100 + seed))
+        for k, one in enumerate((found.R, found.C)):
+            inside[k] += one.ci95[0] <= 20.0 <= one.ci95[1]
+    assert np.all(inside >= 54)  # of 60; 57 are expected
+
+
+@pytest.mark.parametrize(
+    ("label", "truth"),
+    [((20.0, 50.0), (20.0, 20.0)), ((5.0, 20.0), (20.0, 20.0)), ((50.0, 10.0), (5.0, 50.0))],
+)
+def test_a_wrong_label_is_found(label, truth):
+    found = only(recording(*truth, label=label, seed=1))
+    assert not found.match.label_matches
+    assert found.match.label == f"R{label[0]:g}C{label[1]:g}"
+    assert found.settings[0].id == f"R{truth[0]:g}C{truth[1]:g}"
+    assert len(found.settings) == 1
+    assert found.match.source == "pressure and flow"
+
+
+def test_a_lung_that_is_no_setting():
+    found = only(recording(33.0, 33.0, label=(20.0, 20.0)))
+    assert not found.match.label_matches
+    assert found.settings == ()
+
+
+CASES = {
+    "turbulent_resistance": (
+        lambda V, Q, slope, t, p: 6.0 * Q * np.abs(Q), "quadratic", 6.0, 0.1, {}
+    ),
+    "nonlinear_compliance": (
+        # stiffening k: P = V / C + k / 2 (V / C)^2
+        lambda V, Q, slope, t, p: 0.5 * 0.02 * (50.0 * V) ** 2, "stiffening", 0.02, 0.1, {}
+    ),
+    "viscoelasticity": (creep(0.4, 0.8), "ratio", 0.4, 0.3, {}),
+    "inertance": (lambda V, Q, slope, t, p: 0.1 * slope, "inertance", 0.1, 0.1, {}),
+    "direction_resistance": (
+        lambda V, Q, slope, t, p: 5.0 * np.minimum(Q, 0.0), "difference", 5.0, 0.1, {}
+    ),
+    "volume_resistance": (lambda V, Q, slope, t, p: 15.0 * Q * V, "slope", 15.0, 0.1, {}),
+    "circuit_compliance": (None, "compliance", 1.5, 0.15, {"tube": 1.5}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_needed_beyond_R_and_C(name):
+    extra, parameter, value, share, more = CASES[name]
+    found = only(recording(20.0, 20.0, extra, n=20, seed=5, **more))
+    assert [term.name for term in found.terms] == [name]
+    near(found.terms[0].parameters[parameter], value, share)
+    assert found.terms[0].nats > 4.6
+    assert found.terms[0].effect > 0.03
+    if name != "nonlinear_compliance":
+        near(found.C, 20.0, 0.04)
+
+
+def test_a_leak_is_gas_that_does_not_come_back():
+    """The sensor sees what leaks away behind it: 5 mL/s per cmH2O."""
+    plain = recording(20.0, 20.0, n=20, seed=6)
+    dose = np.cumsum(plain.pressure * plain.dt, axis=1)
+    assert plain.flow is not None
+    found = only(replace(plain, volume=None, flow=plain.flow + 5.0 * plain.pressure))
+    assert dose[:, -1].min() > 0
+    (term,) = found.terms
+    assert "leak" in (term.name, *term.alternatives)
+    near(found.C, 20.0, 0.05)
+    assert term.name == "leak"
+    near(term.parameters["conductance"], 5.0, 0.2)
+
+
+def test_nothing_is_found_where_nothing_is():
+    rng = np.random.default_rng(0)
+    false = 0
+    for seed in range(50):
+        lung = rng.choice([5.0, 20.0, 50.0]), rng.choice([10.0, 20.0, 50.0])
+        sensors = (("flow",), ("volume",), SENSORS)[seed % 3]
+        false += bool(only(recording(*lung, n=8, seed=seed, sensors=sensors)).terms)
+    assert false <= 1
+
+
+def test_gaps_partial_breaths_and_clipped_sensors():
+    whole = recording(20.0, 20.0, n=12, seed=8)
+    assert whole.flow is not None
+    assert whole.volume is not None
+    pressure, flow = whole.pressure.copy(), whole.flow.copy()
+    pressure[2, 40:90] = np.nan
+    flow[4, 100:160] = np.nan
+    pressure[:, :] = np.minimum(pressure, 24.0)
+    for volume in (whole.volume, None):
+        found = only(replace(whole, pressure=pressure, flow=flow, volume=volume))
+        near(found.R, 20.0, 0.03)
+        near(found.C, 20.0, 0.03)
+        assert "end of the sensor's range" in " ".join(found.notes)
+    # Parts of breaths only: the first second of some, nothing of others.
+    valid = whole.valid.copy()
+    valid[:4, 130:] = False
+    valid[4:6, 20:] = False
+    found = only(replace(whole, valid=valid))
+    near(found.R, 20.0, 0.03)
+    near(found.C, 20.0, 0.03)
+    assert found.breaths == 10
+    assert "2 of 12 breaths" in found.notes[0]
+
+
+def test_several_lungs_and_few_breaths():
+    two = [recording(5.0, 50.0, n=3, seed=1), recording(20.0, 10.0, n=6, seed=2)]
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(x, name) for x in two])
+        for name in ("R", "C", "time", "u_in", "u_out", "pressure", "flow")
+    }
+    found = mechanics.identify(make_breaths(np.arange(9), **columns))
+    assert [one.label for one in found] == ["R5C50", "R20C10"]
+    assert all(one.match.label_matches for one in found)
+    assert "Fewer than 4 breaths" in found[0].notes[0]
+
+
+def test_what_cannot_be_identified():
+    whole = recording()
+    with pytest.raises(InputError, match="neither flow nor volume"):
+        mechanics.identify(replace(whole, flow=None, volume=None))
+    with pytest.raises(InputError, match="no piece of a breath"):
+        mechanics.identify(replace(whole, pressure=np.full_like(whole.pressure, np.nan)))
+
+
+def pretended(R, C, *, label=(20.0, 20.0), quadratic=0.0):
+    """What a fit to pressure alone would say of one lung."""
+    data = SimpleNamespace(lung=np.zeros(3, int), R=np.full(3, label[0]), C=np.full(3, label[1]))
+    values = {"R": R, "C": C}
+    return cast(Any, SimpleNamespace(
+        problem=SimpleNamespace(data=data),
+        value=lambda path: np.array([values[path]]),
+        ci95=lambda path: np.array([[0.99 * values[path], 1.01 * values[path]]]),
+        column=lambda path: np.full(3, quadratic),
+    ))  # fmt: skip
+
+
+def test_labels_by_pressure_alone():
+    assert mechanics.label(pretended(20.0, 20.0)).label_matches
+    # A valve whose gain is 20 % off, on top of a lung that is 20 % off: R and 1/C together.
+    assert mechanics.label(pretended(28.0, 14.5)).label_matches
+    # R and C off in the same direction: no gain explains that.
+    other = pretended(31.5, 30.0)
+    assert not mechanics.label(other).label_matches
+    assert mechanics.settings_of(other) == {"R20C20": ()}
+    wrong = pretended(5.2, 51.0)
+    assert not mechanics.label(wrong).label_matches
+    assert mechanics.settings_of(wrong)["R20C20"][0].id == "R5C50"
+    # A parabolic resistor has its label at 1 L/s.
+    bent = mechanics.label(pretended(6.0, 20.0, quadratic=13.0))
+    assert bent.label_matches
+    assert bent.fitted_R == pytest.approx(19.0)
+    assert bent.source == "pressure"

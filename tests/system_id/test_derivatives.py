@@ -1,0 +1,124 @@
+"""Pressures at several parameters at once, and their derivatives."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.physics import cases
+from ventbench.physics import parameter, paths
+from ventbench.precision import float64
+from ventbench.system_id import START, Simulator, derivatives, recorded, settings
+
+ORDER = (*paths(), START)
+
+#: None at a kink.
+ACTING = {
+    "R": 11.0, "C": 23.0, "PEEP": 5.0, "gain": 21.0, "R_ex": 4.0, "valve_lag.tau": 0.03,
+    "valve_curve.loss": 0.2, "valve_dead_band.width": 1.23, "circuit_compliance.compliance": 1.0,
+    "leak.conductance": 5.0, "inertance.inertance": 0.04, "turbulent_resistance.quadratic": 3.0,
+    "nonlinear_compliance.stiffening": 0.02, "viscoelasticity.ratio": 0.3, "sensor_lag.tau": 0.03,
+    "sensor_drift.drift": 1.0, "supply_droop.drop": 0.1,
+}  # fmt: skip
+
+LATE = ("valve_delay.delay", "exhalation_valve_delay.opening", "exhalation_valve_delay.closing")
+
+#: Dead times, s; what closes late by a millisecond or two changes less than the integrator errs.
+AT = [(path, first) for path in LATE for first in (0.0, 0.041) if (path, first) != (LATE[2], 0.0)]
+
+
+@pytest.fixture(scope="module")
+def data():
+    return recorded(cases.recording(6, {}))
+
+
+@pytest.fixture(scope="module")
+def simulator(data):
+    return Simulator(data, paths())
+
+
+@pytest.fixture(scope="module")
+def values(data):
+    return settings(data, paths(), ACTING)
+
+
+def columns(names):
+    return tuple(ORDER.index(name) for name in names)
+
+
+@pytest.fixture(scope="module")
+def exact(simulator):
+    """Slopes along a direction, by automatic differentiation of the same model."""
+    (commands,) = simulator._commands
+
+    @jax.jit
+    def slope(values, direction):
+        def run(values):
+            static = simulator._static | {"skip_idle": False}
+            return derivatives._run(values, commands, **static)
+
+        return jax.jvp(run, (values,), (jnp.broadcast_to(direction, values.shape),))[1]
+
+    def found(values, column):
+        direction = np.zeros(len(ORDER))
+        direction[column] = 1.0
+        padded = np.resize(values, (simulator._part, len(ORDER)))
+        with float64():
+            return np.asarray(slope(jnp.asarray(padded), jnp.asarray(direction)))[: len(values)]
+
+    return found
+
+
+def test_are_those_of_automatic_differentiation(simulator, values, exact):
+    names = (*ACTING, START)
+    seen, slopes = simulator.derivatives(values, columns(names))
+    np.testing.assert_allclose(seen, simulator.predict(values), rtol=0, atol=1e-10)
+    for k, name in enumerate(names):
+        other = exact(values, ORDER.index(name))
+        assert np.abs(other).max() > 0.01, name
+        size = np.sqrt(np.mean(other**2))
+        assert np.sqrt(np.mean((slopes[:, k] - other) ** 2)) < 1e-4 * size, name
+
+
+@pytest.mark.parametrize(("path", "first"), AT)
+def test_of_dead_times_are_those_of_milliseconds(simulator, values, path, first):
+    """At zero too, where the smallest one moves the integrator's cuts."""
+    (column,) = columns([path])
+    ends = np.stack([values, values])
+    ends[0, :, column], ends[1, :, column] = first, first + 2e-3
+    there, beyond = simulator.predict_all(ends)
+    moved = (beyond - there) / 2e-3
+    slope = simulator.derivatives(ends[0], (column,))[1][:, 0]
+    assert np.sqrt(np.mean(moved**2)) > 1.0
+    assert np.sqrt(np.mean((slope - moved) ** 2)) < 0.2 * np.sqrt(np.mean(moved**2))
+
+
+def test_look_within_the_bounds_alone(simulator, data, monkeypatch):
+    asked = []
+
+    def predict_all(points):
+        asked.append(points)
+        return np.zeros((len(points), *data.seen.shape))
+
+    monkeypatch.setattr(simulator, "predict_all", predict_all)
+    low = np.array([parameter(name).low for name in paths()])
+    high = np.array([parameter(name).high for name in paths()])
+    for bound in (low, high):
+        values = np.tile(np.append(bound, 5.0), (len(data), 1))
+        simulator.derivatives(values, tuple(range(len(ORDER))))
+        points = asked.pop()
+        assert np.all((points[:, :, :-1] >= low) & (points[:, :, :-1] <= high))
+        moved = points[1:] != points[:1]
+        assert len(moved) == len(ORDER)
+        assert np.array_equal(moved, np.eye(len(ORDER), dtype=bool)[:, None].repeat(len(data), 1))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 6, 13])
+def test_several_points_are_each_by_itself(simulator, values, count):
+    points = np.repeat(values[None], count, axis=0)
+    points[:, :, ORDER.index("leak.conductance")] += np.arange(count)[:, None]
+    alone = np.stack([simulator.predict(point) for point in points])
+    np.testing.assert_allclose(simulator.predict_all(points), alone, rtol=0, atol=1e-10)
+    assert count == 1 or np.abs(np.diff(alone, axis=0)).max() > 0.01

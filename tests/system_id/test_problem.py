@@ -1,0 +1,175 @@
+"""Derivatives, likelihood, noise and search, each against something independent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from tests.physics import cases
+from ventbench.errors import InputError
+from ventbench.system_id import Noise, Unknowns, estimate, fit, recorded, unknowns
+from ventbench.system_id.intervals import quantile
+from ventbench.system_id.least_squares import minimise
+
+M = {"valve_lag": {"tau": 0.05}, "viscoelasticity": {"ratio": 0.4, "time": 0.8}}
+
+
+@pytest.fixture(scope="module")
+def found():
+    return fit(recorded(cases.recording(8, M, noise=0.2, seed=4)), M)
+
+
+def test_gradient_and_jacobian(found):
+    problem = found.problem
+    x = found.minimum.x + np.random.default_rng(0).normal(0, 0.01, len(found.minimum.x))
+    _, gradient, _ = problem.normal(x)
+    residual, slopes = problem.jacobian(x)
+    np.testing.assert_allclose(residual, problem.residual(x), atol=1e-12)
+    for unknown in (0, 1, 4, 5, 6, 9):
+        step = np.zeros_like(x)
+        step[unknown] = 1e-6
+        numeric = (problem.cost(x + step) - problem.cost(x - step)) / 2e-6
+        assert gradient[unknown] == pytest.approx(numeric, rel=1e-4, abs=1e-3)
+        moved = (problem.residual(x + step) - problem.residual(x - step)) / 2e-6
+        column = int(problem.unknowns.path_of[unknown])
+        mine = problem.unknowns.index[:, column] == unknown
+        # One-sided differences: exact to a millionth of the column's largest slope.
+        atol = 1e-6 * np.abs(moved[mine]).max()
+        np.testing.assert_allclose(slopes[mine, column], moved[mine], atol=atol)
+        assert np.all(moved[~mine] == 0)
+
+
+def test_same_optimum_as_scipy(found):
+    """Gaussian noise; scipy's trust region from the labels, over the same residuals."""
+    noise = Noise((0.2,), (0.0,), np.inf)
+    mine = fit(found.problem.data, M, noise=noise)
+    problem = mine.problem
+    index = problem.unknowns.index
+
+    def residual(x):
+        prior = np.sqrt(problem.precision) * (x - problem.mean)
+        white = noise.whiten(problem.residual(x), problem.data.weight)
+        return np.concatenate([white.ravel(), prior])
+
+    def jacobian(x):
+        rows = noise.whiten(problem.jacobian(x)[1], problem.data.weight)
+        full = np.zeros((rows.shape[0], *rows.shape[2:], len(x)))
+        for i, columns in enumerate(index):
+            full[i][..., columns] = np.moveaxis(rows[i], 0, -1)
+        prior = np.diag(np.sqrt(problem.precision))
+        return np.concatenate([full.reshape(-1, len(x)), prior])
+
+    low, high = problem.unknowns.bounds()
+    start = np.clip(mine.minimum.x * 1.05 + 0.02, low, high)
+    search = cast(Any, optimize.least_squares)  # whose types know no function as `jac`
+    theirs = search(residual, start, jac=jacobian, bounds=(low, high), x_scale="jac")
+    assert mine.minimum.cost == pytest.approx(theirs.cost, abs=2e-3)
+
+
+def test_likelihood_against_the_whole_covariance():
+    rng = np.random.default_rng(1)
+    noise = Noise((0.3,), (0.6,), np.inf)
+    lag = np.abs(np.subtract.outer(np.arange(20), np.arange(20)))
+    cov: Any = 0.09 * 0.6**lag
+    residual = rng.multivariate_normal(np.zeros(20), cov, size=3)[:, None]
+    expected = [stats.multivariate_normal.logpdf(r[0], np.zeros(20), cov) for r in residual]
+    np.testing.assert_allclose(noise.log_likelihood(residual, np.ones((3, 1, 20))), expected)
+    # A sample that is not measured does not count.
+    weight = np.ones((3, 1, 20))
+    weight[:, :, 7:] = 0.0
+    short = [stats.multivariate_normal.logpdf(r[0, :7], np.zeros(7), cov[:7, :7]) for r in residual]
+    np.testing.assert_allclose(noise.log_likelihood(residual * weight, weight), short)
+
+
+def test_noise_is_a_density():
+    grid = np.linspace(-60, 60, 200_001)
+    for tail in (1.0, 3.0):
+        noise = Noise((1.0,), (0.0,), tail)
+        density = np.exp(-noise.loss(grid) - noise.log_norm())
+        assert np.trapezoid(density, grid) == pytest.approx(1.0, abs=1e-6)
+        slope = np.gradient(noise.loss(grid), grid)
+        np.testing.assert_allclose(slope, noise.influence(grid) * grid, atol=1e-3)
+
+
+def test_noise_is_estimated_in_spite_of_misfits():
+    rng = np.random.default_rng(2)
+    fresh = rng.normal(size=(50, 1, 80)) * 0.2 * np.sqrt(1 - 0.25)
+    residual = np.zeros_like(fresh)
+    residual[..., 0] = rng.normal(0, 0.2, (50, 1))
+    for t in range(1, 80):
+        residual[..., t] = 0.5 * residual[..., t - 1] + fresh[..., t]
+    residual[:3] += 4.0
+    noise = estimate(residual, np.ones_like(residual))
+    assert noise.sigma[0] == pytest.approx(0.2, rel=0.15)
+    assert 0.4 < noise.ar[0] < 0.85
+
+
+def test_outlying_breaths_do_not_move_a_robust_fit(found):
+    data = found.problem.data
+    seen = data.seen.copy()
+    seen[3, :, 5:30] += 6.0
+    spoilt = fit(replace(data, seen=seen), M, noise=found.problem.noise)
+    plain = fit(replace(data, seen=seen), M, noise=replace(found.problem.noise, tail=np.inf))
+    truth = found.value("C")[0]
+    assert abs(spoilt.value("C")[0] - truth) < 0.5 * abs(plain.value("C")[0] - truth)
+
+
+def test_minimise_stops_at_bounds():
+    """Rosenbrock's valley, whose minimum (1, 1) lies outside; at x = 0.5 it is y = 0.25."""
+
+    def residual(x):
+        return np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]])
+
+    def normal(x):
+        rows = np.array([[-20 * x[0], 10.0], [-1.0, 0.0]])
+        r = residual(x)
+        return float(0.5 * r @ r), rows.T @ r, rows.T @ rows
+
+    def run(high):
+        low, high = np.full(2, -2.0), np.asarray(high)
+        return minimise(
+            lambda x: float(0.5 * residual(x) @ residual(x)), normal, np.array([-1.2, 1.0]),
+            low, high, tolerance=1e-10, iterations=100,
+        )  # fmt: skip
+
+    free = run([3.0, 3.0])
+    assert free.converged
+    np.testing.assert_allclose(free.x, [1.0, 1.0], atol=1e-4)
+    np.testing.assert_allclose(run([0.5, 3.0]).x, [0.5, 0.25], atol=1e-4)
+
+
+@pytest.mark.parametrize("freedom", [5, 10, 40])
+def test_quantile(freedom):
+    assert quantile(freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=0.01)
+
+
+def test_layout_and_its_errors(found):
+    data = found.problem.data
+    layout = unknowns(data, ("R", "gain", "start"), {"gain": np.arange(8) // 4})
+    assert isinstance(layout, Unknowns)
+    assert len(layout.of("R")) == 1
+    assert len(layout.of("gain")) == 2
+    assert layout.shared.sum() == 3
+    x = layout.pack({"R": 12.0, "gain": np.repeat([20.0, 25.0], 4), "start": np.arange(8.0)})
+    back = layout.unpack(x)
+    np.testing.assert_allclose(back[:, 0], 12.0)
+    np.testing.assert_allclose(back[:, 1], np.repeat([20.0, 25.0], 4))
+    np.testing.assert_allclose(back[:, 2], np.arange(8.0))
+    with pytest.raises(InputError, match="freed twice"):
+        unknowns(data, ("R", "R"))
+    with pytest.raises(InputError, match="groups of R"):
+        unknowns(data, ("R",), {"R": [0, 1]})
+
+
+def test_recordings_that_cannot_be_fitted():
+    breaths = cases.recording(2, {})
+    with pytest.raises(InputError, match="no breaths"):
+        recorded(breaths.select([]))
+    with pytest.raises(InputError, match="no flow"):
+        recorded(replace(breaths, flow=None), flow=True)
+    with pytest.raises(InputError, match="no pressure"):
+        recorded(replace(breaths, pressure=np.full_like(breaths.pressure, np.nan)))

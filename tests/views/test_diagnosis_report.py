@@ -1,0 +1,185 @@
+"""The report and the rerun file of a diagnosis."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.diagnosis import made
+from ventbench.diagnosis.result import Diagnosis
+from ventbench.views.diagnosis import write_report, write_rerun
+from ventbench.views.diagnosis.breaths import panels, rmse, worst
+from ventbench.views.diagnosis.chart import Chart, limits, ticks
+
+from .test_report import Page
+
+pytest.importorskip("jinja2", reason="needs the extra ventbench[view]")
+
+
+@pytest.fixture(scope="module")
+def found() -> Diagnosis:
+    return made.diagnosis()
+
+
+def test_report(found: Diagnosis, tmp_path: Path) -> None:
+    path = write_report(tmp_path / "report.html", found)
+    page = Page(path.read_text())
+    assert path.stat().st_size < 200_000
+    (heading,) = [tag for tag, _ in page.tags if tag == "h1"]
+    assert heading
+    assert "Missing in the physics simulator: dead time of the inspiratory valve" in page.text
+    assert "41 ms [38, 44]" in page.text
+    assert "97 %" in page.text
+    one = found.open_loop
+    for value in (one.before.rmse, one.refit.rmse, one.after.rmse, one.noise_floor):
+        assert f"{value:.2f}" in page.text
+    figures = [attrs["aria-label"] for _, attrs in page.tags if attrs.get("role") == "img"]
+    assert len([text for text in figures if text.startswith("Pressure of breath")]) == 6
+    (start,) = [text for text in figures if "Mean error along time since inspiration" in text]
+    assert "significant ranges: 0" in start
+    assert "This recording cannot tell valve_delay from valve_lag." in page.text
+    assert len([text for text in figures if "to record" in text]) == 3
+    assert found.notes[0] in page.text
+    ids = [attrs["id"] for _, attrs in page.tags if "id" in attrs]
+    assert len(ids) == len(set(ids))
+    pointed = {
+        attrs["aria-labelledby"] for _, attrs in page.tags if "aria-labelledby" in attrs
+    }  # fmt: skip
+    assert pointed <= set(ids)
+    assert all("scope" in attrs for tag, attrs in page.tags if tag == "th")
+
+
+def test_nothing_from_outside(found: Diagnosis, tmp_path: Path) -> None:
+    bad = dataclasses.replace(
+        found, plant="<script>alert('x')</script>", notes=("<img src=http://x>",)
+    )
+    text = write_report(tmp_path / "r.html", bad).read_text()
+    page = Page(text)
+    assert not {"script", "iframe", "img", "object", "link"} & {tag for tag, _ in page.tags}
+    assert "&lt;script&gt;" in text
+    for _, attrs in page.tags:
+        assert not [key for key in attrs if key.startswith("on")]
+        assert not {"href", "src"} & set(attrs)
+    assert "url(" not in text
+    assert "default-src 'none'" in text
+
+
+def test_other_verdicts(tmp_path: Path) -> None:
+    unnamed = Page(write_report(tmp_path / "u.html", made.unnamed(12)).read_text())
+    assert "Shape of R(V)" in unnamed.text
+    assert "What is missing</h2>" not in unnamed.text
+    nothing = Page(write_report(tmp_path / "n.html", made.nothing(12)).read_text())
+    assert "Nothing is missing" in nothing.text
+    assert "Nowhere" in nothing.text
+    assert "corrected" not in nothing.text
+
+
+def test_no_nan_reaches_the_page(found: Diagnosis, tmp_path: Path) -> None:
+    pressure = found.traces.breaths.pressure.copy()
+    pressure[2] = np.nan  # a held-out breath that was not measured
+    pressure[5, 10:20] = np.nan
+    broken = dataclasses.replace(
+        found,
+        traces=dataclasses.replace(
+            found.traces, breaths=dataclasses.replace(found.traces.breaths, pressure=pressure)
+        ),
+        open_loop=dataclasses.replace(found.open_loop, noise_floor=float("nan")),
+    )
+    text = write_report(tmp_path / "r.html", broken).read_text()
+    assert not re.search(r"\bnan\b|\binf\b", text.lower())
+    assert "breath 3," not in text
+
+
+def test_equal_input_gives_equal_bytes(found: Diagnosis, tmp_path: Path) -> None:
+    one, two = (write_report(tmp_path / name, found).read_bytes() for name in "ab")
+    assert one == two
+
+
+def test_the_breaths_that_are_shown(found: Diagnosis) -> None:
+    traces = found.traces
+    before, after = rmse(traces, traces.refit), rmse(traces, traces.after)
+    error = (traces.breaths.pressure - traces.refit)[7][traces.breaths.inspiratory[7]]
+    assert before[7] == pytest.approx(np.sqrt(np.mean(error**2)))
+    held = np.flatnonzero(traces.held_out)
+    shown = [i for i, _ in worst(found)]
+    assert len(set(shown)) == 6
+    assert set(shown) <= set(held)
+    assert shown[0] == held[np.argmax(before[held])]
+    rest = [i for i in held if i not in shown[:3]]
+    assert shown[3] == rest[int(np.argmax(after[rest]))]
+    panel = panels(found)[0]
+    assert [look for look, _ in panel.pressure.paths] == ["seen", "before", "refit", "after"]
+    assert panel.errors["refit"] == pytest.approx(before[shown[0]])
+
+
+def test_axes_of_a_chart() -> None:
+    chart = Chart((0.0, 2.0), (-1.0, 3.0), "s", "cmH2O", "")
+    left, top, right, bottom = chart.frame
+    assert chart.at_x(0.0) == left
+    assert chart.at_x(2.0) == right
+    assert chart.at_y(-1.0) == bottom
+    assert chart.at_y(3.0) == top
+    assert chart.zero == pytest.approx(bottom - 0.25 * (bottom - top), abs=0.05)
+    chart.band(1.0, 5.0)
+    assert chart.bands == [(round((left + right) / 2, 1), round((right - left) / 2, 1))]
+    assert ticks(0.0, 1.1, 6) == (pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8, 1.0]), [
+        "0.0", "0.2", "0.4", "0.6", "0.8", "1.0",
+    ])  # fmt: skip
+    assert ticks(-3.0, 12.0, 4)[1] == ["0", "5", "10"]
+    assert limits([1.0, np.nan], [3.0], around=0.5) == (0.0, 4.0)
+    low, high = limits([2.0])
+    assert low < 2.0 < high
+
+
+def read(path: Path) -> dict[str, dict[str, Any]]:
+    chunk = pytest.importorskip("rerun.chunk", reason="reads files back with rerun >= 0.41")
+    entities: dict[str, dict[str, Any]] = {}
+    for part in chunk.RrdReader(str(path)).store().stream():
+        batch, columns = part.to_record_batch(), entities.setdefault(part.entity_path, {})
+        for name in batch.schema.names:
+            column = batch.column(name)
+            if name == "recording_time":
+                columns["time"] = np.array([t.value for t in column]) / 1e9
+            elif name.startswith("Scalars"):
+                columns["values"] = np.array(column.to_pylist()).T[0]
+            elif part.is_static and ":" in name:
+                columns[name.partition(":")[2]] = column[0].as_py()
+    return entities
+
+
+def test_rerun(found: Diagnosis, tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="needs the extra ventbench[view]")
+    path = write_rerun(tmp_path / "diagnosis.rrd", found)
+    assert [item.name for item in tmp_path.iterdir()] == ["diagnosis.rrd"]
+    assert path.stat().st_size < 2_000_000
+    entities = read(path)
+    expected = {f"/R20C50/pressure/{x}" for x in ("recorded", "before", "refit", "after")}
+    expected |= {f"/R20C50/error/{x}" for x in ("before", "refit", "after")}
+    expected |= {"/R20C50/u_in", "/R20C50/u_out", "/R20C50/held_out", "/about"}
+    expected |= {f"/by_breath/{x}" for x in ("before", "refit", "after")}
+    expected |= {"/map/refit", "/map/after"}
+    assert {name for name in entities if not name.startswith("/__")} == expected
+    breaths = found.traces.breaths
+    recorded = entities["/R20C50/pressure/recorded"]
+    np.testing.assert_array_equal(recorded["values"], breaths.pressure.ravel())
+    assert (np.diff(recorded["time"]) > 0).all(), "breaths lie end to end"
+    error = entities["/R20C50/error/refit"]["values"]
+    np.testing.assert_allclose(error, (breaths.pressure - found.traces.refit).ravel())
+    held = entities["/R20C50/held_out"]["values"].reshape(breaths.pressure.shape)
+    np.testing.assert_array_equal(np.isfinite(held).all(axis=1), found.traces.held_out)
+    assert "41 ms" in entities["/about"]["text"][0]
+
+
+def test_rerun_of_other_verdicts_and_names(tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="needs the extra ventbench[view]")
+    odd = dataclasses.replace(made.nothing(6), plant="\u673a ![i](http:)")
+    entities = read(write_rerun(tmp_path / "n.rrd", odd))
+    assert "/map/after" not in entities
+    text = entities["/about"]["text"][0]
+    assert all(ord(c) < 0x180 for c in text), "the viewer ends itself over what its font lacks"
+    assert "\\!\\[i\\]" in text, "a name is neither link nor image"

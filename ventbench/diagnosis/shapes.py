@@ -1,0 +1,74 @@
+"""The slot of a conclusion as it is shown: what it explains, and its drawn shape."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ventbench.diagnosis.beside import Place
+from ventbench.diagnosis.conclude import Conclusion
+from ventbench.diagnosis.moving import Moving
+from ventbench.diagnosis.places import public
+from ventbench.diagnosis.result import Slot
+from ventbench.diagnosis.solved import Solved
+from ventbench.diagnosis.sources import ALVEOLUS, MEASUREMENT, SUPPLY
+from ventbench.physics.catalogue import mechanism
+from ventbench.physics.nonparametric import SLOTS
+from ventbench.physics.shapes import drawn, without_absorbed
+
+_MEANINGS = {
+    ALVEOLUS: "a pressure at the alveolus that moves in time and that no command explains",
+    SUPPLY: "a flow of the supply that moves in time and that no command explains",
+    MEASUREMENT: "a pressure at the sensor that moves in time and that is not in the airway",
+}
+
+
+def slot(conclusion: Conclusion) -> Slot | None:
+    """Slot of a conclusion, or None."""
+    place = conclusion.place
+    if place is None:
+        return None
+    explains = _share(conclusion)
+    if place.source is not None:
+        return _moving(place, place.source, explains)
+    assert place.element is not None
+    x, y, x_unit, y_unit = _curve(conclusion.full, place.element)
+    meaning = SLOTS[place.name].meaning
+    return Slot(place.name, meaning, explains, place.nats, x, x_unit, y, y_unit)
+
+
+def _share(conclusion: Conclusion) -> float:
+    """Share of the squared error above the noise that goes with the slot, 0..1."""
+    named = conclusion.named
+    weight = named.problem.data.weight
+    before = float(np.sum(named.residual**2) / weight.sum())
+    floor = float(conclusion.noise.sigma[0] ** 2)
+    if conclusion.place is not None and conclusion.place.source is not None:
+        after = floor
+    else:
+        after = float(np.sum(conclusion.full.residual**2) / weight.sum())
+    return float(np.clip((before - after) / max(before - min(floor, after), 1e-9), 0.0, 1.0))
+
+
+def _moving(place: Place, source: Moving, explains: float) -> Slot:
+    size = np.sqrt(np.mean(source.shape**2, axis=1))
+    course = source.shape[int(np.argmax(size))]
+    unit = "share of the flow, 1" if place.name == SUPPLY else "pressure, cmH2O"
+    meaning = _MEANINGS[place.name]
+    if source.periodic:
+        meaning += f", {source.scale:.1f} times a second"
+    x = np.arange(len(course), dtype=float)
+    return Slot(
+        place.name, meaning, explains, place.nats, x, "sample of the breath where it is largest",
+        course, unit,
+    )  # fmt: skip
+
+
+def _curve(full: Solved, element: str) -> tuple[np.ndarray, np.ndarray, str, str]:
+    own = [f"{element}.{p.name}" for p in mechanism(element).description.parameters]
+    values = {
+        name: float(np.median(full.column(name)))
+        for name in (*own, "R", "C", "gain", "R_ex", "PEEP")
+    }
+    # The slot's other elements are neutral; the strongest curve is the first.
+    curve = without_absorbed(drawn(public(element), values)[0])
+    return np.asarray(curve.x, float), np.asarray(curve.y, float), curve.x_unit, curve.y_unit

@@ -1,0 +1,92 @@
+"""The runs of the RespiraWorks recordings as breaths, and the mechanics of all of them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+
+from ventbench.mechanics.identify import Mechanics, identify
+from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.build import FILL, stack, stack_times, valid_mask
+from ventbench.recordings.respiraworks import Run, load_respiraworks
+
+#: Shortest breath that is kept, s, and how long before its inspiration a breath is cut, so that the
+#: steep rise lies within.
+_SHORTEST, _BEFORE = 0.5, 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Surveyed:
+    """A run and its lung; None where neither flow nor volume was logged."""
+
+    run: Run
+    mechanics: Mechanics | None
+
+
+def breaths_of(run: Run) -> Breaths:
+    """Make breaths of a run, short ones left out.
+
+    Its valves are another ventilator's: u_in is 0, and u_out is 1 where the target is in the lower
+    half of its range. What was never logged is None.
+    """
+    edges = np.flatnonzero(np.diff(run.breath)) + 1
+    edges = np.searchsorted(run.time, run.time[edges] - _BEFORE)
+    pieces = np.split(np.arange(len(run.time)), edges)
+    pieces = [p for p in pieces if len(p) and run.time[p[-1]] - run.time[p[0]] >= _SHORTEST]
+    lengths = np.array([len(p) for p in pieces])
+    rows = np.concatenate(pieces)
+    target = run.signals["target"]
+    shut = target > 0.5 * (np.nanmin(target) + np.nanmax(target))
+    samples = {"u_in": np.zeros(len(rows)), "u_out": (~shut[rows]).astype(np.int8)}
+    samples["pressure"] = run.signals["pressure"][rows]
+    for name in ("flow", "volume"):
+        if np.isfinite(run.signals[name]).any():
+            samples[name] = run.signals[name][rows]
+    arrays = {name: stack(values, lengths, FILL[name]) for name, values in samples.items()}
+    starts = np.concatenate([run.time[p] - run.time[p[0]] for p in pieces])
+    time, dt = stack_times(starts, lengths)
+    n = len(pieces)
+    return Breaths(
+        breath_id=np.array([run.breath[p[-1]] for p in pieces]), R=np.full(n, run.R),
+        C=np.full(n, run.C), time=time, dt=dt, valid=valid_mask(lengths),
+        time_inferred=np.zeros(n, bool), u_in=arrays["u_in"], u_out=arrays["u_out"],
+        pressure=arrays["pressure"], flow=arrays.get("flow"), volume=arrays.get("volume"),
+    )  # fmt: skip
+
+
+def survey(path: str | os.PathLike[str]) -> tuple[Surveyed, ...]:
+    """Identify the lung of every run of a RespiraWorks file.
+
+    Raises:
+        RecordingError: if the file cannot be read.
+    """
+    found = []
+    for run in load_respiraworks(path):
+        breaths = breaths_of(run)
+        known = breaths.flow is not None or breaths.volume is not None
+        found.append(Surveyed(run, identify(breaths)[0] if known else None))
+    return tuple(found)
+
+
+def table(found: tuple[Surveyed, ...]) -> str:
+    """A Markdown table of a survey: a run a line."""
+    lines = [
+        "| day or gas | test | label | R at its flow | C | label holds | may be | also needs |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for item in found:
+        run, it = item.run, item.mechanics
+        head = f"| {run.name} | {run.test} | R{run.R:g}C{run.C:g} |"
+        if it is None:
+            lines.append(f"{head} | | no flow, no volume | | |")
+            continue
+        one = it.match
+        R = f"{one.fitted_R:.1f} [{one.ci95_R[0]:.1f}, {one.ci95_R[1]:.1f}]"
+        C = f"{one.fitted_C:.1f} [{one.ci95_C[0]:.1f}, {one.ci95_C[1]:.1f}]"
+        may = ", ".join(lung.id for lung in it.settings[:2]) or "none known"
+        needs = ", ".join(term.name for term in it.terms)
+        holds = "yes" if one.label_matches else "**no**"
+        lines.append(f"{head} {R} | {C} | {holds} | {may} | {needs} |")
+    return "\n".join(lines)

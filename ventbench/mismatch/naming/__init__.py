@@ -1,1 +1,0 @@
-"""Which mechanisms a recording needs: screening, refits, gates on held-out breaths, slots."""

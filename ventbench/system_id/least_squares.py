@@ -1,0 +1,109 @@
+"""Levenberg-Marquardt within bounds, for sums whose normal equations are at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ventbench.system_id.data import Floats
+
+#: Cost and, on demand, gradient and approximate Hessian at a point.
+Cost = Callable[[Floats], float]
+Normal = Callable[[Floats], tuple[float, Floats, Floats]]
+
+#: Times that a step is found anew since unknowns would leave their bounds.
+_PASSES = 4
+
+#: Steps in a row that hardly lower the cost after which a valley is called flat.
+_SLOW = 4
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """Where a search ended.
+
+    Attributes:
+        x: the point, ``(U,)``.
+        cost: there.
+        gradient: there, ``(U,)``.
+        hessian: its Gauss-Newton approximation there, ``(U, U)``.
+        iterations: derivatives that were computed.
+        converged: False if it ran out of iterations.
+    """
+
+    x: Floats
+    cost: float
+    gradient: Floats
+    hessian: Floats
+    iterations: int
+    converged: bool
+
+
+def minimise(
+    cost: Cost, normal: Normal, x: Floats, low: Floats, high: Floats, *, tolerance: float = 1e-3,
+    iterations: int = 40,
+) -> Minimum:  # fmt: skip
+    """Search for a minimum from ``x``.
+
+    Unknowns at a bound that the gradient pushes against stay there for the step; others that would
+    pass theirs end there, and the rest of the step is found anew. Damping is by
+    Marquardt's diagonal, so that scales do not matter.
+
+    Args:
+        cost: value at a point; infinite or nan is a step too far.
+        normal: also gradient and Gauss-Newton Hessian.
+        x: start, moved into the bounds, ``(U,)``.
+        low: bounds, ``(U,)``.
+        high: bounds.
+        tolerance: the expected fall of the cost (in nats, if it is minus a log-likelihood) at
+            which the search ends; or after four steps that each gain less than ten times that.
+        iterations: most evaluations of ``normal``.
+    """
+    x = np.clip(x, low, high)
+    value, gradient, hessian = normal(x)
+    damping, slow = 1e-3, 0
+    for iteration in range(1, iterations):
+        pinned = ((x <= low) & (gradient > 0)) | ((x >= high) & (gradient < 0))
+        moved = False
+        while damping < 1e10:
+            step = _step(gradient, hessian, damping, pinned, low - x, high - x)
+            trial = np.clip(x + step, low, high)
+            expected = -float(gradient @ step + 0.5 * step @ hessian @ step)
+            if expected < tolerance and damping <= 1e-2:
+                return Minimum(x, value, gradient, hessian, iteration, True)
+            reached = cost(trial)
+            if reached < value:
+                gain = (value - reached) / max(expected, 1e-12)
+                damping = max(damping * (0.1 if gain > 0.5 else 1.0 if gain > 0.1 else 3.0), 1e-9)
+                moved = True
+                break
+            damping *= 8.0
+        if not moved:  # no smaller value to be found, to rounding
+            return Minimum(x, value, gradient, hessian, iteration, True)
+        slow = slow + 1 if value - reached < 10.0 * tolerance else 0
+        x = trial
+        value, gradient, hessian = normal(x)
+        if slow == _SLOW:
+            return Minimum(x, value, gradient, hessian, iteration, True)
+    return Minimum(x, value, gradient, hessian, iterations, False)
+
+
+def _step(
+    gradient: Floats, hessian: Floats, damping: float, pinned: np.ndarray, low: Floats, high: Floats
+) -> Floats:
+    """Damped Newton step; ``low`` and ``high`` are how far each unknown may go."""
+    step, free = np.zeros_like(gradient), ~pinned
+    floor = 1e-12 * max(float(np.diag(hessian).max(initial=0.0)), 1e-300)
+    damped = hessian + np.diag(damping * np.maximum(np.diag(hessian), floor) + floor)
+    for _ in range(_PASSES):
+        index = np.flatnonzero(free)
+        force = gradient[index] + damped[np.ix_(index, np.flatnonzero(~free))] @ step[~free]
+        step[index] = -np.linalg.solve(damped[np.ix_(index, index)], force)
+        beyond = free & ((step < low) | (step > high))
+        if not beyond.any():
+            break
+        step[beyond] = np.clip(step[beyond], low[beyond], high[beyond])
+        free &= ~beyond
+    return np.clip(step, low, high)

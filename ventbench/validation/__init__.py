@@ -1,0 +1,1 @@
+"""Proofs of the diagnosis: concealed challenges, and the real rig."""

@@ -1,5 +1,0 @@
-"""Pictures of a diagnosis: an HTML report and a rerun file (extra ``ventbench[view]``)."""
-
-from ventbench.views.mismatch.write import write_report, write_rerun
-
-__all__ = ["write_report", "write_rerun"]

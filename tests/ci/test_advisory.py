@@ -2,8 +2,7 @@
 
 import pytest
 
-from ventbench.ci import advisory
-from ventbench.ci.errors import TakeError
+from ci import advisory
 from ventbench.sandbox.runner import SandboxRunner
 from ventbench.submissions.runner import InProcessRunner
 
@@ -17,22 +16,6 @@ def advise(repository, simulators):
         return advisory.advise(*pull, "demo", simulators.plants, runner or SandboxRunner())
 
     return run
-
-
-def test_which_submissions_a_pull_request_changes(repository, demo):
-    def of(commit, base=repository.base):
-        return advisory.submissions(repository.url, base, commit)
-
-    good = repository.commit(demo, repository.base)
-    assert of(good) == ["demo"]
-    assert of(repository.commit({"submissions/README.md": b"x"}, repository.base)) == []
-    assert of(repository.commit({"docs/x.md": b"x"}, good), good) == []
-    both = repository.commit({"submissions/other/a.py": b"", f"{PATH}/a.py": b""}, good)
-    assert of(both, good) == ["demo", "other"]
-    later = repository.commit({"submissions/other/a.py": b""}, repository.base)
-    assert of(good, later) == ["demo"], "what the base has got since is not theirs"
-    with pytest.raises(TakeError, match="40 lower-case"):
-        of("HEAD")
 
 
 def test_a_good_one_is_scored_in_the_sandbox(repository, demo, advise):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ventbench.ci.git import Git, GitError
+from ci.git import Git, GitError
 
 
 def test_output_has_an_end(repository):

@@ -5,11 +5,10 @@ import subprocess
 
 import pytest
 
+from ci import official, propose, publish, workflow
+from ci.git import Git, GitError, environment
+from ci.take import TakeError, take
 from ventbench.board import canonical, record, store
-from ventbench.ci import official, propose, publish, values
-from ventbench.ci.errors import TakeError
-from ventbench.ci.git import Git, GitError, environment
-from ventbench.ci.take import take
 from ventbench.errors import InputError
 from ventbench.sandbox.runner import SandboxRunner
 from ventbench.submissions.runner import InProcessRunner
@@ -154,7 +153,7 @@ def test_main_reads_the_environment(repository, demo, simulators, tmp_path, monk
     }
     for key, value in given.items():
         monkeypatch.setenv(key, value)
-    assert values.run(official.TITLE, official.main) == 2
+    assert workflow.run(official.TITLE, official.main) == 2
     assert "| stopped: ventbench is changed as well" in capsys.readouterr().out
     assert not (tmp_path / "out").exists()
 

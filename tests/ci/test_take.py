@@ -5,10 +5,8 @@ import os
 
 import pytest
 
-from ventbench.ci import git
-from ventbench.ci.changes import PARENT
-from ventbench.ci.errors import TakeError
-from ventbench.ci.take import take
+from ci import git
+from ci.take import PARENT, TakeError, changed_submissions, take
 from ventbench.submissions.folder import MAX_BYTES, open_submission
 
 from .conftest import PATH
@@ -329,3 +327,19 @@ def test_contents_are_those_that_git_hashed(repository, demo, taken):
         content = path.read_bytes()
         head = f"blob {len(content)}\0".encode()
         assert hashlib.sha1(head + content).hexdigest() == repository.blob(content)
+
+
+def test_which_submissions_a_pull_request_changes(repository, demo):
+    def of(commit, base=repository.base):
+        return changed_submissions(repository.url, base, commit)
+
+    good = repository.commit(demo, repository.base)
+    assert of(good) == ["demo"]
+    assert of(repository.commit({"submissions/README.md": b"x"}, repository.base)) == []
+    assert of(repository.commit({"docs/x.md": b"x"}, good), good) == []
+    both = repository.commit({"submissions/other/a.py": b"", f"{PATH}/a.py": b""}, good)
+    assert of(both, good) == ["demo", "other"]
+    later = repository.commit({"submissions/other/a.py": b""}, repository.base)
+    assert of(good, later) == ["demo"], "what the base has got since is not theirs"
+    with pytest.raises(TakeError, match="40 lower-case"):
+        of("HEAD")

@@ -88,7 +88,7 @@ class TestEach:
         assert all(job["timeout-minutes"] <= 60 for job in read(path)["jobs"].values())
 
     def test_called_modules_are_there(self, path):
-        for name in re.findall(r"-m (ventbench\.[\w.]+)", path.read_text()):
+        for name in re.findall(r"-m (ci\.[\w.]+)", path.read_text()):
             assert importlib.util.find_spec(name) is not None
 
 

@@ -1,4 +1,4 @@
-"""What a workflow says through the environment, and what it is told on its page."""
+"""A job of a workflow: its variables, its summary page, its outputs and its exit code."""
 
 from __future__ import annotations
 

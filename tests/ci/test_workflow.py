@@ -2,7 +2,7 @@
 
 import pytest
 
-from ventbench.ci import values
+from ci import workflow
 from ventbench.errors import InputError
 
 HOSTILE = ["::set-output name=x::y", "```", "<script>x</script>", "| a | b |", "a\n::error::b"]
@@ -10,16 +10,16 @@ HOSTILE = ["::set-output name=x::y", "```", "<script>x</script>", "| a | b |", "
 
 def test_a_variable_must_be_set(monkeypatch):
     monkeypatch.setenv("NAME", "demo")
-    assert values.required("NAME") == "demo"
+    assert workflow.required("NAME") == "demo"
     for empty in (lambda: monkeypatch.setenv("NAME", ""), lambda: monkeypatch.delenv("NAME")):
         empty()
         with pytest.raises(InputError, match="NAME is not set"):
-            values.required("NAME")
+            workflow.required("NAME")
 
 
 def test_lines_are_neither_commands_nor_markdown(monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(tmp_path / "summary"))
-    values.summary("Title", HOSTILE)
+    workflow.summary("Title", HOSTILE)
     printed = capsys.readouterr().out
     assert not any(line.lstrip().startswith("::") for line in printed.splitlines())
     title, empty, *block = (tmp_path / "summary").read_text().splitlines()
@@ -30,22 +30,22 @@ def test_lines_are_neither_commands_nor_markdown(monkeypatch, tmp_path, capsys):
 
 def test_without_a_page_it_only_prints(monkeypatch, capsys):
     monkeypatch.delenv("GITHUB_STEP_SUMMARY", raising=False)
-    values.summary("Title", ["x"])
+    workflow.summary("Title", ["x"])
     assert capsys.readouterr().out == "| x\n"
 
 
 def test_outputs_are_single_lines(monkeypatch, tmp_path):
     monkeypatch.setenv("GITHUB_OUTPUT", str(tmp_path / "output"))
-    values.output(branch="record/demo", commit="")
+    workflow.output(branch="record/demo", commit="")
     assert (tmp_path / "output").read_text() == "branch=record/demo\ncommit=\n"
     with pytest.raises(ValueError, match="not one line"):
-        values.output(branch="x\nGH_TOKEN=y")
+        workflow.output(branch="x\nGH_TOKEN=y")
 
 
 def test_what_stops_a_job_is_said(capsys):
     def stopped():
         raise InputError("first\n::error::second")
 
-    assert values.run("Title", stopped) == 2
+    assert workflow.run("Title", stopped) == 2
     assert capsys.readouterr().out == "| stopped: first\n| stopped: ::error::second\n"
-    assert values.run("Title", lambda: 1) == 1
+    assert workflow.run("Title", lambda: 1) == 1

@@ -10,18 +10,18 @@ import re
 import sys
 from pathlib import Path
 
+from ci import workflow
+from ci.git import AUTHOR, Git
+from ci.take import submission_name
 from ventbench.board import build, record, store
 from ventbench.board.replay import Simulators
-from ventbench.ci import values
-from ventbench.ci.errors import submission_name
-from ventbench.ci.git import AUTHOR, Git
 from ventbench.errors import InputError
 
 TITLE = "Record"
 
 #: Most records of one run: one a track.
-MOST = 2
-_MOST_BYTES = 20_000_000
+MAX_RECORDS = 2
+_MAX_FILE_BYTES = 20_000_000
 _RECORD = re.compile(rf"[0-9a-f]{{64}}{re.escape(record.SUFFIX)}")
 
 
@@ -35,12 +35,12 @@ def records(folder: Path) -> list[Path]:
         InputError: if there is none, or anything unexpected.
     """
     for path in folder.rglob("*"):
-        if path.is_symlink() or not path.is_file() or path.stat().st_size > _MOST_BYTES:
-            raise InputError(f"{path.name} is no plain file of less than {_MOST_BYTES} bytes")
-    found = sorted(path for path in folder.iterdir() if _RECORD.fullmatch(path.name))
-    if not 1 <= len(found) <= MOST:
-        raise InputError(f"{folder} holds {len(found)} records; 1 to {MOST} are expected")
-    return found
+        if path.is_symlink() or not path.is_file() or path.stat().st_size > _MAX_FILE_BYTES:
+            raise InputError(f"{path.name} is no plain file of less than {_MAX_FILE_BYTES} bytes")
+    paths = sorted(path for path in folder.iterdir() if _RECORD.fullmatch(path.name))
+    if not 1 <= len(paths) <= MAX_RECORDS:
+        raise InputError(f"{folder} holds {len(paths)} records; 1 to {MAX_RECORDS} are expected")
+    return paths
 
 
 def add(folder: Path, leaderboard: Path, simulators: Simulators) -> list[record.Record]:
@@ -76,7 +76,7 @@ def commit(checkout: Path, added: list[record.Record]) -> str:
     git = Git(checkout)
     git.output("switch", "--quiet", "--create", branch)
     git.output("add", "--all", "--", "leaderboard")
-    what = f"Record {added[0].name}: {', '.join(sorted(item.track for item in added))}"
+    what = f"Record {added[0].name}: {', '.join(sorted(score.track for score in added))}"
     git.output("commit", "--quiet", "--message", what, more=AUTHOR)
     return branch
 
@@ -86,12 +86,14 @@ def main() -> int:
     from ventbench.plants import frozen
 
     checkout = Path.cwd()
-    added = add(Path(values.required("RECORDS")), checkout / "leaderboard", frozen.load())
+    added = add(Path(workflow.required("RECORDS")), checkout / "leaderboard", frozen.load())
     branch = commit(checkout, added)
-    values.output(branch=branch, name=added[0].name)
-    values.summary(TITLE, [f"{item.name} ({item.track}): record {item.sha256}" for item in added])
+    workflow.output(branch=branch, name=added[0].name)
+    workflow.summary(
+        TITLE, [f"{score.name} ({score.track}): record {score.sha256}" for score in added]
+    )
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(values.run(TITLE, main))
+    sys.exit(workflow.run(TITLE, main))

@@ -11,37 +11,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ventbench.ci import values
-from ventbench.ci.changes import changed_submissions
-from ventbench.ci.errors import TakeError, commit_name
-from ventbench.ci.git import fetched
-from ventbench.ci.take import take
+from ci import workflow
+from ci.take import TakeError, changed_submissions, take
 from ventbench.lungs import LUNGS, Lung
 from ventbench.submissions import contract
-from ventbench.submissions.folder import MAX_BYTES, open_submission
+from ventbench.submissions.folder import open_submission
 from ventbench.submissions.runner import Runner
 from ventbench.submissions.scoring import score
 
 TITLE = "Advisory score (not official)"
-#: Submissions looked at in one pull request.
-MOST = 3
-
-
-def submissions(source: str, base: str, commit: str) -> list[str]:
-    """Names of the submissions that a pull request changes.
-
-    Args:
-        source: URL or path of the repository.
-        base: commit that it is meant for.
-        commit: its last one.
-
-    Raises:
-        InputError: if it cannot be fetched.
-    """
-    commits = commit_name(base, "base"), commit_name(commit)
-    with tempfile.TemporaryDirectory() as folder:
-        git = fetched(Path(folder), source, commits, MAX_BYTES)
-        return changed_submissions(git, *commits)
+#: Most submissions checked in one pull request.
+MAX_SUBMISSIONS = 3
 
 
 def advise(
@@ -95,22 +75,22 @@ def main() -> int:
     from ventbench.plants import frozen
     from ventbench.sandbox.runner import SandboxRunner
 
-    pull = values.required("SOURCE"), values.required("BASE"), values.required("COMMIT")
-    names = submissions(*pull)
+    pull = workflow.required("SOURCE"), workflow.required("BASE"), workflow.required("COMMIT")
+    names = changed_submissions(*pull)
     if not names:
-        values.summary(TITLE, ["this pull request changes no submission"])
+        workflow.summary(TITLE, ["this pull request changes no submission"])
         return 0
     plants, runner = frozen.load().plants, SandboxRunner(require_official=True)
-    ready = len(names) <= MOST
+    ready = len(names) <= MAX_SUBMISSIONS
     if not ready:
         text = f"{len(names)} submissions are changed; one pull request, one submission"
-        values.summary(TITLE, [text])
-    for name in names[:MOST]:
+        workflow.summary(TITLE, [text])
+    for name in names[:MAX_SUBMISSIONS]:
         good, lines = advise(*pull, name, plants, runner)
         ready = ready and good
-        values.summary(TITLE, lines)
+        workflow.summary(TITLE, lines)
     return 0 if ready else 1
 
 
 if __name__ == "__main__":
-    sys.exit(values.run(TITLE, main))
+    sys.exit(workflow.run(TITLE, main))

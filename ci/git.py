@@ -21,7 +21,7 @@ AUTHOR = {
     "GIT_COMMITTER_EMAIL": "records@ventbench.invalid",
 }
 
-_KEPT = ("PATH", "HTTPS_PROXY", "https_proxy", "SSL_CERT_FILE", "SSL_CERT_DIR")
+_KEPT_VARIABLES = ("PATH", "HTTPS_PROXY", "https_proxy", "SSL_CERT_FILE", "SSL_CERT_DIR")
 
 
 class GitError(InputError):
@@ -31,7 +31,7 @@ class GitError(InputError):
 def environment() -> dict[str, str]:
     """Environment in which no configuration, replacement object or question is looked at."""
     return {
-        **{name: os.environ[name] for name in _KEPT if name in os.environ},
+        **{name: os.environ[name] for name in _KEPT_VARIABLES if name in os.environ},
         "LC_ALL": "C",
         "HOME": os.devnull,
         "GIT_CONFIG_NOSYSTEM": "1",
@@ -76,36 +76,36 @@ class Git:
             GitError: if it fails, prints more, or takes too long.
         """
         command = ["git", "-C", str(self.folder), "-c", "core.hooksPath=/dev/null", *arguments]
-        with tempfile.TemporaryFile() as said, tempfile.TemporaryFile() as stdin:
+        with tempfile.TemporaryFile() as stderr, tempfile.TemporaryFile() as stdin:
             stdin.write(given)
             stdin.seek(0)
             process = subprocess.Popen(
                 command,
                 stdin=stdin,
                 stdout=subprocess.PIPE,
-                stderr=said,
+                stderr=stderr,
                 start_new_session=True,
                 env={**environment(), **(more or {})},
             )
             assert process.stdout is not None
-            late = threading.Timer(self.timeout_s, _end, [process])
-            late.start()
+            timer = threading.Timer(self.timeout_s, _end, [process])
+            timer.start()
             with process, process.stdout:
-                found = process.stdout.read(limit + 1)
-                if len(found) > limit:
+                printed = process.stdout.read(limit + 1)
+                if len(printed) > limit:
                     _end(process)
                 code = process.wait()
-            in_time = late.is_alive()
-            late.cancel()
-            if len(found) > limit:
+            in_time = timer.is_alive()
+            timer.cancel()
+            if len(printed) > limit:
                 raise GitError(f"git {arguments[0]} lists more than {limit} bytes")
             if not in_time:
                 raise GitError(f"git {arguments[0]} took over {self.timeout_s:g} s")
             if code:
-                said.seek(0)
-                words = said.read(2000).decode(errors="replace").strip()
+                stderr.seek(0)
+                words = stderr.read(2000).decode(errors="replace").strip()
                 raise GitError(f"git {arguments[0]} failed: {words or f'exit code {code}'}")
-        return found
+        return printed
 
     def text(self, *arguments: str, more: Mapping[str, str] | None = None) -> str:
         """Return the one line that git prints; ``more`` as in :meth:`output`."""
@@ -118,7 +118,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         os.killpg(process.pid, signal.SIGKILL)
 
 
-def fetched(folder: Path, source: str, commits: Sequence[str], largest: int) -> Git:
+def fetch(folder: Path, source: str, commits: Sequence[str], largest: int) -> Git:
     """Make a bare repository with some commits and their histories.
 
     Args:
@@ -128,7 +128,7 @@ def fetched(folder: Path, source: str, commits: Sequence[str], largest: int) -> 
         largest: files beyond this many bytes are left out, where the source can do so.
 
     Raises:
-        GitError: if one cannot be had.
+        GitError: if one cannot be fetched.
     """
     repository = Git(folder)
     repository.output("init", "--quiet", "--bare", "--template=")

@@ -7,8 +7,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from ventbench.ci import values
-from ventbench.ci.git import AUTHOR, Git, GitError
+from ci import workflow
+from ci.git import AUTHOR, Git, GitError
 from ventbench.errors import InputError
 
 TITLE = "Pages"
@@ -60,14 +60,14 @@ def main() -> int:
     """Make the pages of ``COMMIT`` in this checkout; see ``publish.yml``."""
     git = Git(Path.cwd())
     previous = git.text("for-each-ref", "--format=%(objectname)", "refs/remotes/origin/gh-pages")
-    commit = values.required("COMMIT")
+    commit = workflow.required("COMMIT")
     if not re.fullmatch(r"[0-9a-f]{40}", commit):
         raise InputError(f"COMMIT is {commit!r}, not the full name of one")
     made = pages(git, commit, previous or None)
-    values.output(commit=made or "")
-    values.summary(TITLE, [f"pages {made}" if made else "the pages are up to date"])
+    workflow.output(commit=made or "")
+    workflow.summary(TITLE, [f"pages {made}" if made else "the pages are up to date"])
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(values.run(TITLE, main))
+    sys.exit(workflow.run(TITLE, main))

@@ -11,12 +11,11 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from ci import workflow
+from ci.take import TakeError, Taken, take
 from ventbench import draws
 from ventbench.board import create
 from ventbench.board.replay import Simulators
-from ventbench.ci import values
-from ventbench.ci.errors import TakeError
-from ventbench.ci.take import Taken, take
 from ventbench.errors import InputError
 from ventbench.submissions import contract
 from ventbench.submissions.folder import open_submission
@@ -92,16 +91,16 @@ def main() -> int:
     from ventbench.plants import frozen
     from ventbench.sandbox.runner import SandboxRunner
 
-    source, out = values.required("SOURCE"), Path(values.required("OUT"))
-    wanted = values.required("TRACK")
-    base, commit, name = (values.required(key) for key in ("BASE", "COMMIT", "NAME"))
+    source, out = workflow.required("SOURCE"), Path(workflow.required("OUT"))
+    wanted = workflow.required("TRACK")
+    base, commit, name = (workflow.required(key) for key in ("BASE", "COMMIT", "NAME"))
     runner = SandboxRunner(require_official=True)
     with tempfile.TemporaryDirectory() as folder:
         taken = take(source, base, commit, name, Path(folder))
         lines = score_taken(taken, source, wanted, frozen.load(), runner, out)
-    values.summary(TITLE, lines)
+    workflow.summary(TITLE, lines)
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(values.run(TITLE, main))
+    sys.exit(workflow.run(TITLE, main))

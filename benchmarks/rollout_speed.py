@@ -29,14 +29,14 @@ import numpy as np
 from ventbench import protocol
 from ventbench.controllers.pid import PID
 from ventbench.files import write_json
+from ventbench.interfaces import Plant
 from ventbench.lungs import LUNGS
 from ventbench.plants import frozen
-from ventbench.plants.base import Plant
 from ventbench.plants.learned import Architecture, Learned, learned
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stack import take
 from ventbench.plants.two_balloon import two_balloon
-from ventbench.rollout import closed_loop
+from ventbench.rollouts import closed_loop
 from ventbench.scenario import Scenario, nominal
 
 #: Environment steps of one run without and with its expirations.

@@ -12,7 +12,7 @@ import time
 import numpy as np
 
 from ventbench import protocol
-from ventbench.controllers.base import Task
+from ventbench.interfaces import Task
 from ventbench.lungs import LUNG_IDS
 from ventbench.sandbox.runner import SandboxRunner
 from ventbench.submissions.cell import ROW

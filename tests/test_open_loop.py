@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ventbench import evaluation, open_loop_test
+from ventbench import open_loop_report
 from ventbench.cli import app
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS, lung
@@ -17,7 +17,7 @@ from ventbench.plants import frozen
 from ventbench.plants.labelled import single_compartments
 from ventbench.precision import float64
 from ventbench.recordings import Breaths, load, make_breaths, write
-from ventbench.rollout import open_loop
+from ventbench.rollouts import open_loop
 from ventbench.training.freeze import MEASURED
 
 FIGURES = ("mae", "median_mae", "ci95", "breaths")
@@ -56,7 +56,7 @@ def breaths(simulators):
 
 
 def test_the_error_is_the_one_that_was_put_in(breaths):
-    result = open_loop_test.run(breaths)
+    result = open_loop_report.run(breaths)
     assert list(result["lungs"]) == ["R5C20", "R20C50"]
     for one in result["lungs"].values():
         for prefix in PREFIXES:  # new breaths: the official simulators judge them
@@ -68,15 +68,15 @@ def test_the_error_is_the_one_that_was_put_in(breaths):
             assert high >= one[f"{prefix}mae"] - 1e-12
         assert one["fitting_label"] == {k: v for k, v in one.items() if k != "fitting_label"}
     assert result["misfits"] == result["not_judged"] == []
-    assert open_loop_test.misfit_lines(result) == []
+    assert open_loop_report.misfit_lines(result) == []
     assert json.loads(json.dumps(result, allow_nan=False)) == result
 
 
 @pytest.mark.parametrize("kind", ["frozen", "hybrid", "learned", "physics"])
 def test_each_kind_is_what_it_says(simulators, breaths, kind):
     kinds = {"physics": single_compartments, "learned": frozen.load_learned().for_breaths}
-    error = evaluation.errors(kinds.get(kind, simulators.for_breaths), breaths)
-    result = open_loop_test.run(breaths, kind)
+    error = open_loop_report.errors(kinds.get(kind, simulators.for_breaths), breaths)
+    result = open_loop_report.run(breaths, kind)
     assert result["plant"] == kind
     assert result["simulators"] == simulators.about()
     for name, index in breaths.by_lung_index.items():
@@ -99,7 +99,7 @@ def test_a_wrong_label_or_valve_is_noticed_and_named(simulators):
         return replace(plants, slopes=plants.slopes * gain)
 
     pressure = answered(stronger, lungs, noise=0.1).pressure
-    result = open_loop_test.run(replace(breaths, C=C, pressure=pressure))
+    result = open_loop_report.run(replace(breaths, C=C, pressure=pressure))
     found = {one["breath_id"]: one["explanation"] for one in result["misfits"]}
     assert found == {1: "lung R5C50", 4: "valve gain x 1.25"}
     mislabelled = result["lungs"]["R5C20"]
@@ -108,7 +108,7 @@ def test_a_wrong_label_or_valve_is_noticed_and_named(simulators):
     assert mislabelled["fitting_label"]["mae"] is None
     stiff = result["lungs"]["R5C10"]
     assert stiff["mae"] > 0.5 > 0.2 > stiff["fitting_label"]["mae"]
-    lines = open_loop_test.misfit_lines(result)
+    lines = open_loop_report.misfit_lines(result)
     assert "2 breaths are explained far better" in lines[0]
     assert "breath 1 (R5C20)" in lines[1]
     assert lines[1].endswith("as lung R5C50")
@@ -118,16 +118,16 @@ def test_breaths_without_a_first_pressure_are_not_judged(breaths):
     pressure = breaths.pressure.copy()
     pressure[1, 0] = np.nan
     pressure[5, 1:INSPIRATORY] = np.nan
-    result = open_loop_test.run(replace(breaths, pressure=pressure))
+    result = open_loop_report.run(replace(breaths, pressure=pressure))
     assert result["not_judged"] == [2, 6]
     assert [one["breaths"] for one in result["lungs"].values()] == [2, 2]
-    assert "2 breaths have no first pressure" in open_loop_test.misfit_lines(result)[-1]
+    assert "2 breaths have no first pressure" in open_loop_report.misfit_lines(result)[-1]
 
 
 def test_many_misfits_are_told_in_few_lines():
     one = {"lung": "R5C10", "mae": 3.0, "mae_explained": 0.5, "explanation": "lung R5C20"}
     misfits = [one | {"breath_id": i} for i in range(25)]
-    lines = open_loop_test.misfit_lines({"misfits": misfits, "not_judged": []})
+    lines = open_loop_report.misfit_lines({"misfits": misfits, "not_judged": []})
     assert len(lines) == 22
     assert lines[-1].endswith("5 more; --json lists all")
 
@@ -149,7 +149,7 @@ def test_the_command_writes_what_the_function_finds(breaths, tmp_path):
         out = tmp_path / "out.json"
         text = run("open-loop", tmp_path / name, "--json", out)
         result = json.loads(out.read_text())
-        assert result == open_loop_test.run(load(tmp_path / name))
+        assert result == open_loop_report.run(load(tmp_path / name))
         for lung_id in ("R5C20", "R20C50"):
             assert lung_id in text
             assert set(result["lungs"][lung_id]) == {"fitting_label"} | {

@@ -15,13 +15,13 @@ import pytest
 from typer.testing import CliRunner
 
 import ventbench
-from ventbench import controls, protocol
+from ventbench import protocol
 from ventbench.cli import app
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
 from ventbench.plants.stack import take
-from ventbench.simulate import simulate
+from ventbench.simulation import read_controls, simulate
 from ventbench.training import freeze
 
 
@@ -79,7 +79,7 @@ def test_simulate_answers_commands_with_the_official_pressures(commands, tmp_pat
     assert list(found) == ["time_step", "u_in", "u_out", "pressure"]
     np.testing.assert_allclose(found["time_step"], 0.033 * np.arange(60), atol=1e-6)
     plant = take(frozen.load().plants, LUNG_IDS.index(name))
-    wanted = simulate(plant, controls.read(commands), start=6.0)
+    wanted = simulate(plant, read_controls(commands), start=6.0)
     np.testing.assert_allclose(found["pressure"], wanted, atol=1e-6)
     assert found["pressure"][0] == 6.0
     assert found["pressure"][29] > 8.0 > found["pressure"][-1]

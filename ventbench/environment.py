@@ -1,6 +1,6 @@
 """The loop around a plant, one control step at a time: the only place where it is written.
 
-The scan of :mod:`ventbench.rollout` and the stepwise scorer of :mod:`ventbench.submissions` both
+The scan of :mod:`ventbench.rollouts` and the stepwise scorer of :mod:`ventbench.submissions` both
 call these functions, so that a controller scores the same either way.
 """
 
@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from ventbench import protocol, waveform
 from ventbench.controllers import expiratory
-from ventbench.controllers.base import Observation
-from ventbench.plants.base import Plant
+from ventbench.interfaces import Observation, Plant
 from ventbench.scenario import Scenario
 
 # Tables over the step of the breath: two breaths of target, so that looking ahead needs no modulo.

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from ventbench import environment as env
 from ventbench import precision, protocol
 from ventbench.errors import InputError
+from ventbench.interfaces import Plant
 from ventbench.lungs import LUNG_IDS, scored_lung
 from ventbench.plants import frozen
-from ventbench.plants.base import Plant
 from ventbench.scenario import Scenario
 from ventbench.training.rl import breaths
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from ventbench import precision
-from ventbench.controllers.base import Controller, Observation
 from ventbench.controllers.pid import PID
 from ventbench.controllers.script import Script
+from ventbench.interfaces import Controller, Observation
 
 
 def plain(p, i, d, pressures, target, dt):

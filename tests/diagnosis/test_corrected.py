@@ -12,9 +12,9 @@ from ventbench import precision
 from ventbench.diagnosis import corrected as module
 from ventbench.diagnosis import simulators, split
 from ventbench.diagnosis.corrected import corrected
+from ventbench.interfaces import Plant
 from ventbench.lungs import lung
 from ventbench.physics import physics
-from ventbench.plants.base import Plant
 from ventbench.recordings.breaths import Breaths
 
 from . import small

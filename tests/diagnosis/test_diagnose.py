@@ -14,10 +14,10 @@ from ventbench.diagnosis import simulators
 from ventbench.diagnosis.diagnose import diagnose
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.errors import InputError
+from ventbench.interfaces import Plant
 from ventbench.lungs import lung
 from ventbench.physics import physics
 from ventbench.plants import text_files
-from ventbench.plants.base import Plant
 from ventbench.recordings import join
 from ventbench.recordings.breaths import Breaths
 

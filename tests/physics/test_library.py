@@ -12,7 +12,7 @@ from ventbench.errors import InputError
 from ventbench.lungs import Lung
 from ventbench.physics import library, mechanism, parameter, paths, physics, strength_path
 from ventbench.precision import float64
-from ventbench.rollout import open_loop
+from ventbench.rollouts import open_loop
 
 from . import cases
 

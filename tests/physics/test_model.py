@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 
 from ventbench import precision
 from ventbench.errors import InputError
+from ventbench.interfaces import Plant
 from ventbench.lungs import LUNGS, Lung
 from ventbench.physics import library, parameter, paths, physics, resolution
 from ventbench.plants import files
-from ventbench.plants.base import Plant
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.rollout import open_loop
+from ventbench.rollouts import open_loop
 
 N, T = 4, 50
 

@@ -13,7 +13,7 @@ from ventbench.physics.nonparametric import SLOTS
 from ventbench.physics.shapes import drawn
 from ventbench.plants import files
 from ventbench.precision import float64
-from ventbench.rollout import open_loop
+from ventbench.rollouts import open_loop
 from ventbench.system_id import Simulator, fit, recorded, settings
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.unknowns import freed, unknowns

@@ -19,16 +19,16 @@ from numpy.typing import ArrayLike
 
 from ventbench import protocol
 from ventbench.controllers import expiratory
+from ventbench.interfaces import Plant
 from ventbench.lungs import LUNG_IDS, lung
 from ventbench.physics import physics
 from ventbench.plants import frozen
-from ventbench.plants.base import Plant
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.learned import Architecture, learned
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.precision import float64
-from ventbench.rollout import open_loop
+from ventbench.rollouts import open_loop
 
 SMALL = Architecture(pressures=3, controls=4, width=16, depth=3, boundaries=2, boundary_width=8)
 SELU = Architecture(width=24, depth=4, boundaries=0, activation="selu")

@@ -14,7 +14,7 @@ from ventbench.plants.corrected import Corrected
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stack import take
 from ventbench.precision import float64
-from ventbench.rollout import open_loop
+from ventbench.rollouts import open_loop
 
 LUNG = lung("R20C50")
 T = 50

@@ -12,7 +12,7 @@ from ventbench.plants.each import Each
 from ventbench.plants.learned import Architecture, learned
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
 from ventbench.plants.stack import stack, take
-from ventbench.rollout import open_loop
+from ventbench.rollouts import open_loop
 
 SMALL = Architecture(pressures=3, controls=4, width=8, depth=2, boundaries=1, boundary_width=4)
 N, T = 3, 12

@@ -22,7 +22,7 @@ from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import RELIEF, RELIEF_ROOM, Hybrid
 from ventbench.precision import float64
-from ventbench.rollout import open_loop
+from ventbench.rollouts import open_loop
 
 T = 40
 ROWS = 4

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ventbench import evaluation
+from ventbench import open_loop_report
 from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
 from ventbench.plants.fingerprints import BY_NONE, fingerprints
@@ -93,20 +93,20 @@ def test_the_errors_of_the_manifest_are_reproduced(official, networks, measured)
     }
     comparison = official.manifest["comparison"]
     assert set(comparison) == set(kinds)
-    errors = {kind: evaluation.errors(find, measured) for kind, find in kinds.items()}
+    errors = {kind: open_loop_report.errors(find, measured) for kind, find in kinds.items()}
     for kind, error in errors.items():
         # Networks are float32, and another machine adds in another order.
         allowed = 1e-3 if kind == "learned" else 1e-6
         for lung, index in measured.by_lung_index.items():
-            agree(evaluation.summary("", error[index]), comparison[kind][lung], allowed)
-    error = evaluation.errors(official.for_breaths, measured)
+            agree(open_loop_report.summary("", error[index]), comparison[kind][lung], allowed)
+    error = open_loop_report.errors(official.for_breaths, measured)
     new = official.unseen(measured)
     for lung, about in official.lungs().items():
         index = measured.by_lung_index[lung]
         figures = {
-            **evaluation.summary("held_out_", errors["hybrid"][index]),
-            **evaluation.summary("official_", error[index][new[index]]),
-            **evaluation.summary("training_", error[index][~new[index]]),
+            **open_loop_report.summary("held_out_", errors["hybrid"][index]),
+            **open_loop_report.summary("official_", error[index][new[index]]),
+            **open_loop_report.summary("training_", error[index][~new[index]]),
         }
         agree(figures, {name: about[name] for name in figures}, 1e-6)
         assert about["training_mae"] < about["held_out_mae"]

@@ -21,7 +21,7 @@ from ventbench.plants.hybrid import (
     Hybrid,
 )
 from ventbench.precision import float64
-from ventbench.rollout import open_loop
+from ventbench.rollouts import open_loop
 
 #: Practically no lag, s.
 NONE = 1e-9

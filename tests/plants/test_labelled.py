@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ventbench import evaluation
 from ventbench.lungs import lung
 from ventbench.plants.labelled import single_compartments, two_balloons
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stack import take
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.precision import float64
+from ventbench.rollouts import open_loop_breaths
 
 LUNGS = ["R20C50", "R5C10", "R50C20"]
 
@@ -30,7 +30,7 @@ def test_each_breath_has_the_plant_of_its_label(make_recording, plants_for, one)
 def test_the_order_of_breaths_does_not_matter(make_recording):
     breaths = make_recording(LUNGS)
     order = [2, 0, 1]
-    straight = evaluation.pressures(single_compartments, breaths)
-    turned = evaluation.pressures(single_compartments, breaths.select(order))
+    straight = open_loop_breaths(single_compartments, breaths)
+    turned = open_loop_breaths(single_compartments, breaths.select(order))
     np.testing.assert_array_equal(turned, straight[order])
     np.testing.assert_array_equal(straight[:, 0], breaths.pressure[:, 0])

@@ -12,7 +12,7 @@ from ventbench.plants.learned import HIGHEST, LOWEST, Architecture, Normalisatio
 from ventbench.plants.mlp import mlp
 from ventbench.plants.sensitivity import control_sensitivity
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.rollout import open_loop
+from ventbench.rollouts import open_loop
 
 SMALL = Architecture(pressures=3, controls=4, width=16, depth=3, boundaries=2, boundary_width=8)
 

@@ -20,7 +20,7 @@ from ventbench.physics import physics
 from ventbench.plants import alike, frozen, text_files
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stack import take
-from ventbench.rollout import open_loop
+from ventbench.rollouts import open_loop
 
 
 def late(lung_id: str, **base: float):

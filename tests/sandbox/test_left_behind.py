@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ventbench import protocol
-from ventbench.controllers.base import Task
+from ventbench.interfaces import Task
 from ventbench.sandbox.child import libc
 from ventbench.sandbox.runner import SandboxRunner
 

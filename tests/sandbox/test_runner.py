@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ventbench import precision, protocol
-from ventbench.controllers.base import Task
+from ventbench.interfaces import Task
 from ventbench.lungs import LUNGS
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stack import stack

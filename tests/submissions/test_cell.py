@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from ventbench.controllers.base import Observation, Task
+from ventbench.interfaces import Observation, Task
 from ventbench.submissions.cell import ROW, Cell, Failed, unpack
 from ventbench.submissions.load import controller_class
 

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import draws, precision, protocol, rollout, scenario, waveform
+from ventbench import draws, precision, protocol, rollouts, scenario, waveform
 from ventbench.controllers import expiratory
-from ventbench.controllers.base import Task
 from ventbench.controllers.pid import PID
 from ventbench.errors import InputError
+from ventbench.interfaces import Task
 from ventbench.lungs import LUNG_IDS, LUNGS, lung
 from ventbench.metrics.waveform import run_error
 from ventbench.plants.stack import take
@@ -37,7 +37,7 @@ def pure_errors(plants, cells, gains):
     errors = []
     with precision.float64():
         for i, gain in enumerate(gains):
-            found, _ = rollout.closed_loop(take(plants, i), PID(*gain), cells)
+            found, _ = rollouts.closed_loop(take(plants, i), PID(*gain), cells)
             errors.append(run_error(found.pressure, np.asarray(cells.pip)[..., None, None]))
     return np.stack(errors)
 
@@ -127,7 +127,7 @@ def test_trajectories(best, plants):
     np.testing.assert_allclose(error, result.nominal, rtol=0, atol=1e-9)
     with precision.float64():
         cells = scenario.nominal(np.array(protocol.PIPS))
-        inspired, expired = rollout.closed_loop(take(plants, 4), PID(5.0, 10.0), cells, whole=True)
+        inspired, expired = rollouts.closed_loop(take(plants, 4), PID(5.0, 10.0), cells, whole=True)
     for name in ("pressure", "u_in"):
         whole = np.concatenate([getattr(inspired, name), getattr(expired, name)], axis=-1)
         np.testing.assert_allclose(

@@ -10,7 +10,7 @@ from tests.physics import cases
 from ventbench.errors import InputError
 from ventbench.physics import library, parameter, paths, strength_path
 from ventbench.precision import float64
-from ventbench.rollout import open_loop
+from ventbench.rollouts import open_loop
 from ventbench.system_id import START, Noise, Simulator, fit, held_out, interval, recorded
 
 BREATHS, NOISE = 8, 0.2

@@ -13,7 +13,7 @@ from ventbench.lungs import RECORDED_LUNGS, Lung
 from ventbench.plants.sessions import Sessions, find
 from ventbench.precision import float64
 from ventbench.recordings import Breaths, make_breaths
-from ventbench.rollout import open_loop
+from ventbench.rollouts import open_loop
 from ventbench.training.hybrid.data import groups_of
 from ventbench.training.hybrid.parameters import Pooled, initial, plants
 

@@ -9,9 +9,9 @@ from typer.testing import CliRunner
 from ventbench import precision, protocol
 from ventbench.cli import app
 from ventbench.controllers import expiratory
-from ventbench.controllers.base import Observation
 from ventbench.controllers.pid import PID
 from ventbench.errors import InputError
+from ventbench.interfaces import Observation
 from ventbench.lungs import LUNG_IDS, lung
 from ventbench.metrics.safety import longest_run
 from ventbench.plants.single_compartment import single_compartment

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from ventbench import evaluation
+from ventbench import open_loop_report
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
@@ -101,8 +101,8 @@ def test_the_manifest_tells_data_split_recipes_and_packages(trained, recordings)
 def test_the_errors_it_writes_are_those_of_the_simulators_it_writes(trained, recordings):
     _, simulators, _ = trained
     measured = load(recordings / freeze.MEASURED)
-    held_out = evaluation.errors(simulators.cross_fitted, measured)
-    official = evaluation.errors(simulators.for_breaths, measured)
+    held_out = open_loop_report.errors(simulators.cross_fitted, measured)
+    official = open_loop_report.errors(simulators.for_breaths, measured)
     for name in LUNG_IDS:
         index = measured.by_lung_index[name]
         about = simulators.lungs()[name]

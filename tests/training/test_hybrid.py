@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import evaluation
+from ventbench import open_loop_report
 from ventbench.errors import InputError
 from ventbench.lungs import lung
 from ventbench.plants.sessions import Session, Sessions
 from ventbench.precision import float64
 from ventbench.recordings import join
+from ventbench.rollouts import open_loop_breaths
 from ventbench.training.hybrid import expiration
 from ventbench.training.hybrid.data import SAMPLES, groups_of, inspirations
 from ventbench.training.hybrid.fit import CHUNK, Recipe
@@ -74,7 +75,7 @@ def mean_errors(pooled, breaths, sessions):
     def of(part):
         return plants(pooled, groups_of(part, sessions))
 
-    return evaluation.errors(of, breaths)
+    return open_loop_report.errors(of, breaths)
 
 
 def test_finds_known_lungs_again(fitted, true_parameters, make_synthetic, known_sessions):
@@ -105,7 +106,7 @@ def test_finds_the_expiratory_valve(fitted, measured, known_sessions):
 
         def error(pooled):
             plant = plants(pooled, groups_of(measured, known_sessions))
-            p = evaluation.pressures(lambda _: plant, measured)
+            p = open_loop_breaths(lambda _: plant, measured)
             return np.abs(p - measured.pressure)[expired].mean()
 
         assert error(refitted) < 0.2 * error(start)  # measured 0.05 and 0.63 cmH2O

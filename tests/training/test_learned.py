@@ -10,7 +10,7 @@ import pytest
 from ventbench.lungs import lung
 from ventbench.plants.learned import Architecture
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.rollout import open_loop
+from ventbench.rollouts import open_loop
 from ventbench.training.learned import (
     CHUNK,
     Recipe,

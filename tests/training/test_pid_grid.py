@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ventbench import precision, protocol, rollout
+from ventbench import precision, protocol, rollouts
 from ventbench.controllers.pid import PID
 from ventbench.lungs import LUNGS
 from ventbench.metrics.waveform import run_error
@@ -32,7 +32,7 @@ def test_an_error_is_that_of_the_scored_run():
         expected = [
             [
                 run_error(
-                    rollout.closed_loop(take(plants, lung), PID(*gain), cells)[0].pressure,
+                    rollouts.closed_loop(take(plants, lung), PID(*gain), cells)[0].pressure,
                     np.asarray(cells.pip)[:, None, None],
                 )
                 for gain in gains

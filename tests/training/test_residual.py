@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ventbench import draws, precision, protocol, rollout
+from ventbench import draws, precision, protocol, rollouts
 from ventbench.board.replay import spread
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
@@ -62,18 +62,18 @@ def test_a_new_network_leaves_the_pid_alone():
     made = untrained(jax.random.key(0), like, (8, 8))
     assert made.layers[0][0].shape == (inputs(like), 8)
     cells = nominal(np.array(protocol.PIPS))
-    found, _ = rollout.closed_loop(take(lungs(2), 1), made, cells)
-    expected, _ = rollout.closed_loop(take(lungs(2), 1), PID(*GAINS), cells)
+    found, _ = rollouts.closed_loop(take(lungs(2), 1), made, cells)
+    expected, _ = rollouts.closed_loop(take(lungs(2), 1), PID(*GAINS), cells)
     np.testing.assert_allclose(found.u_in, expected.u_in, atol=1e-3)
 
 
 def test_it_remembers_the_breath_before():
     one = controller(3)
     cells = nominal(np.array([20.0]))
-    found, _ = rollout.closed_loop(take(lungs(2), 1), one, cells)
+    found, _ = rollouts.closed_loop(take(lungs(2), 1), one, cells)
     u_in = np.asarray(found.u_in[0])
     assert np.abs(u_in[0] - u_in[1]).max() > 0.1
-    forgetful, _ = rollout.closed_loop(take(lungs(2), 1), controller(3, ahead=0), cells)
+    forgetful, _ = rollouts.closed_loop(take(lungs(2), 1), controller(3, ahead=0), cells)
     u_in = np.asarray(forgetful.u_in[0])
     assert np.abs(u_in[1] - u_in[2]).max() < 1e-3
 
@@ -95,7 +95,7 @@ def test_the_submission_is_the_pure_controller(fields, tmp_path):
         errors = []
         for k in range(3):
             one = pure[LUNG_IDS[k] if k < 2 else ALL]
-            found, _ = rollout.closed_loop(take(plants, k), one, cells)
+            found, _ = rollouts.closed_loop(take(plants, k), one, cells)
             errors.append(run_error(found.pressure, np.asarray(cells.pip)[..., None, None]))
     result, _ = score(open_submission(str(folder)), plants, draws=2, lungs=LUNGS[:3], pips=(10, 35))
     assert not result.failures
@@ -127,7 +127,7 @@ def test_the_run_is_that_of_the_scorer():
         plant = single_compartment(LUNGS[3])
         one = jax.tree.map(lambda x: jnp.asarray(x, float), one)
         found = jax.vmap(run, (None, None, 0))(one, plant, cells)
-        expected, _ = rollout.closed_loop(plant, one, cells)
+        expected, _ = rollouts.closed_loop(plant, one, cells)
     np.testing.assert_allclose(found.pressure, expected.pressure, atol=1e-9)
     np.testing.assert_allclose(found.u_in, expected.u_in, atol=1e-9)
 
@@ -163,7 +163,7 @@ def test_members_that_agree_have_no_disagreement_and_others_their_deviation(ense
     pressures = []
     for member in range(2):
         each = [
-            rollout.open_loop(
+            rollouts.open_loop(
                 take(ensemble, member, lung),
                 jnp.array([5.0]),
                 u_in[:1],
@@ -219,7 +219,7 @@ def test_training_lowers_the_error(ensemble, round_robin):
 
     def error(one) -> float:
         pressure = [
-            rollout.closed_loop(take(ensemble, 0, lung), one, cells)[0].pressure for lung in (0, 1)
+            rollouts.closed_loop(take(ensemble, 0, lung), one, cells)[0].pressure for lung in (0, 1)
         ]
         return float(
             np.mean([run_error(p, np.asarray(cells.pip)[:, None, None]) for p in pressure])
@@ -342,7 +342,9 @@ def test_no_controller_beats_the_rise_and_the_search_comes_near():
     with precision.float64():
         cells = nominal(np.array([10.0, 30.0]))
         for k in range(3):
-            pressure = rollout.closed_loop(take(plants, k), PID(10.0, 10.0, 0.0), cells)[0].pressure
+            pressure = rollouts.closed_loop(take(plants, k), PID(10.0, 10.0, 0.0), cells)[
+                0
+            ].pressure
             pid = run_error(pressure, np.asarray(cells.pip)[:, None, None])
             assert np.all(found[k] < pid)
     np.testing.assert_allclose(found, least, atol=0.25)
@@ -389,5 +391,5 @@ def test_a_short_training_on_the_frozen_simulators_beats_their_best_pid():
     one = fit(ensemble, (5.0, 10.0, 0.0), recipe=Recipe(updates=200))
     cells = nominal(np.array(protocol.PIPS))
     plant = jax.tree.map(lambda leaf: jnp.asarray(leaf[index], jnp.float32), simulators.plants)
-    pressure = rollout.closed_loop(plant, one, cells)[0].pressure
+    pressure = rollouts.closed_loop(plant, one, cells)[0].pressure
     assert run_error(pressure, np.asarray(cells.pip)[:, None, None]).mean() < 2.0  # the PID: 2.095

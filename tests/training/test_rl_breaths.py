@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import draws, precision, protocol, rollout, scenario
-from ventbench.controllers.base import Observation
+from ventbench import draws, precision, protocol, rollouts, scenario
 from ventbench.controllers.pid import PID
+from ventbench.interfaces import Observation
 from ventbench.lungs import LUNGS
 from ventbench.metrics.waveform import run_error
 from ventbench.plants.single_compartment import single_compartment
@@ -71,8 +71,8 @@ def test_the_pid_inside_the_features_is_the_pid(lungs):
         network = Dense((4,), 1)
         untrained = Corrected(start(network, jax.random.key(0)), network)
         lung = jax.tree.map(lambda x: x[2], lungs)
-        found, _ = rollout.closed_loop(lung, untrained, cells)
-        wanted, _ = rollout.closed_loop(lung, PID(*features.GAINS), cells)
+        found, _ = rollouts.closed_loop(lung, untrained, cells)
+        wanted, _ = rollouts.closed_loop(lung, PID(*features.GAINS), cells)
     # Its command is cut to the valve's range before the correction, of zero here, is added.
     cut = np.clip(wanted.requested, 0.0, protocol.U_MAX)
     np.testing.assert_allclose(found.requested, cut, atol=1e-9)
@@ -107,7 +107,7 @@ def test_rewards_and_errors_are_the_scores(lungs):
     start = np.asarray(cells.pip - cells.start)
     from_rewards = (start - breaths.REWARD_SCALE * rewards.sum(axis=0)) / 34
     errors = breaths.errors(lung, pid, cells, 6)
-    run, _ = rollout.closed_loop(
+    run, _ = rollouts.closed_loop(
         jax.tree.map(lambda x: x[2], lungs), pid, scenario.nominal(np.asarray(protocol.PIPS))
     )
     wanted = run_error(run.pressure, np.asarray(protocol.PIPS)[:, None, None])

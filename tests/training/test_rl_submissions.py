@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import precision, rollout
+from ventbench import precision, rollouts
 from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stack import stack
@@ -55,7 +55,7 @@ def test_numpy_and_jax_act_alike(name, track, tmp_path):
             policy = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), policy)
             plant = jax.tree.map(lambda x, i=i: x[i], plants)
             cells = jax.tree.map(jnp.asarray, protocol_cells(PIPS, 1))
-            wanted, _ = rollout.closed_loop(plant, policy, cells)
+            wanted, _ = rollouts.closed_loop(plant, policy, cells)
             assert np.ptp(wanted.requested) > 20.0
             np.testing.assert_allclose(found.requested[i], wanted.requested, rtol=0, atol=1e-9)
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from ventbench import lungs, precision, protocol, rollout, scenario, waveform
+from ventbench import lungs, precision, protocol, rollouts, scenario, waveform
 from ventbench.controllers.pid import PID
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.trajectories import Trajectories
@@ -31,7 +31,7 @@ def simulate(name: str, gains: Mapping[str, tuple[float, float]]) -> Trajectorie
     for i, lung in enumerate(lungs.LUNGS):
         with precision.float64():
             cells = scenario.nominal(protocol.PIPS)
-            inspired, expired = rollout.closed_loop(
+            inspired, expired = rollouts.closed_loop(
                 single_compartment(lung), PID(*gains[lung.id]), cells, whole=True
             )
         assert expired is not None

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from ventbench import environment as env
 from ventbench import precision, protocol
 from ventbench.board.replayed import Replayed, Simulators
+from ventbench.interfaces import Plant
 from ventbench.metrics import safety
 from ventbench.metrics.waveform import run_error
-from ventbench.plants.base import Plant
 from ventbench.scenario import Scenario
 from ventbench.submissions.scoring import protocol_cells
 from ventbench.submissions.stepping import as_float64

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from ventbench.errors import InputError
+from ventbench.interfaces import Plant
 from ventbench.lungs import LUNGS, Lung, lung
 from ventbench.plants import alike, frozen, text_files
-from ventbench.plants.base import Plant
 
 
 @dataclass(frozen=True, eq=False)

@@ -55,15 +55,15 @@ def simulate(
 
     Example: `ventbench simulate --lung R20C50 --controls commands.csv`
     """
-    from ventbench import controls as commands
     from ventbench import files
     from ventbench.lungs import LUNGS, scored_lung
     from ventbench.plants import frozen
     from ventbench.plants.stack import take
-    from ventbench.simulate import simulate as run
+    from ventbench.simulation import read_controls
+    from ventbench.simulation import simulate as run
 
     index = LUNGS.index(scored_lung(lung))
-    given = commands.read(controls)
+    given = read_controls(controls)
     pressure = run(take(frozen.load().plants, index), given, start=start)
     columns = zip(given.time, given.u_in, given.u_out, pressure, strict=True)
     rows = [f"{t:.6f},{u:.6f},{int(o)},{p:.6f}" for t, u, o, p in columns]

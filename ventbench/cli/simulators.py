@@ -34,7 +34,7 @@ def open_loop(
     """
     from rich.console import Console
 
-    from ventbench import open_loop_test
+    from ventbench import open_loop_report
     from ventbench import recordings as files
 
     progress = Console(stderr=True)
@@ -43,11 +43,11 @@ def open_loop(
     for note in breaths.notes:
         progress.print(f"note: {note}", markup=False, highlight=False)
     with progress.status(f"simulating {len(breaths)} breaths"):
-        result = open_loop_test.run(breaths, plant)
+        result = open_loop_report.run(breaths, plant)
     emit(result, json)
     console = Console(stderr=str(json) == "-")
     console.print(_table(result))
-    for line in open_loop_test.misfit_lines(result):
+    for line in open_loop_report.misfit_lines(result):
         console.print(line, markup=False, highlight=False)
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from jax import Array
 
 from ventbench import protocol
-from ventbench.controllers.base import Observation
 from ventbench.controllers.expiratory import BIAS
 from ventbench.controllers.pid import PID, PIDState
+from ventbench.interfaces import Observation
 
 #: Scales that bring the features to the order of 1: cmH2O of errors and of targets, % of commands,
 #: shares of the control step.

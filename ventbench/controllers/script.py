@@ -6,7 +6,7 @@ import flax.struct
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.controllers.base import Observation
+from ventbench.interfaces import Observation
 
 
 @flax.struct.dataclass

@@ -14,7 +14,7 @@ from ventbench.diagnosis.distances import distance
 from ventbench.diagnosis.found import Found
 from ventbench.diagnosis.hypothesis import has_own
 from ventbench.diagnosis.simulators import Given
-from ventbench.plants.base import Plant
+from ventbench.interfaces import Plant
 from ventbench.plants.corrected import Corrected
 from ventbench.precision import float64
 from ventbench.recordings.breaths import Breaths

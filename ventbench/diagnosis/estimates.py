@@ -13,9 +13,9 @@ from ventbench.diagnosis.effort import EFFORT
 from ventbench.diagnosis.hypothesis import has_own
 from ventbench.diagnosis.result import Estimate, LungMatch
 from ventbench.diagnosis.solved import Side, Solved
+from ventbench.interfaces import Plant
 from ventbench.physics.catalogue import library, mechanism, paths
 from ventbench.physics.model import Physics
-from ventbench.plants.base import Plant
 from ventbench.precision import float64
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit, fit, interval

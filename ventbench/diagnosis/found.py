@@ -13,8 +13,8 @@ from ventbench.diagnosis.bench import Bench, bench
 from ventbench.diagnosis.conclude import Conclusion, conclude
 from ventbench.diagnosis.places import all_paths
 from ventbench.diagnosis.solved import Side, Solved, simulator
+from ventbench.interfaces import Plant
 from ventbench.physics.catalogue import paths
-from ventbench.plants.base import Plant
 from ventbench.system_id import Fit
 from ventbench.system_id.data import Data, Floats
 

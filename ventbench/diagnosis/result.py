@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.plants.base import Plant
+from ventbench.interfaces import Plant
 from ventbench.recordings.breaths import Breaths
 
 Floats = NDArray[np.float64]

@@ -8,11 +8,11 @@ from typing import Literal
 import numpy as np
 
 from ventbench.errors import InputError
-from ventbench.evaluation import PlantsFor, pressures
+from ventbench.interfaces import Plant
 from ventbench.plants import alike
-from ventbench.plants.base import Plant
 from ventbench.plants.labelled import single_compartments
 from ventbench.recordings.breaths import Breaths
+from ventbench.rollouts import PlantsFor, open_loop_breaths
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.noise import Noise
 
@@ -50,7 +50,7 @@ def _stacked(plants: Mapping[str, Plant], breaths: Breaths) -> Plant:
 
 def answers(plant: Given, breaths: Breaths) -> Floats:
     """Open-loop pressures, cmH2O, ``(n, T)``, NaN for a breath without a first pressure."""
-    return pressures(plants_for(plant), breaths)
+    return open_loop_breaths(plants_for(plant), breaths)
 
 
 def measured(data: Data, answer: Floats, noise: Noise) -> Data:

@@ -72,7 +72,7 @@ class Physics:
     skip_idle: bool = flax.struct.field(pytree_node=False, default=False)
 
     def init(self, pressure: Array, peep: Array | None = None) -> PhysicsState:
-        """Lung at rest, expiratory valve open; see :class:`~ventbench.plants.base.Plant`.
+        """Lung at rest, expiratory valve open; see :class:`~ventbench.interfaces.Plant`.
 
         Without ``peep``, the parameter ``PEEP`` is taken, and without that the pressure.
         """
@@ -95,7 +95,7 @@ class Physics:
     def step(
         self, state: PhysicsState, u_in: Array, u_out: Array, dt: Array
     ) -> tuple[PhysicsState, Array]:
-        """Hold one command; see :class:`~ventbench.plants.base.Plant`."""
+        """Hold one command; see :class:`~ventbench.interfaces.Plant`."""
         after, seen = self.observe(state, u_in, u_out, dt)
         return after, seen[0]
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from ventbench import precision
 from ventbench.errors import InputError
+from ventbench.interfaces import Plant
 from ventbench.physics.model import Physics
-from ventbench.plants.base import Plant
 
 
 def stacked(plants: Sequence[Plant]) -> Plant:

@@ -25,7 +25,7 @@ class Corrected:
     had: Any
 
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[Any, Any, Any]:
-        """All three at rest; see :class:`~ventbench.plants.base.Plant`."""
+        """All three at rest; see :class:`~ventbench.interfaces.Plant`."""
         return tuple(  # type: ignore[return-value]
             one.init(pressure, peep) for one in (self.simulator, self.wanted, self.had)
         )
@@ -33,7 +33,7 @@ class Corrected:
     def step(
         self, state: tuple[Any, Any, Any], u_in: Array, u_out: Array, dt: Array
     ) -> tuple[tuple[Any, Any, Any], Array]:
-        """Hold one command; see :class:`~ventbench.plants.base.Plant`."""
+        """Hold one command; see :class:`~ventbench.interfaces.Plant`."""
         simulator, pressure = self.simulator.step(state[0], u_in, u_out, dt)
         wanted, more = self.wanted.step(state[1], u_in, u_out, dt)
         had, less = self.had.step(state[2], u_in, u_out, dt)

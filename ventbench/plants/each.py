@@ -8,7 +8,7 @@ import flax.struct
 import jax
 from jax import Array
 
-from ventbench.plants.base import Plant
+from ventbench.interfaces import Plant
 
 
 @flax.struct.dataclass
@@ -22,7 +22,7 @@ class Each:
     plants: Any
 
     def init(self, pressure: Array, peep: Array | None = None) -> Any:
-        """State of lungs at rest; see :class:`~ventbench.plants.base.Plant`."""
+        """State of lungs at rest; see :class:`~ventbench.interfaces.Plant`."""
 
         def init(plant: Plant, pressure: Array, peep: Array) -> Any:
             return plant.init(pressure, peep)

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from ventbench import files
 from ventbench.data_files import data_path
 from ventbench.errors import InputError
+from ventbench.interfaces import Plant
 from ventbench.lungs import LUNG_IDS, RECORDED_LUNGS
 from ventbench.plants import files as plant_files
-from ventbench.plants.base import Plant
 from ventbench.plants.each import Each
 from ventbench.plants.fingerprints import BY_ALL, Seen
 from ventbench.plants.hybrid import Hybrid

@@ -127,7 +127,7 @@ class Hybrid:
         return pressure, slope
 
     def init(self, pressure: Array, peep: Array | None = None) -> HybridState:
-        """Lung at the end of an expiration; see :class:`~ventbench.plants.base.Plant`.
+        """Lung at the end of an expiration; see :class:`~ventbench.interfaces.Plant`.
 
         The expiratory valve is open and the resting command holds the pressure, as before every
         inspiration on the rig.
@@ -152,7 +152,7 @@ class Hybrid:
     def step(
         self, state: HybridState, u_in: Array, u_out: Array, dt: Array
     ) -> tuple[HybridState, Array]:
-        """Hold one command; see :class:`~ventbench.plants.base.Plant`.
+        """Hold one command; see :class:`~ventbench.interfaces.Plant`.
 
         Each substep is an exponential step of the drop over the airway, with the airway's
         resistance and the elastic slope of its start.

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.plants.base import Plant
+from ventbench.interfaces import Plant
 
 
 @flax.struct.dataclass

@@ -46,7 +46,7 @@ class SingleCompartment:
     R_ex: Array
 
     def init(self, pressure: Array, peep: Array | None = None) -> SingleCompartmentState:
-        """Lung at rest; see :class:`~ventbench.plants.base.Plant`."""
+        """Lung at rest; see :class:`~ventbench.interfaces.Plant`."""
         return SingleCompartmentState(pressure, pressure if peep is None else peep)
 
     def step(

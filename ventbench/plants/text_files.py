@@ -15,8 +15,8 @@ import numpy as np
 
 from ventbench import files
 from ventbench.errors import InputError
+from ventbench.interfaces import Plant
 from ventbench.lungs import lung
-from ventbench.plants.base import Plant
 from ventbench.plants.files import _decode, _encode
 
 FORMAT = "ventbench-plants-1"

@@ -66,7 +66,7 @@ class TwoBalloon:
     supply: Array
 
     def init(self, pressure: Array, peep: Array | None = None) -> TwoBalloonState:
-        """Lung at rest; see :class:`~ventbench.plants.base.Plant`.
+        """Lung at rest; see :class:`~ventbench.interfaces.Plant`.
 
         Pressures outside -K/2 to 98 % of the balloon's peak become these.
         """

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from ventbench.controllers.base import Task
+from ventbench.interfaces import Task
 from ventbench.sandbox import packages
 from ventbench.sandbox.allowance import GIB, Allowance
 

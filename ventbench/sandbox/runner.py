@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ventbench.controllers.base import Task
+from ventbench.interfaces import Task
 from ventbench.sandbox.allowance import Allowance
 from ventbench.sandbox.child import landlock, lockdown, wire
 from ventbench.sandbox.child.lockdown import OFFICIAL

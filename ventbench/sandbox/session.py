@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench import protocol
-from ventbench.controllers.base import Task
+from ventbench.interfaces import Task
 from ventbench.sandbox import descriptors, dumpable
 from ventbench.sandbox.allowance import Allowance
 from ventbench.sandbox.child import lockdown, wire

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ventbench.controllers.base import Observation, Task
+from ventbench.interfaces import Observation, Task
 from ventbench.protocol import TARGETS_AHEAD
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.load import describe, printable

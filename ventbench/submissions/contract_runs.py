@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ventbench import protocol
-from ventbench.controllers.base import Task
+from ventbench.interfaces import Task
 from ventbench.lungs import LUNG_IDS
 from ventbench.submissions.cell import ROW
 from ventbench.submissions.contract_driver import RENEW, RESET

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ventbench.controllers.base import API_VERSION
+from ventbench.interfaces import API_VERSION
 from ventbench.submissions.errors import SubmissionError
 
 #: What kinds of controller the board distinguishes.

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from ventbench.controllers.base import API_VERSION
+from ventbench.interfaces import API_VERSION
 from ventbench.submissions import manifest
 from ventbench.submissions.errors import SubmissionError
 from ventbench.submissions.findings import Finding

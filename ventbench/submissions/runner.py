@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.controllers.base import Observation, Task
+from ventbench.interfaces import Observation, Task
 from ventbench.submissions.cell import Cell, Failed
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import Submission

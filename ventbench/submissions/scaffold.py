@@ -16,8 +16,8 @@ from string import Template
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.controllers.base import API_VERSION
 from ventbench.errors import InputError
+from ventbench.interfaces import API_VERSION
 from ventbench.submissions.folder import CONTROLLER, MANIFEST, bundled
 from ventbench.submissions.manifest import FAMILIES, NAME, NAME_RULE
 

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from ventbench import draws as published
 from ventbench import precision, protocol, scenario, waveform
-from ventbench.controllers.base import Task
+from ventbench.interfaces import Plant, Task
 from ventbench.lungs import LUNGS, Lung
 from ventbench.metrics import effort, safety, step_response
 from ventbench.metrics.waveform import run_error
-from ventbench.plants.base import Plant
 from ventbench.scenario import Scenario
 from ventbench.submissions.errors import SubmissionError
 from ventbench.submissions.folder import Submission

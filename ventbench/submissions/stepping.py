@@ -14,10 +14,9 @@ from jax import Array
 from numpy.typing import NDArray
 
 from ventbench import environment as env
-from ventbench import precision, protocol, rollout
-from ventbench.controllers.base import Observation, Task
+from ventbench import precision, protocol, rollouts
 from ventbench.controllers.script import Script
-from ventbench.plants.base import Plant, PlantT
+from ventbench.interfaces import Observation, Plant, PlantT, Task
 from ventbench.scenario import Scenario
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import Submission
@@ -154,7 +153,7 @@ def step_through(
 
 def replay(
     plants: Plant, scenario: Scenario, requested: Floats
-) -> tuple[rollout.Inspirations, rollout.Expirations]:
+) -> tuple[rollouts.Inspirations, rollouts.Expirations]:
     """Apply recorded commands again, with the expirations. Call it within ``float64()``.
 
     Args:
@@ -167,6 +166,6 @@ def replay(
     """
 
     def run(plant: Plant, commands: Array) -> Any:
-        return rollout.closed_loop(plant, Script(commands), scenario, whole=True)
+        return rollouts.closed_loop(plant, Script(commands), scenario, whole=True)
 
     return jax.vmap(run)(plants, jnp.asarray(requested.reshape(*requested.shape[:-2], -1)))

@@ -14,9 +14,9 @@ from ventbench import protocol
 from ventbench.controllers import expiratory
 from ventbench.controllers.pid import TIME_CONSTANT
 from ventbench.errors import InputError
+from ventbench.interfaces import Plant
 from ventbench.lungs import lung as parse_lung
 from ventbench.metrics.safety import limit
-from ventbench.plants.base import Plant
 from ventbench.recordings import Breaths, make_breaths
 from ventbench.training.disturbances import RANGES, Disturbance, Ranges, draw
 

@@ -11,13 +11,13 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from ventbench import evaluation, files
-from ventbench.evaluation import PlantsFor
+from ventbench import files, open_loop_report
 from ventbench.lungs import LUNG_IDS, lung
 from ventbench.plants import frozen
 from ventbench.plants.labelled import single_compartments, two_balloons
 from ventbench.plants.learned import Architecture
 from ventbench.plants.sessions import Sessions
+from ventbench.rollouts import PlantsFor
 
 if TYPE_CHECKING:
     from ventbench.training.freeze import Recordings
@@ -61,20 +61,22 @@ def judge(
 
     Returns:
         ``lungs``: for each of the six, its R, C, reference session, and the open-loop errors, see
-        :func:`ventbench.evaluation.summary`, cmH2O: ``held_out_...`` of each breath by the member
-        that has not seen it; ``official_...`` of member 0 on the breaths that it has not seen;
+        :func:`~ventbench.open_loop_report.summary`, cmH2O: ``held_out_...`` of each breath by the
+        member that has not seen it; ``official_...`` of member 0 on breaths that it has not seen;
         ``training_...`` of member 0 on the others. ``comparison``: held-out errors by kind of
         plant, then lung.
     """
     measured = data.measured
-    official = evaluation.errors(simulators.for_breaths, measured)
+    official = open_loop_report.errors(simulators.for_breaths, measured)
     kinds: dict[str, PlantsFor] = {
         "hybrid": simulators.cross_fitted,
         "learned": learned.cross_fitted,
         "single_compartment": single_compartments,
         "two_balloon": two_balloons,
     }
-    found = {kind: evaluation.errors(plants_for, measured) for kind, plants_for in kinds.items()}
+    found = {
+        kind: open_loop_report.errors(plants_for, measured) for kind, plants_for in kinds.items()
+    }
     lungs = {}
     for name in LUNG_IDS:
         index = measured.by_lung_index[name]
@@ -108,7 +110,7 @@ def write(path: Path, manifest: dict[str, Any]) -> None:
 
 def _figures(prefix: str, error: NDArray[np.float64]) -> dict[str, Any]:
     """Summary, empty where there is no breath, as TOML knows no null."""
-    summary = evaluation.summary(prefix, error)
+    summary = open_loop_report.summary(prefix, error)
     return _rounded(summary) if summary[f"{prefix}breaths"] else {}
 
 

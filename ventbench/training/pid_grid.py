@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ventbench import environment as env
 from ventbench import protocol
 from ventbench.controllers.pid import PID
-from ventbench.plants.base import Plant
+from ventbench.interfaces import Plant
 from ventbench.scenario import Scenario, nominal
 
 #: The paper's twenty values of P, I and D, %/cmH2O.

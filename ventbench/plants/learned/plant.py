@@ -96,7 +96,7 @@ class Learned:
     windows: tuple[int, int] = flax.struct.field(pytree_node=False)
 
     def init(self, pressure: Array, peep: Array | None = None) -> LearnedState:
-        """Lung at rest; see :class:`~ventbench.plants.base.Plant`."""
+        """Lung at rest; see :class:`~ventbench.interfaces.Plant`."""
         pressure = jnp.asarray(pressure) * 1.0
         behind = pressure if peep is None else jnp.broadcast_to(peep, pressure.shape)
         return self._rest(pressure, behind.astype(pressure.dtype))

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-from ventbench.controllers.base import Task
+from ventbench.interfaces import Task
 from ventbench.submissions.cell import Cell, Failed
 from ventbench.submissions.errors import SubmissionError
 from ventbench.submissions.load import controller_class, describe

@@ -19,7 +19,7 @@ import sys
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ventbench.controllers.base import Task
+from ventbench.interfaces import Task
 
 from . import libc, preload, privileges, serve
 from .lockdown import Limits, Lockdown

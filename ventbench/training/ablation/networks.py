@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from ventbench import evaluation, files
+from ventbench import files, open_loop_report
 from ventbench.lungs import LUNG_IDS, RECORDED_LUNGS
 from ventbench.metrics import bootstrap
 from ventbench.plants.each import Each
@@ -147,4 +147,4 @@ def _errors(nets: Any, breaths: Breaths, fold: np.ndarray) -> np.ndarray:
         member = np.array([of[int(k)] for k in some.breath_id])
         return Each(jax.tree.map(lambda leaf: jnp.asarray(leaf[member, at]), nets))
 
-    return evaluation.errors(plants_for, breaths)
+    return open_loop_report.errors(plants_for, breaths)

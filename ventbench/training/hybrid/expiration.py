@@ -19,7 +19,7 @@ from jax import Array
 
 from ventbench.plants.sessions import Sessions
 from ventbench.recordings.breaths import Breaths
-from ventbench.rollout import open_loop
+from ventbench.rollouts import open_loop
 from ventbench.training.hybrid.data import groups_of
 from ventbench.training.hybrid.fit import Recipe
 from ventbench.training.hybrid.parameters import Groups, Pooled, plants

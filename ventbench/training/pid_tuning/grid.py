@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench import protocol
-from ventbench.plants.base import Plant
+from ventbench.interfaces import Plant
 from ventbench.training import pid_grid
 from ventbench.training.executor import InProcess, results
 from ventbench.training.pid_tuning.kept import Kept

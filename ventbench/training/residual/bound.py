@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ventbench import environment as env
 from ventbench import precision, protocol
-from ventbench.plants.base import Plant
+from ventbench.interfaces import Plant
 from ventbench.scenario import Scenario, nominal
 
 #: Steps that each start of the search opens the valve fully for, before it nearly closes it.

@@ -13,13 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import files, precision, protocol, rollout
-from ventbench.controllers.base import Controller
+from ventbench import files, precision, protocol, rollouts
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import Residual
+from ventbench.interfaces import Controller, Plant
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics.waveform import run_error
-from ventbench.plants.base import Plant
 from ventbench.plants.stack import take
 from ventbench.scenario import nominal
 from ventbench.training import pid_grid
@@ -136,7 +135,7 @@ def _errors(
         for index in where:
             name = LUNG_IDS[index]
             plant = jax.tree.map(jnp.asarray, lungs[name])
-            inspirations, _ = rollout.closed_loop(plant, wide, cells)
+            inspirations, _ = rollouts.closed_loop(plant, wide, cells)
             error = run_error(inspirations.pressure, np.asarray(cells.pip)[:, None, None])
             found[name] = round(float(error.mean()), 6)
     return found

@@ -18,7 +18,7 @@ from jax import Array
 from ventbench import protocol
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import Residual, untrained
-from ventbench.plants.base import Plant
+from ventbench.interfaces import Plant
 from ventbench.training.learned import checkpoint as checkpoints
 from ventbench.training.residual.loss import disagreement
 from ventbench.training.residual.loss import loss as objective

@@ -12,7 +12,7 @@ from jax import Array
 from ventbench import environment as env
 from ventbench import protocol
 from ventbench.controllers.residual import Residual
-from ventbench.plants.base import Plant
+from ventbench.interfaces import Plant
 from ventbench.scenario import Scenario
 
 

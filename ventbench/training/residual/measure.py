@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import precision, protocol, rollout
+from ventbench import precision, protocol, rollouts
 from ventbench.board.replay import spread
-from ventbench.controllers.base import Controller
+from ventbench.interfaces import Controller
 from ventbench.metrics import safety
 from ventbench.metrics.waveform import run_error
 from ventbench.plants import frozen
@@ -47,7 +47,7 @@ def measure(
         for index, controller in enumerate(controllers):
             plant = jax.tree.map(jnp.asarray, take(simulators.plants, index))
             wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), controller)
-            found, _ = rollout.closed_loop(plant, wide, cells)
+            found, _ = rollouts.closed_loop(plant, wide, cells)
             errors.append(run_error(found.pressure, pip[..., None]))
             requested.append(np.asarray(found.requested))
             safe &= bool(np.all(safety.safe(found.pressure, pip, dt)))

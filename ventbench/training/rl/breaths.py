@@ -12,7 +12,7 @@ from jax import Array
 
 from ventbench import draws, protocol
 from ventbench import environment as env
-from ventbench.plants.base import Plant
+from ventbench.interfaces import Plant
 from ventbench.scenario import Scenario
 from ventbench.training.rl import features
 

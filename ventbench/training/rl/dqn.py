@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from ventbench.plants.base import Plant
+from ventbench.interfaces import Plant
 from ventbench.training.rl import breaths, features, networks, returns
 from ventbench.training.rl.policies import CHOICES, Greedy
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from ventbench import protocol
-from ventbench.controllers.base import Observation
 from ventbench.controllers.pid import PID, PIDState
+from ventbench.interfaces import Observation
 
 #: The PID that is corrected: the best single one of the grid for all six lungs, (P, I, D).
 GAINS = (6.0, 6.0, 0.3)

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 from jax import Array
 
-from ventbench.plants.base import Plant
+from ventbench.interfaces import Plant
 
 
 class Method(Protocol):

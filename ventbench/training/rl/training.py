@@ -18,7 +18,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from ventbench import precision, protocol, scenario
-from ventbench.plants.base import Plant
+from ventbench.interfaces import Plant
 from ventbench.scenario import Scenario
 from ventbench.training.rl import breaths, checkpoint
 from ventbench.training.rl.method import Method

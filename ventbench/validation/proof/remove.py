@@ -7,9 +7,9 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from ventbench import precision
+from ventbench.interfaces import Plant
 from ventbench.physics.catalogue import library, mechanism, parameter, slots
 from ventbench.physics.model import Physics
-from ventbench.plants.base import Plant
 from ventbench.plants.corrected import Corrected
 
 

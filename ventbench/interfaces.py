@@ -1,11 +1,57 @@
-"""What a controller is: as a pure function here, as a plain class in a submission."""
+"""What a plant and a controller are: the two interfaces on which everything else is built.
+
+Standard library only: processes that run submissions import this module too.
+"""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar, runtime_checkable
+
+if TYPE_CHECKING:
+    from jax import Array
 
 #: Version of the submission interface (:class:`Task`, :class:`Observation`, ``reset``, ``act``).
 API_VERSION = 1
+
+State = Any
+PlantT = TypeVar("PlantT")
+
+
+@runtime_checkable
+class Plant(Protocol):
+    """Answers to valve commands with airway pressures.
+
+    A plant is a pytree (its parameters are leaves), so that it can be an argument of ``jit``,
+    stacked over lungs and ensemble members, and differentiated. Both methods are pure; every array
+    argument may have any leading batch shape ``(...)``, which the parameters must broadcast with.
+    Plants contain no ``cond`` or ``switch``: under ``vmap`` those copy weights per element.
+
+    Time: the command of a sample is held for ``dt`` after that sample, and ``step`` returns the
+    pressure at the end of that time, which is the next sample.
+    """
+
+    def init(self, pressure: Array, peep: Array | None = None) -> State:
+        """State of a lung at rest.
+
+        Args:
+            pressure: airway and alveolar pressure, cmH2O, shape ``(...)``.
+            peep: pressure behind the expiratory valve, cmH2O; ``pressure`` if not given.
+        """
+        ...
+
+    def step(self, state: State, u_in: Array, u_out: Array, dt: Array) -> tuple[State, Array]:
+        """Hold one command.
+
+        Args:
+            state: from ``init`` or ``step``.
+            u_in: inspiratory valve, 0..100 %, shape ``(...)``.
+            u_out: expiratory valve, 0 closed, 1 open, shape ``(...)``.
+            dt: time for which the command is held, s, shape ``(...)`` or scalar.
+
+        Returns:
+            The next state and the measured airway pressure, cmH2O, shape ``(...)``.
+        """
+        ...
 
 
 class Task(NamedTuple):

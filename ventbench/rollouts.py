@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from numpy.typing import NDArray
 
 from ventbench import environment as env
-from ventbench import protocol
-from ventbench.controllers.base import Controller
-from ventbench.plants.base import Plant
+from ventbench import precision, protocol
+from ventbench.interfaces import Controller, Plant
+from ventbench.recordings.breaths import Breaths
 from ventbench.scenario import Scenario
 
 BREATHS, INSPIRATION = protocol.BREATHS, protocol.INSPIRATION_STEPS
+
+#: Gives the plants of some breaths: parameters of shape ``(n, ...)``.
+PlantsFor = Callable[[Breaths], Plant]
+
+# Breaths rolled out together: bounds memory, and the last batch is padded so that all compile once.
+_BATCH = 4096
 
 
 @jax.jit
@@ -40,6 +49,32 @@ def open_loop(plant: Plant, start: Array, u_in: Array, u_out: Array, dt: Array) 
     commands = jax.tree.map(lambda x: jnp.moveaxis(x[:, :-1], 1, 0), (u_in, u_out, dt))
     _, pressure = jax.lax.scan(step, plant.init(start), commands)
     return jnp.concatenate([start[:, None], jnp.moveaxis(pressure, 0, 1)], axis=1)
+
+
+def open_loop_breaths(plants_for: PlantsFor, breaths: Breaths) -> NDArray[np.float64]:
+    """Pressures that plants answer to the commands of recorded breaths with, in batches.
+
+    Each breath starts at its first recorded pressure.
+
+    Args:
+        plants_for: see :data:`PlantsFor`.
+        breaths: n breaths of T samples.
+
+    Returns:
+        cmH2O, shape ``(n, T)``; NaN for a breath whose first pressure is blank.
+    """
+    n = len(breaths)
+    batch = min(_BATCH, n)
+    parts = []
+    with precision.float64():
+        for first in range(0, n, batch):
+            index = np.minimum(np.arange(first, first + batch), n - 1)
+            part = breaths.select(index)
+            columns = (part.pressure[:, 0], part.u_in, part.u_out, part.dt)
+            start, *commands = (jnp.asarray(x, float) for x in columns)
+            answer = open_loop(plants_for(part), start, *commands)
+            parts.append(np.asarray(answer)[: min(batch, n - first)])
+    return np.concatenate(parts)
 
 
 @flax.struct.dataclass

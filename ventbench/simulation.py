@@ -1,15 +1,18 @@
-"""Valve commands from a file, for ``ventbench simulate``."""
+"""Valve commands from a file, and what a simulator answers to them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import protocol
+from ventbench import precision, protocol
 from ventbench.errors import InputError
+from ventbench.interfaces import Plant
+from ventbench.rollouts import open_loop
 
 Floats = NDArray[np.float64]
 
@@ -35,31 +38,25 @@ class Controls:
         return np.append(steps, steps[-1] if steps.size else protocol.DT)
 
 
-def _numbers(path: Path, column: str, text: list[str]) -> Floats:
-    values = np.empty(len(text))
-    for row, cell in enumerate(text):
-        try:
-            values[row] = float(cell)
-        except ValueError:
-            values[row] = np.nan
-        if not np.isfinite(values[row]):
-            raise InputError(
-                f"{path} line {row + 2}, column {column}: {cell!r} is not a number. Fix the row."
-            )
-    return values
+def simulate(
+    plant: Plant, controls: Controls, *, start: float = protocol.PEEP
+) -> NDArray[np.float64]:
+    """Pressures that a plant answers to commands with.
+
+    Args:
+        plant: any plant.
+        controls: T commands.
+        start: pressure at the first sample, cmH2O; the lung is at rest there.
+
+    Returns:
+        Pressure at each sample, cmH2O, shape ``(T,)``.
+    """
+    with precision.float64():
+        commands = (jnp.asarray(x)[None] for x in (controls.u_in, controls.u_out, controls.dt))
+        return np.asarray(open_loop(plant, jnp.asarray([float(start)]), *commands))[0]
 
 
-def _first(path: Path, column: str, bad: NDArray[np.bool_], values: Floats, why: str) -> None:
-    if np.any(bad):
-        row = int(np.argmax(bad))
-        raise InputError(f"{path} line {row + 2}, column {column}: {values[row]:g} {why}")
-
-
-def _steps(count: int) -> Floats:
-    return np.arange(count, dtype=np.float64) * protocol.DT
-
-
-def read(path: Path) -> Controls:
+def read_controls(path: Path) -> Controls:
     """Read a CSV file of commands.
 
     Args:
@@ -93,3 +90,27 @@ def read(path: Path) -> Controls:
     back = np.append(False, np.diff(time) <= 0)
     _first(path, "time_step", back, time, "s is not later than the row before. Give one breath.")
     return Controls(time, u_in, u_out)
+
+
+def _numbers(path: Path, column: str, text: list[str]) -> Floats:
+    values = np.empty(len(text))
+    for row, cell in enumerate(text):
+        try:
+            values[row] = float(cell)
+        except ValueError:
+            values[row] = np.nan
+        if not np.isfinite(values[row]):
+            raise InputError(
+                f"{path} line {row + 2}, column {column}: {cell!r} is not a number. Fix the row."
+            )
+    return values
+
+
+def _first(path: Path, column: str, bad: NDArray[np.bool_], values: Floats, why: str) -> None:
+    if np.any(bad):
+        row = int(np.argmax(bad))
+        raise InputError(f"{path} line {row + 2}, column {column}: {values[row]:g} {why}")
+
+
+def _steps(count: int) -> Floats:
+    return np.arange(count, dtype=np.float64) * protocol.DT

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import draws, precision, protocol, rollout, scenario
+from ventbench import draws, precision, protocol, rollouts, scenario
 from ventbench import environment as env
-from ventbench.controllers.base import Observation
 from ventbench.controllers.pid import PID
 from ventbench.controllers.script import Script
+from ventbench.interfaces import Observation
 from ventbench.lungs import LUNGS
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stack import stack, take
@@ -53,7 +53,7 @@ def test_closed_loop_against_python_loop(plants):
     with precision.float64():
         cells = draws.scenarios((10.0, 35.0), 2)
         for k in (0, 5):
-            inspired, expired = rollout.closed_loop(take(plants, k), controller, cells, whole=True)
+            inspired, expired = rollouts.closed_loop(take(plants, k), controller, cells, whole=True)
             pressure, requested, applied = looped(take(plants, k), controller, cells)
             assert inspired.pressure.shape == (2, 2, 3, 34)
             for found, expected in (
@@ -69,8 +69,8 @@ def test_closed_loop_against_python_loop(plants):
 def test_without_expirations(plants, nominal):
     with precision.float64():
         plant = take(plants, 0)
-        short, none = rollout.closed_loop(plant, PID(1.0, 5.0), nominal)
-        whole, _ = rollout.closed_loop(plant, PID(1.0, 5.0), nominal, whole=True)
+        short, none = rollouts.closed_loop(plant, PID(1.0, 5.0), nominal)
+        whole, _ = rollouts.closed_loop(plant, PID(1.0, 5.0), nominal, whole=True)
     assert none is None
     np.testing.assert_allclose(short.pressure, whole.pressure, rtol=0, atol=1e-10)
 
@@ -78,7 +78,7 @@ def test_without_expirations(plants, nominal):
 def test_controller_state_lives_through_the_breaths(plants, nominal):
     with precision.float64():
         lines = jnp.broadcast_to(jnp.arange(102.0), (6, 102))
-        found, _ = rollout.closed_loop(take(plants, 0), Script(lines), nominal)
+        found, _ = rollouts.closed_loop(take(plants, 0), Script(lines), nominal)
     np.testing.assert_array_equal(found.requested.reshape(6, 102), lines)
     np.testing.assert_array_equal(found.u_in.reshape(6, 102), np.minimum(lines, 100))
     np.testing.assert_array_equal(found.pressure[:, :, 0], 5.0)
@@ -86,15 +86,15 @@ def test_controller_state_lives_through_the_breaths(plants, nominal):
 
 def test_vmap_over_lungs_is_each_lung(plants, nominal):
     with precision.float64():
-        together, _ = jax.vmap(lambda p: rollout.closed_loop(p, PID(1.0, 5.0), nominal))(plants)
+        together, _ = jax.vmap(lambda p: rollouts.closed_loop(p, PID(1.0, 5.0), nominal))(plants)
         for k in range(6):
-            alone, _ = rollout.closed_loop(take(plants, k), PID(1.0, 5.0), nominal)
+            alone, _ = rollouts.closed_loop(take(plants, k), PID(1.0, 5.0), nominal)
             np.testing.assert_allclose(together.pressure[k], alone.pressure, rtol=0, atol=1e-9)
 
 
 def test_gradient_with_respect_to_gains(plants, nominal):
     def loss(gains):
-        found, _ = rollout.closed_loop(take(plants, 5), PID(*gains), nominal)
+        found, _ = rollouts.closed_loop(take(plants, 5), PID(*gains), nominal)
         return jnp.mean((found.pressure - nominal.pip[:, None, None]) ** 2)
 
     with precision.float64():
@@ -108,15 +108,15 @@ def test_gradient_with_respect_to_gains(plants, nominal):
 
 def test_single_precision_is_close(plants, nominal):
     with precision.float64():
-        double, _ = rollout.closed_loop(take(plants, 4), PID(0.5, 5.0), nominal)
+        double, _ = rollouts.closed_loop(take(plants, 4), PID(0.5, 5.0), nominal)
     to_single = jax.tree.map(lambda x: np.asarray(x, np.float32), (take(plants, 4), nominal))
-    single, _ = rollout.closed_loop(to_single[0], PID(0.5, 5.0), to_single[1])
+    single, _ = rollouts.closed_loop(to_single[0], PID(0.5, 5.0), to_single[1])
     assert single.pressure.dtype == jnp.float32
     np.testing.assert_allclose(single.pressure, double.pressure, atol=1e-3)
 
 
 def test_compiles_once(plants, nominal):
-    function: Any = rollout.closed_loop
+    function: Any = rollouts.closed_loop
     function.clear_cache()
     with precision.float64():
         for k in range(3):
@@ -132,7 +132,7 @@ def test_open_loop_against_python_loop(plants):
     start = rng.uniform(4, 8, size=4)
     with precision.float64():
         plant = take(plants, 3)
-        found = rollout.open_loop(plant, *map(jnp.asarray, (start, u_in, u_out, dt)))
+        found = rollouts.open_loop(plant, *map(jnp.asarray, (start, u_in, u_out, dt)))
         state, expected = plant.init(jnp.asarray(start)), [start]
         for t in range(49):
             state, pressure = plant.step(state, *(jnp.asarray(x[:, t]) for x in (u_in, u_out, dt)))
@@ -146,7 +146,7 @@ def test_open_loop_ignores_the_last_command(plants):
         changed = (commands[0].at[0, -1].set(99.0), *commands[1:])
         plant, start = take(plants, 0), jnp.array([5.0])
         np.testing.assert_array_equal(
-            rollout.open_loop(plant, start, *commands), rollout.open_loop(plant, start, *changed)
+            rollouts.open_loop(plant, start, *commands), rollouts.open_loop(plant, start, *changed)
         )
 
 

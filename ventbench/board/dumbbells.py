@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ventbench.board.record import Record
-from ventbench.views.runs import number
+from ventbench.text import number
 
 #: Width of the drawing, left and width of its axis, height of a row.
 WIDTH, LEFT, AXIS, ROW = 640, 40, 580, 14

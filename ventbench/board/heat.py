@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ventbench.board.record import Record
-from ventbench.views.runs import number
+from ventbench.text import number
 
 #: Limits between the shades, cmH2O: the same for all entries, so that maps can be compared.
 ERRORS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0)

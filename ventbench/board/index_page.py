@@ -11,7 +11,7 @@ from ventbench.board import pages, text
 from ventbench.board.board import Track
 from ventbench.board.ranking import BASELINES, Row
 from ventbench.board.store import Store
-from ventbench.views.runs import number
+from ventbench.text import number
 
 if TYPE_CHECKING:
     import jinja2

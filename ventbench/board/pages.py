@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ventbench import protocol
 from ventbench.board import text
-from ventbench.views.extras import require
+from ventbench.extras import require
 
 if TYPE_CHECKING:
     import jinja2

@@ -9,7 +9,7 @@ from typing import Any
 from markupsafe import Markup
 
 from ventbench.board.ranking import Interval
-from ventbench.views.runs import number
+from ventbench.text import number
 
 #: Shown where there is nothing to show.
 NONE = "–"

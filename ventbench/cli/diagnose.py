@@ -49,8 +49,8 @@ def diagnose(
     """
     from rich.console import Console
 
+    from ventbench import extras
     from ventbench import recordings as files
-    from ventbench.views import extras
 
     extras.require("jinja2", "rerun")
     progress = Console(stderr=True)

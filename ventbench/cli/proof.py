@@ -47,11 +47,10 @@ def proof(
     """
     from rich.console import Console
 
-    from ventbench import compilation
+    from ventbench import compilation, extras
     from ventbench.cli.diagnose import keep
     from ventbench.cli.study import bars
     from ventbench.validation.proof import prove
-    from ventbench.views import extras
 
     extras.require("jinja2", "rerun")
     folder = _folder(recordings)

@@ -45,10 +45,9 @@ def samples(
     """
     from rich.console import Console
 
-    from ventbench import files
+    from ventbench import extras, files
     from ventbench.lungs import scored_lung
     from ventbench.training import study as work
-    from ventbench.views import extras
 
     extras.require("matplotlib")
     with bars() as shown:

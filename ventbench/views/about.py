@@ -9,8 +9,9 @@ import numpy as np
 
 import ventbench
 from ventbench import protocol
+from ventbench.text import number
 from ventbench.trajectories import Trajectories
-from ventbench.views.runs import errors, number
+from ventbench.views.runs import errors
 
 #: Longest name over a column of the table, characters.
 COLUMN = 16

@@ -12,10 +12,11 @@ import numpy as np
 
 from ventbench import protocol
 from ventbench.lungs import lung as parse_lung
+from ventbench.text import number
 from ventbench.trajectories import Trajectories
 from ventbench.views import panels, scores, style
 from ventbench.views.drawing import Drawing
-from ventbench.views.runs import Floats, labels, number
+from ventbench.views.runs import Floats, labels
 
 #: Width, pixels.
 PIXELS = 1800

@@ -31,7 +31,7 @@ def png(grid: Grid, *, each: bool = True, single: bool = True) -> bytes:
     Raises:
         InputError: if matplotlib is missing.
     """
-    from ventbench.views.extras import require
+    from ventbench.extras import require
 
     require("matplotlib")
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -11,9 +11,10 @@ import numpy as np
 import ventbench
 from ventbench import protocol
 from ventbench.lungs import lung as parse_lung
+from ventbench.text import number
 from ventbench.trajectories import Trajectories
 from ventbench.views import panels, scores, style, svg
-from ventbench.views.runs import Floats, labels, number
+from ventbench.views.runs import Floats, labels
 
 
 def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None = None) -> str:

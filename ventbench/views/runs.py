@@ -102,13 +102,3 @@ def errors(run: Trajectories) -> Floats:
         x.reshape(shape)[..., : protocol.INSPIRATION_STEPS] for x in (run.pressure, run.target)
     )
     return run_error(np.where(np.isfinite(pressure), pressure, np.nan), target)
-
-
-def number(value: float | None, digits: int = 2, sign: bool = False) -> str:
-    """Text of a figure; a dash for none, "failed" for NaN; a true minus sign."""
-    if value is None:
-        return "–"
-    if not np.isfinite(value):
-        return "failed"
-    # + 0.0 turns -0.0, which rounding may leave, into 0.0.
-    return f"{round(value, digits) + 0.0:{'+' if sign else ''}.{digits}f}".replace("-", "−")

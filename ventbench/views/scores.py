@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from ventbench.errors import InputError
+from ventbench.text import number
 from ventbench.trajectories import Trajectories
-from ventbench.views.runs import Floats, errors, number
+from ventbench.views.runs import Floats, errors
 
 #: Keys of a score that are shown elsewhere or say nothing about where the score comes from.
 NOT_PROVENANCE = frozenset(

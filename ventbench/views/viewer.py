@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from ventbench.views import extras
+from ventbench import extras
 
 
 def has_display() -> bool:

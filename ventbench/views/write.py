@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ventbench import files
+from ventbench import extras, files
 from ventbench.trajectories import Trajectories
-from ventbench.views import extras
 from ventbench.views.runs import check
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ventbench import files
+from ventbench import extras, files
 from ventbench.diagnosis.result import Diagnosis
-from ventbench.views import extras
 
 
 def write_report(path: Path | str, found: Diagnosis) -> Path:

@@ -1,0 +1,24 @@
+"""Numbers and foreign text as reports, pages and messages show them."""
+
+from __future__ import annotations
+
+import math
+
+
+def number(value: float | None, digits: int = 2, sign: bool = False) -> str:
+    """Text of a figure; a dash for none, "failed" for NaN; a true minus sign."""
+    if value is None:
+        return "–"
+    if not math.isfinite(value):
+        return "failed"
+    # + 0.0 turns -0.0, which rounding may leave, into 0.0.
+    return f"{round(value, digits) + 0.0:{'+' if sign else ''}.{digits}f}".replace("-", "−")
+
+
+def plain(text: str) -> str:
+    """Text in which nothing is invisible or turns the reading direction; not escaped."""
+    if text.isprintable():
+        return text
+    return "".join(
+        c if c.isprintable() else " " if c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in text
+    )

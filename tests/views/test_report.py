@@ -11,6 +11,7 @@ import pytest
 
 from ventbench import protocol
 from ventbench.errors import InputError
+from ventbench.text import number
 from ventbench.trajectories import Trajectories
 from ventbench.views import runs as shared
 from ventbench.views import scores, svg, write_figure, write_report
@@ -165,7 +166,7 @@ def test_best_and_differences(best: Trajectories, robust: Trajectories) -> None:
     assert ours["best"]
     assert not base["best"]
     assert (ours["class"], base["difference"]) == ("better", "")
-    assert ours["difference"] == shared.number(
+    assert ours["difference"] == number(
         shared.errors(best).mean() - shared.errors(robust).mean(), sign=True
     )
     same = report.table(best.lungs, scores.collect([best, best]))[0]["cells"][0]

@@ -77,21 +77,6 @@ def test_labels_are_short_printable_and_distinct(best: Trajectories) -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "sign", "text"),
-    [
-        (1.234, False, "1.23"),
-        (-1.236, True, "−1.24"),
-        (0.5, True, "+0.50"),
-        (-0.001, False, "0.00"),
-        (None, False, "–"),
-        (np.nan, False, "failed"),
-    ],
-)
-def test_number(value: float | None, sign: bool, text: str) -> None:
-    assert shared.number(value, sign=sign) == text
-
-
-@pytest.mark.parametrize(
     ("write", "module"),
     list(zip(WRITERS, ("rerun", "jinja2", "matplotlib"), strict=True)),
 )

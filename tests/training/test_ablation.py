@@ -23,7 +23,6 @@ from ventbench.recordings import write
 from ventbench.training import freeze
 from ventbench.training import learned as learning
 from ventbench.training.ablation import controllers, networks
-from ventbench.training.ablation.rows import Rows
 from ventbench.training.residual import Recipe
 
 SMALL = Recipe(updates=2, copies=1, widths=(8,), pressures=2, commands=2, ahead=2, members=2)
@@ -66,20 +65,6 @@ def test_each_variant_differs_in_one_thing():
         assert len(changed) == (name != networks.BASE)
         if changed:
             assert name.endswith(f" {getattr(one, changed[0])}")
-
-
-def test_a_finished_piece_is_not_made_again(tmp_path):
-    made, rows = [], Rows(tmp_path / "rows")
-
-    def make() -> list[float]:
-        made.append(1)
-        return [0.1, 0.2]
-
-    for _ in range(2):
-        assert rows.get("a-0", {"gains": (1.0, 2.0)}, make) == [0.1, 0.2]
-    assert made == [1]
-    with pytest.raises(InputError, match=r"a-0\.json is of other settings"):
-        rows.get("a-0", {"gains": (1.0, 3.0)}, make)
 
 
 def test_controllers_are_compared(tmp_path):

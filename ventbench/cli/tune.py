@@ -56,17 +56,18 @@ def pid(
         raise InputError("say for which lungs: --lung LUNG, --all or --robust, one of them")
     names = (scored_lung(lung).id,) if lung is not None else LUNG_IDS
     grid = _search(names, out, workers, scheduler)
+    import shutil
+
     from ventbench import files
     from ventbench.plants import frozen
     from ventbench.training import pid_tuning
-    from ventbench.training.pid_tuning.grid import forget
 
     result = pid_tuning.summary(grid, each=not robust, single=lung is None)
     result["simulators"] = frozen.load().about()
     pid_tuning.write(out / TABLE, grid)
     files.write_json(out / RESULT, result)
     written = [TABLE, RESULT, *_plot(out / PLOT, grid, not robust, lung is None)]
-    forget(out / PARTS)
+    shutil.rmtree(out / PARTS)
     emit(result, json)
     console = Console(stderr=str(json) == "-")
     console.print(_table(result))

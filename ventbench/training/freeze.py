@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,11 @@ from ventbench.plants.fingerprints import BY_ALL, seen
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.learned import Architecture, Learned
 from ventbench.recordings import Breaths, folds, join, load
+from ventbench.resume import Format, WorkFolder
 from ventbench.training import learned as networks
 from ventbench.training import manifest
 from ventbench.training.hybrid.fit import Recipe
 from ventbench.training.hybrid.member import fit_member, session_plants, training_set
-from ventbench.training.parts import Parts
 
 MEASURED, RECONSTRUCTED = "pvp_quicklung.csv", "pvp_quicklung_reconstructed.csv"
 
@@ -33,6 +33,9 @@ MEMBERS, SEED = 5, 0
 
 #: The paper's networks, smaller: there are far fewer breaths than the paper had.
 ARCHITECTURE = Architecture(width=48, depth=4)
+
+#: A plant with numpy leaves as a finished result.
+PLANT = Format(".npz", plant_files.save, partial(plant_files.load, as_array=np.asarray))
 
 #: Called with what is being done and the share of all that is done, 0..1.
 Progress = Callable[[str, float], None]
@@ -103,14 +106,14 @@ def train(
     # The clocks alone, and of breaths that every member sees.
     table = sessions.find(data.reconstructed)
     about = manifest.provenance(data, recipe, network_recipe, ARCHITECTURE)
-    parts = Parts(out / "parts", about)
+    parts = WorkFolder(out / "parts", about)
     with precision.float64():
         members = list(_hybrid(data, table, recipe, parts, report))
     nets = list(_networks(data, network_recipe, parts, report))
 
     report("testing on held-out breaths", _HYBRID_SHARE + _LEARNED_SHARE)
     _write(out, about, table, data, _stack(members), _stack(nets))
-    shutil.rmtree(parts.folder)
+    parts.delete()
     report("done", 1.0)
     return frozen.load(path=out)
 
@@ -144,7 +147,7 @@ def _write(
 
 
 def _hybrid(
-    data: Recordings, table: sessions.Sessions, recipe: Recipe, parts: Parts, report: Progress
+    data: Recordings, table: sessions.Sessions, recipe: Recipe, parts: WorkFolder, report: Progress
 ) -> Iterator[Any]:
     arranged = training_set(data.measured, data.reconstructed, data.fold, table, recipe)
     for member in range(MEMBERS):
@@ -156,11 +159,11 @@ def _hybrid(
             return session_plants(fit_member(arranged, member, recipe, tell), table, recipe)
 
         tell(0.0)
-        yield parts.get(f"hybrid-{member}", make)
+        yield parts.get(f"hybrid-{member}", make, PLANT)
 
 
 def _networks(
-    data: Recordings, recipe: networks.Recipe, parts: Parts, report: Progress
+    data: Recordings, recipe: networks.Recipe, parts: WorkFolder, report: Progress
 ) -> Iterator[Any]:
     """One stack of networks over the settings for each member."""
     total = MEMBERS * len(RECORDED_LUNGS)
@@ -177,7 +180,7 @@ def _networks(
             def make(lung: Lung = lung, name: str = name, number: int = number) -> Learned:
                 return network(data, lung, number, ARCHITECTURE, recipe, parts.checkpoint(name))
 
-            nets.append(parts.get(name, make))
+            nets.append(parts.get(name, make, PLANT))
         yield _stack(nets)
 
 

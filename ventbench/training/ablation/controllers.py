@@ -14,8 +14,8 @@ import pandas as pd
 from ventbench import files, precision, protocol
 from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
+from ventbench.resume import WorkFolder
 from ventbench.training import pid_grid
-from ventbench.training.ablation.rows import Rows
 from ventbench.training.residual import Recipe, fit
 from ventbench.training.residual.measure import DRAWS, measure
 
@@ -107,7 +107,11 @@ def compare(
     """
     chosen = {k: v for k, v in variants(recipe).items() if only is None or k in (BASE, *only)}
     gains = gains or best_single(simulators)
-    rows, found = Rows(out / "rows"), []
+    about = {
+        "recipe": asdict(recipe), "gains": list(gains), "draws": draws,
+        "simulators": simulators.about(),
+    }  # fmt: skip
+    work, found = WorkFolder(out / "rows", about), []
     todo = [(name, seed) for name in chosen for seed in seeds]
     for number, (name, seed) in enumerate(todo):
         variant = chosen[name]
@@ -121,15 +125,11 @@ def compare(
             variant: Variant = variant, own: Gains = own, seed: int = seed, part: str = part,
             tell: Callable[[float], None] = tell,
         ) -> dict[str, float]:  # fmt: skip
-            checkpoint = out / "rows" / f"{part}.npz"
+            checkpoint = work.checkpoint(part)
             return _trained(simulators, own, variant.recipe, seed, draws, checkpoint, tell)
 
         tell(0.0)
-        identity = {
-            "recipe": asdict(variant.recipe), "gains": list(own), "seed": seed, "draws": draws,
-            "simulators": simulators.about(),
-        }  # fmt: skip
-        found.append({"variant": name, "seed": seed} | rows.get(part, identity, make))
+        found.append({"variant": name, "seed": seed} | work.get(part, make))
     runs = pd.DataFrame(found)
     files.write_text(out / "runs.csv", runs.round(5).to_csv(index=False))
     files.write_text(out / "summary.csv", summary(runs).round(4).to_csv(index=False))
@@ -164,7 +164,6 @@ def _trained(
     simulators: frozen.Frozen, gains: Gains, recipe: Recipe, seed: int, draws: int,
     checkpoint: Path, tell: Callable[[float], None],
 ) -> dict[str, float]:  # fmt: skip
-    checkpoint.parent.mkdir(parents=True, exist_ok=True)
     with precision.float32():
         controller = fit(
             jax.tree.map(np.asarray, simulators.ensemble), gains, recipe=recipe, seed=seed,

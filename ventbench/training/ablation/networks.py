@@ -18,9 +18,9 @@ from ventbench.metrics import bootstrap
 from ventbench.plants.each import Each
 from ventbench.plants.learned import Architecture
 from ventbench.recordings import Breaths
+from ventbench.resume import WorkFolder
 from ventbench.training import freeze
 from ventbench.training import learned as networks
-from ventbench.training.ablation.rows import Rows
 
 #: What the others are compared with.
 BASE = "base"
@@ -76,7 +76,11 @@ def compare(
     judged, fold = data.measured.select(scored), data.fold[scored]
     hashes = {name: files.sha256(folder / name) for name in (freeze.MEASURED, freeze.RECONSTRUCTED)}
     chosen = {k: v for k, v in variants(base).items() if only is None or k in (BASE, *only)}
-    rows, found = Rows(out / "rows"), []
+    about = {
+        "architecture": asdict(base), "recipe": asdict(recipe), "recordings": hashes,
+        "members": freeze.MEMBERS,
+    }  # fmt: skip
+    work, found = WorkFolder(out / "rows", about), []
     for number, (name, architecture) in enumerate(chosen.items()):
 
         def tell(share: float, name: str = name, number: int = number) -> None:
@@ -85,15 +89,11 @@ def compare(
         def make(
             architecture: Architecture = architecture, tell: Callable[[float], None] = tell
         ) -> list[float]:
-            nets = _nets(data, architecture, recipe, out / "rows" / "network.npz", tell)
+            nets = _nets(data, architecture, recipe, work.checkpoint("network"), tell)
             return _errors(nets, judged, fold).tolist()
 
         tell(0.0)
-        identity = {
-            "architecture": asdict(architecture), "recipe": asdict(recipe), "recordings": hashes,
-            "members": freeze.MEMBERS,
-        }  # fmt: skip
-        errors = rows.get(name.replace(" ", "-"), identity, make)
+        errors = work.get(name.replace(" ", "-"), make)
         columns = {"breath_id": judged.breath_id, "lung": judged.lung_ids, "error": errors}
         found.append(pd.DataFrame({"variant": name} | columns))
     breaths = pd.concat(found, ignore_index=True)
@@ -124,7 +124,6 @@ def _nets(
 ) -> Any:  # fmt: skip
     """Networks of the scored lungs, leaves ``(members, 6, ...)``."""
     ids = [lung.id for lung in RECORDED_LUNGS]
-    checkpoint.parent.mkdir(parents=True, exist_ok=True)
     members = []
     for member in range(freeze.MEMBERS):
         nets = []

@@ -15,7 +15,7 @@ import optax
 from jax import Array
 
 from ventbench.plants.learned import Architecture, Learned, learned
-from ventbench.training.learned import checkpoint as checkpoints
+from ventbench.resume import Checkpoint, fingerprint
 from ventbench.training.learned.data import (
     Floats,
     Inspirations,
@@ -126,10 +126,13 @@ def fit(
     init_key, train_key = jax.random.split(jax.random.key(seed))
     plant = learned(init_key, architecture, normalisation(data, tau))
     nets: Any = (plant.general, plant.boundary)
-    carry, first = (nets, _optimiser(recipe).init(nets)), 0
-    identity = checkpoints.identity(architecture, recipe, seed, tau, data)
-    if checkpoint is not None and checkpoint.exists():
-        carry, first = checkpoints.resume(checkpoint, carry, identity)
+    carry: Any = (nets, _optimiser(recipe).init(nets))
+    settings = {
+        "architecture": dataclasses.asdict(architecture), "recipe": dataclasses.asdict(recipe),
+        "seed": seed, "tau": tau, "data": fingerprint(data),
+    }  # fmt: skip
+    stored = Checkpoint(checkpoint, settings)
+    carry, first = stored.restore(carry)
     while first < recipe.steps:
         new, loss = _advance(carry, plant, data, train_key, jnp.asarray(first), recipe)
         loss = float(loss)
@@ -138,11 +141,9 @@ def fit(
                 f"training diverged between updates {first} and {first + CHUNK}"
             )
         carry, first = new, min(first + CHUNK, recipe.steps)
-        if checkpoint is not None:
-            checkpoints.save(checkpoint, carry, first, identity)
+        stored.save(carry, first)
         if progress is not None:
             progress(Progress(first, recipe.steps, loss))
-    if checkpoint is not None:
-        checkpoint.unlink(missing_ok=True)
+    stored.delete()
     (general, boundary), _ = carry
     return dataclasses.replace(plant, general=general, boundary=boundary)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -14,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench import protocol
+from ventbench.errors import InputError
 from ventbench.interfaces import Plant
+from ventbench.resume import ARRAY, WorkFolder, fingerprint
 from ventbench.training import pid_grid
 from ventbench.training.executor import InProcess, results
-from ventbench.training.pid_tuning.kept import Kept
 
 #: Gains of a part.
 PART = pid_grid.BATCH
@@ -68,19 +68,18 @@ def tune(
     gains = pid_grid.gains() if gains is None else gains
     firsts = range(0, len(gains), part)
     total = len(plants) * len(gains) * len(protocol.PIPS)
-    about = {"simulators": dict(identity), "gains": gains.tolist(), "part": part}
-    kept = None if folder is None else Kept(folder, about)
+    about = {"simulators": dict(identity), "gains": fingerprint(gains), "part": part}
+    work = None if folder is None else WorkFolder(folder, about)
     found: dict[str, NDArray[np.float32]] = {}
     jobs = {}
     for lung, plant in plants.items():
         plain = jax.tree.map(np.asarray, plant)
         for first in firsts:
             name, some = f"{lung}-{first}", gains[first : first + part]
-            old = None if kept is None else kept.get(name, (len(some), len(protocol.PIPS)))
-            if old is None:
-                jobs[name] = (plain, some)
+            if work is not None and work.has(name, ARRAY):
+                found[name] = _finished(work, name, len(some))
             else:
-                found[name] = old
+                jobs[name] = (plain, some)
     done = sum(error.size for error in found.values())
     report = progress or (lambda done, total: None)
     report(done, total)
@@ -88,8 +87,8 @@ def tune(
         if name in found:
             raise RuntimeError(f"part {name} came back twice")
         found[name] = error
-        if kept is not None:
-            kept.put(name, error)
+        if work is not None:
+            work.put(name, error, ARRAY)
         done += error.size
         report(done, total)
     error = np.stack(
@@ -104,6 +103,9 @@ def errors(plant: Plant, gains: NDArray[np.float64]) -> NDArray[np.float32]:
     return pid_grid.errors(stacked, gains)[0]
 
 
-def forget(folder: Path) -> None:
-    """Delete the parts of a search that is done."""
-    shutil.rmtree(folder, ignore_errors=True)
+def _finished(work: WorkFolder, name: str, gains: int) -> NDArray[np.float32]:
+    error, shape = work.read(name, ARRAY), (gains, len(protocol.PIPS))
+    if error.shape != shape or error.dtype != np.float32:
+        path = work.path(name, ARRAY)
+        raise InputError(f"{path} holds {error.dtype} {error.shape}, not float32 {shape}")
+    return error

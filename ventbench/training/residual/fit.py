@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -19,7 +18,7 @@ from ventbench import protocol
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import Residual, untrained
 from ventbench.interfaces import Plant
-from ventbench.training.learned import checkpoint as checkpoints
+from ventbench.resume import Checkpoint, fingerprint
 from ventbench.training.residual.loss import disagreement
 from ventbench.training.residual.loss import loss as objective
 from ventbench.training.residual.randomise import scenarios
@@ -138,10 +137,13 @@ def fit(
         limit=recipe.limit,
     )
     controller = untrained(start_key, like, recipe.widths)
-    carry, first = (controller.layers, _optimiser(recipe).init(controller.layers)), 0
-    identity = _identity(plants, gains, recipe, seed)
-    if checkpoint is not None and checkpoint.exists():
-        carry, first = checkpoints.resume(checkpoint, carry, identity)
+    carry: Any = (controller.layers, _optimiser(recipe).init(controller.layers))
+    settings = {
+        "recipe": dataclasses.asdict(recipe), "gains": list(gains), "seed": seed,
+        "simulators": fingerprint(plants),
+    }  # fmt: skip
+    stored = Checkpoint(checkpoint, settings)
+    carry, first = stored.restore(carry)
     while first < recipe.updates:
         new, loss = _advance(carry, like, plants, key, jnp.asarray(first), recipe)
         loss = float(loss)
@@ -150,17 +152,9 @@ def fit(
                 f"training diverged between updates {first} and {first + CHUNK}"
             )
         carry, first = new, min(first + CHUNK, recipe.updates)
-        if checkpoint is not None:
-            checkpoints.save(checkpoint, carry, first, identity)
+        stored.save(carry, first)
         if progress is not None:
             progress(Progress(first, recipe.updates, loss))
-    if checkpoint is not None and not keep:
-        checkpoint.unlink(missing_ok=True)
+    if not keep:
+        stored.delete()
     return controller.replace(layers=carry[0])  # type: ignore[attr-defined]
-
-
-def _identity(plants: Plant, gains: tuple[float, ...], recipe: Recipe, seed: int) -> str:
-    """Text that differs when a checkpoint cannot be continued."""
-    sums = [float(np.asarray(leaf, float).sum()) for leaf in jax.tree.leaves(plants)]
-    parts = (dataclasses.asdict(recipe), list(gains), seed, sums)
-    return json.dumps(parts, sort_keys=True)

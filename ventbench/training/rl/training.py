@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -19,8 +18,9 @@ from numpy.typing import NDArray
 
 from ventbench import precision, protocol, scenario
 from ventbench.interfaces import Plant
+from ventbench.resume import Checkpoint
 from ventbench.scenario import Scenario
-from ventbench.training.rl import breaths, checkpoint
+from ventbench.training.rl import breaths
 from ventbench.training.rl.method import Method
 
 #: Cells on each lung by which the best policy of a training is chosen, and the seed they come from.
@@ -120,6 +120,7 @@ def train(
     about: str = "",
     file: Path | None = None,
     progress: Progress | None = None,
+    save_seconds: float = SAVE_SECONDS,
 ) -> Trained:
     """Train R policies side by side.
 
@@ -134,6 +135,7 @@ def train(
         about: text that tells one training from another, such as the simulators' hash.
         file: checkpoint that is resumed from and written to; kept at the end.
         progress: see :data:`Progress`.
+        save_seconds: least time between two checkpoints, s.
 
     Raises:
         InputError: if the checkpoint belongs to another training.
@@ -145,12 +147,18 @@ def train(
         points = -(-method.iterations // chunk)
         curves = np.full((len(seeds), points + 1, 2), np.nan, np.float32)
         curves[:, 0, 0] = first
-        seconds, compiling, done = np.zeros(points + 1), np.zeros(()), 0
+        seconds, compiling = np.zeros(points + 1), np.zeros(())
         carry: Any = (runs, curves, seconds, compiling)
-        name = [type(method).__name__, asdict(method), list(map(int, seeds)), chunk, about]  # type: ignore[call-overload]
-        identity = json.dumps([*name, jax.__version__])
-        if file is not None and file.exists():
-            (runs, curves, seconds, compiling), done = checkpoint.resume(file, carry, identity)
+        settings = {
+            "method": type(method).__name__,
+            "recipe": asdict(method),  # type: ignore[call-overload]
+            "seeds": list(map(int, seeds)),
+            "chunk": chunk,
+            "about": about,
+            "jax": jax.__version__,
+        }
+        stored = Checkpoint(file, settings)
+        (runs, curves, seconds, compiling), done = stored.restore(carry)
         began = time.perf_counter()
         if done < points:  # once for nothing, so that no point's time contains the compiling
             jax.block_until_ready(_advance(method, runs, plants, chunk))
@@ -164,8 +172,8 @@ def train(
             seconds[done] = seconds[done - 1] + now - before
             if not np.isfinite(curves[:, done]).all():
                 raise FloatingPointError(f"training diverged before point {done} of {points}")
-            if file is not None and (now - saved > SAVE_SECONDS or done == points):
-                checkpoint.save(file, (runs, curves, seconds, compiling), done, identity)
+            if now - saved > save_seconds or done == points:
+                stored.save((runs, curves, seconds, compiling), done)
                 saved = time.perf_counter()
             if progress is not None:
                 progress(done / points, np.asarray(runs.error))

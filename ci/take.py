@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 from ci.git import Git, GitError, fetch
 from ventbench.errors import InputError
-from ventbench.submissions import paths
+from ventbench.submissions.errors import printable
+from ventbench.submissions.file_checks import collisions, kind_problem, path_problem
 from ventbench.submissions.folder import MAX_BYTES, MAX_FILES
-from ventbench.submissions.load import printable
 from ventbench.submissions.manifest import NAME, NAME_RULE
 
 #: Folder of all submissions in the repository.
@@ -233,15 +233,15 @@ def _entry_problems(files: list[TreeEntry]) -> list[str]:
         return [f"the folder has {len(names)} files; at most {MAX_FILES} are accepted"]
     problems = []
     for mode, _, path in files:
-        for wrong in (_MODE_PROBLEMS.get(mode, f"has mode {mode}"), paths.problem(path)):
+        for wrong in (_MODE_PROBLEMS.get(mode, f"has mode {mode}"), path_problem(path)):
             if wrong:
                 problems.append(f"{path} {wrong}")
-        advice = paths.refused(path)
+        advice = kind_problem(path)
         if advice:
             problems.append(f"{path} is of a kind that is not accepted; {advice}")
     twice = sorted({path for path in names if names.count(path) > 1})
     problems += [f"{path} is there twice" for path in twice]
-    pairs = paths.collisions(names)
+    pairs = collisions(names)
     return problems + [f"{a} and {b} differ only in upper and lower case" for a, b in pairs]
 
 

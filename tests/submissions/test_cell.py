@@ -4,8 +4,7 @@ import sys
 import pytest
 
 from ventbench.interfaces import Observation, Task
-from ventbench.submissions.cell import ROW, Cell, Failed, unpack
-from ventbench.submissions.load import controller_class
+from ventbench.submissions.cell import ROW, Cell, Failed, controller_class, unpack
 
 ROBUSTNESS = Task("robustness", None, 0.03, 34)
 ROWS = [float(i) for i in range(ROW)]

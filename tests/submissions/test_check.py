@@ -7,15 +7,12 @@ import zipfile
 import numpy as np
 import pytest
 
-from ventbench.submissions import (
-    contract,
-    folder_check,
-    manifest_check,
-    source_check,
-    weights_check,
-)
+from ventbench.submissions import contract
+from ventbench.submissions.file_checks import check_files, weights_problems
 from ventbench.submissions.folder import MAX_BYTES
+from ventbench.submissions.manifest import check_manifest
 from ventbench.submissions.scaffold import create
+from ventbench.submissions.static_checks import check_sources
 
 from .conftest import MANIFEST
 
@@ -33,12 +30,12 @@ def found(findings):
 
 
 def files(folder):
-    return {f.file: f.what for f in folder_check.check(folder) if f.problem}
+    return {f.file: f.what for f in check_files(folder) if f.problem}
 
 
 def test_scaffold_has_nothing(demo):
-    assert folder_check.check(demo) == []
-    assert source_check.check(demo) == []
+    assert check_files(demo) == []
+    assert check_sources(demo) == []
 
 
 def test_everything_at_once(demo):
@@ -109,7 +106,7 @@ def test_what_is_noted_but_accepted(demo):
     (demo / "__pycache__").mkdir()
     (demo / "__pycache__" / "network.cpython-311.pyc").write_bytes(b"\0")
     (demo / "controller.py").chmod(0o755)
-    notes = folder_check.check(demo)
+    notes = check_files(demo)
     assert {note.file: note.what for note in notes} == {
         ".DS_Store": "was written by macOS",
         "controller.py": "is executable",
@@ -127,7 +124,7 @@ def test_names_that_differ_in_case_only(demo):
 def test_size_names_the_largest(demo):
     with open(demo / "notes.txt", "wb") as file:
         file.truncate(MAX_BYTES + 1)
-    (problem,) = (f for f in folder_check.check(demo) if f.problem)
+    (problem,) = (f for f in check_files(demo) if f.problem)
     assert problem.what == "has 5.0 MB; at most 5 MB are accepted"
     assert "the largest are notes.txt (5.0 MB)" in problem.advice
 
@@ -156,7 +153,7 @@ def test_pickles_in_weights_are_not_run(tmp_path, monkeypatch):
     (tmp_path / "raw.npz").write_bytes(pickle.dumps(Evil()))
     np.save("one.npy", np.array([Evil()], object), allow_pickle=True)
     for name in ("objects.npz", "raw.npz", "one.npy"):
-        (problem,) = weights_check.problems(tmp_path / name)
+        (problem,) = weights_problems(tmp_path / name)
         assert problem.startswith("cannot be read without pickle"), name
     assert not (tmp_path / "pwned").exists()
 
@@ -172,7 +169,7 @@ def test_pickles_in_weights_are_not_run(tmp_path, monkeypatch):
 )
 def test_arrays_must_be_finite_numbers(values, said, tmp_path):
     np.savez(tmp_path / "w.npz", w=values, b=np.zeros(3))
-    assert weights_check.problems(tmp_path / "w.npz") == [said]
+    assert weights_problems(tmp_path / "w.npz") == [said]
 
 
 def test_bombs_and_disguises(tmp_path):
@@ -180,18 +177,18 @@ def test_bombs_and_disguises(tmp_path):
     with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("w.npy", bytes(200_000_000))
     assert bomb.stat().st_size < 1_000_000
-    assert weights_check.problems(bomb) == ["unpacks to 200 MB; at most 100 MB are accepted"]
+    assert weights_problems(bomb) == ["unpacks to 200 MB; at most 100 MB are accepted"]
     stowed = tmp_path / "stowed.npz"
     with zipfile.ZipFile(stowed, "w") as archive:
         archive.writestr("code.py", "import os")
-    assert weights_check.problems(stowed) == ["holds 'code.py', which is no array"]
+    assert weights_problems(stowed) == ["holds 'code.py', which is no array"]
     huge = tmp_path / "huge.npz"
     header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }"
     header = header.ljust(117) + b"\n"
     with zipfile.ZipFile(huge, "w") as archive:
         magic = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little")
         archive.writestr("w.npy", magic + header)
-    (problem,) = weights_check.problems(huge)
+    (problem,) = weights_problems(huge)
     assert problem.startswith("cannot be read")
 
 
@@ -201,7 +198,7 @@ def test_safetensors(tmp_path):
     def write(header, data):
         text = json.dumps(header).encode()
         (tmp_path / "w.safetensors").write_bytes(len(text).to_bytes(8, "little") + text + data)
-        return weights_check.problems(tmp_path / "w.safetensors")
+        return weights_problems(tmp_path / "w.safetensors")
 
     def about(dtype, shape, *offsets):
         return {"w": {"dtype": dtype, "shape": shape, "data_offsets": offsets}}
@@ -214,12 +211,12 @@ def test_safetensors(tmp_path):
     assert write(about("F32", [2], 0, 80), numbers)[0].endswith("outside of the file")
     assert write([], b"")[0].startswith("cannot be read")
     (tmp_path / "w.safetensors").write_bytes(b"\x80\x04K\x01.")
-    assert weights_check.problems(tmp_path / "w.safetensors") == ["is not a safetensors file"]
+    assert weights_problems(tmp_path / "w.safetensors") == ["is not a safetensors file"]
 
 
 def manifest_of(demo, text):
     (demo / "submission.toml").write_text(text)
-    findings, read = manifest_check.check(demo)
+    findings, read = check_manifest(demo)
     return findings, read
 
 
@@ -260,7 +257,7 @@ def sources(demo, text, **others):
     (demo / "controller.py").write_text(text)
     for name, content in others.items():
         (demo / f"{name}.py").write_text(content)
-    return source_check.check(demo)
+    return check_sources(demo)
 
 
 def test_syntax_errors_have_line_and_column(demo):
@@ -384,7 +381,7 @@ def test_nothing_is_run_or_imported(demo, tmp_path):
     bomb = f"open({str(tmp_path / 'ran')!r}, 'w')\n"
     sources(demo, bomb + GOOD, network=bomb)
     contract._opened(str(demo))
-    folder_check.check(demo)
+    check_files(demo)
     assert not (tmp_path / "ran").exists()
 
 

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from ventbench.cli import app
-from ventbench.submissions import contract, judgement
+from ventbench.submissions import contract
 from ventbench.submissions.contract_runs import STEPS
 from ventbench.submissions.errors import SubmissionError
 from ventbench.submissions.runner import InProcessRunner
@@ -226,11 +226,11 @@ def test_slowness_is_found(check):
 
 
 def test_time_limits():
-    assert judgement.ACTS == 756 * 102
-    assert list(judgement.time(np.full(9, 1e-3))) == []
-    (note,) = judgement.time(np.full(9, 10e-3))
+    assert contract.ACTS == 756 * 102
+    assert list(contract.time_findings(np.full(9, 1e-3))) == []
+    (note,) = contract.time_findings(np.full(9, 10e-3))
     assert not note.problem
-    (problem,) = judgement.time(np.full(9, 20e-3))
+    (problem,) = contract.time_findings(np.full(9, 20e-3))
     assert problem.problem
     assert problem.what == (
         "act takes 20 ms on average, the 77112 calls of a score 771 s on 2 cores"
@@ -241,8 +241,8 @@ def test_repetition_is_exact():
     run = np.linspace(0.0, 50.0, STEPS)
     between = np.zeros(1)
     thrice = np.concatenate([run, between, run, between, run])
-    assert list(judgement.repetition(run, run, thrice)) == []
-    (finding,) = judgement.repetition(run, np.nextafter(run, 100.0), thrice)
+    assert list(contract.repetition_findings(run, run, thrice)) == []
+    (finding,) = contract.repetition_findings(run, np.nextafter(run, 100.0), thrice)
     assert "another process" in finding.what
 
 

@@ -2,8 +2,8 @@ import sys
 
 import pytest
 
-from ventbench.submissions.errors import SubmissionError
-from ventbench.submissions.load import controller_class, printable
+from ventbench.submissions.cell import controller_class
+from ventbench.submissions.errors import SubmissionError, printable
 
 
 def load(folder):

@@ -3,7 +3,7 @@ import re
 import pytest
 
 from ventbench.submissions.errors import SubmissionError
-from ventbench.submissions.manifest import Training, read
+from ventbench.submissions.manifest import Training, read_manifest
 
 from .conftest import MANIFEST
 
@@ -14,7 +14,7 @@ def problems(tmp_path):
         path = tmp_path / "submission.toml"
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
         with pytest.raises(SubmissionError) as caught:
-            read(path, "mine/submission.toml")
+            read_manifest(path, "mine/submission.toml")
         assert str(caught.value) == "\n".join(caught.value.problems)
         return list(caught.value.problems)
 
@@ -24,13 +24,13 @@ def problems(tmp_path):
 def test_good(tmp_path):
     path = tmp_path / "submission.toml"
     path.write_text(MANIFEST + '[training]\ndata = "none"\nseeds = [1, 2]\nper_lung = true\n')
-    manifest = read(path)
+    manifest = read_manifest(path)
     assert manifest.name == "mine"
     assert manifest.authors == ("A. Name",)
     assert manifest.tracks == ("robustness", "performance")
     assert manifest.training == Training("none", "", (1, 2), "", True)
     path.write_text(MANIFEST)
-    assert read(path).training == Training()
+    assert read_manifest(path).training == Training()
 
 
 def test_every_problem_at_once(problems):
@@ -112,4 +112,4 @@ def test_hostile_text(problems):
 
 def test_missing_file(tmp_path):
     with pytest.raises(SubmissionError, match="cannot be read: No such file"):
-        read(tmp_path / "submission.toml")
+        read_manifest(tmp_path / "submission.toml")

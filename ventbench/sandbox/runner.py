@@ -20,7 +20,7 @@ from ventbench.sandbox.pipes import Pipes
 from ventbench.sandbox.session import SandboxSession, said
 from ventbench.sandbox.zygote import Zygote
 from ventbench.submissions.folder import Submission
-from ventbench.submissions.runner import Session
+from ventbench.submissions.runner import ControllerSession
 
 _PROBE_S = 30.0
 
@@ -83,7 +83,7 @@ class SandboxRunner:
             "official": not self.missing,
         }
 
-    def start(self, submission: Submission, tasks: Sequence[Task]) -> Session:
+    def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
         """See ``submissions.runner.Runner``.
 
         Raises:

@@ -31,7 +31,7 @@ _GRACE_S = 0.5
 
 
 class SandboxSession:
-    """Fresh, locked-down controllers, one process each; see ``submissions.runner.Session``.
+    """Fresh, locked-down controllers, one process each: a ``runner.ControllerSession``.
 
     Args:
         submission: whose code runs.
@@ -101,7 +101,7 @@ class SandboxSession:
         self._give_up(late)
 
     def act(self, observations: Floats) -> Floats:
-        """See ``submissions.runner.Session``."""
+        """See ``submissions.runner.ControllerSession``."""
         self._sequence += 1
         for cell, outcome in self._pipes.early().items():
             self._judge(cell, outcome)
@@ -118,7 +118,7 @@ class SandboxSession:
         return commands
 
     def close(self) -> None:
-        """See ``submissions.runner.Session``."""
+        """See ``submissions.runner.ControllerSession``."""
         self._live.clear()
         self._stack.close()
 

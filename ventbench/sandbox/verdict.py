@@ -11,7 +11,7 @@ from typing import NamedTuple
 from ventbench.sandbox.child.wire import Reply
 from ventbench.sandbox.pipes import Outcome
 from ventbench.sandbox.zygote import signal_name
-from ventbench.submissions.load import printable
+from ventbench.submissions.errors import printable
 
 #: Kinds that a cell may give itself, before the first observation and after it.
 _BEFORE, _DURING = ("reset", "import", "construct"), ("act", "type", "value")

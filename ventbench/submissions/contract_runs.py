@@ -1,17 +1,31 @@
-"""What the contract shows a controller: plain runs, repetitions, and unusual inputs."""
+"""Runs that the contract shows a controller, and its answers; :mod:`contract` judges them.
+
+Plain runs, repetitions in the same and in another process, and unusual inputs. The controller runs
+from a copy of the submission in which it can be reset and made anew in the middle of a run.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+import contextlib
+import dataclasses
+import shutil
+import tempfile
+import time
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ventbench import protocol
 from ventbench.interfaces import Task
 from ventbench.lungs import LUNG_IDS
 from ventbench.submissions.cell import ROW
-from ventbench.submissions.contract_driver import RENEW, RESET
+from ventbench.submissions.errors import Failure
+from ventbench.submissions.folder import CONTROLLER, Submission
+from ventbench.submissions.runner import Runner
 
 #: Yields observations, receives commands in %.
 Script = Generator[list[float], float, None]
@@ -24,7 +38,7 @@ _PIP = 25.0  # cmH2O
 _FULL, _TIME_CONSTANT = 60.0, 0.2  # of the stand-in for a lung, cmH2O at 100 % and s
 
 
-class Run(NamedTuple):
+class ContractRun(NamedTuple):
     """One cell.
 
     Attributes:
@@ -38,7 +52,7 @@ class Run(NamedTuple):
     unusual: str = ""
 
 
-def plain(tracks: Sequence[str]) -> list[Run]:
+def plain(tracks: Sequence[str]) -> list[ContractRun]:
     """A run for each lung on the performance track, and for the unnamed one on the other.
 
     Args:
@@ -47,16 +61,16 @@ def plain(tracks: Sequence[str]) -> list[Run]:
     runs = []
     for track in tracks:
         lungs = LUNG_IDS if track == "performance" else (None,)
-        runs += [Run(task(track, lung), breaths()) for lung in lungs]
+        runs += [ContractRun(task(track, lung), breaths()) for lung in lungs]
     return runs
 
 
-def repeated(told: Task) -> list[Run]:
+def repeated(told: Task) -> list[ContractRun]:
     """Return the plain run in another process; thrice in one, reset, then renewed between."""
-    return [Run(told, breaths()), Run(told, _thrice())]
+    return [ContractRun(told, breaths()), ContractRun(told, _thrice())]
 
 
-def unusual(told: Task) -> list[Run]:
+def unusual(told: Task) -> list[ContractRun]:
     """Short runs with inputs at and beyond the edge of what a bench gives."""
     random = np.random.default_rng(0)
     steps = protocol.INSPIRATION_STEPS
@@ -72,7 +86,7 @@ def unusual(told: Task) -> list[Run]:
         "a pressure and a target of 0 cmH2O": _played(pressure=0.0, target=0.0),
         "a target of 60 cmH2O": _played(target=60.0),
     }
-    return [Run(told, script, f"with {what}") for what, script in inputs.items()]
+    return [ContractRun(told, script, f"with {what}") for what, script in inputs.items()]
 
 
 def task(track: str, lung: str | None) -> Task:
@@ -85,8 +99,8 @@ def breaths() -> Script:
     for _ in range(BREATHS):
         pressure, command = protocol.PEEP, 5.0
         for step in range(protocol.INSPIRATION_STEPS):
-            time = step * protocol.DT
-            answer = yield _row(time, protocol.DT, pressure, _target(time), command)
+            elapsed = step * protocol.DT
+            answer = yield _row(elapsed, protocol.DT, pressure, _target(elapsed), command)
             command = min(max(answer, 0.0), protocol.U_MAX)
             rest = protocol.PEEP + _FULL * command / protocol.U_MAX
             pressure += (rest - pressure) * protocol.DT / _TIME_CONSTANT
@@ -106,21 +120,138 @@ def _played(
 ) -> Script:
     steps = protocol.INSPIRATION_STEPS
     widths = np.broadcast_to(dt, steps)
-    times, pressures = np.cumsum(widths) - widths, np.broadcast_to(pressure, steps)
+    starts, pressures = np.cumsum(widths) - widths, np.broadcast_to(pressure, steps)
     command = 5.0
-    columns = (times.tolist(), widths.tolist(), pressures.tolist())
-    for time, width, measured in zip(*columns, strict=True):
-        answer = yield _row(time, width, measured, target, command)
+    columns = (starts.tolist(), widths.tolist(), pressures.tolist())
+    for start, width, measured in zip(*columns, strict=True):
+        answer = yield _row(start, width, measured, target, command)
         command = min(max(answer, 0.0), protocol.U_MAX)
 
 
-def _target(time: float, pip: float = _PIP) -> float:
+def _target(elapsed: float, pip: float = _PIP) -> float:
     falls = (protocol.FALL_START, protocol.FALL_END)
-    return float(np.interp(time, falls, (pip, protocol.PEEP)))
+    return float(np.interp(elapsed, falls, (pip, protocol.PEEP)))
 
 
-def _row(time: float, dt: float, pressure: float, target: float, command: float) -> list[float]:
-    ahead = [_target(time + k * dt, target) for k in range(1, protocol.TARGETS_AHEAD + 1)]
-    row = [time, dt, pressure, target, *ahead, command]
+def _row(elapsed: float, dt: float, pressure: float, target: float, command: float) -> list[float]:
+    ahead = [_target(elapsed + k * dt, target) for k in range(1, protocol.TARGETS_AHEAD + 1)]
+    row = [elapsed, dt, pressure, target, *ahead, command]
     assert len(row) == ROW
     return row
+
+
+#: Observations with these times, which no run has, ask for a reset, or a new controller and reset.
+RESET, RENEW = -1.0, -2.0
+
+# Runs at the end of controller.py, under a name of its own: the author's lines keep their numbers,
+# and the driver's are never taken for the author's. The class itself stays, as its code may name
+# it; only its `act` is replaced.
+_DRIVER = f"""
+def _drive(theirs):
+    from inspect import getattr_static
+
+    act, news, tasks = getattr_static(theirs, "act"), {{}}, {{}}
+    reset = getattr_static(theirs, "reset")
+
+    def bound(function, self):
+        return function.__get__(self, type(self)) if hasattr(function, "__get__") else function
+
+    def driven_reset(self, task):
+        tasks[id(self)] = task
+        return bound(reset, self)(task)
+
+    def driven_act(self, observation):
+        if observation.time >= 0.0:
+            return bound(act, news.get(id(self), self))(observation)
+        if observation.time == {RENEW}:
+            news[id(self)] = theirs()
+        bound(reset, news.get(id(self), self))(tasks[id(self)])
+        return 0.0
+
+    theirs.reset, theirs.act = driven_reset, driven_act
+
+
+_found = globals().get("Controller")
+if isinstance(_found, type) and hasattr(_found, "reset") and hasattr(_found, "act"):
+    _drive(_found)
+"""
+
+
+@contextlib.contextmanager
+def driven(submission: Submission) -> Iterator[Submission]:
+    """Give a submission whose controller obeys :data:`RESET` and :data:`RENEW`.
+
+    Args:
+        submission: stays as it is.
+    """
+    with tempfile.TemporaryDirectory() as parent:
+        # Links resolved: Landlock and messages compare real paths.
+        folder = Path(parent).resolve() / submission.folder.name
+        shutil.copytree(submission.folder, folder, ignore=shutil.ignore_patterns("__pycache__"))
+        path = folder / CONTROLLER
+        path.chmod(0o644)
+        with open(path, "ab") as file:
+            code = f'\nexec(compile({_DRIVER!r}, "<contract>", "exec"))\n'
+            file.write(code.encode())
+        yield dataclasses.replace(submission, folder=folder)
+
+
+Floats = NDArray[np.float64]
+
+#: Rounds whose time does not count: first calls load and compile.
+_WARM_UP = 3
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What came of the runs.
+
+    Attributes:
+        commands: of each run, %, up to its end or failure.
+        failures: by number of the run.
+        act_seconds: of one ``act`` in each round of all runs, without the first ones.
+    """
+
+    commands: tuple[Floats, ...]
+    failures: dict[int, Failure]
+    act_seconds: Floats
+
+
+def run_all(submission: Submission, runs: Sequence[ContractRun], runner: Runner) -> Answers:
+    """Run all runs side by side.
+
+    Args:
+        submission: whose controller is asked.
+        runs: fresh ones.
+        runner: of the controllers.
+
+    Raises:
+        SubmissionError: if the code cannot be imported.
+    """
+    commands: list[list[float]] = [[] for _ in runs]
+    failures: dict[int, Failure] = {}
+    seconds = []
+    session = runner.start(submission, [run.task for run in runs])
+    try:
+        rows = [next(run.script) for run in runs]  # of one that has ended, its last again
+        waiting = set(range(len(runs)))
+        while waiting:
+            batch = np.array(rows)
+            live = max(1, len(runs) - len(session.failures))
+            start = time.perf_counter()
+            answers = session.act(batch)
+            seconds.append((time.perf_counter() - start) / live)
+            for k in sorted(waiting):
+                if k in session.failures:
+                    failures[k] = session.failures[k]
+                    waiting.remove(k)
+                    continue
+                commands[k].append(float(answers[k]))
+                try:
+                    rows[k] = runs[k].script.send(float(answers[k]))
+                except StopIteration:
+                    waiting.remove(k)
+    finally:
+        session.close()
+    kept = tuple(np.array(values) for values in commands)
+    return Answers(kept, failures, np.array(seconds[_WARM_UP:]))

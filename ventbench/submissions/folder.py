@@ -10,11 +10,10 @@ from pathlib import Path
 
 from ventbench import data_files, files
 from ventbench.submissions.errors import SubmissionError
-from ventbench.submissions.manifest import Manifest, read
+from ventbench.submissions.manifest import MANIFEST, Manifest, read_manifest
 
-#: Files that every submission has.
+#: File of the controller.
 CONTROLLER = "controller.py"
-MANIFEST = "submission.toml"
 
 #: Largest folder, bytes, and number of files.
 MAX_BYTES = 5_000_000
@@ -100,7 +99,7 @@ def open_submission(name: str) -> Submission:
             problems.append(f"{name}: {required} is missing")
     if problems:
         raise SubmissionError(*problems)
-    manifest = read(folder / MANIFEST, f"{name}/{MANIFEST}".replace("//", "/"))
+    manifest = read_manifest(folder / MANIFEST, f"{name}/{MANIFEST}".replace("//", "/"))
     return Submission(name.rstrip("/"), folder, manifest, content_hash(folder, paths))
 
 

@@ -1,17 +1,23 @@
-"""``submission.toml``: what an author says about an entry."""
+"""``submission.toml``: what an author says about an entry, read and checked."""
 
 from __future__ import annotations
 
 import difflib
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ventbench.interfaces import API_VERSION
-from ventbench.submissions.errors import SubmissionError
+from ventbench.submissions.errors import Finding, SubmissionError
+
+#: Name of the file.
+MANIFEST = "submission.toml"
+
+#: Stands for the author until the author fills in a name.
+AUTHOR = "Your Name"
 
 #: What kinds of controller the board distinguishes.
 FAMILIES = ("pid", "residual", "ppo", "dqn", "other")
@@ -75,7 +81,7 @@ class Manifest:
 
 
 # A check takes a TOML value and returns the value to keep, or raises ValueError with what is wrong.
-Check = Callable[[Any], Any]
+ValueCheck = Callable[[Any], Any]
 
 
 def _text(value: Any) -> str:
@@ -94,7 +100,7 @@ def _name(value: Any) -> str:
     return value
 
 
-def _one_of(choices: tuple[str, ...]) -> Check:
+def _one_of(choices: tuple[str, ...]) -> ValueCheck:
     def check(value: Any) -> str:
         if value not in choices:
             raise ValueError(f"{value!r} is not one of {', '.join(choices)}{_hint(value, choices)}")
@@ -109,7 +115,7 @@ def _version(value: Any) -> int:
     return value
 
 
-def _many(check: Check, *, least: int) -> Check:
+def _many(check: ValueCheck, *, least: int) -> ValueCheck:
     def checked(value: Any) -> tuple[Any, ...]:
         if not isinstance(value, list) or len(value) < least:
             raise ValueError("must be a list" + (" that is not empty" if least else ""))
@@ -121,7 +127,7 @@ def _many(check: Check, *, least: int) -> Check:
     return checked
 
 
-def _typed(kind: type, text: str) -> Check:
+def _typed(kind: type, text: str) -> ValueCheck:
     def check(value: Any) -> Any:
         if type(value) is not kind:
             raise ValueError(f"must be {text}, not {value!r}")
@@ -130,14 +136,14 @@ def _typed(kind: type, text: str) -> Check:
     return check
 
 
-_TRAINING: dict[str, Check] = {
+_TRAINING: dict[str, ValueCheck] = {
     "data": _text,
     "simulators": _text,
     "seeds": _many(_typed(int, "an integer"), least=0),
     "compute": _text,
     "per_lung": _typed(bool, "true or false"),
 }
-_REQUIRED: dict[str, Check] = {
+_REQUIRED: dict[str, ValueCheck] = {
     "name": _name,
     "authors": _many(_text, least=1),
     "licence": _text,
@@ -154,7 +160,7 @@ def _hint(value: Any, choices: tuple[str, ...]) -> str:
 
 
 def _checked(
-    table: dict[str, Any], checks: dict[str, Check], where: str, problems: list[str]
+    table: dict[str, Any], checks: dict[str, ValueCheck], where: str, problems: list[str]
 ) -> dict[str, Any]:
     kept = {}
     for key, value in table.items():
@@ -168,7 +174,7 @@ def _checked(
     return kept
 
 
-def read(path: Path, label: str | None = None) -> Manifest:
+def read_manifest(path: Path, label: str | None = None) -> Manifest:
     """Read and check a manifest.
 
     Args:
@@ -200,3 +206,123 @@ def read(path: Path, label: str | None = None) -> Manifest:
     if problems:
         raise SubmissionError(*problems)
     return Manifest(**kept, training=Training(**trained))
+
+
+#: SPDX identifiers that most authors use.
+LICENCES = (
+    *("0BSD", "AGPL-3.0-only", "AGPL-3.0-or-later", "Apache-2.0", "Artistic-2.0", "BSD-2-Clause"),
+    *("BSD-3-Clause", "BSL-1.0", "CC-BY-4.0", "CC-BY-SA-4.0", "CC0-1.0", "ECL-2.0", "EPL-2.0"),
+    *("EUPL-1.2", "GPL-2.0-only", "GPL-2.0-or-later", "GPL-3.0-only", "GPL-3.0-or-later", "ISC"),
+    *("LGPL-2.1-only", "LGPL-2.1-or-later", "LGPL-3.0-only", "LGPL-3.0-or-later", "MIT", "MIT-0"),
+    *("MPL-2.0", "MulanPSL-2.0", "NCSA", "OSL-3.0", "PostgreSQL", "UPL-1.0", "Unlicense", "Zlib"),
+)
+_SPDX = re.compile(r"\(?[A-Za-z0-9.+-]+\)?( (AND|OR|WITH) \(?[A-Za-z0-9.+-]+\)?)*")
+
+_EXAMPLES = {
+    "name": 'write name = "my_controller"',
+    "authors": 'write authors = ["A. Name", "B. Name"]',
+    "licence": 'write licence = "Apache-2.0"',
+    "api_version": f"write api_version = {API_VERSION}",
+    "family": f"write one of {', '.join(FAMILIES)} in quotes",
+    "tracks": f"write tracks = {list(TRACKS)}, or one of them".replace("'", '"'),
+    "description": 'write description = "What it does, in a sentence or two."',
+    "training": "write a line [training], and its keys below it",
+    "training.data": 'write data = "what it was learned or tuned on"',
+    "training.simulators": 'write simulators = "1", or leave it out',
+    "training.seeds": "write seeds = [0, 1, 2], or leave it out",
+    "training.compute": 'write compute = "20 min on 2 CPU cores", or leave it out',
+    "training.per_lung": "write per_lung = true or false, or leave it out",
+}
+_OTHER_ADVICE = "see submission.toml in submissions/README.md for the keys and their values"
+
+# How read_manifest names a key, and tomllib a place.
+_KEY = re.compile(
+    rf"{re.escape(MANIFEST)}, key (?P<table>training\.)?(?P<key>\w+|(['\"]).*?\3)"
+    r"(: (?P<what>.*)| (?P<unknown>is not .*))",
+    re.DOTALL,
+)
+_TOML_PLACE = re.compile(r" \(at line (\d+), column (\d+)\)")
+
+
+def check_manifest(folder: Path) -> tuple[list[Finding], Manifest | None]:
+    """Read the manifest and look at what it says.
+
+    Args:
+        folder: of the submission.
+
+    Returns:
+        The findings, and the manifest unless it cannot be read.
+    """
+    path = folder / MANIFEST
+    if not path.is_file():
+        return [], None  # reported by check_files
+    try:
+        manifest = read_manifest(path, MANIFEST)
+    except SubmissionError as error:
+        lines = _lines(path)
+        return [_explained(problem, lines) for problem in error.problems], None
+    return list(_consistency(manifest, folder, _lines(path))), manifest
+
+
+def _explained(problem: str, lines: list[str]) -> Finding:
+    """A finding of one of the manifest's problems, whose text names the key."""
+    known = _KEY.fullmatch(problem)
+    if known is None:
+        text = problem.removeprefix(f"{MANIFEST}: ")
+        at = _TOML_PLACE.search(text)
+        line, column = (int(at[1]), int(at[2])) if at else (None, None)
+        what = _TOML_PLACE.sub("", text)
+        return Finding("manifest", MANIFEST, what, _OTHER_ADVICE, line, column)
+    key = (known["table"] or "") + known["key"].strip("'\"")
+    advice = "remove or rename it" if known["unknown"] else _EXAMPLES.get(key, _OTHER_ADVICE)
+    what = f"key {key} {known['unknown'] or known['what']}"
+    return Finding("manifest", MANIFEST, what, advice, _line(lines, key))
+
+
+def _line(lines: list[str], key: str) -> int | None:
+    table, _, name = key.rpartition(".")
+    pattern = re.compile(rf"\s*[\"']?{re.escape(name)}[\"']?\s*=|\s*\[\s*{re.escape(name)}\s*\]")
+    table_here = ""
+    for number, line in enumerate(lines, 1):
+        if pattern.match(line) and table_here == table:
+            return number
+        header = re.match(r"\s*\[\s*(\w+)\s*\]", line)
+        table_here = header[1] if header else table_here
+    return None
+
+
+def _lines(path: Path) -> list[str]:
+    small = path.stat().st_size < 100_000
+    return path.read_text(errors="replace").splitlines() if small else []
+
+
+def _consistency(manifest: Manifest, folder: Path, lines: list[str]) -> Iterator[Finding]:
+    def finding(key: str, what: str, advice: str, *, problem: bool = False) -> Finding:
+        text = f"key {key} {what}"
+        return Finding("manifest", MANIFEST, text, advice, _line(lines, key), problem=problem)
+
+    if not _SPDX.fullmatch(manifest.licence):
+        what = f"{manifest.licence!r} is not an SPDX identifier{_licence_hint(manifest.licence)}"
+        yield finding("licence", what, _EXAMPLES["licence"], problem=True)
+    else:
+        for name in re.split(r" (?:AND|OR|WITH) ", manifest.licence):
+            if name.strip("()") not in LICENCES:
+                what = f"{name!r} is not a well-known SPDX identifier{_licence_hint(name)}"
+                advice = "make sure that it allows others to run and publish the submission"
+                yield finding("licence", what, advice)
+    if manifest.name != folder.name:
+        what = f"is {manifest.name}, the folder is {folder.name}"
+        yield finding("name", what, f"a pull request must put it into submissions/{manifest.name}/")
+    if AUTHOR in manifest.authors:
+        yield finding("authors", f"still says {AUTHOR}", "write your name")
+    if manifest.training.per_lung and "robustness" in manifest.tracks:
+        what = "is true, but task.lung is None on the robustness track"
+        advice = "make sure that it can do without, or leave it out"
+        yield finding("training.per_lung", what, advice)
+    if manifest.family not in ("pid", "other") and not manifest.training.data:
+        yield finding("training.data", "is missing", "say what it was trained on")
+
+
+def _licence_hint(licence: str) -> str:
+    close = difflib.get_close_matches(licence.strip("()"), LICENCES, n=1, cutoff=0.5)
+    return f"; did you mean {close[0]}?" if close else ""

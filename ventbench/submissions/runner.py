@@ -14,15 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.interfaces import Observation, Task
-from ventbench.submissions.cell import Cell, Failed
+from ventbench.submissions.cell import Cell, Failed, controller_class
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import Submission
-from ventbench.submissions.load import controller_class
 
 Floats = NDArray[np.float64]
 
 
-class Session(Protocol):
+class ControllerSession(Protocol):
     """Controllers of all cells of one submission, between start and close."""
 
     @property
@@ -61,7 +60,7 @@ class Runner(Protocol):
         """See the class."""
         ...
 
-    def start(self, submission: Submission, tasks: Sequence[Task]) -> Session:
+    def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
         """Make and reset one fresh controller for each cell.
 
         A controller that cannot be made or reset is a failure of its cell, found in the session.
@@ -111,7 +110,7 @@ class InProcessSession:
                 self.failures[index] = failed.failure
 
     def act(self, observations: Floats) -> Floats:
-        """See :class:`Session`."""
+        """See :class:`ControllerSession`."""
         commands = np.zeros(self._count)
         rows = observations.tolist()
         for index, cell in list(self._cells.items()):
@@ -137,6 +136,6 @@ class InProcessRunner:
 
     sandbox: Mapping[str, Any] | None = None
 
-    def start(self, submission: Submission, tasks: Sequence[Task]) -> Session:
+    def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
         """See :class:`Runner`."""
         return InProcessSession(submission, tasks)

@@ -18,11 +18,8 @@ from numpy.typing import NDArray
 
 from ventbench.errors import InputError
 from ventbench.interfaces import API_VERSION
-from ventbench.submissions.folder import CONTROLLER, MANIFEST, bundled
-from ventbench.submissions.manifest import FAMILIES, NAME, NAME_RULE
-
-#: Stands for the author until the author fills in a name.
-AUTHOR = "Your Name"
+from ventbench.submissions.folder import CONTROLLER, bundled
+from ventbench.submissions.manifest import AUTHOR, FAMILIES, MANIFEST, NAME, NAME_RULE
 
 #: File of the weights that the network families start from.
 WEIGHTS = "weights.npz"

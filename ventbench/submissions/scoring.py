@@ -21,7 +21,7 @@ from ventbench.submissions.errors import SubmissionError
 from ventbench.submissions.folder import Submission
 from ventbench.submissions.result import CellFailure, Score
 from ventbench.submissions.runner import InProcessRunner, Runner
-from ventbench.submissions.stepping import Run, as_float64, replay, step_through
+from ventbench.submissions.stepping import ProtocolRun, as_float64, replay, step_through
 from ventbench.trajectories import Trajectories
 
 Floats = NDArray[np.float64]
@@ -129,7 +129,7 @@ def protocol_cells(pips: tuple[float, ...], draws: int) -> Scenario:
     return jax.tree.map(lambda *x: np.concatenate(x), cells, published.scenarios(pips, draws))
 
 
-def _figures(run: Run, cells: Scenario) -> dict[str, Floats]:
+def _figures(run: ProtocolRun, cells: Scenario) -> dict[str, Floats]:
     """Secondary figures of the scored nominal inspirations, shape ``(L, P, scored breaths)``."""
     pressure, u_in, requested = (
         x[:, 0][:, :, protocol.SCORED_BREATHS, :] for x in (run.pressure, run.u_in, run.requested)
@@ -151,7 +151,7 @@ def _figures(run: Run, cells: Scenario) -> dict[str, Floats]:
 
 
 def _failures(
-    run: Run,
+    run: ProtocolRun,
     submission: Submission,
     tasks: Sequence[Task],
     lungs: tuple[str, ...],

@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Run:
+class ProtocolRun:
     """Inspirations of all cells; arrays of shape ``(L, ..., BREATHS, INSPIRATION_STEPS)``.
 
     L lungs; ``(...)`` is the batch shape of the scenario.
@@ -104,7 +104,7 @@ def step_through(
     runner: Runner,
     submission: Submission,
     tasks: Sequence[Task],
-) -> Run:
+) -> ProtocolRun:
     """Run a submission on every lung and cell. Call it within ``precision.float64()``.
 
     Args:
@@ -148,7 +148,7 @@ def step_through(
     if broken.size:
         raise FloatingPointError(f"simulator {broken[0]} answered with NaN or infinity")
     by_cell = {tuple(int(i) for i in np.unravel_index(k, batch)): v for k, v in failures.items()}
-    return Run(pressure, requested, applied, by_cell, np.array(seconds))
+    return ProtocolRun(pressure, requested, applied, by_cell, np.array(seconds))
 
 
 def replay(
@@ -159,7 +159,7 @@ def replay(
     Args:
         plants: from :func:`as_float64`, L lungs.
         scenario: cells of each lung, batch shape ``(...)``.
-        requested: as in :class:`Run`.
+        requested: as in :class:`ProtocolRun`.
 
     Returns:
         Arrays of shape ``(L, ..., BREATHS, steps)``, cmH2O and %.

@@ -11,9 +11,8 @@ from types import FrameType
 from typing import NoReturn
 
 from ventbench.interfaces import Task
-from ventbench.submissions.cell import Cell, Failed
+from ventbench.submissions.cell import Cell, Failed, controller_class, describe
 from ventbench.submissions.errors import SubmissionError
-from ventbench.submissions.load import controller_class, describe
 
 from . import lockdown, sources, wire
 from .lockdown import Limits, Lockdown

@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import pytest
 
-from ventbench.diagnosis.bench import Bench
-from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.solved import Solved
-from ventbench.diagnosis.steps import settle
+from ventbench.diagnosis.evaluator import Evaluator
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
+from ventbench.diagnosis.selection import fit_with_noise
 
 from . import small
 
@@ -18,8 +17,8 @@ from . import small
 class Plain(NamedTuple):
     """A recording in which nothing is missing."""
 
-    bench: Bench
-    null: Solved
+    evaluator: Evaluator
+    null: FittedModel
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -31,8 +30,8 @@ def one_size() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def plain() -> Plain:
-    bench = small.split(small.made())
-    return Plain(bench, settle(bench, Hypothesis()))
+    evaluator = small.split(small.made())
+    return Plain(evaluator, fit_with_noise(evaluator, Hypothesis()))
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.bench import Bench, bench
+from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
 from ventbench.physics import library, paths
 from ventbench.physics.catalogue import slots
 from ventbench.recordings.breaths import Breaths
@@ -41,9 +41,9 @@ def made(*effects: Effect, seed: int = 0, **changed: Any) -> Breaths:
     return record(one, np.random.default_rng(seed), steps=16)
 
 
-def split(breaths: Breaths, names: tuple[str, ...] | None = None) -> Bench:
+def split(breaths: Breaths, names: tuple[str, ...] | None = None) -> Evaluator:
     """On the bench, with the library's parameters or some."""
-    return bench(recorded(breaths), HELD[: len(breaths)], names or paths())
+    return make_evaluator(recorded(breaths), HELD[: len(breaths)], names or paths())
 
 
 def with_few() -> tuple[str, ...]:
@@ -53,13 +53,13 @@ def with_few() -> tuple[str, ...]:
 
 def one_size(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compile for these breaths alone."""
-    monkeypatch.setattr("ventbench.diagnosis.solved._SIZES", (BREATHS,))
+    monkeypatch.setattr("ventbench.diagnosis.hypothesis._SIZES", (BREATHS,))
 
 
 def limit_slots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave a few slots to choose from."""
     few = {name: slots()[name] for name in FEW}
-    monkeypatch.setattr("ventbench.diagnosis.places.slots", lambda: few)
+    monkeypatch.setattr("ventbench.diagnosis.screening.slots", lambda: few)
     monkeypatch.setattr("ventbench.diagnosis.found.all_paths", with_few)
 
 

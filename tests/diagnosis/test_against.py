@@ -74,6 +74,6 @@ def test_what_recording_and_simulator_share_is_no_mismatch():
     def error(answer: np.ndarray) -> float:
         return float(np.sqrt(np.mean((answer - breaths.pressure)[inside] ** 2)))
 
-    refit = before + had.pressures(refitted(had, found.bench.training.data), held, first) - own
+    refit = before + had.pressures(refitted(had, found.evaluator.training.data), held, first) - own
     assert error(after) < 0.6 * error(refit)
     assert error(after) < 0.4 * error(before)

@@ -7,11 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.bench import Bench, bench, by_label
-from ventbench.diagnosis.effort import ONSETS, SHARE, WIDTH
-from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.solved import Side
-from ventbench.diagnosis.steps import settle
+from ventbench.diagnosis.evaluator import Evaluator, by_label, make_evaluator
+from ventbench.diagnosis.hypothesis import Hypothesis, Partition
+from ventbench.diagnosis.patient_effort import ONSETS, SHARE, WIDTH
+from ventbench.diagnosis.selection import fit_with_noise
 from ventbench.physics import paths
 from ventbench.system_id import START, Data, Noise, recorded, settings
 
@@ -22,19 +21,19 @@ GAUSSIAN = Noise((0.2,), (0.0,), np.inf)
 DELAY, LAG = Hypothesis(("valve_delay",)), Hypothesis(("sensor_lag",))
 
 
-def shifted(side: Side, by: float) -> Side:
+def shifted(partition: Partition, by: float) -> Partition:
     """The same breaths, read higher."""
-    data = side.data
-    return Side(dataclasses.replace(data, seen=data.seen + by), side.simulator)
+    data = partition.data
+    return Partition(dataclasses.replace(data, seen=data.seen + by), partition.simulator)
 
 
 @pytest.fixture(scope="module")
-def late() -> Bench:
+def late() -> Evaluator:
     return small.split(small.made(small.effect("valve_delay", delay=0.05)))
 
 
 @pytest.fixture(scope="module")
-def lagging() -> Bench:
+def lagging() -> Evaluator:
     return small.split(small.made(small.effect("sensor_lag", tau=0.05)))
 
 
@@ -42,21 +41,21 @@ def test_breaths_are_split_and_none_is_lost():
     breaths = small.made()
     made = small.split(breaths)
     assert np.array_equal(made.training.data.u_in, breaths.u_in[~small.HELD])
-    assert np.array_equal(made.judging.data.seen[:, 0], breaths.pressure[small.HELD])
+    assert np.array_equal(made.held_out.data.seen[:, 0], breaths.pressure[small.HELD])
 
 
 def test_parameters_are_found_again(lagging):
-    solved = lagging.solve(LAG, GAUSSIAN)
-    assert solved.column("sensor_lag.tau") == pytest.approx(0.05, rel=0.05)
+    fitted = lagging.fit(LAG, GAUSSIAN)
+    assert fitted.column("sensor_lag.tau") == pytest.approx(0.05, rel=0.05)
     # The valve's gain is 22.8 here and there, so that R and C are the rig's.
-    assert solved.column("R") == pytest.approx(small.RIG.R, rel=0.03)
-    assert solved.column("C") == pytest.approx(small.RIG.C, rel=0.03)
-    assert np.std(solved.residual) == pytest.approx(0.2, rel=0.15)
+    assert fitted.column("R") == pytest.approx(small.RIG.R, rel=0.03)
+    assert fitted.column("C") == pytest.approx(small.RIG.C, rel=0.03)
+    assert np.std(fitted.residual) == pytest.approx(0.2, rel=0.15)
 
 
 def test_dead_time_is_known_up_to_what_resistance_can_take_over(late):
-    solved = late.solve(DELAY, GAUSSIAN)
-    delay, R, C = (solved.column(p)[0] for p in ("valve_delay.delay", "R", "C"))
+    fitted = late.fit(DELAY, GAUSSIAN)
+    delay, R, C = (fitted.column(p)[0] for p in ("valve_delay.delay", "R", "C"))
     # Between the same two samples; later gas is as much pressure as less resistance.
     assert 0.034 < delay < 0.064
     assert R - 1e3 * (delay - 0.05) / C == pytest.approx(small.RIG.R, rel=0.01)
@@ -64,93 +63,96 @@ def test_dead_time_is_known_up_to_what_resistance_can_take_over(late):
 
 
 def test_another_start_ends_at_the_same_place(lagging):
-    near = lagging.solve(LAG, GAUSSIAN)
+    near = lagging.fit(LAG, GAUSSIAN)
     for start in (0.01, 0.12):
-        other = lagging.solve(LAG, GAUSSIAN, start={"sensor_lag.tau": start, "R": 30.0})
+        other = lagging.fit(LAG, GAUSSIAN, start={"sensor_lag.tau": start, "R": 30.0})
         assert other.column("sensor_lag.tau")[0] == pytest.approx(
             near.column("sensor_lag.tau")[0], rel=0.01
         )
-    again = lagging.solve(LAG, GAUSSIAN, near)
+    again = lagging.fit(LAG, GAUSSIAN, near)
     assert again.minimum.cost <= near.minimum.cost + 1e-6
 
 
 def test_what_is_fixed_stays(late):
     held = Hypothesis(("leak",), ("leak.exponent",), (("leak.exponent", 1.0),))
-    solved = late.solve(held, GAUSSIAN, iterations=3)
-    assert np.all(solved.column("leak.exponent") == 1.0)
-    assert "leak.exponent" not in solved.problem.unknowns.paths
+    fitted = late.fit(held, GAUSSIAN, iterations=3)
+    assert np.all(fitted.column("leak.exponent") == 1.0)
+    assert "leak.exponent" not in fitted.problem.unknowns.paths
 
 
 def test_held_out_breaths_have_no_part_in_a_fit(late):
-    one = late.solve(DELAY, GAUSSIAN)
-    other = dataclasses.replace(late, judging=shifted(late.judging, 3.0)).solve(DELAY, GAUSSIAN)
+    one = late.fit(DELAY, GAUSSIAN)
+    other = dataclasses.replace(late, held_out=shifted(late.held_out, 3.0)).fit(DELAY, GAUSSIAN)
     assert np.array_equal(one.values, other.values)
 
 
 def test_carried_takes_what_is_shared_and_starts_at_the_first_reading(late):
-    solved = late.solve(DELAY, GAUSSIAN)
-    values = late.carried(solved, late.judging)
-    order = (*late.judging.simulator.names, START)
+    fitted = late.fit(DELAY, GAUSSIAN)
+    values = late.transferred_values(fitted, late.held_out)
+    order = (*late.held_out.simulator.names, START)
     for path in ("R", "C", "R_ex", "PEEP", "valve_delay.delay"):
-        assert np.all(values[:, order.index(path)] == solved.column(path)[0])
-    assert np.array_equal(values[:, -1], late.judging.data.seen[:, 0, 0])
-    assert np.array_equal(values[:, order.index("position")], late.judging.data.position)
-    seen = late.predict(solved, late.judging)
-    assert np.array_equal(seen, late.judging.simulator.predict(values))
-    error = (seen - late.judging.data.seen)[:, 0, :30]
+        assert np.all(values[:, order.index(path)] == fitted.column(path)[0])
+    assert np.array_equal(values[:, -1], late.held_out.data.seen[:, 0, 0])
+    assert np.array_equal(values[:, order.index("position")], late.held_out.data.position)
+    seen = late.predict(fitted, late.held_out)
+    assert np.array_equal(seen, late.held_out.simulator.predict(values))
+    error = (seen - late.held_out.data.seen)[:, 0, :30]
     assert np.sqrt(np.mean(error**2)) < 0.5
 
 
 def test_each_breaths_own_gain_is_not_carried_to_others(late):
-    own = dataclasses.replace(late, spread=0.1)
-    solved = own.solve(DELAY, GAUSSIAN)
-    assert len(np.unique(solved.column("gain"))) == len(own.training.data)
-    order = own.judging.simulator.names
-    assert np.all(own.carried(solved, own.judging)[:, order.index("gain")] == 22.8)
+    own = dataclasses.replace(late, gain_sd=0.1)
+    fitted = own.fit(DELAY, GAUSSIAN)
+    assert len(np.unique(fitted.column("gain"))) == len(own.training.data)
+    order = own.held_out.simulator.names
+    assert np.all(own.transferred_values(fitted, own.held_out)[:, order.index("gain")] == 22.8)
     # Held-out breaths take a gain each, and so can only be likelier.
-    assert np.all(own.judged(solved) > late.judged(late.solve(DELAY, GAUSSIAN)) - 1.0)
+    assert np.all(
+        own.held_out_log_likelihood(fitted)
+        > late.held_out_log_likelihood(late.fit(DELAY, GAUSSIAN)) - 1.0
+    )
 
 
 def test_a_better_hypothesis_is_likelier_on_other_breaths(late):
-    null, named = (late.solve(one, GAUSSIAN) for one in (Hypothesis(), DELAY))
-    gained = late.judged(named) - late.judged(null)
+    null, named = (late.fit(one, GAUSSIAN) for one in (Hypothesis(), DELAY))
+    gained = late.held_out_log_likelihood(named) - late.held_out_log_likelihood(null)
     assert gained.shape == (8,)
     assert np.all(gained > 20.0)
     assert late.criterion(named) < late.criterion(null) - 100.0
     # A term that does nothing costs the logarithm of the samples.
-    more = late.solve(DELAY.plus(Hypothesis(("sensor_drift",))), GAUSSIAN, named)
+    more = late.fit(DELAY.plus(Hypothesis(("sensor_drift",))), GAUSSIAN, named)
     lost = late.criterion(more) - late.criterion(named)
     fallen = 2.0 * (more.log_likelihood - named.log_likelihood)
     assert lost == pytest.approx(np.log(8 * small.SAMPLES) - fallen, abs=1e-6)
 
 
 def test_criterion_at_another_noise(late):
-    solved = late.solve(DELAY, GAUSSIAN)
+    fitted = late.fit(DELAY, GAUSSIAN)
     loud = Noise((0.4,), (0.0,), np.inf)
-    size = solved.residual.size
-    square = np.sum(solved.residual**2)
+    size = fitted.residual.size
+    square = np.sum(fitted.residual**2)
     want = -0.5 * square / 0.16 - size * (np.log(0.4) + 0.5 * np.log(2 * np.pi))
-    assert solved.likelihood_at(loud) == pytest.approx(want, rel=1e-9)
-    penalty = solved.shared * np.log(size)
-    assert solved.shared == 5
-    assert late.criterion(solved, loud) == pytest.approx(-2 * want + penalty, rel=1e-9)
+    assert fitted.log_likelihood_at(loud) == pytest.approx(want, rel=1e-9)
+    penalty = fitted.shared * np.log(size)
+    assert fitted.shared == 5
+    assert late.criterion(fitted, loud) == pytest.approx(-2 * want + penalty, rel=1e-9)
 
 
-def brute_force(made: Bench, values: np.ndarray, duration: float, which: int) -> float:
+def brute_force(made: Evaluator, values: np.ndarray, duration: float, which: int) -> float:
     """Log-likelihood of a breath, its effort integrated out by sums over true simulations.
 
     A start is fitted to each effort, by a derivative that is a difference.
     """
-    side = made.judging
-    order = (*side.simulator.names, START)
+    partition = made.held_out
+    order = (*partition.simulator.names, START)
     columns = [order.index(f"patient_effort.{p}") for p in ("amplitude", "onset", "duration")]
-    measured = side.data.seen[which, 0]
+    measured = partition.data.seen[which, 0]
 
     def seen(amplitude: float, onset: float, start: float) -> np.ndarray:
         trial = values.copy()
         trial[:, columns] = amplitude, onset, duration
         trial[:, -1] = start
-        return side.simulator.predict(trial)[which, 0]
+        return partition.simulator.predict(trial)[which, 0]
 
     def likelihood(amplitude: float, onset: float) -> float:
         first = values[which, -1]
@@ -171,11 +173,11 @@ def brute_force(made: Bench, values: np.ndarray, duration: float, which: int) ->
 @pytest.mark.parametrize("which", [2, 3])
 def test_efforts_are_integrated_out(which):
     made = small.split(small.made(small.effect("patient_effort", amplitude=0.5, duration=0.8)))
-    solved = made.solve(Hypothesis(("patient_effort",)), GAUSSIAN)
-    problem, x = made.judge(solved)
-    duration = float(solved.column("patient_effort.duration")[0])
+    fitted = made.fit(Hypothesis(("patient_effort",)), GAUSSIAN)
+    problem, x = made.refit_breath_parameters(fitted)
+    duration = float(fitted.column("patient_effort.duration")[0])
     want = brute_force(made, problem.values(x), duration, which)
-    assert made.judged(solved)[which] == pytest.approx(want, abs=0.15)
+    assert made.held_out_log_likelihood(fitted)[which] == pytest.approx(want, abs=0.15)
     assert abs(want - problem.log_likelihood(x)[which]) > 0.3
 
 
@@ -191,31 +193,31 @@ def test_what_belongs_to_R_is_one_for_each_label():
     assert list(groups) == ["turbulent_resistance.quadratic"]
     found = groups["turbulent_resistance.quadratic"]
     assert np.array_equal(found, np.where(data.R == 5.0, 0, 1))
-    made = bench(data, small.HELD, paths())
-    solved = made.solve(Hypothesis(("turbulent_resistance", "leak")), GAUSSIAN, iterations=2)
-    layout = solved.problem.unknowns
+    made = make_evaluator(data, small.HELD, paths())
+    fitted = made.fit(Hypothesis(("turbulent_resistance", "leak")), GAUSSIAN, iterations=2)
+    layout = fitted.problem.unknowns
     sizes = {path: len(layout.of(path)) for path in layout.paths}
     assert sizes["R"] == sizes["C"] == sizes["turbulent_resistance.quadratic"] == 2
     assert sizes["leak.conductance"] == sizes["R_ex"] == 1
     # A held-out breath takes what its own label has.
-    carried = made.carried(solved, made.judging)[:, paths().index("R")]
-    wanted = [solved.column("R")[made.training.data.R == R][0] for R in made.judging.data.R]
+    carried = made.transferred_values(fitted, made.held_out)[:, paths().index("R")]
+    wanted = [fitted.column("R")[made.training.data.R == R][0] for R in made.held_out.data.R]
     assert np.array_equal(carried, wanted)
 
 
 def test_a_lung_without_training_breaths_takes_the_first_ones(late):
-    solved = late.solve(DELAY, GAUSSIAN)
-    other = dataclasses.replace(late.judging.data, R=np.full(8, 5.0))
-    carried = late.carried(solved, Side(other, late.judging.simulator))
-    assert np.all(carried[:, paths().index("R")] == solved.column("R")[0])
+    fitted = late.fit(DELAY, GAUSSIAN)
+    other = dataclasses.replace(late.held_out.data, R=np.full(8, 5.0))
+    carried = late.transferred_values(fitted, Partition(other, late.held_out.simulator))
+    assert np.all(carried[:, paths().index("R")] == fitted.column("R")[0])
 
 
 def test_settling_finds_the_noise():
     loud = small.split(small.made(noise=0.4, coloured=1.0, correlation=0.7, seed=2))
-    solved = settle(loud, Hypothesis())
-    assert solved.noise.sigma[0] == pytest.approx(0.4, rel=0.2)
-    assert solved.noise.ar[0] == pytest.approx(0.7, abs=0.12)
+    fitted = fit_with_noise(loud, Hypothesis())
+    assert fitted.noise.sigma[0] == pytest.approx(0.4, rel=0.2)
+    assert fitted.noise.ar[0] == pytest.approx(0.7, abs=0.12)
     neutral = settings(loud.training.data, paths(), {})
     assert np.array_equal(
-        solved.values[:, paths().index("gain")], neutral[:, paths().index("gain")]
+        fitted.values[:, paths().index("gain")], neutral[:, paths().index("gain")]
     )

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.conclude import conclude, is_hidden
-from ventbench.diagnosis.places import all_paths
+from ventbench.diagnosis.conclusion import conclude, is_hidden
+from ventbench.diagnosis.latent_inputs import ALVEOLUS, SUPPLY
+from ventbench.diagnosis.screening import all_parameter_paths
 from ventbench.diagnosis.shapes import slot
-from ventbench.diagnosis.sources import ALVEOLUS, SUPPLY
 from ventbench.recordings import join
 
 from . import small
@@ -34,7 +34,7 @@ def test_nothing_is_missing():
     assert found.place is None
     assert not found.hidden
     assert found.full is found.named
-    assert (found.nats, found.alternatives, found.spread) == ({}, {}, 0.0)
+    assert (found.nats, found.alternatives, found.gain_sd) == ({}, {}, 0.0)
     assert found.noise.sigma[0] == pytest.approx(0.2, rel=0.15)
     assert slot(found) is None
 
@@ -42,15 +42,17 @@ def test_nothing_is_missing():
 def compared(nats: dict[str, tuple[float, float]]) -> tuple[Any, list[Any]]:
     """A bench, and a last comparison of names with what they gain in training and held out."""
 
-    def solved(name: str, train: float, held: float) -> SimpleNamespace:
-        return SimpleNamespace(name=name, criterion=-train, judged=np.full(4, held / 4))
+    def fitted(name: str, train: float, held: float) -> SimpleNamespace:
+        return SimpleNamespace(name=name, criterion=-train, held_out=np.full(4, held / 4))
 
-    bench = SimpleNamespace(criterion=lambda one: one.criterion, judged=lambda one: one.judged)
+    evaluator = SimpleNamespace(
+        criterion=lambda one: one.criterion, held_out_log_likelihood=lambda one: one.held_out
+    )
     rivals = [
-        SimpleNamespace(name=name, solved=solved(name, *gain), criterion=-gain[0])
+        SimpleNamespace(name=name, fitted=fitted(name, *gain), criterion=-gain[0])
         for name, gain in nats.items()
     ]
-    return bench, [SimpleNamespace(before=solved("", 0.0, 0.0), rivals=rivals)]
+    return evaluator, [SimpleNamespace(before=fitted("", 0.0, 0.0), rivals=rivals)]
 
 
 @pytest.mark.parametrize(
@@ -144,7 +146,7 @@ def test_breaths_whose_valves_differ_are_no_physics():
     found = concluded(join(rows))
     assert found.names == ()
     assert found.place is None
-    assert 0.03 < found.spread < 0.2
+    assert 0.03 < found.gain_sd < 0.2
     assert found.noise.sigma[0] == pytest.approx(0.2, rel=0.2)
 
 
@@ -159,7 +161,7 @@ def test_breaths_whose_valves_differ_are_no_physics():
 )
 def test_places_are_found_among_all(name, form, parameters, place):
     breaths = small.made(small.effect(name, form, **parameters), samples=60)
-    found = concluded(breaths, all_paths)
+    found = concluded(breaths, all_parameter_paths)
     assert found.names == ()
     assert found.place is not None
     assert found.place.name == place
@@ -167,9 +169,11 @@ def test_places_are_found_among_all(name, form, parameters, place):
 
 @pytest.mark.slow  # all slots take minutes to compile
 def test_a_name_or_nothing_is_enough_among_all_places():
-    named = concluded(small.made(small.effect("viscoelasticity", ratio=0.7, time=1.0)), all_paths)
+    named = concluded(
+        small.made(small.effect("viscoelasticity", ratio=0.7, time=1.0)), all_parameter_paths
+    )
     assert named.names == ("viscoelasticity",)
     assert named.place is None
-    nothing = concluded(small.made(seed=1), all_paths)
+    nothing = concluded(small.made(seed=1), all_parameter_paths)
     assert nothing.names == ()
     assert nothing.place is None

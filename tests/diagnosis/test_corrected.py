@@ -34,8 +34,8 @@ def something(pressure: np.ndarray, plant: dict[str, Plant]) -> Any:
     """What is asked of something found: pressures and plants."""
     return SimpleNamespace(
         conclusion=SimpleNamespace(full=None, null=None),
-        bench=SimpleNamespace(training=SimpleNamespace(data=None)),
-        pressures=lambda solved, held, first: pressure,
+        evaluator=SimpleNamespace(training=SimpleNamespace(data=None)),
+        pressures=lambda fitted, held, first: pressure,
         plants=lambda: plant,
     )
 
@@ -73,22 +73,22 @@ def test_of_the_base_model_is_kept_what_does_not_throw_breaths_far_off(
     error = breaths.pressure - before
     gains = {"null": 0.5, "full": 1.0 - full, "named": 1.0 - named}
 
-    def pressures(solved: Any, held: Any, first: Any) -> np.ndarray:
-        return before + gains[solved.which] * error
+    def pressures(fitted: Any, held: Any, first: Any) -> np.ndarray:
+        return before + gains[fitted.which] * error
 
-    solved = {key: SimpleNamespace(which=key, names=("leak",)) for key in gains}
+    fitted = {key: SimpleNamespace(which=key, names=("leak",)) for key in gains}
     found: Any = SimpleNamespace(
-        conclusion=SimpleNamespace(**solved, place=object()), bench=None, pressures=pressures,
-        fit=solved["full"],
+        conclusion=SimpleNamespace(**fitted, place=object()), evaluator=None, pressures=pressures,
+        fit=fitted["full"],
     )  # fmt: skip
     monkeypatch.setattr(module.estimates, "plants", lambda fit: fit.which)
-    monkeypatch.setattr(module.estimates, "plants_of", lambda one, bench: one.which)
+    monkeypatch.setattr(module.estimates, "plants_of", lambda one, evaluator: one.which)
     one = corrected(breaths, split.held_out(breaths), before, found, None, "physics")
     assert one.plants == kept
     np.testing.assert_allclose(one.answers["after"], before + gains[kept] * error)
     assert bool(one.notes) is (kept != "full")
     assert not one.left
-    solved["full"].names = ("patient_effort",)  # the mean of all breaths' is no breath's
+    fitted["full"].names = ("patient_effort",)  # the mean of all breaths' is no breath's
     one = corrected(breaths, split.held_out(breaths), before, found, None, "physics")
     assert (one.plants, one.notes) == ("full", ())
 
@@ -100,18 +100,18 @@ def test_a_few_breaths_far_off_are_enough(breaths, monkeypatch):
     left = np.full((len(breaths), 1), 0.1)
     left[np.flatnonzero(~held)[0]] = 2.5
 
-    def pressures(solved: Any, held: Any, first: Any) -> np.ndarray:
-        return breaths.pressure - {"null": 0.5, "full": left, "named": 0.3}[solved.which] * error
+    def pressures(fitted: Any, held: Any, first: Any) -> np.ndarray:
+        return breaths.pressure - {"null": 0.5, "full": left, "named": 0.3}[fitted.which] * error
 
-    solved = {k: SimpleNamespace(which=k, names=("leak",)) for k in ("null", "full", "named")}
+    fitted = {k: SimpleNamespace(which=k, names=("leak",)) for k in ("null", "full", "named")}
     found: Any = SimpleNamespace(
-        conclusion=SimpleNamespace(**solved, place=object()), bench=None, pressures=pressures,
-        fit=solved["full"],
+        conclusion=SimpleNamespace(**fitted, place=object()), evaluator=None, pressures=pressures,
+        fit=fitted["full"],
     )  # fmt: skip
     fitted = ~held[:, None] & breaths.valid & (breaths.time > 0)
     means = [np.abs(x * error)[fitted].mean() for x in (left, 0.5)]
     assert means[0] < means[1]
-    monkeypatch.setattr(module.estimates, "plants_of", lambda one, bench: one.which)
+    monkeypatch.setattr(module.estimates, "plants_of", lambda one, evaluator: one.which)
     one = corrected(breaths, held, before, found, None, "physics")
     assert (one.plants, len(one.notes)) == ("named", 1)
 

@@ -24,13 +24,13 @@ def test_the_larger_of_two_lags_comes_first(monkeypatch, found):
     values = {path: value for path, value in zip(LAGS, found, strict=True) if value is not None}
     hypothesis = SimpleNamespace(names=("valve_lag",), free=LAGS[1:], fixed=())
     unknowns = SimpleNamespace(paths=("R", *values, START))
-    solved: Any = SimpleNamespace(
+    fitted: Any = SimpleNamespace(
         hypothesis=hypothesis, noise=None, column=lambda path: np.full(3, values.get(path, 20.0)),
         problem=SimpleNamespace(unknowns=unknowns, data=SimpleNamespace(lung=np.zeros(3))),
     )  # fmt: skip
     monkeypatch.setattr(estimates, "fit", lambda *_, start, **__: start)
-    side: Any = SimpleNamespace(data=None, simulator=None)
-    start: Any = estimates.estimated(solved, side, side)
+    partition: Any = SimpleNamespace(data=None, simulator=None)
+    start: Any = estimates.estimated(fitted, partition, partition)
     assert start["R"] == 20.0
     assert start[LAGS[0]] == 0.08
     assert start.get(LAGS[1]) == (None if found[1] is None else 0.01)

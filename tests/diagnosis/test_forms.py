@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from ventbench.diagnosis.forms import without_trimmings
 from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.steps import settle
+from ventbench.diagnosis.refinement import drop_compensating_terms
+from ventbench.diagnosis.selection import fit_with_noise
 from ventbench.physics import library, paths
 from ventbench.physics.catalogue import slots
 
@@ -18,15 +18,15 @@ BOTH = Hypothesis(("leak", "viscoelasticity"))
 @pytest.fixture
 def only_leaks(monkeypatch):
     one = {"leak_shape": slots()["leak_shape"]}
-    monkeypatch.setattr("ventbench.diagnosis.places.slots", lambda: one)
+    monkeypatch.setattr("ventbench.diagnosis.screening.slots", lambda: one)
 
 
 def left(*effects):
     breaths = small.made(*effects, noise=0.1, seed=2)
-    bench = small.split(breaths)
+    evaluator = small.split(breaths)
     wide = small.split(breaths, paths((*library(), "leak_shape")))
     said: list[str] = []
-    named = without_trimmings(bench, wide, settle(bench, BOTH), said.append)
+    named = drop_compensating_terms(evaluator, wide, fit_with_noise(evaluator, BOTH), said.append)
     assert said
     return named
 
@@ -48,7 +48,7 @@ def test_two_that_act_both_stay():
 
 
 def test_a_single_name_trims_nothing(plain):
-    one = plain.bench.solve(Hypothesis(("leak",)), plain.null.noise, plain.null, iterations=1)
+    one = plain.evaluator.fit(Hypothesis(("leak",)), plain.null.noise, plain.null, iterations=1)
     said: list[str] = []
-    assert without_trimmings(plain.bench, plain.bench, one, said.append) is one
+    assert drop_compensating_terms(plain.evaluator, plain.evaluator, one, said.append) is one
     assert not said

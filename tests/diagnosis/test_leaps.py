@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from ventbench.diagnosis.evaluator import delay_restarts
 from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.leaps import leapt
-from ventbench.diagnosis.steps import noise_of, settle
+from ventbench.diagnosis.selection import estimate_noise, fit_with_noise
 
 from . import small
 
@@ -22,20 +22,20 @@ def late():
 
 def test_a_search_that_stays_on_its_side_is_carried_over(late):
     late_by = Hypothesis(("exhalation_valve_delay",))
-    stuck = late.solve(late_by, settle(late, late_by).noise, start={PATH: 0.02})
-    moved = leapt(stuck.problem, stuck.minimum.x)
+    stuck = late.fit(late_by, fit_with_noise(late, late_by).noise, start={PATH: 0.02})
+    moved = delay_restarts(stuck.problem, stuck.minimum.x)
     there = moved[stuck.problem.unknowns.of(PATH)]
     assert there == pytest.approx(0.1, abs=0.025)
-    solved = settle(late, late_by, stuck)
-    assert solved.column(PATH)[0] == pytest.approx(0.1, abs=0.02)
-    assert noise_of(solved).sigma[0] == pytest.approx(0.1, rel=0.3)
+    fitted = fit_with_noise(late, late_by, stuck)
+    assert fitted.column(PATH)[0] == pytest.approx(0.1, abs=0.02)
+    assert estimate_noise(fitted).sigma[0] == pytest.approx(0.1, rel=0.3)
 
 
 def test_what_is_right_stays(late):
-    solved = settle(late, Hypothesis(("exhalation_valve_delay",)))
-    assert leapt(solved.problem, solved.minimum.x) == pytest.approx(solved.minimum.x)
+    fitted = fit_with_noise(late, Hypothesis(("exhalation_valve_delay",)))
+    assert delay_restarts(fitted.problem, fitted.minimum.x) == pytest.approx(fitted.minimum.x)
 
 
 def test_without_dead_times_there_is_nothing_to_leap_over(late):
-    solved = late.solve(Hypothesis(("sensor_lag",)), settle(late, Hypothesis()).noise)
-    assert leapt(solved.problem, solved.minimum.x) is solved.minimum.x
+    fitted = late.fit(Hypothesis(("sensor_lag",)), fit_with_noise(late, Hypothesis()).noise)
+    assert delay_restarts(fitted.problem, fitted.minimum.x) is fitted.minimum.x

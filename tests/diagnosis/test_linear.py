@@ -8,10 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.bench import Bench
-from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.linear import Local, gain, local
-from ventbench.diagnosis.solved import Solved
+from ventbench.diagnosis.evaluator import Evaluator
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
+from ventbench.diagnosis.linearisation import Linearisation, gain, linearise
 from ventbench.system_id import START, Noise
 
 from . import small
@@ -21,17 +20,19 @@ NOISE = Noise((0.2,), (0.5,), np.inf)
 
 
 class Linear(NamedTuple):
-    bench: Bench
-    null: Solved
-    place: Local
+    evaluator: Evaluator
+    null: FittedModel
+    place: Linearisation
 
 
 @pytest.fixture(scope="module")
 def bent() -> Linear:
     """Fitted without the little turbulence that is there."""
-    bench = small.split(small.made(small.effect("turbulent_resistance", quadratic=1.0), noise=0.1))
-    null = bench.solve(Hypothesis(), NOISE, tolerance=1e-6, iterations=30)
-    return Linear(bench, null, local(null.problem, null.minimum.x, np.inf))
+    evaluator = small.split(
+        small.made(small.effect("turbulent_resistance", quadratic=1.0), noise=0.1)
+    )
+    null = evaluator.fit(Hypothesis(), NOISE, tolerance=1e-6, iterations=30)
+    return Linear(evaluator, null, linearise(null.problem, null.minimum.x, np.inf))
 
 
 def whitened(difference: np.ndarray) -> np.ndarray:
@@ -90,7 +91,7 @@ def test_gain_is_the_fall_of_the_cost_after_a_refit(bent):
     values[:, names.index("turbulent_resistance.quadratic")] = 0.2
     seen = bent.null.problem.simulator.predict(values)
     nats, share = gain(bent.place, bent.place.template(seen))
-    refitted = bent.bench.solve(
+    refitted = bent.evaluator.fit(
         Hypothesis(("turbulent_resistance",)), NOISE, bent.null, tolerance=1e-6, iterations=30
     )
     fallen = bent.null.minimum.cost - refitted.minimum.cost
@@ -120,14 +121,14 @@ def test_far_samples_are_cut_off(bent):
         bent.null.problem, data=dataclasses.replace(bent.null.problem.data, seen=seen)
     )
     at = bent.null.minimum.x
-    free, cut = (local(problem, at, clip).residual for clip in (np.inf, 4.0))
+    free, cut = (linearise(problem, at, clip).residual for clip in (np.inf, 4.0))
     assert np.abs(free).max() > 15.0
     assert np.abs(cut).max() < 5.0
 
 
 def test_a_gain_of_each_breath_is_its_own(bent):
-    bench = dataclasses.replace(bent.bench, spread=0.1)
-    solved = bench.solve(Hypothesis(), NOISE, iterations=2)
-    place = local(solved.problem, solved.minimum.x)
+    evaluator = dataclasses.replace(bent.evaluator, gain_sd=0.1)
+    fitted = evaluator.fit(Hypothesis(), NOISE, iterations=2)
+    place = linearise(fitted.problem, fitted.minimum.x)
     assert place.own.shape[1] == 2
     assert place.shared.shape[0] == 4

@@ -7,11 +7,19 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis import moving
-from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.solved import Side
-from ventbench.diagnosis.sources import ALVEOLUS, GAIN, MEASUREMENT, SUPPLY, responses
-from ventbench.diagnosis.steps import settle
+from ventbench.diagnosis.hypothesis import Hypothesis, Partition
+from ventbench.diagnosis.latent_inputs import (
+    ALVEOLUS,
+    GAIN,
+    MEASUREMENT,
+    SUPPLY,
+    _Kernel,
+    fit_latent_inputs,
+    input_responses,
+    log_likelihood_without_input,
+)
+from ventbench.diagnosis.linearisation import linearise
+from ventbench.diagnosis.selection import fit_with_noise
 from ventbench.system_id import Simulator
 
 from . import small
@@ -22,22 +30,22 @@ INSPIRED = 30
 @pytest.fixture(scope="module")
 def clean(plain):
     """The training breaths, the values of a fit to them, and its prediction, ``(n, T)``."""
-    side = plain.bench.training
-    values = plain.bench.carried(plain.null, side)
-    return side, values, side.simulator.predict(values)[:, 0]
+    partition = plain.evaluator.training
+    values = plain.evaluator.transferred_values(plain.null, partition)
+    return partition, values, partition.simulator.predict(values)[:, 0]
 
 
 def test_a_source_at_the_alveolus_does_what_muscles_do(clean):
-    side, values, before = clean
-    names = side.simulator.names
-    time = np.cumsum(side.data.dt, axis=1) - side.data.dt
+    partition, values, before = clean
+    names = partition.simulator.names
+    time = np.cumsum(partition.data.dt, axis=1) - partition.data.dt
     onset, duration, amplitude = 0.5, 0.7, -0.5
     pulling = values.copy()
     for name, value in (("amplitude", amplitude), ("onset", onset), ("duration", duration)):
         pulling[:, names.index(f"patient_effort.{name}")] = value
-    seen = side.simulator.predict(pulling)[:, 0] - before
+    seen = partition.simulator.predict(pulling)[:, 0] - before
     source = -amplitude * np.sin(np.pi * np.clip((time - onset) / duration, 0.0, 1.0))
-    answer = responses(side, values, ALVEOLUS)
+    answer = input_responses(partition, values, ALVEOLUS)
     drawn = np.einsum("nk,nkt->nt", source, answer)
     # The flow is the valve's: what is added at the alveolus is seen whole in inspiration.
     np.testing.assert_allclose(drawn[:, :INSPIRED], source[:, :INSPIRED], atol=1e-9)
@@ -48,52 +56,52 @@ def test_a_source_at_the_alveolus_does_what_muscles_do(clean):
 
 @pytest.mark.parametrize("sample", [5, 17, 29])
 def test_a_source_at_the_supply_is_more_command(clean, sample):
-    side, values, before = clean
-    u_in = side.data.u_in.copy()
+    partition, values, before = clean
+    u_in = partition.data.u_in.copy()
     u_in[:, sample - 1] *= 1.001
-    other = Simulator(dataclasses.replace(side.data, u_in=u_in), side.simulator.names)
+    other = Simulator(dataclasses.replace(partition.data, u_in=u_in), partition.simulator.names)
     slope = (other.predict(values)[:, 0] - before) / 0.001
-    found = responses(side, values, SUPPLY)[:, sample]
+    found = input_responses(partition, values, SUPPLY)[:, sample]
     np.testing.assert_allclose(found[:, :INSPIRED], slope[:, :INSPIRED], atol=1e-3)
     assert np.abs(slope).max() > 1.0
     np.testing.assert_allclose(found, slope, atol=0.1 * np.abs(slope).max())
 
 
 def test_a_gain_is_all_the_commands(clean):
-    side, values, before = clean
-    column = side.simulator.names.index("gain")
+    partition, values, before = clean
+    column = partition.simulator.names.index("gain")
     more = values.copy()
     more[:, column] *= 1.0001
-    slope = (side.simulator.predict(more)[:, 0] - before) / 0.0001
-    found = responses(side, values, GAIN)
+    slope = (partition.simulator.predict(more)[:, 0] - before) / 0.0001
+    found = input_responses(partition, values, GAIN)
     assert found.shape == (8, 1, small.SAMPLES)
     np.testing.assert_allclose(found[:, 0], slope, atol=1e-3 * np.abs(slope).max())
 
 
 def test_a_source_at_the_sensor_is_seen_as_it_is(clean):
-    side, values, _ = clean
-    found = responses(side, values, MEASUREMENT)
+    partition, values, _ = clean
+    found = input_responses(partition, values, MEASUREMENT)
     assert np.array_equal(found, np.broadcast_to(np.eye(small.SAMPLES), found.shape))
 
 
 def heard(*effects, seed=0, **changed):
-    bench = small.split(small.made(*effects, seed=seed, **changed))
-    null = settle(bench, Hypothesis())
-    return bench, null, moving.without(bench, null)
+    evaluator = small.split(small.made(*effects, seed=seed, **changed))
+    null = fit_with_noise(evaluator, Hypothesis())
+    return evaluator, null, log_likelihood_without_input(evaluator, null)
 
 
 @pytest.mark.parametrize("frequency", [1.1, 1.5])
 def test_a_beating_heart_is_found_at_its_rate(frequency):
     effect = small.effect("cardiogenic", "oscillation", amplitude=1.3, frequency=frequency)
-    bench, null, (training, judged) = heard(effect, style="pi")
-    found = moving.moving(bench, null)
+    evaluator, null, (training, judged) = heard(effect, style="pi")
+    found = fit_latent_inputs(evaluator, null)
     best = found[ALVEOLUS]
     assert best.periodic
     assert best.scale == pytest.approx(frequency, abs=0.2)
     # A sine of amplitude 1.3.
     assert best.size in (0.8, 1.6)
     assert best.training > training + 40.0
-    assert np.sum(best.judged - judged) > 20.0
+    assert np.sum(best.held_out - judged) > 20.0
     # In the physics, not in the sensor: exhalation tells.
     assert best.training > found[MEASUREMENT].training
     assert best.shape.shape == (8, small.SAMPLES)
@@ -102,8 +110,8 @@ def test_a_beating_heart_is_found_at_its_rate(frequency):
 
 def test_a_pulsating_supply_is_found_at_the_supply():
     effect = small.effect("pulsating_supply", "oscillation", amplitude=0.175, frequency=5.0)
-    bench, null, _ = heard(effect)
-    found = moving.moving(bench, null)
+    evaluator, null, _ = heard(effect)
+    found = fit_latent_inputs(evaluator, null)
     best = max(found.values(), key=lambda one: one.training)
     assert best.source == SUPPLY
     assert best.periodic
@@ -113,32 +121,34 @@ def test_a_pulsating_supply_is_found_at_the_supply():
 
 @pytest.mark.parametrize("coloured", [0.0, 0.6])
 def test_noise_is_no_source_in_the_physics(coloured):
-    bench, null, (_, judged) = heard(coloured=coloured, correlation=0.8, seed=7)
-    found = moving.moving(bench, null)
+    evaluator, null, (_, judged) = heard(coloured=coloured, correlation=0.8, seed=7)
+    found = fit_latent_inputs(evaluator, null)
     sensor = found.pop(MEASUREMENT)
     best = max(found.values(), key=lambda one: one.training)
-    gained = float((best.judged - judged).sum())
-    ahead = float((best.judged - sensor.judged).sum())
+    gained = float((best.held_out - judged).sum())
+    ahead = float((best.held_out - sensor.held_out).sum())
     assert min(gained, ahead) < 4.6
 
 
 def test_likelihood_without_a_source_is_that_of_the_breaths(plain):
     noise = dataclasses.replace(plain.null.noise, tail=np.inf)
-    null = plain.bench.solve(Hypothesis(), noise, plain.null)
-    _, judged = moving.without(plain.bench, null)
+    null = plain.evaluator.fit(Hypothesis(), noise, plain.null)
+    _, judged = log_likelihood_without_input(plain.evaluator, null)
     constant = 0.5 * np.log(2 * np.pi) * small.SAMPLES
-    np.testing.assert_allclose(judged - constant, plain.bench.judged(null), atol=0.2)
+    np.testing.assert_allclose(
+        judged - constant, plain.evaluator.held_out_log_likelihood(null), atol=0.2
+    )
 
 
 def test_kernel_of_a_source_is_the_ratio_of_two_gaussians(plain):
     """Against the determinant and the inverse of the whole covariance of a breath."""
     noise = dataclasses.replace(plain.null.noise, ar=(0.4,), tail=np.inf)
-    problem, x = plain.bench.judge(plain.null)
-    place = moving.local(dataclasses.replace(problem, noise=noise), x, np.inf)
-    side: Side = plain.bench.judging
-    answers = responses(side, place.values, MEASUREMENT)
-    gained = moving._Kernel(place, side, answers, True, 1.3).gained(0.7)
-    time = np.cumsum(side.data.dt, axis=1) - side.data.dt
+    problem, x = plain.evaluator.refit_breath_parameters(plain.null)
+    place = linearise(dataclasses.replace(problem, noise=noise), x, np.inf)
+    partition: Partition = plain.evaluator.held_out
+    answers = input_responses(partition, place.values, MEASUREMENT)
+    gained = _Kernel(place, partition, answers, True, 1.3).gained(0.7)
+    time = np.cumsum(partition.data.dt, axis=1) - partition.data.dt
     own = place.own.swapaxes(1, 2)
     for i in (0, 6):
         waves = np.stack([f(2 * np.pi * 1.3 * time[i]) for f in (np.cos, np.sin)])

@@ -7,9 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis import places
 from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.steps import settle
+from ventbench.diagnosis.screening import (
+    all_parameter_paths,
+    component_of,
+    score_nonparametric_terms,
+    special_cases,
+)
+from ventbench.diagnosis.selection import fit_with_noise
 from ventbench.physics import library, parameter
 from ventbench.physics.catalogue import slots
 from ventbench.physics.nonparametric import SLOTS
@@ -23,29 +28,29 @@ NOISE = Noise((0.2,), (0.0,), np.inf)
 
 def test_every_element_has_a_place_and_holds_what_is_in_the_library():
     for name in slots():
-        assert name in SLOTS[places.public(name)].elements
-        assert set(places.holds(name)) <= set(library())
-        assert set(places.holds(name)) <= set(SLOTS[places.public(name)].holds)
+        assert name in SLOTS[component_of(name)].elements
+        assert set(special_cases(name)) <= set(library())
+        assert set(special_cases(name)) <= set(SLOTS[component_of(name)].holds)
     # Elements of one place that hold different things.
-    assert places.public("sensor_memory") == places.public("drift_shape") == "measurement"
-    assert places.holds("sensor_memory") == ("sensor_lag",)
-    assert places.holds("drift_shape") == ("sensor_drift",)
-    assert places.holds("sensor_shape") == ()
-    assert places.holds("volume_resistance") == ()
-    assert places.holds("flow_shape") == ("turbulent_resistance",)
+    assert component_of("sensor_memory") == component_of("drift_shape") == "measurement"
+    assert special_cases("sensor_memory") == ("sensor_lag",)
+    assert special_cases("drift_shape") == ("sensor_drift",)
+    assert special_cases("sensor_shape") == ()
+    assert special_cases("volume_resistance") == ()
+    assert special_cases("flow_shape") == ("turbulent_resistance",)
 
 
 def test_all_paths_are_those_of_the_library_and_of_all_slots():
-    found = places.all_paths()
+    found = all_parameter_paths()
     owners = {path.rpartition(".")[0] for path in found} - {""}
     assert owners == set(library()) | set(slots())
     assert len(set(found)) == len(found)
 
 
 def scanned(*effects, seed=0, **changed):
-    bench = small.split(small.made(*effects, seed=seed, **changed), small.with_few())
-    null = settle(bench, Hypothesis())
-    return bench, null, places.scan(null)
+    evaluator = small.split(small.made(*effects, seed=seed, **changed), small.with_few())
+    null = fit_with_noise(evaluator, Hypothesis())
+    return evaluator, null, score_nonparametric_terms(null)
 
 
 @pytest.mark.usefixtures("few_slots")
@@ -60,7 +65,9 @@ def test_resistance_that_follows_volume_is_found(change):
     assert best == sorted(best, reverse=True)
     assert all(one.hypothesis == Hypothesis((one.name,)) for one in found)
     again = dataclasses.replace(null, hypothesis=Hypothesis((found[0].name,)))
-    assert {one.name for one in places.scan(again)} == set(small.FEW) - {found[0].name}
+    assert {one.name for one in score_nonparametric_terms(again)} == set(small.FEW) - {
+        found[0].name
+    }
 
 
 @pytest.mark.usefixtures("few_slots")
@@ -73,11 +80,13 @@ def test_nothing_is_promised_where_nothing_is():
 @pytest.mark.usefixtures("few_slots")
 def test_promised_nats_are_what_a_refit_gains():
     effect = small.effect("turbulent_resistance", quadratic=1.0)
-    bench = small.split(small.made(effect), small.with_few())
-    null = bench.solve(Hypothesis(), NOISE, tolerance=1e-4, iterations=30)
-    found = {one.name: one.nats for one in places.scan(null)}
+    evaluator = small.split(small.made(effect), small.with_few())
+    null = evaluator.fit(Hypothesis(), NOISE, tolerance=1e-4, iterations=30)
+    found = {one.name: one.nats for one in score_nonparametric_terms(null)}
     assert max(found, key=lambda name: found[name]) == "flow_shape"
-    refitted = bench.solve(Hypothesis(("flow_shape",)), NOISE, null, iterations=30, tolerance=1e-4)
+    refitted = evaluator.fit(
+        Hypothesis(("flow_shape",)), NOISE, null, iterations=30, tolerance=1e-4
+    )
     # The cost has the prior of the coefficients in it, as the promise has.
     fallen = null.minimum.cost - refitted.minimum.cost
     assert fallen > 5.0

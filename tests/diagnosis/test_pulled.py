@@ -7,19 +7,20 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis import moving
-from ventbench.diagnosis.bench import Bench
-from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.pulled import (
+from ventbench.diagnosis.evaluator import Evaluator
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
+from ventbench.diagnosis.latent_inputs import (
+    exceeds_sensor_noise,
+)
+from ventbench.diagnosis.patient_effort import (
     AMPLITUDE,
     DURATION,
     ONSET,
-    integrated,
-    restarted,
-    settled,
+    effort_log_likelihood_gain,
+    marginal_log_likelihood,
+    restart_efforts,
 )
-from ventbench.diagnosis.solved import Solved
-from ventbench.diagnosis.steps import settle
+from ventbench.diagnosis.selection import fit_with_noise
 from ventbench.system_id import Noise
 
 from . import small
@@ -29,20 +30,20 @@ NOISE = Noise((0.1,), (0.0,), np.inf)
 
 
 @pytest.fixture(scope="module")
-def active() -> Bench:
+def active() -> Evaluator:
     one = small.effect("patient_effort", amplitude=5.0, duration=0.6)
     return small.split(small.made(one, noise=0.1))
 
 
 @pytest.fixture(scope="module")
-def fitted(active) -> Solved:
-    return settle(active, EFFORT)
+def fitted(active) -> FittedModel:
+    return fit_with_noise(active, EFFORT)
 
 
-def misplaced(solved: Solved, onset: float) -> np.ndarray:
+def misplaced(fitted: FittedModel, onset: float) -> np.ndarray:
     """Its unknowns with all efforts begun elsewhere."""
-    x = solved.minimum.x.copy()
-    x[solved.problem.unknowns.of(ONSET)] = onset
+    x = fitted.minimum.x.copy()
+    x[fitted.problem.unknowns.of(ONSET)] = onset
     return x
 
 
@@ -58,7 +59,7 @@ def test_all_efforts_are_found_from_a_poor_start(active, fitted):
 def test_efforts_that_begin_elsewhere_are_moved_back(fitted, refined):
     problem = fitted.problem
     wrong = misplaced(fitted, 1.7)
-    mended = restarted(problem, wrong, refined=refined)
+    mended = restart_efforts(problem, wrong, refined=refined)
     gained = problem.log_likelihood(mended) - problem.log_likelihood(wrong)
     strong = np.abs(fitted.column(AMPLITUDE)) > 2.0
     assert np.all(gained[strong] > 100.0)
@@ -68,15 +69,15 @@ def test_efforts_that_begin_elsewhere_are_moved_back(fitted, refined):
 
 def test_efforts_that_are_the_likeliest_stay(fitted):
     x = fitted.minimum.x
-    assert restarted(fitted.problem, x, refined=False) == pytest.approx(x)
+    assert restart_efforts(fitted.problem, x, refined=False) == pytest.approx(x)
 
 
 def test_evidence_of_a_breath_is_the_integral_over_its_efforts(active, fitted):
     """Against a sum over a fine grid of amplitudes and onsets, at the fitted parameters."""
-    still, x = active.judge(fitted)
+    still, x = active.refit_breath_parameters(fitted)
     still = dataclasses.replace(still, noise=NOISE)
     duration = float(fitted.column(DURATION)[0])
-    found = integrated(still, x, duration)
+    found = effort_log_likelihood_gain(still, x, duration)
     names = still.simulator.names
     columns = [names.index(path) for path in (AMPLITUDE, ONSET)]
     amplitudes, onsets = np.arange(-8.0, 8.01, 0.25), np.arange(0.0, 1.7, 0.04)
@@ -99,26 +100,26 @@ def test_evidence_of_a_breath_is_the_integral_over_its_efforts(active, fitted):
 
 
 def test_what_a_fit_found_is_integrated_alike(active, fitted):
-    training = dataclasses.replace(active, judging=active.training)
-    anew = training.judged(fitted)
-    assert settled(fitted, fitted.noise) == pytest.approx(anew, abs=4.0)
+    training = dataclasses.replace(active, held_out=active.training)
+    restart = training.held_out_log_likelihood(fitted)
+    assert marginal_log_likelihood(fitted, fitted.noise) == pytest.approx(restart, abs=4.0)
 
 
 def test_a_patient_who_pulls_is_told_from_noise_that_wanders(active, fitted):
-    assert moving.beats_noise(active, fitted)
+    assert exceeds_sensor_noise(active, fitted)
     wandering = small.split(small.made(noise=0.3, coloured=0.9, correlation=0.9, seed=4))
-    assert not moving.beats_noise(wandering, settle(wandering, EFFORT))
+    assert not exceeds_sensor_noise(wandering, fit_with_noise(wandering, EFFORT))
 
 
 def test_of_breaths_to_come_the_mean_over_efforts_is_expected(active, fitted):
-    passive = active.solve(Hypothesis(), fitted.noise, fitted)
-    values = active.carried(fitted, active.judging)
-    simulator = active.judging.simulator
+    passive = active.fit(Hypothesis(), fitted.noise, fitted)
+    values = active.transferred_values(fitted, active.held_out)
+    simulator = active.held_out.simulator
     columns = [simulator.names.index(path) for path in (AMPLITUDE, ONSET)]
     answers = []
     for effort in zip(fitted.column(AMPLITUDE), fitted.column(ONSET), strict=True):
         values[:, columns] = effort
         answers.append(simulator.predict(values))
-    expected = active.predict(fitted, active.judging)
+    expected = active.predict(fitted, active.held_out)
     assert expected == pytest.approx(np.mean(answers, axis=0))
-    assert np.abs(expected - active.predict(passive, active.judging)).max() > 0.2
+    assert np.abs(expected - active.predict(passive, active.held_out)).max() > 0.2

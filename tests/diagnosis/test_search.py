@@ -7,12 +7,20 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.candidates import screen, strengths
-from ventbench.diagnosis.gate import GATE, believed
 from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.rivals import SAME, alternatives
-from ventbench.diagnosis.search import dropped, forward, shaped
-from ventbench.diagnosis.steps import noise_of, settle, step, whitened
+from ventbench.diagnosis.refinement import SAME, alternatives
+from ventbench.diagnosis.screening import screen_mechanisms, trial_strengths
+from ventbench.diagnosis.selection import (
+    compare_candidates,
+    drop_redundant_terms,
+    estimate_noise,
+    fit_with_noise,
+    fit_with_white_noise,
+    forward_selection,
+    free_shape_parameters,
+    passes_heldout_test,
+)
+from ventbench.diagnosis.settings import GATE
 from ventbench.physics import library, parameter
 from ventbench.system_id import Noise
 
@@ -42,9 +50,9 @@ def quiet(what: str) -> None:
 
 @pytest.mark.parametrize("name", MILD)
 def test_screening_ranks_a_mild_effect_among_the_first(name):
-    bench = small.split(small.made(small.effect(name, **MILD[name]), seed=3))
-    null = settle(bench, Hypothesis())
-    found = screen(null, whitened(bench, null))
+    evaluator = small.split(small.made(small.effect(name, **MILD[name]), seed=3))
+    null = fit_with_noise(evaluator, Hypothesis())
+    found = screen_mechanisms(null, fit_with_white_noise(evaluator, null))
     assert {one.name for one in found} == set(library())
     place = [one.name for one in found].index(name)
     assert place < 5, [one.name for one in found]
@@ -57,18 +65,22 @@ def test_screening_ranks_a_mild_effect_among_the_first(name):
 
 
 def test_screening_leaves_out_what_is_there_and_looks_only_at_what_it_is_told(plain):
-    named = plain.bench.solve(Hypothesis(("leak",)), plain.null.noise, plain.null, iterations=1)
-    assert "leak" not in {one.name for one in screen(named, whitened(plain.bench, named))}
-    some = screen(plain.null, whitened(plain.bench, plain.null), ("leak", "inertance"))
+    named = plain.evaluator.fit(Hypothesis(("leak",)), plain.null.noise, plain.null, iterations=1)
+    assert "leak" not in {
+        one.name for one in screen_mechanisms(named, fit_with_white_noise(plain.evaluator, named))
+    }
+    some = screen_mechanisms(
+        plain.null, fit_with_white_noise(plain.evaluator, plain.null), ("leak", "inertance")
+    )
     assert {one.name for one in some} == {"leak", "inertance"}
 
 
 def test_what_cannot_act_is_not_looked_at():
     active = small.split(small.made(small.effect("turbulent_resistance", quadratic=10.0)))
     without = dataclasses.replace(active, excluded=("turbulent_resistance", "patient_effort"))
-    assert set(active.known) - set(without.known) == set(without.excluded)
-    null = settle(without, Hypothesis())
-    named, steps = forward(without, null, quiet)
+    assert set(active.allowed_mechanisms) - set(without.allowed_mechanisms) == set(without.excluded)
+    null = fit_with_noise(without, Hypothesis())
+    named, steps = forward_selection(without, null, quiet)
     assert not set(named.hypothesis.names) & set(without.excluded)
     assert not {one.name for one in steps[0].rivals} & set(without.excluded)
 
@@ -76,7 +88,7 @@ def test_what_cannot_act_is_not_looked_at():
 @pytest.mark.parametrize("name", sorted(library()))
 def test_strengths_that_are_looked_at_are_possible(name):
     item = library()[name].description.strength
-    tried = strengths(item)
+    tried = trial_strengths(item)
     assert tried
     assert item.neutral not in tried
     assert all(item.low <= x <= item.high for x in tried)
@@ -84,66 +96,68 @@ def test_strengths_that_are_looked_at_are_possible(name):
 
 def test_gate_needs_much_and_from_more_than_one_breath():
     even = np.full(8, 1.0)
-    assert believed(even)
-    assert not believed(0.9 * GATE / 8 * even)
-    assert not believed(-even)
+    assert passes_heldout_test(even)
+    assert not passes_heldout_test(0.9 * GATE / 8 * even)
+    assert not passes_heldout_test(-even)
     one = np.zeros(8)
     one[3] = 1000.0
-    assert not believed(one)
-    assert not believed(one + 0.1)
-    assert believed(one + 200.0)
+    assert not passes_heldout_test(one)
+    assert not passes_heldout_test(one + 0.1)
+    assert passes_heldout_test(one + 200.0)
     # Two breaths of another rig do not outvote the others, nor carry them.
     mixed = np.array([20.0, 25.0, 18.0, -150.0, 30.0, 22.0, 24.0, -60.0, 28.0, 26.0, 33.0, 19.0])
-    assert believed(mixed)
+    assert passes_heldout_test(mixed)
     carried = np.tile([0.1, -0.2, 0.1, -0.3, 0.2], 4)
     carried[[3, 11]] = 150.0, 60.0
-    assert not believed(carried)
+    assert not passes_heldout_test(carried)
     # A total that loses in half of the breaths is scatter.
     mixed = np.array([40.0, -30.0] * 4)
     assert mixed.sum() > GATE
-    assert not believed(mixed)
+    assert not passes_heldout_test(mixed)
 
 
 def test_nothing_is_worth_a_look_if_nothing_is_promising(plain):
-    found = screen(plain.null, whitened(plain.bench, plain.null))
+    found = screen_mechanisms(plain.null, fit_with_white_noise(plain.evaluator, plain.null))
     faint = [one for one in found if max(one.nats, one.white) <= 3.0]
     assert faint
-    assert step(plain.bench, plain.null, faint) is None
-    assert step(plain.bench, plain.null, []) is None
+    assert compare_candidates(plain.evaluator, plain.null, faint) is None
+    assert compare_candidates(plain.evaluator, plain.null, []) is None
 
 
 def test_a_step_orders_candidates_at_one_noise():
-    bench = small.split(small.made(small.effect("turbulent_resistance", quadratic=10.0)))
-    null = settle(bench, Hypothesis())
-    found = step(bench, null, screen(null, whitened(bench, null)))
+    evaluator = small.split(small.made(small.effect("turbulent_resistance", quadratic=10.0)))
+    null = fit_with_noise(evaluator, Hypothesis())
+    found = compare_candidates(
+        evaluator, null, screen_mechanisms(null, fit_with_white_noise(evaluator, null))
+    )
     assert found is not None
     assert found.rivals[0].name == "turbulent_resistance"
     criteria = [one.criterion for one in found.rivals]
     assert criteria == sorted(criteria)
     assert len({one.name for one in found.rivals}) == len(found.rivals)
     # The noise is the best one's, and no longer what the effect left in the residual.
-    best = found.rivals[0].solved
-    assert best.log_likelihood > best.likelihood_at(null.noise) + 20.0
-    assert found.before.noise == found.rivals[0].solved.noise
+    best = found.rivals[0].fitted
+    assert best.log_likelihood > best.log_likelihood_at(null.noise) + 20.0
+    assert found.before.noise == found.rivals[0].fitted.noise
     assert found.nats == pytest.approx(found.gained.sum())
-    assert believed(found.gained)
+    assert passes_heldout_test(found.gained)
 
 
 @pytest.mark.parametrize("name", STRONG)
 def test_one_strong_effect_is_named_and_nothing_else(name):
-    bench = small.split(small.made(small.effect(name, **STRONG[name]), seed=4))
-    named, steps = forward(bench, settle(bench, Hypothesis()), quiet)
+    evaluator = small.split(small.made(small.effect(name, **STRONG[name]), seed=4))
+    named, steps = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
     assert named.hypothesis.names == (name,)
-    assert believed(steps[0].gained)
+    assert passes_heldout_test(steps[0].gained)
     assert named.noise.sigma[0] == pytest.approx(0.2, rel=0.2)
-    assert noise_of(named).ar[0] == pytest.approx(0.0, abs=0.2)
+    assert estimate_noise(named).ar[0] == pytest.approx(0.0, abs=0.2)
 
 
 @pytest.mark.slow  # every refit has each breath's own effort
 def test_strong_efforts_are_named_and_nothing_else():
     effect = small.effect("patient_effort", amplitude=5.0, duration=0.8)
-    bench = small.split(small.made(effect, seed=4))
-    named, _ = forward(bench, settle(bench, Hypothesis()), quiet)
+    evaluator = small.split(small.made(effect, seed=4))
+    named, _ = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
     assert named.hypothesis.names == ("patient_effort",)
 
 
@@ -152,8 +166,8 @@ def test_two_strong_effects_are_both_named():
     two = (
         small.effect("turbulent_resistance", quadratic=10.0), small.effect("sensor_lag", tau=0.12)
     )  # fmt: skip
-    bench = small.split(small.made(*two))
-    named, _ = forward(bench, settle(bench, Hypothesis()), quiet)
+    evaluator = small.split(small.made(*two))
+    named, _ = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
     assert set(named.hypothesis.names) == {"turbulent_resistance", "sensor_lag"}
 
 
@@ -161,26 +175,28 @@ def test_two_strong_effects_are_both_named():
 @pytest.mark.parametrize("seed", [10, 11, 12])
 def test_nothing_is_named_in_noise(coloured, seed):
     recording = small.made(coloured=coloured, correlation=0.8, seed=seed)
-    bench = small.split(recording)
-    named, _ = forward(bench, settle(bench, Hypothesis()), quiet)
+    evaluator = small.split(recording)
+    named, _ = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
     assert named.hypothesis.names == ()
 
 
 def test_a_term_that_another_replaces_is_dropped():
-    bench = small.split(small.made(small.effect("sensor_lag", tau=0.12)))
+    evaluator = small.split(small.made(small.effect("sensor_lag", tau=0.12)))
     noise = Noise((0.2,), (0.0,))
-    both = bench.solve(Hypothesis(("sensor_drift", "sensor_lag")), noise)
-    assert dropped(bench, both).hypothesis.names == ("sensor_lag",)
-    kept = bench.solve(Hypothesis(("sensor_lag", "sensor_drift")), noise)
+    both = evaluator.fit(Hypothesis(("sensor_drift", "sensor_lag")), noise)
+    assert drop_redundant_terms(evaluator, both).hypothesis.names == ("sensor_lag",)
+    kept = evaluator.fit(Hypothesis(("sensor_lag", "sensor_drift")), noise)
     # Only those before the newest are asked.
-    assert dropped(bench, kept).hypothesis.names == ("sensor_lag", "sensor_drift")
+    assert drop_redundant_terms(evaluator, kept).hypothesis.names == ("sensor_lag", "sensor_drift")
 
 
 @pytest.mark.parametrize("form", ["linear", "library"])
 def test_a_shape_is_freed_if_the_recording_asks_for_it(form):
     effect = small.effect("leak", form, conductance=20.0)
-    bench = small.split(small.made(effect, noise=0.1, seed=5))
-    found = shaped(bench, bench.solve(Hypothesis(("leak",)), Noise((0.1,), (0.0,))))
+    evaluator = small.split(small.made(effect, noise=0.1, seed=5))
+    found = free_shape_parameters(
+        evaluator, evaluator.fit(Hypothesis(("leak",)), Noise((0.1,), (0.0,)))
+    )
     # The library's is an orifice.
     assert found.hypothesis.free == (("leak.exponent",) if form == "linear" else ())
     wanted = 1.0 if form == "linear" else 0.5
@@ -201,8 +217,8 @@ def test_a_shape_is_freed_if_the_recording_asks_for_it(form):
     ],
 )
 def test_another_form_is_found_by_the_shape_of_its_name(effect, path, wanted):
-    bench = small.split(small.made(effect, noise=0.03, seed=5))
-    found = shaped(bench, settle(bench, Hypothesis((effect.name,))))
+    evaluator = small.split(small.made(effect, noise=0.03, seed=5))
+    found = free_shape_parameters(evaluator, fit_with_noise(evaluator, Hypothesis((effect.name,))))
     assert found.hypothesis.free == (path,)
     assert found.column(path)[0] == pytest.approx(wanted, rel=0.15)
 
@@ -211,37 +227,37 @@ def test_another_form_is_found_by_the_shape_of_its_name(effect, path, wanted):
 def alike():
     """A recording from which a lag of the valve and a compliant circuit look the same."""
     effect = small.effect("valve_lag", tau=0.04)
-    bench = small.split(small.made(effect, noise=0.3, style="pi"))
-    return bench, *forward(bench, settle(bench, Hypothesis()), quiet)
+    evaluator = small.split(small.made(effect, noise=0.3, style="pi"))
+    return evaluator, *forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
 
 
 def test_a_rival_that_is_nearly_as_good_is_listed(alike):
-    bench, named, steps = alike
-    named, other = alternatives(bench, named, steps)
+    evaluator, named, steps = alike
+    named, other = alternatives(evaluator, named, steps)
     (name,) = named.hypothesis.names
     assert {name, *other[name].names} == {"valve_lag", "circuit_compliance"}
     assert 0.5 <= other[name].confidence < 0.9
     rival = other[name].rivals[0]
-    gap = rival.criterion - bench.criterion(named)
+    gap = rival.criterion - evaluator.criterion(named)
     assert other[name].confidence == pytest.approx(1.0 / (1.0 + np.exp(-0.5 * gap)))
 
 
 @pytest.mark.slow  # many refits
 def test_a_worse_name_is_swapped_for_the_better_one(alike):
-    bench, named, _ = alike
-    wrong = bench.solve(Hypothesis(("viscoelasticity",)), named.noise)
-    swapped, other = alternatives(bench, wrong, [])
+    evaluator, named, _ = alike
+    wrong = evaluator.fit(Hypothesis(("viscoelasticity",)), named.noise)
+    swapped, other = alternatives(evaluator, wrong, [])
     assert set(swapped.hypothesis.names) <= {"valve_lag", "circuit_compliance"}
-    assert bench.criterion(swapped) < bench.criterion(wrong) - 20.0
+    assert evaluator.criterion(swapped) < evaluator.criterion(wrong) - 20.0
     assert set(other) == set(swapped.hypothesis.names)
-    kept, _ = alternatives(bench, wrong, [], swap=False)
+    kept, _ = alternatives(evaluator, wrong, [], swap=False)
     assert kept.hypothesis.names == ("viscoelasticity",)
 
 
 def test_an_effect_like_no_other_has_no_alternative():
-    bench = small.split(small.made(small.effect("viscoelasticity", ratio=0.7, time=1.0)))
-    named, steps = forward(bench, settle(bench, Hypothesis()), quiet)
-    named, other = alternatives(bench, named, steps)
+    evaluator = small.split(small.made(small.effect("viscoelasticity", ratio=0.7, time=1.0)))
+    named, steps = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
+    named, other = alternatives(evaluator, named, steps)
     # But for what pressure alone can never tell from it.
     assert other["viscoelasticity"].names == SAME["viscoelasticity"]
     assert other["viscoelasticity"].confidence > 0.99

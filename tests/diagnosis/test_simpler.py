@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.simpler import OneShape
-from ventbench.diagnosis.steps import settle
+from ventbench.diagnosis.refinement import SingleTermAlternative
+from ventbench.diagnosis.selection import fit_with_noise
 
 from . import small
 
@@ -20,15 +20,19 @@ def few(monkeypatch):
 
 def one_shape(breaths):
     narrow = small.split(breaths)
-    null = settle(narrow, Hypothesis())
-    return narrow, null, OneShape(narrow, lambda: small.split(breaths, small.with_few()), null)
+    null = fit_with_noise(narrow, Hypothesis())
+    return (
+        narrow,
+        null,
+        SingleTermAlternative(narrow, lambda: small.split(breaths, small.with_few()), null),
+    )
 
 
 def test_names_that_imitate_a_shape_give_way(few):
     effect = small.effect("volume_resistance", "R(V)", change=0.65)
     narrow, null, simpler = one_shape(small.made(effect, noise=0.1))
-    assert simpler(settle(narrow, Hypothesis(SUM.names[:2]))) is None  # too few to ask
-    assert simpler(settle(narrow, SUM)) is null
+    assert simpler(fit_with_noise(narrow, Hypothesis(SUM.names[:2]))) is None  # too few to ask
+    assert simpler(fit_with_noise(narrow, SUM)) is null
 
 
 def test_names_that_act_stay(few):
@@ -40,4 +44,4 @@ def test_names_that_act_stay(few):
             noise=0.1,
         )
     )
-    assert simpler(settle(narrow, SUM)) is None
+    assert simpler(fit_with_noise(narrow, SUM)) is None

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ventbench.diagnosis import estimates, simulators
 from ventbench.diagnosis.found import Found, found_in
-from ventbench.diagnosis.solved import Side, Solved
+from ventbench.diagnosis.hypothesis import FittedModel, Partition
 from ventbench.system_id import Fit
 from ventbench.system_id.data import Data, Floats
 
@@ -63,13 +63,13 @@ def _exactly(had: Found, own: Data, held: NDArray[np.bool_], like: Found) -> Fit
 
     Its parameters are what it was taken to have; their reach is what such breaths tell of them.
     """
-    solved = had.conclusion.full
-    side = Side(own.select(~held), had.bench.training.simulator)
-    problem = replace(solved.problem, noise=like.conclusion.noise)
-    return estimates.estimated(replace(solved, problem=problem), side, had.bench)
+    fitted = had.conclusion.full
+    partition = Partition(own.select(~held), had.evaluator.training.simulator)
+    problem = replace(fitted.problem, noise=like.conclusion.noise)
+    return estimates.estimated(replace(fitted, problem=problem), partition, had.evaluator)
 
 
-def refitted(had: Found, data: Data, like: Found | None = None) -> Solved:
+def refitted(had: Found, data: Data, like: Found | None = None) -> FittedModel:
     """The simulator's own physics with R, C, R_ex, PEEP of other breaths.
 
     Args:
@@ -78,10 +78,10 @@ def refitted(had: Found, data: Data, like: Found | None = None) -> Solved:
         like: whose noise is taken; the simulator's if not given.
     """
     own = had.conclusion.full
-    bench = had.bench
+    evaluator = had.evaluator
     noise = (like or had).conclusion.noise
-    side = Side(data, bench.training.simulator)
-    return bench.solve(own.hypothesis, noise, own, side=side)
+    partition = Partition(data, evaluator.training.simulator)
+    return evaluator.fit(own.hypothesis, noise, own, partition=partition)
 
 
 def _error(data: Data, pressure: Floats) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ventbench.diagnosis import estimates
-from ventbench.diagnosis.conclude import Conclusion
+from ventbench.diagnosis.conclusion import Conclusion
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id import Fit
 

@@ -72,7 +72,7 @@ def corrected(
         return _physics(breaths, found, held, answers, seen)
     # Its own physics, then the same with the recording's R, C, R_ex and PEEP.
     own = had.pressures(had.conclusion.full, held, first)
-    refit = had.pressures(refitted(had, found.bench.training.data, found), held, first)
+    refit = had.pressures(refitted(had, found.evaluator.training.data, found), held, first)
     answers = {"before": before, "refit": before + refit - own, "after": before + after - own}
     errs, wanted = _errs(breaths, answers, seen), found.plants()
     if left := bool(errs[1] >= errs[0]):
@@ -111,7 +111,7 @@ def _physics(
         f"With {what} the simulator would err more on the breaths that were fitted than with R "
         "and C refitted, so the corrected simulator is without it."
     )
-    plants = estimates.plants_of(kept, found.bench)
+    plants = estimates.plants_of(kept, found.evaluator)
     return Correction(answers, _errs(breaths, answers, seen), plants, notes=(note,))
 
 

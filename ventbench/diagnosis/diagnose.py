@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from ventbench.diagnosis import estimates, flows, shapes, simulators, split
 from ventbench.diagnosis.against import against
 from ventbench.diagnosis.compare import Lack, lacking
-from ventbench.diagnosis.conclude import Conclusion
+from ventbench.diagnosis.conclusion import Conclusion
 from ventbench.diagnosis.corrected import Correction, corrected
 from ventbench.diagnosis.distances import distances
 from ventbench.diagnosis.found import Found, found_in
 from ventbench.diagnosis.locate import locate
 from ventbench.diagnosis.next_breath import request
+from ventbench.diagnosis.refinement import Alternatives
 from ventbench.diagnosis.result import Diagnosis, LungMatch, Named, Request, Traces, Verdict
-from ventbench.diagnosis.rivals import Alternatives
 from ventbench.diagnosis.simulators import Given
 from ventbench.diagnosis.steady import steadied
 from ventbench.errors import InputError
@@ -147,5 +147,5 @@ def _named(one: Lack, conclusion: Conclusion, fit: Fit, had: Found | None) -> Na
 
 
 def _request(conclusion: Conclusion) -> Request | None:
-    rivals = [one.solved for other in conclusion.alternatives.values() for one in other.rivals]
+    rivals = [one.fitted for other in conclusion.alternatives.values() for one in other.rivals]
     return request(conclusion.named, rivals, noise=Noise((conclusion.noise.sigma[0],), (0.0,)))

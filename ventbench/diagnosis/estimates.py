@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from ventbench import mechanics
-from ventbench.diagnosis.bench import Bench
-from ventbench.diagnosis.effort import EFFORT
-from ventbench.diagnosis.hypothesis import has_own
+from ventbench.diagnosis.evaluator import Evaluator
+from ventbench.diagnosis.hypothesis import FittedModel, Partition, has_own
+from ventbench.diagnosis.patient_effort import EFFORT
 from ventbench.diagnosis.result import Estimate, LungMatch
-from ventbench.diagnosis.solved import Side, Solved
 from ventbench.interfaces import Plant
 from ventbench.physics.catalogue import library, mechanism, paths
 from ventbench.physics.model import Physics
@@ -29,34 +28,41 @@ _UNCERTAIN = ("supply_droop.recovery",)
 _ALIKE = (("valve_lag.tau", "valve_lag.second"),)
 
 
-def estimated(solved: Solved, side: Side, bench: Bench) -> Fit:
+def estimated(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -> Fit:
     """Fit a conclusion's hypothesis to a side's breaths, with covariance.
 
     Args:
-        solved: the conclusion, on some of the breaths.
-        side: breaths to fit.
-        bench: that it was found on.
+        fitted: the conclusion, on some of the breaths.
+        partition: breaths to fit.
+        evaluator: that it was found on.
     """
-    hypothesis = solved.hypothesis
+    hypothesis = fitted.hypothesis
     free = [p for p in _UNCERTAIN if p.rpartition(".")[0] in hypothesis.names]
     start: dict[str, Any] = {}
-    for path in solved.problem.unknowns.paths:
+    for path in fitted.problem.unknowns.paths:
         if path != START and not ("." in path and has_own(path.rpartition(".")[0])):
-            start[path] = float(np.median(solved.column(path)))
+            start[path] = float(np.median(fitted.column(path)))
     for first, second in _ALIKE:
         if {first, second} <= set(start) and start[second] > start[first]:
             start[first], start[second] = start[second], start[first]
-    known = solved.problem.data
+    known = fitted.problem.data
     if len(np.unique(known.lung)) > 1:
-        same = (side.data.R[:, None] == known.R) & (side.data.C[:, None] == known.C)
-        start |= {path: solved.column(path)[np.argmax(same, axis=1)] for path in ("R", "C")}
+        same = (partition.data.R[:, None] == known.R) & (partition.data.C[:, None] == known.C)
+        start |= {path: fitted.column(path)[np.argmax(same, axis=1)] for path in ("R", "C")}
     if EFFORT in hypothesis.names:  # each breath's own are looked for where it is likeliest
-        near = bench.solve(hypothesis, solved.noise, start=start, side=side, anew=True)
+        near = evaluator.fit(
+            hypothesis, fitted.noise, start=start, partition=partition, restart=True
+        )
         start |= {path: near.column(path) for path in near.problem.unknowns.paths}
     return fit(
-        side.data, hypothesis.names, free=dict.fromkeys((*hypothesis.free, *free)),
-        fixed=dict(hypothesis.fixed), start=start, noise=solved.noise, simulator=side.simulator,
-    )  # fmt: skip
+        partition.data,
+        hypothesis.names,
+        free=dict.fromkeys((*hypothesis.free, *free)),
+        fixed=dict(hypothesis.fixed),
+        start=start,
+        noise=fitted.noise,
+        simulator=partition.simulator,
+    )
 
 
 def parameters(found: Fit, name: str) -> dict[str, Estimate]:
@@ -116,10 +122,15 @@ def plants(found: Fit) -> dict[str, Plant]:
     return _by_label(problem.data, problem.simulator, found.mechanisms, found.values)
 
 
-def plants_of(solved: Solved, bench: Bench) -> dict[str, Plant]:
+def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
     """The same of a hypothesis as it was fitted to the training breaths of a bench."""
-    side = bench.training
-    return _by_label(side.data, side.simulator, solved.names, bench.carried(solved, side))
+    partition = evaluator.training
+    return _by_label(
+        partition.data,
+        partition.simulator,
+        fitted.names,
+        evaluator.transferred_values(fitted, partition),
+    )
 
 
 def _by_label(

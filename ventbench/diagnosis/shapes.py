@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ventbench.diagnosis.beside import Place
-from ventbench.diagnosis.conclude import Conclusion
-from ventbench.diagnosis.moving import Moving
-from ventbench.diagnosis.places import public
+from ventbench.diagnosis.conclusion import Conclusion
+from ventbench.diagnosis.hypothesis import FittedModel
+from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY, LatentInput
+from ventbench.diagnosis.refinement import UnnamedEffect
 from ventbench.diagnosis.result import Slot
-from ventbench.diagnosis.solved import Solved
-from ventbench.diagnosis.sources import ALVEOLUS, MEASUREMENT, SUPPLY
+from ventbench.diagnosis.screening import component_of
 from ventbench.physics.catalogue import mechanism
 from ventbench.physics.nonparametric import SLOTS
 from ventbench.physics.shapes import drawn, without_absorbed
@@ -49,7 +48,7 @@ def _share(conclusion: Conclusion) -> float:
     return float(np.clip((before - after) / max(before - min(floor, after), 1e-9), 0.0, 1.0))
 
 
-def _moving(place: Place, source: Moving, explains: float) -> Slot:
+def _moving(place: UnnamedEffect, source: LatentInput, explains: float) -> Slot:
     size = np.sqrt(np.mean(source.shape**2, axis=1))
     course = source.shape[int(np.argmax(size))]
     unit = "share of the flow, 1" if place.name == SUPPLY else "pressure, cmH2O"
@@ -63,12 +62,12 @@ def _moving(place: Place, source: Moving, explains: float) -> Slot:
     )  # fmt: skip
 
 
-def _curve(full: Solved, element: str) -> tuple[np.ndarray, np.ndarray, str, str]:
+def _curve(full: FittedModel, element: str) -> tuple[np.ndarray, np.ndarray, str, str]:
     own = [f"{element}.{p.name}" for p in mechanism(element).description.parameters]
     values = {
         name: float(np.median(full.column(name)))
         for name in (*own, "R", "C", "gain", "R_ex", "PEEP")
     }
     # The slot's other elements are neutral; the strongest curve is the first.
-    curve = without_absorbed(drawn(public(element), values)[0])
+    curve = without_absorbed(drawn(component_of(element), values)[0])
     return np.asarray(curve.x, float), np.asarray(curve.y, float), curve.x_unit, curve.y_unit

@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ventbench.diagnosis.bench import Bench, by_label
+from ventbench.diagnosis.evaluator import Evaluator, by_label
 from ventbench.diagnosis.found import Found
-from ventbench.diagnosis.gate import LITTLE, WEAK, believed
-from ventbench.diagnosis.hypothesis import Hypothesis, has_own
-from ventbench.diagnosis.solved import Side, Solved
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, has_own
+from ventbench.diagnosis.selection import LITTLE, WEAK, passes_heldout_test
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id import Fit, fit
 from ventbench.system_id.unknowns import described, freed
@@ -40,39 +39,44 @@ def steadied(
         return None
     place = found.conclusion.place
     element = (place.element,) if place is not None and place.element else ()
-    bench = _widest(found.bench, had.bench)
+    evaluator = _widest(found.evaluator, had.evaluator)
 
-    def having(names: Sequence[str]) -> tuple[Fit, Solved]:
+    def having(names: Sequence[str]) -> tuple[Fit, FittedModel]:
         asked = (*names, *element)
         hypothesis = _of(full.hypothesis, own.hypothesis, asked)
-        one = _fitted(bench, hypothesis, asked, full, own)
+        one = _fitted(evaluator, hypothesis, asked, full, own)
         likelihood = float(one.problem.log_likelihood(one.minimum.x).sum())
-        return one, Solved(hypothesis, one.problem, one.minimum, likelihood)
+        return one, FittedModel(hypothesis, one.problem, one.minimum, likelihood)
 
-    names, (one, solved) = tuple(missing), having(missing)
-    if believed(found.bench.judged(full) - bench.judged(solved)):
+    names, (one, fitted) = tuple(missing), having(missing)
+    if passes_heldout_test(
+        found.evaluator.held_out_log_likelihood(full) - evaluator.held_out_log_likelihood(fitted)
+    ):
         return None
-    nothing = bench.judged(having(())[1])
+    nothing = evaluator.held_out_log_likelihood(having(())[1])
     while names:
         # What only trimmed another R or C is idle beside the simulator's own.
         fewer = [(name, *having([other for other in names if other != name])) for name in names]
-        lost = [bench.judged(solved) - bench.judged(less) for _, _, less in fewer]
+        lost = [
+            evaluator.held_out_log_likelihood(fitted) - evaluator.held_out_log_likelihood(less)
+            for _, _, less in fewer
+        ]
         least = int(np.argmin([nats.sum() for nats in lost]))
         name, one_less, less = fewer[least]
-        whole = float((bench.judged(solved) - nothing).sum())
-        trace = is_faint(solved, own, name) and lost[least].sum() < LITTLE * whole
-        if believed(lost[least]) and not trace:
+        whole = float((evaluator.held_out_log_likelihood(fitted) - nothing).sum())
+        trace = is_faint(fitted, own, name) and lost[least].sum() < LITTLE * whole
+        if passes_heldout_test(lost[least]) and not trace:
             break
-        one, solved = one_less, less
+        one, fitted = one_less, less
         names = tuple(other for other in names if other != name)
-    return Found(bench, replace(found.conclusion, full=solved), one), names
+    return Found(evaluator, replace(found.conclusion, full=fitted), one), names
 
 
-def is_faint(solved: Solved, own: Solved, name: str) -> bool:
+def is_faint(fitted: FittedModel, own: FittedModel, name: str) -> bool:
     """Whether a mechanism is by far less than a mild one beyond what the simulator has of it."""
     item = mechanism(name).description.strength
     path = f"{name}.{item.name}"
-    beyond = np.abs(solved.column(path) - own.column(path)[0])
+    beyond = np.abs(fitted.column(path) - own.column(path)[0])
     return bool(beyond.max() < WEAK * abs(item.mild - item.neutral))
 
 
@@ -83,34 +87,42 @@ def _of(full: Hypothesis, own: Hypothesis, asked: tuple[str, ...]) -> Hypothesis
 
 
 def _fitted(
-    bench: Bench, hypothesis: Hypothesis, asked: tuple[str, ...], full: Solved, own: Solved
+    evaluator: Evaluator,
+    hypothesis: Hypothesis,
+    asked: tuple[str, ...],
+    full: FittedModel,
+    own: FittedModel,
 ) -> Fit:
-    side = bench.training
-    names = side.simulator.names
-    values = bench.carried(own, side)
+    partition = evaluator.training
+    names = partition.simulator.names
+    values = evaluator.transferred_values(own, partition)
     free = [p for p in (*freed(asked), *hypothesis.free) if p.rpartition(".")[0] in asked]
     fixed: dict[str, ArrayLike] = {
         name: values[:, k] for k, name in enumerate(names) if name not in (*free, "position")
     }
     given = {p: x for p, x in hypothesis.fixed if p.rpartition(".")[0] in asked}
-    loose = ("gain",) if bench.spread else ()
+    loose = ("gain",) if evaluator.gain_sd else ()
     neutral = float(np.log(described("gain").neutral))
     return fit(
-        side.data, hypothesis.names, free=(*free, *loose),
+        partition.data,
+        hypothesis.names,
+        free=(*free, *loose),
         fixed={p: x for p, x in (fixed | given).items() if p not in loose},
         start={p: float(np.median(full.column(p))) for p in free},
-        groups=by_label(side.data, tuple(free)) | {p: np.arange(len(side.data)) for p in loose},
-        prior={p: (neutral, bench.spread) for p in loose},
-        noise=full.noise, simulator=side.simulator,
-    )  # fmt: skip
+        groups=by_label(partition.data, tuple(free))
+        | {p: np.arange(len(partition.data)) for p in loose},
+        prior={p: (neutral, evaluator.gain_sd) for p in loose},
+        noise=full.noise,
+        simulator=partition.simulator,
+    )
 
 
-def _widest(found: Bench, had: Bench) -> Bench:
+def _widest(found: Evaluator, had: Evaluator) -> Evaluator:
     """The recording on the bench whose simulator knows everything that either needs."""
     if len(found.training.simulator.names) >= len(had.training.simulator.names):
         return found
     return replace(
         found,
-        training=Side(found.training.data, had.training.simulator),
-        judging=Side(found.judging.data, had.judging.simulator),
+        training=Partition(found.training.data, had.training.simulator),
+        held_out=Partition(found.held_out.data, had.held_out.simulator),
     )

@@ -17,7 +17,7 @@ _RIDGE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Local:
+class Linearisation:
     """A fitted hypothesis seen as linear: m whitened samples in each of n breaths.
 
     Attributes:
@@ -62,7 +62,7 @@ class Local:
         return self.without_shared(white)[:, 0]
 
 
-def local(problem: Problem, x: Floats, clip: float = CLIP) -> Local:
+def linearise(problem: Problem, x: Floats, clip: float = CLIP) -> Linearisation:
     """Linearise a problem at its unknowns.
 
     Args:
@@ -83,19 +83,19 @@ def local(problem: Problem, x: Floats, clip: float = CLIP) -> Local:
     breath |= np.array([count == len(white) and count > 1 for count in counts])
     own = _orthonormal(rows[:, breath])
     values = problem.values(x)
-    found = Local(problem, values, residual, white, own, np.zeros((0, white.size)))
+    found = Linearisation(problem, values, residual, white, own, np.zeros((0, white.size)))
     columns = []
     for k in np.flatnonzero(~breath):
         left = found.without_own(rows[:, [k]])[:, 0]
         for unknown in np.unique(layout.index[:, k]):
             columns.append(np.where((layout.index[:, k] == unknown)[:, None], left, 0.0).ravel())
     shared = _orthonormal(np.asarray(columns)[None])[0] if columns else found.shared
-    found = Local(problem, values, problem.predict(x), white, own, shared)
+    found = Linearisation(problem, values, problem.predict(x), white, own, shared)
     clean = found.without_shared(found.without_own(white[:, None]))[:, 0]
-    return Local(problem, values, found.seen, clean, own, shared)
+    return Linearisation(problem, values, found.seen, clean, own, shared)
 
 
-def gain(local: Local, template: Floats) -> tuple[float, float]:
+def gain(local: Linearisation, template: Floats) -> tuple[float, float]:
     """Nats that the best multiple of a template gains, and that multiple (negative: none)."""
     power = float(np.sum(template**2))
     if power < 1e-12:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import tempfile
 from collections.abc import Callable
@@ -53,6 +54,22 @@ def as_json(value: Any) -> str:
 def write_json(path: Path, value: Any) -> None:
     """Create or replace a JSON file in one step; see :func:`as_json`."""
     write_text(path, as_json(value))
+
+
+def json_values(value: Any) -> Any:
+    """Plain JSON values of nested dicts, sequences and NumPy or JAX numbers.
+
+    A number that is not finite becomes None.
+    """
+    if isinstance(value, dict):
+        return {str(key): json_values(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_values(part) for part in value]
+    if hasattr(value, "item"):  # a number of NumPy or JAX
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def sha256(path: Path) -> str:

@@ -7,19 +7,18 @@ import dataclasses
 import numpy as np
 
 from ventbench import precision
-from ventbench.diagnosis.locate import locate
-from ventbench.diagnosis.result import (
-    Diagnosis,
-    Distance,
-    Distances,
-    Estimate,
-    LungMatch,
-    Named,
-    Request,
-    Slot,
+from ventbench.diagnosis.findings import (
+    BreathRequest,
+    MissingMechanism,
+    NonparametricTerm,
+    OpenLoopComparison,
+    OpenLoopError,
     Traces,
 )
+from ventbench.diagnosis.residual_analysis import locate
+from ventbench.diagnosis.result import Diagnosis
 from ventbench.lungs import lung
+from ventbench.mechanics.lung_match import Estimate, LungMatch
 from ventbench.physics import physics
 from ventbench.recordings.breaths import Breaths
 
@@ -95,12 +94,12 @@ def diagnosis(n: int = 40) -> Diagnosis:
     after = answer(*inputs, 1.1 * about.R, 0.95 * about.C, 0.04)[0]
     held = np.arange(n) % 3 == 2
 
-    def distance(simulated: np.ndarray, part: np.ndarray | bool = True) -> Distance:
+    def distance(simulated: np.ndarray, part: np.ndarray | bool = True) -> OpenLoopError:
         inside = recorded.inspiratory & held[:, None] & part
         error = (recorded.pressure - simulated)[inside]
-        return Distance(float(np.abs(error).mean()), float(np.sqrt(np.mean(error**2))))
+        return OpenLoopError(float(np.abs(error).mean()), float(np.sqrt(np.mean(error**2))))
 
-    def stages(part: np.ndarray | bool) -> dict[str, Distance]:
+    def stages(part: np.ndarray | bool) -> dict[str, OpenLoopError]:
         kinds = {"before": before, "refit": refit, "after": after}
         return {name: distance(simulated, part) for name, simulated in kinds.items()}
 
@@ -110,7 +109,7 @@ def diagnosis(n: int = 40) -> Diagnosis:
     return Diagnosis(
         verdict="named",
         mechanisms=(
-            Named(
+            MissingMechanism(
                 name="valve_delay",
                 parameters={"delay": Estimate(0.041, "s", (0.038, 0.044))},
                 confidence=0.97,
@@ -118,9 +117,9 @@ def diagnosis(n: int = 40) -> Diagnosis:
                 nats=212.0,
             ),
         ),
-        slot=None,
+        nonparametric=None,
         location=locate(recorded, refit, NOISE, flow, volume),
-        open_loop=Distances(
+        open_loop=OpenLoopComparison(
             tuple(recorded.breath_id[held].tolist()),
             **stages(True),
             noise_floor=NOISE,
@@ -130,7 +129,7 @@ def diagnosis(n: int = 40) -> Diagnosis:
             },
         ),
         lungs=(LungMatch("R20C50", 22.1, 47.4, (21.8, 22.4), (47.0, 47.8), False, "pressure"),),
-        request=Request(
+        request=BreathRequest(
             "3 breaths of random pulses of the valve",
             ("valve_delay", "valve_lag"),
             64.0,
@@ -140,7 +139,7 @@ def diagnosis(n: int = 40) -> Diagnosis:
         ),
         traces=Traces(recorded, held, before, refit, after, flow, volume),
         plants={"R20C50": plant},
-        plant="physics",
+        simulator="physics",
         noise=(NOISE, 0.1),
         notes=("2 breaths have no pressure and were left out.",),
         seconds=21.4,
@@ -151,9 +150,11 @@ def unnamed(n: int = 40) -> Diagnosis:
     """The same, but with a slot instead of a name."""
     x = np.linspace(0.0, 900.0, 25)
     y = 2.0 * np.sin(x / 300.0)
-    slot = Slot("R(V)", "resistance of the airway", 0.83, 41.0, x, "volume, mL", y, "R, cmH2O s/L")
+    term = NonparametricTerm(
+        "R(V)", "resistance of the airway", 0.83, 41.0, x, "volume, mL", y, "R, cmH2O s/L"
+    )
     return dataclasses.replace(
-        diagnosis(n), verdict="unnamed", mechanisms=(), slot=slot, request=None
+        diagnosis(n), verdict="unnamed", mechanisms=(), nonparametric=term, request=None
     )
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from ventbench.diagnosis import compare, estimates
 from ventbench.diagnosis.compare import Lack, lacking
-from ventbench.diagnosis.result import Estimate
+from ventbench.mechanics.lung_match import Estimate
 
 
 def conclusion(**nats: float) -> Any:

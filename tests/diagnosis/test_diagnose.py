@@ -75,10 +75,10 @@ def test_the_effect_is_named_with_its_strength(found):
     assert strength.value == pytest.approx(10.0, rel=0.1)
     assert one.confidence > 0.99
     assert one.nats > 50.0
-    assert found.slot is None
+    assert found.nonparametric is None
     assert found.request is None
     assert found.noise[0] == pytest.approx(0.2, rel=0.15)
-    assert found.plant == "physics"
+    assert found.simulator == "physics"
 
 
 def test_the_lung_is_the_rigs(found):
@@ -173,7 +173,7 @@ def test_the_corrected_plant_in_its_file_gives_the_same_answers(which, request, 
 def test_nothing_is_missing_where_the_simulator_has_it(own):
     assert own.verdict == "nothing_missing"
     assert own.mechanisms == ()
-    assert own.plant == "given"
+    assert own.simulator == "given"
     assert own.open_loop.before.rmse < 2.5 * own.open_loop.noise_floor
 
 
@@ -200,9 +200,9 @@ def test_another_strength_than_the_simulators_is_missing(breaths):
 def test_what_has_no_name_is_drawn_where_it_is(strange):
     assert strange.verdict == "unnamed"
     assert strange.mechanisms == ()
-    assert strange.slot is not None
-    assert strange.slot.name == "R(V)"
-    assert strange.slot.x.shape == strange.slot.y.shape
+    assert strange.nonparametric is not None
+    assert strange.nonparametric.name == "R(V)"
+    assert strange.nonparametric.x.shape == strange.nonparametric.y.shape
     assert strange.open_loop.after.rmse < 0.7 * strange.open_loop.refit.rmse
     plain = json.loads(json.dumps(strange.as_dict(), allow_nan=False))
     assert {"name", "explains"} <= set(plain["slot"])

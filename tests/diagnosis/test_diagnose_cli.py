@@ -76,7 +76,7 @@ def test_four_files_and_the_words(recording, tmp_path, calls):
     assert not calls[0]["passive"]
     words = " ".join(text.split())
     assert words.startswith("Missing in the physics simulator: dead time of the inspiratory valve")
-    assert "41 ms [38, 44] of dead time" in words
+    assert "Dead time of the inspiratory valve: 41 ms [38, 44]." in words
     for name in FILES:
         assert str(out / name) in text.replace("\n", "")
     plain = json.loads((out / "diagnosis.json").read_text())

@@ -15,7 +15,8 @@ from typer.testing import CliRunner
 from tests.diagnosis import made
 from ventbench import files, precision
 from ventbench.cli import proof as command
-from ventbench.diagnosis.result import Diagnosis, Distance
+from ventbench.diagnosis.findings import OpenLoopError
+from ventbench.diagnosis.result import Diagnosis
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS, LUNGS, lung
 from ventbench.physics import physics
@@ -262,7 +263,7 @@ def test_the_unnamed_part_does_not_count_for_the_cut(recordings, tmp_path, monke
     start = physics(lung("R20C50"))
     with precision.float64():
         plant = start.having(**{"valve_shape.c1": 0.5})
-    after = Distance(0.2, 0.3)
+    after = OpenLoopError(0.2, 0.3)
     loop = dataclasses.replace(one.open_loop, after=after)
     monkeypatch.setattr(
         run, "diagnose",

@@ -56,7 +56,7 @@ def test_report(found: Diagnosis, tmp_path: Path) -> None:
 
 def test_nothing_from_outside(found: Diagnosis, tmp_path: Path) -> None:
     bad = dataclasses.replace(
-        found, plant="<script>alert('x')</script>", notes=("<img src=http://x>",)
+        found, simulator="<script>alert('x')</script>", notes=("<img src=http://x>",)
     )
     text = write_report(tmp_path / "r.html", bad).read_text()
     page = Page(text)
@@ -177,7 +177,7 @@ def test_rerun(found: Diagnosis, tmp_path: Path) -> None:
 
 def test_rerun_of_other_verdicts_and_names(tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="needs the extra ventbench[view]")
-    odd = dataclasses.replace(made.nothing(6), plant="\u673a ![i](http:)")
+    odd = dataclasses.replace(made.nothing(6), simulator="\u673a ![i](http:)")
     entities = read(write_rerun(tmp_path / "n.rrd", odd))
     assert "/map/after" not in entities
     text = entities["/about"]["text"][0]

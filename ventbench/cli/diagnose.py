@@ -87,7 +87,7 @@ def keep(out: Path, found: Diagnosis) -> list[Path]:
 
     recorded = found.traces.breaths
     about = {
-        "corrected": found.plant,
+        "corrected": found.simulator,
         "mechanisms": [item.name for item in found.mechanisms],
         "recording": recorded.source,
         "recording_sha256": recorded.sha256,
@@ -134,7 +134,7 @@ def _diagnose(breaths: Breaths, plant: str, lung: str | None, passive: bool) -> 
             bars.update(task, description=what, completed=share)
 
         found = find(breaths, plant=simulator, lung=lung, passive=passive, progress=progress)
-    return found if plant in KINDS else dataclasses.replace(found, plant=Path(plant).name)
+    return found if plant in KINDS else dataclasses.replace(found, simulator=Path(plant).name)
 
 
 def _plants(plant: str, breaths: Breaths) -> Any:
@@ -153,14 +153,16 @@ def _plants(plant: str, breaths: Breaths) -> Any:
 
 
 def _say(console: Any, found: Diagnosis) -> None:
-    from ventbench.diagnosis import words
+    from ventbench.diagnosis import report_text
 
-    verdict, *others = words.sentences(found)
+    verdict, *others = report_text.sentences(found)
     console.print(verdict, style="bold", markup=False, highlight=False)
     for text in others:
         console.print(text, markup=False, highlight=False)
     for place in found.location[:3]:
-        console.print(f"  {words.location(place, found.noise[0])}", markup=False, highlight=False)
+        console.print(
+            f"  {report_text.error_region(place, found.noise[0])}", markup=False, highlight=False
+        )
 
 
 def register(app: typer.Typer) -> None:

@@ -95,10 +95,10 @@ def _lung(one: Mechanics) -> dict[str, Any]:
     """JSON values; what is not finite becomes null."""
     import dataclasses
 
-    from ventbench.diagnosis.as_json import _finite
+    from ventbench import files
 
     plain = dataclasses.asdict(one) | {"settings": [lung.id for lung in one.settings]}
-    return _finite(plain)
+    return files.json_values(plain)
 
 
 def _run(item: Surveyed) -> dict[str, Any]:

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from ventbench.diagnosis import estimates, simulators
 from ventbench.diagnosis.against import refitted
-from ventbench.diagnosis.distances import distance
 from ventbench.diagnosis.found import Found
 from ventbench.diagnosis.hypothesis import has_own
+from ventbench.diagnosis.residual_analysis import open_loop_error
 from ventbench.diagnosis.simulators import Given
 from ventbench.interfaces import Plant
 from ventbench.plants.corrected import Corrected
@@ -90,10 +90,12 @@ def _physics(
     Efforts of a patient are each breath's own: their mean, which is what others are expected to
     have, may be off in all of them.
     """
-    least = distance(breaths.pressure, answers["refit"], seen)
+    least = open_loop_error(breaths.pressure, answers["refit"], seen)
 
     def serves(pressure: Floats) -> bool:
-        errs = distance(breaths.pressure, pressure, seen)  # the square sees what few breaths hide
+        errs = open_loop_error(
+            breaths.pressure, pressure, seen
+        )  # the square sees what few breaths hide
         return errs.mae <= _FAR * least.mae and errs.rmse <= _FAR * least.rmse
 
     own = any(has_own(name) for name in found.conclusion.full.names)
@@ -119,7 +121,7 @@ def _errs(
     breaths: Breaths, answers: dict[str, Floats], seen: NDArray[np.bool_]
 ) -> tuple[float, float]:
     before, after = (
-        distance(breaths.pressure, answers[key], seen).mae for key in ("before", "after")
+        open_loop_error(breaths.pressure, answers[key], seen).mae for key in ("before", "after")
     )
     return before, after
 

@@ -8,20 +8,21 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.diagnosis import estimates, flows, shapes, simulators, split
+from ventbench.diagnosis import estimates, shapes, simulators, split
 from ventbench.diagnosis.against import against
 from ventbench.diagnosis.compare import Lack, lacking
 from ventbench.diagnosis.conclusion import Conclusion
 from ventbench.diagnosis.corrected import Correction, corrected
-from ventbench.diagnosis.distances import distances
+from ventbench.diagnosis.experiment_design import request_breaths
+from ventbench.diagnosis.findings import BreathRequest, MissingMechanism, Traces, Verdict
 from ventbench.diagnosis.found import Found, found_in
-from ventbench.diagnosis.locate import locate
-from ventbench.diagnosis.next_breath import request
 from ventbench.diagnosis.refinement import Alternatives
-from ventbench.diagnosis.result import Diagnosis, LungMatch, Named, Request, Traces, Verdict
+from ventbench.diagnosis.residual_analysis import compare_open_loop, flow_and_volume, locate
+from ventbench.diagnosis.result import Diagnosis
 from ventbench.diagnosis.simulators import Given
 from ventbench.diagnosis.steady import steadied
 from ventbench.errors import InputError
+from ventbench.mechanics.lung_match import LungMatch
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit, Noise, recorded
 from ventbench.system_id.data import Floats
@@ -92,7 +93,7 @@ def _diagnosis(
         names, place, removed = [], None, [_left(correction)]
     noise = conclusion.noise
     lungs, more = _lungs(breaths, alone)
-    flow, volume = flows.of_fit(breaths, found.fit, answers["refit"])
+    flow, volume = flow_and_volume(breaths, found.fit, answers["refit"])
     here = np.flatnonzero(~np.isnan(answers["refit"]).all(axis=1))
     location = locate(
         breaths.select(here), answers["refit"][here], noise.sigma[0], flow[here], volume[here]
@@ -102,15 +103,15 @@ def _diagnosis(
     return Diagnosis(
         verdict=verdict,
         mechanisms=tuple(_named(one, conclusion, found.fit, had) for one in names),
-        slot=place,
+        nonparametric=place,
         location=location,
-        open_loop=distances(breaths, held, answers, float(noise.sigma[0])),
+        open_loop=compare_open_loop(breaths, held, answers, float(noise.sigma[0])),
         lungs=lungs,
         request=None if useless else _request(conclusion),
         traces=Traces(breaths, held, answers["before"], answers["refit"], answers["after"], flow,
                       volume),
         plants=correction.plants,
-        plant=plant if isinstance(plant, str) else "given",
+        simulator=plant if isinstance(plant, str) else "given",
         noise=(float(noise.sigma[0]), float(noise.ar[0])),
         notes=(*notes, *removed, *correction.notes, *more),
         seconds=time.perf_counter() - began,
@@ -137,15 +138,17 @@ def _lungs(breaths: Breaths, fit: Fit) -> tuple[tuple[LungMatch, ...], list[str]
     return estimates.lungs(fit), []
 
 
-def _named(one: Lack, conclusion: Conclusion, fit: Fit, had: Found | None) -> Named:
+def _named(one: Lack, conclusion: Conclusion, fit: Fit, had: Found | None) -> MissingMechanism:
     other = conclusion.alternatives.get(one.name, Alternatives((), 1.0, ()))
     own = estimates.parameters(had.fit, one.name) if had is not None and one.changed else {}
-    return Named(
+    return MissingMechanism(
         one.name, estimates.parameters(fit, one.name), other.confidence, other.names,
         conclusion.nats.get(one.name, 0.0), one.changed, {key: x.value for key, x in own.items()},
     )  # fmt: skip
 
 
-def _request(conclusion: Conclusion) -> Request | None:
+def _request(conclusion: Conclusion) -> BreathRequest | None:
     rivals = [one.fitted for other in conclusion.alternatives.values() for one in other.rivals]
-    return request(conclusion.named, rivals, noise=Noise((conclusion.noise.sigma[0],), (0.0,)))
+    return request_breaths(
+        conclusion.named, rivals, noise=Noise((conclusion.noise.sigma[0],), (0.0,))
+    )

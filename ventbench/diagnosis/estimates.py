@@ -11,8 +11,8 @@ from ventbench import mechanics
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, has_own
 from ventbench.diagnosis.patient_effort import EFFORT
-from ventbench.diagnosis.result import Estimate, LungMatch
 from ventbench.interfaces import Plant
+from ventbench.mechanics.lung_match import Estimate, LungMatch
 from ventbench.physics.catalogue import library, mechanism, paths
 from ventbench.physics.model import Physics
 from ventbench.precision import float64

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ventbench.diagnosis.conclusion import Conclusion
+from ventbench.diagnosis.findings import NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel
 from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY, LatentInput
 from ventbench.diagnosis.refinement import UnnamedEffect
-from ventbench.diagnosis.result import Slot
 from ventbench.diagnosis.screening import component_of
 from ventbench.physics.catalogue import mechanism
 from ventbench.physics.nonparametric import SLOTS
@@ -21,7 +21,7 @@ _MEANINGS = {
 }
 
 
-def slot(conclusion: Conclusion) -> Slot | None:
+def slot(conclusion: Conclusion) -> NonparametricTerm | None:
     """Slot of a conclusion, or None."""
     place = conclusion.place
     if place is None:
@@ -32,7 +32,7 @@ def slot(conclusion: Conclusion) -> Slot | None:
     assert place.element is not None
     x, y, x_unit, y_unit = _curve(conclusion.full, place.element)
     meaning = SLOTS[place.name].meaning
-    return Slot(place.name, meaning, explains, place.nats, x, x_unit, y, y_unit)
+    return NonparametricTerm(place.name, meaning, explains, place.nats, x, x_unit, y, y_unit)
 
 
 def _share(conclusion: Conclusion) -> float:
@@ -48,7 +48,7 @@ def _share(conclusion: Conclusion) -> float:
     return float(np.clip((before - after) / max(before - min(floor, after), 1e-9), 0.0, 1.0))
 
 
-def _moving(place: UnnamedEffect, source: LatentInput, explains: float) -> Slot:
+def _moving(place: UnnamedEffect, source: LatentInput, explains: float) -> NonparametricTerm:
     size = np.sqrt(np.mean(source.shape**2, axis=1))
     course = source.shape[int(np.argmax(size))]
     unit = "share of the flow, 1" if place.name == SUPPLY else "pressure, cmH2O"
@@ -56,7 +56,7 @@ def _moving(place: UnnamedEffect, source: LatentInput, explains: float) -> Slot:
     if source.periodic:
         meaning += f", {source.scale:.1f} times a second"
     x = np.arange(len(course), dtype=float)
-    return Slot(
+    return NonparametricTerm(
         place.name, meaning, explains, place.nats, x, "sample of the breath where it is largest",
         course, unit,
     )  # fmt: skip

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ventbench.diagnosis.result import Estimate
+from ventbench.mechanics.lung_match import Estimate
 from ventbench.mechanics.regression import GRID, Table, log_likelihood, solve, table
 from ventbench.mechanics.segments import Segment
 from ventbench.mechanics.select import FEWEST, GATE, splits

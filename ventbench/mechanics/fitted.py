@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.diagnosis.result import Estimate
+from ventbench.mechanics.lung_match import Estimate
 from ventbench.mechanics.regression import Solution, Table, effect
 from ventbench.mechanics.segments import Segment
 from ventbench.mechanics.select import Chosen

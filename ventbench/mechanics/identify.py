@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ventbench.diagnosis.result import Estimate, LungMatch
 from ventbench.errors import InputError
 from ventbench.lungs import Lung
 from ventbench.mechanics import labels
 from ventbench.mechanics.circuit import Circuit, behind, circuit
 from ventbench.mechanics.fitted import Fitted, Term
+from ventbench.mechanics.lung_match import Estimate, LungMatch
 from ventbench.mechanics.regression import GRID, Table, covariance, solve, table
 from ventbench.mechanics.segments import Segment, clipped, segments
 from ventbench.mechanics.select import FEWEST, Chosen, select

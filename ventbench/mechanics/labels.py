@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from ventbench.diagnosis.result import Estimate, LungMatch
 from ventbench.lungs import RECORDED_LUNGS, Lung
+from ventbench.mechanics.lung_match import Estimate, LungMatch
 from ventbench.system_id import Fit
 
 #: Factors by which R and C may differ from the label, beyond their intervals: what calibration of

@@ -15,7 +15,7 @@ import ventbench
 from ventbench import files, recordings
 from ventbench.diagnosis import simulators
 from ventbench.diagnosis.diagnose import diagnose
-from ventbench.diagnosis.distances import distance
+from ventbench.diagnosis.residual_analysis import open_loop_error
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.errors import InputError
 from ventbench.recordings.breaths import Breaths
@@ -134,7 +134,7 @@ def _run(
 
     # The PVP breathed for a test lung.
     found = diagnose(setting.breaths, plant=setting.plant, passive=True, progress=tell)
-    found = dataclasses.replace(found, plant=setting.called)
+    found = dataclasses.replace(found, simulator=setting.called)
     out.mkdir(parents=True, exist_ok=True)
     (out / DONE).unlink(missing_ok=True)
     written = keep(out, found)
@@ -169,5 +169,5 @@ def _by_names_alone(found: Diagnosis) -> float | None:
         held: Breaths = found.traces.breaths.select(found.traces.held_out)
         plants = {name: remove.by_names_alone(plant) for name, plant in found.plants.items()}
         inspiration = held.inspiratory & (held.time > 0)
-        error = distance(held.pressure, simulators.answers(plants, held), inspiration).mae
+        error = open_loop_error(held.pressure, simulators.answers(plants, held), inspiration).mae
     return float(error) if np.isfinite(error) else None

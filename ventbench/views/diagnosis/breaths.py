@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ventbench.diagnosis.result import Diagnosis, Traces
+from ventbench.diagnosis.findings import Traces
+from ventbench.diagnosis.result import Diagnosis
 from ventbench.views.diagnosis.chart import Chart, limits
 from ventbench.views.runs import Floats
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ventbench.diagnosis.locate import Profile, profiles
-from ventbench.diagnosis.result import Diagnosis, Request, Slot
+from ventbench.diagnosis.findings import BreathRequest, NonparametricTerm
+from ventbench.diagnosis.residual_analysis import Profile, profiles
+from ventbench.diagnosis.result import Diagnosis
 from ventbench.views.diagnosis.breaths import command
 from ventbench.views.diagnosis.chart import Chart, limits
 
@@ -19,7 +20,7 @@ def by_axis(found: Diagnosis) -> list[Chart]:
     inputs = (traces.breaths, traces.refit, traces.flow, traces.volume)
     refitted = profiles(*inputs)
     # Sorted by what the refitted one did, so that both are over the same samples.
-    corrected = profiles(*inputs, judged=traces.after)
+    corrected = profiles(*inputs, simulated=traces.after)
     return [_axis(found, a, b) for a, b in zip(refitted, corrected, strict=True)]
 
 
@@ -59,7 +60,7 @@ def _near(end: np.ndarray, mean: np.ndarray) -> np.ndarray:
     return np.clip(end, -reach, reach)
 
 
-def slot(shape: Slot) -> Chart:
+def slot(shape: NonparametricTerm) -> Chart:
     """The curve that a slot has taken."""
     chart = Chart(
         (float(shape.x.min()), float(shape.x.max())),
@@ -74,7 +75,7 @@ def slot(shape: Slot) -> Chart:
     return chart
 
 
-def request(wanted: Request) -> list[Chart]:
+def request(wanted: BreathRequest) -> list[Chart]:
     """The first breaths to record next."""
     charts = []
     for k in range(min(len(wanted.u_in), SHOWN)):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from ventbench.diagnosis import words
+from ventbench.diagnosis import report_text
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.errors import InputError
 from ventbench.views import style
@@ -49,7 +49,7 @@ def recording(found: Diagnosis) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "diagnosis.rrd")
         stream.save(file, default_blueprint=blueprint(found))
-        stream.send_recording_name(f"diagnosis of {plain(found.plant)}")
+        stream.send_recording_name(f"diagnosis of {plain(found.simulator)}")
         text = rr.TextDocument(markdown(found), media_type=rr.MediaType.MARKDOWN)
         stream.log(ABOUT, text, static=True)
         for lung, index in found.traces.breaths.by_lung_index.items():
@@ -67,8 +67,10 @@ def plain(text: str) -> str:
 
 def markdown(found: Diagnosis) -> str:
     """The text panel: the diagnosis in words, and what is seen."""
-    verdict, *others = (escape(plain(text)) for text in words.sentences(found))
-    places = [escape(words.location(place, found.noise[0])) for place in found.location[:5]]
+    verdict, *others = (escape(plain(text)) for text in report_text.sentences(found))
+    places = [
+        escape(report_text.error_region(place, found.noise[0])) for place in found.location[:5]
+    ]
     lines = [f"## {verdict}", "", *(f"{text}\n" for text in others)]
     if places:
         lines += ["## Where the refitted simulator errs", "", *(f"- {text}" for text in places), ""]

@@ -8,8 +8,9 @@ import jinja2
 import numpy as np
 
 import ventbench
-from ventbench.diagnosis import quantity, words
-from ventbench.diagnosis.result import Diagnosis, Distance, Named
+from ventbench.diagnosis import report_text
+from ventbench.diagnosis.findings import MissingMechanism, OpenLoopError
+from ventbench.diagnosis.result import Diagnosis
 from ventbench.physics import mechanism
 from ventbench.views import style
 from ventbench.views.diagnosis import breaths, figures
@@ -27,16 +28,16 @@ def html(found: Diagnosis) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    lead = [*map(words.named, found.mechanisms), words.effect(found)]
-    lead += [words.slot(found), words.distances(found)]
+    lead = [*map(report_text.missing_mechanism, found.mechanisms), report_text.effect(found)]
+    lead += [report_text.nonparametric_term(found), report_text.open_loop(found)]
     return environment.get_template("diagnosis.html.j2").render(
-        verdict=words.verdict(found),
+        verdict=report_text.verdict(found),
         lead=[text for text in lead if text],
-        plant=found.plant,
+        plant=found.simulator,
         light=style.RUN_COLORS,
         dark=style.RUN_COLORS_DARK,
         mechanisms=[_named(item) for item in found.mechanisms],
-        alternatives=words.alternatives(found),
+        alternatives=report_text.alternatives(found),
         bars=bars(found),
         groups=groups(found),
         corrected=found.verdict != "nothing_missing",
@@ -46,13 +47,13 @@ def html(found: Diagnosis) -> str:
         places=[_place(found, i) for i in range(min(len(found.location), PLACES))],
         more=max(len(found.location) - PLACES, 0),
         axes=figures.by_axis(found),
-        slot=found.slot,
-        slot_words=words.slot(found),
-        slot_chart=None if found.slot is None else figures.slot(found.slot),
+        slot=found.nonparametric,
+        slot_words=report_text.nonparametric_term(found),
+        slot_chart=None if found.nonparametric is None else figures.slot(found.nonparametric),
         request=found.request,
-        request_words=words.request(found),
+        request_words=report_text.request(found),
         request_charts=[] if found.request is None else figures.request(found.request),
-        lungs=[words.lung(match) for match in found.lungs],
+        lungs=[report_text.lung(match) for match in found.lungs],
         notes=found.notes,
         about=_about(found),
         version=ventbench.__version__,
@@ -93,13 +94,13 @@ def _stages(found: Diagnosis) -> list[tuple[str, str, str]]:
     return [x for x in breaths.STAGES if x[0] != "after" or found.verdict != "nothing_missing"]
 
 
-def _cell(distance: Distance | None) -> dict[str, str]:
+def _cell(distance: OpenLoopError | None) -> dict[str, str]:
     if distance is None:
         return {"rmse": "–", "mae": "–"}
     return {"rmse": _number(distance.rmse), "mae": _number(distance.mae)}
 
 
-def _named(item: Named) -> dict[str, Any]:
+def _named(item: MissingMechanism) -> dict[str, Any]:
     """A mechanism for the table."""
     about = mechanism(item.name).description
     meanings = {parameter.name: parameter.meaning for parameter in about.parameters}
@@ -112,7 +113,7 @@ def _named(item: Named) -> dict[str, Any]:
         "confidence": f"{100 * item.confidence:.0f} %",
         "alternatives": item.alternatives,
         "parameters": [
-            (meanings.get(key, key), quantity.quantity(value, f"{item.name}.{key}"))
+            (meanings.get(key, key), report_text.quantity(value, f"{item.name}.{key}"))
             for key, value in item.parameters.items()
         ],
     }
@@ -121,9 +122,9 @@ def _named(item: Named) -> dict[str, Any]:
 def _place(found: Diagnosis, index: int) -> dict[str, str]:
     place = found.location[index]
     return {
-        "text": words.location(place, found.noise[0]),
+        "text": report_text.error_region(place, found.noise[0]),
         "share": f"{100 * place.share:.0f} %",
-        "p": quantity.probability(place.p_value),
+        "p": report_text.probability(place.p_value),
     }
 
 
@@ -133,7 +134,7 @@ def _about(found: Diagnosis) -> list[tuple[str, str]]:
     sd, correlation = found.noise
     rows = [
         ("ventbench", ventbench.__version__),
-        ("simulator", found.plant),
+        ("simulator", found.simulator),
         ("recording", recorded.source or "in memory"),
         ("its SHA-256", recorded.sha256 or ""),
         ("breaths", f"{len(recorded)}, of which {held} were held out of every fit"),

@@ -6,9 +6,10 @@ import dataclasses
 
 import pytest
 
-from ventbench.diagnosis import words
-from ventbench.diagnosis.quantity import probability, quantity
-from ventbench.diagnosis.result import Distance, Estimate, Named, Place
+from ventbench.diagnosis import report_text
+from ventbench.diagnosis.findings import ErrorRegion, MissingMechanism, OpenLoopError
+from ventbench.diagnosis.report_text import probability, quantity
+from ventbench.mechanics.lung_match import Estimate
 from ventbench.physics import library, parameter
 
 from . import made
@@ -38,10 +39,10 @@ def test_every_mechanism_has_a_sentence():
     for name, item in library().items():
         known = item.description.parameters
         values = {p.name: Estimate(p.strong, p.unit, (p.mild, p.high)) for p in known}
-        text = words.named(Named(name, values, 0.8, (), 10.0))
-        assert item.description.title in text
+        text = report_text.missing_mechanism(MissingMechanism(name, values, 0.8, (), 10.0))
+        assert item.description.title in text.lower()
         assert text.count("[") == len(known)
-        assert text.endswith("Confidence in the name: 80 %.")
+        assert text.endswith("Confidence in this mechanism: 80 %.")
         for p in known[1:]:
             assert p.meaning in text
     assert parameter("valve_delay.delay").meaning == "dead time"
@@ -49,54 +50,57 @@ def test_every_mechanism_has_a_sentence():
 
 def test_a_named_mechanism():
     found = made.diagnosis(12)
-    said = words.sentences(found)
+    said = report_text.sentences(found)
     assert said[0] == (
         "Missing in the physics simulator: dead time of the inspiratory valve (valve_delay)."
     )
-    assert said[1].startswith(
-        "The recording needs 41 ms [38, 44] of dead time of the inspiratory valve."
-    )
+    assert said[1].startswith("Dead time of the inspiratory valve: 41 ms [38, 44]. Confidence")
     assert "This recording cannot tell valve_delay from valve_lag." in said
+    assert any(text.startswith("The lung does not match its label R20C50: R 22.1") for text in said)
     assert any(
-        text.startswith("The lung is not what its label R20C50 says: the recording fits R 22.1")
-        for text in said
-    )
-    assert any(
-        text.startswith("Record next: 3 breaths of random pulses of the valve. That tells "
-        "valve_delay and valve_lag apart")
+        text.startswith("Record next: 3 breaths of random pulses of the valve. These breaths "
+        "distinguish between valve_delay and valve_lag (expected evidence 64 nats; 5 decide).")
         for text in said
     )  # fmt: skip
     assert said[-1] == found.notes[0]
     changed = dataclasses.replace(found.mechanisms[0], changed=True)
-    assert "needs another: dead time of the inspiratory valve: 41 ms" in words.named(changed)
-    both = dataclasses.replace(changed, had={"delay": 0.0123})
-    assert "inspiratory valve: 41 ms [38, 44] instead of 12 ms" in words.named(both)
+    assert (
+        "valve, which the simulator has with another strength: 41 ms [38, 44]. "
+        in report_text.missing_mechanism(changed)
+    )
+    both = dataclasses.replace(changed, simulator_values={"delay": 0.0123})
+    assert (
+        "inspiratory valve: 41 ms [38, 44] instead of 12 ms in the simulator."
+        in report_text.missing_mechanism(both)
+    )
 
 
 def test_the_effect_of_what_is_missing():
     found = made.diagnosis(12)
-    start = Place("time since inspiration", 0.0, 0.2, "s", -2.13, 0.001, 0.6)
-    other = Place("volume", 0.0, 50.0, "mL", 1.0, 0.001, 0.9)
+    start = ErrorRegion("time since inspiration", 0.0, 0.2, "s", -2.13, 0.001, 0.6)
+    other = ErrorRegion("volume", 0.0, 50.0, "mL", 1.0, 0.001, 0.9)
     one = dataclasses.replace(found, location=(other, start))
-    assert words.effect(one) == (
+    assert report_text.effect(one) == (
         "Without it the simulated pressure is 2.1 cmH2O too high in the first 0.2 s of each "
         "breath, even with R and C refitted."
     )
     two = dataclasses.replace(one, mechanisms=one.mechanisms * 2)
-    assert words.effect(two).startswith("Without them ")
-    assert words.effect(dataclasses.replace(found, location=())) == ""
+    assert report_text.effect(two).startswith("Without them ")
+    assert report_text.effect(dataclasses.replace(found, location=())) == ""
 
 
 def test_a_simulator_that_is_left_as_it_is_was_not_refitted():
     found = made.unnamed(12)
-    assert words.effect(found).startswith("With R and C refitted, ")
+    assert report_text.effect(found).startswith("With R and C refitted, ")
     loop = found.open_loop
     same = dataclasses.replace(loop, refit=loop.before, after=loop.before)
-    left = dataclasses.replace(found, open_loop=same, slot=None)
-    assert words.effect(left).startswith("The simulated pressure is ")
-    assert f"{loop.before.rmse:.2f} as given, noise" in words.distances(left)
+    left = dataclasses.replace(found, open_loop=same, nonparametric=None)
+    assert report_text.effect(left).startswith("The simulated pressure is ")
+    assert f"{loop.before.rmse:.2f} cmH2O as given; measurement noise" in report_text.open_loop(
+        left
+    )
     nothing = dataclasses.replace(left, verdict="nothing_missing")
-    assert words.verdict(nothing) == (
+    assert report_text.verdict(nothing) == (
         "Nothing is missing: the physics simulator explains the recording."
     )
 
@@ -114,46 +118,54 @@ def test_a_simulator_that_is_left_as_it_is_was_not_refitted():
 )
 def test_places(place, text):
     axis, low, high, unit = place
-    sentence = words.location(Place(axis, low, high, unit, 0.52, 0.01, 0.5), 0.2)
+    sentence = report_text.error_region(ErrorRegion(axis, low, high, unit, 0.52, 0.01, 0.5), 0.2)
     assert sentence.startswith(f"The simulated pressure is 0.52 cmH2O too low {text}")
-    square = words.location(Place(axis, low, high, unit, 0.01, 0.01, 0.5), 0.2)
-    assert f"errors whose sign changes from breath to breath {text}" in square
+    square = report_text.error_region(ErrorRegion(axis, low, high, unit, 0.01, 0.01, 0.5), 0.2)
+    assert square.startswith(f"The simulated pressure is off {text}")
+    assert square.endswith(", by errors whose sign changes from breath to breath.")
 
 
 def test_other_verdicts():
-    said = words.sentences(made.unnamed(12))
-    assert said[0].endswith("no name for; it acts as resistance of the airway, R(V).")
+    said = report_text.sentences(made.unnamed(12))
+    assert said[0].endswith(
+        "that is not in the library of mechanisms; its place in the model is R(V) (resistance of "
+        "the airway)."
+    )
     assert any("83 % of the squared error above the noise" in text for text in said)
     nothing = made.nothing(12)
-    said = words.sentences(nothing)
+    said = report_text.sentences(nothing)
     assert said[0].startswith("Nothing is missing")
     assert not any("corrected" in text for text in said)
-    both = dataclasses.replace(made.diagnosis(12), slot=made.unnamed(12).slot)
-    assert words.verdict(both).endswith("; something without a name is missing too.")
-    assert words.slot(both).startswith("What remains acts as resistance of the airway, R(V)")
-    slot = made.unnamed(12).slot
-    assert slot is not None
-    any_curve = dataclasses.replace(slot, name="f(V)", meaning="f(V): any recoil of the lung")
-    text = words.verdict(dataclasses.replace(made.unnamed(12), slot=any_curve))
-    assert text.endswith("it acts as a recoil of the lung, f(V).")
+    both = dataclasses.replace(made.diagnosis(12), nonparametric=made.unnamed(12).nonparametric)
+    assert report_text.verdict(both).endswith(
+        "; an effect that is not in the library is missing too."
+    )
+    assert report_text.nonparametric_term(both).startswith(
+        "Beside these mechanisms, a free function at R(V) (resistance of the airway) explains 83 %"
+    )
+    term = made.unnamed(12).nonparametric
+    assert term is not None
+    named = dataclasses.replace(term, name="f(V)", meaning="f(V): the recoil of the lung")
+    text = report_text.verdict(dataclasses.replace(made.unnamed(12), nonparametric=named))
+    assert text.endswith("its place in the model is f(V) (the recoil of the lung).")
 
 
 def test_distances_and_a_lung_that_matches():
     found = made.diagnosis(12)
     distances = dataclasses.replace(
         found.open_loop,
-        before=Distance(1.0, 1.24),
-        refit=Distance(0.5, 0.62),
-        after=Distance(0.2, 0.22),
+        before=OpenLoopError(1.0, 1.24),
+        refit=OpenLoopError(0.5, 0.62),
+        after=OpenLoopError(0.2, 0.22),
         noise_floor=0.21,
         held_out_breaths=tuple(range(20)),
     )
-    assert words.distances(dataclasses.replace(found, open_loop=distances)) == (
-        "Open-loop error on 20 held-out breaths (root mean square): 1.24 as given, 0.62 refitted, "
-        "0.22 corrected, noise 0.21 cmH2O."
+    assert report_text.open_loop(dataclasses.replace(found, open_loop=distances)) == (
+        "Root-mean-square open-loop error on 20 held-out breaths: 1.24 cmH2O as given, 0.62 with "
+        "R and C refitted, 0.22 corrected; measurement noise 0.21."
     )
     match = dataclasses.replace(found.lungs[0], label_matches=True, source="pressure and flow")
-    assert words.lung(match) == (
+    assert report_text.lung(match) == (
         "The lung matches its label R20C50: R 22.1 cmH2O s/L [21.8, 22.4] and "
         "C 47.4 mL/cmH2O [47.0, 47.8], from pressure and flow."
     )

@@ -1,4 +1,4 @@
-"""What an error is looked at along: phase, command, edges, pressure, flow, volume, time, lung."""
+"""Quantities along which errors are analysed: phase, command, pressure and others."""
 
 from __future__ import annotations
 
@@ -12,30 +12,36 @@ from ventbench.recordings.breaths import Breaths
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-#: Width of the bins of time in a phase, s.
+#: Width of the ranges of time in a phase, s.
 PHASE_STEP = 0.1
 
-#: Ends of the bins of the command, %, and of the time since an edge, s.
+#: Ends of the ranges of the command, %, and of the time since an edge, s.
 OPENINGS = (0.0, 1.0, 2.0, 3.0, 5.0, 7.5, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0, 100.0)
 SINCE_EDGE = (0.0, 0.035, 0.07, 0.105, 0.15, 0.2, 0.3, 0.5, 1.0, 3.0)
 
 #: A change of the command by more than this is an edge, % (percentage points).
 EDGE = 5.0
 
-#: About how many bins flow, volume and pressure get, and parts of the recording.
-BINS, PARTS = 10, 5
+#: About how many ranges pressure, flow and volume get.
+RANGES = 10
+
+#: Parts that a recording is divided into by the number of the breath.
+PARTS = 5
+
+#: Share of the extreme values at either end that the ranges of a quantity need not hold.
+_EXTREME = 0.005
 
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """k neighbouring ranges of one quantity, and the range that each sample lies in.
+    """k neighbouring ranges of one quantity, and the range in which each sample lies.
 
     Attributes:
-        name: such as ``time since inspiration``.
+        name: of the quantity, such as ``time since inspiration``.
         unit: of ``edges``.
         edges: ends of the ranges, ``(k + 1,)``.
-        bins: range of each sample, -1 for none, ``(n, T)``.
-        merge: whether neighbouring ranges may become one.
+        bins: index of the range of each sample, -1 for none, ``(n, T)``.
+        merge: whether neighbouring ranges may be merged.
     """
 
     name: str
@@ -54,9 +60,9 @@ def axes(
 ) -> tuple[Axis, ...]:
     """All axes of a recording.
 
-    A sample belongs to the phase, command and edge that acted before it, since those made it.
-    Pressure, flow and volume are the simulator's: sorted by the recorded ones, noise alone would
-    have a mean error at either end.
+    A sample is assigned to the phase, command and edge that acted before it, because these caused
+    it. Pressure, flow and volume are those of the simulator: sorted by the recorded values, noise
+    alone would have a mean error in the outermost ranges.
 
     Args:
         breaths: n breaths of T samples.
@@ -71,24 +77,27 @@ def axes(
         (breaths.u_out == 1) & (breaths.time >= start) & breaths.valid, breaths.time, np.inf
     ).min(axis=1, keepdims=True)
     # A breath without the phase has no time in it.
-    start, opened = (np.where(np.isfinite(x), x, np.nan) for x in (start, opened))
+    start, opened = (np.where(np.isfinite(time), time, np.nan) for time in (start, opened))
     u_in = before(breaths.u_in)
-    found = [
+    all_axes = [
         _phase("time since inspiration", breaths.time - start, acted & breaths.valid),
         _phase("time since expiration", breaths.time - opened, ~acted & breaths.valid),
         _axis("valve opening", "%", np.array(OPENINGS), u_in, acted),
         _axis("time since a valve edge", "s", np.array(SINCE_EDGE), since_edge(breaths)),
-        _axis("pressure", "cmH2O", nice(pressure, breaths.valid), pressure),
+        _axis("pressure", "cmH2O", round_edges(pressure, breaths.valid), pressure),
     ]
     if flow is not None:
-        found.append(_axis("flow", "mL/s", nice(flow, breaths.valid), flow))
+        all_axes.append(_axis("flow", "mL/s", round_edges(flow, breaths.valid), flow))
     if volume is not None:
-        found.append(_axis("volume", "mL", nice(volume, breaths.valid), volume))
-    return (*found, *_parts(breaths), *_lungs(breaths))
+        all_axes.append(_axis("volume", "mL", round_edges(volume, breaths.valid), volume))
+    return (*all_axes, *_parts(breaths), *_lungs(breaths))
 
 
 def before(values: NDArray) -> NDArray:
-    """What acted on each sample: the value of the one before; the first has its own, ``(n, T)``."""
+    """Value that acted on each sample: that of the sample before, ``(n, T)``.
+
+    The first sample has its own value.
+    """
     return np.concatenate([values[:, :1], values[:, :-1]], axis=1)
 
 
@@ -103,13 +112,13 @@ def since_edge(breaths: Breaths) -> Floats:
     return np.where(np.isfinite(earlier), breaths.time - earlier, np.nan)
 
 
-def nice(values: Floats, valid: NDArray[np.bool_]) -> Floats:
-    """Ends of about :data:`BINS` ranges at round numbers that hold all but the outermost values."""
+def round_edges(values: Floats, valid: NDArray[np.bool_]) -> Floats:
+    """Ends of about :data:`RANGES` ranges at round numbers, without the most extreme values."""
     inside = values[valid & np.isfinite(values)]
     if inside.size == 0:
         return np.array([0.0, 1.0])
-    low, high = np.quantile(inside, [0.005, 0.995])
-    wanted = max((high - low) / BINS, 1e-6)
+    low, high = np.quantile(inside, [_EXTREME, 1.0 - _EXTREME])
+    wanted = max((high - low) / RANGES, 1e-6)
     scale = 10.0 ** np.floor(np.log10(wanted))
     step = scale * next(x for x in (1.0, 2.0, 5.0, 10.0) if x * scale >= 0.999 * wanted)
     first, last = np.floor(low / step), max(np.ceil(high / step), np.floor(low / step) + 1)
@@ -119,8 +128,8 @@ def nice(values: Floats, valid: NDArray[np.bool_]) -> Floats:
 def _axis(
     name: str, unit: str, edges: Floats, values: Floats, inside: NDArray[np.bool_] | bool = True
 ) -> Axis:
-    """Sort values into ranges; what lies beyond the ends is in none."""
-    # A sum of times is a hair off what it should be.
+    """Sort values into ranges; a value beyond the ends is in none."""
+    # Sums of times carry rounding errors.
     bins = np.searchsorted(edges, values + 1e-9, side="right") - 1
     with np.errstate(invalid="ignore"):
         bins[np.abs(values - edges[-1]) < 1e-6] = len(edges) - 2
@@ -135,7 +144,7 @@ def _phase(name: str, time: Floats, inside: NDArray[np.bool_]) -> Axis:
 
 
 def _parts(breaths: Breaths) -> list[Axis]:
-    """Fifths of the recording, by the number of the breath, from 1."""
+    """Parts of the recording by the number of the breath."""
     n, count = len(breaths), min(PARTS, len(breaths))
     cuts = np.round(np.linspace(0, n, count + 1))
     number = np.repeat(np.arange(n)[:, None], breaths.time.shape[1], axis=1)
@@ -144,13 +153,13 @@ def _parts(breaths: Breaths) -> list[Axis]:
 
 
 def _lungs(breaths: Breaths) -> list[Axis]:
-    """Each lung of several, over the whole breath."""
+    """One axis for each lung if there are several, over the whole breath."""
     if len(breaths.by_lung_index) < 2:
         return []
     end = float(np.max(breaths.time, initial=0.0, where=breaths.valid))
-    found = []
+    lungs = []
     for name in breaths.by_lung_index:
         inside = (breaths.lung_ids == name)[:, None] & breaths.valid
         bins = np.where(inside, 0, -1)
-        found.append(Axis(f"lung {name}", "s", np.array([0.0, end]), bins, merge=False))
-    return found
+        lungs.append(Axis(f"lung {name}", "s", np.array([0.0, end]), bins, merge=False))
+    return lungs

@@ -8,7 +8,8 @@ import json
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.result import Distance, Estimate
+from ventbench.diagnosis.findings import OpenLoopError
+from ventbench.mechanics.lung_match import Estimate
 
 from . import made
 
@@ -61,7 +62,9 @@ def test_what_is_not_finite_becomes_null_and_numpy_numbers_are_numbers():
         nats=np.float32(2.5),
         changed=np.bool_(True),
     )
-    distances = dataclasses.replace(found.open_loop, noise_floor=nan, before=Distance(nan, 1.0))
+    distances = dataclasses.replace(
+        found.open_loop, noise_floor=nan, before=OpenLoopError(nan, 1.0)
+    )
     found = dataclasses.replace(found, mechanisms=(named,), open_loop=distances, lungs=())
     plain = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     assert plain["mechanisms"][0]["parameters"]["delay"]["ci95"] == [None, None]

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.next_breath import Rig, families, request
-from ventbench.diagnosis.next_breath.information import contrast, forecast
+from ventbench.diagnosis.candidate_breaths import Rig, families
+from ventbench.diagnosis.experiment_design import contrast, forecast, request_breaths
 from ventbench.physics import paths
 from ventbench.system_id import Data, Noise, Simulator, fit, settings
 
@@ -73,7 +73,7 @@ def expected(truth, other, u_in, u_out):
 
 def test_pulses_tell_a_lag_from_a_delay():
     lag, delay = both({"valve_lag.tau": 0.04}, "valve_lag", "valve_delay")
-    found = request(lag, [delay])
+    found = request_breaths(lag, [delay])
     assert found is not None
     assert "pulse" in found.title
     assert found.title.endswith("(lung R20C20)")
@@ -87,7 +87,7 @@ def test_pulses_tell_a_lag_from_a_delay():
 
 def test_a_hold_tells_a_leak_from_creep():
     leak, creep = both({"leak.conductance": 3.0}, "leak", "viscoelasticity")
-    found = request(leak, [creep])
+    found = request_breaths(leak, [creep])
     assert found is not None
     assert "hold" in found.title
     held = (found.u_in == 0) & (found.u_out == 0)
@@ -102,7 +102,7 @@ def test_what_is_asked_for_is_safe_also_with_another_lung():
     data = recorded(stiff)
     one = fit(data, ["nonlinear_compliance", "valve_delay"], noise=NOISE)
     two = fit(data, ["nonlinear_compliance", "valve_lag"], noise=NOISE)
-    found = request(one, [two])
+    found = request_breaths(one, [two])
     assert found is not None
     assert found.why == ("valve_delay", "valve_lag")
     seen = simulated(found.u_in, found.u_out, stiff).seen
@@ -112,9 +112,9 @@ def test_what_is_asked_for_is_safe_also_with_another_lung():
 
 def test_nothing_to_ask():
     plain, _ = both({}, "valve_lag", "valve_delay")
-    assert request(plain, []) is None
+    assert request_breaths(plain, []) is None
     # The same hypothesis twice: no breath tells it from itself.
-    assert request(plain, [plain]) is None
+    assert request_breaths(plain, [plain]) is None
 
 
 def test_commands_of_all_kinds_are_possible():
@@ -139,7 +139,7 @@ def test_nats_against_new_recordings():
     gains, foretold = [], []
     for seed in range(4):
         leak, band = both({"leak.conductance": 2.0}, "leak", "valve_dead_band", seed=seed)
-        found = request(leak, [band])
+        found = request_breaths(leak, [band])
         assert found is not None
         # The rig is what the fit says: what the fit does not know is not to be tested here.
         truth = {path: leak.column(path)[0] for path in ("leak.conductance", "R_ex", "PEEP")}

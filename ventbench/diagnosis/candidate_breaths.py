@@ -1,4 +1,4 @@
-"""Breaths that could be recorded: commands that stress one part of the physics each."""
+"""Breaths that could be recorded next: each family of commands stresses one part of the physics."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-#: Breaths of a family, which differ in size or in seed.
+#: Breaths in a family; they differ in size or in seed.
 VARIANTS = 5
 
 #: Ends of inspiration, s: of most families; of fast inflations; of slow ones.
@@ -19,19 +19,19 @@ _INSPIRED, _FAST, _SLOW = 1.0, 0.35, 1.5
 #: Length of a hold with both valves shut, s, and of the shutters of an interrupted expiration.
 _HOLD, _SHUTTER = 2.0, 0.16
 
-#: Most that may be asked of the inspiratory valve, %.
-_MOST = 100.0
+#: Largest command of the inspiratory valve, %.
+_LARGEST = 100.0
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Lung and valve, roughly: only the size of the commands depends on them.
+    """Rough values of lung and valve; only the size of the commands depends on them.
 
     Attributes:
-        R: cmH2O s/L.
-        C: mL/cmH2O.
+        R: resistance, cmH2O s/L.
+        C: compliance, mL/cmH2O.
         gain: of the inspiratory valve, mL/s per %.
-        peep: cmH2O.
+        peep: expiratory pressure, cmH2O.
     """
 
     R: float
@@ -42,13 +42,13 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """Breaths of one kind.
+    """k breaths of one kind.
 
     Attributes:
         name: short.
         title: what to do on the rig, in words.
-        u_in: %, ``(k, T)``.
-        u_out: 0/1, ``(k, T)``.
+        u_in: commands of the inspiratory valve, %, ``(k, T)``.
+        u_out: commands of the expiratory valve, 0/1, ``(k, T)``.
     """
 
     name: str
@@ -57,33 +57,34 @@ class Family:
     u_out: Floats
 
     def scaled(self, by: Floats) -> Family:
-        """The same with inspirations ``by`` times as strong, ``(k,)``."""
+        """Return the family with each inspiration scaled by a factor, ``(k,)``."""
         return Family(self.name, self.title, self.u_in * by[:, None], self.u_out)
 
     def select(self, which: NDArray[np.bool_]) -> Family:
-        """Some of the breaths, by mask ``(k,)``."""
+        """Return some of the breaths, by mask ``(k,)``."""
         return Family(self.name, self.title, self.u_in[which], self.u_out[which])
 
 
 def families(rig: Rig, samples: int, dt: float) -> tuple[Family, ...]:
-    """All kinds of breath, sized so that a plain R-C lung stays at or below 35 cmH2O.
+    """Make all families, sized so that an R-C lung stays at or below 35 cmH2O.
 
     Args:
-        rig: that they are meant for.
-        samples: of a breath.
-        dt: between samples, s.
+        rig: lung and valve that the breaths are for.
+        samples: number of samples of a breath.
+        dt: time between samples, s.
     """
     t = np.arange(samples, dtype=np.float64) * dt
-    made = [Family(name, title, *_sized(rig, dt, *shape(rig, t))) for name, title, shape in _KINDS]
-    return tuple(made)
+    return tuple(
+        Family(name, title, *_sized(rig, dt, *shape(rig, t))) for name, title, shape in _KINDS
+    )
 
 
 def _sized(rig: Rig, dt: float, u: Floats, out: Floats, peaks: Floats) -> tuple[Floats, Floats]:
-    """Scale inspirations to the peaks, cmH2O, that a plain R-C lung would reach."""
+    """Scale inspirations to the peak pressures, cmH2O, that an R-C lung would reach."""
     flow = rig.gain * u
     rise = np.cumsum(flow, axis=1) * dt / rig.C + rig.R * flow / 1000.0
     wanted = np.maximum(peaks - rig.peep, 2.0)
-    return np.clip(u * (wanted / rise.max(axis=1))[:, None], 0.0, _MOST), out
+    return np.clip(u * (wanted / rise.max(axis=1))[:, None], 0.0, _LARGEST), out
 
 
 def _rows(t: Floats) -> Floats:
@@ -145,7 +146,7 @@ def _long_expiration(rig: Rig, t: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _shutters(rig: Rig, t: Floats) -> tuple[Floats, Floats, Floats]:
-    """Expiratory valve open and shut in turn, at another pace in each breath."""
+    """Open and shut the expiratory valve in turn, at another pace in each breath."""
     u = (_rows(t) < _FAST).astype(float)
     pace = _SHUTTER * np.linspace(0.7, 1.6, VARIANTS)[:, None]
     late = _rows(t) - _FAST

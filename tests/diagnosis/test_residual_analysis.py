@@ -1,4 +1,4 @@
-"""Where errors are: found in the right range, and by chance no more often than promised."""
+"""Errors by hand; where they lie: in the right range, and by chance as rarely as promised."""
 
 from __future__ import annotations
 
@@ -7,10 +7,20 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis import significance
-from ventbench.diagnosis.axes import axes, before, nice, since_edge
-from ventbench.diagnosis.locate import MATERIAL, locate, profiles
+from ventbench.diagnosis.residual_analysis import (
+    MATERIAL,
+    compare_open_loop,
+    locate,
+    open_loop_error,
+    p_values,
+    profiles,
+    statistic,
+)
+from ventbench.diagnosis.residual_axes import axes, before, round_edges, since_edge
+from ventbench.recordings import join
 from ventbench.recordings.breaths import Breaths
+
+from . import made
 
 SD = 0.2
 
@@ -151,7 +161,7 @@ def test_p_values_against_all_flips_of_few_breaths():
     largest = np.abs(signs @ values / scale).max(axis=1)
     seen = np.abs(values.sum(axis=0) / scale)
     exact_p = (largest[:, None] >= seen - 1e-12).mean(axis=0)
-    found = significance.p_values(values, two_sided=True, seed=0)
+    found = p_values(values, two_sided=True, seed=0)
     np.testing.assert_allclose(found, exact_p, atol=0.03)
 
 
@@ -159,10 +169,10 @@ def test_the_statistic_rises_with_students_t():
     rng = np.random.default_rng(2)
     values = rng.standard_normal((12, 50)) + rng.standard_normal(50)
     t = values.mean(axis=0) / (values.std(axis=0, ddof=1) / np.sqrt(12))
-    z = significance.statistic(values)
+    z = statistic(values)
     np.testing.assert_allclose(t, z * np.sqrt(11.0) / np.sqrt(12.0 - z**2))
     values[:8, 0] = np.nan
-    assert significance.statistic(values)[0] == 0.0, "four breaths are too few"
+    assert statistic(values)[0] == 0.0, "four breaths are too few"
 
 
 def test_samples_are_sorted_by_what_acted_before_them():
@@ -196,17 +206,92 @@ def test_time_since_an_edge():
 
 def test_ranges_end_at_round_numbers():
     values = np.linspace(3.0, 41.0, 500)[None]
-    np.testing.assert_allclose(nice(values, np.ones((1, 500), bool)), np.arange(0.0, 46.0, 5.0))
-    assert len(nice(np.full((1, 9), 5.0), np.ones((1, 9), bool))) >= 2
-    assert len(nice(np.full((1, 9), np.nan), np.ones((1, 9), bool))) == 2
+    np.testing.assert_allclose(
+        round_edges(values, np.ones((1, 500), bool)), np.arange(0.0, 46.0, 5.0)
+    )
+    assert len(round_edges(np.full((1, 9), 5.0), np.ones((1, 9), bool))) >= 2
+    assert len(round_edges(np.full((1, 9), np.nan), np.ones((1, 9), bool))) == 2
 
 
 def test_profiles_judge_one_simulator_along_the_ranges_of_another():
     recorded, pressure, flow, volume = exact(14)
     judged = pressure - 0.5 * (recorded.time < 0.2)
     for mine, wanted in ((None, 0.0), (judged, 0.5)):
-        found = profiles(recorded, pressure, flow, volume, judged=mine)
+        found = profiles(recorded, pressure, flow, volume, simulated=mine)
         (start,) = [p for p in found if p.axis.name == "time since inspiration"]
         np.testing.assert_allclose(start.mean[:2], wanted, atol=1e-9)
         np.testing.assert_allclose(start.mean[2:10], 0.0, atol=1e-9)
         assert start.breaths[:10].tolist() == [60] * 10
+
+
+def test_of_some_samples():
+    recorded = np.array([[1.0, 2.0, np.nan, 4.0], [0.0, 0.0, 0.0, 0.0]])
+    simulated = np.array([[1.0, 5.0, 7.0, 8.0], [9.0, 9.0, np.nan, 9.0]])
+    mask = np.array([[True, True, True, True], [False] * 4])
+    found = open_loop_error(recorded, simulated, mask)
+    assert found.mae == pytest.approx((0.0 + 3.0 + 4.0) / 3)
+    assert found.rmse == pytest.approx(np.sqrt((9.0 + 16.0) / 3))
+    nothing = open_loop_error(recorded, simulated, ~mask & (np.arange(4) == 2))
+    assert np.isnan(nothing.mae)
+    assert np.isnan(nothing.rmse)
+
+
+@pytest.fixture
+def breaths():
+    other = made.breaths("R5C10", n=4, seed=3)
+    return join([made.breaths(n=4), dataclasses.replace(other, breath_id=other.breath_id + 100)])
+
+
+def answers(breaths):
+    """Off by a number in inspiration and by twice as much after it."""
+    off = np.where(breaths.u_out == 1, 2.0, 1.0)
+    return {name: breaths.pressure + k * off for name, k in
+            (("before", 3.0), ("refit", 2.0), ("after", 1.0))}  # fmt: skip
+
+
+def test_only_inspiration_of_held_out_breaths_counts(breaths):
+    held = np.arange(8) % 4 == 1
+    given = answers(breaths)
+    for x in given.values():
+        x[~held] += 100.0
+        x[:, 0] += 100.0  # where every simulation starts
+    found = compare_open_loop(breaths, held, given, 0.2)
+    assert found.held_out_breaths == (2, 102)
+    assert (found.before.mae, found.before.rmse) == pytest.approx((3.0, 3.0))
+    assert (found.refit.mae, found.after.rmse) == pytest.approx((2.0, 1.0))
+    assert found.noise_floor == 0.2
+    assert found.groups["expiration"]["refit"].mae == pytest.approx(4.0)
+
+
+def test_parts_of_the_breath_and_lungs(breaths):
+    held = np.ones(8, bool)
+    given = answers(breaths)
+    early = breaths.time <= 0.2
+    given["after"][early] += 4.0
+    given["before"][breaths.lung_ids == "R5C10"] += 5.0
+    found = compare_open_loop(breaths, held, given, 0.2)
+    assert list(found.groups) == [
+        "first 0.2 s of inspiration", "rest of inspiration", "expiration", "lung R5C10",
+        "lung R20C50",
+    ]  # fmt: skip
+    assert found.groups["first 0.2 s of inspiration"]["after"].mae == pytest.approx(5.0)
+    assert found.groups["rest of inspiration"]["after"].mae == pytest.approx(1.0)
+    assert found.groups["lung R5C10"]["before"].mae == pytest.approx(8.0)
+    assert found.groups["lung R20C50"]["before"].mae == pytest.approx(3.0)
+    # Parts together are the whole.
+    inside = breaths.inspiratory & (breaths.time > 0)
+    error = (given["after"] - breaths.pressure)[inside]
+    assert found.after.rmse == pytest.approx(np.sqrt(np.mean(error**2)))
+
+
+def test_one_lung_is_no_part_and_gaps_do_not_count(breaths):
+    one = breaths.select(np.arange(4))
+    pressure = one.pressure.copy()
+    pressure[:, 10:15] = np.nan
+    given = answers(one)
+    given["after"][2] = np.nan
+    given["after"][:, 10:15] = 1e6
+    holes = dataclasses.replace(one, pressure=pressure)
+    found = compare_open_loop(holes, np.ones(4, bool), given, 0.2)
+    assert not [name for name in found.groups if name.startswith("lung")]
+    assert found.after.mae == pytest.approx(1.0)

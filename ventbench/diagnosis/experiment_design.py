@@ -1,0 +1,356 @@
+"""Choice of the breaths to record next: those that distinguish best between hypotheses.
+
+What new breaths would say of two hypotheses is computed by linear theory around both fits, in nats
+of log-likelihood ratio. Only breaths that are safe under all hypotheses are proposed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.diagnosis.candidate_breaths import Family, Rig, families
+from ventbench.diagnosis.findings import BreathRequest
+from ventbench.lungs import Lung
+from ventbench.physics.catalogue import parameter, strength_path
+from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.derivatives import START, Simulator
+from ventbench.system_id.least_squares import Minimum
+from ventbench.system_id.noise import Noise
+from ventbench.system_id.problem import Problem
+from ventbench.system_id.unknowns import described
+
+#: Pressures, cmH2O, that every hypothesis must predict for a breath: 0 to 50, with allowance for
+#: the noise of the starting pressure.
+SAFE = (-1.0, 50.0)
+
+#: Nats below which new breaths would not distinguish the hypotheses.
+LEAST = 1.0
+
+#: Factor by which a breath that is not safe is weakened, and how often that is tried.
+_WEAKER, _TRIES = 0.75, 3
+
+#: Share of the diagonal that keeps a Hessian invertible where data say nothing.
+_RIDGE = 1e-9
+
+#: Iterations of a refit with the weights of robust noise.
+_REFITS = 4
+
+
+class FittedHypothesis(Protocol):
+    """A hypothesis at its optimum: a fit, or anything with its problem and its minimum."""
+
+    @property
+    def problem(self) -> Problem:
+        """Problem of the breaths recorded so far."""
+        ...
+
+    @property
+    def minimum(self) -> Minimum:
+        """Minimum of the cost."""
+        ...
+
+
+def request_breaths(
+    chosen: FittedHypothesis,
+    alternatives: Sequence[FittedHypothesis],
+    *,
+    noise: Noise | None = None,
+    breaths: int = 5,
+) -> BreathRequest | None:
+    """Find the breaths to record next.
+
+    The value of a family of breaths, or of a mix of two, is the log-likelihood that is expected to
+    be lost if one hypothesis is true and another is refitted to recorded and new breaths together.
+    It is computed both ways for each alternative, and the smallest counts.
+
+    Args:
+        chosen: the best hypothesis, on the recorded breaths.
+        alternatives: hypotheses to distinguish it from.
+        noise: of the measurement; that of ``chosen`` if not given.
+        breaths: number of breaths to record.
+
+    Returns:
+        Commands with what to do in words, or None if no safe breaths would distinguish them.
+    """
+    if not alternatives:
+        return None
+    noise, data = noise or chosen.problem.noise, chosen.problem.data
+    best: _Design | None = None
+    for label in np.unique(data.lung):
+        here = np.flatnonzero((data.lung == label) & (data.weight[:, 0].any(axis=1)))
+        if not here.size:
+            continue
+        design = _best_on_lung(chosen, alternatives, noise, breaths, here)
+        if design and (best is None or design.nats > best.nats):
+            best = design
+    if best is None or best.nats < LEAST:
+        return None
+    return _worded(best, (chosen, *alternatives), float(np.median(data.dt)))
+
+
+def acting(fitted: FittedHypothesis) -> tuple[str, ...]:
+    """Mechanisms of a hypothesis: free ones, and fixed ones that are not neutral."""
+    problem = fitted.problem
+    free = {path.rpartition(".")[0] for path in problem.unknowns.paths}
+    owners = dict.fromkeys(path.rpartition(".")[0] for path in problem.simulator.names)
+    names = []
+    for name in filter(None, owners):
+        path = strength_path(name)
+        column = problem.fixed[:, problem.simulator.names.index(path)]
+        if name in free or np.any(column != parameter(path).neutral):
+            names.append(name)
+    return tuple(names)
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """What a hypothesis expects of m new breaths.
+
+    Attributes:
+        white: predicted readings, whitened, ``(m, c T)``.
+        rows: derivatives of the readings by the shared unknowns, ``(m, s, c T)``.
+        own: derivatives of the readings by each breath's own unknowns, ``(m, o, c T)``.
+        own_precision: prior precision of each breath's own unknowns, ``(o,)``.
+        known: information of the recorded breaths on the shared unknowns, ``(s, s)``.
+    """
+
+    white: Floats
+    rows: Floats
+    own: Floats
+    own_precision: Floats
+    known: Floats
+
+
+def values_of(fitted: FittedHypothesis, data: Data, lung: NDArray[np.intp], start: float) -> Floats:
+    """Physical values for new breaths, taken in turn from recorded ones, ``(m, P + 1)``.
+
+    Args:
+        fitted: the hypothesis.
+        data: m new breaths.
+        lung: indices of recorded breaths of the lung.
+        start: reading that the new breaths start from, cmH2O.
+    """
+    problem = fitted.problem
+    rows = np.resize(lung, len(data))
+    values = problem.values(fitted.minimum.x)[rows]
+    columns = (*problem.simulator.names, START)
+    if "position" in columns:
+        values[:, columns.index("position")] = data.position
+    values[:, -1] = start
+    return values
+
+
+def forecast(
+    fitted: FittedHypothesis, data: Data, simulator: Simulator, lung: NDArray[np.intp],
+    start: float, noise: Noise,
+) -> Forecast:  # fmt: skip
+    """Predict new breaths with derivatives; for the arguments see :func:`values_of`."""
+    problem = fitted.problem
+    layout = problem.unknowns
+    values = values_of(fitted, data, lung, start)
+    seen, slopes = simulator.derivatives(values, problem.columns)
+    slopes = slopes * layout.slopes(values[:, list(problem.columns)])[:, :, None, None]
+    rows = noise.whiten(slopes, data.weight).reshape(len(data), len(layout.paths), -1)
+    white = noise.whiten(seen, data.weight).reshape(len(data), -1)
+    mine = np.array([_is_own(problem, column) for column in range(len(layout.paths))])
+    index = layout.index[lung[0]]
+    known = _information(fitted.minimum.hessian, index[~mine])
+    return Forecast(white, rows[:, ~mine], rows[:, mine], problem.precision[index[mine]], known)
+
+
+@dataclass(frozen=True, eq=False)
+class Contrast:
+    """Difference of two hypotheses in m new breaths, if one is true and the other is refitted.
+
+    Each breath's own unknowns are eliminated: rows and differences are what their refit leaves.
+
+    Attributes:
+        difference: whitened, ``(m, k)``.
+        rows: derivatives by the shared unknowns of the refitted hypothesis, ``(m, s, k)``.
+        known: information of the recorded breaths on the shared unknowns, ``(s, s)``.
+        noise: of the measurement.
+    """
+
+    difference: Floats
+    rows: Floats
+    known: Floats
+    noise: Noise
+
+    def nats(self, which: NDArray[np.intp]) -> float:
+        """Log-likelihood that the refitted hypothesis is expected to lose in some breaths."""
+        rows, difference = self.rows[which], self.difference[which]
+        left, step = difference, np.zeros(len(self.known))
+        for _ in range(_REFITS):
+            weighted = rows * self.noise.influence(left)[:, None]
+            hessian = self.known + np.matmul(weighted, rows.swapaxes(1, 2)).sum(axis=0)
+            gradient = np.matmul(weighted, difference[:, :, None])[:, :, 0].sum(axis=0)
+            step = np.linalg.solve(_regular(hessian), gradient)
+            left = difference - np.einsum("msk,s->mk", rows, step)
+        return float(np.sum(self.noise.loss(left)) + 0.5 * step @ self.known @ step)
+
+
+def contrast(truth: Forecast, refitted: Forecast, noise: Noise) -> Contrast:
+    """Contrast of two hypotheses, if the first is true and the second is refitted."""
+    count, extra = len(truth.white), len(refitted.own_precision)
+    more = np.zeros((count, extra))
+    difference = np.concatenate([truth.white - refitted.white, more], axis=1)
+    rows = np.concatenate(
+        [refitted.rows, np.zeros((*refitted.rows.shape[:2], extra))], axis=2
+    )  # fmt: skip
+    # The prior of a breath's own unknowns counts as further readings of them.
+    before = np.broadcast_to(np.diag(np.sqrt(refitted.own_precision)), (count, extra, extra))
+    own = np.concatenate([refitted.own, before], axis=2)
+    both = np.concatenate([rows, difference[:, None]], axis=1)
+    inner = np.matmul(own, own.swapaxes(1, 2))
+    share = np.linalg.solve(_regular(inner), np.matmul(own, both.swapaxes(1, 2)))
+    both = both - np.matmul(share.swapaxes(1, 2), own)
+    return Contrast(both[:, -1], both[:, :-1], refitted.known, noise)
+
+
+def _is_own(problem: Problem, column: int) -> bool:
+    """Whether a free parameter has a value of its own in each breath."""
+    path = problem.unknowns.paths[column]
+    if path in ("R", "C"):
+        return False
+    alone = len(np.unique(problem.unknowns.index[:, column])) == len(problem.data) > 1
+    return alone or path == START or described(path).scope == "breath"
+
+
+def _information(hessian: Floats, which: NDArray[np.int64]) -> Floats:
+    """Information of a Hessian on some unknowns, all others refitted."""
+    covariance = np.asarray(np.linalg.inv(_regular(hessian)), np.float64)
+    return np.asarray(np.linalg.inv(_regular(covariance[np.ix_(which, which)])), np.float64)
+
+
+def _regular(matrix: Floats) -> Floats:
+    """Return the matrix with a slightly larger diagonal, which can be inverted, ``(..., k, k)``."""
+    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+    most = np.max(diagonal, axis=-1, keepdims=True, initial=1e-300)
+    extra = _RIDGE * np.maximum(diagonal, _RIDGE * most)
+    return matrix + extra[..., None] * np.eye(matrix.shape[-1])
+
+
+@dataclass(frozen=True, eq=False)
+class _Design:
+    """Breaths of one or two families on one lung, with what they are expected to give."""
+
+    nats: float
+    families: tuple[Family, ...]
+    members: tuple[tuple[int, ...], ...]
+    lung: Lung
+
+
+def _best_on_lung(
+    chosen: FittedHypothesis, alternatives: Sequence[FittedHypothesis], noise: Noise, breaths: int,
+    here: NDArray[np.intp],
+) -> _Design | None:  # fmt: skip
+    """The best design on the lung of the recorded breaths ``here``."""
+    problem = chosen.problem
+    values = problem.values(chosen.minimum.x)[here]
+    columns = (*problem.simulator.names, START)
+    rig = Rig(*(float(np.median(values[:, columns.index(n)])) for n in ("R", "C", "gain", "PEEP")))
+    start = float(np.median(values[:, -1]))
+    samples, dt = problem.data.u_in.shape[1], float(np.median(problem.data.dt))
+    every = (chosen, *alternatives)
+    kinds = _safe(families(rig, samples, dt), every, problem.data, here, start)
+    if not kinds:
+        return None
+    data = _data(kinds, problem.data, here)
+    simulator = Simulator(data, problem.simulator.names, problem.simulator.substeps)
+    expected = [forecast(hypothesis, data, simulator, here, start, noise) for hypothesis in every]
+    pairs = [
+        pair
+        for other in expected[1:]
+        for pair in (
+            contrast(expected[0], other, noise),
+            contrast(other, expected[0], noise),
+        )
+    ]
+    lung = Lung(float(problem.data.R[here[0]]), float(problem.data.C[here[0]]))
+    return _best(kinds, pairs, breaths, lung)
+
+
+def _best(
+    kinds: tuple[Family, ...], pairs: Sequence[Contrast], breaths: int, lung: Lung
+) -> _Design | None:
+    """The family or mix of two whose smallest nats are the largest."""
+    ends = np.cumsum([len(kind.u_in) for kind in kinds])
+    firsts = ends - [len(kind.u_in) for kind in kinds]
+    sets = [(i,) for i in range(len(kinds))] + list(combinations(range(len(kinds)), 2))
+    best = None
+    for chosen in sets:
+        counts = [breaths] if len(chosen) == 1 else [breaths - breaths // 2, breaths // 2]
+        members = tuple(
+            tuple(np.linspace(0, len(kinds[i].u_in) - 1, count).round().astype(int).tolist())
+            for i, count in zip(chosen, counts, strict=True)
+        )
+        which = [firsts[i] + np.array(m, int) for i, m in zip(chosen, members, strict=True)]
+        nats = min(pair.nats(np.concatenate(which)) for pair in pairs)
+        if best is None or nats > best.nats:
+            best = _Design(nats, tuple(kinds[i] for i in chosen), members, lung)
+    return best
+
+
+def _safe(
+    kinds: tuple[Family, ...], hypotheses: Sequence[FittedHypothesis], recorded: Data,
+    here: NDArray[np.intp], start: float,
+) -> tuple[Family, ...]:  # fmt: skip
+    """Breaths that every hypothesis predicts within :data:`SAFE`, weakened where needed."""
+    for attempt in range(_TRIES + 1):
+        data = _data(kinds, recorded, here)
+        safe = np.ones(len(data), bool)
+        for hypothesis in hypotheses:
+            known = hypothesis.problem.simulator
+            simulator = Simulator(data, known.names, known.substeps)
+            pressure = simulator.predict(values_of(hypothesis, data, here, start))[:, 0]
+            inside = (pressure >= SAFE[0]) & (pressure <= SAFE[1])  # False where it is not finite
+            safe &= inside.all(axis=1)
+        parts = np.split(safe, np.cumsum([len(kind.u_in) for kind in kinds])[:-1])
+        if safe.all() or attempt == _TRIES:
+            break
+        kinds = tuple(
+            kind.scaled(np.where(part, 1.0, _WEAKER))
+            for kind, part in zip(kinds, parts, strict=True)
+        )
+    left = (kind.select(part) for kind, part in zip(kinds, parts, strict=True))
+    return tuple(kind for kind in left if len(kind.u_in))
+
+
+def _data(kinds: Sequence[Family], recorded: Data, here: NDArray[np.intp]) -> Data:
+    """Breaths of all families as data without readings, on the lung of recorded breaths."""
+    u_in = np.concatenate([kind.u_in for kind in kinds])
+    u_out = np.concatenate([kind.u_out for kind in kinds])
+    count, channels = len(u_in), recorded.seen.shape[1]
+    shape = (count, channels, u_in.shape[1])
+    weight = np.ones(shape)
+    weight[:, 1:, 0] = 0.0
+    ones: Floats = np.ones(count)
+    return Data(
+        u_in, u_out, np.full(u_in.shape, float(np.median(recorded.dt))), np.zeros(shape), weight,
+        recorded.R[here[0]] * ones, recorded.C[here[0]] * ones, ones,
+    )  # fmt: skip
+
+
+def _worded(design: _Design, hypotheses: Sequence[FittedHypothesis], dt: float) -> BreathRequest:
+    parts = [
+        f"{len(members)} x {kind.title}"
+        for kind, members in zip(design.families, design.members, strict=True)
+    ]
+    pairs = list(zip(design.families, design.members, strict=True))
+    u_in = np.concatenate([kind.u_in[list(members)] for kind, members in pairs])
+    u_out = np.concatenate([kind.u_out[list(members)] for kind, members in pairs])
+    acts = [acting(hypothesis) for hypothesis in hypotheses]
+    common = set(acts[0]).intersection(*acts[1:])
+    names = [
+        " + ".join(n for n in own if n not in common) or "no further mechanism" for own in acts
+    ]
+    return BreathRequest(
+        f"{'; '.join(parts)} (lung {design.lung.id})", tuple(dict.fromkeys(names)), design.nats,
+        u_in, u_out, np.full(u_in.shape, dt),
+    )  # fmt: skip

@@ -1,0 +1,200 @@
+"""The parts of a diagnosis: verdict, mechanisms, error regions, open-loop errors, traces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.interfaces import Plant
+from ventbench.mechanics.lung_match import Estimate, LungMatch
+from ventbench.recordings.breaths import Breaths
+
+Floats = NDArray[np.float64]
+
+#: ``named``: mechanisms of the library are missing. ``nothing_missing``: none is. ``unnamed``:
+#: something is missing that the library does not have; a nonparametric term may say where it acts.
+Verdict = Literal["named", "nothing_missing", "unnamed"]
+
+
+@dataclass(frozen=True)
+class MissingMechanism:
+    """A mechanism that the recording needs and the simulator lacks.
+
+    Attributes:
+        name: of the library.
+        parameters: estimates by short name.
+        confidence: probability that this mechanism, and none of the alternatives, acts, 0..1.
+        alternatives: mechanisms that the recording cannot distinguish from it, the likeliest first.
+        nats: held-out log-likelihood that is lost without it.
+        changed: True if the simulator has the mechanism too, with other parameters.
+        simulator_values: parameters that the simulator has, by short name; empty if not changed.
+    """
+
+    name: str
+    parameters: dict[str, Estimate]
+    confidence: float
+    alternatives: tuple[str, ...]
+    nats: float
+    changed: bool = False
+    simulator_values: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class NonparametricTerm:
+    """A place in the model where an effect acts that the library does not have.
+
+    Attributes:
+        name: of the place, such as ``f(V)``.
+        meaning: in words.
+        explains: share of the squared error above the noise that the term explains, 0..1.
+        nats: held-out log-likelihood that it gains.
+        x: what the term depends on, ``(k,)``.
+        x_unit: name and unit of ``x``, such as ``volume, mL``.
+        y: value of the term, without the part that R and C can absorb, ``(k,)``.
+        y_unit: name and unit of ``y``.
+    """
+
+    name: str
+    meaning: str
+    explains: float
+    nats: float
+    x: Floats
+    x_unit: str
+    y: Floats
+    y_unit: str
+
+
+@dataclass(frozen=True)
+class ErrorRegion:
+    """A range of one quantity in which the refitted simulator errs.
+
+    Attributes:
+        axis: the quantity, such as ``time since inspiration``.
+        low: start of the range.
+        high: end of the range.
+        unit: of the range.
+        mean_error: recorded minus simulated pressure, mean over the range, cmH2O.
+        p_value: corrected for all ranges of all axes.
+        share: of the squared error above the noise that lies in the range, 0..1.
+    """
+
+    axis: str
+    low: float
+    high: float
+    unit: str
+    mean_error: float
+    p_value: float
+    share: float
+
+
+@dataclass(frozen=True)
+class OpenLoopError:
+    """Mean absolute and root-mean-square open-loop error, cmH2O."""
+
+    mae: float
+    rmse: float
+
+
+@dataclass(frozen=True, eq=False)
+class OpenLoopComparison:
+    """Open-loop errors over the inspirations of held-out breaths.
+
+    Attributes:
+        held_out_breaths: their ids.
+        before: error of the simulator as given.
+        refit: error after R, C, R_ex and PEEP are refitted.
+        after: error of the corrected simulator.
+        noise_floor: root-mean-square error of a perfect simulator, cmH2O.
+        groups: errors of parts of the breath and of lungs, by group and stage, such as
+            ``{"lung R5C10": {"before": OpenLoopError(...), ...}}``.
+    """
+
+    held_out_breaths: tuple[int, ...]
+    before: OpenLoopError
+    refit: OpenLoopError
+    after: OpenLoopError
+    noise_floor: float
+    groups: dict[str, dict[str, OpenLoopError]]
+
+
+@dataclass(frozen=True, eq=False)
+class Traces:
+    """Recorded breaths with simulated pressures; arrays ``(n, T)``, NaN where unknown.
+
+    Attributes:
+        breaths: n recorded breaths.
+        held_out: which of them no fit has seen, bool ``(n,)``.
+        before: pressure of the simulator as given, cmH2O.
+        refit: pressure with R, C, R_ex and PEEP refitted, cmH2O.
+        after: pressure of the corrected simulator, cmH2O.
+        flow: of the refitted simulator into the lung, mL/s, or None.
+        volume: of the refitted simulator, mL, or None.
+    """
+
+    breaths: Breaths
+    held_out: NDArray[np.bool_]
+    before: Floats
+    refit: Floats
+    after: Floats
+    flow: Floats | None = None
+    volume: Floats | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class BreathRequest:
+    """Breaths to record next, because they distinguish between hypotheses.
+
+    Attributes:
+        title: what to do on the rig, in words.
+        why: mechanisms that the breaths distinguish.
+        nats: log-likelihood ratio that the breaths are expected to give.
+        u_in: commands of the inspiratory valve, %, ``(k, T)``.
+        u_out: commands of the expiratory valve, 0/1, ``(k, T)``.
+        dt: time to the next sample, s, ``(k, T)``.
+    """
+
+    title: str
+    why: tuple[str, ...]
+    nats: float
+    u_in: Floats
+    u_out: Floats
+    dt: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """Everything that a diagnosis establishes.
+
+    Attributes:
+        verdict: see :data:`Verdict`.
+        mechanisms: missing ones, the most important first.
+        nonparametric: a term for an effect that is not in the library, or None.
+        location: regions in which the refitted simulator errs, the most certain first.
+        open_loop: errors before and after the correction.
+        lungs: one for each lung of the recording.
+        request: breaths to record next, or None if nothing is open.
+        traces: pressures of all breaths.
+        plants: the corrected simulator of each lung, by label.
+        simulator: name of what was diagnosed, such as ``physics``.
+        noise: standard deviation of the measurement noise, cmH2O, and its correlation between
+            neighbouring samples.
+        notes: further information for the reader, a sentence each.
+        seconds: computing time.
+    """
+
+    verdict: Verdict
+    mechanisms: tuple[MissingMechanism, ...]
+    nonparametric: NonparametricTerm | None
+    location: tuple[ErrorRegion, ...]
+    open_loop: OpenLoopComparison
+    lungs: tuple[LungMatch, ...]
+    request: BreathRequest | None
+    traces: Traces
+    plants: dict[str, Plant]
+    simulator: str
+    noise: tuple[float, float]
+    notes: tuple[str, ...]
+    seconds: float

@@ -1,0 +1,297 @@
+"""A diagnosis in plain sentences, and numbers as a person reads them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from ventbench.diagnosis.findings import ErrorRegion, Findings, MissingMechanism, NonparametricTerm
+from ventbench.mechanics.lung_match import Estimate, LungMatch
+from ventbench.physics import mechanism
+
+#: Axes whose ranges are parts of a breath: an effect is described best by these.
+_PHASES = ("time since inspiration", "time since expiration")
+_EDGE = "time since a valve edge"
+
+#: How a range of time is described: what it starts from, and what it is the beginning of.
+_MOMENTS = {
+    _PHASES[0]: ("the start of inspiration", "of each breath"),
+    _PHASES[1]: ("the start of expiration", "of expiration"),
+    _EDGE: ("an edge of a valve", "after an edge of a valve"),
+}
+
+#: Moments up to this are given in ms, s.
+_SHORT_MOMENT = 0.15
+
+#: Parameters of time below this are given in ms, s.
+_SHORT_PARAMETER = 0.5
+
+#: Parameters without a unit that are shares: given in %.
+_SHARES = frozenset({"valve_curve.loss", "supply_droop.drop", "sensor_drift.gain"})
+
+#: A mean error below this share of the noise says nothing about its sign.
+_NO_SIGN = 0.25
+
+
+def sentences(findings: Findings) -> list[str]:
+    """Everything a reader should know, the most important first."""
+    texts = [verdict(findings), *map(missing_mechanism, findings.mechanisms)]
+    texts += [effect(findings), *alternatives(findings), nonparametric_term(findings)]
+    texts += [open_loop(findings), *map(lung, findings.lungs), request(findings), *findings.notes]
+    return [text for text in texts if text]
+
+
+def verdict(findings: Findings) -> str:
+    """The answer in one sentence."""
+    simulator, term = f"the {findings.simulator} simulator", findings.nonparametric
+    if findings.verdict == "nothing_missing":
+        how = "" if _is_unchanged(findings) else "with R and C refitted, "
+        return f"Nothing is missing: {how}{simulator} explains the recording."
+    if findings.verdict == "unnamed":
+        if term is None:
+            return (
+                f"Something is missing in {simulator}, but the recording singles out neither a "
+                "mechanism nor a place in the model."
+            )
+        return (
+            f"Something is missing in {simulator} that is not in the library of mechanisms; its "
+            f"place in the model is {place(term)}."
+        )
+    names = _listed([f"{title(item.name)} ({item.name})" for item in findings.mechanisms])
+    rest = "" if term is None else "; an effect that is not in the library is missing too"
+    return f"Missing in {simulator}: {names}{rest}."
+
+
+def title(name: str) -> str:
+    """Return the name of a mechanism in words."""
+    return mechanism(name).description.title
+
+
+def missing_mechanism(missing: MissingMechanism) -> str:
+    """Values of a missing mechanism with their 95 % intervals, and the confidence in its name."""
+    about = mechanism(missing.name).description
+    meanings = {parameter.name: parameter.meaning for parameter in about.parameters}
+    values = []
+    for name, estimate in missing.parameters.items():
+        text, path = quantity(estimate, f"{missing.name}.{name}"), f"{missing.name}.{name}"
+        if name in missing.simulator_values:
+            other = quantity_like(missing.simulator_values[name], estimate, path)
+            text += f" instead of {other} in the simulator"
+        meaning = meanings.get(name, name)
+        # "Dead time" need not be said twice.
+        values.append(text if meaning in about.title else f"{text} ({meaning})")
+    start = _capital(about.title)
+    if missing.changed and not missing.simulator_values:
+        start += ", which the simulator has with another strength"
+    confidence = f"Confidence in this mechanism: {100 * missing.confidence:.0f} %."
+    return f"{start}{': ' if values else ''}{'; '.join(values)}. {confidence}"
+
+
+def effect(findings: Findings) -> str:
+    """Where and by how much the simulator errs without the correction."""
+    if not findings.location:
+        return ""
+    phases = [region for region in findings.location if region.axis in _PHASES]
+    region = max(phases or findings.location, key=lambda region: region.share)
+    text = _error(region, findings.noise[0])
+    if findings.verdict == "named":
+        without = "Without it" if len(findings.mechanisms) == 1 else "Without them"
+        return f"{without} {text}, even with R and C refitted."
+    if _is_unchanged(findings):
+        return error_region(region, findings.noise[0])
+    return f"With R and C refitted, {text}."
+
+
+def error_region(region: ErrorRegion, noise: float = 0.0) -> str:
+    """One error region as a sentence.
+
+    Args:
+        region: to describe.
+        noise: standard deviation of the measurement, cmH2O; far smaller errors have no sign.
+    """
+    return _capital(f"{_error(region, noise)}.")
+
+
+def where(region: ErrorRegion) -> str:
+    """A region in words that follow "the pressure is too high"."""
+    if region.axis in _MOMENTS:
+        after, whole = _MOMENTS[region.axis]
+        if region.low == 0:
+            return f"in the first {_time(region.high)} {whole}"
+        ends = f"{region.low:.6g} to {region.high:.6g} s"
+        if region.high <= _SHORT_MOMENT:
+            ends = f"{1000 * region.low:.6g} to {1000 * region.high:.6g} ms"
+        return f"from {ends} after {after}"
+    if region.axis == "breath number":
+        return f"in breaths {region.low:.6g} to {region.high:.6g} of the recording"
+    if region.axis.startswith("lung "):
+        return f"on {region.axis}"
+    unit = "" if region.unit in ("1", "") else f" {region.unit}"
+    return f"where the {region.axis} is {region.low:.6g} to {region.high:.6g}{unit}"
+
+
+def alternatives(findings: Findings) -> list[str]:
+    """Mechanisms that the recording cannot distinguish."""
+    return [
+        f"This recording cannot tell {item.name} from {_listed(item.alternatives, 'or')}."
+        for item in findings.mechanisms
+        if item.alternatives
+    ]
+
+
+def request(findings: Findings) -> str:
+    """What to record next."""
+    wanted = findings.request
+    if wanted is None:
+        return ""
+    text = f"Record next: {wanted.title.rstrip('.')}."
+    if not wanted.why:
+        return text
+    what = f"distinguish between {_listed(wanted.why)}"
+    if len(wanted.why) == 1:
+        what = f"test {wanted.why[0]}"
+    return f"{text} These breaths {what} (expected evidence {wanted.nats:.0f} nats; 5 decide)."
+
+
+def nonparametric_term(findings: Findings) -> str:
+    """Where an effect acts that is not in the library, and how much it explains."""
+    term = findings.nonparametric
+    if term is None:
+        return ""
+    beside = "Beside these mechanisms, a" if findings.verdict == "named" else "A"
+    return (
+        f"{beside} free function at {place(term)} explains {100 * term.explains:.0f} % of the "
+        "squared error above the noise."
+    )
+
+
+def place(term: NonparametricTerm) -> str:
+    """Place of a term with its meaning: ``f(V) (the recoil of the lung depends on ...)``."""
+    return f"{term.name} ({term.meaning.removeprefix(f'{term.name}: ')})"
+
+
+def open_loop(findings: Findings) -> str:
+    """Open-loop errors before and after the correction."""
+    errors = findings.open_loop
+    given, refit, after, noise = (
+        rounded(value, 2)
+        for value in (
+            errors.before.rmse, errors.refit.rmse, errors.after.rmse, errors.noise_floor,
+        )
+    )  # fmt: skip
+    others = "" if _is_unchanged(findings) else f", {refit} with R and C refitted"
+    if findings.verdict != "nothing_missing" and errors.after != errors.refit:
+        others += f", {after} corrected"
+    return (
+        f"Root-mean-square open-loop error on {len(errors.held_out_breaths)} held-out breaths: "
+        f"{given} cmH2O as given{others}; measurement noise {noise}."
+    )
+
+
+def lung(match: LungMatch) -> str:
+    """Whether a lung is what its label says."""
+    values = [
+        f"{name} {quantity(Estimate(value, unit, ends))}"
+        for name, value, ends, unit in (
+            ("R", match.fitted_R, match.ci95_R, "cmH2O s/L"),
+            ("C", match.fitted_C, match.ci95_C, "mL/cmH2O"),
+        )
+        if math.isfinite(value)
+    ]
+    fitted = f"{' and '.join(values)}, from {match.source}" if values else "R and C unknown"
+    if match.label_matches:
+        return f"The lung matches its label {match.label}: {fitted}."
+    known = f" It may be {' or '.join(match.settings[:2])}." if match.settings else ""
+    return f"The lung does not match its label {match.label}: {fitted}.{known}"
+
+
+def quantity(estimate: Estimate, path: str = "") -> str:
+    """A value with the ends of its interval, such as ``41 ms [38, 44]``.
+
+    Args:
+        estimate: to be shown.
+        path: of the parameter, such as ``valve_curve.loss``; tells shares, which are given in %.
+    """
+    factor, unit = _scale(estimate, path)
+    value, low, high = (factor * x for x in (estimate.value, *estimate.ci95))
+    places = _decimals(value, low, high)
+    name = f" {unit}" if unit else ""
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return f"{rounded(value, places)}{name}"
+    return f"{rounded(value, places)}{name} [{rounded(low, places)}, {rounded(high, places)}]"
+
+
+def quantity_like(value: float, estimate: Estimate, path: str = "") -> str:
+    """Another value of a parameter, in the unit and with the digits of its estimate."""
+    factor, unit = _scale(estimate, path)
+    places = _decimals(*(factor * x for x in (estimate.value, *estimate.ci95)))
+    return f"{rounded(factor * value, places)}{f' {unit}' if unit else ''}"
+
+
+def rounded(value: float, places: int) -> str:
+    """Fixed decimals; zero is never negative."""
+    if not math.isfinite(value):
+        return "unknown"
+    text = f"{value:.{places}f}"
+    return text.removeprefix("-") if float(text) == 0 else text
+
+
+def probability(p_value: float) -> str:
+    """A p-value as it is written in text."""
+    return "p < 0.01" if p_value < 0.01 else f"p = {p_value:.2f}"
+
+
+def _decimals(value: float, low: float, high: float) -> int:
+    """Digits after the point with which half the interval shows one or two digits."""
+    half = 0.5 * (high - low)
+    if not (math.isfinite(half) and half > 0):
+        half = abs(value) / 100 if math.isfinite(value) and value else 1.0
+    return min(max(0, -math.floor(math.log10(half))), 6)
+
+
+def _scale(estimate: Estimate, path: str) -> tuple[float, str]:
+    """Factor and unit in which a parameter is given."""
+    largest = max(
+        (abs(x) for x in (estimate.value, *estimate.ci95) if math.isfinite(x)), default=0.0
+    )
+    if estimate.unit == "s" and 0.0 < largest < _SHORT_PARAMETER:
+        return 1000.0, "ms"
+    if path in _SHARES:
+        return 100.0, "%"
+    return 1.0, "" if estimate.unit == "1" else estimate.unit
+
+
+def _is_unchanged(findings: Findings) -> bool:
+    """Whether the simulator is left as it is, without a refit."""
+    return findings.open_loop.refit == findings.open_loop.before
+
+
+def _error(region: ErrorRegion, noise: float) -> str:
+    """How the simulator errs in a region; errors are recorded minus simulated."""
+    size = abs(region.mean_error)
+    if size < max(_NO_SIGN * noise, 0.005):
+        return (
+            f"the simulated pressure is off {where(region)}, by errors whose sign changes from "
+            "breath to breath"
+        )
+    side = "too low" if region.mean_error > 0 else "too high"
+    return f"the simulated pressure is {_two_digits(size)} cmH2O {side} {where(region)}"
+
+
+def _two_digits(value: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}" if value >= 0.01 else f"{value:.3f}"
+
+
+def _time(seconds: float) -> str:
+    return f"{1000 * seconds:.6g} ms" if seconds <= _SHORT_MOMENT else f"{seconds:.6g} s"
+
+
+def _listed(names: Sequence[str], word: str = "and") -> str:
+    if len(names) < 2:
+        return "".join(names)
+    return f"{', '.join(names[:-1])} {word} {names[-1]}"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]

@@ -69,8 +69,8 @@ def answer(
     Example: `ventbench challenge answer runs/challenge --jobs 2`
     """
     from ventbench.cli.study import bars
-    from ventbench.validation.challenge import folder as files
     from ventbench.validation.challenge.answer import answer as work
+    from ventbench.validation.challenge.folder import ChallengeFolder
 
     with bars() as shown:
         task = shown.add_task("diagnosing", total=None)
@@ -78,7 +78,7 @@ def answer(
         def progress(done: int, total: int) -> None:
             shown.update(task, completed=done, total=total)
 
-        failed = work(files.Folder(folder, round_), jobs=jobs, progress=progress)
+        failed = work(ChallengeFolder(folder, round_), jobs=jobs, progress=progress)
     for name, problem in sorted(failed.items()):
         typer.echo(f"{name}: no answer: {problem}", err=True)
     if failed:
@@ -94,10 +94,10 @@ def record(folder: Folder, seed: Seed) -> None:
 
     Example: `ventbench challenge record runs/challenge --seed "$SECRET"`
     """
-    from ventbench.validation.challenge import folder as files
     from ventbench.validation.challenge import requests
+    from ventbench.validation.challenge.folder import ChallengeFolder
 
-    names = requests.record(files.Folder(folder), seed)
+    names = requests.record(ChallengeFolder(folder), seed)
     typer.echo(f"recorded what was asked for in {len(names)} cases")
 
 
@@ -123,7 +123,7 @@ def reveal(
     from rich.console import Console
 
     from ventbench.cli.study import bars
-    from ventbench.validation.challenge import folder as files
+    from ventbench.validation.challenge.folder import ChallengeFolder
     from ventbench.validation.challenge.reveal import reveal as work
 
     with bars() as shown:
@@ -133,7 +133,7 @@ def reveal(
             shown.update(task, completed=done, total=total)
 
         found = work(
-            files.Folder(folder, round_), seed, with_oracle=oracle, jobs=jobs, progress=progress
+            ChallengeFolder(folder, round_), seed, with_oracle=oracle, jobs=jobs, progress=progress
         )
     emit(found.as_dict(), json)
     console = Console(stderr=str(json) == "-")

@@ -10,7 +10,7 @@ import typer
 from ventbench.cli.options import JsonFile, emit
 
 if TYPE_CHECKING:
-    from ventbench.validation.proof import Proof
+    from ventbench.validation.real_rig_proof import Proof
 
 
 def proof(
@@ -50,7 +50,7 @@ def proof(
     from ventbench import compilation, extras
     from ventbench.cli.diagnose import keep
     from ventbench.cli.study import bars
-    from ventbench.validation.proof import prove
+    from ventbench.validation.real_rig_proof import prove
 
     extras.require("jinja2", "rerun")
     folder = _folder(recordings)

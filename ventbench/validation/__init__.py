@@ -1,1 +1,1 @@
-"""Proofs of the diagnosis: concealed challenges, and the real rig."""
+"""Proofs that the diagnosis works: sealed challenges, and the real rig."""

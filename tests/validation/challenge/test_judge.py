@@ -4,11 +4,16 @@ from dataclasses import replace
 
 import pytest
 
-from ventbench.validation.challenge import truth
 from ventbench.validation.challenge.cases import Base, Effect
-from ventbench.validation.challenge.confusion import by_effect, confusion
-from ventbench.validation.challenge.figures import figures, second, share, wilson
-from ventbench.validation.challenge.judge import judge
+from ventbench.validation.challenge.figures import (
+    by_parameter,
+    confusion,
+    figures,
+    second_round,
+    share,
+    wilson,
+)
+from ventbench.validation.challenge.judge import judge, true_values
 
 from .truths import answer, case, drawn, mechanism
 
@@ -73,12 +78,12 @@ def test_values_are_those_a_fit_with_the_nominal_gain_sees():
     tube = Effect("circuit_compliance", "mild", "library", {"compliance": 1.2})
     rough = Effect("turbulent_resistance", "mild", "library", {"quadratic": 4.0})
     weak = case(LEAK, tube, rough, LAG, base=Base(10.0, 20.0, gain=22.8 * 1.1))
-    found = truth.values(weak)
+    found = true_values(weak)
     assert found == pytest.approx({
         "leak.conductance": 20 / 1.1, "circuit_compliance.compliance": 1.2 / 1.1,
         "turbulent_resistance.quadratic": 4 * 1.21, "valve_lag.tau": 0.04,
     })  # fmt: skip
-    assert truth.values(case(LINEAR)) == {}
+    assert true_values(case(LINEAR)) == {}
 
 
 def test_estimates_know_error_and_coverage():
@@ -134,7 +139,7 @@ def test_second_round_counts_what_was_open():
     mistaken = judged("single", [LEAK], answer("named", mechanism("valve_dead_band")))
     before = {"a": sure, "b": unsure, "c": mistaken, "d": unsure}
     after = {"a": sure, "b": sure, "c": mistaken, "d": sure}
-    found = second(before, after)
+    found = second_round(before, after)
     assert (found.value, found.count) == (pytest.approx(2 / 3), 3)
 
 
@@ -152,7 +157,7 @@ def test_confusion_has_truths_and_answers():
     found = judged(
         "single", [LEAK], answer("named", mechanism("leak", conductance=(20.0, 19.0, 21.0)))
     )
-    table = by_effect([found])
+    table = by_parameter([found])
     assert table == {"leak.conductance": {"count": 1, "covered": 1, "median_error": 0.0}}
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from ventbench.errors import InputError
 from ventbench.physics import library
-from ventbench.validation.challenge.forms import LIBRARY, OUTSIDE, in_library
-from ventbench.validation.challenge.plan import CLASSES, KINDS, draw
+from ventbench.validation.challenge.cases import KINDS, LIBRARY, OUTSIDE, in_library
+from ventbench.validation.challenge.plan import CLASSES, draw
 
 
 def drawn(kind, count, seed=0):

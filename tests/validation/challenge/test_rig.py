@@ -7,9 +7,22 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ventbench.validation.challenge.cases import Base, Case, Effect
-from ventbench.validation.challenge.forms import ENTRIES, effect, in_library
-from ventbench.validation.challenge.rig import draw_base, record, record_commands, replay
+from ventbench.validation.challenge.cases import (
+    EFFECTS,
+    Base,
+    Case,
+    Effect,
+    draw_base,
+    draw_effect,
+    in_library,
+)
+from ventbench.validation.challenge.rig import (
+    record,
+    record_commands,
+    replay,
+    sampling_times,
+    step_grid,
+)
 
 from .truths import case
 
@@ -59,16 +72,16 @@ MIXED = [
 @pytest.mark.parametrize("names", MIXED, ids=",".join)
 def test_half_the_step_changes_nothing(names):
     rng = np.random.default_rng(3)
-    one = case(*(effect(name, "strong", rng) for name in names), samples=45)
-    coarse = record(one, np.random.default_rng(1))
+    one = case(*(draw_effect(name, "strong", rng) for name in names), samples=45)
+    recorded = record(one, np.random.default_rng(1), steps=8)
     steps = 320 if "inertance" in names else 128
-    start = coarse.pressure[:, 0] * 0 + 5.0
-    usual = replay(one, coarse, start, 0, steps // 2)
-    fine = replay(one, coarse, start, 0, steps)
+    start = np.full(len(recorded), 5.0)
+    usual = replay(one, recorded, start, 0, steps // 2)
+    fine = replay(one, recorded, start, 0, steps)
     assert np.abs(usual - fine).max() < 0.005
 
 
-EVERY = [(name, form) for name, entry in ENTRIES.items() for form in entry.forms]
+EVERY = [(name, form) for name, entry in EFFECTS.items() for form in entry.forms]
 
 
 @pytest.fixture(scope="module")
@@ -85,13 +98,13 @@ def test_each_effect_is_there_and_stronger_is_more(plain, name, form):
     base, breaths, without = plain
 
     def change(strength):
-        item = effect(name, strength, np.random.default_rng(4), form)
+        item = draw_effect(name, strength, np.random.default_rng(4), form)
         one = Case("", 5.0, 10.0, (item,), base, breaths=6)
         return np.sqrt(np.mean((replay(one, breaths, np.full(6, base.peep), 0) - without) ** 2))
 
     mild, strong = change("mild"), change("strong")
     assert strong > 0.01
-    same = ENTRIES[name].mild == ENTRIES[name].strong
+    same = EFFECTS[name].mild == EFFECTS[name].strong
     assert strong == mild if same else strong > 1.2 * mild
 
 
@@ -204,12 +217,12 @@ def test_a_recording_is_what_a_laboratory_would_have():
 
 def test_strengths_vary_within_15_percent():
     rng = np.random.default_rng(6)
-    drawn = [effect("leak", "mild", rng).parameters["conductance"] for _ in range(50)]
+    drawn = [draw_effect("leak", "mild", rng).parameters["conductance"] for _ in range(50)]
     assert 8 * 0.85 <= min(drawn) < 8 * 0.9
     assert 8 * 1.1 < max(drawn) <= 8 * 1.15
-    assert in_library(effect("leak", "mild", rng))
-    assert not in_library(effect("leak", "mild", rng, "linear"))
-    assert not in_library(effect("cardiogenic", "mild", rng))
+    assert in_library(draw_effect("leak", "mild", rng))
+    assert not in_library(draw_effect("leak", "mild", rng, "linear"))
+    assert not in_library(draw_effect("cardiogenic", "mild", rng))
 
 
 def test_it_shares_no_code_with_the_library():
@@ -219,3 +232,16 @@ def test_it_shares_no_code_with_the_library():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_samples_keep_their_times_under_any_dead_times(seed):
+    rng = np.random.default_rng(seed)
+    u_out = np.zeros((3, 80), np.int8)
+    u_out[:, 31:] = 1
+    for _ in range(25):
+        time = sampling_times(3, 80, 3e-4, rng)
+        delay, opening_delay = (float(s) for s in rng.uniform(0.0, 0.12, 2))
+        nodes = step_grid(time, u_out, delay, opening_delay, 8).nodes
+        assert np.all(np.diff(nodes, axis=1) > 0)
+        np.testing.assert_allclose(nodes[:, ::8], time, atol=0)

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 
@@ -14,10 +13,9 @@ from ventbench.errors import InputError
 from ventbench.recordings import load
 from ventbench.validation.challenge import requests
 from ventbench.validation.challenge.answer import answer
-from ventbench.validation.challenge.folder import Folder
+from ventbench.validation.challenge.folder import ChallengeFolder
 from ventbench.validation.challenge.make import make
 from ventbench.validation.challenge.reveal import reveal
-from ventbench.validation.challenge.rig import record
 
 from .truths import Found, mechanism, request, sees_nothing
 from .truths import answer as made_up
@@ -35,7 +33,7 @@ def made(tmp_path_factory):
 @pytest.fixture(scope="module")
 def answered(made):
     """All answered by one who knows the truth, but is not sure and asks for more."""
-    folder = Folder(made[0])
+    folder = ChallengeFolder(made[0])
     names = {
         load(folder.recording(drawn.case.name)).sha256: [e.name for e in drawn.case.effects]
         for drawn, _ in folder.truth(SECRET)
@@ -77,7 +75,7 @@ def test_a_challenge_is_not_overwritten(made):
 
 
 def test_answers_go_on_where_they_stopped(made):
-    folder, seen = Folder(made[0], 1), []
+    folder, seen = ChallengeFolder(made[0], 1), []
 
     def fails(breaths, lung):
         seen.append(lung)
@@ -89,20 +87,22 @@ def test_answers_go_on_where_they_stopped(made):
     assert all(text == "ValueError: no idea" for text in problems.values())
 
 
-def test_processes_make_room_for_new_ones(made, tmp_path, monkeypatch):
-    folder = Folder(tmp_path / "c")
+def test_processes_make_room_for_new_ones(made, tmp_path):
+    folder = ChallengeFolder(tmp_path / "c")
     shutil.copytree(made[0], folder.path, ignore=shutil.ignore_patterns("answers", "requests"))
-    monkeypatch.setattr("ventbench.validation.challenge.answer._CASES", 2)
     told = []
-    found = answer(folder, jobs=1, diagnose=sees_nothing, progress=lambda *done: told.append(done))
-    assert found == {}
+    failed = answer(
+        folder, jobs=1, diagnose=sees_nothing, cases_per_process=2,
+        progress=lambda *done: told.append(done),
+    )  # fmt: skip
+    assert failed == {}
     assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
     firsts = [value["first_in_process"] for value in folder.answers().values()]
     assert firsts == [True, False, True]
 
 
 def test_a_recording_that_cannot_be_read_does_not_stop_the_others(tmp_path):
-    folder = Folder(tmp_path / "c")
+    folder = ChallengeFolder(tmp_path / "c")
     make(SECRET, folder.path, "null", 2)
     text = folder.recording("case_0001").read_text().splitlines()
     text[5] = text[5].rpartition(",")[0] + ",259.2"
@@ -111,23 +111,6 @@ def test_a_recording_that_cannot_be_read_does_not_stop_the_others(tmp_path):
     assert list(problems) == ["case_0001"]
     assert "column pressure: 259.2 is outside -20..120 cmH2O" in problems["case_0001"]
     assert list(folder.answers()) == ["case_0002"]
-
-
-def test_a_recording_beyond_the_sensors_range_is_made_anew(tmp_path, monkeypatch):
-    drawn = []
-
-    def too_much_at_first(case, rng, *, share):
-        breaths = record(dataclasses.replace(case, breaths=4), rng, share=share)
-        drawn.append(breaths)
-        high = np.where(len(drawn) == 1, 200.0, breaths.pressure)
-        return dataclasses.replace(breaths, pressure=high)
-
-    monkeypatch.setattr("ventbench.validation.challenge.make.record", too_much_at_first)
-    make(SECRET, tmp_path / "c", "null", 1)
-    assert len(drawn) == 2
-    assert np.any(drawn[0].u_in != drawn[1].u_in)
-    kept = load(Folder(tmp_path / "c").recording("case_0001"))
-    np.testing.assert_array_equal(kept.u_in, drawn[1].u_in)
 
 
 def test_the_one_who_knows_is_right(answered):
@@ -150,7 +133,7 @@ def test_the_one_who_knows_is_right(answered):
 def test_more_breaths_resolve(answered):
     names = requests.record(answered, SECRET)
     assert len(names) == 3
-    second = Folder(answered.path, 2)
+    second = ChallengeFolder(answered.path, 2)
     first, longer = load(answered.recording(names[0])), load(second.recording(names[0]))
     assert len(longer) == len(first) + 2
     np.testing.assert_array_equal(longer.pressure[:-2], first.pressure)
@@ -188,7 +171,7 @@ def test_a_changed_recording_is_refused(answered):
     path = answered.recording("case_0003")
     kept = path.read_text()
     path.write_text(kept.replace("\n1,", "\n1 ,", 1))
-    with pytest.raises(InputError, match="not the recording that was made"):
+    with pytest.raises(InputError, match="not the recording that the challenge was made with"):
         reveal(answered, SECRET)
     path.write_text(kept)
 

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ventbench.validation.challenge.cases import Base, Case, Effect
-from ventbench.validation.challenge.plan import Drawn
+from ventbench.validation.challenge.cases import Base, Case, DrawnCase, Effect
 
 
 def case(*effects: Effect, **changed: Any) -> Case:
@@ -17,8 +16,8 @@ def case(*effects: Effect, **changed: Any) -> Case:
     return Case("case_0001", 10.0, 20.0, effects, **given)
 
 
-def drawn(kind: Any, *effects: Effect) -> Drawn:
-    return Drawn(kind, case(*effects))
+def drawn(kind: Any, *effects: Effect) -> DrawnCase:
+    return DrawnCase(kind, case(*effects))
 
 
 def mechanism(name: str, *alternatives: str, **parameters: tuple[float, float, float]) -> Any:

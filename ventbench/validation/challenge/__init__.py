@@ -1,6 +1,6 @@
-"""Recordings with concealed effects, by a simulator of its own, and scores of what finds them.
+"""Sealed challenges: recordings with concealed effects, answers to them, and their scores.
 
-The rig shares no code with :mod:`ventbench.physics`: other equations where there is a choice,
-another integrator, numpy only. What it conceals is published as a hash first and revealed with its
-seed.
+The rig that makes the recordings shares no code with :mod:`ventbench.physics`: it uses other
+equations where there is a choice, another integrator, and numpy only. A hash of what it conceals is
+published first; the seed reveals the rest.
 """

@@ -1,4 +1,4 @@
-"""Answering a challenge: each recording to the diagnosis, which sees nothing else."""
+"""Answering a challenge: each recording goes to the diagnosis, which sees nothing else."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import load
 from ventbench.training.executor import executor, results
 from ventbench.validation.challenge import requests
-from ventbench.validation.challenge.folder import Folder
+from ventbench.validation.challenge.folder import ChallengeFolder
 
-#: So that each process computes on one core.
-_THREADS = {
+#: Environment of the processes, each of which computes on one core.
+_SINGLE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
@@ -28,19 +28,20 @@ _THREADS = {
     "VENTBENCH_THREADS": "1",
 }
 
-#: Cases a process, on average, before it makes room for a new one: it grows by a MiB or two a case.
-_CASES = 25
+#: Mean number of cases after which a new process replaces an old one, whose memory grows by a MiB
+#: or two a case.
+_CASES_PER_PROCESS = 25
 
-#: Cases that this process has answered.
+#: Number of cases that this process has answered.
 _answered = 0
 
 
-class Found(Protocol):
-    """What a diagnosis must give."""
+class Answer(Protocol):
+    """What a diagnosis must return."""
 
     @property
     def request(self) -> Any:
-        """Breaths to record next, or None."""
+        """Breaths to record next, a :class:`~.requests.Commands`, or None."""
         ...
 
     def as_dict(self) -> dict[str, Any]:
@@ -48,45 +49,50 @@ class Found(Protocol):
         ...
 
 
-#: Breaths and the lung's label to a diagnosis.
-Diagnose = Callable[[Breaths, str], Found]
+#: Takes breaths and the lung's label.
+Diagnose = Callable[[Breaths, str], Answer]
+
+#: Arguments of :func:`_answer_case`, by name of the case.
+Work = Mapping[str, tuple[Any, ...]]
 
 
 def answer(
-    folder: Folder, *, jobs: int = 2, diagnose: Diagnose | None = None,
+    folder: ChallengeFolder, *, jobs: int = 2, diagnose: Diagnose | None = None,
+    cases_per_process: int = _CASES_PER_PROCESS,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, str]:  # fmt: skip
-    """Answer what has no answer yet, each as it is found.
+    """Answer all cases that have no answer yet; each answer is written as soon as it is there.
 
     Args:
         folder: of the challenge.
-        jobs: processes, of one thread each; 0 for none but this one.
-        diagnose: ventbench's own if None.
-        progress: told how many are answered, of how many.
+        jobs: number of processes of one thread each; 0 to work in this process.
+        diagnose: the diagnosis; ventbench's own if None.
+        cases_per_process: mean number of cases after which a new process replaces an old one.
+        progress: called with the number of answered cases and the number of all cases.
 
     Returns:
-        Why a case has no answer, by name.
+        The reason why a case has no answer, by name.
 
     Raises:
         InputError: if there is no challenge, a recording is missing, or a process has died.
     """
     entries = folder.cases()
     missing = [name for name in entries if not folder.recording(name).is_file()]
-    if folder.round == 2:  # only those that have asked for more
+    if folder.round == 2:  # has recordings only of the cases that requested breaths
         for name in missing:
             del entries[name]
     elif missing:
         raise InputError(f"{folder.recording(missing[0])} is missing")
-    work: Mapping[str, tuple[Any, ...]] = {
+    work: Work = {
         name: (folder, name, entry["lung"], diagnose)
         for name, entry in entries.items()
         if not folder.answer(name).is_file()
     }
     done, failed = len(entries) - len(work), {}
     progress(done, len(entries))
-    for part in _parts(work, _CASES * max(jobs, 1)):
-        with _one_thread(), executor(jobs) as pool:
-            for name, problem in results(pool, _one, part):
+    for batch in _batches(work, cases_per_process * max(jobs, 1)):
+        with _single_threaded(), executor(jobs) as pool:
+            for name, problem in results(pool, _answer_case, batch):
                 done += 1
                 progress(done, len(entries))
                 if problem:
@@ -94,36 +100,38 @@ def answer(
     return failed
 
 
-def _parts(work: Mapping[str, tuple[Any, ...]], size: int) -> Iterator[dict[str, tuple[Any, ...]]]:
-    """In order, so many at a time.
+def _batches(work: Work, size: int) -> Iterator[Work]:
+    """Split the work, in order.
 
     ``max_tasks_per_child`` of an executor would do, but hangs in Python 3.11.
     """
     rest = iter(work.items())
-    while part := dict(islice(rest, size)):
-        yield part
+    while batch := dict(islice(rest, size)):
+        yield batch
 
 
-def _one(folder: Folder, name: str, lung: str, diagnose: Diagnose | None) -> str:
-    """Answer one case; returns what went wrong, or nothing."""
+def _answer_case(
+    folder: ChallengeFolder, name: str, lung: str, diagnose: Diagnose | None
+) -> str:  # fmt: skip
+    """Answer one case; returns what went wrong, or an empty text."""
     global _answered
     began = time.perf_counter()
     try:
         breaths = load(folder.recording(name))
-        found = (diagnose or _own)(breaths, lung)
-        value = found.as_dict()
+        diagnosis = (diagnose or _ventbench_diagnosis)(breaths, lung)
+        value = diagnosis.as_dict()
     except Exception as error:
         return f"{type(error).__name__}: {error}"
     seconds = time.perf_counter() - began
-    if found.request is not None:
-        requests.write(folder.request(name), found.request, int(breaths.breath_id.max()) + 1)
+    if diagnosis.request is not None:
+        requests.write(folder.request(name), diagnosis.request, int(breaths.breath_id.max()) + 1)
     files.write_json(
         folder.answer(name),
         {
             "recording_sha256": breaths.sha256,
             "lung": lung,
             "seconds": round(seconds, 2),
-            "peak_mib": round(_peak(), 1),
+            "peak_mib": round(_peak_memory(), 1),
             "first_in_process": _answered == 0,
             "diagnosis": value,
         },
@@ -132,25 +140,24 @@ def _one(folder: Folder, name: str, lung: str, diagnose: Diagnose | None) -> str
     return ""
 
 
-def _own(breaths: Breaths, lung: str) -> Found:
-    from importlib import import_module
+def _ventbench_diagnosis(breaths: Breaths, lung: str) -> Answer:
+    from ventbench.diagnosis.diagnose import diagnose
 
     compilation.keep()
-    diagnosing = import_module("ventbench.diagnosis.diagnose")
-    return diagnosing.diagnose(breaths, plant="physics", lung=lung)
+    return diagnose(breaths, plant="physics", lung=lung)
 
 
-def _peak() -> float:
-    """Most memory that this process has held, MiB."""
+def _peak_memory() -> float:
+    """Largest memory of this process so far, MiB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Set what processes started within inherit."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(_THREADS)
+def _single_threaded() -> Iterator[None]:
+    """Set the environment that processes started within the block inherit."""
+    before = {name: os.environ.get(name) for name in _SINGLE_THREAD}
+    os.environ.update(_SINGLE_THREAD)
     try:
         yield
     finally:

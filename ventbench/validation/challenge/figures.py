@@ -1,13 +1,15 @@
-"""Figures to reach: shares with intervals, medians, and whether each goal is met."""
+"""Figures of a challenge: shares with intervals, medians, goals, and tables of the answers."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from ventbench.validation.challenge.judge import Judged
+from ventbench.validation.challenge.judge import EstimateAgainstTruth, JudgedCase
 from ventbench.validation.challenge.plan import CLASSES
 
 
@@ -16,12 +18,12 @@ class Figure:
     """A measured value and its goal.
 
     Attributes:
-        what: in words.
-        value: measured, None if there was nothing to measure.
+        what: the measured quantity, in words.
+        value: None if there was nothing to measure.
         goal: in words, ``""`` if there is none.
-        count: of what it was measured on.
+        count: number of cases, parameters or breaths behind the value.
         ci95: Wilson's interval of a share, else None.
-        met: the goal, None if there is none or no value.
+        met: whether the goal is met; None without a goal or a value.
     """
 
     what: str
@@ -33,7 +35,7 @@ class Figure:
 
 
 def wilson(hits: int, count: int) -> tuple[float, float]:
-    """95 % interval of a share by Wilson's score."""
+    """95 % score interval (Wilson) of a share."""
     z = 1.959964
     centre = hits + z * z / 2
     reach = z * np.sqrt(hits * (count - hits) / count + z * z / 4)
@@ -44,9 +46,9 @@ def wilson(hits: int, count: int) -> tuple[float, float]:
 def share(
     what: str, hits: Iterable[bool], *, least: float | None = None, most: float | None = None
 ) -> Figure:
-    """A share of cases, with its goal."""
-    given = list(hits)
-    n, k = len(given), sum(given)
+    """Share of the hits, with its goal."""
+    each = list(hits)
+    n, k = len(each), sum(each)
     goal = _goal(least, most)
     if n == 0:
         return Figure(what, None, goal, 0, None, None)
@@ -61,8 +63,8 @@ def _goal(least: float | None, most: float | None) -> str:
     return f">= {least:.0%}" if most is None else f"{least:.0%} to {most:.0%}"
 
 
-def number(what: str, values: Sequence[float], of: Callable, most: float | None) -> Figure:
-    """A statistic with its upper limit."""
+def statistic(what: str, values: Sequence[float], of: Callable, most: float | None) -> Figure:
+    """Statistic ``of`` the values, with its upper limit."""
     goal = "" if most is None else f"<= {most:g}"
     if len(values) == 0:
         return Figure(what, None, goal, 0, None, None)
@@ -70,8 +72,8 @@ def number(what: str, values: Sequence[float], of: Callable, most: float | None)
     return Figure(what, value, goal, len(values), None, None if most is None else value <= most)
 
 
-def figures(cases: Sequence[Judged]) -> list[Figure]:
-    """All that can be said without an oracle."""
+def figures(cases: Sequence[JudgedCase]) -> list[Figure]:
+    """All figures that need no oracle."""
     single = [c for c in cases if c.kind == "single"]
     seen = [c for c in single if c.visible]
     strong = [c for c in seen if c.strengths == ("strong",)]
@@ -104,7 +106,7 @@ def figures(cases: Sequence[Judged]) -> list[Figure]:
         share("pair: both and only both", (c.named == c.library for c in pair), least=0.85),
         share("four: terms found",
               (name in c.named for c in four for name in sorted(c.seen)), least=0.90),
-        number("four: spurious names a case", [len(c.wrong) for c in four], np.mean, 0.25),
+        statistic("four: spurious names a case", [len(c.wrong) for c in four], np.mean, 0.25),
         share("masked: right name and nothing else", (c.right for c in masked)),
         share("masked: a wrong name", (bool(c.wrong) for c in masked)),
         *_parameters(cases),
@@ -115,10 +117,10 @@ def figures(cases: Sequence[Judged]) -> list[Figure]:
     ]  # fmt: skip
 
 
-def _distances(cases: Sequence[Judged]) -> list[Figure]:
+def _distances(cases: Sequence[JudgedCase]) -> list[Figure]:
     acting = [c for c in cases if c.effects]
     return [
-        number(f"held-out RMSE with an effect, {stage}, median", values, np.median, None)
+        statistic(f"held-out RMSE with an effect, {stage}, median", values, np.median, None)
         for stage, values in (
             ("before", [c.before for c in acting]),
             ("refitted", [c.refit for c in acting]),
@@ -127,44 +129,83 @@ def _distances(cases: Sequence[Judged]) -> list[Figure]:
     ]
 
 
-def _parameters(cases: Sequence[Judged]) -> list[Figure]:
-    made = [item for c in cases for item in c.estimates]
-    errors = [item.error for item in made]
+def _parameters(cases: Sequence[JudgedCase]) -> list[Figure]:
+    estimates = [estimate for c in cases for estimate in c.estimates]
+    errors = [estimate.error for estimate in estimates]
     return [
-        number("parameters: median relative error", errors, np.median, 0.10),
+        statistic("parameters: median relative error", errors, np.median, 0.10),
         share(
             "parameters: 95 % intervals that hold the truth",
-            (item.covered for item in made),
+            (estimate.covered for estimate in estimates),
             least=0.92,
             most=0.98,
         ),
     ]
 
 
-def _costs(cases: Sequence[Judged]) -> list[Figure]:
+def _costs(cases: Sequence[JudgedCase]) -> list[Figure]:
     started = [c for c in cases if not c.first]
     few = [c.seconds for c in started if c.kind != "four"]
     many = [c.seconds for c in started if c.kind == "four"]
     return [
-        number("seconds a case, longest", few, np.max, 60.0),
-        number("seconds a case, median", few, np.median, None),
-        number("seconds a case with four effects, longest", many, np.max, 180.0),
-        number("memory, MiB, most", [c.peak for c in cases], np.max, 1024.0),
+        statistic("seconds a case, longest", few, np.max, 60.0),
+        statistic("seconds a case, median", few, np.median, None),
+        statistic("seconds a case with four effects, longest", many, np.max, 180.0),
+        statistic("memory, MiB, most", [c.peak for c in cases], np.max, 1024.0),
     ]
 
 
-def _in_class(case: Judged) -> bool:
+def _within_class(case: JudgedCase) -> bool:
     return any(case.wrong & group and case.library & group for group in CLASSES)
 
 
-def second(before: dict[str, Judged], after: dict[str, Judged]) -> Figure:
-    """Share of the confusable cases that the breaths asked for have resolved.
+def second_round(before: dict[str, JudgedCase], after: dict[str, JudgedCase]) -> Figure:
+    """Share of the confusable cases that the requested breaths resolve.
 
-    Confusable: alternatives were listed, or a name of the same class was given for the true one.
+    A case is confusable if its first answer lists alternatives, or gives another name of the same
+    class for the true one.
     """
     cases = [
         after[name].resolved
         for name, first in before.items()
-        if name in after and (first.open or _in_class(first))
+        if name in after and (first.open or _within_class(first))
     ]
     return share("confusable cases resolved by five more breaths", cases, least=0.80)
+
+
+_NOTHING, _SEVERAL = "nothing missing", "several names"
+
+
+def confusion(cases: Sequence[JudgedCase]) -> dict[str, dict[str, int]]:
+    """Counts by truth, then by answer, over the cases with one effect or none."""
+    table: dict[str, Counter[str]] = {}
+    for case in sorted(cases, key=lambda c: c.effects):
+        if len(case.effects) <= 1:
+            truth = case.effects[0] if case.effects else _NOTHING
+            table.setdefault(truth, Counter())[_answer_in_words(case)] += 1
+    return {truth: dict(counts.most_common()) for truth, counts in table.items()}
+
+
+def _answer_in_words(case: JudgedCase) -> str:
+    if case.verdict == "nothing_missing":
+        return _NOTHING
+    if case.verdict == "unnamed":
+        return f"unnamed: {case.slot}"
+    name = next(iter(case.named)) if len(case.named) == 1 else _SEVERAL
+    return name if case.slot is None else f"{name} + {case.slot}"
+
+
+def by_parameter(cases: Sequence[JudgedCase]) -> dict[str, dict[str, Any]]:
+    """Coverage and median error of the estimates of each parameter, by its path."""
+    grouped: dict[str, list[EstimateAgainstTruth]] = {}
+    for case in cases:
+        for estimate in case.estimates:
+            grouped.setdefault(estimate.path, []).append(estimate)
+    return {
+        path: {
+            "count": len(estimates),
+            "covered": sum(estimate.covered for estimate in estimates),
+            "median_error": sorted(e.error for e in estimates)[len(estimates) // 2],
+        }
+        for path, estimates in sorted(grouped.items())
+    }

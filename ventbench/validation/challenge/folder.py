@@ -1,25 +1,108 @@
-"""The folder of a challenge: where its files are, and reading them with checks."""
+"""Files of a challenge: where they are, and the answers under seal.
+
+The answers are encrypted with the secret, and their hash is published before anyone answers.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ventbench import files
 from ventbench.errors import InputError
-from ventbench.validation.challenge import seal
-from ventbench.validation.challenge.plan import Drawn
+from ventbench.validation.challenge.cases import Base, Case, DrawnCase, Effect
+
+_FORMAT = "ventbench-challenge-1"
+
+#: Cases, each with the nats of its effects.
+Truth = list[tuple[DrawnCase, list[float]]]
+
+
+def random_generator(secret: str, *purpose: str) -> np.random.Generator:
+    """Return random numbers that only the secret determines, different ones for each purpose."""
+    text = "\n".join((_FORMAT, secret, *purpose))
+    digest = hashlib.sha256(text.encode()).digest()
+    return np.random.default_rng(np.random.SeedSequence(int.from_bytes(digest, "big")))
+
+
+def encode_answers(secret: str, drawn: list[DrawnCase], nats: list[list[float]]) -> bytes:
+    """Return the plain text of the answers; a random nonce keeps their hash from being guessed.
+
+    Args:
+        secret: of the challenge.
+        drawn: its cases.
+        nats: of each effect of each case, from
+            :func:`~ventbench.validation.challenge.detectability.log_likelihood_loss`.
+    """
+    cases = [
+        {"kind": question.kind, "nats": of_effects, "case": asdict(question.case)}
+        for question, of_effects in zip(drawn, nats, strict=True)
+    ]
+    nonce = random_generator(secret, "nonce").bytes(32).hex()
+    value = {"format": _FORMAT, "nonce": nonce, "cases": cases}
+    return (json.dumps(value, indent=1, allow_nan=False) + "\n").encode()
+
+
+def decode_answers(text: bytes) -> Truth:
+    """Return the cases and the nats of their effects from the plain text of the answers."""
+    return [
+        (DrawnCase(entry["kind"], _case(entry["case"])), [float(nats) for nats in entry["nats"]])
+        for entry in json.loads(text)["cases"]
+    ]
+
+
+def _case(value: dict[str, Any]) -> Case:
+    effects = tuple(Effect(**effect) for effect in value["effects"])
+    base = None if value["base"] is None else Base(**value["base"])
+    return Case(**(value | {"effects": effects, "base": base}))
+
+
+def commitment(text: bytes) -> str:
+    """SHA-256 of the plain answers, hexadecimal."""
+    return hashlib.sha256(text).hexdigest()
+
+
+def encrypt(text: bytes, secret: str, public: bytes) -> bytes:
+    """Encrypt or decrypt with a key stream of SHA-256 blocks.
+
+    Args:
+        text: answers, plain or encrypted.
+        secret: of the challenge.
+        public: the public file of the cases, so that no key stream is used twice.
+    """
+    key = hashlib.sha256(public + b"\n" + secret.encode()).digest()
+    blocks = range((len(text) + 31) // 32)
+    stream = b"".join(hashlib.sha256(key + k.to_bytes(8, "big")).digest() for k in blocks)
+    return bytes(a ^ b for a, b in zip(text, stream, strict=False))
+
+
+def unseal(data: bytes, secret: str, public: bytes, published: str) -> bytes:
+    """Decrypt the answers and check them against the published hash.
+
+    Raises:
+        InputError: if the secret is another one, or the answers are not those that were published.
+    """
+    text = encrypt(data, secret, public)
+    if commitment(text) != published:
+        raise InputError(
+            f"this seed decrypts answers whose SHA-256 is {commitment(text)}, but {published} was "
+            "published; give the seed that the challenge was made with, and its files unchanged"
+        )
+    return text
 
 
 @dataclass(frozen=True)
-class Folder:
-    """Files of a challenge.
+class ChallengeFolder:
+    """Paths of a challenge's files.
 
     Attributes:
         path: of the folder.
-        round: 1, or 2 with the breaths that were asked for.
+        round: 1, or 2 with the breaths that the first answers requested.
     """
 
     path: Path
@@ -45,19 +128,19 @@ class Folder:
         return "" if self.round == 1 else f"_{self.round}"
 
     def recording(self, name: str) -> Path:
-        """Of a case."""
+        """Recording of a case."""
         return self.path / f"recordings{self._suffix}" / f"{name}.csv"
 
     def answer(self, name: str) -> Path:
-        """What was found in a case."""
+        """Answer to a case."""
         return self.path / f"answers{self._suffix}" / f"{name}.json"
 
     def request(self, name: str) -> Path:
-        """Breaths that are asked for."""
+        """Breaths that the answer to a case requests."""
         return self.path / f"requests{self._suffix}" / f"{name}.csv"
 
     def cases(self) -> dict[str, dict[str, str]]:
-        """Public entries by name.
+        """Return the public entries by name.
 
         Raises:
             InputError: if there is no challenge in the folder.
@@ -70,37 +153,38 @@ class Folder:
         return {Path(entry["file"]).stem: entry for entry in entries}
 
     def check_recordings(self) -> None:
-        """Compare the first round's recordings with their hashes.
+        """Compare the recordings of the first round with their hashes.
 
         Raises:
-            InputError: if one is missing or another one.
+            InputError: if a recording is missing or has another hash.
         """
         for name, entry in self.cases().items():
-            path = Folder(self.path).recording(name)
+            path = ChallengeFolder(self.path).recording(name)
             if not path.is_file():
-                raise InputError(f"{path} is missing; make the challenge anew in another folder")
+                raise InputError(f"{path} is missing; make the challenge again in another folder")
             if files.sha256(path) != entry["sha256"]:
-                raise InputError(f"{path} is not the recording that was made; its hash differs")
+                raise InputError(
+                    f"{path} is not the recording that the challenge was made with; its hash "
+                    "differs"
+                )
 
     def answers(self) -> dict[str, dict[str, Any]]:
-        """What was found, by name; cases without an answer are left out."""
-        found = {}
-        for name in self.cases():
-            path = self.answer(name)
-            if path.is_file():
-                found[name] = json.loads(path.read_text())
-        return found
+        """Return the answers by name; cases without an answer are left out."""
+        paths = {name: self.answer(name) for name in self.cases()}
+        return {
+            name: json.loads(path.read_text()) for name, path in paths.items() if path.is_file()
+        }
 
-    def truth(self, secret: str) -> list[tuple[Drawn, list[float]]]:
-        """Open the seal.
+    def truth(self, secret: str) -> Truth:
+        """Open the seal; returns the cases with the nats of their effects.
 
         Raises:
-            InputError: if the secret is not that of the challenge or files are missing.
+            InputError: if the secret is not that of the challenge, or files are missing.
         """
         self.cases()
         for path in (self.sealed, self.commitment):
             if not path.is_file():
                 raise InputError(f"{path} is missing; the challenge cannot be revealed without it")
-        promised = self.commitment.read_text().split()[0]
-        text = seal.opened(self.sealed.read_bytes(), secret, self.public.read_bytes(), promised)
-        return seal.parse(text)
+        published = self.commitment.read_text().split()[0]
+        text = unseal(self.sealed.read_bytes(), secret, self.public.read_bytes(), published)
+        return decode_answers(text)

@@ -1,27 +1,112 @@
-"""One answer against the truth."""
+"""One answer against the truth: names, places and values.
+
+A fit assumes the nominal gain of the valve; true values are converted to what it should find.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
-from ventbench.validation.challenge import truth
-from ventbench.validation.challenge.plan import Drawn, Kind
+from ventbench.validation.challenge.cases import (
+    EFFECTS,
+    NOMINAL_GAIN,
+    Case,
+    DrawnCase,
+    Effect,
+    Kind,
+    in_library,
+)
+from ventbench.validation.challenge.detectability import LIMIT
 
-#: Names besides the first that may be listed.
-_LISTED = 2
+#: Places that are right for an effect outside the library.
+PLACES: dict[str, frozenset[str]] = {
+    "volume_resistance": frozenset({"R(V)"}),
+    "cardiogenic": frozenset({"f(t) at the alveolus"}),
+    "pulsating_supply": frozenset({"f(t) at the supply"}),
+    "direction_resistance": frozenset({"R(direction)", "f(Q)"}),
+    "second_compartment": frozenset({"memory of p", "memory of V"}),
+    "sensor_nonlinearity": frozenset({"measurement"}),
+    "expiratory_valve_orifice": frozenset({"exhalation path"}),
+}
+
+#: Mechanisms whose equations equal those of an effect outside the library when only pressure is
+#: seen.
+EQUIVALENTS: dict[str, str] = {"second_compartment": "viscoelasticity"}
+
+#: Power of (true gain / nominal gain) by which a parameter's value changes when a fit assumes the
+#: nominal gain: flows are scaled, pressures are not.
+_POWERS = {
+    "leak.conductance": -1,
+    "circuit_compliance.compliance": -1,
+    "inertance.inertance": 1,
+    "turbulent_resistance.quadratic": 2,
+}
+
+#: Number of alternatives of an answer that count.
+_ALTERNATIVES = 2
+
+
+def library_names(case: Case) -> frozenset[str]:
+    """Mechanisms of the library that are in the case."""
+    return frozenset(effect.name for effect in case.effects if EFFECTS[effect.name].inside)
+
+
+def acceptable_names(case: Case) -> frozenset[str]:
+    """Mechanisms of the library that are in the case, or are equivalent to an effect in it."""
+    equivalents = {EQUIVALENTS[e.name] for e in case.effects if e.name in EQUIVALENTS}
+    return library_names(case) | equivalents
+
+
+def right_places(case: Case) -> frozenset[str]:
+    """Places that are right for the case's effects outside the library."""
+    return frozenset().union(*(PLACES.get(effect.name, frozenset()) for effect in case.effects))
+
+
+def detectable_names(case: Case, nats: list[float]) -> frozenset[str]:
+    """Effects above the detection limit, by their nats."""
+    pairs = zip(case.effects, nats, strict=True)
+    return frozenset(effect.name for effect, loss in pairs if loss >= LIMIT)
+
+
+def true_values(case: Case) -> dict[str, float]:
+    """Parameters by path, of effects that the library has in exactly this form.
+
+    Parameters that the library fits only on request (shapes), parameters that differ from breath to
+    breath, and rounding, which has no size, are left out.
+    """
+    assert case.base is not None
+    ratio = case.base.gain / NOMINAL_GAIN
+    values = {}
+    for effect in case.effects:
+        if in_library(effect):
+            values |= _values_of(effect, ratio)
+    return values
+
+
+def _values_of(effect: Effect, ratio: float) -> dict[str, float]:
+    given = effect.parameters
+    if effect.name == "command_rounding":
+        return {}
+    if effect.name == "patient_effort":
+        return {"patient_effort.duration": given["duration"]}
+    if effect.name == "supply_droop":  # per flow, which is scaled
+        k = given["drop"] / (1.0 - given["drop"]) * ratio
+        return {"supply_droop.drop": k / (1.0 + k)}
+    paths = {f"{effect.name}.{key}": value for key, value in given.items()}
+    return {path: value * ratio ** _POWERS.get(path, 0) for path, value in paths.items()}
 
 
 @dataclass(frozen=True)
-class Estimated:
-    """A parameter: what was found and what is true.
+class EstimateAgainstTruth:
+    """An estimated parameter beside its true value.
 
     Attributes:
         path: of the parameter.
-        value: found.
-        low: end of its 95 % interval.
-        high: other end.
-        true: as seen with the nominal valve gain.
+        value: estimate.
+        low: lower end of the estimate's 95 % interval.
+        high: upper end of the interval.
+        true: as a fit with the nominal valve gain sees it.
     """
 
     path: str
@@ -32,7 +117,7 @@ class Estimated:
 
     @property
     def error(self) -> float:
-        """Relative, without sign."""
+        """Absolute relative error."""
         return abs(self.value - self.true) / abs(self.true)
 
     @property
@@ -42,30 +127,30 @@ class Estimated:
 
 
 @dataclass(frozen=True)
-class Judged:
-    """One case.
+class JudgedCase:
+    """One case with its answer.
 
     Attributes:
         name: of the case.
         kind: of the question.
         lung: label.
         strengths: of the effects.
-        effects: names, in the rig.
-        library: of these, the library's (or what is as good).
+        effects: names of the effects in the rig.
+        library: names of the library that are acceptable for these effects.
         seen: effects above the detection limit.
-        verdict: that was given.
-        named: mechanisms that were named.
-        listed: true mechanisms that were named or listed as one of two alternatives.
-        open: the answer names alternatives.
-        slot: that was given, or None.
-        right_slot: it is one of the effect's.
-        estimates: of the parameters of rightly named effects in the library's form.
-        before: held-out open-loop RMSE, cmH2O.
-        refit: likewise.
-        after: likewise.
-        seconds: that the answer took.
+        verdict: of the answer.
+        named: mechanisms that the answer names.
+        listed: true mechanisms that are named or among the first two alternatives to a name.
+        open: whether the answer lists alternatives.
+        slot: place without a name that the answer gives, or None.
+        right_slot: whether that place is one of the effect's.
+        estimates: parameters of rightly named effects in the library's form.
+        before: held-out open-loop RMSE of the given simulator, cmH2O.
+        refit: held-out open-loop RMSE of the refitted simulator, cmH2O.
+        after: held-out open-loop RMSE of the corrected simulator, cmH2O.
+        seconds: time of the answer.
         peak: memory, MiB.
-        first: it was the first of its process, with compilation.
+        first: whether the case was the first of its process, which includes compilation.
     """
 
     name: str
@@ -81,7 +166,7 @@ class Judged:
     open: bool
     slot: str | None
     right_slot: bool
-    estimates: tuple[Estimated, ...]
+    estimates: tuple[EstimateAgainstTruth, ...]
     before: float
     refit: float
     after: float
@@ -91,17 +176,17 @@ class Judged:
 
     @property
     def visible(self) -> bool:
-        """Every effect is above the detection limit."""
+        """Whether every effect is above the detection limit."""
         return self.seen == frozenset(self.effects)
 
     @property
     def silent(self) -> bool:
-        """Nothing was said to be missing."""
+        """Whether the answer is that nothing is missing."""
         return self.verdict == "nothing_missing"
 
     @property
     def right(self) -> bool:
-        """All true names, no other name and no place without a name."""
+        """Whether the answer has all true names, no other name and no place without a name."""
         if self.kind == "outside":
             return self.said_outside and self.right_slot
         if not self.effects:
@@ -115,61 +200,63 @@ class Judged:
 
     @property
     def said_outside(self) -> bool:
-        """It was said that the library lacks the effect, or a name that is as good was given."""
-        as_good = bool(self.library) and self.named == self.library
-        return self.verdict == "unnamed" or as_good
+        """Whether the answer calls the effect unknown to the library, or names an equivalent."""
+        equivalent = bool(self.library) and self.named == self.library
+        return self.verdict == "unnamed" or equivalent
 
     @property
     def resolved(self) -> bool:
-        """Right, and without alternatives."""
+        """Whether the answer is right and lists no alternatives."""
         return self.right and not self.open
 
 
-def judge(drawn: Drawn, worth: list[float], answer: dict[str, Any]) -> Judged:
-    """Compare.
+def judge(drawn: DrawnCase, nats: list[float], answer: dict[str, Any]) -> JudgedCase:
+    """Compare an answer with the truth.
 
     Args:
         drawn: the case.
-        worth: nats of its effects.
-        answer: file of the answer.
+        nats: of its effects.
+        answer: content of the answer's file.
     """
-    case, found = drawn.case, answer["diagnosis"]
-    library = truth.acceptable(case)
-    given = found["mechanisms"]
-    named = frozenset(item["name"] for item in given)
-    alternatives = {name for item in given for name in item["alternatives"][:_LISTED]}
-    slot = found["slot"]["name"] if found["slot"] else None
-    as_good = drawn.kind == "outside" and bool(library) and named == library
-    return Judged(
+    case, diagnosis = drawn.case, answer["diagnosis"]
+    library = acceptable_names(case)
+    mechanisms = diagnosis["mechanisms"]
+    named = frozenset(mechanism["name"] for mechanism in mechanisms)
+    alternatives = {name for m in mechanisms for name in m["alternatives"][:_ALTERNATIVES]}
+    place = diagnosis["slot"]["name"] if diagnosis["slot"] else None
+    equivalent = drawn.kind == "outside" and bool(library) and named == library
+    return JudgedCase(
         name=case.name,
         kind=drawn.kind,
         lung=case.lung,
-        strengths=tuple(item.strength for item in case.effects),
-        effects=tuple(item.name for item in case.effects),
+        strengths=tuple(effect.strength for effect in case.effects),
+        effects=tuple(effect.name for effect in case.effects),
         library=library,
-        seen=truth.seen(case, worth),
-        verdict=found["verdict"],
+        seen=detectable_names(case, nats),
+        verdict=diagnosis["verdict"],
         named=named,
         listed=library & (named | alternatives),
-        open=any(item["alternatives"] for item in given),
-        slot=slot,
-        right_slot=slot in truth.slots(case) or as_good,
-        estimates=_estimates(truth.values(case), given),
-        before=found["open_loop"]["before"]["rmse"],
-        refit=found["open_loop"]["refit"]["rmse"],
-        after=found["open_loop"]["after"]["rmse"],
+        open=any(mechanism["alternatives"] for mechanism in mechanisms),
+        slot=place,
+        right_slot=place in right_places(case) or equivalent,
+        estimates=_estimates(true_values(case), mechanisms),
+        before=diagnosis["open_loop"]["before"]["rmse"],
+        refit=diagnosis["open_loop"]["refit"]["rmse"],
+        after=diagnosis["open_loop"]["after"]["rmse"],
         seconds=answer["seconds"],
         peak=answer["peak_mib"],
         first=answer["first_in_process"],
     )
 
 
-def _estimates(true: dict[str, float], given: list[dict[str, Any]]) -> tuple[Estimated, ...]:
-    made = []
-    for item in given:
-        for key, value in item["parameters"].items():
-            path = f"{item['name']}.{key}"
-            low, high = value["ci95"]
-            if path in true and None not in (low, high, value["value"]):
-                made.append(Estimated(path, value["value"], low, high, true[path]))
-    return tuple(made)
+def _estimates(
+    true: dict[str, float], mechanisms: list[dict[str, Any]]
+) -> tuple[EstimateAgainstTruth, ...]:
+    estimates = []
+    for mechanism in mechanisms:
+        for key, estimate in mechanism["parameters"].items():
+            path, value = f"{mechanism['name']}.{key}", estimate["value"]
+            low, high = estimate["ci95"]
+            if path in true and None not in (low, high, value):
+                estimates.append(EstimateAgainstTruth(path, value, low, high, true[path]))
+    return tuple(estimates)

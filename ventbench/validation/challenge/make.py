@@ -1,4 +1,4 @@
-"""Making a challenge: recordings for everyone, answers under seal, their hash first."""
+"""Making a challenge: recordings for everyone, answers under seal, and the hash of the answers."""
 
 from __future__ import annotations
 
@@ -15,16 +15,24 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.schema import COLUMNS
 from ventbench.recordings.write import write
 from ventbench.training.executor import executor, results
-from ventbench.validation.challenge import seal
-from ventbench.validation.challenge.detect import nats
-from ventbench.validation.challenge.folder import Folder
-from ventbench.validation.challenge.plan import Drawn, Kind, draw
+from ventbench.validation.challenge.cases import DrawnCase, Kind
+from ventbench.validation.challenge.detectability import log_likelihood_loss
+from ventbench.validation.challenge.folder import (
+    ChallengeFolder,
+    commitment,
+    encode_answers,
+    encrypt,
+    random_generator,
+)
+from ventbench.validation.challenge.plan import draw
 from ventbench.validation.challenge.rig import record
 
-#: What a recording's pressure may be, and how often a case is recorded anew that leaves it: first
-#: with other commands, then with gentler ones, each time this share of those before.
+#: Limits of a recorded pressure.
 PRESSURE = COLUMNS["pressure"]
-_ATTEMPTS, _MORE, _GENTLER = 10, 10, 0.85
+
+#: Attempts to stay within the limits: with other commands of the usual size first, then with
+#: gentler ones, each this share of the attempt before.
+_USUAL_ATTEMPTS, _GENTLE_ATTEMPTS, _GENTLER = 10, 10, 0.85
 
 
 def make(
@@ -36,66 +44,81 @@ def make(
     The same secret, kind and count give the same bytes.
 
     Args:
-        secret: what everything is drawn from.
+        secret: seed of everything that is drawn.
         out: folder, which must not hold a challenge yet.
         kind: of the cases.
-        count: of the cases.
-        jobs: processes.
-        progress: told how many recordings are made.
+        count: number of cases.
+        jobs: number of processes.
+        progress: called with the number of finished recordings.
 
     Returns:
         The commitment: SHA-256 of the answers.
 
     Raises:
-        InputError: if the folder holds a challenge, or there is nothing to draw.
+        InputError: if the folder holds a challenge, or there are too few cases for all kinds.
     """
-    folder = Folder(out)
+    folder = ChallengeFolder(out)
     if folder.sealed.exists():
         raise InputError(f"{out} holds a challenge already; choose another folder")
     drawn = [
-        Drawn(item.kind, replace(item.case, name=f"case_{k:04d}"))
-        for k, item in enumerate(draw(kind, count, seal.generator(secret, "plan")), start=1)
+        DrawnCase(question.kind, replace(question.case, name=f"case_{k:04d}"))
+        for k, question in enumerate(draw(kind, count, random_generator(secret, "plan")), start=1)
     ]
-    worth: dict[str, list[float]] = {}
+    names = [question.case.name for question in drawn]
+    nats: dict[str, list[float]] = {}
     with executor(jobs if jobs > 1 else 0) as pool:
-        work = {item.case.name: (secret, folder, item) for item in drawn}
-        for name, found in results(pool, _one, work):
-            worth[name] = found
-            progress(len(worth))
-    text = seal.plain(secret, drawn, [worth[item.case.name] for item in drawn])
-    files.write_text(folder.commitment, seal.commitment(text) + "\n")
+        work = {question.case.name: (secret, folder, question) for question in drawn}
+        for name, of_effects in results(pool, _make_case, work):
+            nats[name] = of_effects
+            progress(len(nats))
+    text = encode_answers(secret, drawn, [nats[name] for name in names])
+    files.write_text(folder.commitment, commitment(text) + "\n")
     entries = [
         {
-            "file": f"recordings/{item.case.name}.csv",
-            "lung": item.case.lung,
-            "sha256": files.sha256(folder.recording(item.case.name)),
+            "file": f"recordings/{question.case.name}.csv",
+            "lung": question.case.lung,
+            "sha256": files.sha256(folder.recording(question.case.name)),
         }
-        for item in drawn
+        for question in drawn
     ]
     files.write_json(folder.public, {"cases": entries})
-    data = seal.sealed(text, secret, folder.public.read_bytes())
-    files.write_atomically(folder.sealed, lambda file: file.write(data))
-    return seal.commitment(text)
+    sealed = encrypt(text, secret, folder.public.read_bytes())
+    files.write_atomically(folder.sealed, lambda file: file.write(sealed))
+    return commitment(text)
 
 
-def _one(secret: str, folder: Folder, item: Drawn) -> list[float]:
-    """Record one case; returns what each of its effects is worth."""
-    breaths = _recorded(secret, item)
-    write(breaths, folder.recording(item.case.name))
-    return [round(nats(item.case, breaths, k), 1) for k in range(len(item.case.effects))]
+def _make_case(secret: str, folder: ChallengeFolder, drawn: DrawnCase) -> list[float]:
+    """Record one case; returns the nats of each of its effects."""
+    case = drawn.case
+    breaths = record_within_limits(secret, drawn)
+    write(breaths, folder.recording(case.name))
+    return [round(log_likelihood_loss(case, breaths, k), 1) for k in range(len(case.effects))]
 
 
-def _recorded(secret: str, item: Drawn) -> Breaths:
-    """A recording within a sensor's range: with other commands, if those of before left it.
+def record_within_limits(
+    secret: str, drawn: DrawnCase, *, usual: int = _USUAL_ATTEMPTS, gentle: int = _GENTLE_ATTEMPTS,
+    record: Callable[..., Breaths] = record,
+) -> Breaths:  # fmt: skip
+    """Record a case, repeatedly until the pressures are within the limits of a recording.
 
-    Lungs that stiffen steeply leave it with all of the usual ones.
+    Lungs that stiffen steeply leave the limits under all usual commands.
+
+    Args:
+        secret: of the challenge.
+        drawn: the case.
+        usual: number of attempts with commands of the usual size.
+        gentle: number of attempts with smaller and smaller ones after these.
+        record: simulates a case; see :func:`~ventbench.validation.challenge.rig.record`.
+
+    Raises:
+        InputError: if every attempt leaves the limits.
     """
-    name = item.case.name
-    for attempt in range(_ATTEMPTS + _MORE):
-        more = () if attempt == 0 else (f"again {attempt}",)
-        share = _GENTLER ** max(attempt - _ATTEMPTS + 1, 0)
-        rng = seal.generator(secret, "recording", name, *more)
-        breaths = record(item.case, rng, share=share)
+    name = drawn.case.name
+    for attempt in range(usual + gentle):
+        repeated = () if attempt == 0 else (f"again {attempt}",)
+        share = _GENTLER ** max(attempt - usual + 1, 0)
+        rng = random_generator(secret, "recording", name, *repeated)
+        breaths = record(drawn.case, rng, share=share)
         if np.all((breaths.pressure >= PRESSURE.low) & (breaths.pressure <= PRESSURE.high)):
             return breaths
     span = f"{PRESSURE.low:g}..{PRESSURE.high:g} cmH2O"

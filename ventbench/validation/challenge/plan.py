@@ -1,23 +1,29 @@
-"""Which cases are drawn, for each kind of question that is put."""
+"""Which cases a challenge draws, for each kind of question."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
 from ventbench.errors import InputError
 from ventbench.lungs import LUNGS, Lung
-from ventbench.validation.challenge.cases import Case, Effect, Strength
-from ventbench.validation.challenge.forms import ENTRIES, LIBRARY, OUTSIDE, effect
-from ventbench.validation.challenge.rig import draw_base
+from ventbench.validation.challenge.cases import (
+    EFFECTS,
+    KINDS,
+    LIBRARY,
+    OUTSIDE,
+    Case,
+    DrawnCase,
+    Effect,
+    Kind,
+    Strength,
+    draw_base,
+    draw_effect,
+)
 
-Kind = Literal["single", "null", "pair", "four", "outside", "form", "masked"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
-
-#: Share of the cases of each kind when all are drawn.
+#: Share of each kind in a challenge of all kinds.
 SHARES: dict[Kind, float] = {
     "single": 0.34,
     "null": 0.18,
@@ -28,33 +34,25 @@ SHARES: dict[Kind, float] = {
     "masked": 0.07,
 }
 
-#: Classes within which one lung's pressure may not tell one effect from the other.
+#: Classes of effects that the pressure of a single lung may not tell apart.
 CLASSES: tuple[frozenset[str], ...] = (
     frozenset({"valve_lag", "sensor_lag", "circuit_compliance"}),
     frozenset({"leak", "valve_dead_band", "command_rounding", "viscoelasticity"}),
 )
 
-#: Not put into company: with others it is below the detection limit.
-_ALONE = ("inertance", "command_rounding")
+#: Never combined with other effects, among which they are below the detection limit.
+_SINGLE_ONLY = ("inertance", "command_rounding")
 
-_BOTH: tuple[Strength, ...] = ("mild", "strong")
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """A case and the question that it belongs to."""
-
-    kind: Kind
-    case: Case
+_STRENGTHS: tuple[Strength, ...] = ("mild", "strong")
 
 
-def draw(kind: Kind | Literal["all"], count: int, rng: np.random.Generator) -> list[Drawn]:
-    """Draw cases of a kind or of all, in an order that tells nothing.
+def draw(kind: Kind | Literal["all"], count: int, rng: np.random.Generator) -> list[DrawnCase]:
+    """Draw cases of one kind or of all kinds, in random order.
 
     Args:
-        kind: which.
-        count: how many.
-        rng: what they are drawn from.
+        kind: of the cases.
+        count: number of cases.
+        rng: source of random numbers.
 
     Raises:
         InputError: if there are fewer cases than kinds.
@@ -62,7 +60,7 @@ def draw(kind: Kind | Literal["all"], count: int, rng: np.random.Generator) -> l
     if count < (len(KINDS) if kind == "all" else 1):
         raise InputError(f"{count} cases are too few for {kind}; ask for at least {len(KINDS)}")
     sizes: list[tuple[Kind, int]] = _sizes(count) if kind == "all" else [(kind, count)]
-    cases = [Drawn(k, case) for k, n in sizes for case in _of_kind(k, n, rng)]
+    cases = [DrawnCase(k, case) for k, n in sizes for case in _of_kind(k, n, rng)]
     return [cases[i] for i in rng.permutation(len(cases))]
 
 
@@ -77,69 +75,69 @@ def _sizes(count: int) -> list[tuple[Kind, int]]:
 def _of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[Case]:
     if kind == "single":
         for name, strength, lung, form in _grid(LIBRARY, count, rng, other=False):
-            yield _case(lung, (effect(name, strength, rng, form),), rng)
+            yield _case(lung, (draw_effect(name, strength, rng, form),), rng)
     elif kind == "form":
-        names = tuple(name for name in LIBRARY if len(ENTRIES[name].forms) > 1)
+        names = tuple(name for name in LIBRARY if len(EFFECTS[name].forms) > 1)
         for name, strength, lung, form in _grid(names, count, rng, other=True):
-            yield _case(lung, (effect(name, strength, rng, form),), rng)
+            yield _case(lung, (draw_effect(name, strength, rng, form),), rng)
     elif kind == "outside":
         for name, strength, lung, form in _grid(OUTSIDE, count, rng, other=False):
-            yield _case(lung, (effect(name, strength, rng, form),), rng)
+            yield _case(lung, (draw_effect(name, strength, rng, form),), rng)
     elif kind == "masked":
         for name, strength, lung, form in _grid(LIBRARY, count, rng, other=False):
-            yield _masked(lung, effect(name, strength, rng, form), rng)
+            yield _masked(lung, draw_effect(name, strength, rng, form), rng)
     else:
-        for lung in _round(list(LUNGS), count, rng):
+        for lung in _rotate(list(LUNGS), count, rng):
             if kind == "null":
                 yield _null(lung, rng)
             else:
-                yield _case(lung, _company(2 if kind == "pair" else 4, rng), rng)
+                yield _case(lung, _combination(2 if kind == "pair" else 4, rng), rng)
 
 
 def _grid(
     names: tuple[str, ...], count: int, rng: np.random.Generator, *, other: bool
 ) -> Iterator[tuple[str, Strength, Lung, str]]:
-    """Draw evenly from names x strengths x lungs; ``other``: in turn the forms but the first."""
+    """Draw evenly from names x strengths x lungs; ``other``: from all forms but the first."""
     cells = {}
     for name in names:
-        mixed = [list(rng.permutation(len(LUNGS))) for _ in _BOTH]
+        mixed = [list(rng.permutation(len(LUNGS))) for _ in _STRENGTHS]
         first = int(rng.integers(2))
-        order = [(_BOTH[(first + k) % 2], mixed[(first + k) % 2][k // 2]) for k in range(12)]
-        forms = ENTRIES[name].forms[1:] if other else ENTRIES[name].forms[:1]
+        order = [(_STRENGTHS[(first + k) % 2], mixed[(first + k) % 2][k // 2]) for k in range(12)]
+        forms = EFFECTS[name].forms[1:] if other else EFFECTS[name].forms[:1]
         cells[name] = [
             (strength, LUNGS[int(place)], forms[k % len(forms)])
             for k, (strength, place) in enumerate(order)
         ]
     turns = dict.fromkeys(names, 0)
-    for name in _round(list(names), count, rng):
+    for name in _rotate(list(names), count, rng):
         strength, lung, form = cells[name][turns[name] % 12]
         turns[name] += 1
         yield name, strength, lung, form
 
 
-def _round(items: list, count: int, rng: np.random.Generator) -> Iterator:
-    """Take items in turn, each round in another order."""
+def _rotate(values: list, count: int, rng: np.random.Generator) -> Iterator:
+    """Take values in turn, in a new random order each time round."""
     for k in range(count):
-        if k % len(items) == 0:
-            order = rng.permutation(len(items))
-        yield items[order[k % len(items)]]
+        if k % len(values) == 0:
+            order = rng.permutation(len(values))
+        yield values[order[k % len(values)]]
 
 
-def _company(size: int, rng: np.random.Generator) -> tuple[Effect, ...]:
-    """Strong effects, no two of one class."""
-    found: list[str] = []
+def _combination(size: int, rng: np.random.Generator) -> tuple[Effect, ...]:
+    """Strong effects, no two of the same class."""
+    chosen: list[str] = []
     for index in rng.permutation(len(LIBRARY)):
         name = LIBRARY[index]
-        if name in _ALONE or any(name in c and c & set(found) for c in CLASSES):
+        if name in _SINGLE_ONLY or any(name in c and c & set(chosen) for c in CLASSES):
             continue
-        found.append(name)
-        if len(found) == size:
+        chosen.append(name)
+        if len(chosen) == size:
             break
-    return tuple(effect(name, "strong", rng) for name in sorted(found))
+    return tuple(draw_effect(name, "strong", rng) for name in sorted(chosen))
 
 
 def _case(lung: Lung, effects: tuple[Effect, ...], rng: np.random.Generator) -> Case:
-    """Noise is white in half of the cases, else up to 0.6 of its variance is correlated."""
+    """A case with effects; half of the cases have white noise, the others coloured noise."""
     return Case(
         "", lung.R, lung.C, effects, draw_base(lung.R, lung.C, rng),
         coloured=float(rng.uniform(0.1, 0.6)) if rng.uniform() < 0.5 else 0.0,
@@ -149,7 +147,7 @@ def _case(lung: Lung, effects: tuple[Effect, ...], rng: np.random.Generator) -> 
 
 
 def _null(lung: Lung, rng: np.random.Generator) -> Case:
-    """Nothing but what is no physics: noise of any colour, gain, jitter, a rounded log."""
+    """A case without effects, but with noise, gain, jitter and rounding that are no physics."""
     base = draw_base(lung.R, lung.C, rng)
     return Case(
         "", lung.R, lung.C, (), base,
@@ -162,10 +160,10 @@ def _null(lung: Lung, rng: np.random.Generator) -> Case:
     )  # fmt: skip
 
 
-def _masked(lung: Lung, item: Effect, rng: np.random.Generator) -> Case:
-    """Closed loop only, few breaths."""
+def _masked(lung: Lung, effect: Effect, rng: np.random.Generator) -> Case:
+    """A case with few breaths, all in closed loop."""
     return Case(
-        "", lung.R, lung.C, (item,), draw_base(lung.R, lung.C, rng),
+        "", lung.R, lung.C, (effect,), draw_base(lung.R, lung.C, rng),
         noise=float(rng.choice(np.array([0.1, 0.2, 0.3]))),
         breaths=int(rng.integers(8, 16)),
         style="pi",

@@ -1,4 +1,4 @@
-"""Breaths that a diagnosis asks for, as a file, and what the concealed rig answers."""
+"""Breaths that a diagnosis requests: their files, and their recording on the concealed rig."""
 
 from __future__ import annotations
 
@@ -13,13 +13,10 @@ from numpy.typing import NDArray
 
 from ventbench import files
 from ventbench.errors import InputError
-from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.join import join
 from ventbench.recordings.read import load
 from ventbench.recordings.write import write as write_recording
-from ventbench.validation.challenge import seal
-from ventbench.validation.challenge.cases import Case
-from ventbench.validation.challenge.folder import Folder
+from ventbench.validation.challenge.folder import ChallengeFolder, random_generator
 from ventbench.validation.challenge.rig import record_commands
 
 Floats = NDArray[np.float64]
@@ -28,7 +25,7 @@ _COLUMNS = ("breath_id", "time_step", "u_in", "u_out")
 
 
 class Commands(Protocol):
-    """What is asked for; all ``(k, T)``."""
+    """Requested breaths, as a diagnosis states them; all ``(k, T)``."""
 
     @property
     def u_in(self) -> Floats:
@@ -42,43 +39,49 @@ class Commands(Protocol):
 
     @property
     def dt(self) -> Floats:
-        """To the next sample, s."""
+        """Time to the next sample, s."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
-    """Breaths of a request; ``(k, T)`` each: s, %, 0/1."""
+class Request:
+    """Requested breaths, as read from a file.
+
+    Attributes:
+        time: of the samples from the breath's first, s, ``(k, T)``.
+        u_in: inspiratory valve, %, ``(k, T)``.
+        u_out: expiratory valve, 0/1, ``(k, T)``.
+    """
 
     time: Floats
     u_in: Floats
     u_out: NDArray[np.int8]
 
 
-def write(path: Path, asked: Commands, first: int) -> None:
-    """Write a request; breaths are numbered on from ``first``."""
+def write(path: Path, requested: Commands, first: int) -> None:
+    """Write a request; its breaths have the numbers from ``first`` on."""
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(_COLUMNS)
-    time = np.cumsum(np.pad(asked.dt[:, :-1], ((0, 0), (1, 0))), axis=1)
+    time = np.cumsum(np.pad(requested.dt[:, :-1], ((0, 0), (1, 0))), axis=1)
     for i in range(len(time)):
-        for t, u_in, u_out in zip(time[i], asked.u_in[i], asked.u_out[i], strict=True):
+        for t, u_in, u_out in zip(time[i], requested.u_in[i], requested.u_out[i], strict=True):
             rows.writerow((first + i, round(float(t), 6), round(float(u_in), 6), int(u_out)))
     files.write_text(path, text.getvalue())
 
 
-def read(path: Path) -> Asked:
+def read(path: Path) -> Request:
     """Read a request.
 
     Raises:
-        InputError: if the file is not one.
+        InputError: if the file is not a request.
     """
     with open(path, newline="") as file:
         lines = list(csv.reader(file))
     if not lines or tuple(lines[0]) != _COLUMNS:
         raise InputError(f"{path}: the columns must be {','.join(_COLUMNS)}")
     try:
-        table = np.array([[float(x) for x in row] for row in lines[1:]])
+        table = np.array([[float(cell) for cell in row] for row in lines[1:]])
         ids, counts = np.unique(table[:, 0], return_counts=True)
         time, u_in, u_out = (table[:, k].reshape(len(ids), int(counts[0])) for k in (1, 2, 3))
     except (ValueError, IndexError) as error:
@@ -87,35 +90,31 @@ def read(path: Path) -> Asked:
         ) from error
     if not (np.all((u_in >= 0) & (u_in <= 100)) and np.all(np.diff(time, axis=1) > 0)):
         raise InputError(f"{path}: u_in must be 0..100 % and time must rise within each breath")
-    return Asked(time, u_in, (u_out > 0.5).astype(np.int8))
+    return Request(time, u_in, (u_out > 0.5).astype(np.int8))
 
 
-def record(folder: Folder, secret: str) -> list[str]:
-    """Record what was asked for, each on its own rig, behind the recording that is there.
+def record(folder: ChallengeFolder, secret: str) -> list[str]:
+    """Record the requested breaths, each on its own rig, and append them to the first recording.
 
     Args:
         folder: first round of a challenge.
-        secret: of it.
+        secret: of the challenge.
 
     Returns:
-        Names of the cases.
+        Names of the cases with a request.
 
     Raises:
         InputError: if the secret is another one, or a request cannot be read.
     """
-    second, names = Folder(folder.path, 2), []
+    second, names = ChallengeFolder(folder.path, 2), []
     for drawn, _ in folder.truth(secret):
         case = drawn.case
         path = folder.request(case.name)
         if path.is_file():
-            more = _answered(case, read(path), secret)
-            write_recording(
-                join([load(folder.recording(case.name)), more]), second.recording(case.name)
-            )
+            requested = read(path)
+            rng = random_generator(secret, "second recording", case.name)
+            more = record_commands(case, requested.time, requested.u_in, requested.u_out, rng)
+            both = join([load(folder.recording(case.name)), more])
+            write_recording(both, second.recording(case.name))
             names.append(case.name)
     return names
-
-
-def _answered(case: Case, asked: Asked, secret: str) -> Breaths:
-    rng = seal.generator(secret, "second recording", case.name)
-    return record_commands(case, asked.time, asked.u_in, asked.u_out, rng)

@@ -1,39 +1,52 @@
-"""Opening the seal and scoring the answers."""
+"""Opening the seal and scoring the answers, also against a fit that knows the true structure."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ventbench.errors import InputError
+from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.read import load
 from ventbench.training.executor import executor, results
-from ventbench.validation.challenge import oracle, truth
-from ventbench.validation.challenge.confusion import by_effect, confusion
-from ventbench.validation.challenge.figures import Figure, figures, number, second
-from ventbench.validation.challenge.folder import Folder
-from ventbench.validation.challenge.judge import Judged, judge
-from ventbench.validation.challenge.plan import Drawn
+from ventbench.validation.challenge.figures import (
+    Figure,
+    by_parameter,
+    confusion,
+    figures,
+    second_round,
+    statistic,
+)
+from ventbench.validation.challenge.folder import ChallengeFolder, Truth
+from ventbench.validation.challenge.judge import JudgedCase, judge, library_names
+
+#: Goals for the corrected simulator's held-out RMSE over the oracle's: median, 95th percentile.
+_MEDIAN_RATIO, _LARGE_RATIO = 1.02, 1.10
+
+#: Parameters of each breath's own effort.
+_EFFORT = ("patient_effort.amplitude", "patient_effort.onset")
 
 
 @dataclass(frozen=True)
-class Revealed:
-    """All that is printed.
+class ChallengeResult:
+    """Scores of a challenge.
 
     Attributes:
-        commitment: hash of the answers, checked.
-        unanswered: cases without an answer; in the second round, of those that asked for breaths.
-        cases: the others.
+        commitment: hash of the true answers, checked.
+        unanswered: cases without an answer; in the second round only those with a request.
+        cases: the answered cases.
         figures: measured values with their goals.
-        confusion: see :func:`~.confusion.confusion`.
-        parameters: see :func:`~.confusion.by_effect`.
+        confusion: see :func:`~.figures.confusion`.
+        parameters: see :func:`~.figures.by_parameter`.
     """
 
     commitment: str
     unanswered: tuple[str, ...]
-    cases: tuple[Judged, ...]
+    cases: tuple[JudgedCase, ...]
     figures: tuple[Figure, ...]
     confusion: dict[str, dict[str, int]]
     parameters: dict[str, dict[str, Any]]
@@ -43,97 +56,143 @@ class Revealed:
         return {
             "commitment": self.commitment,
             "unanswered": list(self.unanswered),
-            "figures": [asdict(item) for item in self.figures],
+            "figures": [asdict(figure) for figure in self.figures],
             "confusion": self.confusion,
             "parameters": self.parameters,
-            "cases": [_plain(case) for case in self.cases],
+            "cases": [_as_dict(case) for case in self.cases],
         }
 
 
 def reveal(
-    folder: Folder, secret: str, *, with_oracle: bool = False, jobs: int = 0,
+    folder: ChallengeFolder, secret: str, *, with_oracle: bool = False, jobs: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Revealed:  # fmt: skip
-    """Check hashes and score.
+) -> ChallengeResult:  # fmt: skip
+    """Check all hashes and score the answers.
 
     Args:
-        folder: of the challenge; of its second round, the first is read too.
-        secret: that it was made with.
+        folder: of the challenge; for the second round, the first is read too.
+        secret: that the challenge was made with.
         with_oracle: compare with fits that know the true structure, which takes seconds a case.
-        jobs: processes that fit oracles; 0 for none but this one.
-        progress: told how many oracles are fitted, of how many.
+        jobs: number of processes that fit; 0 to work in this process.
+        progress: called with the number of finished fits and the number of all fits.
 
     Raises:
-        InputError: if the secret or a file is another one, or there is no answer.
+        InputError: if the secret or a file is not that of the challenge, or there is no answer.
     """
-    known = folder.truth(secret)
+    truth = folder.truth(secret)
     folder.check_recordings()
-    cases = _judged(folder, known)
+    cases = _judged(folder, truth)
     if not cases:
         raise InputError(f"{folder.answer('case_0001').parent} has no answers; run `answer` first")
-    found = figures(list(cases.values()))
+    measured = figures(list(cases.values()))
     if folder.round == 2:
-        found.append(second(_judged(Folder(folder.path), known), cases))
+        measured.append(second_round(_judged(ChallengeFolder(folder.path), truth), cases))
     if with_oracle:
-        found += _against_oracle(folder, known, cases, jobs, progress)
-    return Revealed(
+        measured += _against_oracle(folder, truth, cases, jobs, progress)
+    return ChallengeResult(
         folder.commitment.read_text().split()[0],
-        tuple(name for name in _asked(folder) if name not in cases),
+        tuple(name for name in _expected(folder) if name not in cases),
         tuple(cases.values()),
-        tuple(found),
+        tuple(measured),
         confusion(list(cases.values())),
-        by_effect(list(cases.values())),
+        by_parameter(list(cases.values())),
     )
 
 
-def _asked(folder: Folder) -> list[str]:
-    """Cases that should have an answer: in the second round those that asked for breaths."""
-    first = Folder(folder.path)
+def _expected(folder: ChallengeFolder) -> list[str]:
+    """Cases that should have an answer: in the second round those with a request."""
+    first = ChallengeFolder(folder.path)
     return [n for n in folder.cases() if folder.round == 1 or first.request(n).is_file()]
 
 
-def _judged(folder: Folder, known: list[tuple[Drawn, list[float]]]) -> dict[str, Judged]:
+def _judged(folder: ChallengeFolder, truth: Truth) -> dict[str, JudgedCase]:
     answers = folder.answers()
     if folder.round == 1:
         public = folder.cases()
-        for name, found in answers.items():
-            if found["recording_sha256"] != public[name]["sha256"]:
+        for name, given in answers.items():
+            if given["recording_sha256"] != public[name]["sha256"]:
                 raise InputError(f"{folder.answer(name)} answers another recording; remove it")
     return {
-        drawn.case.name: judge(drawn, worth, answers[drawn.case.name])
-        for drawn, worth in known
+        drawn.case.name: judge(drawn, nats, answers[drawn.case.name])
+        for drawn, nats in truth
         if drawn.case.name in answers
     }
 
 
 def _against_oracle(
-    folder: Folder, known: list[tuple[Drawn, list[float]]], cases: dict[str, Judged],
+    folder: ChallengeFolder, truth: Truth, cases: dict[str, JudgedCase],
     jobs: int, progress: Callable[[int, int], None],
 ) -> list[Figure]:  # fmt: skip
-    """Ratios of the held-out RMSE to that of a fit with the true names."""
+    """Ratios of the held-out RMSE to that of a fit with the true structure."""
     answers, ratios = folder.answers(), []
-    could = {
+    fits = {
         d.case.name: (
             folder.recording(d.case.name),
             answers[d.case.name]["diagnosis"]["open_loop"]["held_out_breaths"],
-            truth.names(d.case),
+            library_names(d.case),
         )
-        for d, _ in known
+        for d, _ in truth
         if d.case.name in cases and d.kind != "outside"
     }
     with executor(jobs) as pool:
-        for name, best in results(pool, oracle.of_recording, could):
+        for name, best in results(pool, oracle_rmse_of_file, fits):
             ratios.append(cases[name].after / best)
-            progress(len(ratios), len(could))
+            progress(len(ratios), len(fits))
     return [
-        number("held-out RMSE over the oracle's, median", ratios, np.median, 1.02),
-        number("held-out RMSE over the oracle's, 95th percentile", ratios,
-               lambda x: np.percentile(x, 95), 1.10),
+        statistic("held-out RMSE over the oracle's, median", ratios, np.median, _MEDIAN_RATIO),
+        statistic("held-out RMSE over the oracle's, 95th percentile", ratios,
+               lambda values: np.percentile(values, 95), _LARGE_RATIO),
     ]  # fmt: skip
 
 
-def _plain(case: Judged) -> dict[str, Any]:
+def _as_dict(case: JudgedCase) -> dict[str, Any]:
     value = asdict(case) | {"right": case.right, "wrong": sorted(case.wrong)}
     for key in ("library", "seen", "named", "listed"):
         value[key] = sorted(value[key])
     return value
+
+
+def oracle_rmse_of_file(path: Path, held_out: list[int], names: frozenset[str]) -> float:
+    """Apply :func:`oracle_rmse` to a recording in a file."""
+    return oracle_rmse(load(path), held_out, names)
+
+
+def oracle_rmse(breaths: Breaths, held_out: list[int], names: frozenset[str]) -> float:
+    """Held-out open-loop RMSE over inspiratory samples of a fit with the true names, cmH2O.
+
+    Each simulated breath starts from its first reading. The effort of a future breath is unknown;
+    the prediction is the mean over the efforts of the fitted breaths.
+
+    Args:
+        breaths: the recording.
+        held_out: ids of the breaths on which the answer was scored.
+        names: mechanisms of the library that are in the rig.
+
+    Raises:
+        InputError: if no breath or every breath is held out.
+    """
+    from ventbench.physics.catalogue import parameter
+    from ventbench.system_id import START, Simulator, fit, recorded, settings
+
+    apart = np.isin(breaths.breath_id, held_out)
+    if not apart.any() or apart.all():
+        raise InputError(f"{apart.sum()} of {len(apart)} breaths are held out; both are needed")
+    data = recorded(breaths)
+    fitted = fit(data.select(~apart), sorted(names))
+    test = data.select(apart)
+    simulator = Simulator(test, fitted.problem.simulator.names)
+    values = settings(test, simulator.names, {})
+    for column, name in enumerate(simulator.names):
+        per_breath = "." in name and parameter(name).scope == "breath"
+        if name != "position" and name != START and not per_breath:
+            values[:, column] = fitted.column(name)[0]
+    predicted = [simulator.predict(values)]
+    if set(_EFFORT) <= set(simulator.names):
+        columns, predicted = [simulator.names.index(path) for path in _EFFORT], []
+        for effort in zip(*(fitted.column(path) for path in _EFFORT), strict=True):
+            values[:, columns] = effort
+            predicted.append(simulator.predict(values))
+    error = np.mean(predicted, axis=0)[:, 0] - test.seen[:, 0]
+    counted = (test.u_out < 0.5) & (test.weight[:, 0] > 0)
+    counted[:, 0] = False  # every simulation starts there, and no answer is scored there either
+    return float(np.sqrt(np.mean(error[counted] ** 2)))

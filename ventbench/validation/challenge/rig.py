@@ -1,35 +1,104 @@
-"""A case on its rig: what a laboratory would have recorded."""
+"""A case on its rig, recorded as a laboratory would: sampling, integration steps, simulation."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.errors import InputError
 from ventbench.recordings.breaths import Breaths
-from ventbench.validation.challenge.cases import Base, Case
-from ventbench.validation.challenge.clock import FINE, STEPS, clock, sampling
-from ventbench.validation.challenge.control import Controller, expiratory
-from ventbench.validation.challenge.network import READING, Network
-from ventbench.validation.challenge.sensor import Sensor
-from ventbench.validation.challenge.sources import Sources
-from ventbench.validation.challenge.valve import Floats, Valve
+from ventbench.validation.challenge.cases import Base, Case, draw_base
+from ventbench.validation.challenge.circuit import READING, Circuit, Disturbances
+from ventbench.validation.challenge.controller import Controller, expiratory
+from ventbench.validation.challenge.instruments import Floats, Sensor, Valve
+
+#: Means of the sampling interval that a breath may have, s.
+INTERVALS = (0.0319, 0.0340)
+
+#: Integration steps between two samples: about half a millisecond each, with half steps.
+STEPS = 64
+
+#: Integration steps where gas has mass, whose pressure responds within milliseconds.
+FINE = 160
+
+#: Shortest integration step, s.
+_SHORTEST_STEP = 1e-6
 
 #: From one breath's first sample to the next one's, s.
 _PERIOD = 3.0
 
 
-def draw_base(lung_R: float, lung_C: float, rng: np.random.Generator) -> Base:
-    """Draw a rig around a lung's label: R off by up to 15 %, C by up to 7 %, and the rest."""
-    return Base(
-        R=float(lung_R * rng.uniform(0.85, 1.15)),
-        C=float(lung_C * rng.uniform(0.93, 1.07)),
-        R_ex=float(rng.uniform(4.0, 7.0)),
-        peep=float(rng.uniform(4.5, 5.5)),
-        gain=float(22.8 * rng.uniform(0.9, 1.1)),
-    )
+@dataclass(frozen=True)
+class StepGrid:
+    """Integration steps of n breaths.
+
+    Attributes:
+        nodes: ends of the steps, s, ``(n, steps + 1)``.
+        command: index of the command that the valve follows in a step, -1 before the first,
+            ``(n, steps)``.
+        opened: 1 in the steps with an open expiratory valve, ``(n, steps)``.
+    """
+
+    nodes: Floats
+    command: NDArray[np.int64]
+    opened: Floats
+
+
+def sampling_times(n: int, samples: int, jitter: float, rng: np.random.Generator) -> Floats:
+    """Draw sampling times, s, ``(n, samples)``: a mean interval for each breath, and jitter."""
+    mean = rng.choice(np.array(INTERVALS), n)[:, None]
+    dt = np.clip(mean + jitter * rng.standard_normal((n, samples - 1)), 0.5 * mean, 1.5 * mean)
+    time = np.concatenate([np.zeros((n, 1)), np.cumsum(dt, axis=1)], axis=1)
+    return np.round(time, 6)
+
+
+def step_grid(
+    time: Floats, u_out: NDArray[np.int8], delay: float, opening_delay: float, steps: int
+) -> StepGrid:
+    """Divide the time between samples into steps whose ends include the delayed commands.
+
+    Args:
+        time: of the samples, s, ``(n, T)``.
+        u_out: command of the expiratory valve, ``(n, T)``.
+        delay: dead time of the inspiratory valve, s.
+        opening_delay: dead time of the expiratory valve's opening, s.
+        steps: number of steps between two samples.
+    """
+    n = len(time)
+    share = np.arange(steps) / steps
+    inner = time[:, :-1, None] + share * np.diff(time, axis=1)[:, :, None]
+    nodes = np.concatenate([inner.reshape(n, -1), time[:, -1:]], axis=1)
+    command = np.empty((n, nodes.shape[1] - 1), np.int64)
+    opened = np.empty(command.shape)
+    for i in range(n):
+        delays = np.array([d for d in (delay, opening_delay) if d])
+        _move_onto_edges(nodes[i], np.sort((time[i] + delays[:, None]).ravel()), steps)
+        middle = 0.5 * (nodes[i, 1:] + nodes[i, :-1])
+        command[i] = np.searchsorted(time[i] + delay, middle) - 1
+        now = np.searchsorted(time[i], middle) - 1
+        then = np.searchsorted(time[i] + opening_delay, middle) - 1
+        opened[i] = u_out[i, now] & np.where(then < 0, 0, u_out[i, then])
+    return StepGrid(nodes, command, opened)
+
+
+def _move_onto_edges(nodes: Floats, edges: Floats, steps: int) -> None:
+    """Move an end of a step onto each edge, in order; the samples keep their times."""
+    free = 1
+    for edge in edges[edges < nodes[-1] - 1e-5]:
+        above = int(np.searchsorted(nodes, edge))
+        nearest = above - 1 if edge - nodes[above - 1] < nodes[above] - edge else above
+        if nearest % steps == 0:
+            nearest += 1 if edge >= nodes[nearest] else -1
+        nearest = max(nearest, free)
+        nearest += nearest % steps == 0  # pushed on by the edge before
+        if nearest >= len(nodes) - 1:
+            break  # no step is left before the last sample
+        nodes[nearest] = np.clip(
+            edge, nodes[nearest - 1] + _SHORTEST_STEP, nodes[nearest + 1] - _SHORTEST_STEP
+        )
+        free = nearest + 1
 
 
 def record(
@@ -39,18 +108,18 @@ def record(
 
     Args:
         case: what is in it.
-        rng: what times, gains, noise and efforts are drawn from, and the rig if the case has none.
-        steps: of the integration between two samples; as many as it needs if None.
-        share: of the usual pressures above PEEP and commands.
+        rng: source of times, gains, noise and efforts, and of the rig if the case has none.
+        steps: integration steps between two samples; as many as the effects need if None.
+        share: scales pressures above PEEP and commands; 1 for the usual ones.
     """
     base = case.base or draw_base(case.lung_R, case.lung_C, rng)
-    time = sampling(case.breaths, case.samples, case.jitter, rng)
+    time = sampling_times(case.breaths, case.samples, case.jitter, rng)
     controller = Controller(case, time, rng, share)
     return _run(case, base, time, expiratory(time), controller, np.arange(len(time)), rng, steps)
 
 
-class _Given:
-    """Commands that are known beforehand."""
+class _GivenCommands:
+    """Commands that are known beforehand, in place of a controller."""
 
     def __init__(self, u_in: Floats) -> None:
         self._u_in = u_in
@@ -70,16 +139,22 @@ def record_commands(
         time: of the samples, s, ``(k, T)``.
         u_in: %, ``(k, T)``.
         u_out: 0/1, ``(k, T)``.
-        rng: of noise and efforts.
+        rng: source of noise and efforts.
 
     Raises:
-        InputError: if the case has no base, which would be another rig.
+        InputError: if the case has no base: a new one would be another rig.
     """
     if case.base is None:
         raise InputError(f"{case.name}: the rig of this case is not known")
     sized = replace(case, samples=time.shape[1])
     return _run(
-        sized, case.base, time, u_out, _Given(u_in), case.breaths + np.arange(len(time)), rng
+        sized,
+        case.base,
+        time,
+        u_out,
+        _GivenCommands(u_in),
+        case.breaths + np.arange(len(time)),
+        rng,
     )
 
 
@@ -91,43 +166,38 @@ def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 
         breaths: commands and times.
         start: airway pressure at rest, ``(n,)``.
         seed: of efforts and phases.
-        steps: of the integration between two samples.
+        steps: integration steps between two samples.
     """
     assert case.base is not None
     clean = replace(case, noise=0.0, step=0.0, samples=breaths.time.shape[1])
-    given, rng = _Given(breaths.u_in), np.random.default_rng(seed)
-    made = _run(
-        clean,
-        case.base,
-        breaths.time,
-        breaths.u_out,
-        given,
-        breaths.breath_id - 1,
-        rng,
-        steps,
-        start,
+    given, rng = _GivenCommands(breaths.u_in), np.random.default_rng(seed)
+    number = breaths.breath_id - 1
+    simulated = _run(
+        clean, case.base, breaths.time, breaths.u_out, given, number, rng, steps, start
     )
-    return made.pressure
+    return simulated.pressure
 
 
 def _run(
-    case: Case, base: Base, time: Floats, u_out: NDArray[np.int8], controller: Controller | _Given,
-    number: NDArray[np.int64], rng: np.random.Generator, steps: int | None = None,
-    start: Floats | None = None,
+    case: Case, base: Base, time: Floats, u_out: NDArray[np.int8],
+    controller: Controller | _GivenCommands, number: NDArray[np.int64], rng: np.random.Generator,
+    steps: int | None = None, start: Floats | None = None,
 ) -> Breaths:  # fmt: skip
+    """Simulate breaths side by side; ``number``: place of each in the recording, from 0."""
     n, samples = time.shape
-    effects = {item.name: item for item in case.effects}
+    effects = {effect.name: effect for effect in case.effects}
     steps = steps or (FINE if "inertance" in effects else STEPS)
     began = _PERIOD * number + rng.uniform(-0.05, 0.05, n)
-    network = Network(effects, base, Sources(effects, began, rng))
+    circuit = Circuit(effects, base, Disturbances(effects, began, rng))
     valve = Valve(effects, base.gain, n)
     sensor = Sensor(case, effects, number / max(case.breaths - 1, 1), rng)
     delay = effects["valve_delay"].parameters["delay"] if "valve_delay" in effects else 0.0
-    late = effects.get("exhalation_valve_delay")
-    grid = clock(time, u_out, delay, late.parameters["opening"] if late else 0.0, steps)
+    opening = effects.get("exhalation_valve_delay")
+    opening_delay = opening.parameters["opening"] if opening else 0.0
+    grid = step_grid(time, u_out, delay, opening_delay, steps)
     spread = 0.3 * rng.standard_normal(n)
-    state = network.start(base.peep + spread if start is None else start)
-    asked = np.zeros((n, samples + 1))  # the last column is the closed valve before the breath
+    state = circuit.start(base.peep + spread if start is None else start)
+    asked = np.zeros((n, samples + 1))  # the last column: the valve is closed before the breath
     u_in, pressure = np.zeros((n, samples)), np.zeros((n, samples))
     rows = np.arange(n)
     lengths = np.diff(grid.nodes, axis=1)
@@ -140,7 +210,7 @@ def _run(
             break
         for s in range(k * steps, (k + 1) * steps):
             flow = asked[rows, grid.command[:, s]]
-            state = network.step(state, lengths[:, s], flow, grid.opened[:, s], grid.nodes[:, s])
+            state = circuit.step(state, lengths[:, s], flow, grid.opened[:, s], grid.nodes[:, s])
     return Breaths(
         breath_id=number + 1,
         R=np.full(n, case.lung_R), C=np.full(n, case.lung_C),

@@ -23,11 +23,19 @@ from ventbench.physics import physics
 from ventbench.plants import text_files
 from ventbench.plants.corrected import Corrected
 from ventbench.recordings import join, write
-from ventbench.validation.proof import PARTS, prove, remove, run
-from ventbench.validation.proof.claims import claims
-from ventbench.validation.proof.figures import cut
-from ventbench.validation.proof.inject import lagged, slower_sensor
-from ventbench.validation.proof.parts import FEW, LAG
+from ventbench.validation import real_rig_proof
+from ventbench.validation.real_rig_parts import (
+    FEW,
+    LAG,
+    PARTS,
+    by_names_alone,
+    has_unnamed,
+    lagged,
+    most_important,
+    slower_sensor,
+    without,
+)
+from ventbench.validation.real_rig_proof import RECORDING, claims, cut, prove
 
 
 def keep(out: Path, found: Diagnosis) -> list[Path]:
@@ -44,7 +52,7 @@ def recordings(tmp_path_factory) -> Path:
     for i, name in enumerate((*LUNG_IDS, "R50C20")):
         some = made.breaths(name, n=4, seed=i)
         parts.append(dataclasses.replace(some, breath_id=some.breath_id + 100 * i))
-    write(join(parts), folder / run.RECORDING)
+    write(join(parts), folder / RECORDING)
     return folder
 
 
@@ -70,10 +78,8 @@ class Diagnoses:
 
 
 @pytest.fixture
-def diagnoses(monkeypatch: pytest.MonkeyPatch) -> Diagnoses:
-    fake = Diagnoses()
-    monkeypatch.setattr(run, "diagnose", fake)
-    return fake
+def diagnoses() -> Diagnoses:
+    return Diagnoses()
 
 
 def test_the_lag_of_a_step_and_of_a_ramp():
@@ -120,7 +126,7 @@ def test_what_is_removed_does_nothing():
     both = {"valve_delay": {"delay": 0.04}, "exhalation_valve_delay": {"opening": 0.03}}
     with precision.float64():
         plant = physics(lung("R20C50"), both)
-        less = remove.without(plant, ("valve_delay",))
+        less = without(plant, ("valve_delay",))
     assert float(less.get("valve_delay.delay")) == 0.0
     assert float(less.get("exhalation_valve_delay.opening")) == 0.03
     assert float(less.get("R")) == 20.0
@@ -129,36 +135,38 @@ def test_what_is_removed_does_nothing():
 
 def test_the_most_important_is_no_patients_effort():
     effort, delay = {"name": "patient_effort"}, {"name": "valve_delay"}
-    assert remove.most_important([effort, delay, {"name": "leak"}]) == "valve_delay"
-    assert remove.most_important([effort]) is None
-    assert remove.most_important([]) is None
+    assert most_important([effort, delay, {"name": "leak"}]) == "valve_delay"
+    assert most_important([effort]) is None
+    assert most_important([]) is None
 
 
 def test_by_names_alone_leaves_the_names():
     with precision.float64():
         named = physics(lung("R5C10"), {"valve_delay": {"delay": 0.04}})
         both = named.having(**{"valve_shape.c1": 0.5})
-    assert not remove.has_unnamed(named)
-    assert remove.has_unnamed(both)
-    alone = remove.by_names_alone(both)
+    assert not has_unnamed(named)
+    assert has_unnamed(both)
+    alone = by_names_alone(both)
     assert float(alone.get("valve_shape.c1")) == 0.0  # type: ignore[attr-defined]
     assert float(alone.get("valve_delay.delay")) == 0.04  # type: ignore[attr-defined]
     with precision.float64():
         own = named.having(**{"valve_shape.c1": 0.2, "supply_memory.c1": 0.3})
     corrected = Corrected(named, both, own)
-    assert remove.has_unnamed(corrected)
-    less: Any = remove.by_names_alone(corrected)
+    assert has_unnamed(corrected)
+    less: Any = by_names_alone(corrected)
     assert float(less.wanted.get("valve_delay.delay")) == 0.04
     for path, value in {"valve_shape.c1": 0.2, "supply_memory.c1": 0.3}.items():
         assert float(less.wanted.get(path)) == pytest.approx(value), "it is the simulator's own"
         assert less.had.get(path) == less.wanted.get(path), "and makes no difference"
-    none: Any = remove.by_names_alone(Corrected(named, both, named))
+    none: Any = by_names_alone(Corrected(named, both, named))
     assert float(none.wanted.get("valve_shape.c1")) == 0.0
 
 
 def test_all_parts_and_once_only(recordings, tmp_path, diagnoses):
     told: list[tuple[str, str, float]] = []
-    found = prove(recordings, tmp_path, keep, progress=lambda *x: told.append(x))
+    found = prove(
+        recordings, tmp_path, keep, progress=lambda *x: told.append(x), diagnose=diagnoses
+    )
     assert (
         list(found.parts) == list(PARTS) == ["rc", "two_balloon", "removed", "injected", "frozen"]
     )
@@ -180,50 +188,48 @@ def test_all_parts_and_once_only(recordings, tmp_path, diagnoses):
     assert plain["plant"] == "corrected R-C without valve_delay"
     assert json.loads((tmp_path / "proof.json").read_text()) == found.as_dict()
     assert str(recordings) not in (tmp_path / "proof.json").read_text()
-    again = prove(recordings, tmp_path, keep)
+    again = prove(recordings, tmp_path, keep, diagnose=diagnoses)
     assert len(diagnoses.asked) == 5
     assert again.as_dict() == found.as_dict()
 
 
 def test_what_changed_is_done_again(recordings, tmp_path, diagnoses):
-    prove(recordings, tmp_path, keep, ["rc", "removed"])
+    prove(recordings, tmp_path, keep, ["rc", "removed"], diagnose=diagnoses)
     assert len(diagnoses.asked) == 2
     (tmp_path / "rc" / "diagnosis.json").unlink()  # as if it had been stopped there
     diagnoses.names = ("leak", "valve_delay")
-    found = prove(recordings, tmp_path, keep)
+    found = prove(recordings, tmp_path, keep, diagnose=diagnoses)
     assert found.parts["removed"]["wanted"] == "leak"
     assert found.parts["removed"]["about"]["removed"] == "leak"
     assert len(diagnoses.asked) == 7, "rc, removed since rc was, and the other three"
 
 
-def test_a_part_that_was_stopped_does_not_count(recordings, tmp_path, monkeypatch):
+def test_a_part_that_was_stopped_does_not_count(recordings, tmp_path):
     def stopped(breaths, *, plant, passive, progress):
         raise KeyboardInterrupt
 
     fake = Diagnoses()
-    monkeypatch.setattr(run, "diagnose", fake)
-    prove(recordings, tmp_path, keep, ["rc"])
-    monkeypatch.setattr(run, "diagnose", stopped)
+    prove(recordings, tmp_path, keep, ["rc"], diagnose=fake)
     with pytest.raises(KeyboardInterrupt):
-        prove(recordings, tmp_path, keep)
-    monkeypatch.setattr(run, "diagnose", fake)
-    assert list(prove(recordings, tmp_path, keep, ["frozen"]).parts) == ["rc", "frozen"]
+        prove(recordings, tmp_path, keep, diagnose=stopped)
+    proof = prove(recordings, tmp_path, keep, ["frozen"], diagnose=fake)
+    assert list(proof.parts) == ["rc", "frozen"]
     assert len(fake.asked) == 2
 
 
 def test_bad_requests(recordings, tmp_path, diagnoses):
     with pytest.raises(InputError, match=r"no part 'all' in the proof; choose of rc, two_balloon"):
-        prove(recordings, tmp_path, keep, ["all"])
+        prove(recordings, tmp_path, keep, ["all"], diagnose=diagnoses)
     with pytest.raises(InputError, match="removed starts from the part rc"):
-        prove(recordings, tmp_path, keep, ["removed"])
+        prove(recordings, tmp_path, keep, ["removed"], diagnose=diagnoses)
     with pytest.raises(InputError, match="there is no such file"):
-        prove(tmp_path, tmp_path, keep)
+        prove(tmp_path, tmp_path, keep, diagnose=diagnoses)
     assert diagnoses.asked == []
 
 
 def test_nothing_to_remove_is_a_claim_that_fails(recordings, tmp_path, diagnoses):
     diagnoses.names = ("patient_effort",)
-    found = prove(recordings, tmp_path, keep, ["rc", "removed"])
+    found = prove(recordings, tmp_path, keep, ["rc", "removed"], diagnose=diagnoses)
     assert "nothing to remove" in found.impossible["removed"]
     assert [claim.met for claim in found.claims if claim.part == "removed"] == [False]
     assert not found.met
@@ -257,7 +263,7 @@ def test_claims_are_computed():
     assert cut(None, 2.0) is None
 
 
-def test_the_unnamed_part_does_not_count_for_the_cut(recordings, tmp_path, monkeypatch):
+def test_the_unnamed_part_does_not_count_for_the_cut(recordings, tmp_path):
     """Its plants are simulated again without it; here names alone are as bad as the start."""
     one = made.diagnosis(12)
     start = physics(lung("R20C50"))
@@ -265,11 +271,8 @@ def test_the_unnamed_part_does_not_count_for_the_cut(recordings, tmp_path, monke
         plant = start.having(**{"valve_shape.c1": 0.5})
     after = OpenLoopError(0.2, 0.3)
     loop = dataclasses.replace(one.open_loop, after=after)
-    monkeypatch.setattr(
-        run, "diagnose",
-        lambda *_, **__: dataclasses.replace(one, open_loop=loop, plants={"R20C50": plant}),
-    )  # fmt: skip
-    found = prove(recordings, tmp_path, keep, ["rc"])
+    diagnosis = dataclasses.replace(one, open_loop=loop, plants={"R20C50": plant})
+    found = prove(recordings, tmp_path, keep, ["rc"], diagnose=lambda *_, **__: diagnosis)
     part = found.parts["rc"]
     assert part["mae"]["after"] == 0.2
     assert part["mae_by_names_alone"] == pytest.approx(one.open_loop.before.mae, rel=0.1)
@@ -278,10 +281,11 @@ def test_the_unnamed_part_does_not_count_for_the_cut(recordings, tmp_path, monke
 
 
 @pytest.fixture
-def app(monkeypatch: pytest.MonkeyPatch) -> typer.Typer:
+def app(monkeypatch: pytest.MonkeyPatch, diagnoses: Diagnoses) -> typer.Typer:
     pytest.importorskip("jinja2", reason="needs the extra ventbench[view]")
     pytest.importorskip("rerun", reason="needs the extra ventbench[view]")
     monkeypatch.setenv("VENTBENCH_CACHE", "")  # nothing of JAX is configured
+    monkeypatch.setattr(real_rig_proof, "diagnose_recording", diagnoses)
     app = typer.Typer()
     command.register(app)
     return app

@@ -10,17 +10,19 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import ventbench
-from ventbench import protocol
+from ventbench import precision, protocol
 from ventbench.cli import app
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
 from ventbench.plants.stack import take
+from ventbench.rollouts import open_loop
 from ventbench.simulation import read_controls, simulate
 from ventbench.training import freeze
 
@@ -78,9 +80,12 @@ def test_simulate_answers_commands_with_the_official_pressures(commands, tmp_pat
     found = columns(text)
     assert list(found) == ["time_step", "u_in", "u_out", "pressure"]
     np.testing.assert_allclose(found["time_step"], 0.033 * np.arange(60), atol=1e-6)
-    plant = take(frozen.load().plants, LUNG_IDS.index(name))
-    wanted = simulate(plant, read_controls(commands), start=6.0)
+    given, plant = read_controls(commands), take(frozen.load().plants, LUNG_IDS.index(name))
+    with precision.float64():
+        row = [jnp.asarray(x)[None] for x in (given.u_in, given.u_out, given.dt)]
+        wanted = open_loop(plant, jnp.asarray([6.0]), *row)[0]
     np.testing.assert_allclose(found["pressure"], wanted, atol=1e-6)
+    np.testing.assert_array_equal(simulate(given, lung=name, start=6.0).pressure, wanted)
     assert found["pressure"][0] == 6.0
     assert found["pressure"][29] > 8.0 > found["pressure"][-1]
     out = tmp_path / "out.csv"
@@ -101,7 +106,7 @@ def test_simulate_refuses_bad_input(commands, tmp_path):
     message = run("simulate", "--lung", "R9", "--controls", commands, code=2)
     assert "'R9' is not a lung id" in message
     message = run("simulate", "--lung", "R5C30", "--controls", commands, code=2)
-    assert f"choose one of {', '.join(LUNG_IDS)}" in message
+    assert f"the simulators frozen have {', '.join(LUNG_IDS)}" in message
     bad = tmp_path / "bad.csv"
     bad.write_text("u_in\n5\n120\n")
     message = run("simulate", "--lung", "R5C10", "--controls", bad, code=2)

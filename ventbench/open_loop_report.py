@@ -13,14 +13,11 @@ from ventbench.interfaces import Plant
 from ventbench.lungs import RECORDED_LUNGS
 from ventbench.metrics import bootstrap, open_loop
 from ventbench.plants import frozen
-from ventbench.plants.labelled import single_compartments
+from ventbench.plants.catalog import NAMES, Given, load_simulators
 from ventbench.recordings import Breaths
 from ventbench.rollouts import PlantsFor, open_loop_breaths
 
 Floats = NDArray[np.float64]
-
-#: Kinds that were trained on recordings.
-LEARNED_KINDS = ("frozen", "hybrid", "learned")
 
 #: A breath is looked at more closely if its error exceeds this, cmH2O ...
 SUSPECT = 1.0
@@ -32,38 +29,36 @@ FAR_BETTER = 0.4
 GAINS = (0.6, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6)
 
 
-def run(breaths: Breaths, kind: str = "frozen") -> dict[str, Any]:
+def run(breaths: Breaths, plant: Given = "frozen") -> dict[str, Any]:
     """Test simulators against a recording.
 
     Args:
         breaths: the recording.
-        kind: ``"frozen"`` (the official simulators) or their kind by name, ``"hybrid"``;
-            ``"learned"`` for the paper's networks; ``"physics"`` for R-C lungs at their labels.
+        plant: the simulators; see :func:`ventbench.plants.catalog.load_simulators`.
 
     Returns:
-        JSON values: ``plant``; ``lungs``; ``misfits``; ``not_judged``, the ids of breaths without a
-        first or another inspiratory pressure; ``notes``. For each lung the figures of
-        :func:`summary`, cmH2O: without prefix of the simulators that make the
-        scores, over all breaths; ``held_out_...`` of each breath by a member of the ensemble that
-        has not seen it; ``official_held_out_...`` of the simulators that make the scores, on what
-        they have not seen. In ``fitting_label`` the same without the misfits.
+        JSON values: ``plant``; ``simulators``, the official ones, by which misfits are judged;
+        ``about``, what is known of others if they are from a file, a function or the caller;
+        ``lungs``; ``misfits``; ``not_judged``, the ids of breaths without a first or another
+        inspiratory pressure; ``notes``. For each lung the figures of :func:`summary`, cmH2O:
+        without prefix of the simulators that make the scores, over all breaths; ``held_out_...``
+        of each breath by a member of the ensemble that has not seen it; ``official_held_out_...``
+        of the simulators that make the scores, on what they have not seen. In ``fitting_label``
+        the figures without the misfits.
 
     Raises:
         InputError: if there is no simulator for a lung of the recording.
     """
-    simulators = frozen.load()
-    official, cross_fitted = _kinds(simulators, kind)
-    error = errors(official, breaths)
-    crossed = errors(cross_fitted, breaths)
-    if kind in LEARNED_KINDS:
-        held_out, unseen = simulators.held_out(breaths), simulators.unseen(breaths)
-    else:
-        held_out = unseen = np.ones(len(breaths), bool)  # nothing of it is learned
+    official = frozen.load()
+    tested = load_simulators(plant, breaths=breaths)
+    error = mean_errors(tested.pressures(breaths), breaths)
+    crossed = mean_errors(tested.pressures(breaths, cross_fitted=True), breaths)
+    held_out, unseen = tested.held_out(breaths), tested.unseen(breaths)
     doubtful = misfits(
-        simulators.cross_fitted,
+        official.cross_fitted,
         lambda plants, gain: replace(plants, slopes=plants.slopes * gain),
         breaths,
-        errors(simulators.cross_fitted, breaths),
+        errors(official.cross_fitted, breaths),
         tuple((lung.R, lung.C) for lung in RECORDED_LUNGS),
     )
     apart = np.isin(breaths.breath_id, [misfit.breath_id for misfit in doubtful])
@@ -79,24 +74,15 @@ def run(breaths: Breaths, kind: str = "frozen") -> dict[str, Any]:
     for lung, index in breaths.by_lung_index.items():
         lungs[lung] = figures(index) | {"fitting_label": figures(index[~apart[index]])}
     return {
-        "plant": kind,
-        "simulators": simulators.about(),
+        "plant": plant if isinstance(plant, str) and plant in NAMES else tested.name,
+        "simulators": official.about(),
+        **({} if tested.kind in NAMES else {"about": dict(tested.about)}),
         "unit": "cmH2O",
         "lungs": lungs,
         "misfits": [asdict(misfit) for misfit in doubtful],
         "not_judged": breaths.breath_id[np.isnan(error)].tolist(),
         "notes": list(breaths.notes),
     }
-
-
-def _kinds(simulators: frozen.Frozen, kind: str) -> tuple[PlantsFor, PlantsFor]:
-    """Official and cross-fitted plants of a kind."""
-    if kind == "physics":
-        return single_compartments, single_compartments
-    if kind == "learned":
-        learned = frozen.load_learned()
-        return learned.for_breaths, learned.cross_fitted
-    return simulators.for_breaths, simulators.cross_fitted
 
 
 def misfit_lines(result: dict[str, Any]) -> list[str]:
@@ -123,11 +109,19 @@ def misfit_lines(result: dict[str, Any]) -> list[str]:
 
 
 def errors(plants_for: PlantsFor, breaths: Breaths) -> Floats:
-    """Open-loop MAE of each breath over its inspiratory samples, cmH2O, shape ``(n,)``.
+    """Open-loop MAE of each breath by some plants; see :func:`mean_errors`."""
+    return mean_errors(open_loop_breaths(plants_for, breaths), breaths)
+
+
+def mean_errors(simulated: Floats, breaths: Breaths) -> Floats:
+    """Mean |simulated - recorded| of each breath over its inspiratory samples, cmH2O, ``(n,)``.
 
     NaN where a breath has no first pressure or no other inspiratory one.
+
+    Args:
+        simulated: open-loop answers, cmH2O, shape ``(n, T)``.
+        breaths: n recorded breaths.
     """
-    simulated = open_loop_breaths(plants_for, breaths)
     blank = np.isnan(breaths.pressure[:, 0])
     found = open_loop.mae(breaths.pressure, np.nan_to_num(simulated), breaths.inspiratory)
     return np.where(blank, np.nan, found)

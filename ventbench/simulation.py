@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ventbench import precision, protocol
+from ventbench import protocol
 from ventbench.errors import InputError
-from ventbench.interfaces import Plant
-from ventbench.rollouts import open_loop
+from ventbench.plants.catalog import Given, load_simulators
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Floats = NDArray[np.float64]
 
@@ -38,22 +40,99 @@ class Controls:
         return np.append(steps, steps[-1] if steps.size else protocol.DT)
 
 
+@dataclass(frozen=True)
+class Simulation:
+    """What a simulator answered to one sequence of commands; arrays of shape ``(T,)``.
+
+    Attributes:
+        lung: id, such as ``"R20C50"``.
+        simulators: name of the simulators.
+        time: s.
+        u_in: inspiratory valve, %.
+        u_out: expiratory valve, 0/1.
+        pressure: airway pressure, cmH2O.
+    """
+
+    lung: str
+    simulators: str
+    time: Floats
+    u_in: Floats
+    u_out: Floats
+    pressure: Floats
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row a sample: ``time_step`` (s), ``u_in`` (%), ``u_out``, ``pressure`` (cmH2O)."""
+        import pandas as pd
+
+        names = ("time_step", "u_in", "u_out", "pressure")
+        values = (self.time, self.u_in, self.u_out.astype(int), self.pressure)
+        return pd.DataFrame(dict(zip(names, values, strict=True)))
+
+    def to_csv(self) -> str:
+        """Text of a CSV file with the columns of :meth:`to_frame`."""
+        columns = zip(self.time, self.u_in, self.u_out, self.pressure, strict=True)
+        rows = [f"{t:.6f},{u:.6f},{int(o)},{p:.6f}" for t, u, o, p in columns]
+        return "\n".join(["time_step,u_in,u_out,pressure", *rows]) + "\n"
+
+    def _repr_html_(self) -> str:
+        """A line of text and the table, as a notebook shows it."""
+        title = (
+            f"<p>Lung {self.lung} by the {self.simulators} simulators: {len(self.time)} samples, "
+            f"highest pressure {self.pressure.max():.1f} cmH2O</p>"
+        )
+        return title + self.to_frame().to_html(max_rows=10, index=False, float_format="%.3f")
+
+
 def simulate(
-    plant: Plant, controls: Controls, *, start: float = protocol.PEEP
-) -> NDArray[np.float64]:
-    """Pressures that a plant answers to commands with.
+    controls: Controls | Path | str | ArrayLike,
+    *,
+    lung: str = "R20C50",
+    plant: Given = "frozen",
+    start: float = protocol.PEEP,
+) -> Simulation:
+    """Answer valve commands with pressures.
 
     Args:
-        plant: any plant.
-        controls: T commands.
+        controls: T commands; or a CSV file of them, see :func:`read_controls`; or ``u_in`` alone,
+            %, shape ``(T,)``, at steps of 30 ms with the expiratory valve closed.
+        lung: id of the lung.
+        plant: simulators; see :func:`ventbench.load_simulators`.
         start: pressure at the first sample, cmH2O; the lung is at rest there.
 
     Returns:
-        Pressure at each sample, cmH2O, shape ``(T,)``.
+        The commands and the pressures, shapes ``(T,)``.
+
+    Raises:
+        InputError: if a command is wrong, or there is no simulator for the lung.
+
+    Example:
+        >>> import numpy as np
+        >>> import ventbench
+        >>> u_in = np.full(30, 10.0)  # the inspiratory valve held at 10 % for 0.9 s
+        >>> answer = ventbench.simulate(u_in, lung="R20C50", plant="physics")
+        >>> answer.pressure.shape
+        (30,)
+        >>> bool(answer.pressure[-1] > answer.pressure[1] > 5.0)
+        True
     """
-    with precision.float64():
-        commands = (jnp.asarray(x)[None] for x in (controls.u_in, controls.u_out, controls.dt))
-        return np.asarray(open_loop(plant, jnp.asarray([float(start)]), *commands))[0]
+    if isinstance(controls, str | Path):
+        controls = read_controls(Path(controls))
+    elif not isinstance(controls, Controls):
+        controls = _controls(controls)
+    simulators = load_simulators(plant)
+    commands = (controls.u_in, controls.u_out, controls.dt)
+    pressure = simulators.respond(lung, *commands, initial_pressure=start)
+    return Simulation(lung, simulators.name, controls.time, controls.u_in, controls.u_out, pressure)
+
+
+def _controls(u_in: ArrayLike) -> Controls:
+    values = np.asarray(u_in, float)
+    if values.ndim != 1 or not values.size:
+        raise InputError(f"u_in has shape {values.shape}; give one command a sample, shape (T,)")
+    wrong = ~((values >= 0) & (values <= protocol.U_MAX))
+    if np.any(wrong):
+        raise InputError(f"u_in[{wrong.argmax()}] = {values[wrong.argmax()]:g} is outside 0..100 %")
+    return Controls(_steps(values.size), values, np.zeros_like(values))
 
 
 def read_controls(path: Path) -> Controls:

@@ -128,14 +128,3 @@ def test_score_on_the_plants_of_a_file(tmp_path: Path) -> None:
     assert code == 2
     assert "leave --plant out" in text
     assert run("score", "pid_best", "--plant", "nothing")[0] == 2
-
-
-def test_the_named_simulators() -> None:
-    from ventbench.cli.plants import choose
-
-    official = choose("frozen")
-    assert official.official is not None
-    assert official.about == frozen.load().about()
-    base = choose("physics")
-    assert (base.official, base.lungs) == (None, LUNGS)
-    np.testing.assert_array_equal(take(base.plants, 5).get("C"), 50.0)  # type: ignore[attr-defined]

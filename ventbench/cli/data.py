@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ventbench.cli.options import Clip, JsonFile, Pad, emit
+from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, emit
 
 #: Breaths that are explored side by side.
 _TOGETHER = 60
@@ -51,9 +51,7 @@ def check(
 def explore(
     out: Annotated[Path, typer.Argument(help="CSV, CSV.GZ or Parquet to write.")],
     lung: Annotated[str, typer.Option(help="Lung setting, such as R20C50.")] = "R20C50",
-    plant: Annotated[
-        str, typer.Option(help="frozen, physics, or a file of plants such as corrected.json.")
-    ] = "frozen",
+    plant: PlantName = "frozen",
     breaths: Annotated[int, typer.Option(min=1, help="Breaths; the PIPs take turns.")] = 60,
     noise: Annotated[float, typer.Option(min=0.0, help="Of the sensor, cmH2O.")] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Of disturbances and noise.")] = 0,
@@ -66,17 +64,11 @@ def explore(
     Example: `ventbench data explore explored.csv --lung R5C20 --breaths 120 --noise 0.2`
     """
     from ventbench import recordings
-    from ventbench.cli.plants import choose
-    from ventbench.errors import InputError
-    from ventbench.plants.stack import take
+    from ventbench.plants.catalog import load_simulators
     from ventbench.training import exploration
 
-    chosen = choose(plant)
-    names = [item.id for item in chosen.lungs]
-    if lung not in names:
-        raise InputError(f"--lung {lung}: {plant} has {', '.join(names)}")
-    one = take(chosen.plants, names.index(lung))
-    bench = exploration.PlantBench(one, min(breaths, _TOGETHER), noise=noise, seed=seed)
+    chosen = load_simulators(plant).plant(lung)
+    bench = exploration.PlantBench(chosen, min(breaths, _TOGETHER), noise=noise, seed=seed)
     made = exploration.explore(bench, lung, breaths, seed=seed)
     recordings.write(made, out)
     for note in made.notes:

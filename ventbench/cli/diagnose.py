@@ -139,10 +139,12 @@ def _diagnose(breaths: Breaths, plant: str, lung: str | None, passive: bool) -> 
 
 def _plants(plant: str, breaths: Breaths) -> Any:
     """Plants of a file, which must have all lungs of the recording."""
-    from ventbench.cli.plants import read
     from ventbench.errors import InputError
+    from ventbench.plants import text_files
 
-    plants = read(Path(plant))
+    if not Path(plant).is_file():
+        raise InputError(f"--plant {plant}: there is no such file, nor a plant of that name")
+    plants = text_files.load(Path(plant))
     missing = [name for name in breaths.by_lung_index if name not in plants]
     if missing:
         raise InputError(

@@ -13,6 +13,16 @@ JsonFile = Annotated[
 ]
 Clip = Annotated[bool, typer.Option("--clip", help="Bring u_in into 0..100 % instead of refusing.")]
 Pad = Annotated[bool, typer.Option("--pad", help="Accept breaths of unequal length.")]
+PlantName = Annotated[
+    str,
+    typer.Option(
+        "--plant",
+        metavar="PLANT",
+        help="Simulators: frozen (the official ones), learned, physics, two_balloon, a file of "
+        "plants such as corrected.json, a CSV or Parquet file of simulated pressures, or "
+        "module:function.",
+    ),
+]
 RecordingsDir = Annotated[
     Path | None,
     typer.Option(

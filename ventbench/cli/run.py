@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from ventbench import protocol
-from ventbench.cli.options import JsonFile, emit
+from ventbench.cli.options import JsonFile, PlantName, emit
 
 
 def lungs(json: JsonFile = None) -> None:
@@ -39,7 +39,7 @@ def lungs(json: JsonFile = None) -> None:
 
 
 def simulate(
-    lung: Annotated[str, typer.Option(help="Which of the six lungs.")],
+    lung: Annotated[str, typer.Option(help="Lung, such as R20C50.")],
     controls: Annotated[
         Path,
         typer.Option(metavar="FILE", help="CSV: u_in in %; optionally u_out and time_step in s."),
@@ -50,24 +50,16 @@ def simulate(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the CSV here instead of stdout.")
     ] = None,
+    plant: PlantName = "frozen",
 ) -> None:
     """Answer a file of valve commands with pressures, as CSV.
 
     Example: `ventbench simulate --lung R20C50 --controls commands.csv`
     """
     from ventbench import files
-    from ventbench.lungs import LUNGS, scored_lung
-    from ventbench.plants import frozen
-    from ventbench.plants.stack import take
-    from ventbench.simulation import read_controls
-    from ventbench.simulation import simulate as run
+    from ventbench.simulation import simulate as work
 
-    index = LUNGS.index(scored_lung(lung))
-    given = read_controls(controls)
-    pressure = run(take(frozen.load().plants, index), given, start=start)
-    columns = zip(given.time, given.u_in, given.u_out, pressure, strict=True)
-    rows = [f"{t:.6f},{u:.6f},{int(o)},{p:.6f}" for t, u, o, p in columns]
-    text = "\n".join(["time_step,u_in,u_out,pressure", *rows]) + "\n"
+    text = work(controls, lung=lung, plant=plant, start=start).to_csv()
     if out is None:
         typer.echo(text, nl=False)
     else:

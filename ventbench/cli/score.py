@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ventbench.cli.options import JsonFile, emit
+from ventbench.cli.options import JsonFile, PlantName, emit
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -38,13 +38,7 @@ def score(
         Path | None,
         typer.Option(metavar="DIR", help="Keep a record here, for `board add`; needs --draws 20."),
     ] = None,
-    plant: Annotated[
-        str,
-        typer.Option(
-            metavar="frozen|physics|hybrid|FILE",
-            help="Simulators: the official ones, R-C lungs, or a corrected.json of `diagnose`.",
-        ),
-    ] = "frozen",
+    plant: PlantName = "frozen",
     in_process: Annotated[
         bool,
         typer.Option("--in-process", help="Run without the sandbox: only for code that you trust."),
@@ -61,8 +55,8 @@ def score(
     """
     from rich.console import Console
 
-    from ventbench.cli.plants import choose
     from ventbench.errors import InputError
+    from ventbench.plants.catalog import load_simulators
     from ventbench.submissions.folder import open_submission
     from ventbench.submissions.scoring import score as run
 
@@ -75,7 +69,7 @@ def score(
     if len(set(names)) < len(names):
         raise InputError(f"two submissions have the same name: {', '.join(sorted(names))}")
     progress = Console(stderr=True)
-    simulators = choose(plant)
+    simulators = load_simulators(plant)
     if record is not None and simulators.official is None:
         raise InputError("--record is for the official simulators: leave --plant out")
     runner = _runner(in_process)
@@ -89,7 +83,7 @@ def score(
             results.append(
                 run(
                     submission,
-                    simulators.plants,
+                    simulators.stacked,
                     track=track,
                     draws=draws,
                     lungs=simulators.lungs,

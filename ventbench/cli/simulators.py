@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
-from ventbench.cli.options import Clip, JsonFile, Pad, RecordingsDir, emit, recordings_folder
-
-Kind = Literal["frozen", "learned", "physics", "hybrid"]
+from ventbench.cli.options import (
+    Clip,
+    JsonFile,
+    Pad,
+    PlantName,
+    RecordingsDir,
+    emit,
+    recordings_folder,
+)
 
 train = typer.Typer(name="train", help="Learn simulators and controllers.", no_args_is_help=True)
 
 
 def open_loop(
     recordings: Annotated[Path, typer.Argument(help="CSV, CSV.GZ or Parquet, public schema.")],
-    plant: Annotated[
-        Kind, typer.Option(help="frozen: the official ones; physics: R-C lungs at their labels.")
-    ] = "frozen",
+    plant: PlantName = "frozen",
     clip: Clip = False,
     pad: Pad = False,
     json: JsonFile = None,

@@ -20,7 +20,7 @@ from ventbench import files
 from ventbench.data_files import data_path
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
-from ventbench.lungs import LUNG_IDS, RECORDED_LUNGS
+from ventbench.lungs import LUNG_IDS, LUNGS, RECORDED_LUNGS
 from ventbench.plants import files as plant_files
 from ventbench.plants.each import Each
 from ventbench.plants.fingerprints import BY_ALL, Seen
@@ -127,6 +127,12 @@ class FrozenLearned:
 
     members: Plant
     seen: Seen
+
+    @property
+    def plants(self) -> Plant:
+        """The networks of the six lungs, leaves ``(6, ...)`` in the order of ``LUNGS``."""
+        at = np.array([RECORDED_LUNGS.index(lung) for lung in LUNGS])
+        return jax.tree.map(lambda leaf: leaf[0, at], self.members)
 
     def for_breaths(self, breaths: Breaths) -> Plant:
         """As of :meth:`Frozen.for_breaths`; a network knows the lung, not the rig."""

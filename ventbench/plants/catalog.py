@@ -1,0 +1,543 @@
+"""The simulators behind every ``--plant``: one resolver for names, files, functions and arrays.
+
+====================================  ===========================================================
+What is given                         What it stands for
+====================================  ===========================================================
+``frozen`` (or ``hybrid``)            the official simulators
+``learned``                           the paper's networks, trained on the same breaths
+``physics``                           R-C lungs at their labels
+``two_balloon``                       the paper's balloon lungs at their labels
+``FILE.json``, ``FILE.npz``           plants of some lungs, such as a ``corrected.json``
+``FOLDER``                            what ``ventbench train simulator`` wrote
+``FILE.csv``, ``FILE.parquet``        simulated pressures of recorded breaths, in the public schema
+``module:name``                       a Python function of commands, a plant, or plants by lung
+a plant                               that plant for every lung
+a mapping                             plants by lung id
+a function                            ``f(u_in, u_out, dt, *, R, C, initial_pressure)``
+an array                              simulated pressures of given breaths
+====================================  ===========================================================
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, Literal, Protocol, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ventbench import files, precision, recordings
+from ventbench.errors import InputError
+from ventbench.interfaces import Plant
+from ventbench.lungs import LUNGS, Lung, lung
+from ventbench.physics import physics
+from ventbench.plants import alike, frozen, labelled, text_files
+from ventbench.plants.each import Each
+from ventbench.plants.stack import take
+from ventbench.plants.two_balloon import two_balloon
+from ventbench.recordings.breaths import Breaths
+from ventbench.rollouts import PlantsFor, open_loop, open_loop_breaths
+
+Floats = NDArray[np.float64]
+
+Kind = Literal["frozen", "learned", "physics", "two_balloon", "plants", "function", "pressures"]
+
+#: Simulators that need no file.
+NAMES = ("frozen", "hybrid", "learned", "physics", "two_balloon")
+
+#: Commands of a table of simulated pressures may differ from the recorded ones by rounding, %.
+_SAME_COMMAND = 0.05
+
+
+class PressureFunction(Protocol):
+    """A simulator as a Python function of one breath's commands; numpy will do."""
+
+    def __call__(
+        self,
+        u_in: Floats,
+        u_out: Floats,
+        dt: Floats,
+        /,
+        *,
+        R: float,
+        C: float,
+        initial_pressure: float,
+    ) -> ArrayLike:
+        """Simulate one breath.
+
+        Args:
+            u_in: inspiratory valve, 0..100 %, shape ``(T,)``.
+            u_out: expiratory valve, 0 closed, 1 open, shape ``(T,)``.
+            dt: time from each sample to the next, s, shape ``(T,)``; the last is not used.
+            R: labelled resistance, cmH2O/(L/s).
+            C: labelled compliance, mL/cmH2O.
+            initial_pressure: at the first sample, cmH2O.
+
+        Returns:
+            Pressure at each sample, cmH2O, shape ``(T,)``.
+        """
+        ...
+
+
+#: All that :func:`load_simulators` takes.
+Given: TypeAlias = (
+    "str | Path | Simulators | Plant | Mapping[str, Plant] | PressureFunction | ArrayLike"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Simulators:
+    """Simulators of lungs, whatever they were given as.
+
+    Attributes:
+        kind: what they are. ``"frozen"``, ``"learned"``, ``"physics"``, ``"two_balloon"`` and
+            ``"plants"`` have plants; ``"function"`` answers to commands; ``"pressures"`` only to
+            the recorded commands of its own breaths.
+        name: what messages and reports call them.
+        about: JSON values that results keep of them: version, file, hashes.
+        lungs: for which :attr:`stacked` has plants, in its order; empty where there is none.
+        sha256: of the file or manifest they come from; None if there is none.
+        official: the official set if they are it, else None.
+    """
+
+    kind: Kind
+    name: str
+    about: Mapping[str, Any]
+    lungs: tuple[Lung, ...] = ()
+    sha256: str | None = None
+    official: frozen.Frozen | None = None
+    _stack: Callable[[], Plant] | None = None
+    _for_breaths: PlantsFor | None = None
+    _cross_fitted: PlantsFor | None = None
+    _training: frozen.Frozen | None = field(default=None, repr=False)
+    _function: PressureFunction | None = None
+    _table: Mapping[int, tuple[Lung, Floats, Floats]] = field(default_factory=dict, repr=False)
+
+    @property
+    def has_plants(self) -> bool:
+        """Whether there are plants, which can be scored and corrected."""
+        return self._for_breaths is not None
+
+    @property
+    def is_base_physics(self) -> bool:
+        """Whether they are the base model of :mod:`ventbench.physics` at the labels, no more."""
+        return self.kind == "physics"
+
+    @cached_property
+    def stacked(self) -> Plant:
+        """One plant whose leaves have :attr:`lungs` on their leading axis, ``(L, ...)``.
+
+        Raises:
+            InputError: if there are only pressures or a function, or the plants of the lungs
+                cannot be run together.
+        """
+        if self._stack is None:
+            raise InputError(f"{self._without_plants} It cannot run in a closed loop.")
+        return self._stack()
+
+    def plant(self, lung_id: str) -> Plant:
+        """Return the plant of one lung.
+
+        Raises:
+            InputError: if there is none.
+        """
+        stacked, known = self.stacked, [entry.id for entry in self.lungs]
+        wanted = lung(lung_id).id
+        if wanted not in known:
+            raise InputError(
+                f"--lung {lung_id}: the simulators {self.name} have {', '.join(known)}"
+            )
+        return take(stacked, known.index(wanted))
+
+    def for_breaths(self, breaths: Breaths) -> Plant:
+        """Plants of recorded breaths, by lung and, where it matters, by rig.
+
+        Returns:
+            A plant with leaves ``(n, ...)``.
+
+        Raises:
+            InputError: if there are no plants, or none for a lung of the recording.
+        """
+        if self._for_breaths is None:
+            raise InputError(self._without_plants)
+        return self._for_breaths(breaths)
+
+    def cross_fitted(self, breaths: Breaths) -> Plant:
+        """Plants that have not been trained on the breaths where there are such.
+
+        The same as :meth:`for_breaths` for simulators that are not learned.
+        """
+        return (self._cross_fitted or self.for_breaths)(breaths)
+
+    def plant_of_breath(self, breaths: Breaths, index: int) -> Plant:
+        """Return the plant of one recorded breath, without a leading axis; float64 leaves."""
+        with precision.float64():
+            stacked = self.for_breaths(breaths.select([index]))
+            inner = stacked.plants if isinstance(stacked, Each) else stacked
+            return take(inner, 0)
+
+    def held_out(self, breaths: Breaths) -> NDArray[np.bool_]:
+        """Whether :meth:`cross_fitted` gives a plant that has not seen the breath, ``(n,)``."""
+        if self._training is None:
+            return np.ones(len(breaths), bool)
+        return self._training.held_out(breaths)
+
+    def unseen(self, breaths: Breaths) -> NDArray[np.bool_]:
+        """Whether :meth:`for_breaths` gives a plant that has not seen the breath, ``(n,)``."""
+        if self._training is None:
+            return np.ones(len(breaths), bool)
+        return self._training.unseen(breaths)
+
+    def pressures(self, breaths: Breaths, *, cross_fitted: bool = False) -> Floats:
+        """Open-loop answers to recorded commands, each from the first recorded pressure.
+
+        Args:
+            breaths: n breaths of T samples.
+            cross_fitted: by the plants of :meth:`cross_fitted`.
+
+        Returns:
+            cmH2O, shape ``(n, T)``; NaN for a breath whose first pressure is blank.
+
+        Raises:
+            InputError: if there is no simulator for a lung, a function fails or answers with
+                another shape, or a table lacks a breath.
+        """
+        if self._function is not None:
+            return self._by_function(self._function, breaths)
+        if self._for_breaths is None:
+            return self._by_table(breaths)
+        return open_loop_breaths(self.cross_fitted if cross_fitted else self.for_breaths, breaths)
+
+    def respond(
+        self, lung_id: str, u_in: Floats, u_out: Floats, dt: Floats, *, initial_pressure: float
+    ) -> Floats:
+        """Answer to any sequence of commands.
+
+        Args:
+            lung_id: such as ``"R20C50"``.
+            u_in: inspiratory valve, %, shape ``(T,)``.
+            u_out: expiratory valve, 0/1, shape ``(T,)``.
+            dt: time from each sample to the next, s, shape ``(T,)``.
+            initial_pressure: at the first sample, where the lung is at rest, cmH2O.
+
+        Returns:
+            Pressure at each sample, cmH2O, shape ``(T,)``.
+
+        Raises:
+            InputError: if there are only simulated pressures, or none for the lung.
+        """
+        if self._function is not None:
+            return self._call(
+                self._function, u_in, u_out, dt, lung(lung_id), initial_pressure, "the commands"
+            )
+        plant = self.plant(lung_id)
+        with precision.float64():
+            commands = (jnp.asarray(column, float)[None] for column in (u_in, u_out, dt))
+            start = jnp.asarray([float(initial_pressure)])
+            return np.asarray(open_loop(plant, start, *commands))[0]
+
+    @property
+    def _without_plants(self) -> str:
+        if self.kind == "function":
+            return f"{self.name} is a function of whole commands, not a plant with init and step."
+        return f"{self.name} holds simulated pressures of recorded breaths, not a simulator."
+
+    def _by_function(self, function: PressureFunction, breaths: Breaths) -> Floats:
+        answers = np.full(breaths.pressure.shape, np.nan)
+        for i, start in enumerate(breaths.pressure[:, 0].tolist()):
+            if np.isfinite(start):
+                label = Lung(float(breaths.R[i]), float(breaths.C[i]))
+                commands = breaths.u_in[i], breaths.u_out[i].astype(float), breaths.dt[i]
+                what = f"breath {breaths.breath_id[i]}"
+                answers[i] = self._call(function, *commands, label, start, what)
+        return answers
+
+    def _call(
+        self, function: PressureFunction, u_in: Floats, u_out: Floats, dt: Floats, label: Lung,
+        start: float, what: str,
+    ) -> Floats:  # fmt: skip
+        try:
+            answer = function(
+                np.array(u_in, float), np.array(u_out, float), np.array(dt, float),
+                R=label.R, C=label.C, initial_pressure=float(start),
+            )  # fmt: skip
+            pressure = np.asarray(answer, float)
+        except Exception as error:
+            raise InputError(
+                f"{self.name} raised {type(error).__name__} at {what} of lung {label}: {error}"
+            ) from error
+        if pressure.shape != np.shape(u_in):
+            raise InputError(
+                f"{self.name} answered to {what} with shape {pressure.shape}; a pressure for each "
+                f"of the {np.size(u_in)} samples is wanted, shape {np.shape(u_in)}"
+            )
+        if not np.all(np.isfinite(pressure)):
+            raise InputError(f"{self.name} answered to {what} with a pressure that is not finite")
+        return pressure
+
+    def _by_table(self, breaths: Breaths) -> Floats:
+        answers = np.full(breaths.pressure.shape, np.nan)
+        for i, number in enumerate(breaths.breath_id.tolist()):
+            if number not in self._table:
+                raise InputError(f"{self.name} has no breath {number} of the recording")
+            label, u_in, pressure = self._table[number]
+            samples = int(np.count_nonzero(breaths.valid[i]))
+            if label.id != breaths.lung_ids[i] or len(pressure) != samples:
+                raise InputError(
+                    f"{self.name}: breath {number} is of lung {label} with {len(pressure)} "
+                    f"samples, in the recording of {breaths.lung_ids[i]} with {samples}"
+                )
+            apart = np.abs(u_in - breaths.u_in[i, :samples])
+            if apart.max() > _SAME_COMMAND:
+                raise InputError(
+                    f"{self.name}: breath {number} has another command than the recording, u_in "
+                    f"{u_in[apart.argmax()]:g} at sample {apart.argmax() + 1}; simulate the "
+                    "recorded commands"
+                )
+            if np.isfinite(breaths.pressure[i, 0]):
+                answers[i, :samples] = pressure
+                answers[i, samples:] = pressure[-1]
+        return answers
+
+
+def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) -> Simulators:
+    """Simulators by whatever stands for them; see the table of this module.
+
+    Args:
+        given: a name, a path, ``"module:name"``, a plant, plants by lung id, a function of
+            commands (see :class:`PressureFunction`) or an array of simulated pressures. What is
+            :class:`Simulators` already is returned as it is.
+        breaths: the recording that an array answers to, row by row; only for arrays.
+
+    Returns:
+        The simulators.
+
+    Raises:
+        InputError: if there are no such simulators, or a file is damaged.
+
+    Example:
+        >>> from ventbench import load_simulators
+        >>> load_simulators("physics").plant("R20C50").get("C").item()
+        50.0
+    """
+    if isinstance(given, Simulators):
+        return given
+    if isinstance(given, str | Path):
+        return _by_text(str(given))
+    if isinstance(given, Mapping):
+        return _plants(dict(given), "the given plants", {"kind": "plants"})
+    if isinstance(given, Plant) and not isinstance(given, type):
+        return _single(given, type(given).__name__)
+    if callable(given):
+        name = getattr(given, "__qualname__", type(given).__name__)
+        return _of_function(given, name)
+    return _of_array(given, breaths)
+
+
+def _by_text(text: str) -> Simulators:
+    if text in _NAMED:
+        return _NAMED[text]()
+    path = Path(text)
+    if (path / frozen.MANIFEST).is_file():
+        return _trained(path)
+    if path.is_file():
+        name = path.name.lower()
+        if name.endswith((".csv", ".csv.gz", ".parquet")):
+            return _pressures_file(path)
+        return _plant_file(path)
+    module, colon, attribute = text.partition(":")
+    if colon and all(part.isidentifier() for part in (*module.split("."), attribute)):
+        return _imported(module, attribute)
+    raise InputError(
+        f"--plant {text!r}: there is no such file, nor a simulator of that name; choose "
+        f"{', '.join(NAMES)}, a file of plants (.json, .npz), a CSV or Parquet file of simulated "
+        "pressures, or module:function"
+    )
+
+
+def _official(path: Path | None = None) -> Simulators:
+    found = frozen.load(path=path)
+    return Simulators(
+        "frozen", "frozen", found.about(), LUNGS, found.manifest_sha256, found,
+        lambda: found.plants, found.for_breaths, found.cross_fitted, found,
+    )  # fmt: skip
+
+
+def _trained(path: Path) -> Simulators:
+    """Simulators of a folder; they are the official ones if its manifest is theirs."""
+    found = frozen.load(path=path)
+    official = found.manifest_sha256 == files.sha256(frozen.folder() / frozen.MANIFEST)
+    return Simulators(
+        "frozen", path.name, found.about(), LUNGS, found.manifest_sha256,
+        found if official else None, lambda: found.plants, found.for_breaths, found.cross_fitted,
+        found,
+    )  # fmt: skip
+
+
+def _learned() -> Simulators:
+    found, official = frozen.load_learned(), frozen.load()
+    about = {"kind": "learned", **{k: official.about()[k] for k in ("version", "manifest_sha256")}}
+    return Simulators(
+        "learned", "learned", about, LUNGS, official.manifest_sha256, None,
+        lambda: found.plants, found.for_breaths, found.cross_fitted, official,
+    )  # fmt: skip
+
+
+def _physics() -> Simulators:
+    def base() -> Plant:
+        with precision.float64():
+            return alike.stacked([physics(entry) for entry in LUNGS])
+
+    # Of recorded breaths the exact solution is quicker than the general solver.
+    return Simulators(
+        "physics", "physics", {"kind": "physics"}, LUNGS, None, None, base,
+        labelled.single_compartments,
+    )  # fmt: skip
+
+
+def _two_balloon() -> Simulators:
+    def balloons() -> Plant:
+        with precision.float64():
+            return alike.stacked([two_balloon(entry) for entry in LUNGS])
+
+    return Simulators(
+        "two_balloon", "two_balloon", {"kind": "two_balloon"}, LUNGS, None, None, balloons,
+        labelled.two_balloons,
+    )  # fmt: skip
+
+
+_NAMED: dict[str, Callable[[], Simulators]] = {
+    "frozen": _official,
+    "hybrid": _official,  # the kind of plant that the official ones are
+    "learned": _learned,
+    "physics": _physics,
+    "two_balloon": _two_balloon,
+}
+
+
+def _plants(
+    plants: dict[str, Plant], name: str, about: Mapping[str, Any], sha256: str | None = None
+) -> Simulators:
+    if not plants:
+        raise InputError(f"{name}: there is no plant in it")
+    for key, plant in plants.items():
+        if not isinstance(plant, Plant):
+            raise InputError(
+                f"{name}, lung {key}: a {type(plant).__name__} is no plant; it needs init and step"
+            )
+    plants = {lung(key).id: plant for key, plant in plants.items()}
+
+    def for_breaths(breaths: Breaths) -> Plant:
+        missing = sorted(set(breaths.lung_ids.tolist()) - set(plants))
+        if missing:
+            raise InputError(
+                f"the simulator has no lung {missing[0]} of the recording ({name}); it has "
+                f"{', '.join(plants)}"
+            )
+        return alike.stacked([plants[key] for key in breaths.lung_ids.tolist()])
+
+    return Simulators(
+        "plants", name, about, tuple(lung(key) for key in plants), sha256, None,
+        lambda: alike.stacked(list(plants.values())), for_breaths,
+    )  # fmt: skip
+
+
+def _single(plant: Plant, name: str, sha256: str | None = None) -> Simulators:
+    def repeated(count: int) -> Plant:
+        def repeat(leaf: Any) -> NDArray[Any]:
+            values = np.asarray(leaf)
+            return np.broadcast_to(values, (count, *values.shape))
+
+        return jax.tree.map(repeat, plant)
+
+    about: dict[str, Any] = {"kind": "plant", "plant": name}
+    if sha256 is not None:
+        about["sha256"] = sha256
+    return Simulators(
+        "plants", name, about, LUNGS, sha256, None, partial(repeated, len(LUNGS)),
+        lambda breaths: Each(repeated(len(breaths))),
+    )  # fmt: skip
+
+
+def _plant_file(path: Path) -> Simulators:
+    digest = files.sha256(path)
+    about = {"kind": "file", "file": path.name, "sha256": digest}
+    return _plants(text_files.load(path), path.name, about, digest)
+
+
+def _of_function(function: Any, name: str, sha256: str | None = None) -> Simulators:
+    about: dict[str, Any] = {"kind": "function", "function": name}
+    if sha256 is not None:
+        about["sha256"] = sha256
+    return Simulators("function", name, about, sha256=sha256, _function=function)
+
+
+def _imported(module: str, attribute: str) -> Simulators:
+    """What ``module:attribute`` names; modules of the working folder are found too."""
+    text = f"{module}:{attribute}"
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        loaded = importlib.import_module(module)
+        value = getattr(loaded, attribute)
+    except Exception as error:
+        raise InputError(
+            f"--plant {text}: it cannot be imported: {type(error).__name__}: {error}"
+        ) from error
+    finally:
+        sys.path.remove(str(Path.cwd()))
+    source = inspect.getsourcefile(loaded)
+    digest = files.sha256(Path(source)) if source is not None else None
+    if isinstance(value, Mapping):
+        return _plants(dict(value), text, {"kind": "plants", "module": text}, digest)
+    if isinstance(value, Plant) and not isinstance(value, type):
+        return _single(value, text, digest)
+    if callable(value):
+        return _of_function(value, text, digest)
+    raise InputError(
+        f"--plant {text}: a {type(value).__name__} is neither a function, a plant nor plants by "
+        "lung id"
+    )
+
+
+def _pressures_file(path: Path) -> Simulators:
+    breaths = recordings.load(path, pad=True)
+    digest = files.sha256(path)
+    about = {"kind": "pressures", "file": path.name, "sha256": digest}
+    return _of_pressures(breaths, breaths.pressure, path.name, about, digest)
+
+
+def _of_array(given: Any, breaths: Breaths | None) -> Simulators:
+    try:
+        pressures = np.asarray(given, float)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"a {type(given).__name__} stands for no simulators; give a name, a file, a plant, "
+            "plants by lung id, a function of commands or an array of pressures"
+        ) from error
+    if breaths is None or pressures.shape != breaths.pressure.shape:
+        wanted = "the breaths it answers to" if breaths is None else str(breaths.pressure.shape)
+        raise InputError(
+            f"an array of simulated pressures, shape {pressures.shape}, needs {wanted}"
+        )
+    return _of_pressures(breaths, pressures, "the given pressures", {"kind": "pressures"}, None)
+
+
+def _of_pressures(
+    breaths: Breaths, pressures: Floats, name: str, about: Mapping[str, Any], sha256: str | None
+) -> Simulators:
+    table = {}
+    for i, number in enumerate(breaths.breath_id.tolist()):
+        samples = breaths.valid[i]
+        if not np.all(np.isfinite(pressures[i, samples])):
+            raise InputError(f"{name}: breath {number} has a blank pressure; simulate every sample")
+        label = Lung(float(breaths.R[i]), float(breaths.C[i]))
+        table[number] = (label, breaths.u_in[i, samples], pressures[i, samples])
+    return Simulators("pressures", name, about, sha256=sha256, _table=table)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ventbench.physics import library, parameter, paths
-from ventbench.physics.catalogue import slots
+from ventbench.physics.catalogue import basis_terms
 from ventbench.precision import float64
 from ventbench.recordings import Breaths
 from ventbench.system_id import Simulator, derivatives, recorded, settings
@@ -107,7 +107,7 @@ def main() -> None:
     if arguments.columns < 1 or arguments.repeats < 1:
         parser.error("--columns and --repeats must be at least 1")
     os.environ["VENTBENCH_THREADS"] = "1"
-    for names in (paths(), paths((*library(), *slots()))):
+    for names in (paths(), paths((*library(), *basis_terms()))):
         compare(names, arguments.columns, arguments.repeats)
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
 from ventbench.physics import library, paths
-from ventbench.physics.catalogue import slots
+from ventbench.physics.catalogue import basis_terms
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import recorded
 from ventbench.validation.challenge.cases import Base, Case, Effect
@@ -58,8 +58,8 @@ def one_size(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def limit_slots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave a few slots to choose from."""
-    few = {name: slots()[name] for name in FEW}
-    monkeypatch.setattr("ventbench.diagnosis.screening.slots", lambda: few)
+    few = {name: basis_terms()[name] for name in FEW}
+    monkeypatch.setattr("ventbench.diagnosis.screening.basis_terms", lambda: few)
     monkeypatch.setattr("ventbench.diagnosis.found.all_paths", with_few)
 
 

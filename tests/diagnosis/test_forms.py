@@ -8,7 +8,7 @@ from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.refinement import drop_compensating_terms
 from ventbench.diagnosis.selection import fit_with_noise
 from ventbench.physics import library, paths
-from ventbench.physics.catalogue import slots
+from ventbench.physics.catalogue import basis_terms
 
 from . import small
 
@@ -17,8 +17,8 @@ BOTH = Hypothesis(("leak", "viscoelasticity"))
 
 @pytest.fixture
 def only_leaks(monkeypatch):
-    one = {"leak_shape": slots()["leak_shape"]}
-    monkeypatch.setattr("ventbench.diagnosis.screening.slots", lambda: one)
+    one = {"leak_shape": basis_terms()["leak_shape"]}
+    monkeypatch.setattr("ventbench.diagnosis.screening.basis_terms", lambda: one)
 
 
 def left(*effects):

@@ -12,12 +12,11 @@ from ventbench.diagnosis.screening import (
     all_parameter_paths,
     component_of,
     score_nonparametric_terms,
-    special_cases,
 )
 from ventbench.diagnosis.selection import fit_with_noise
 from ventbench.physics import library, parameter
-from ventbench.physics.catalogue import slots
-from ventbench.physics.nonparametric import SLOTS
+from ventbench.physics.catalogue import basis_terms
+from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.system_id import Noise
 
 from . import small
@@ -26,24 +25,16 @@ from . import small
 NOISE = Noise((0.2,), (0.0,), np.inf)
 
 
-def test_every_element_has_a_place_and_holds_what_is_in_the_library():
-    for name in slots():
-        assert name in SLOTS[component_of(name)].elements
-        assert set(special_cases(name)) <= set(library())
-        assert set(special_cases(name)) <= set(SLOTS[component_of(name)].holds)
-    # Elements of one place that hold different things.
+def test_every_basis_term_belongs_to_a_component():
+    for name in basis_terms():
+        assert name in NONPARAMETRIC_COMPONENTS[component_of(name)].terms
     assert component_of("sensor_memory") == component_of("drift_shape") == "measurement"
-    assert special_cases("sensor_memory") == ("sensor_lag",)
-    assert special_cases("drift_shape") == ("sensor_drift",)
-    assert special_cases("sensor_shape") == ()
-    assert special_cases("volume_resistance") == ()
-    assert special_cases("flow_shape") == ("turbulent_resistance",)
 
 
 def test_all_paths_are_those_of_the_library_and_of_all_slots():
     found = all_parameter_paths()
     owners = {path.rpartition(".")[0] for path in found} - {""}
-    assert owners == set(library()) | set(slots())
+    assert owners == set(library()) | set(basis_terms())
     assert len(set(found)) == len(found)
 
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from ventbench.physics import library, mechanism, parameter, paths
-from ventbench.physics.catalogue import slots
+from ventbench.physics.catalogue import basis_terms
 from ventbench.physics.idle import acts, unless_idle
 from ventbench.physics.model import Physics
 from ventbench.system_id import START, Simulator, recorded, settings
 
 from . import cases
 
-NAMES = paths((*library(), *slots()))
+NAMES = paths((*library(), *basis_terms()))
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def of_strength(name):
     return item.strong if item.strong != item.neutral else item.high
 
 
-@pytest.mark.parametrize("name", [*library(), *slots()])
+@pytest.mark.parametrize("name", [*library(), *basis_terms()])
 def test_one_that_acts_alone_acts_as_among_all(skipping, whole, off, name):
     """Through any of its coefficients: the first is not the whole strength of a slot."""
     item = mechanism(name)

@@ -11,6 +11,7 @@ import pytest
 from ventbench.errors import InputError
 from ventbench.lungs import Lung
 from ventbench.physics import library, mechanism, parameter, paths, physics, strength_path
+from ventbench.physics.catalogue import basis_terms, special_cases
 from ventbench.precision import float64
 from ventbench.rollouts import open_loop
 
@@ -42,10 +43,33 @@ def test_description_is_complete(name):
     assert {x for x in described.confusable if "_" in x} <= set(library()) - {name}
     assert json.loads(json.dumps(described.as_dict()))["name"] == name
     assert not described.strength.shape
+    assert set(described.special_case_of) <= set(basis_terms())
+    short = [item.name for item in described.parameters]
+    assert {name for pair in described.interchangeable for name in pair} <= set(short)
+    assert not set(described.equivalents) & set(library())
     for item in described.parameters:
         assert item.unit
         assert item.meaning
     assert described.strength.mild != described.strength.neutral
+
+
+@pytest.mark.parametrize("name", library())
+def test_screening_strengths_are_possible(name):
+    strength = mechanism(name).description.strength
+    tried = strength.screening_strengths()
+    assert tried
+    assert strength.neutral not in tried
+    assert all(strength.low <= value <= strength.high for value in tried)
+
+
+def test_special_cases_differ_between_the_terms_of_a_component():
+    assert special_cases("sensor_memory") == ("sensor_lag",)
+    assert special_cases("drift_shape") == ("sensor_drift",)
+    assert special_cases("sensor_shape") == special_cases("volume_resistance") == ()
+    assert special_cases("flow_shape") == ("turbulent_resistance",)
+    assert set(special_cases("command_memory")) == {
+        "valve_delay", "valve_lag", "supply_droop", "valve_hysteresis",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", library())

@@ -13,19 +13,13 @@ from ventbench.diagnosis.hypothesis import FittedModel, Partition, has_own
 from ventbench.diagnosis.patient_effort import EFFORT
 from ventbench.interfaces import Plant
 from ventbench.mechanics.lung_match import Estimate, LungMatch
-from ventbench.physics.catalogue import library, mechanism, paths
+from ventbench.physics.catalogue import library, mechanism, parameter, paths
 from ventbench.physics.model import Physics
 from ventbench.precision import float64
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit, fit, interval
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.derivatives import START, Simulator
-
-#: Shapes whose default is a guess: the interval of a strength must allow for it.
-_UNCERTAIN = ("supply_droop.recovery",)
-
-#: Pairs that change nothing when they change places, as two lags in a row: the larger comes first.
-_ALIKE = (("valve_lag.tau", "valve_lag.second"),)
 
 
 def estimated(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -> Fit:
@@ -37,14 +31,17 @@ def estimated(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
         evaluator: that it was found on.
     """
     hypothesis = fitted.hypothesis
-    free = [p for p in _UNCERTAIN if p.rpartition(".")[0] in hypothesis.names]
+    own = [path for path in paths(hypothesis.names) if "." in path]
+    free = [path for path in own if parameter(path).uncertain]
     start: dict[str, Any] = {}
     for path in fitted.problem.unknowns.paths:
         if path != START and not ("." in path and has_own(path.rpartition(".")[0])):
             start[path] = float(np.median(fitted.column(path)))
-    for first, second in _ALIKE:
-        if {first, second} <= set(start) and start[second] > start[first]:
-            start[first], start[second] = start[second], start[first]
+    for name in hypothesis.names:
+        for pair in mechanism(name).description.interchangeable:
+            first, second = (f"{name}.{each}" for each in pair)
+            if {first, second} <= set(start) and start[second] > start[first]:
+                start[first], start[second] = start[second], start[first]
     known = fitted.problem.data
     if len(np.unique(known.lung)) > 1:
         same = (partition.data.R[:, None] == known.R) & (partition.data.C[:, None] == known.C)

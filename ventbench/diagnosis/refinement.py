@@ -36,7 +36,6 @@ from ventbench.diagnosis.patient_effort import EFFORT
 from ventbench.diagnosis.screening import (
     score_nonparametric_terms,
     screen_mechanisms,
-    special_cases,
 )
 from ventbench.diagnosis.selection import (
     Comparison,
@@ -49,6 +48,7 @@ from ventbench.diagnosis.selection import (
     passes_heldout_test,
 )
 from ventbench.diagnosis.settings import GATE
+from ventbench.physics.catalogue import mechanism, special_cases
 from ventbench.system_id.data import Floats
 from ventbench.system_id.together import each
 
@@ -320,9 +320,6 @@ class SingleTermAlternative:
 #: Criterion (twice the nats) within which a name is an alternative, and most that are listed.
 _CLOSE, _LISTED = 10.0, 2
 
-#: What pressure alone can never tell from a mechanism: the same impedance under another name.
-SAME = {"viscoelasticity": ("second_compartment",)}
-
 
 @dataclass(frozen=True, eq=False)
 class Alternatives:
@@ -394,5 +391,5 @@ def _again(
 def _close(name: str, rivals: list[RankedModel], criterion: float) -> Alternatives:
     near = [one for one in rivals if one.criterion < criterion + _CLOSE][:_LISTED]
     odds = np.exp(-0.5 * np.array([max(one.criterion - criterion, 0.0) for one in near]))
-    names = tuple(one.name for one in near) + SAME.get(name, ())
+    names = tuple(one.name for one in near) + mechanism(name).description.equivalents
     return Alternatives(names[:_LISTED], float(1.0 / (1.0 + odds.sum())), tuple(near))

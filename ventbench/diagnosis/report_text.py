@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from ventbench.diagnosis.findings import ErrorRegion, Findings, MissingMechanism, NonparametricTerm
 from ventbench.mechanics.lung_match import Estimate, LungMatch
-from ventbench.physics import mechanism
+from ventbench.physics import mechanism, parameter
 
 #: Axes whose ranges are parts of a breath: an effect is described best by these.
 _PHASES = ("time since inspiration", "time since expiration")
@@ -25,9 +25,6 @@ _SHORT_MOMENT = 0.15
 
 #: Parameters of time below this are given in ms, s.
 _SHORT_PARAMETER = 0.5
-
-#: Parameters without a unit that are shares: given in %.
-_SHARES = frozenset({"valve_curve.loss", "supply_droop.drop", "sensor_drift.gain"})
 
 #: A mean error below this share of the noise says nothing about its sign.
 _NO_SIGN = 0.25
@@ -256,7 +253,7 @@ def _scale(estimate: Estimate, path: str) -> tuple[float, str]:
     )
     if estimate.unit == "s" and 0.0 < largest < _SHORT_PARAMETER:
         return 1000.0, "ms"
-    if path in _SHARES:
+    if path and parameter(path).share:
         return 100.0, "%"
     return 1.0, "" if estimate.unit == "1" else estimate.unit
 

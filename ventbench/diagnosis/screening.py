@@ -13,26 +13,14 @@ import numpy as np
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
 from ventbench.diagnosis.linearisation import Linearisation, gain, linearise
 from ventbench.diagnosis.patient_effort import EFFORT, evidence
-from ventbench.physics.catalogue import library, mechanism, parameter, paths, slots
-from ventbench.physics.nonparametric import SLOTS
-from ventbench.physics.parameters import Parameter
+from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter, paths
+from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.system_id.data import Floats
 from ventbench.system_id.derivatives import Simulator
 from ventbench.system_id.together import each
 
 #: A multiple of a template beyond these is not believed.
 _LEAST, _MOST = 0.2, 3.0
-
-#: Values that are tried of parameters other than the strength, by path.
-_ALSO = {
-    "viscoelasticity.time": (0.2, 0.5, 1.5),
-    "command_rounding.bias": (0.0, 0.5),
-    "valve_curve.power": (1.0, 3.0),
-    "leak.exponent": (0.5, 1.0),
-}
-
-#: Parameters without a derivative: a candidate holds them at the value that was tried.
-HELD = ("command_rounding.bias",)
 
 
 @dataclass(frozen=True)
@@ -84,7 +72,7 @@ def _best(simulator: Simulator, places: list[Linearisation], name: str) -> Candi
     first, *others = library()[name].description.parameters
     best, start = np.zeros(len(places)), {}
     paths = [f"{name}.{first.name}", *(f"{name}.{p.name}" for p in others)]
-    choices = [trial_strengths(first), *(_ALSO.get(path, ()) or (None,) for path in paths[1:])]
+    choices = [first.screening_strengths(), *(other.grid or (None,) for other in others)]
     work, points = [], []
     for setting, (k, place) in product(product(*choices), enumerate(places)):
         trial = place.values.copy()
@@ -104,7 +92,7 @@ def _best(simulator: Simulator, places: list[Linearisation], name: str) -> Candi
             strength = float(np.clip(given[paths[0]] * scale, first.low, first.high))
             start = given | {paths[0]: strength}
         best[k] = nats
-    held = {p: v for p, v in start.items() if p in HELD and v != parameter(p).neutral}
+    held = {p: v for p, v in start.items() if parameter(p).discrete and v != parameter(p).neutral}
     return Candidate(name, Hypothesis((name,), (), tuple(held.items())), start, *map(float, best))
 
 
@@ -115,35 +103,19 @@ def _effort(places: list[Linearisation]) -> Candidate:
     return Candidate(EFFORT, Hypothesis((EFFORT,)), start, *nats)
 
 
-def trial_strengths(item: Parameter) -> tuple[float, ...]:
-    """Strengths at which a mechanism's effect is looked at."""
-    if item.scan:
-        return tuple(x for x in item.scan if x != item.neutral)
-    both = (0.3 * item.mild, item.mild, item.strong)
-    return (*both, *(-x for x in both if -x >= item.low))
-
-
 #: Directions whose derivatives are taken at once.
 _TOGETHER = 16
 
 
 def all_parameter_paths() -> tuple[str, ...]:
     """Parameters of the library and of all slots."""
-    return paths((*library(), *slots()))
+    return paths((*library(), *basis_terms()))
 
 
 def component_of(element: str) -> str:
-    """Public name of the slot that an element belongs to."""
-    return next(slot.name for slot in SLOTS.values() if element in slot.elements)
-
-
-def special_cases(element: str) -> tuple[str, ...]:
-    """Mechanisms of the library that an element holds as special cases, or nearly."""
-    own = {
-        "sensor_memory": ("sensor_lag",), "drift_shape": ("sensor_drift",), "sensor_shape": (),
-        "outlet_shape": (),
-    }  # fmt: skip
-    return own.get(element, SLOTS[component_of(element)].holds)
+    """Public name of the nonparametric component that a basis term belongs to."""
+    components = NONPARAMETRIC_COMPONENTS.values()
+    return next(component.name for component in components if element in component.terms)
 
 
 def score_nonparametric_terms(fitted: FittedModel) -> list[Candidate]:
@@ -152,7 +124,7 @@ def score_nonparametric_terms(fitted: FittedModel) -> list[Candidate]:
     Args:
         fitted: fitted with a simulator of all slots' parameters.
     """
-    missing = [name for name in slots() if name not in fitted.hypothesis.names]
+    missing = [name for name in basis_terms() if name not in fitted.hypothesis.names]
     columns = [f"{n}.{p.name}" for n in missing for p in mechanism(n).description.parameters]
     slopes = _slopes(fitted, columns)
     problem, x = fitted.problem, fitted.minimum.x

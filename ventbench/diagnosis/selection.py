@@ -16,7 +16,7 @@ from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, has_own
 from ventbench.diagnosis.latent_inputs import exceeds_sensor_noise
 from ventbench.diagnosis.patient_effort import EFFORT
-from ventbench.diagnosis.screening import HELD, Candidate, screen_mechanisms
+from ventbench.diagnosis.screening import Candidate, screen_mechanisms
 from ventbench.diagnosis.settings import GATE
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id.data import Floats
@@ -389,7 +389,7 @@ def free_shape_parameters(evaluator: Evaluator, current: FittedModel) -> FittedM
     name = current.hypothesis.names[-1]
     for item in mechanism(name).description.parameters:
         path = f"{name}.{item.name}"
-        if not item.shape or path in HELD:
+        if not item.shape or item.discrete:
             continue
         freer = evaluator.fit(
             current.hypothesis.plus(Hypothesis((name,), (path,))), current.noise, current

@@ -11,7 +11,7 @@ from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY, Lat
 from ventbench.diagnosis.refinement import UnnamedEffect
 from ventbench.diagnosis.screening import component_of
 from ventbench.physics.catalogue import mechanism
-from ventbench.physics.nonparametric import SLOTS
+from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.physics.shapes import drawn, without_absorbed
 
 _MEANINGS = {
@@ -31,7 +31,7 @@ def slot(conclusion: Conclusion) -> NonparametricTerm | None:
         return _moving(place, place.source, explains)
     assert place.element is not None
     x, y, x_unit, y_unit = _curve(conclusion.full, place.element)
-    meaning = SLOTS[place.name].meaning
+    meaning = NONPARAMETRIC_COMPONENTS[place.name].meaning
     return NonparametricTerm(place.name, meaning, explains, place.nats, x, x_unit, y, y_unit)
 
 

@@ -1,47 +1,89 @@
-"""All mechanisms and elements of slots, found by the modules of their packages."""
+"""All mechanisms and basis terms by name, and their parameters by path."""
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Iterable
-from functools import lru_cache
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from types import ModuleType
 
 from ventbench.errors import InputError
-from ventbench.physics import base, mechanisms
-from ventbench.physics import nonparametric as places
+from ventbench.physics import base, mechanisms, nonparametric
 from ventbench.physics.mechanism import Mechanism
 from ventbench.physics.parameters import Parameter
 
 
-@lru_cache(maxsize=1)
+@dataclass(frozen=True, eq=False)
+class Catalogue:
+    """What a model can be built of.
+
+    Attributes:
+        library: mechanisms by name, in alphabetical order.
+        basis_terms: of nonparametric components, by name, in alphabetical order.
+    """
+
+    library: dict[str, Mechanism]
+    basis_terms: dict[str, Mechanism]
+
+    @cached_property
+    def everything(self) -> dict[str, Mechanism]:
+        """The library, then the basis terms."""
+        return self.library | self.basis_terms
+
+
+#: The catalogue in use, once it has been asked for.
+_current: Catalogue | None = None
+
+
+@contextmanager
+def extended(*added: Mechanism) -> Iterator[None]:
+    """Add mechanisms to the library while the block runs, in all threads of the process.
+
+    Models, fits and screening then know them by name, as those of ``physics/mechanisms``.
+
+    Raises:
+        InputError: if the catalogue already has a mechanism or basis term of that name.
+    """
+    global _current
+    before = _catalogue()
+    names = [item.description.name for item in added]
+    for name in names:
+        if name in before.everything or names.count(name) > 1:
+            raise InputError(f"the catalogue already has a mechanism {name!r}; choose another name")
+    library = before.library | dict(zip(names, added, strict=True))
+    _current = replace(before, library=dict(sorted(library.items())))
+    try:
+        yield
+    finally:
+        _current = before
+
+
 def library() -> dict[str, Mechanism]:
     """Every mechanism by name, in alphabetical order.
 
-    A module of the package ``mechanisms`` holds one, as ``MECHANISM``, under its own name.
+    Each module of the package ``mechanisms`` defines one, as ``MECHANISM``, under its own name.
     """
-    return _found(mechanisms)
+    return _catalogue().library
 
 
-@lru_cache(maxsize=1)
-def slots() -> dict[str, Mechanism]:
-    """Every element of a slot by name, in alphabetical order: shapes that have no name.
+def basis_terms() -> dict[str, Mechanism]:
+    """Every basis term of the nonparametric components by name, in alphabetical order.
 
-    Modules of the package ``slots`` hold them in the same way, except those whose names begin with
-    an underscore. They are not in the library; a fit that names them has them.
+    They are not in the library; a fit has those that its caller names.
     """
-    return _found(places)
+    return _catalogue().basis_terms
 
 
-@lru_cache(maxsize=1)
 def everything() -> dict[str, Mechanism]:
-    """The library, then the elements of slots."""
-    return library() | slots()
+    """The library, then the basis terms."""
+    return _catalogue().everything
 
 
 def mechanism(name: str) -> Mechanism:
-    """One mechanism, or element of a slot.
+    """A mechanism or basis term.
 
     Raises:
         InputError: if there is none of this name.
@@ -52,6 +94,12 @@ def mechanism(name: str) -> Mechanism:
         raise InputError(f"no mechanism {name!r}; choose of {', '.join(library())}") from None
 
 
+def special_cases(term: str) -> tuple[str, ...]:
+    """Mechanisms of the library that a basis term contains, exactly or nearly."""
+    described = (item.description for item in library().values())
+    return tuple(about.name for about in described if term in about.special_case_of)
+
+
 def parameter(path: str) -> Parameter:
     """A parameter by its path: ``R``, or ``valve_delay.delay``.
 
@@ -60,21 +108,18 @@ def parameter(path: str) -> Parameter:
     """
     owner, _, short = path.rpartition(".")
     among = mechanism(owner).description.parameters if owner else base.PARAMETERS
-    for item in among:
-        if item.name == short:
-            return item
+    for candidate in among:
+        if candidate.name == short:
+            return candidate
     raise InputError(f"no parameter {path!r}; {owner or 'the base'} has {_names(among)}")
 
 
-@lru_cache
 def paths(names: tuple[str, ...] | None = None) -> tuple[str, ...]:
     """Paths of the base parameters and of those of some mechanisms, or of the whole library.
 
-    ``paths((*library(), *slots()))`` has the elements of slots as well.
+    ``paths((*library(), *basis_terms()))`` has those of the basis terms as well.
     """
-    chosen = library() if names is None else {name: mechanism(name) for name in names}
-    own = [f"{name}.{p.name}" for name, item in chosen.items() for p in item.description.parameters]
-    return (*(p.name for p in base.PARAMETERS), *own)
+    return _paths(_catalogue(), names)
 
 
 def strength_path(name: str) -> str:
@@ -82,15 +127,33 @@ def strength_path(name: str) -> str:
     return f"{name}.{mechanism(name).description.strength.name}"
 
 
-def _found(package: ModuleType) -> dict[str, Mechanism]:
-    found: dict[str, Mechanism] = {}
-    modules = sorted(item.name for item in pkgutil.iter_modules(package.__path__))
-    for module in (name for name in modules if not name.startswith("_")):
-        mechanism = importlib.import_module(f"{package.__name__}.{module}").MECHANISM
-        if mechanism.description.name != module:
-            raise ValueError(f"{module}.py describes {mechanism.description.name!r}")
-        found[module] = mechanism
-    return found
+def _catalogue() -> Catalogue:
+    global _current
+    if _current is None:
+        _current = Catalogue(_discovered(mechanisms), _discovered(nonparametric))
+    return _current
+
+
+@lru_cache
+def _paths(catalogue: Catalogue, names: tuple[str, ...] | None) -> tuple[str, ...]:
+    chosen = catalogue.library if names is None else {name: mechanism(name) for name in names}
+    own = [
+        f"{name}.{parameter.name}"
+        for name, each in chosen.items()
+        for parameter in each.description.parameters
+    ]
+    return (*(parameter.name for parameter in base.PARAMETERS), *own)
+
+
+def _discovered(package: ModuleType) -> dict[str, Mechanism]:
+    discovered: dict[str, Mechanism] = {}
+    modules = sorted(module.name for module in pkgutil.iter_modules(package.__path__))
+    for name in (name for name in modules if not name.startswith("_")):
+        mechanism = importlib.import_module(f"{package.__name__}.{name}").MECHANISM
+        if mechanism.description.name != name:
+            raise ValueError(f"{name}.py describes {mechanism.description.name!r}")
+        discovered[name] = mechanism
+    return discovered
 
 
 def _names(parameters: Iterable[Parameter]) -> str:

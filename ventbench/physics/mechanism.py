@@ -36,6 +36,12 @@ class Description:
         confusable: names of mechanisms, or of other things, that look alike.
         detectable: smallest strength found in about 20 breaths of one lung, in the strength's unit,
             or None if it was not measured.
+        equivalents: names of other structures, in or outside the library, that have the same
+            impedance, so that pressure alone can never tell them from this mechanism.
+        interchangeable: pairs of its parameters whose values can be exchanged without any effect,
+            as the time constants of two lags in series. Reports give the larger value first.
+        special_case_of: basis terms (of ``ventbench.physics.nonparametric``) that contain this
+            mechanism, exactly or nearly.
     """
 
     name: str
@@ -47,6 +53,9 @@ class Description:
     signature: str
     confusable: tuple[str, ...] = ()
     detectable: float | None = None
+    equivalents: tuple[str, ...] = ()
+    interchangeable: tuple[tuple[str, str], ...] = ()
+    special_case_of: tuple[str, ...] = ()
 
     @property
     def strength(self) -> Parameter:

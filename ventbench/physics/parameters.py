@@ -34,6 +34,13 @@ class Parameter:
             steeply where an edge passes one, so that its interval is a profile's.
         spread: standard deviation before any data, in coordinates, around ``neutral``; given for
             what must stay there where no data bear on it, be it a strength.
+        grid: of a parameter other than the strength: values at which screening tries the mechanism,
+            as the shape of its effect differs much between them. The neutral value alone if empty.
+        discrete: True if the response has no useful derivative with respect to it, such as a choice
+            between two rules. A fit holds it at the grid value that screening chose.
+        uncertain: True for a shape parameter whose default is a guess. Final estimates free it, so
+            that the interval of the strength allows for it.
+        share: True for a dimensionless share, which reports show in percent.
     """
 
     name: str
@@ -51,6 +58,10 @@ class Parameter:
     scan: tuple[float, ...] = ()
     kinked: bool = False
     spread: float | None = None
+    grid: tuple[float, ...] = ()
+    discrete: bool = False
+    uncertain: bool = False
+    share: bool = False
 
     def __post_init__(self) -> None:
         """Check what the transforms rely on.
@@ -58,11 +69,22 @@ class Parameter:
         Raises:
             ValueError: if the bounds are out of order or the scale does not fit.
         """
-        values = (self.neutral, self.mild, self.strong)
+        values = (self.neutral, self.mild, self.strong, *self.grid)
         if not self.low < self.high or not all(self.low <= x <= self.high for x in values):
             raise ValueError(f"{self.name}: {values} must lie within {self.low}..{self.high}")
         if self.scale == "log" and self.low <= 0:
             raise ValueError(f"{self.name}: a log scale needs a positive lower bound")
+
+    def screening_strengths(self) -> tuple[float, ...]:
+        """Strengths at which screening evaluates the effect of this parameter's mechanism.
+
+        These are the values of ``scan`` if there are any, else a weak, a mild and a strong effect,
+        with both signs where the bounds allow it.
+        """
+        if self.scan:
+            return tuple(value for value in self.scan if value != self.neutral)
+        positive = (0.3 * self.mild, self.mild, self.strong)
+        return (*positive, *(-value for value in positive if -value >= self.low))
 
     def coordinate(self, value: ArrayLike) -> NDArray[np.float64]:
         """Where a fit sees a physical value: its logarithm on a log scale, else itself.

@@ -10,8 +10,8 @@ import numpy as np
 
 from ventbench.errors import InputError
 from ventbench.physics import base
-from ventbench.physics.catalogue import slots
-from ventbench.physics.nonparametric import SLOTS
+from ventbench.physics.catalogue import basis_terms
+from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.physics.nonparametric._element import Element, Shape
 from ventbench.precision import float64
 
@@ -33,13 +33,13 @@ def drawn(
     Raises:
         InputError: if there is no such slot, or the range holds no part of the curve.
     """
-    if slot not in SLOTS:
-        raise InputError(f"no slot {slot!r}; choose of {', '.join(SLOTS)}")
+    if slot not in NONPARAMETRIC_COMPONENTS:
+        raise InputError(f"no slot {slot!r}; choose of {', '.join(NONPARAMETRIC_COMPONENTS)}")
     known = {item.name: float(values.get(item.name, item.neutral)) for item in base.PARAMETERS}
     found = []
     with float64():
-        for name in SLOTS[slot].elements:
-            element = slots()[name]
+        for name in NONPARAMETRIC_COMPONENTS[slot].terms:
+            element = basis_terms()[name]
             assert isinstance(element, Element)  # as all modules there are
             own = {
                 item.name: jnp.asarray(float(values.get(f"{name}.{item.name}", item.neutral)))
@@ -49,7 +49,7 @@ def drawn(
     shapes = [shape for _, some in sorted(found, key=lambda pair: -pair[0]) for shape in some]
     if within is None:
         return tuple(shapes)
-    axis = SLOTS[slot].axis
+    axis = NONPARAMETRIC_COMPONENTS[slot].axis
     return tuple(_cut(shape, *within) if shape.x_unit == axis else shape for shape in shapes)
 
 

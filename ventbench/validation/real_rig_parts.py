@@ -21,7 +21,7 @@ from ventbench import files, precision
 from ventbench.diagnosis.simulators import Given
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNG_IDS, LUNGS
-from ventbench.physics.catalogue import library, mechanism, parameter, slots
+from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter
 from ventbench.physics.model import Physics
 from ventbench.plants import text_files
 from ventbench.plants.corrected import Corrected
@@ -193,9 +193,9 @@ def by_names_alone(plant: Plant) -> Plant:
     Components that the given simulator has itself keep its values.
     """
     if not isinstance(plant, Corrected):
-        return without(plant, slots()) if isinstance(plant, Physics) else plant
+        return without(plant, basis_terms()) if isinstance(plant, Physics) else plant
     had, wanted = plant.had, plant.wanted
-    coefficients = [path for path in (*wanted.names, *had.names) if _owner(path) in slots()]
+    coefficients = [path for path in (*wanted.names, *had.names) if _owner(path) in basis_terms()]
     with precision.float64():
         same = wanted.having(**{path: had.get(path) for path in coefficients})
     return dataclasses.replace(plant, wanted=same)
@@ -204,7 +204,9 @@ def by_names_alone(plant: Plant) -> Plant:
 def has_unnamed(plant: Plant) -> bool:
     """Whether a corrected plant has nonparametric components."""
     physics = plant.wanted if isinstance(plant, Corrected) else plant
-    return isinstance(physics, Physics) and any(_owner(path) in slots() for path in physics.names)
+    return isinstance(physics, Physics) and any(
+        _owner(path) in basis_terms() for path in physics.names
+    )
 
 
 def _owner(path: str) -> str:

@@ -38,6 +38,8 @@ class CommandRounding(Mechanism):
                 0.0,
                 0.0,
                 shape=True,
+                grid=(0.0, 0.5),
+                discrete=True,
             ),
         ),
         source=(
@@ -48,6 +50,7 @@ class CommandRounding(Mechanism):
             "a dead band of 0.5 %; what remains follows the fraction of each command."
         ),
         confusable=("valve_dead_band",),
+        special_case_of=("valve_shape",),
     )
 
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:

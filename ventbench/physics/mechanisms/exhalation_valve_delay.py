@@ -52,6 +52,7 @@ class ExhalationValveDelay(Mechanism):
         ),
         confusable=("inertance", "sensor_lag"),
         detectable=0.003,
+        special_case_of=("outlet_memory",),
     )
 
     def outlet_dead_time(self, values: Values, u_out: Array) -> Array:

@@ -30,6 +30,7 @@ class Leak(Mechanism):
                 0.5,
                 0.5,
                 shape=True,
+                grid=(0.5, 1.0),
             ),
         ),
         source=(
@@ -42,6 +43,7 @@ class Leak(Mechanism):
         ),
         confusable=("viscoelasticity", "valve_dead_band", "supply_droop"),
         detectable=0.25,
+        special_case_of=("leak_shape",),
     )
 
     def network(self, values: Values, network: Network, view: View) -> Network:

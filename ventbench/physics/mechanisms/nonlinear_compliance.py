@@ -44,6 +44,7 @@ class NonlinearCompliance(Mechanism):
         ),
         confusable=("valve_curve", "leak"),
         detectable=0.01,
+        special_case_of=("recoil_shape",),
     )
 
     def network(self, values: Values, network: Network, view: View) -> Network:

@@ -44,6 +44,7 @@ class SensorDrift(Mechanism):
                 0.0,
                 0.0,
                 shape=True,
+                share=True,
             ),
             Parameter(
                 "warming",
@@ -66,6 +67,7 @@ class SensorDrift(Mechanism):
         ),
         confusable=("a PEEP that changes during the recording",),
         detectable=0.05,
+        special_case_of=("drift_shape",),
     )
 
     rank = 1

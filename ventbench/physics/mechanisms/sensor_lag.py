@@ -24,6 +24,7 @@ class SensorLag(Mechanism):
         ),
         confusable=("valve_lag", "circuit_compliance", "valve_delay"),
         detectable=0.019,
+        special_case_of=("sensor_memory",),
     )
     stateful = True
 

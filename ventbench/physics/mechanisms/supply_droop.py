@@ -26,8 +26,21 @@ class SupplyDroop(Mechanism):
                 0.0,
                 0.1,
                 0.3,
+                share=True,
             ),
-            Parameter("recovery", "s", "time constant", 0.1, 5.0, 1.0, 1.0, 1.0, "log", shape=True),
+            Parameter(
+                "recovery",
+                "s",
+                "time constant",
+                0.1,
+                5.0,
+                1.0,
+                1.0,
+                1.0,
+                "log",
+                shape=True,
+                uncertain=True,
+            ),
         ),
         source=(
             "Reservoir behind a regulator or blower: its pressure falls with the flow drawn "
@@ -36,6 +49,7 @@ class SupplyDroop(Mechanism):
         signature="Flow is lost late in inspiration and in big breaths; after a pause it is back.",
         confusable=("valve_curve", "leak", "viscoelasticity"),
         detectable=0.02,
+        special_case_of=("command_memory", "command_plays", "supply_memory"),
     )
 
     rank = 1

@@ -56,6 +56,7 @@ class TurbulentResistance(Mechanism):
         ),
         confusable=("valve_curve",),
         detectable=0.5,
+        special_case_of=("flow_shape",),
     )
 
     def network(self, values: Values, network: Network, view: View) -> Network:

@@ -27,6 +27,7 @@ class ValveCurve(Mechanism):
                 0.0,
                 0.2,
                 0.5,
+                share=True,
             ),
             Parameter(
                 "power",
@@ -38,6 +39,7 @@ class ValveCurve(Mechanism):
                 1.0,
                 1.0,
                 shape=True,
+                grid=(1.0, 3.0),
             ),
         ),
         source=(
@@ -52,6 +54,7 @@ class ValveCurve(Mechanism):
         ),
         confusable=("turbulent_resistance", "supply_droop", "nonlinear_compliance"),
         detectable=0.015,
+        special_case_of=("valve_shape",),
     )
 
     rank = 3

@@ -31,6 +31,7 @@ class ValveDeadBand(Mechanism):
         ),
         confusable=("leak", "command_rounding", "valve_hysteresis"),
         detectable=0.1,
+        special_case_of=("valve_shape",),
     )
 
     rank = 2

@@ -41,6 +41,7 @@ class ValveDelay(Mechanism):
         ),
         confusable=("valve_lag", "sensor_lag", "circuit_compliance"),
         detectable=0.009,
+        special_case_of=("command_memory", "command_plays", "supply_memory"),
     )
 
     def dead_time(self, values: Values) -> Array:

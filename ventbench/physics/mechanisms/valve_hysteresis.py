@@ -48,6 +48,7 @@ class ValveHysteresis(Mechanism):
         ),
         confusable=("valve_dead_band", "valve_delay"),
         detectable=0.1,
+        special_case_of=("command_memory", "command_plays", "supply_memory"),
     )
 
     rank = 1

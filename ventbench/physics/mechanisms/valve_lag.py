@@ -41,6 +41,8 @@ class ValveLag(Mechanism):
         ),
         confusable=("sensor_lag", "circuit_compliance", "valve_delay"),
         detectable=0.009,
+        special_case_of=("command_memory", "command_plays", "supply_memory"),
+        interchangeable=(("tau", "second"),),
     )
     stateful = True
 

@@ -28,7 +28,18 @@ class Viscoelasticity(Mechanism):
                 0.25,
                 0.7,
             ),
-            Parameter("time", "s", "its relaxation time", 0.1, 5.0, 1.0, 1.0, 1.0, "log"),
+            Parameter(
+                "time",
+                "s",
+                "its relaxation time",
+                0.1,
+                5.0,
+                1.0,
+                1.0,
+                1.0,
+                "log",
+                grid=(0.2, 0.5, 1.5),
+            ),
         ),
         source=(
             "Maxwell element beside the elastance (Bates, Lung Mechanics, Cambridge 2009): "
@@ -41,6 +52,8 @@ class Viscoelasticity(Mechanism):
         ),
         confusable=("leak", "supply_droop"),
         detectable=0.02,
+        special_case_of=("recoil_memory",),
+        equivalents=("second_compartment",),
     )
 
     stateful = True

@@ -10,69 +10,65 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Slot:
+class NonparametricComponent:
     """A place in the physics.
 
     Attributes:
         name: public.
-        elements: that together are the slot, to be fitted at once.
-        holds: mechanisms of the library that are special cases of it, exactly or nearly.
+        terms: that together are the slot, to be fitted at once.
         meaning: in words.
         axis: what its shape depends on, with the unit.
     """
 
     name: str
-    elements: tuple[str, ...]
-    holds: tuple[str, ...]
+    terms: tuple[str, ...]
     meaning: str
     axis: str
 
 
-#: All slots, by public name.
-SLOTS = {
-    slot.name: slot
-    for slot in (
-        Slot(
-            "f(u)", ("valve_shape",), ("valve_curve", "valve_dead_band", "command_rounding"),
+#: All nonparametric components, by public name.
+NONPARAMETRIC_COMPONENTS = {
+    component.name: component
+    for component in (
+        NonparametricComponent(
+            "f(u)", ("valve_shape",),
             "flow of the inspiratory valve depends on the command in another way", "command, %",
         ),
-        Slot(
+        NonparametricComponent(
             "memory of u", ("command_memory", "command_plays", "supply_memory"),
-            ("valve_delay", "valve_lag", "supply_droop", "valve_hysteresis"),
             "flow of the inspiratory valve depends on what the command was before",
             "time after a step, s",
         ),
-        Slot(
-            "f(p)", ("leak_shape",), ("leak",),
+        NonparametricComponent(
+            "f(p)", ("leak_shape",),
             "gas leaves beside the lung, by the pressure at the airway", "airway pressure, cmH2O",
         ),
-        Slot(
-            "f(Q)", ("flow_shape",), ("turbulent_resistance",),
+        NonparametricComponent(
+            "f(Q)", ("flow_shape",),
             "the pressure drop of the airway depends on flow in another way", "flow, L/s",
         ),
-        Slot(
-            "R(V)", ("volume_resistance",), (),
+        NonparametricComponent(
+            "R(V)", ("volume_resistance",),
             "the resistance of the airway depends on the volume of the lung", "volume, mL",
         ),
-        Slot(
-            "R(direction)", ("direction_resistance",), (),
+        NonparametricComponent(
+            "R(direction)", ("direction_resistance",),
             "the resistance of the airway is another one outwards than inwards", "flow, L/s",
         ),
-        Slot(
-            "f(V)", ("recoil_shape",), ("nonlinear_compliance",),
+        NonparametricComponent(
+            "f(V)", ("recoil_shape",),
             "the recoil of the lung depends on volume in another way", "volume, mL",
         ),
-        Slot(
-            "memory of p", ("recoil_memory",), ("viscoelasticity",),
+        NonparametricComponent(
+            "memory of p", ("recoil_memory",),
             "the recoil of the lung depends on what its volume was before", "time after a step, s",
         ),
-        Slot(
-            "exhalation path", ("outlet_shape", "outlet_memory"), ("exhalation_valve_delay",),
+        NonparametricComponent(
+            "exhalation path", ("outlet_shape", "outlet_memory"),
             "the expiratory valve conducts in another way, or opens slowly", "p - PEEP, cmH2O",
         ),
-        Slot(
+        NonparametricComponent(
             "measurement", ("sensor_shape", "sensor_memory", "drift_shape"),
-            ("sensor_lag", "sensor_drift"),
             "the sensor shows another pressure than that at the airway",
             "airway pressure, cmH2O",
         ),

@@ -1,0 +1,102 @@
+"""A mechanism that is added under its own name is modelled, fitted and screened like the others."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ventbench.diagnosis.evaluator import make_evaluator
+from ventbench.diagnosis.hypothesis import Hypothesis
+from ventbench.diagnosis.screening import screen_mechanisms
+from ventbench.diagnosis.selection import fit_with_noise, fit_with_white_noise
+from ventbench.errors import InputError
+from ventbench.lungs import Lung
+from ventbench.physics import Description, Mechanism, Parameter, library, paths, physics
+from ventbench.physics.catalogue import extended
+from ventbench.precision import float64
+from ventbench.rollouts import open_loop
+from ventbench.system_id import Simulator, fit, interval, recorded
+
+from . import cases
+
+#: Pressure at which the valve of this mechanism opens, cmH2O.
+OPENS = 15.0
+
+
+class ReliefValve(Mechanism):
+    """A valve at the airway that lets gas out above a pressure."""
+
+    description = Description(
+        name="relief_valve",
+        title="relief valve at the airway",
+        site="circuit",
+        equation="q_relief = conductance max(p - 15 cmH2O, 0)",
+        parameters=(
+            Parameter("conductance", "mL/s per cmH2O", "above 15", 0.0, 60.0, 0.0, 10.0, 30.0),
+        ),
+        source="made up",
+        signature="Pressure is cut off above 15 cmH2O.",
+        confusable=("leak",),
+    )
+
+    def network(self, values, network, view):
+        """Tangent of the outflow at the last pressure."""
+        slope = 1e-3 * values["conductance"] * (view.pressure > OPENS)
+        return network.plus(leak=slope, leak_flow=-slope * OPENS)
+
+
+RELIEF_VALVE = ReliefValve()
+
+#: A small library, so that compiling takes seconds.
+NAMES = ("relief_valve", "valve_delay", "turbulent_resistance")
+
+
+@pytest.fixture(scope="module")
+def relieved():
+    """Twelve breaths of the model with the valve, 0.05 cmH2O of noise."""
+    breaths = cases.recording(12, {})
+    with extended(RELIEF_VALVE), float64():
+        plant = physics(Lung(10.0, 25.0), {"relief_valve": {"conductance": 20.0}}, PEEP=5.0)
+        commands = (breaths.pressure[:, 0], breaths.u_in, breaths.u_out * 1.0, breaths.dt)
+        pressure = np.array(open_loop(plant, *(jnp.asarray(x) for x in commands)))
+    noise = np.random.default_rng(0).normal(0, 0.05, pressure.shape)
+    return breaths, recorded(breaths).answered(pressure + noise)
+
+
+def test_it_is_known_by_name_within_the_block_only():
+    before = paths()
+    with extended(RELIEF_VALVE):
+        assert list(library()) == sorted(library())
+        assert set(paths()) - set(before) == {"relief_valve.conductance"}
+        with (
+            pytest.raises(InputError, match="already has a mechanism 'relief_valve'"),
+            extended(RELIEF_VALVE),
+        ):
+            pass
+    assert "relief_valve" not in library()
+    assert paths() == before
+
+
+def test_a_model_has_its_effect(relieved):
+    breaths, data = relieved
+    assert breaths.pressure.max() > OPENS + 3.0
+    assert data.seen.max() < breaths.pressure.max() - 1.0
+
+
+def test_a_fit_estimates_its_strength(relieved):
+    with extended(RELIEF_VALVE):
+        simulator = Simulator(relieved[1], paths(NAMES))
+        fitted = fit(relieved[1], ["relief_valve"], simulator=simulator)
+        conductance = interval(fitted, "relief_valve.conductance")
+    assert conductance.low < 20.0 < conductance.high
+    assert conductance.value == pytest.approx(20.0, rel=0.1)
+
+
+def test_screening_puts_it_first(relieved):
+    with extended(RELIEF_VALVE):
+        evaluator = make_evaluator(relieved[1], np.arange(12) % 2 == 1, paths(NAMES))
+        null = fit_with_noise(evaluator, Hypothesis())
+        candidates = screen_mechanisms(null, fit_with_white_noise(evaluator, null), NAMES)
+    assert candidates[0].name == "relief_valve"
+    assert candidates[0].nats > 50.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import pytest
@@ -19,13 +18,6 @@ class Plain(NamedTuple):
 
     evaluator: Evaluator
     null: FittedModel
-
-
-@pytest.fixture(scope="session", autouse=True)
-def one_size() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        small.one_size(patch)
-        yield
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
+from ventbench.diagnosis.settings import DataSettings, SelectionConfig
 from ventbench.physics import library, paths
 from ventbench.physics.catalogue import basis_terms
 from ventbench.recordings.breaths import Breaths
@@ -25,6 +26,9 @@ LABEL, RIG = "R20C20", Base(21.0, 19.5)
 #: One size of array for training, judging and all breaths.
 BREATHS, SAMPLES = 16, 40
 HELD = np.arange(BREATHS) % 2 == 1
+
+#: One compilation for all of these breaths.
+SETTINGS = SelectionConfig(data=DataSettings(batch_size=BREATHS))
 
 #: A few elements of slots, whose derivatives take a quarter of the time to compile.
 FEW = ("volume_resistance", "flow_shape")
@@ -43,7 +47,9 @@ def made(*effects: Effect, seed: int = 0, **changed: Any) -> Breaths:
 
 def split(breaths: Breaths, names: tuple[str, ...] | None = None) -> Evaluator:
     """On the bench, with the library's parameters or some."""
-    return make_evaluator(recorded(breaths), HELD[: len(breaths)], names or paths())
+    return make_evaluator(
+        recorded(breaths), HELD[: len(breaths)], names or paths(), settings=SETTINGS
+    )
 
 
 def with_few() -> tuple[str, ...]:
@@ -51,16 +57,11 @@ def with_few() -> tuple[str, ...]:
     return paths((*library(), *FEW))
 
 
-def one_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compile for these breaths alone."""
-    monkeypatch.setattr("ventbench.diagnosis.hypothesis._SIZES", (BREATHS,))
-
-
 def limit_slots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave a few slots to choose from."""
     few = {name: basis_terms()[name] for name in FEW}
     monkeypatch.setattr("ventbench.diagnosis.screening.basis_terms", lambda: few)
-    monkeypatch.setattr("ventbench.diagnosis.found.all_paths", with_few)
+    monkeypatch.setattr("ventbench.diagnosis.found.all_parameter_paths", with_few)
 
 
 def numbered(breaths: Breaths, first: int) -> Breaths:

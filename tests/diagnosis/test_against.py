@@ -28,7 +28,6 @@ PASSIVE = ("patient_effort",)
 def small_problems() -> Iterator[None]:
     """One size of array and a few slots: the rest would take minutes to compile."""
     with pytest.MonkeyPatch.context() as patch:
-        small.one_size(patch)
         small.limit_slots(patch)
         yield
 
@@ -49,7 +48,7 @@ def test_what_recording_and_simulator_share_is_no_mismatch():
     before = simulators.answers({small.LABEL: plant}, made) + strange(made)
     breaths = dataclasses.replace(made, pressure=made.pressure + strange(made))
     data, held = recorded(breaths), split.held_out(breaths)
-    alone = found_in(data, held, PASSIVE, lambda what: None)
+    alone = found_in(data, held, PASSIVE, lambda what: None, small.SETTINGS)
     told: list[str] = []
     found, had = against(data, held, before, alone, PASSIVE, told.append)
     assert had.conclusion.names == ()

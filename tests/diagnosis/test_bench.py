@@ -193,7 +193,7 @@ def test_what_belongs_to_R_is_one_for_each_label():
     assert list(groups) == ["turbulent_resistance.quadratic"]
     found = groups["turbulent_resistance.quadratic"]
     assert np.array_equal(found, np.where(data.R == 5.0, 0, 1))
-    made = make_evaluator(data, small.HELD, paths())
+    made = make_evaluator(data, small.HELD, paths(), settings=small.SETTINGS)
     fitted = made.fit(Hypothesis(("turbulent_resistance", "leak")), GAUSSIAN, iterations=2)
     layout = fitted.problem.unknowns
     sizes = {path: len(layout.of(path)) for path in layout.paths}

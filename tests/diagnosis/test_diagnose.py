@@ -30,7 +30,6 @@ NAME = "turbulent_resistance"
 def small_problems() -> Iterator[None]:
     """One size of array and a few slots: the rest would take minutes to compile."""
     with pytest.MonkeyPatch.context() as patch:
-        small.one_size(patch)
         small.limit_slots(patch)
         # With the noise of the usual seed, a strength here comes out three intervals too high.
         patch.setattr(simulators, "_SEED", 1)
@@ -44,7 +43,7 @@ def breaths() -> Breaths:
 
 @pytest.fixture(scope="module")
 def found(breaths) -> Diagnosis:
-    return diagnose(breaths)
+    return diagnose(breaths, settings=small.SETTINGS)
 
 
 def turbulent(quadratic: float) -> dict[str, Plant]:
@@ -57,13 +56,15 @@ def turbulent(quadratic: float) -> dict[str, Plant]:
 @pytest.fixture(scope="module")
 def own(breaths) -> Diagnosis:
     """Of a user's simulator that has the effect."""
-    return diagnose(breaths, plant=turbulent(10.0))
+    return diagnose(breaths, plant=turbulent(10.0), settings=small.SETTINGS)
 
 
 @pytest.fixture(scope="module")
 def strange() -> Diagnosis:
     """Of a recording with an effect that has no name."""
-    return diagnose(small.made(small.effect("volume_resistance", "R(V)", change=0.65)))
+    return diagnose(
+        small.made(small.effect("volume_resistance", "R(V)", change=0.65)), settings=small.SETTINGS
+    )
 
 
 def test_the_effect_is_named_with_its_strength(found):
@@ -148,7 +149,7 @@ def shaken(breaths: Breaths, held: np.ndarray) -> Breaths:
 
 @pytest.fixture(scope="module")
 def other(breaths, found) -> Diagnosis:
-    return diagnose(shaken(breaths, found.traces.held_out))
+    return diagnose(shaken(breaths, found.traces.held_out), settings=small.SETTINGS)
 
 
 def test_held_out_readings_change_no_answer(found, other):
@@ -189,7 +190,7 @@ def test_the_corrected_plant_answers_as_the_report_says(own, breaths):
 
 @pytest.mark.slow  # two more conclusions
 def test_another_strength_than_the_simulators_is_missing(breaths):
-    much = diagnose(breaths, plant=turbulent(20.0))
+    much = diagnose(breaths, plant=turbulent(20.0), settings=small.SETTINGS)
     assert much.verdict == "named"
     (one,) = much.mechanisms
     assert (one.name, one.changed) == (NAME, True)
@@ -218,7 +219,12 @@ def test_gaps_and_other_lungs_are_left_out():
     other = dataclasses.replace(other, R=np.full(2, 5.0))
     both = join([dataclasses.replace(one, pressure=pressure), other])
     told: list[float] = []
-    found = diagnose(both, lung=small.LABEL, progress=lambda what, share: told.append(share))
+    found = diagnose(
+        both,
+        lung=small.LABEL,
+        progress=lambda what, share: told.append(share),
+        settings=small.SETTINGS,
+    )
     assert found.verdict == "nothing_missing"
     assert found.mechanisms == ()
     assert len(found.traces.breaths) == small.BREATHS - 1
@@ -235,10 +241,10 @@ def test_gaps_and_other_lungs_are_left_out():
 
 def test_what_cannot_be_diagnosed_is_refused(breaths):
     with pytest.raises(InputError, match=r"3 usable breaths; a diagnosis needs at least 4"):
-        diagnose(breaths.select(np.arange(3)))
+        diagnose(breaths.select(np.arange(3)), settings=small.SETTINGS)
     with pytest.raises(InputError, match=r"0 usable breaths"):
-        diagnose(breaths, lung="R50C50")
+        diagnose(breaths, lung="R50C50", settings=small.SETTINGS)
     with pytest.raises(InputError, match=r"no simulator 'phisics'"):
-        diagnose(breaths, plant="phisics")  # type: ignore[arg-type]
+        diagnose(breaths, plant="phisics", settings=small.SETTINGS)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"the simulator has no lung R20C20; it has R5C10"):
-        diagnose(breaths, plant={"R5C10": turbulent(1.0)[small.LABEL]})
+        diagnose(breaths, plant={"R5C10": turbulent(1.0)[small.LABEL]}, settings=small.SETTINGS)

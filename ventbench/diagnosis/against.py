@@ -42,7 +42,8 @@ def against(
         What was found in the recording, and in the simulator.
     """
     answered = simulators.measured(data, before, alone.conclusion.noise)
-    had = found_in(answered, held, excluded, lambda what: tell(f"simulator: {what}"))
+    settings = alone.evaluator.settings
+    had = found_in(answered, held, excluded, lambda what: tell(f"simulator: {what}"), settings)
     first = before[:, 0]
     own = had.pressures(had.conclusion.full, held, first)
     beyond = np.nan_to_num(before - own)
@@ -54,7 +55,9 @@ def against(
     errs = min(_error(seen, before[~held]), _error(seen, least[~held]))
     if errs >= _CLEARER * _error(seen, most[~held]):
         return alone, had
-    found = found_in(beside, held, excluded, lambda what: tell(f"beside the simulator: {what}"))
+    found = found_in(
+        beside, held, excluded, lambda what: tell(f"beside the simulator: {what}"), settings
+    )
     return found, replace(had, fit=_exactly(had, data.answered(own), held, found))
 
 

@@ -19,6 +19,7 @@ from ventbench.diagnosis.found import Found, found_in
 from ventbench.diagnosis.refinement import Alternatives
 from ventbench.diagnosis.residual_analysis import compare_open_loop, flow_and_volume, locate
 from ventbench.diagnosis.result import Diagnosis
+from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.diagnosis.simulators import Given
 from ventbench.diagnosis.steady import steadied
 from ventbench.errors import InputError
@@ -37,6 +38,7 @@ def diagnose(
     lung: str | None = None,
     passive: bool = False,
     progress: Progress | None = None,
+    settings: SelectionConfig = DEFAULT,
 ) -> Diagnosis:
     """Find what a simulator lacks.
 
@@ -49,6 +51,7 @@ def diagnose(
         lung: use only the breaths of this label.
         passive: nobody breathes, as in a test lung: efforts are out of the question.
         progress: is told what is done and which share of the whole is behind.
+        settings: every threshold.
 
     Raises:
         InputError: if there are too few breaths, or no simulator for their lung.
@@ -63,7 +66,7 @@ def diagnose(
     before = simulators.answers(plant, breaths)
     data = recorded(breaths)
     excluded = ("patient_effort",) if passive else ()
-    alone = found_in(data, held, excluded, lambda what: tell(what, 0.3))
+    alone = found_in(data, held, excluded, lambda what: tell(what, 0.3), settings)
     found, had = alone, None
     if plant != "physics":
         tell("the same questions to the simulator", 0.6)

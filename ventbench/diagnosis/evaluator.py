@@ -19,7 +19,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, simulator
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, make_partition
 from ventbench.diagnosis.linearisation import linearise
 from ventbench.diagnosis.patient_effort import (
     AMPLITUDE,
@@ -30,12 +30,14 @@ from ventbench.diagnosis.patient_effort import (
     marginal_log_likelihood,
     restart_efforts,
 )
+from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.physics.catalogue import library
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.derivatives import START
 from ventbench.system_id.least_squares import minimise
 from ventbench.system_id.noise import Noise
-from ventbench.system_id.problem import Problem, settings
+from ventbench.system_id.problem import Problem
+from ventbench.system_id.problem import settings as parameter_values
 from ventbench.system_id.together import each
 from ventbench.system_id.unknowns import described, unknowns
 
@@ -55,6 +57,7 @@ class Evaluator:
         excluded: mechanisms that cannot act, as efforts in a passive test lung.
         folds: other splits of the same breaths, training and judging, so that with this one every
             breath judges once.
+        settings: every threshold.
     """
 
     training: Partition
@@ -62,6 +65,7 @@ class Evaluator:
     gain_sd: float = 0.0
     excluded: tuple[str, ...] = ()
     folds: tuple[tuple[Partition, Partition], ...] = ()
+    settings: SelectionConfig = DEFAULT
     _known: WeakKeyDictionary[FittedModel, Floats] = field(
         init=False, repr=False, default_factory=WeakKeyDictionary
     )
@@ -209,7 +213,7 @@ class Evaluator:
         """
         data, known = partition.data, fitted.problem.data
         names = fitted.problem.simulator.names
-        values = settings(data, partition.simulator.names, {})
+        values = parameter_values(data, partition.simulator.names, {})
         same = (data.R[:, None] == known.R) & (data.C[:, None] == known.C)
         same |= ~same.any(axis=1, keepdims=True)
         first = np.argmax(same, axis=1)
@@ -230,7 +234,7 @@ class Evaluator:
         groups = {"gain": np.arange(len(partition.data))} if self.gain_sd else {}
         groups |= by_label(partition.data, free)
         layout = unknowns(partition.data, free, groups)
-        base = settings(partition.data, partition.simulator.names, fixed)
+        base = parameter_values(partition.data, partition.simulator.names, fixed)
         gain = float(np.log(described("gain").neutral))
         mean, precision = layout.prior({"gain": (gain, self.gain_sd)} if self.gain_sd else {})
         return Problem(partition.data, partition.simulator, layout, base, noise, mean, precision)
@@ -246,27 +250,30 @@ class Evaluator:
 
 
 def make_evaluator(
-    data: Data, held_out: NDArray[np.bool_], names: tuple[str, ...], excluded: tuple[str, ...] = ()
+    data: Data,
+    held_out: NDArray[np.bool_],
+    names: tuple[str, ...],
+    excluded: tuple[str, ...] = (),
+    settings: SelectionConfig = DEFAULT,
 ) -> Evaluator:
     """Split a recording.
 
     Args:
         data: all n breaths.
-        held_out: those to judge by, bool, ``(n,)``.
+        held_out: those that evaluate hypotheses, bool, ``(n,)``.
         names: parameters that hypotheses may have.
         excluded: mechanisms that cannot act.
+        settings: every threshold.
     """
 
-    def split(judging: NDArray[np.bool_]) -> tuple[Partition, Partition]:
-        parts = data.select(~judging), data.select(judging)
-        return Partition(parts[0], simulator(parts[0], names)), Partition(
-            parts[1], simulator(parts[1], names)
-        )
+    def split(mask: NDArray[np.bool_]) -> tuple[Partition, Partition]:
+        training, other = data.select(~mask), data.select(mask)
+        return make_partition(training, names, settings), make_partition(other, names, settings)
 
     order = np.cumsum(~held_out)
     folds = [~held_out & (order % 2 == k) for k in range(2)]
     others = tuple(split(fold) for fold in folds if fold.any() and not fold.all())
-    return Evaluator(*split(held_out), excluded=excluded, folds=others)
+    return Evaluator(*split(held_out), excluded=excluded, folds=others, settings=settings)
 
 
 def by_label(data: Data, free: tuple[str, ...]) -> dict[str, NDArray[np.int64]]:

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.conclusion import Conclusion, conclude
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
-from ventbench.diagnosis.hypothesis import FittedModel, Partition, simulator
+from ventbench.diagnosis.hypothesis import FittedModel, make_partition
 from ventbench.diagnosis.screening import all_parameter_paths
+from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.interfaces import Plant
 from ventbench.physics.catalogue import paths
 from ventbench.system_id import Fit
@@ -52,7 +53,11 @@ class Found:
 
 
 def found_in(
-    data: Data, held: NDArray[np.bool_], excluded: tuple[str, ...], tell: Callable[[str], None]
+    data: Data,
+    held: NDArray[np.bool_],
+    excluded: tuple[str, ...],
+    tell: Callable[[str], None],
+    settings: SelectionConfig = DEFAULT,
 ) -> Found:
     """Draw a conclusion.
 
@@ -61,12 +66,13 @@ def found_in(
         held: which of them are held out, ``(n,)``.
         excluded: mechanisms that cannot act.
         tell: is told what is done.
+        settings: every threshold.
     """
-    narrow = make_evaluator(data, held, paths(), excluded)
+    narrow = make_evaluator(data, held, paths(), excluded, settings)
     wide: list[Evaluator] = []
 
     def wider() -> Evaluator:
-        wide.append(make_evaluator(data, held, all_parameter_paths(), excluded))
+        wide.append(make_evaluator(data, held, all_parameter_paths(), excluded, settings))
         return wide[0]
 
     found = conclude(narrow, wider, tell)
@@ -75,7 +81,7 @@ def found_in(
         replace(narrow, gain_sd=found.gain_sd),
         [replace(one, gain_sd=found.gain_sd) for one in wide],
     )
-    partition = Partition(data, simulator(data, paths()))
+    partition = make_partition(data, paths(), settings)
     if found.place is not None and found.place.element is not None:
         # With a slot, the training breaths alone: all of them would be one more compilation.
         return Found(wide[0], found, estimates.estimated(found.full, wide[0].training, wide[0]))

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 
+from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.physics.catalogue import mechanism, strength_path
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.derivatives import START, Simulator
@@ -61,11 +62,6 @@ class Hypothesis:
 def has_own(name: str) -> bool:
     """Whether a mechanism has parameters that are each breath's own."""
     return any(item.scope == "breath" for item in mechanism(name).description.parameters)
-
-
-#: Breaths that are simulated at once: one number, so that little is compiled and held in memory.
-#: Two thirds of 60 breaths are one part; many breaths at once hide what starting each step costs.
-_SIZES = (40,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +136,14 @@ class FittedModel:
         return float(noise.log_likelihood(self.residual, self.problem.data.weight).sum())
 
 
-def simulator(data: Data, names: tuple[str, ...]) -> Simulator:
-    """Place some breaths in parts of one size."""
-    return Simulator(data, names, sizes=_SIZES)
+def make_partition(
+    data: Data, names: tuple[str, ...], settings: SelectionConfig = DEFAULT
+) -> Partition:
+    """Combine breaths with a simulator of their commands.
+
+    Args:
+        data: the breaths.
+        names: parameters of the simulator.
+        settings: gives the breaths that are simulated at once.
+    """
+    return Partition(data, Simulator(data, names, sizes=(settings.data.batch_size,)))

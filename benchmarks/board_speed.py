@@ -23,7 +23,7 @@ from ventbench.board.replayed import Simulators
 from ventbench.board.verify import verify
 from ventbench.plants import frozen
 from ventbench.submissions.folder import open_submission
-from ventbench.submissions.scoring import score
+from ventbench.submissions.scoring import run_protocol
 
 #: What must not be exceeded with 1,000 records, s.
 BUILD_LIMIT_S, VERIFY_LIMIT_S = 10.0, 300.0
@@ -34,7 +34,7 @@ FACTORS = (1.0, 0.99, 0.98, 0.97, 0.96, 0.95, 0.94, 0.93)
 
 def drafts(plants: Simulators) -> list[create.Draft]:
     """Real records: commands of the PID times a factor."""
-    result, _ = score(open_submission("pid_best"), plants.plants, draws=draws.COUNT)
+    result = run_protocol(open_submission("pid_best"), plants.plants, draws=draws.COUNT)
     found = []
     for factor in FACTORS:
         requested = result.requested * factor

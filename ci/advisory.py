@@ -17,7 +17,7 @@ from ventbench.lungs import LUNGS, Lung
 from ventbench.submissions import contract
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.runner import Runner
-from ventbench.submissions.scoring import score
+from ventbench.submissions.scoring import run_protocol
 
 TITLE = "Advisory score (not official)"
 #: Most submissions checked in one pull request.
@@ -61,7 +61,7 @@ def advise(
         if submission.manifest.name != name:
             return False, [*lines, f"{name}: submission.toml calls it {submission.manifest.name}"]
         for track in submission.manifest.tracks:
-            result, _ = score(submission, plants, track=track, runner=runner, lungs=lungs)
+            result = run_protocol(submission, plants, track=track, runner=runner, lungs=lungs)
             by_lung = zip(result.lungs, result.by_lung, strict=True)
             each = ", ".join(f"{lung} {value:.3f}" for lung, value in by_lung)
             lines.append(f"{name}: {track}: {result.score:.3f} cmH2O nominal ({each})")

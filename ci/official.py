@@ -21,7 +21,7 @@ from ventbench.submissions import contract
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.manifest import TRACKS
 from ventbench.submissions.runner import Runner
-from ventbench.submissions.scoring import score
+from ventbench.submissions.scoring import run_protocol
 
 TITLE = "Official score"
 
@@ -71,7 +71,7 @@ def score_taken(
         raise TakeError(f"submission.toml calls it {submission.manifest.name}, not {taken.name}")
     where = {"repository": source, "commit": taken.commit, "tree": taken.tree}
     for track in tracks(wanted, submission.manifest.tracks):
-        result, _ = score(
+        result = run_protocol(
             submission,
             simulators.plants,
             track=track,

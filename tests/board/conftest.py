@@ -19,12 +19,13 @@ from ventbench.board.record import Record
 from ventbench.board.replay import replay
 from ventbench.board.replayed import Simulators
 from ventbench.lungs import LUNG_IDS, LUNGS, Lung
+from ventbench.plants import frozen
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
 from ventbench.plants.stack import stack
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.result import CellFailure, Score
-from ventbench.submissions.scoring import score
+from ventbench.submissions.scoring import run_protocol
 
 SANDBOX = {"layers": ["landlock", "seccomp"], "official": True}
 NOW = datetime(2026, 11, 20, 12, tzinfo=UTC)
@@ -63,8 +64,10 @@ def scores(simulators: Textbook) -> dict[str, Score]:
     """The two PIDs, scored."""
     found = {}
     for name in ("pid_best", "pid_robust"):
-        result, _ = score(open_submission(name), simulators.plants, draws=draws.COUNT)
-        found[name] = dataclasses.replace(result, sandbox=SANDBOX)
+        result = run_protocol(open_submission(name), simulators.plants, draws=draws.COUNT)
+        found[name] = dataclasses.replace(
+            result, sandbox=SANDBOX, frozen_sha256=frozen.MANIFEST_SHA256
+        )
     return found
 
 

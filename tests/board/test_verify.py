@@ -16,7 +16,7 @@ from ventbench.board.verify import Report, verify
 from ventbench.errors import InputError
 from ventbench.plants import frozen
 from ventbench.submissions.folder import open_submission
-from ventbench.submissions.scoring import score
+from ventbench.submissions.scoring import run_protocol
 
 from .conftest import Textbook, put
 
@@ -143,7 +143,7 @@ def test_changed_simulators_are_named(leaderboard: Path, simulators: Textbook) -
 def test_the_frozen_simulators_replay_and_no_byte_of_them_may_change(tmp_path: Path) -> None:
     folder, simulators = tmp_path / "leaderboard", frozen.load()
     entry = open_submission("pid_robust")
-    result, _ = score(entry, simulators.plants, draws=20, simulators=simulators.about())
+    result = run_protocol(entry, simulators.plants, draws=20, simulators=simulators.about())
     put(folder, create.create(result, simulators), simulators)
     build.build(folder)
     report = verify(folder, frozen.load)

@@ -23,7 +23,7 @@ from ventbench.submissions.cell import ROW
 from ventbench.submissions.errors import SubmissionError
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.runner import InProcessRunner
-from ventbench.submissions.scoring import score
+from ventbench.submissions.scoring import run_protocol
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no processes to fork here")
 
@@ -40,8 +40,8 @@ def test_scores_are_those_of_the_plain_process():
         plants = stack([single_compartment(lung) for lung in LUNGS])
     for name in ("pid_best", "pid_robust"):
         submission = open_submission(name)
-        apart, _ = score(submission, plants, draws=1, pips=(20.0,), runner=SandboxRunner())
-        plain, _ = score(submission, plants, draws=1, pips=(20.0,))
+        apart = run_protocol(submission, plants, draws=1, pips=(20.0,), runner=SandboxRunner())
+        plain = run_protocol(submission, plants, draws=1, pips=(20.0,))
         assert not apart.failures
         np.testing.assert_array_equal(apart.nominal, plain.nominal)
         np.testing.assert_array_equal(apart.drawn, plain.drawn)

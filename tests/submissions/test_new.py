@@ -15,7 +15,7 @@ from ventbench.submissions.folder import open_submission
 from ventbench.submissions.manifest import FAMILIES
 from ventbench.submissions.runner import InProcessRunner
 from ventbench.submissions.scaffold import contents, create, initial_weights
-from ventbench.submissions.scoring import score
+from ventbench.submissions.scoring import run_protocol
 
 # Observations of a controller: time, dt, pressure, target, ahead, command before.
 NETWORKS = ("residual", "ppo", "dqn")
@@ -37,7 +37,7 @@ def test_is_ready_and_scores(family, tmp_path, one_lung):
     report = contract.check(str(folder))
     assert report.ok, "\n".join(report.lines())
     assert report.notes[0].what == "key authors still says Your Name"
-    result, _ = score(
+    result = run_protocol(
         open_submission(str(folder)), one_lung, lungs=LUNGS[:1], pips=(20.0,), track="robustness"
     )
     assert not result.failures
@@ -47,13 +47,13 @@ def test_is_ready_and_scores(family, tmp_path, one_lung):
 
 def test_residual_starts_as_its_pi_controller(tmp_path, one_lung):
     def scored(folder):
-        return score(
+        return run_protocol(
             open_submission(str(folder)),
             one_lung,
             lungs=LUNGS[:1],
             pips=(20.0,),
             track="robustness",
-        )[0].requested
+        ).requested
 
     residual = scored(create("residual", "residual", tmp_path))
     plain = create("plain", "pid", tmp_path)

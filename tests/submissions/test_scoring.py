@@ -15,12 +15,13 @@ from ventbench.errors import InputError
 from ventbench.interfaces import Task
 from ventbench.lungs import LUNG_IDS, LUNGS, lung
 from ventbench.metrics.waveform import run_error
+from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stack import take
 from ventbench.submissions import stepping
 from ventbench.submissions.errors import Failure, SubmissionError
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.runner import InProcessRunner
-from ventbench.submissions.scoring import score
+from ventbench.submissions.scoring import run_protocol, score
 
 GAINS = {
     "R5C10": (10.0, 0.2),
@@ -44,26 +45,26 @@ def pure_errors(plants, cells, gains):
 
 @pytest.fixture(scope="module")
 def best(plants):
-    return score(open_submission("pid_best"), plants, draws=20)
+    return run_protocol(open_submission("pid_best"), plants, draws=20)
 
 
 def test_nominal_is_that_of_the_pure_pid(plants, best):
     with precision.float64():
         cells = scenario.nominal(np.array(protocol.PIPS))
     expected = pure_errors(plants, cells, GAINS.values())
-    np.testing.assert_allclose(best[0].nominal, expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(best.nominal, expected, rtol=0, atol=1e-9)
 
 
 def test_draws_are_those_of_the_pure_pid(plants, best):
     with precision.float64():
         cells = draws.scenarios()
     expected = np.moveaxis(pure_errors(plants, cells, GAINS.values()), 0, 1)
-    np.testing.assert_allclose(best[0].drawn, expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(best.drawn, expected, rtol=0, atol=1e-9)
 
 
 def test_robust_pid(plants):
     for track in ("robustness", "performance"):
-        found, _ = score(open_submission("pid_robust"), plants, track=track)
+        found = run_protocol(open_submission("pid_robust"), plants, track=track)
         with precision.float64():
             cells = scenario.nominal(np.array(protocol.PIPS))
         expected = pure_errors(plants, cells, [(6.0, 6.0, 0.3)] * 6)
@@ -71,7 +72,7 @@ def test_robust_pid(plants):
 
 
 def test_json(best):
-    found = best[0].to_json()
+    found = best.to_json()
     json.dumps(found, allow_nan=False)
     assert found["protocol"] == 1
     assert list(found["lungs"]) == list(LUNG_IDS)
@@ -83,7 +84,7 @@ def test_json(best):
         assert own["ci95"][0] < own["score"] < own["ci95"][1], lung_id
     assert found["score"] == pytest.approx(np.mean([x["score"] for x in found["lungs"].values()]))
     assert len(found["draws"]["values"]) == 20
-    assert found["draws"]["values"][3] == pytest.approx(best[0].drawn[3].mean())
+    assert found["draws"]["values"][3] == pytest.approx(best.drawn[3].mean())
     assert found["draws"]["sha256"] == draws.SHA256
     assert found["sandbox"] is None
     assert found["official"] is False
@@ -96,7 +97,7 @@ def test_json(best):
 
 
 def test_secondary_figures_are_those_of_the_lung(best, plants):
-    result, trajectories = best
+    result, trajectories = best, best.trajectories
     for values in result.figures.values():
         assert values.shape == (6, 6, 2)
     inspirations = trajectories.pressure.reshape(6, 6, 3, 100)[:, :, 1:, :34]
@@ -109,14 +110,14 @@ def test_secondary_figures_are_those_of_the_lung(best, plants):
 
 
 def test_deterministic(best, plants):
-    again, _ = score(open_submission("pid_best"), plants, draws=20)
-    first, second = best[0].to_json(), again.to_json()
+    again = run_protocol(open_submission("pid_best"), plants, draws=20)
+    first, second = best.to_json(), again.to_json()
     assert set(first.pop("timing")) == set(second.pop("timing"))
     assert first == second
 
 
 def test_trajectories(best, plants):
-    result, found = best
+    result, found = best, best.trajectories
     assert found.pressure.shape == (6, 6, 300)
     np.testing.assert_allclose(found.time, 0.03 * np.arange(300))
     np.testing.assert_array_equal(found.target[2, 3], waveform.target(np.arange(300), 25.0))
@@ -137,7 +138,7 @@ def test_trajectories(best, plants):
 
 def test_parts(best, plants):
     part = jax.tree.map(lambda leaf: leaf[jnp.array([5, 0])], plants)
-    found, _ = score(
+    found = run_protocol(
         open_submission("pid_best"),
         part,
         draws=2,
@@ -145,8 +146,8 @@ def test_parts(best, plants):
         pips=[35.0, 10.0],
         simulators={"version": 1},
     )
-    np.testing.assert_allclose(found.nominal, best[0].nominal[[5, 0]][:, [5, 0]], atol=1e-12)
-    np.testing.assert_allclose(found.drawn, best[0].drawn[:2, [5, 0]][:, :, [5, 0]], atol=1e-12)
+    np.testing.assert_allclose(found.nominal, best.nominal[[5, 0]][:, [5, 0]], atol=1e-12)
+    np.testing.assert_allclose(found.drawn, best.drawn[:2, [5, 0]][:, :, [5, 0]], atol=1e-12)
     result = found.to_json()
     assert result["complete"] is False
     assert result["simulators"] == {"version": 1}
@@ -154,7 +155,7 @@ def test_parts(best, plants):
 
 
 def test_without_draws(plants):
-    result = score(open_submission("pid_best"), plants)[0].to_json()
+    result = run_protocol(open_submission("pid_best"), plants).to_json()
     assert result["draws"] is None
     assert result["lungs"]["R5C10"]["draws"] is None
 
@@ -163,8 +164,8 @@ def test_compiles_once(plants):
     compiled: list[Any] = [stepping._inspire, stepping._observe]
     for function in compiled:
         function.clear_cache()
-    score(open_submission("pid_best"), plants, draws=1)
-    score(open_submission("pid_robust"), plants, draws=1)
+    run_protocol(open_submission("pid_best"), plants, draws=1)
+    run_protocol(open_submission("pid_robust"), plants, draws=1)
     assert [function._cache_size() for function in compiled] == [1, 1]
 
 
@@ -184,7 +185,7 @@ def test_what_a_submission_is_told(make, plants, track, known):
                 return 2.0 * len(self.seen) - 20.0
         """
     folder = make(source)
-    score(open_submission(str(folder)), plants, track=track, draws=1)
+    run_protocol(open_submission(str(folder)), plants, track=track, draws=1)
     runs = [json.loads(line) for line in (folder.parent / "log").read_text().splitlines()]
     assert len(runs) == 6 * 2 * 6
     for index, (task, seen) in enumerate(runs):
@@ -212,9 +213,7 @@ def test_failed_cells(make, plants):
             raise ValueError("no idea")
         return 3.0
         """
-    found, trajectories = score(
-        open_submission(str(make(act=act))), plants, track="performance", draws=1
-    )
+    found = run_protocol(open_submission(str(make(act=act))), plants, track="performance", draws=1)
     result = found.to_json()
     assert result["score"] is None
     assert result["lungs"]["R5C20"]["score"] is None
@@ -229,14 +228,14 @@ def test_failed_cells(make, plants):
         "controller.py line 8 raised ValueError at step 6 of breath 2 (lung R5C20): no idea; "
         "the entry is not ranked."
     )
-    inspired = trajectories.u_in[1, 2].reshape(3, 100)[:, :34].ravel()
+    inspired = found.trajectories.u_in[1, 2].reshape(3, 100)[:, :34].ravel()
     np.testing.assert_array_equal(inspired, np.where(np.arange(102) < 39, 3.0, 0.0))
     json.dumps(result, allow_nan=False)
 
 
 def test_failure_in_a_draw(make, plants):
     act = "return 3.0 if observation.target in (10, 15, 20, 25, 30, 35) else None"
-    result = score(open_submission(str(make(act=act))), plants, draws=2)[0].to_json()
+    result = run_protocol(open_submission(str(make(act=act))), plants, draws=2).to_json()
     assert result["score"] is None
     assert result["draws"]["score"] is None
     assert result["draws"]["values"] == [None, None]
@@ -248,14 +247,14 @@ def test_failure_in_a_draw(make, plants):
 
 def test_all_cells_fail_before_the_first_step(make, plants):
     source = "class Controller:\n def reset(self): pass\n def act(self, o): return 0.0\n"
-    result = score(open_submission(str(make(source))), plants)[0].to_json()
+    result = run_protocol(open_submission(str(make(source))), plants).to_json()
     assert len(result["failures"]) == 36
     assert "raised TypeError in reset (lung hidden)" in result["failures"][0]["message"]
 
 
 def test_unsafe_lung(make, plants):
     act = "return 100.0 if self.task.lung == 'R5C10' else 0.0"
-    found, _ = score(open_submission(str(make(act=act))), plants, track="performance")
+    found = run_protocol(open_submission(str(make(act=act))), plants, track="performance")
     np.testing.assert_array_equal(found.safe, [False] + [True] * 5)
     result = found.to_json()
     assert result["safe"] is False
@@ -264,7 +263,7 @@ def test_unsafe_lung(make, plants):
 
 def test_clipping(make, plants):
     act = "return -1.0 if observation.time == 0 else 101.0 if observation.time > 0.95 else 1.0"
-    result = score(open_submission(str(make(act=act))), plants)[0].to_json()
+    result = run_protocol(open_submission(str(make(act=act))), plants).to_json()
     assert result["lungs"]["R5C10"]["clipped"] == {
         "below": 18, "above": 36, "commands": 612, "share": 54 / 612,
     }  # fmt: skip
@@ -273,28 +272,28 @@ def test_clipping(make, plants):
 
 def test_wrong_track(plants):
     with pytest.raises(SubmissionError, match="enters performance; it cannot be scored for robus"):
-        score(open_submission("pid_best"), plants, track="robustness")
+        run_protocol(open_submission("pid_best"), plants, track="robustness")
 
 
 def test_too_many_draws(plants):
     with pytest.raises(InputError, match="20 published draws"):
-        score(open_submission("pid_best"), plants, draws=21)
+        run_protocol(open_submission("pid_best"), plants, draws=21)
 
 
 def test_plants_of_other_lungs(plants):
     with pytest.raises(ValueError, match="not stacked over 2 lungs"):
-        score(open_submission("pid_best"), plants, lungs=LUNGS[:2])
+        run_protocol(open_submission("pid_best"), plants, lungs=LUNGS[:2])
 
 
 def test_broken_simulator_is_no_score(plants):
     broken = dataclasses.replace(plants, C=np.array([10.0, 20.0, np.nan, 10.0, 20.0, 50.0]))
     with pytest.raises(FloatingPointError, match="simulator 2 answered with NaN"):
-        score(open_submission("pid_best"), broken)
+        run_protocol(open_submission("pid_best"), broken)
 
 
 def test_code_that_cannot_be_imported(make, plants):
     with pytest.raises(SubmissionError, match=r"controller.py line 1: "):
-        score(open_submission(str(make("x = (\n"))), plants)
+        run_protocol(open_submission(str(make("x = (\n"))), plants)
 
 
 class Recorder:
@@ -319,7 +318,7 @@ class Recorder:
 
 def test_another_runner(plants):
     runner = Recorder()
-    found, _ = score(open_submission("pid_best"), plants, draws=1, runner=runner)
+    found = run_protocol(open_submission("pid_best"), plants, draws=1, runner=runner)
     assert len(runner.rows) == 102
     assert all(rows.shape == (72, 15) and rows.dtype == np.float64 for rows in runner.rows)
     assert [task.lung for task in runner.tasks[::12]] == list(LUNG_IDS)
@@ -340,7 +339,7 @@ def test_session_is_closed_when_the_loop_breaks(plants):
 
     runner = Breaks()
     with pytest.raises(KeyboardInterrupt):
-        score(open_submission("pid_best"), plants, runner=runner)
+        run_protocol(open_submission("pid_best"), plants, runner=runner)
     assert runner.closed == 1
 
 
@@ -367,11 +366,88 @@ def test_jax_in_a_submission_is_as_elsewhere(make, plants):
         return jnp.asarray(observation.pressure)
         """
     part = jax.tree.map(lambda leaf: leaf[:1], plants)
-    found, _ = score(open_submission(str(make(act=act))), part, lungs=LUNGS[:1], pips=[10.0])
+    found = run_protocol(open_submission(str(make(act=act))), part, lungs=LUNGS[:1], pips=[10.0])
     assert found.failures == ()
 
 
 def test_nothing_is_left_on_the_search_path(plants):
     before = list(sys.path)
-    score(open_submission("pid_best"), plants)
+    run_protocol(open_submission("pid_best"), plants)
     assert sys.path == before
+
+
+@pytest.fixture(scope="module")
+def two_lungs():
+    with precision.float64():
+        return {lung.id: single_compartment(lung) for lung in LUNGS[:2]}
+
+
+class Proportional:
+    """A class in place of a folder."""
+
+    def reset(self, task):
+        self.gain = {"R5C10": 1.0}.get(task.lung, 2.0)
+
+    def act(self, observation):
+        return 5.0 + self.gain * (observation.target - observation.pressure)
+
+
+def twice(observation):
+    return 5.0 + 2.0 * (observation.target - observation.pressure)
+
+
+def test_a_folder_a_name_a_class_and_a_function_are_scored_alike(make, two_lungs):
+    act = "return 5.0 + 2.0 * (observation.target - observation.pressure)"
+    folder = make(act=act)
+    inside = score(folder, plants=two_lungs, sandbox=False)
+    again = score(str(folder), plants=two_lungs, draws=1, sandbox=False)
+    function = score(twice, plants=two_lungs, draws=1)
+    assert (again.track, function.track) == ("robustness", "robustness")
+    np.testing.assert_array_equal(again.nominal, inside.nominal)
+    np.testing.assert_array_equal(function.nominal, inside.nominal)
+    np.testing.assert_array_equal(function.drawn, again.drawn)
+    told = score(Proportional, plants=two_lungs)
+    assert told.track == "performance"
+    np.testing.assert_array_equal(told.nominal[1], inside.nominal[1])
+    assert not np.array_equal(told.nominal[0], inside.nominal[0])
+    hidden = score(Proportional, plants=two_lungs, track="robustness")
+    np.testing.assert_array_equal(hidden.nominal, inside.nominal)
+    named = score("pid_best", plants=two_lungs, sandbox=False)
+    assert named.submission == open_submission("pid_best")
+    for result in (inside, function, told, named):
+        assert result.sandbox is None
+        assert not result.official
+    json.dumps(function.to_json(), allow_nan=False)
+    assert function.to_json()["submission"]["sha256"] is None
+
+
+def test_a_folder_runs_in_the_sandbox_unless_told_otherwise(make, two_lungs):
+    result = score(make(act="return 3.0"), plants=two_lungs)
+    assert result.sandbox is not None
+    assert not result.failures
+    assert not result.official, "not the frozen lungs"
+
+
+def test_failures_of_a_function_name_its_file_and_line(two_lungs):
+    def divides(observation):
+        return 1.0 / 0.0
+
+    result = score(divides, plants=two_lungs)
+    assert result.failures[0].message.startswith("divides: test_scoring.py line ")
+    typed = eval("lambda observation: {}['gain']")
+    result = score(typed, plants=two_lungs)
+    assert result.failures[0].message.startswith("<lambda>: <lambda> raised KeyError at step 1")
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (Proportional(), "give the class Proportional, not an instance"),
+        (type("Half", (), {"reset": print}), "class Half has no method act"),
+        (type("None_", (), {}), "class None_ has no method reset and no method act"),
+        (3, "a int cannot be scored; give a folder"),
+    ],
+)
+def test_what_cannot_be_scored(given, said):
+    with pytest.raises(SubmissionError, match=said):
+        score(given, plants="physics")

@@ -26,7 +26,7 @@ from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stack import stack, take
 from ventbench.scenario import nominal
 from ventbench.submissions.folder import open_submission
-from ventbench.submissions.scoring import protocol_cells, score
+from ventbench.submissions.scoring import protocol_cells, run_protocol
 from ventbench.training import pid_grid
 from ventbench.training.residual import ALL, Recipe, bound, fit, load, save
 from ventbench.training.residual.command import train
@@ -97,7 +97,9 @@ def test_the_submission_is_the_pure_controller(fields, tmp_path):
             one = pure[LUNG_IDS[k] if k < 2 else ALL]
             found, _ = rollouts.closed_loop(take(plants, k), one, cells)
             errors.append(run_error(found.pressure, np.asarray(cells.pip)[..., None, None]))
-    result, _ = score(open_submission(str(folder)), plants, draws=2, lungs=LUNGS[:3], pips=(10, 35))
+    result = run_protocol(
+        open_submission(str(folder)), plants, draws=2, lungs=LUNGS[:3], pips=(10, 35)
+    )
     assert not result.failures
     expected = np.stack(errors)
     np.testing.assert_allclose(result.nominal, expected[:, 0], rtol=0, atol=1e-9)
@@ -375,7 +377,7 @@ def test_the_submissions_score_what_they_say(name):
         "residual_mlp_all": (2.159, 2.255),
     }[name]
     simulators = frozen.load()
-    result, _ = score(open_submission(name), simulators.plants, draws=20)
+    result = run_protocol(open_submission(name), simulators.plants, draws=20)
     assert result.nominal.mean() == pytest.approx(nominal_score, abs=1e-3)
     assert result.drawn.mean() == pytest.approx(drawn_score, abs=1e-3)
     assert result.safe.all()

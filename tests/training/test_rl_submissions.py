@@ -16,7 +16,7 @@ from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stack import stack
 from ventbench.protocol import PIPS
 from ventbench.submissions.folder import open_submission
-from ventbench.submissions.scoring import protocol_cells, score
+from ventbench.submissions.scoring import protocol_cells, run_protocol
 from ventbench.training.rl import export, networks, policies
 
 HERE = Path(__file__).parents[2] / "submissions"
@@ -49,7 +49,7 @@ def test_numpy_and_jax_act_alike(name, track, tmp_path):
     export.write(folder / "weights.npz", made)
     with precision.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS])
-        found, _ = score(open_submission(str(folder)), plants, track=track, draws=1)
+        found = run_protocol(open_submission(str(folder)), plants, track=track, draws=1)
         for i, lung in enumerate(LUNG_IDS):
             policy = made[lung if track == "performance" else "all"]
             policy = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), policy)

@@ -81,6 +81,8 @@ def create(
             f"{label}: a record needs all lungs, all PIPs and all {draws.COUNT} draws; "
             f"score it with --draws {draws.COUNT}"
         )
+    if score.submission.controller is not None:
+        raise InputError(f"{label}: only a submission in a folder can have a record")
     hashes = file_hashes(score.submission.folder)
     if combined_hash(hashes) != score.submission.sha256:
         raise InputError(f"{label} was changed while it was scored; score it again")

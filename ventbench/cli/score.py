@@ -12,13 +12,13 @@ from ventbench.cli.options import JsonFile, PlantName, emit
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from ventbench.submissions.runner import Runner
+    from ventbench.submissions.result import Score
 
 Track = Literal["performance", "robustness"]
 
 
 def score(
-    submissions: Annotated[
+    names: Annotated[
         list[str],
         typer.Argument(metavar="SUBMISSION...", help="Folders, or names of bundled submissions."),
     ],
@@ -57,70 +57,49 @@ def score(
 
     from ventbench.errors import InputError
     from ventbench.plants.catalog import load_simulators
+    from ventbench.submissions import scoring
     from ventbench.submissions.folder import open_submission
-    from ventbench.submissions.scoring import score as run
 
     if record is not None and draws < 20:
         raise InputError("--record needs all published draws: add --draws 20")
     if report and out is None:
         raise InputError("--report needs --out DIR to write to")
-    opened = [open_submission(name) for name in submissions]
-    names = [entry.manifest.name for entry in opened]
-    if len(set(names)) < len(names):
-        raise InputError(f"two submissions have the same name: {', '.join(sorted(names))}")
-    progress = Console(stderr=True)
+    opened = [open_submission(name) for name in names]
+    entries = [entry.manifest.name for entry in opened]
+    if len(set(entries)) < len(entries):
+        raise InputError(f"two submissions have the same name: {', '.join(sorted(entries))}")
     simulators = load_simulators(plant)
     if record is not None and simulators.official is None:
         raise InputError("--record is for the official simulators: leave --plant out")
-    runner = _runner(in_process)
-    if simulators.official is None:
-        progress.print(f"These scores are not official: simulators of {plant}.", style="yellow")
-    elif not (runner.sandbox or {}).get("official"):
-        progress.print("These scores are not official: no full sandbox.", style="yellow")
-    results = []
-    for submission in opened:
-        with progress.status(f"scoring {submission.label}"):
-            results.append(
-                run(
-                    submission,
-                    simulators.stacked,
-                    track=track,
-                    draws=draws,
-                    lungs=simulators.lungs,
-                    runner=runner,
-                    simulators=simulators.about,
+    progress = Console(stderr=True)
+    scores = []
+    for entry in opened:
+        with progress.status(f"scoring {entry.label}"):
+            scores.append(
+                scoring.score(
+                    entry, plants=simulators, track=track, draws=draws, sandbox=not in_process
                 )
             )
-    plain = [result.to_json() for result, _ in results]
-    if simulators.official is None:
-        plain = [one | {"official": False} for one in plain]
-    emit(plain[0] if len(plain) == 1 else {"submissions": plain}, json)
+    results = [result.to_json() for result in scores]
+    emit(results[0] if len(results) == 1 else {"submissions": results}, json)
     console = Console(stderr=str(json) == "-")
-    console.print(_table(plain))
-    for result, _ in results:
+    console.print(_table(results))
+    because = dict.fromkeys(reason for result in scores for reason in result.not_official_because)
+    if because:
+        progress.print(f"These scores are not official: {', '.join(because)}.", style="yellow")
+    for result in scores:
         for failure in result.failures[:3]:
             progress.print(failure.message, style="red", markup=False)
     if out is not None:
-        for path in _keep(out, results, plain, report):
+        for path in _keep(out, scores, report):
             console.print(f"wrote {path}", markup=False, highlight=False)
     if record is not None and simulators.official is not None:
         from ventbench.board import create
 
-        kept = create.keep(record, [result for result, _ in results], simulators.official)
-        for path in kept:
+        for path in create.keep(record, scores, simulators.official):
             console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
-    if any(result.failures for result, _ in results):
+    if any(result.failures for result in scores):
         raise typer.Exit(1)
-
-
-def _runner(in_process: bool) -> Runner:
-    if in_process:
-        from ventbench.submissions.runner import InProcessRunner
-
-        return InProcessRunner()
-    from ventbench.sandbox.runner import SandboxRunner
-
-    return SandboxRunner()
 
 
 def _table(scores: list[dict[str, Any]]) -> Table:
@@ -132,33 +111,29 @@ def _table(scores: list[dict[str, Any]]) -> Table:
 
     table = Table(title="Mean |pressure - target|, cmH2O (lower is better)")
     table.add_column("lung")
-    for one in scores:
-        table.add_column(f"{one['name']}\n{one['track']}", justify="right")
+    for entry in scores:
+        table.add_column(f"{entry['name']}\n{entry['track']}", justify="right")
     for lung in scores[0]["lungs"]:
-        table.add_row(lung, *(show(one["lungs"][lung]["score"]) for one in scores))
+        table.add_row(lung, *(show(entry["lungs"][lung]["score"]) for entry in scores))
     table.add_section()
-    table.add_row("mean", *(show(one["score"]) for one in scores), style="bold")
+    table.add_row("mean", *(show(entry["score"]) for entry in scores), style="bold")
     if scores[0]["draws"]:
-        drawn = [one["draws"] for one in scores]
+        drawn = [entry["draws"] for entry in scores]
         table.add_row("mean of the draws", *(show(draws["score"]) for draws in drawn))
         table.add_row("95 % interval", *("..".join(map(show, draws["ci95"])) for draws in drawn))
     return table
 
 
-def _keep(out: Path, results: list[Any], plain: list[Any], report: bool) -> list[Path]:
-    from ventbench import files
-
-    written = []
-    for (result, trajectories), values in zip(results, plain, strict=True):
-        folder = out / result.submission.manifest.name
-        files.write_json(folder / "score.json", values)
-        trajectories.save(folder / "trajectories.npz")
-        written.append(folder)
+def _keep(out: Path, scores: list[Score], report: bool) -> list[Path]:
+    written = [out / result.submission.manifest.name for result in scores]
+    for folder, result in zip(written, scores, strict=True):
+        result.save(folder)
     if report:
         from ventbench import views
 
-        runs = [trajectories for _, trajectories in results]
-        written.append(views.write_report(out / "report.html", runs, plain))
+        runs = [result.trajectories for result in scores]
+        values = [result.to_json() for result in scores]
+        written.append(views.write_report(out / "report.html", runs, values))
         written.append(views.write_rerun(out / "scores.rrd", runs))
     return written
 

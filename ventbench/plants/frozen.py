@@ -29,6 +29,8 @@ from ventbench.plants.sessions import Sessions
 from ventbench.recordings.breaths import Breaths
 
 FORMAT = "ventbench-simulators-1"
+#: SHA-256 of the manifest of version 1, which holds those of all its files.
+MANIFEST_SHA256 = "10d5cc74ada5ed307dfc0f26e2b90820fe110f69437992042fd02b3735ebeed7"
 MANIFEST, MEMBERS, LEARNED, SEEN = "manifest.toml", "hybrid.npz", "learned.npz", "seen.npz"
 
 

@@ -42,13 +42,17 @@ class Cell:
         controller: the submission's class.
         task: what it is told.
         folder: of the submission, to name files and lines in it.
+        source: what messages name where no line of the folder is to blame.
 
     Raises:
         Failed: if it cannot be made or reset.
     """
 
-    def __init__(self, controller: Callable[[], Any], task: Task, folder: Path):
+    def __init__(
+        self, controller: Callable[[], Any], task: Task, folder: Path, source: str | None = None
+    ):
         self._task, self._folder, self._calls = task, folder, 0
+        self._source = source or FILE
         instance = self._call("construct", controller)
         self._call("reset", lambda: instance.reset(task))
         self._act = instance.act
@@ -70,7 +74,7 @@ class Cell:
         try:
             value = self._act(observation)
         except (Exception, SystemExit) as error:
-            raise self._failed("act", *describe(error, self._folder)) from error
+            raise self._failed("act", *describe(error, self._folder, self._source)) from error
         if type(value) is not float:
             value = self._number(value)
         if not math.isfinite(value):
@@ -81,7 +85,7 @@ class Cell:
         try:
             return function()
         except (Exception, SystemExit) as error:
-            what, detail = describe(error, self._folder)
+            what, detail = describe(error, self._folder, self._source)
             when = "Controller()" if kind == "construct" else "reset"
             raise self._failed(kind, f"{what} in {when}", detail) from error
 
@@ -218,14 +222,19 @@ def _search_path(folder: Path) -> Iterator[None]:
         sys.modules.update(hidden)
 
 
-def describe(error: BaseException, folder: Path) -> tuple[str, str]:
+def describe(error: BaseException, folder: Path, source: str | None = None) -> tuple[str, str]:
     """Say where in the submission an exception was raised, and what it says.
+
+    Args:
+        error: the exception.
+        folder: of the submission.
+        source: its name where no line of the folder raised it; ``controller.py`` if not given.
 
     Returns:
         Such as ``"controller.py line 12 raised ValueError"`` and ``"no gains for R5C10"``; both
         printable and short.
     """
-    place = FILE
+    place = source or FILE
     trace = error.__traceback__
     while trace is not None:
         with contextlib.suppress(ValueError):

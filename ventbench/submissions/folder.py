@@ -1,16 +1,24 @@
-"""A submission is a folder: how it is found, what it may hold, what identifies it."""
+"""A submission is a folder: how it is found, what it may hold, what identifies it.
+
+For scoring from Python a class or a function can take its place.
+"""
 
 from __future__ import annotations
 
 import difflib
 import hashlib
+import inspect
 import os
+import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ventbench import data_files, files
+from ventbench.interfaces import API_VERSION, Observation, Task
 from ventbench.submissions.errors import SubmissionError
-from ventbench.submissions.manifest import MANIFEST, Manifest, read_manifest
+from ventbench.submissions.manifest import MANIFEST, TRACKS, Manifest, read_manifest
 
 #: File of the controller.
 CONTROLLER = "controller.py"
@@ -32,13 +40,16 @@ class Submission:
         label: how the person named it; starts every message.
         folder: absolute path.
         manifest: of ``submission.toml``.
-        sha256: of the folder, see :func:`content_hash`.
+        sha256: of the folder, see :func:`content_hash`; None for a class or function.
+        controller: makes a controller, for a class or function in place of a folder; it can only
+            run in this process.
     """
 
     label: str
     folder: Path
     manifest: Manifest
-    sha256: str
+    sha256: str | None
+    controller: Callable[[], Any] | None = None
 
 
 def bundled() -> list[str]:
@@ -101,6 +112,54 @@ def open_submission(name: str) -> Submission:
         raise SubmissionError(*problems)
     manifest = read_manifest(folder / MANIFEST, f"{name}/{MANIFEST}".replace("//", "/"))
     return Submission(name.rstrip("/"), folder, manifest, content_hash(folder, paths))
+
+
+def submission_of(controller: Any) -> Submission:
+    """Take a class or a function as a submission, to be run in this process.
+
+    Args:
+        controller: a class whose instances have ``reset(task)`` and ``act(observation)``, which
+            enters both tracks, performance first; or a function from an observation to ``u_in``,
+            %, which keeps nothing and is scored for robustness first.
+
+    Raises:
+        SubmissionError: if it is neither.
+    """
+    name = getattr(controller, "__name__", type(controller).__name__)
+    if isinstance(controller, type):
+        lacks = [m for m in ("reset", "act") if not callable(getattr(controller, m, None))]
+        if lacks:
+            raise SubmissionError(f"class {name} has no method {' and no method '.join(lacks)}")
+        make, tracks = controller, TRACKS
+    elif callable(getattr(controller, "act", None)):
+        raise SubmissionError(f"give the class {name}, not an instance: each run needs a new one")
+    elif callable(controller):
+        make, tracks = (lambda: _Stateless(controller)), TRACKS[::-1]
+    else:
+        raise SubmissionError(
+            f"a {name} cannot be scored; give a folder, the name of a bundled submission, a class "
+            "with reset and act, or a function from an observation to u_in"
+        )
+    try:
+        file = Path(inspect.getfile(controller)).resolve()
+    except (TypeError, OSError):
+        file = Path()
+    # What was typed at a prompt is in no file: messages then name no line.
+    folder = file.parent if file.is_file() else Path(os.devnull)
+    plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+    description = (inspect.getdoc(controller) or "").partition("\n")[0]
+    manifest = Manifest(plain, (), "", API_VERSION, "other", tracks, description)
+    return Submission(name, folder, manifest, None, make)
+
+
+class _Stateless:
+    """A function of the observation as a controller."""
+
+    def __init__(self, function: Callable[[Observation], float]):
+        self.act = function
+
+    def reset(self, task: Task) -> None:
+        """Keep nothing of a task."""
 
 
 def _walk(folder: Path) -> list[Path]:

@@ -1,27 +1,37 @@
-"""The result of scoring a submission, and its JSON."""
+"""The result of scoring a submission: its JSON, its tables, and whether it is official."""
 
 from __future__ import annotations
 
 import dataclasses
+import html
 import math
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import ventbench
-from ventbench import draws, protocol
+from ventbench import draws, files, protocol
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics import bootstrap
 from ventbench.metrics.waveform import lung_score
+from ventbench.plants import frozen
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import Submission
+from ventbench.trajectories import Trajectories
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Floats = NDArray[np.float64]
+
+#: Failures that a printed score names; the JSON has all.
+_FAILURES_SHOWN = 3
 
 
 @dataclass(frozen=True)
@@ -43,11 +53,12 @@ class CellFailure:
     message: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Score:
     """Scores of one submission on one track; L lungs, P PIPs, K draws, cmH2O.
 
-    The JSON holds all but ``requested``, which is what a record is replayed from.
+    ``print(score)`` and a notebook show one row a lung. The JSON holds all but ``requested``, which
+    is what a record is replayed from, and ``trajectories``.
 
     Attributes:
         submission: that was scored.
@@ -55,19 +66,23 @@ class Score:
         lungs: ids, length L.
         pips: nominal PIPs, cmH2O, length P.
         nominal: error of each nominal run, shape ``(L, P)``; NaN where the controller failed.
-        drawn: error of each drawn run, shape ``(K, L, P)``, likewise.
+        drawn: error of each drawn run, shape ``(K, L, P)``; NaN where the controller failed.
         safe: whether all runs of a lung passed the safety gate, shape ``(L,)``.
         peak: highest pressure of a lung in any run, cmH2O, shape ``(L,)``.
         figures: secondary figures of the scored nominal inspirations by name, shape
             ``(L, P, scored breaths)``; NaN where one does not exist.
         below: nominal commands below 0 %, shape ``(L,)``.
-        above: nominal commands above 100 %, likewise.
+        above: nominal commands above 100 %, shape ``(L,)``.
         commands: nominal commands on each lung.
         failures: of all cells.
         requested: all commands, nominal cells first, %, shape
             ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``; 0 once a cell has failed.
         sandbox: the runner's layers; None in this process.
         simulators: what the caller says about the plants (version, hashes); goes into the JSON.
+        frozen_sha256: of the frozen simulators' manifest if the plants that were run are exactly
+            those, to the bit; else None, whatever the caller says about them.
+        draws_sha256: of the file of the draws; None without draws.
+        trajectories: nominal runs with their expirations.
         timing: seconds, by name; the only numbers that differ from run to run.
     """
 
@@ -87,6 +102,9 @@ class Score:
     requested: Floats
     sandbox: Mapping[str, Any] | None
     simulators: Mapping[str, Any] | None
+    frozen_sha256: str | None
+    draws_sha256: str | None
+    trajectories: Trajectories
     timing: Mapping[str, float]
 
     @property
@@ -102,8 +120,20 @@ class Score:
 
     @property
     def official(self) -> bool:
-        """Whether its sandbox had every layer that the word needs."""
-        return self.sandbox is not None and self.sandbox.get("official") is True
+        """Whether nothing stands in the way of calling it so, see :attr:`not_official_because`."""
+        return not self.not_official_because
+
+    @property
+    def not_official_because(self) -> tuple[str, ...]:
+        """Everything that an official score needs and this one lacks, in words."""
+        reasons = {
+            "no full sandbox": (self.sandbox or {}).get("official") is not True,
+            "not on the frozen simulators": self.frozen_sha256 != frozen.MANIFEST_SHA256,
+            "not all lungs and PIPs": not self.complete,
+            "other draws than the published ones": len(self.drawn) > 0
+            and self.draws_sha256 != draws.SHA256,
+        }
+        return tuple(reason for reason, holds in reasons.items() if holds)
 
     @property
     def complete(self) -> bool:
@@ -140,6 +170,74 @@ class Score:
             "timing": dict(self.timing),
         }
 
+    def save(self, folder: Path) -> None:
+        """Write ``score.json`` and ``trajectories.npz``, creating the folder if it is missing.
+
+        Raises:
+            OSError: if they cannot be written.
+        """
+        files.write_json(folder / "score.json", self.to_json())
+        self.trajectories.save(folder / "trajectories.npz")
+
+    def to_frame(self) -> pd.DataFrame:
+        """Errors of all runs as a table, one row a cell.
+
+        Returns:
+            Columns ``lung`` (id), ``pip_cmH2O``, ``draw`` (0 for the nominal run, then 1..K) and
+            ``error_cmH2O`` (mean |pressure - target|; NaN where the controller failed);
+            ``L * P * (1 + K)`` rows.
+        """
+        import pandas as pd
+
+        errors = np.concatenate([self.nominal[None], self.drawn])
+        draw, lung, pip = (axis.ravel() for axis in np.indices(errors.shape))
+        return pd.DataFrame(
+            {
+                "lung": np.array(self.lungs)[lung],
+                "pip_cmH2O": np.array(self.pips)[pip],
+                "draw": draw,
+                "error_cmH2O": errors.ravel(),
+            }
+        )
+
+    def summary(self) -> pd.DataFrame:
+        """One row a lung, indexed by its id.
+
+        Returns:
+            Columns ``score_cmH2O`` (nominal), ``draws_cmH2O`` (mean over the draws; only with
+            draws), ``safe`` and ``peak_cmH2O`` (highest pressure of any run).
+        """
+        import pandas as pd
+
+        columns: dict[str, Any] = {"score_cmH2O": self.by_lung}
+        if len(self.drawn):
+            columns["draws_cmH2O"] = lung_score(self.drawn).mean(axis=0)
+        columns |= {"safe": self.safe, "peak_cmH2O": self.peak}
+        return pd.DataFrame(columns, index=pd.Index(self.lungs, name="lung"))
+
+    def _headline(self) -> str:
+        score = "failed" if math.isnan(self.score) else f"{self.score:.3f} cmH2O"
+        because = ", ".join(self.not_official_because)
+        status = f"not official: {because}" if because else "official"
+        return f"{self.submission.manifest.name}, {self.track}: {score} ({status})"
+
+    def __repr__(self) -> str:
+        return f"<Score of {self._headline()}>"
+
+    def __str__(self) -> str:
+        rows = self.summary().reset_index()
+        table = rows.to_string(index=False, float_format="{:.3f}".format, na_rep="failed")
+        failures = [failure.message for failure in self.failures[:_FAILURES_SHOWN]]
+        more = len(self.failures) - len(failures)
+        return "\n".join([self._headline(), table, *failures, *([f"... {more} more"] * (more > 0))])
+
+    def _repr_html_(self) -> str:
+        rows = self.summary().reset_index()
+        table = rows.to_html(index=False, float_format="{:.3f}".format, na_rep="failed")
+        failures = [failure.message for failure in self.failures[:_FAILURES_SHOWN]]
+        said = "".join(f"<p>{html.escape(text)}</p>" for text in (self._headline(), *failures))
+        return f"<div>{said}{table}</div>"
+
     def _lung(self, i: int) -> dict[str, Any]:
         pips = zip(self.pips, self.nominal[i], strict=True)
         return {
@@ -157,7 +255,7 @@ class Score:
             return None
         # A draw that failed must not be left out of a mean.
         summary = bootstrap.summary(values if np.isfinite(values).all() else [])
-        about = {"version": draws.VERSION, "sha256": draws.SHA256} if published else {}
+        about = {"version": draws.VERSION, "sha256": self.draws_sha256} if published else {}
         return {
             "score": _number(summary.mean),
             "ci95": [_number(limit) for limit in summary.ci95],

@@ -99,13 +99,16 @@ class InProcessSession:
     """See :class:`InProcessRunner`."""
 
     def __init__(self, submission: Submission, tasks: Sequence[Task]):
-        controller = controller_class(submission.folder, submission.label)
+        controller = submission.controller
+        source = None if controller is None else submission.label
+        if controller is None:
+            controller = controller_class(submission.folder, submission.label)
         self.failures: dict[int, Failure] = {}
         self._count = len(tasks)
         self._cells: dict[int, Cell] = {}
         for index, task in enumerate(tasks):
             try:
-                self._cells[index] = Cell(controller, task, submission.folder)
+                self._cells[index] = Cell(controller, task, submission.folder, source)
             except Failed as failed:
                 self.failures[index] = failed.failure
 

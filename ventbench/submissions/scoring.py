@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,9 +17,11 @@ from ventbench.interfaces import Plant, Task
 from ventbench.lungs import LUNGS, Lung
 from ventbench.metrics import effort, safety, step_response
 from ventbench.metrics.waveform import run_error
+from ventbench.plants import frozen
+from ventbench.plants.hybrid import Hybrid
 from ventbench.scenario import Scenario
 from ventbench.submissions.errors import SubmissionError
-from ventbench.submissions.folder import Submission
+from ventbench.submissions.folder import Submission, open_submission, submission_of
 from ventbench.submissions.result import CellFailure, Score
 from ventbench.submissions.runner import InProcessRunner, Runner
 from ventbench.submissions.stepping import ProtocolRun, as_float64, replay, step_through
@@ -28,6 +31,73 @@ Floats = NDArray[np.float64]
 
 
 def score(
+    submission: Any,
+    *,
+    plants: Any = "frozen",
+    track: str | None = None,
+    draws: int = 0,
+    sandbox: bool = True,
+) -> Score:
+    """Score a controller on the lungs of a set of simulators.
+
+    Lower is better: mean |pressure - target| over the inspirations, cmH2O.
+
+    Args:
+        submission: folder of a submission, the name of a bundled one, a class with ``reset(task)``
+            and ``act(observation)``, or a function from an observation to ``u_in``, %. Classes and
+            functions run in this process.
+        plants: simulators, as anything that
+            :func:`ventbench.plants.catalog.load_simulators` takes.
+        track: ``"performance"`` (the controller is told the lung) or ``"robustness"``; the first
+            that the submission enters if not given.
+        draws: how many of the 20 published draws to run besides the nominal cells.
+        sandbox: run a folder in locked-down processes. Without it, its code runs in this process
+            with all rights: only for code that you trust, and never official.
+
+    Returns:
+        The score; ``print`` and notebooks show one row a lung.
+
+    Raises:
+        SubmissionError: if there is no such submission, it cannot be run at all, or it does not
+            enter the track.
+        SandboxError: if this machine cannot run submissions apart.
+        InputError: if there are no such simulators or draws.
+        FloatingPointError: if a plant answers with NaN or infinity.
+
+    Example:
+        >>> from ventbench import score
+        >>> def proportional(observation):
+        ...     return 5.0 + 2.0 * (observation.target - observation.pressure)
+        >>> result = score(proportional, plants="physics")
+        >>> result.official
+        False
+    """
+    from ventbench.plants.catalog import load_simulators
+
+    runner: Runner = InProcessRunner()
+    if isinstance(submission, Submission):
+        entry = submission
+    elif isinstance(submission, str | Path):
+        entry = open_submission(str(submission))
+    else:
+        entry = submission_of(submission)
+    simulators = load_simulators(plants)
+    if sandbox and entry.controller is None:
+        from ventbench.sandbox.runner import SandboxRunner
+
+        runner = SandboxRunner()
+    return run_protocol(
+        entry,
+        simulators.stacked,
+        track=track,
+        draws=draws,
+        lungs=simulators.lungs,
+        runner=runner,
+        simulators=simulators.about,
+    )
+
+
+def run_protocol(
     submission: Submission,
     plants: Plant,
     *,
@@ -37,8 +107,8 @@ def score(
     pips: Sequence[float] = protocol.PIPS,
     runner: Runner | None = None,
     simulators: Mapping[str, Any] | None = None,
-) -> tuple[Score, Trajectories]:
-    """Run a submission through the protocol.
+) -> Score:
+    """Run a submission through the protocol, on any stacked plants and by any runner.
 
     Args:
         submission: from :func:`ventbench.submissions.folder.open_submission`.
@@ -49,9 +119,6 @@ def score(
         pips: cmH2O.
         runner: of the controllers; in this process if not given.
         simulators: what is known of the plants (version, hashes), to be written into the result.
-
-    Returns:
-        The score, and the nominal trajectories with their expirations.
 
     Raises:
         SubmissionError: if the submission cannot be run at all, or does not enter the track.
@@ -76,6 +143,7 @@ def score(
     ]
     with precision.float64():
         plants = as_float64(plants, len(names))
+        frozen_sha256 = _frozen_sha256(plants)
         cells = protocol_cells(pips, draws)
         run = step_through(plants, cells, runner, submission, tasks)
         nominal = jax.tree.map(lambda x: x[0], cells)
@@ -98,7 +166,7 @@ def score(
     for cell in run.failures:
         errors[cell] = np.nan
     requested = run.requested[:, 0]
-    result = Score(
+    return Score(
         submission=submission,
         track=track,
         lungs=names,
@@ -115,9 +183,21 @@ def score(
         requested=run.requested,
         sandbox=runner.sandbox,
         simulators=simulators,
+        frozen_sha256=frozen_sha256,
+        draws_sha256=published.SHA256 if draws else None,
+        trajectories=trajectories,
         timing=timing,
     )
-    return result, trajectories
+
+
+def _frozen_sha256(plants: Plant) -> str | None:
+    """SHA-256 of the frozen simulators' manifest if float64 plants are exactly those, else None."""
+    if type(plants) is not Hybrid:
+        return None
+    official = frozen.load()
+    leaves, wanted = jax.tree.leaves(plants), jax.tree.leaves(official.plants)
+    same = all(map(np.array_equal, leaves, (np.asarray(leaf, np.float64) for leaf in wanted)))
+    return official.manifest_sha256 if same else None
 
 
 def protocol_cells(pips: tuple[float, ...], draws: int) -> Scenario:

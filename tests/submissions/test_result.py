@@ -1,0 +1,179 @@
+"""Whether a score is official is a property of the score; and how it shows itself."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from ventbench import draws, precision
+from ventbench.lungs import LUNGS
+from ventbench.plants import frozen
+from ventbench.plants.corrected import Corrected
+from ventbench.submissions.folder import open_submission
+from ventbench.submissions.scoring import _frozen_sha256, run_protocol
+from ventbench.submissions.stepping import as_float64
+from ventbench.trajectories import load
+
+FULL = {"layers": ["landlock", "seccomp"], "official": True}
+
+
+class Pretender:
+    """A runner that claims a full sandbox and asks for 3 % always."""
+
+    sandbox = FULL
+
+    def start(self, submission, tasks):
+        self.failures = {}
+        return self
+
+    def act(self, observations):
+        return np.full(len(observations), 3.0)
+
+    def close(self):
+        pass
+
+
+def scored(plants, **options):
+    options = {"runner": Pretender(), "simulators": frozen.load().about()} | options
+    return run_protocol(open_submission("pid_robust"), plants, **options)
+
+
+@pytest.fixture(scope="module")
+def official():
+    return scored(frozen.load().plants)
+
+
+@pytest.fixture(scope="module")
+def textbook(plants):
+    return scored(plants, draws=2)
+
+
+def test_the_frozen_simulators_are_those_of_the_published_hash():
+    assert frozen.load().manifest_sha256 == frozen.MANIFEST_SHA256
+
+
+def test_official_needs_everything(official):
+    assert official.official
+    assert official.not_official_because == ()
+    assert official.to_json()["official"] is True
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"sandbox": None}, "no full sandbox"),
+        ({"sandbox": {**FULL, "official": False}}, "no full sandbox"),
+        ({"sandbox": {**FULL, "official": 1}}, "no full sandbox"),
+        ({"frozen_sha256": None}, "not on the frozen simulators"),
+        ({"frozen_sha256": "0" * 64}, "not on the frozen simulators"),
+        ({"pips": (10.0,)}, "not all lungs and PIPs"),
+        ({"lungs": ("R5C10",)}, "not all lungs and PIPs"),
+        ({"drawn": np.ones((1, 6, 6))}, "other draws than the published ones"),
+        (
+            {"drawn": np.ones((1, 6, 6)), "draws_sha256": "0" * 64},
+            "other draws than the published ones",
+        ),
+    ],
+)
+def test_lacking_one_thing_it_is_not(official, changed, reason):
+    result = dataclasses.replace(official, **changed)
+    assert result.not_official_because == (reason,)
+    assert not result.official
+
+
+def test_published_draws_are_official(official):
+    drawn = {"drawn": np.ones((20, 6, 6)), "draws_sha256": draws.SHA256}
+    assert dataclasses.replace(official, **drawn).official
+
+
+def test_words_of_the_caller_make_no_simulators_frozen(textbook):
+    assert textbook.simulators == frozen.load().about()
+    assert textbook.sandbox == FULL
+    assert not textbook.official
+    assert textbook.to_json()["official"] is False
+
+
+@pytest.fixture(scope="module")
+def hybrids():
+    with precision.float64():
+        return as_float64(frozen.load().plants, len(LUNGS))
+
+
+def test_only_the_frozen_numbers_themselves_count(hybrids):
+    with precision.float64():
+        assert _frozen_sha256(hybrids) == frozen.MANIFEST_SHA256
+        nudged = hybrids.replace(R=hybrids.R.at[3].set(np.nextafter(hybrids.R[3], 1e3)))
+        assert _frozen_sha256(nudged) is None
+        rounded = jax.tree.map(lambda leaf: leaf.astype("float32").astype(float), hybrids)
+        assert _frozen_sha256(rounded) is None
+        assert _frozen_sha256(jax.tree.map(lambda leaf: leaf[:3], hybrids)) is None
+
+
+def test_a_corrected_simulator_is_never_the_frozen_one(hybrids):
+    names = {field.name for field in dataclasses.fields(Corrected)}
+    corrected = Corrected(**dict.fromkeys(names, hybrids))  # type: ignore[arg-type]
+    assert _frozen_sha256(corrected) is None
+
+
+def test_a_frame_has_every_cell(textbook):
+    frame = textbook.to_frame()
+    assert list(frame) == ["lung", "pip_cmH2O", "draw", "error_cmH2O"]
+    assert len(frame) == 6 * 6 * 3
+    one = frame.query("lung == 'R20C10' and pip_cmH2O == 25 and draw == 2")
+    assert one.error_cmH2O.item() == textbook.drawn[1, 3, 3]
+    nominal = frame[frame.draw == 0].groupby("lung", sort=False).error_cmH2O.mean()
+    np.testing.assert_allclose(nominal.to_numpy(), textbook.by_lung)
+
+
+def test_summary_has_a_row_for_each_lung(textbook):
+    table = textbook.summary()
+    assert list(table) == ["score_cmH2O", "draws_cmH2O", "safe", "peak_cmH2O"]
+    assert list(table.index) == list(textbook.lungs)
+    assert table.draws_cmH2O.mean() == pytest.approx(np.mean(textbook.drawn))
+
+
+def test_it_shows_itself(textbook, official):
+    assert repr(textbook).startswith("<Score of pid_robust, robustness: ")
+    said = str(textbook)
+    assert "(not official: not on the frozen simulators)" in said
+    assert "R20C50" in said
+    assert "(official)" in str(official)
+    assert "draws_cmH2O" not in str(official)
+    page = textbook._repr_html_()
+    assert page.count("<tr") == 7
+    assert "pid_robust" in page
+
+
+def test_failures_are_shown_and_escaped(textbook):
+    class Fails(Pretender):
+        def start(self, submission, tasks):
+            from ventbench.submissions.errors import Failure
+
+            self.failures = {k: Failure("act", "<b>raised</b>") for k in range(6)}
+            return self
+
+    plants = textbook_lung()
+    result = scored(plants, runner=Fails(), lungs=LUNGS[:1])
+    assert "failed" in repr(result)
+    assert str(result).count("<b>raised</b>") == 3
+    assert "... 3 more" in str(result)
+    assert "<b>raised" not in result._repr_html_()
+    assert "failed" in result._repr_html_()
+
+
+def textbook_lung():
+    from ventbench.plants.single_compartment import single_compartment
+    from ventbench.plants.stack import stack
+
+    with precision.float64():
+        return stack([single_compartment(LUNGS[0])])
+
+
+def test_save(textbook, tmp_path):
+    textbook.save(tmp_path / "new")
+    plain = json.loads(json.dumps(textbook.to_json()))
+    assert json.loads((tmp_path / "new" / "score.json").read_text()) == plain
+    kept = load(tmp_path / "new" / "trajectories.npz")
+    np.testing.assert_array_equal(kept.pressure, textbook.trajectories.pressure)

@@ -80,7 +80,7 @@ def test_another_label_is_refused(public_recordings):
 
 
 def test_the_table(surveyed):
-    lines = mechanics.table(surveyed).splitlines()
+    lines = mechanics.survey_table(surveyed).splitlines()
     assert len(lines) == 50
     assert sum("no flow, no volume" in line for line in lines) == 8
     assert all(line.count("|") == 9 for line in lines)

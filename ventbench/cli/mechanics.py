@@ -10,7 +10,7 @@ import typer
 from ventbench.cli.options import Clip, JsonFile, Pad, emit
 
 if TYPE_CHECKING:
-    from ventbench.mechanics import Mechanics, Surveyed
+    from ventbench.mechanics import Mechanics, SurveyedRun
 
 
 def mechanics(
@@ -64,7 +64,7 @@ def _is_respiraworks(path: Path) -> bool:
         return False
 
 
-def _survey(path: Path) -> tuple[Surveyed, ...]:
+def _survey(path: Path) -> tuple[SurveyedRun, ...]:
     from ventbench.errors import InputError
     from ventbench.mechanics import survey
 
@@ -101,17 +101,17 @@ def _lung(one: Mechanics) -> dict[str, Any]:
     return files.json_values(plain)
 
 
-def _run(item: Surveyed) -> dict[str, Any]:
+def _run(item: SurveyedRun) -> dict[str, Any]:
     run, found = item.run, item.mechanics
     about = {"run": run.name, "test": run.test, "drive": run.drive, "R": run.R, "C": run.C}
     return about | {"mechanics": None if found is None else _lung(found)}
 
 
-def _say_runs(console: Any, runs: tuple[Surveyed, ...]) -> None:
-    from ventbench.mechanics import table
+def _say_runs(console: Any, runs: tuple[SurveyedRun, ...]) -> None:
+    from ventbench.mechanics import survey_table
 
     # Lines of a Markdown table must not be broken.
-    console.print(table(runs), markup=False, highlight=False, soft_wrap=True)
+    console.print(survey_table(runs), markup=False, highlight=False, soft_wrap=True)
     known = [item.mechanics for item in runs if item.mechanics is not None]
     holds = sum(one.match.label_matches for one in known)
     console.print(

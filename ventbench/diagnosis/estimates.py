@@ -82,10 +82,10 @@ def parameters(found: Fit, name: str) -> dict[str, Estimate]:
 def lungs(found: Fit) -> tuple[LungMatch, ...]:
     """R and C of each label as the model has them, and whether the label can be right.
 
-    Judged as :func:`~ventbench.mechanics.labels` does, at the flow that labels hold for.
+    Judged as :func:`~ventbench.mechanics.match_labels` does, at the flow that labels hold for.
     """
-    settings, matches = mechanics.settings_of(found), []
-    for group, one in enumerate(mechanics.labels(found)):
+    settings, matches = mechanics.settings_by_label(found), []
+    for group, one in enumerate(mechanics.match_labels(found)):
         ends = {path: found.ci95(path)[group] for path in ("R", "C")}
         matches.append(
             replace(

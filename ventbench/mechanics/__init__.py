@@ -1,21 +1,24 @@
 """Lung mechanics from pressure with flow or volume, and whether a lung is what its label says."""
 
-from ventbench.mechanics.fitted import Term
-from ventbench.mechanics.identify import Mechanics, identify
-from ventbench.mechanics.labels import label, labels, match, matching, settings_of
-from ventbench.mechanics.respiraworks import Surveyed, breaths_of, survey, table
+from ventbench.mechanics.identify import Mechanics, Term, identify
+from ventbench.mechanics.labels import (
+    match_label,
+    match_labels,
+    matching_settings,
+    settings_by_label,
+)
+from ventbench.mechanics.respiraworks import SurveyedRun, breaths_of, survey, survey_table
 
 __all__ = [
     "Mechanics",
-    "Surveyed",
+    "SurveyedRun",
     "Term",
     "breaths_of",
     "identify",
-    "label",
-    "labels",
-    "match",
-    "matching",
-    "settings_of",
+    "match_label",
+    "match_labels",
+    "matching_settings",
+    "settings_by_label",
     "survey",
-    "table",
+    "survey_table",
 ]

@@ -2,42 +2,95 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ventbench.errors import InputError
 from ventbench.lungs import Lung
-from ventbench.mechanics import labels
-from ventbench.mechanics.circuit import Circuit, behind, circuit
-from ventbench.mechanics.fitted import Fitted, Term
+from ventbench.mechanics.labels import fits, match_label, matching_settings
 from ventbench.mechanics.lung_match import Estimate, LungMatch
-from ventbench.mechanics.regression import GRID, Table, covariance, solve, table
-from ventbench.mechanics.segments import Segment, clipped, segments
-from ventbench.mechanics.select import FEWEST, Chosen, select
-from ventbench.mechanics.terms import BASE, columns_of
+from ventbench.mechanics.regression import (
+    BASE,
+    COLUMNS,
+    GRID,
+    TIMES,
+    CrossProducts,
+    RegressionFit,
+    columns_of,
+    covariance,
+    cross_products,
+    effect_size,
+    fit,
+)
+from ventbench.mechanics.segments import Segment, clipped_share, segments
+from ventbench.mechanics.term_selection import (
+    FEWEST_BREATHS,
+    CircuitCompliance,
+    SelectedTerm,
+    behind_circuit,
+    circuit_compliance,
+    select_terms,
+)
 from ventbench.recordings.breaths import Breaths
+from ventbench.system_id.intervals import quantile
 
-#: Share of clipped pressures, and size of what is left, cmH2O, that the reader must be told of.
-_CLIPPED, _LARGE = 0.02, 1.0
+Floats = NDArray[np.float64]
+
+#: Share of clipped pressures, and residual, cmH2O, above which a note warns the reader.
+_NOTED_CLIPPING, _NOTED_NOISE = 0.02, 1.0
+
+#: Peak flow, L/s, below which a note says that R is known at small flow only.
+_SMALL_FLOW = 0.2
+
+#: Relative error of the quadratic part beyond the largest measured flow: resistors are not exactly
+#: parabolic.
+_EXTRAPOLATION_ERROR = 0.5
+
+#: Least degrees of freedom of an interval; with fewer it would say nothing.
+_LEAST_FREEDOM = 4
+
+#: Largest product of R and leak for which R and 1/C are corrected.
+_MOST_LEAK = 0.5
+
+
+@dataclass(frozen=True)
+class Term:
+    """An effect that a lung needs beyond R and C.
+
+    Attributes:
+        name: of the effect.
+        parameters: by short name.
+        nats: log-likelihood ratio on held-out breaths.
+        effect: root mean square of what the term alone explains, cmH2O.
+        alternatives: names of effects that would explain nearly as much.
+    """
+
+    name: str
+    parameters: dict[str, Estimate]
+    nats: float
+    effect: float
+    alternatives: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Mechanics:
-    """A lung, as pressure and flow show it.
+    """Mechanics of a lung.
 
     Attributes:
         label: of the recording.
-        R: resistance at small flow, inspiratory, cmH2O s/L.
+        R: inspiratory resistance at small flow, cmH2O s/L.
         C: compliance over the tidal volume, mL/cmH2O.
-        offset: pressure at the start of a breath if nothing flowed, cmH2O.
-        terms: what is needed beyond R and C, the most important first.
-        match: with R at the flow for which its label holds.
+        offset: pressure at the start of a breath without the effect of flow, cmH2O.
+        terms: effects beyond R and C, the most important first.
+        match: comparison with the label, with R at the flow for which the label holds.
         settings: known settings that this lung may be, the nearest first.
-        noise: standard deviation of what is left, cmH2O.
-        breaths: that were used.
-        samples: smoothed ones.
-        notes: what the reader should know.
+        noise: standard deviation of the residual, cmH2O.
+        breaths: number of breaths that were used.
+        samples: number of smoothed samples.
+        notes: warnings to the reader.
     """
 
     label: str
@@ -57,99 +110,237 @@ def identify(breaths: Breaths) -> tuple[Mechanics, ...]:
     """Identify each lung of a recording with flow or volume.
 
     Raises:
-        InputError: if there is neither, or too little of a lung to tell R from C.
+        InputError: if neither is recorded, or too little of a lung to tell R from C.
     """
-    return tuple(_one(name, part) for name, part in breaths.by_lung().items())
+    return tuple(_identify_lung(name, part) for name, part in breaths.by_lung().items())
 
 
-def _one(name: str, breaths: Breaths) -> Mechanics:
-    pieces = segments(breaths)
-    if not pieces:
+def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
+    measured = segments(breaths)
+    if not measured:
         raise InputError(
             f"{name}: no piece of a breath has pressure with flow or volume for about a second; "
             "record longer pieces"
         )
-    tube = circuit(pieces)
-    pieces = tuple(behind(s, tube.compliance.value if tube else 0.0) for s in pieces)
-    known = table(pieces)
-    chosen = select(known)
-    full = _fitted(known, chosen, pieces, breaths)
-    plain = _fitted(known, _bent(known), pieces, breaths)
+    circuit = circuit_compliance(measured)
+    compliance = circuit.compliance.value if circuit else 0.0
+    at_lung = tuple(behind_circuit(segment, compliance) for segment in measured)
+    table = cross_products(at_lung)
+    selected = select_terms(table)
+    full = _fit_lung(table, selected, at_lung, breaths)
+    plain = _fit_lung(table, _quadratic_resistance(table), at_lung, breaths)
     label = Lung(float(breaths.R[0]), float(breaths.C[0]))
-    best = _best(full, plain, label)
+    best = _best_for_label(full, plain, label)
     source = "pressure and flow" if breaths.flow is not None else "pressure and volume"
-    noise = float(full.solution.sigma / np.sqrt(1.0 - GRID[full.solution.grid] ** 2))
+    noise = float(full.fitted.sigma / np.sqrt(1.0 - GRID[full.fitted.grid] ** 2))
     return Mechanics(
         name, best.resistance(0.0), best.compliance(), full.offset(),
-        (*_circuit(tube), *(full.term(item) for item in chosen)),
-        labels.match(label, best.resistance, best.compliance(), source),
-        labels.matching(best.resistance, best.compliance()),
-        noise, len(known), sum(len(piece) for piece in pieces),
-        tuple(_notes(breaths, pieces, known, noise)),
+        (*_circuit_term(circuit), *(full.term(term) for term in selected)),
+        match_label(label, best.resistance, best.compliance(), source),
+        matching_settings(best.resistance, best.compliance()),
+        noise, len(table), sum(len(segment) for segment in at_lung),
+        tuple(_notes(breaths, at_lung, table, noise)),
     )  # fmt: skip
 
 
-def _fitted(
-    known: Table, chosen: tuple[Chosen, ...], pieces: tuple[Segment, ...], breaths: Breaths
-) -> Fitted:
-    columns = (*range(len(BASE)), *(item.column for item in chosen))
-    found = solve(known, np.ones(len(known), bool), columns)
-    return Fitted(found, covariance(known, found), known, pieces, _blur(breaths))
+def _fit_lung(
+    table: CrossProducts, selected: tuple[SelectedTerm, ...], segments: tuple[Segment, ...],
+    breaths: Breaths,
+) -> LungFit:  # fmt: skip
+    columns = (*range(len(BASE)), *(term.column for term in selected))
+    fitted = fit(table, np.ones(len(table), bool), columns)
+    # A flow may jump between two samples, which a measured volume shows.
+    blur = 0.0 if breaths.volume is not None else 0.25 * float(np.median(breaths.dt))
+    return LungFit(fitted, covariance(table, fitted), table, segments, blur)
 
 
-def _bent(known: Table) -> tuple[Chosen, ...]:
-    """The quadratic part of a resistor, unless it comes out negative: labels leave it open."""
+def _quadratic_resistance(table: CrossProducts) -> tuple[SelectedTerm, ...]:
+    """The quadratic part of the resistance, which a label leaves open, unless it is negative."""
     (column,) = columns_of("turbulent_resistance")
-    found = solve(known, np.ones(len(known), bool), (*range(len(BASE)), column))
-    return (Chosen("turbulent_resistance", column, 0.0, ()),) if found.x[-1] > 0.0 else ()
+    fitted = fit(table, np.ones(len(table), bool), (*range(len(BASE)), column))
+    if fitted.coefficients[-1] <= 0.0:
+        return ()
+    return (SelectedTerm("turbulent_resistance", column, 0.0, ()),)
 
 
-def _best(full: Fitted, plain: Fitted, label: Lung) -> Fitted:
-    """The description to judge the label by.
+def _best_for_label(full: LungFit, plain: LungFit, label: Lung) -> LungFit:
+    """The fit whose R and C the label is compared with.
 
-    Further terms take part of R and C over, rightly (creep) or not (what only looks like creep), so
-    that a plain lung is tried too: what counts is whether either is a setting.
+    Further terms take over part of R and C, rightly (creep) or wrongly (what only looks like
+    creep). The lung may therefore match a setting by either fit.
     """
-    for one in (full, plain):
-        if labels.fits(one.resistance, one.compliance(), label):
-            return one
-    for one in (full, plain):
-        if labels.matching(one.resistance, one.compliance()):
-            return one
+    for lung in (full, plain):
+        if fits(lung.resistance, lung.compliance(), label):
+            return lung
+    for lung in (full, plain):
+        if matching_settings(lung.resistance, lung.compliance()):
+            return lung
     return plain
 
 
-def _circuit(tube: Circuit | None) -> tuple[Term, ...]:
-    if tube is None:
+def _circuit_term(circuit: CircuitCompliance | None) -> tuple[Term, ...]:
+    if circuit is None:
         return ()
-    others = ("sensor_lag",)
-    parameters = {"compliance": tube.compliance}
-    return (Term("circuit_compliance", parameters, tube.nats, tube.effect, others),)
+    parameters = {"compliance": circuit.compliance}
+    return (Term("circuit_compliance", parameters, circuit.nats, circuit.effect, ("sensor_lag",)),)
 
 
-def _blur(breaths: Breaths) -> float:
-    """Uncertainty of the integral of a flow that may jump between two samples, s."""
-    return 0.0 if breaths.volume is not None else 0.25 * float(np.median(breaths.dt))
-
-
-def _notes(breaths: Breaths, pieces: tuple[Segment, ...], known: Table, noise: float) -> list[str]:
+def _notes(
+    breaths: Breaths, segments: tuple[Segment, ...], table: CrossProducts, noise: float
+) -> list[str]:
     notes = []
-    if len(known) < FEWEST:
-        notes.append(f"Fewer than {FEWEST} breaths: R and C alone, nothing else could be tested.")
-    if lost := len(breaths) - len(known):
+    if len(table) < FEWEST_BREATHS:
+        notes.append(
+            f"Fewer than {FEWEST_BREATHS} breaths: R and C alone, nothing else could be tested."
+        )
+    if lost := len(breaths) - len(table):
         notes.append(f"{lost} of {len(breaths)} breaths have no piece long enough to be used.")
-    share = clipped(breaths)
-    if share > _CLIPPED:
+    share = clipped_share(breaths)
+    if share > _NOTED_CLIPPING:
         notes.append(
             f"{100 * share:.0f} % of the pressures stand at the end of the sensor's range and are "
             "left out."
         )
-    top = max(float(piece.flow.max()) for piece in pieces)
-    if top < 0.2:
-        notes.append(f"The flow stays below {1000 * top:.0f} mL/s: R is known at small flow only.")
-    if noise > _LARGE:
+    peak = max(float(segment.flow.max()) for segment in segments)
+    if peak < _SMALL_FLOW:
+        notes.append(f"The flow stays below {1000 * peak:.0f} mL/s: R is known at small flow only.")
+    if noise > _NOTED_NOISE:
         notes.append(
             f"{noise:.1f} cmH2O are left unexplained, such as a valve that chatters: R and C are "
             "rough."
         )
     return notes
+
+
+@dataclass(frozen=True, eq=False)
+class LungFit:
+    """Coefficients of a regression, and the quantities of a lung that follow from them.
+
+    Attributes:
+        fitted: the regression.
+        covariance: of its coefficients, ``(k, k)``.
+        table: cross products of its breaths.
+        segments: of the breaths.
+        blur: uncertainty of the time over which the flow is integrated, s.
+    """
+
+    fitted: RegressionFit
+    covariance: Floats
+    table: CrossProducts
+    segments: tuple[Segment, ...]
+    blur: float
+
+    def resistance(self, flow: float) -> Estimate:
+        """Inspiratory resistance at a flow, L/s, and at half of the tidal volume, cmH2O s/L."""
+        half = 0.5 * self._tidal_volume()
+
+        def value(x: Callable[[str], float]) -> float:
+            quadratic = x("turbulent_resistance") * flow
+            return (x("resistance") + quadratic + x("volume_resistance") * half) * _leak_factor(x)
+
+        estimate = self._derived(value, "cmH2O s/L")
+        peak = max(float(segment.flow.max()) for segment in self.segments)
+        quadratic = abs(self._coefficient("turbulent_resistance"))
+        extrapolated = _EXTRAPOLATION_ERROR * quadratic * max(flow - peak, 0.0)
+        jumps = self.blur * self._coefficient("elastance")
+        half_width = 0.5 * (estimate.ci95[1] - estimate.ci95[0])
+        reach = float(np.linalg.norm([half_width, jumps, extrapolated]))
+        ends = (estimate.value - reach, estimate.value + reach)
+        return Estimate(estimate.value, estimate.unit, ends)
+
+    def compliance(self) -> Estimate:
+        """Compliance over the tidal volume, mL/cmH2O."""
+        tidal = self._tidal_volume()
+        elastance = self._derived(
+            lambda x: (x("elastance") + x("nonlinear_compliance") * tidal) * _leak_factor(x), ""
+        )
+        low, high = (max(end, 1e-3) for end in elastance.ci95)
+        return Estimate(1000.0 / elastance.value, "mL/cmH2O", (1000.0 / high, 1000.0 / low))
+
+    def offset(self) -> Estimate:
+        """Median initial pressure of the segments that begin where their breath does, cmH2O."""
+        values = []
+        for segment in (s for s in self.segments if s.first):
+            rows = np.stack([COLUMNS[c].values(segment) for c in self.fitted.columns], axis=1)
+            left = segment.pressure - rows @ self.fitted.coefficients
+            values.append(float(np.polyval(np.polyfit(segment.time, left, 1), 0.0)))
+        if not values:
+            return Estimate(float("nan"), "cmH2O", (float("nan"), float("nan")))
+        median, count = float(np.median(values)), len(values)
+        # Robust standard error of a median: a breath that was cut off must not count for much.
+        spread = 1.25 * 1.4826 * float(np.median(np.abs(np.array(values) - median)))
+        factor = quantile(max(count - 1, _LEAST_FREEDOM))
+        reach = factor * spread / np.sqrt(count) if count > 1 else np.inf
+        return Estimate(median, "cmH2O", (median - reach, median + reach))
+
+    def term(self, selected: SelectedTerm) -> Term:
+        """The term with its parameters, in the units of the library if the library has it."""
+        name = selected.name
+        if name == "inertance" and self._coefficient(name) < 0.0:
+            name = "sensor_lag"
+        others = selected.alternatives + (("flow_sensor_lag",) if name == "inertance" else ())
+        size = effect_size(self.table, self.fitted, selected.column)
+        return Term(name, self._parameters(name, selected.column), selected.nats, size, others)
+
+    def _parameters(self, name: str, column: int) -> dict[str, Estimate]:
+        coefficients = {
+            "turbulent_resistance": ("quadratic", "cmH2O s2/L2"),
+            "inertance": ("inertance", "cmH2O s2/L"),
+            "direction_resistance": ("difference", "cmH2O s/L"),
+            "volume_resistance": ("slope", "cmH2O s/L2"),
+            "expiratory_flow": ("quadratic", "cmH2O s2/L2"),
+        }
+        if name in coefficients:
+            short, unit = coefficients[name]
+            return {short: self._derived(lambda x: x(name), unit)}
+        if name == "nonlinear_compliance":
+            stiffening = self._derived(lambda x: 2.0 * x(name) / x("elastance") ** 2, "1/cmH2O")
+            return {"stiffening": stiffening}
+        if name == "leak":
+            leak = self._derived(lambda x: 1000.0 * x(name) / x("elastance"), "mL/s per cmH2O")
+            return {"conductance": leak}
+        if name == "sensor_lag":
+            return {"tau": self._derived(lambda x: -x("inertance") / x("resistance"), "s")}
+        time = COLUMNS[column].time
+        assert time is not None
+        low = max((t for t in TIMES if t < time), default=time)
+        high = min((t for t in TIMES if t > time), default=time)
+        return {
+            "ratio": self._derived(lambda x: x(name) / x("elastance"), "1"),
+            "time": Estimate(time, "s", (low, high)),
+        }
+
+    def _derived(self, value: Callable[[Callable[[str], float]], float], unit: str) -> Estimate:
+        """A function of the coefficients, with its interval by linear error propagation."""
+        x = self.fitted.coefficients
+        terms = [COLUMNS[c].term for c in self.fitted.columns]
+
+        def at(point: Floats) -> float:
+            named = {term: float(v) for term, v in zip(terms, point, strict=True)}
+            return float(value(lambda name: named.get(name, 0.0)))
+
+        step = 1e-4 * np.maximum(np.abs(x), 1e-6)
+        slopes = [
+            (at(x + h * direction) - at(x - h * direction)) / (2.0 * h)
+            for h, direction in zip(step, np.eye(len(x)), strict=True)
+        ]
+        sd = float(np.sqrt(max(np.array(slopes) @ self.covariance @ np.array(slopes), 0.0)))
+        reach, centre = quantile(max(len(self.table) - 1, _LEAST_FREEDOM)) * sd, at(x)
+        return Estimate(centre, unit, (centre - reach, centre + reach))
+
+    def _coefficient(self, term: str) -> float:
+        terms = [COLUMNS[c].term for c in self.fitted.columns]
+        return float(self.fitted.coefficients[terms.index(term)]) if term in terms else 0.0
+
+    def _tidal_volume(self) -> float:
+        """Range of the volume, median over the segments, L."""
+        return float(np.median([np.ptp(segment.volume) for segment in self.segments]))
+
+
+def _leak_factor(x: Callable[[str], float]) -> float:
+    """Factor by which R and 1/C are larger if part of the measured flow leaks before the lung.
+
+    With a leak g, p = R (Q - g p) + ...: the regression finds R / (1 + R g), and 1/C likewise.
+    """
+    lost = x("resistance") * x("leak") / x("elastance")
+    return 1.0 / (1.0 - min(lost, _MOST_LEAK))

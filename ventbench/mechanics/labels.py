@@ -1,7 +1,7 @@
-"""Whether a lung is what its label says, and which setting it is if not.
+"""Comparison of a lung with its label and with all known settings.
 
 The resistors of test lungs such as the QuickLung are parabolic: they have their nominal resistance
-at one flow only. Where the quadratic part is known, R is taken at that flow.
+at one flow only. Where the quadratic part is known, R is evaluated at that flow.
 """
 
 from __future__ import annotations
@@ -13,17 +13,18 @@ from ventbench.lungs import RECORDED_LUNGS, Lung
 from ventbench.mechanics.lung_match import Estimate, LungMatch
 from ventbench.system_id import Fit
 
-#: Factors by which R and C may differ from the label, beyond their intervals: what calibration of
-#: lung and sensors allows.
+#: Factors by which R and C may differ from the label beyond their intervals: calibration errors of
+#: lung and sensors.
 TOLERANCE_R, TOLERANCE_C = 1.3, 1.2
 
-#: Resistance of tubes and filters between pressure sensor and lung, cmH2O s/L: R may be more by it.
+#: Resistance of tubes and filters between pressure sensor and lung, by which R may be larger,
+#: cmH2O s/L.
 APPARATUS = 2.0
 
-#: Flow at which a parabolic resistor is taken to have its nominal resistance, L/s.
+#: Flow at which a parabolic resistor has its nominal resistance, L/s.
 REFERENCE_FLOW = 1.0
 
-#: Factor by which the gain of the valve may be off where flow was not measured.
+#: Factor by which the gain of the valve may be wrong where flow is not measured.
 GAIN = 1.2
 
 #: Resistance, cmH2O s/L, at a flow, L/s.
@@ -31,13 +32,13 @@ Resistance = Callable[[float], Estimate]
 
 
 def fits(resistance: Resistance, compliance: Estimate, setting: Lung, scale: float = 1.0) -> bool:
-    """Whether a setting is within tolerance of the intervals.
+    """Whether a setting is within tolerance of the intervals of R and C.
 
     Args:
         resistance: of the lung, by flow.
         compliance: of the lung, mL/cmH2O.
         setting: to compare with.
-        scale: factor by which R and 1/C may be wrong together.
+        scale: common factor by which R and 1/C may be wrong.
     """
     low, high = resistance(REFERENCE_FLOW).ci95
     ends = (low - APPARATUS) / TOLERANCE_R, high * TOLERANCE_R
@@ -48,22 +49,32 @@ def fits(resistance: Resistance, compliance: Estimate, setting: Lung, scale: flo
     return max(from_R[0], from_C[0], -reach) <= min(from_R[1], from_C[1], reach) + 1e-12
 
 
-def matching(resistance: Resistance, compliance: Estimate, scale: float = 1.0) -> tuple[Lung, ...]:
-    """The known settings that a lung may be, the nearest first."""
+def matching_settings(
+    resistance: Resistance, compliance: Estimate, scale: float = 1.0
+) -> tuple[Lung, ...]:
+    """Return the known settings within tolerance, the nearest first; see :func:`fits`."""
 
     def distance(setting: Lung) -> float:
         value = resistance(REFERENCE_FLOW).value
         away = _log(value / setting.R) / math.log(TOLERANCE_R)
         return away**2 + (_log(compliance.value / setting.C) / math.log(TOLERANCE_C)) ** 2
 
-    known = [item for item in RECORDED_LUNGS if fits(resistance, compliance, item, scale)]
-    return tuple(sorted(known, key=distance))
+    within = [lung for lung in RECORDED_LUNGS if fits(resistance, compliance, lung, scale)]
+    return tuple(sorted(within, key=distance))
 
 
-def match(
+def match_label(
     label: Lung, resistance: Resistance, compliance: Estimate, source: str, scale: float = 1.0
 ) -> LungMatch:
-    """Compare a lung with its label."""
+    """Compare a lung with its label; see :func:`fits`.
+
+    Args:
+        label: setting that the recording states.
+        resistance: of the lung, by flow.
+        compliance: of the lung, mL/cmH2O.
+        source: signals that R and C follow from, in words.
+        scale: common factor by which R and 1/C may be wrong.
+    """
     at = resistance(REFERENCE_FLOW)
     same = fits(resistance, compliance, label, scale)
     return LungMatch(
@@ -71,51 +82,47 @@ def match(
     )  # fmt: skip
 
 
-def labels(fit: Fit) -> tuple[LungMatch, ...]:
+def match_labels(fit: Fit) -> tuple[LungMatch, ...]:
     """Compare each lung of a fit to pressure alone with its label.
 
-    The gain of the valve is a common scale of R and 1/C: it may be off by a factor of 1.2.
+    The unknown gain of the valve scales R and 1/C by a common factor of up to 1.2.
     """
     return tuple(
-        match(setting, resistance, compliance, "pressure", GAIN)
+        match_label(setting, resistance, compliance, "pressure", GAIN)
         for setting, resistance, compliance in _of_fit(fit)
     )
 
 
-def settings_of(fit: Fit) -> dict[str, tuple[Lung, ...]]:
-    """The known settings that each lung of a fit to pressure alone may be, by its label."""
+def settings_by_label(fit: Fit) -> dict[str, tuple[Lung, ...]]:
+    """Return the known settings within tolerance of each lung of a fit to pressure, by label."""
     return {
-        setting.id: matching(resistance, compliance, GAIN)
+        setting.id: matching_settings(resistance, compliance, GAIN)
         for setting, resistance, compliance in _of_fit(fit)
     }
 
 
-def label(fit: Fit) -> LungMatch:
-    """Like :func:`labels`, of the first lung."""
-    return labels(fit)[0]
-
-
 def _of_fit(fit: Fit) -> list[tuple[Lung, Resistance, Estimate]]:
-    data, found = fit.problem.data, []
-    quadratic = fit.column("turbulent_resistance.quadratic")
+    """Label, resistance by flow, and compliance of each lung of a fit."""
+    data, lungs = fit.problem.data, []
+    quadratics = fit.column("turbulent_resistance.quadratic")
     for group in range(int(data.lung.max()) + 1):
         breath = int((data.lung == group).argmax())
         ends = {path: fit.ci95(path)[group] for path in ("R", "C")}
         R, C = (float(fit.value(path)[group]) for path in ("R", "C"))
-        K2 = float(quadratic[breath])
+        quadratic = float(quadratics[breath])
 
         def resistance(
-            flow: float, R: float = R, K2: float = K2, ci: object = ends["R"]
+            flow: float, R: float = R, quadratic: float = quadratic, ci95: object = ends["R"]
         ) -> Estimate:
-            low, high = ci  # type: ignore[misc]
-            more = K2 * flow
+            low, high = ci95  # type: ignore[misc]
+            more = quadratic * flow
             return Estimate(R + more, "cmH2O s/L", (float(low) + more, float(high) + more))
 
         low, high = ends["C"]
         compliance = Estimate(C, "mL/cmH2O", (float(low), float(high)))
         setting = Lung(float(data.R[breath]), float(data.C[breath]))
-        found.append((setting, resistance, compliance))
-    return found
+        lungs.append((setting, resistance, compliance))
+    return lungs
 
 
 def _log(ratio: float) -> float:

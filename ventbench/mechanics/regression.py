@@ -1,39 +1,111 @@
-"""Regression of pressure, breath by breath: cross products, fits, likelihoods, intervals.
+"""Regression of pressure on flow and volume: columns, cross products, fits, likelihoods.
 
-Each piece of a breath has an offset and a drift of its own, and first-order autoregressive noise.
-For each autocorrelation of a grid, all columns are whitened and cleared of offset and drift once;
-after that every fit of any columns needs only sums of small matrices.
+Each segment of a breath has an offset and a drift of its own, and first-order autoregressive noise.
+For each autocorrelation of a grid, all columns are whitened and projected off offset and drift
+once; every fit of any columns then needs only sums of small matrices.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.mechanics.segments import Segment
-from ventbench.mechanics.terms import COLUMNS
 
 Floats = NDArray[np.float64]
 
 #: Autocorrelations between neighbouring smoothed samples.
 GRID = (0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.88, 0.94)
 
-#: Smallest standard deviation that is believed, cmH2O.
-_FLOOR = 0.005
+#: Smallest standard deviation of the noise, cmH2O; a smaller one is an artefact of rounding.
+_LEAST_SIGMA = 0.005
+
+#: Relaxation times to choose from, s.
+TIMES = tuple(float(x) for x in np.geomspace(0.3, 3.0, 11))
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the regression; a term may have several columns to choose from.
+
+    Attributes:
+        term: name of the effect.
+        values: of the column in a segment, ``(n,)``.
+        time: relaxation time, s, or None.
+    """
+
+    term: str
+    values: Callable[[Segment], Floats]
+    time: float | None = None
+
+
+def _relaxing_volume(time: float, periodic: bool) -> Callable[[Segment], Floats]:
+    """Solution of dS/dt = Q - S / time, from rest or as if the same breath came before."""
+
+    def values(segment: Segment) -> Floats:
+        t, v = segment.time, segment.volume
+        decay = np.exp(-np.diff(t) / time)
+        # Exact for a flow that is constant within a step.
+        gain = (1.0 - decay) * time / np.diff(t) * np.diff(v)
+        start = 0.0
+        for _ in range(2 if periodic else 1):
+            out = np.zeros(len(t))
+            out[0] = start
+            for i in range(len(t) - 1):
+                out[i + 1] = out[i] * decay[i] + gain[i]
+            start = out[-1]
+        return out
+
+    return values
+
+
+#: Columns of R and 1/C, which every fit has.
+BASE = (
+    Column("resistance", lambda s: s.flow),
+    Column("elastance", lambda s: s.volume),
+)
+
+#: All columns.
+COLUMNS = (
+    *BASE,
+    Column("turbulent_resistance", lambda s: s.flow * np.abs(s.flow)),
+    Column("nonlinear_compliance", lambda s: s.volume**2),
+    Column("inertance", lambda s: s.slope),
+    Column("leak", lambda s: -s.dose),
+    Column("direction_resistance", lambda s: np.minimum(s.flow, 0.0)),
+    Column("volume_resistance", lambda s: s.flow * s.volume),
+    Column("expiratory_flow", lambda s: np.minimum(s.flow, 0.0) * np.abs(s.flow)),
+    *(
+        Column("viscoelasticity", _relaxing_volume(time, periodic), time)
+        for periodic in (False, True)
+        for time in TIMES
+    ),
+)
+
+#: Terms beyond R and C, in the order of their columns.
+TERMS = tuple(dict.fromkeys(column.term for column in COLUMNS[len(BASE) :]))
+
+#: Terms whose coefficient must be positive.
+POSITIVE = ("turbulent_resistance", "viscoelasticity", "leak")
+
+
+def columns_of(term: str) -> tuple[int, ...]:
+    """Indices of the columns of a term."""
+    return tuple(i for i, column in enumerate(COLUMNS) if column.term == term)
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
-    """Cross products of all columns and the pressure, of b breaths.
+class CrossProducts:
+    """Cross products of the columns and the pressure, of b breaths.
 
     Attributes:
-        products: ``(b, len(GRID), K + 1, K + 1)`` for K columns; the last row belongs to the
-            pressure.
-        freedom: samples less offsets and drifts, ``(b,)``.
-        constant: terms of the log-likelihood that depend on the autocorrelation, ``(b, grid)``.
+        products: ``(b, g, K + 1, K + 1)`` for the g autocorrelations of :data:`GRID` and K columns;
+            the last row and column belong to the pressure.
+        freedom: number of samples less offsets and drifts, ``(b,)``.
+        constant: part of the log-likelihood that depends on the autocorrelation alone, ``(b, g)``.
         breaths: index of each breath in the recording, ``(b,)``.
     """
 
@@ -48,24 +120,31 @@ class Table:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class RegressionFit:
     """A fit of k columns.
 
     Attributes:
-        columns: by index.
-        x: coefficients, ``(k,)``.
-        sigma: standard deviation of what is new in each smoothed sample, cmH2O.
-        grid: index of the autocorrelation.
+        columns: their indices.
+        coefficients: ``(k,)``.
+        sigma: standard deviation of the innovations of the noise, cmH2O.
+        grid: index of the autocorrelation in :data:`GRID`.
     """
 
     columns: tuple[int, ...]
-    x: Floats
+    coefficients: Floats
     sigma: float
     grid: int
 
 
-def table(segments: Sequence[Segment], columns: Sequence[int] | None = None) -> Table:
-    """Cross products of all breaths that have a piece, of some columns or of all."""
+def cross_products(
+    segments: Sequence[Segment], columns: Sequence[int] | None = None
+) -> CrossProducts:
+    """Compute the cross products of the breaths that have segments.
+
+    Args:
+        segments: of the breaths.
+        columns: indices of the columns; all if None.
+    """
     chosen = COLUMNS if columns is None else [COLUMNS[c] for c in columns]
     indices = sorted({segment.breath for segment in segments})
     size = len(chosen) + 1
@@ -77,78 +156,88 @@ def table(segments: Sequence[Segment], columns: Sequence[int] | None = None) -> 
         own = np.stack([np.ones(len(segment)), segment.time - segment.time.mean()], axis=1)
         freedom[row] += len(segment) - own.shape[1]
         for k, rho in enumerate(GRID):
-            white, nuisance = (_whiten(x, rho, segment.begins) for x in (full, own))
+            white = _whiten(full, rho, segment.begins)
+            nuisance = _whiten(own, rho, segment.begins)
             basis, upper = np.linalg.qr(nuisance)
             white = white - basis @ (basis.T @ white)
             products[row, k] += white.T @ white
             constant[row, k] += 0.5 * segment.begins.sum() * np.log(1.0 - rho**2)
             constant[row, k] -= float(np.sum(np.log(np.abs(np.diag(upper)))))
-    return Table(products, freedom, constant, np.array(indices, np.int64))
+    return CrossProducts(products, freedom, constant, np.array(indices, np.int64))
 
 
-def solve(table: Table, which: NDArray[np.bool_], columns: Sequence[int]) -> Solution:
-    """Fit columns to some of the breaths, by restricted likelihood over the grid."""
+def fit(table: CrossProducts, which: NDArray[np.bool_], columns: Sequence[int]) -> RegressionFit:
+    """Fit columns to some of the breaths by restricted maximum likelihood.
+
+    Args:
+        table: of the breaths.
+        which: breaths to fit, bool ``(b,)``.
+        columns: indices of the columns.
+    """
     columns = tuple(columns)
     pick = [*columns, -1]
     total = table.products[which].sum(axis=0)[:, pick][:, :, pick]
     freedom = float(table.freedom[which].sum())
     constants = table.constant[which].sum(axis=0)
-    best, reached = None, -np.inf
+    best, highest = None, -np.inf
     for k in range(len(GRID)):
         left = _regular(total[k, :-1, :-1])
         x = np.linalg.solve(left, total[k, :-1, -1])
         square = max(float(total[k, -1, -1] - x @ total[k, :-1, -1]), 0.0)
-        sigma = max(np.sqrt(square / max(freedom - len(columns), 1.0)), _FLOOR)
+        sigma = max(np.sqrt(square / max(freedom - len(columns), 1.0)), _LEAST_SIGMA)
         value = constants[k] - freedom * np.log(sigma) - 0.5 * square / sigma**2
-        if value > reached:
-            best, reached = Solution(columns, x, float(sigma), k), value
+        if value > highest:
+            best, highest = RegressionFit(columns, x, float(sigma), k), value
     assert best is not None
     return best
 
 
-def log_likelihood(table: Table, found: Solution) -> Floats:
-    """Of each breath, its own offsets and drifts integrated out, ``(b,)``, up to a constant."""
-    pick = [*found.columns, -1]
-    products = table.products[:, found.grid][:, pick][:, :, pick]
-    towards = np.append(found.x, -1.0)
+def log_likelihood(table: CrossProducts, fitted: RegressionFit) -> Floats:
+    """Log-likelihood of each breath, ``(b,)``, up to a constant.
+
+    Offsets and drifts are integrated out.
+    """
+    pick = [*fitted.columns, -1]
+    products = table.products[:, fitted.grid][:, pick][:, :, pick]
+    towards = np.append(fitted.coefficients, -1.0)
     square = np.einsum("i,bij,j->b", towards, products, towards)
     return (
-        table.constant[:, found.grid]
-        - table.freedom * np.log(found.sigma)
-        - 0.5 * square / found.sigma**2
+        table.constant[:, fitted.grid]
+        - table.freedom * np.log(fitted.sigma)
+        - 0.5 * square / fitted.sigma**2
     )
 
 
-def covariance(table: Table, found: Solution) -> Floats:
-    """Of the coefficients, ``(k, k)``: the larger of the model's and the spread of the breaths'.
+def covariance(table: CrossProducts, fitted: RegressionFit) -> Floats:
+    """Covariance of the coefficients, ``(k, k)``.
 
-    The breaths are the independent units: a sandwich of their scores, with the correction for few
-    of them.
+    Each variance is the larger of the model's and that of a sandwich estimator, whose independent
+    units are the breaths, corrected for their small number.
     """
-    columns = list(found.columns)
-    products = table.products[:, found.grid]
+    columns = list(fitted.columns)
+    products = table.products[:, fitted.grid]
     curvature = products[:, columns][:, :, columns]
     bread = np.asarray(np.linalg.inv(_regular(curvature.sum(axis=0))), np.float64)
-    model = bread * found.sigma**2
+    model = bread * fitted.sigma**2
     count = len(table)
     if count < 3:
         return model
-    scores = products[:, columns, -1] - curvature @ found.x
+    scores = products[:, columns, -1] - curvature @ fitted.coefficients
     meat = scores.T @ scores * count / (count - 1)
     sandwich = bread @ meat @ bread
     grown = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(model), 1.0))
     return model * np.outer(grown, grown)
 
 
-def effect(table: Table, found: Solution, column: int) -> float:
-    """Root mean square of what a column alone explains, others refitted, cmH2O."""
-    others = [c for c in found.columns if c != column]
+def effect_size(table: CrossProducts, fitted: RegressionFit, column: int) -> float:
+    """Root mean square of what a column explains beyond the others, cmH2O."""
+    others = [c for c in fitted.columns if c != column]
     total = table.products[:, 0].sum(axis=0)
     own = total[column, column]
     if others:
         cross = total[others, column]
         own = own - cross @ np.linalg.solve(_regular(total[np.ix_(others, others)]), cross)
-    x = found.x[found.columns.index(column)]
+    x = fitted.coefficients[fitted.columns.index(column)]
     return float(abs(x) * np.sqrt(max(own, 0.0) / table.freedom.sum()))
 
 

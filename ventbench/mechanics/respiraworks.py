@@ -1,4 +1,4 @@
-"""The runs of the RespiraWorks recordings as breaths, and the mechanics of all of them."""
+"""The runs of the RespiraWorks recordings as breaths, and the mechanics of each run."""
 
 from __future__ import annotations
 
@@ -12,27 +12,34 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.build import FILL, stack, stack_times, valid_mask
 from ventbench.recordings.respiraworks import Run, load_respiraworks
 
-#: Shortest breath that is kept, s, and how long before its inspiration a breath is cut, so that the
-#: steep rise lies within.
-_SHORTEST, _BEFORE = 0.5, 0.25
+#: Shortest breath that is kept, s.
+_SHORTEST = 0.5
+
+#: Start of a breath before its inspiration, s, so that the breath includes the whole steep rise.
+_LEAD = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class Surveyed:
-    """A run and its lung; None where neither flow nor volume was logged."""
+class SurveyedRun:
+    """A run and the mechanics of its lung.
+
+    Attributes:
+        run: as recorded.
+        mechanics: None if the run has neither flow nor volume.
+    """
 
     run: Run
     mechanics: Mechanics | None
 
 
 def breaths_of(run: Run) -> Breaths:
-    """Make breaths of a run, short ones left out.
+    """Split a run into breaths; breaths shorter than 0.5 s are left out.
 
-    Its valves are another ventilator's: u_in is 0, and u_out is 1 where the target is in the lower
-    half of its range. What was never logged is None.
+    Commands of this ventilator's valves are unknown: u_in is 0, and u_out is 1 where the target is
+    in the lower half of its range. Signals that were never logged are None.
     """
     edges = np.flatnonzero(np.diff(run.breath)) + 1
-    edges = np.searchsorted(run.time, run.time[edges] - _BEFORE)
+    edges = np.searchsorted(run.time, run.time[edges] - _LEAD)
     pieces = np.split(np.arange(len(run.time)), edges)
     pieces = [p for p in pieces if len(p) and run.time[p[-1]] - run.time[p[0]] >= _SHORTEST]
     lengths = np.array([len(p) for p in pieces])
@@ -56,37 +63,37 @@ def breaths_of(run: Run) -> Breaths:
     )  # fmt: skip
 
 
-def survey(path: str | os.PathLike[str]) -> tuple[Surveyed, ...]:
+def survey(path: str | os.PathLike[str]) -> tuple[SurveyedRun, ...]:
     """Identify the lung of every run of a RespiraWorks file.
 
     Raises:
         RecordingError: if the file cannot be read.
     """
-    found = []
+    surveyed = []
     for run in load_respiraworks(path):
         breaths = breaths_of(run)
-        known = breaths.flow is not None or breaths.volume is not None
-        found.append(Surveyed(run, identify(breaths)[0] if known else None))
-    return tuple(found)
+        measured = breaths.flow is not None or breaths.volume is not None
+        surveyed.append(SurveyedRun(run, identify(breaths)[0] if measured else None))
+    return tuple(surveyed)
 
 
-def table(found: tuple[Surveyed, ...]) -> str:
-    """A Markdown table of a survey: a run a line."""
+def survey_table(surveyed: tuple[SurveyedRun, ...]) -> str:
+    """Return a Markdown table with one run a line."""
     lines = [
         "| day or gas | test | label | R at its flow | C | label holds | may be | also needs |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
-    for item in found:
-        run, it = item.run, item.mechanics
+    for entry in surveyed:
+        run, lung = entry.run, entry.mechanics
         head = f"| {run.name} | {run.test} | R{run.R:g}C{run.C:g} |"
-        if it is None:
+        if lung is None:
             lines.append(f"{head} | | no flow, no volume | | |")
             continue
-        one = it.match
-        R = f"{one.fitted_R:.1f} [{one.ci95_R[0]:.1f}, {one.ci95_R[1]:.1f}]"
-        C = f"{one.fitted_C:.1f} [{one.ci95_C[0]:.1f}, {one.ci95_C[1]:.1f}]"
-        may = ", ".join(lung.id for lung in it.settings[:2]) or "none known"
-        needs = ", ".join(term.name for term in it.terms)
-        holds = "yes" if one.label_matches else "**no**"
+        match = lung.match
+        R = f"{match.fitted_R:.1f} [{match.ci95_R[0]:.1f}, {match.ci95_R[1]:.1f}]"
+        C = f"{match.fitted_C:.1f} [{match.ci95_C[0]:.1f}, {match.ci95_C[1]:.1f}]"
+        may = ", ".join(setting.id for setting in lung.settings[:2]) or "none known"
+        needs = ", ".join(term.name for term in lung.terms)
+        holds = "yes" if match.label_matches else "**no**"
         lines.append(f"{head} {R} | {C} | {holds} | {may} | {needs} |")
     return "\n".join(lines)

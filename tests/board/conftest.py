@@ -39,6 +39,10 @@ HOSTILE = (
 class Textbook:
     """Textbook lungs, as :func:`ventbench.plants.frozen.load` returns the frozen ones."""
 
+    # Of the frozen ones a board uses none of these; the resolver of --plant hands them on.
+    manifest_sha256 = "0" * 64
+    for_breaths = cross_fitted = None
+
     def __init__(self) -> None:
         with precision.float64():
             # Numpy leaves, as the frozen ones have: they take the precision of their user.
@@ -47,7 +51,7 @@ class Textbook:
             self.ensemble: SingleCompartment = jax.tree.map(np.asarray, stack(each))
 
     def about(self) -> Mapping[str, Any]:
-        return {"version": 1, "kind": "textbook", "manifest_sha256": "0" * 64}
+        return {"version": 1, "kind": "textbook", "manifest_sha256": self.manifest_sha256}
 
 
 def _lungs(factor: float) -> SingleCompartment:

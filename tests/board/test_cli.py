@@ -22,7 +22,7 @@ RUN = CliRunner()
 
 @pytest.fixture(autouse=True)
 def _textbook(monkeypatch: pytest.MonkeyPatch, simulators: Textbook) -> None:
-    monkeypatch.setattr(frozen, "load", lambda version=1: simulators)
+    monkeypatch.setattr(frozen, "load", lambda version=1, path=None: simulators)
 
 
 def run(*arguments: object, code: int = 0) -> str:

@@ -22,7 +22,7 @@ from ventbench.files import write_json
 from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stack import stack
+from ventbench.plants.stacking import stack
 from ventbench.training import pid_grid
 
 #: On the physical lung, paper appendix: P, I; D is 0.

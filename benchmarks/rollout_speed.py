@@ -34,7 +34,7 @@ from ventbench.lungs import LUNGS
 from ventbench.plants import frozen
 from ventbench.plants.learned import Architecture, Learned, learned
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stack import take
+from ventbench.plants.stacking import take
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.rollouts import closed_loop
 from ventbench.scenario import Scenario, nominal

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,11 +15,15 @@ from ventbench.cli import app
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS, lung
 from ventbench.plants import frozen
-from ventbench.plants.labelled import single_compartments
+from ventbench.plants.single_compartment import single_compartment
+from ventbench.plants.stacking import nominal_plants
 from ventbench.precision import float64
 from ventbench.recordings import Breaths, load, make_breaths, write
 from ventbench.rollouts import open_loop
 from ventbench.training.freeze import MEASURED
+
+single_compartments = partial(nominal_plants, single_compartment)
+
 
 FIGURES = ("mae", "median_mae", "ci95", "breaths")
 PREFIXES = ("", "held_out_", "official_held_out_")

@@ -12,7 +12,7 @@ from ventbench.controllers.script import Script
 from ventbench.interfaces import Observation
 from ventbench.lungs import LUNGS
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stack import stack, take
+from ventbench.plants.stacking import stack, take
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from ventbench.cli import app
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
-from ventbench.plants.stack import take
+from ventbench.plants.stacking import take
 from ventbench.rollouts import open_loop
 from ventbench.simulation import read_controls, simulate
 from ventbench.training import freeze

@@ -13,7 +13,7 @@ from ventbench.interfaces import Plant
 from ventbench.lungs import RECORDED_LUNGS
 from ventbench.metrics import bootstrap, open_loop
 from ventbench.plants import frozen
-from ventbench.plants.catalog import NAMES, Given, load_simulators
+from ventbench.plants.catalog import Given, load_simulators, names
 from ventbench.recordings import Breaths
 from ventbench.rollouts import PlantsFor, open_loop_breaths
 
@@ -74,9 +74,9 @@ def run(breaths: Breaths, plant: Given = "frozen") -> dict[str, Any]:
     for lung, index in breaths.by_lung_index.items():
         lungs[lung] = figures(index) | {"fitting_label": figures(index[~apart[index]])}
     return {
-        "plant": plant if isinstance(plant, str) and plant in NAMES else tested.name,
+        "plant": plant if isinstance(plant, str) and plant in names() else tested.name,
         "simulators": official.about(),
-        **({} if tested.kind in NAMES else {"about": dict(tested.about)}),
+        **({} if tested.kind in names() else {"about": dict(tested.about)}),
         "unit": "cmH2O",
         "lungs": lungs,
         "misfits": [asdict(misfit) for misfit in doubtful],

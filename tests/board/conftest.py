@@ -21,7 +21,7 @@ from ventbench.board.replayed import Simulators
 from ventbench.lungs import LUNG_IDS, LUNGS, Lung
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
-from ventbench.plants.stack import stack
+from ventbench.plants.stacking import stack
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.result import CellFailure, Score

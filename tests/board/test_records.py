@@ -64,7 +64,7 @@ def test_replay_agrees_with_the_scorer(drafts, scores) -> None:
 
 def test_spread_is_the_deviation_of_the_ensemble(drafts, scores, simulators: Textbook) -> None:
     from ventbench import precision, scenario
-    from ventbench.plants.stack import take
+    from ventbench.plants.stacking import take
     from ventbench.submissions.stepping import replay
 
     pressures = []

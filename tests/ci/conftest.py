@@ -16,7 +16,7 @@ import pytest
 from ventbench import precision
 from ventbench.lungs import LUNGS
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stack import stack
+from ventbench.plants.stacking import stack
 from ventbench.submissions.scaffold import contents
 
 IDENTITY = {

@@ -17,7 +17,7 @@ from ventbench.errors import InputError
 from ventbench.interfaces import Plant
 from ventbench.lungs import lung
 from ventbench.physics import physics
-from ventbench.plants import text_files
+from ventbench.plants.plant_files import load_plants, save_plants
 from ventbench.recordings import join
 from ventbench.recordings.breaths import Breaths
 
@@ -164,8 +164,8 @@ def test_held_out_readings_change_no_answer(found, other):
 def test_the_corrected_plant_in_its_file_gives_the_same_answers(which, request, tmp_path):
     diagnosis: Diagnosis = request.getfixturevalue(which)
     path, held = tmp_path / "corrected.json", diagnosis.traces.held_out
-    text_files.save(path, diagnosis.plants)
-    answer = simulators.answers(text_files.load(path), diagnosis.traces.breaths)
+    save_plants(path, diagnosis.plants)
+    answer = simulators.answers(load_plants(path), diagnosis.traces.breaths)
     # Its parameters are fitted to all breaths, those of the traces to the training breaths.
     apart = answer[held] - diagnosis.traces.after[held]
     assert np.sqrt(np.mean(apart**2)) < 0.25

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from ventbench.cli import diagnose as command
 from ventbench.errors import InputError
-from ventbench.plants import text_files
+from ventbench.plants.plant_files import load_plants
 from ventbench.recordings import write
 
 from . import made
@@ -117,7 +117,7 @@ def test_the_corrected_plant_can_be_diagnosed_itself(recording, tmp_path, calls)
     out = tmp_path / "out"
     run(recording, "--lung", "R20C50", "--out", out)
     corrected = out / "corrected.json"
-    found = text_files.load(corrected)
+    found = load_plants(corrected)
     assert list(found) == ["R20C50"]
     message = run(recording, "--plant", corrected, "--out", out, code=2)
     assert "has no lung R5C10 of the recording; it has R20C50" in message

@@ -16,7 +16,7 @@ from ventbench.errors import InputError
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNGS, Lung
 from ventbench.physics import library, parameter, paths, physics, resolution
-from ventbench.plants import files
+from ventbench.plants.plant_files import load_plant, save_plant
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.rollouts import open_loop
 
@@ -152,8 +152,8 @@ def test_end_expiratory_pressure():
 def test_file_round_trip(tmp_path):
     with precision.float64():
         plant = everything()
-        files.save(tmp_path / "plant.npz", plant)
-        loaded = files.load(tmp_path / "plant.npz")
+        save_plant(tmp_path / "plant.npz", plant)
+        loaded = load_plant(tmp_path / "plant.npz")
         assert loaded.names == plant.names
         assert isinstance(loaded, Plant)
         c = jnp.full(N, 5.0), *commands(top=20.0)

@@ -11,7 +11,7 @@ from ventbench.physics import library, mechanism, parameter, paths, strength_pat
 from ventbench.physics.catalogue import basis_terms, special_cases
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.physics.shapes import drawn
-from ventbench.plants import files
+from ventbench.plants.plant_files import load_plant, save_plant
 from ventbench.precision import float64
 from ventbench.rollouts import open_loop
 from ventbench.system_id import Simulator, fit, recorded, settings
@@ -254,8 +254,8 @@ def test_plants_with_slots_are_kept_in_files(bench, tmp_path):
         at = jnp.asarray(bench.data.position)
         found = bench.fit(truth, (), fixed=given)
         plant = found.plant().having(**given, position=at)
-        files.save(tmp_path / "plant.npz", plant)
-        loaded = files.load(tmp_path / "plant.npz")
+        save_plant(tmp_path / "plant.npz", plant)
+        loaded = load_plant(tmp_path / "plant.npz")
         assert loaded.names == plant.names
         assert "command_plays.c4" in loaded.names
         data = bench.data

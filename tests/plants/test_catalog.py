@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +15,18 @@ from ventbench import files, precision
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNG_IDS, LUNGS, Lung, lung
-from ventbench.plants import frozen, labelled, text_files
-from ventbench.plants.catalog import NAMES, load_simulators
+from ventbench.plants import frozen
+from ventbench.plants.catalog import load_simulators, names
+from ventbench.plants.plant_files import save_plants
 from ventbench.plants.single_compartment import single_compartment
+from ventbench.plants.stacking import nominal_plants
+from ventbench.plants.two_balloon import two_balloon
 from ventbench.recordings import write
 from ventbench.rollouts import open_loop_breaths
+
+single_compartments = partial(nominal_plants, single_compartment)
+two_balloons = partial(nominal_plants, two_balloon)
+
 
 SETTINGS = ["R20C50", "R5C10", "R20C50"]
 
@@ -41,7 +49,7 @@ def closed(breaths):
     return dataclasses.replace(breaths, u_out=np.zeros_like(breaths.u_out))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", names())
 def test_every_name_has_plants_for_lungs_and_for_breaths(name, breaths):
     found = load_simulators(name)
     assert (found.official is not None) == (name in ("frozen", "hybrid"))
@@ -67,9 +75,9 @@ def test_the_named_ones_are_what_they_say(breaths):
     base = load_simulators("physics")
     assert base.is_base_physics
     assert float(base.plant("R20C50").get("C")) == 50.0  # type: ignore[attr-defined]
-    wanted = open_loop_breaths(labelled.single_compartments, breaths)
+    wanted = open_loop_breaths(single_compartments, breaths)
     np.testing.assert_array_equal(base.pressures(breaths), wanted)
-    wanted = open_loop_breaths(labelled.two_balloons, breaths)
+    wanted = open_loop_breaths(two_balloons, breaths)
     np.testing.assert_array_equal(load_simulators("two_balloon").pressures(breaths), wanted)
 
 
@@ -93,7 +101,7 @@ def test_plants_by_lung_from_a_mapping_and_a_file(breaths, tmp_path):
         given.pressures(breaths), load_simulators("physics").pressures(breaths), atol=1e-9
     )
     path = tmp_path / "corrected.json"
-    text_files.save(path, plants)
+    save_plants(path, plants)
     found = load_simulators(path)
     assert found.lungs == (lung("R20C50"), lung("R5C10"))
     assert found.about == {"kind": "file", "file": path.name, "sha256": files.sha256(path)}

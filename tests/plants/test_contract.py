@@ -1,13 +1,17 @@
-"""What every plant must hold. Add a plant by one line in PLANTS; sizes as in the protocol.
+"""What every plant must hold. The cases are made from the registry of plant families.
 
-Physics plants promise more: a network gives what its training gave. Of the frozen simulators two
-stand here; what all six hold is in ``test_frozen_physics.py``.
+A family with a lung at its label is tried at the two ends of the scored settings and must behave
+like physics; the others need an example here. What all six frozen simulators hold is in
+``test_frozen_physics.py``. A new family is one line in the registry, as the last test shows.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,23 +19,31 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from jax import Array
 from numpy.typing import ArrayLike
 
 from ventbench import protocol
 from ventbench.controllers import expiratory
 from ventbench.interfaces import Plant
-from ventbench.lungs import LUNG_IDS, lung
+from ventbench.lungs import LUNG_IDS, Lung, lung
 from ventbench.physics import physics
 from ventbench.plants import frozen
+from ventbench.plants.catalog import load_simulators
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.learned import Architecture, learned
+from ventbench.plants.plant_files import save_plants
+from ventbench.plants.registry import FAMILIES, PlantFamily
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.two_balloon import two_balloon
 from ventbench.precision import float64
 from ventbench.rollouts import open_loop
+from ventbench.submissions import scoring
+from ventbench.submissions.folder import open_submission
 
 SMALL = Architecture(pressures=3, controls=4, width=16, depth=3, boundaries=2, boundary_width=8)
 SELU = Architecture(width=24, depth=4, boundaries=0, activation="selu")
+
+#: The two ends of the scored settings.
+STIFF_AND_SOFT = ("R5C10", "R20C50")
 
 
 def official(lung_id: str) -> Plant:
@@ -47,24 +59,37 @@ def bent(lung_id: str) -> Plant:
 
 def corrected(lung_id: str) -> Plant:
     """Make a textbook lung that lacked turbulence."""
-    had = lung(lung_id)
-    return Corrected(single_compartment(had), bent(lung_id), physics(had))
+    label = lung(lung_id)
+    return Corrected(single_compartment(label), bent(lung_id), physics(label))
 
 
-#: The two ends of the scored settings.
-STIFF_AND_SOFT = ("R5C10", "R20C50")
-#: Built anew in each precision.
-PLANTS = {
-    **{f"single_compartment-{x}": partial(single_compartment, lung(x)) for x in STIFF_AND_SOFT},
-    **{f"two_balloon-{x}": partial(two_balloon, lung(x)) for x in STIFF_AND_SOFT},
-    "physics-R5C10": partial(bent, "R5C10"),
-    "corrected-R20C50": partial(corrected, "R20C50"),
-    **{f"frozen-{x}": partial(official, x) for x in STIFF_AND_SOFT},
-    "learned-tanh": lambda: learned(jax.random.key(0), SMALL),
-    "learned-selu": lambda: learned(jax.random.key(1), SELU),
+#: Plants of the families that need more than a label.
+EXAMPLES = {
+    "physics": {"R5C10": partial(bent, "R5C10")},
+    "corrected": {"R20C50": partial(corrected, "R20C50")},
+    "hybrid": {name: partial(official, name) for name in STIFF_AND_SOFT},
+    "learned": {
+        "tanh": lambda: learned(jax.random.key(0), SMALL),
+        "selu": lambda: learned(jax.random.key(1), SELU),
+    },
 }
-TEXTBOOK = [name for name in PLANTS if name.startswith(("single", "two", "physics", "corrected"))]
-FROZEN = [name for name in PLANTS if name.startswith("frozen")]
+
+
+def cases(families: Mapping[str, PlantFamily]) -> dict[str, Callable[[], Any]]:
+    """Make the plants to try, by family and lung; they are built anew in each precision."""
+    found: dict[str, Callable[[], Any]] = {}
+    for name, family in families.items():
+        if family.for_lung is None:
+            examples = EXAMPLES[name]
+        else:
+            examples = {x: partial(family.for_lung, lung(x)) for x in STIFF_AND_SOFT}
+        found |= {f"{name}-{example}": make for example, make in examples.items()}
+    return found
+
+
+PLANTS = cases(FAMILIES)
+TEXTBOOK = [name for name in PLANTS if not name.startswith(("hybrid", "learned"))]
+FROZEN = [name for name in PLANTS if name.startswith("hybrid")]
 PHYSICS = TEXTBOOK + FROZEN
 #: Commands that hold PEEP while the expiratory valve is open, %: in the recordings, and so in what
 #: has learned from them, PEEP is held by a resting flow of about 5 %, the protocol's own bias.
@@ -234,3 +259,52 @@ def test_nominal_variation_changes_nothing(name):
     one = jnp.asarray(1.0)
     u_in = np.random.default_rng(4).uniform(0, 15, (1, T))
     np.testing.assert_array_equal(pressures(plant, u_in), pressures(plant.vary(one, one), u_in))
+
+
+@flax.struct.dataclass
+class FirstOrder:
+    """A toy family: pressure follows the command with a time constant; PEEP when the valve opens.
+
+    All that a family needs: ``init``, ``step``, ``vary`` and a lung at its label.
+    """
+
+    gain: Array
+    tau: Array
+
+    def init(self, pressure: Array, peep: Array | None = None) -> tuple[Array, Array]:
+        pressure = jnp.asarray(pressure) * 1.0
+        return pressure, pressure if peep is None else peep + 0.0 * pressure
+
+    def step(self, state, u_in, u_out, dt):
+        pressure, peep = state
+        goal = peep + (1.0 - u_out) * self.gain * u_in
+        pressure = goal + (pressure - goal) * jnp.exp(-dt / self.tau)
+        return (pressure, peep), pressure
+
+    def vary(self, r_scale, c_scale):
+        return FirstOrder(self.gain * r_scale, self.tau * r_scale * c_scale)
+
+
+def first_order(label: Lung) -> FirstOrder:
+    return FirstOrder(jnp.asarray(0.02 * label.R, float), jnp.asarray(0.1, float))
+
+
+def test_a_new_family_is_one_file_and_one_line(make_recording, tmp_path, monkeypatch):
+    monkeypatch.setitem(FAMILIES, "first_order", PlantFamily(FirstOrder, first_order))
+    for name, make in cases({"first_order": FAMILIES["first_order"]}).items():
+        monkeypatch.setitem(PLANTS, name, make)
+        monkeypatch.setitem(HOLDING, name, 0.0)
+        test_batched_equals_vmapped_equals_single(name)
+        test_stacked_plants_are_each_their_own(name)
+        test_expiration_returns_to_peep(name, 12.0)
+        test_nominal_variation_changes_nothing(name)
+    # It has a name for `--plant`, and its plants go into files of both formats.
+    simulators = load_simulators("first_order")
+    recording = make_recording(["R5C10", "R20C50"])
+    answers = simulators.pressures(recording)
+    for name in ("plants.json", "plants.npz"):
+        save_plants(tmp_path / name, {x: simulators.plant(x) for x in STIFF_AND_SOFT})
+        again = load_simulators(tmp_path / name).pressures(recording)
+        np.testing.assert_array_equal(again, answers)
+    score, _ = scoring.score(open_submission("pid_best"), simulators.stacked, pips=(10.0,))
+    assert np.isfinite(score.score)

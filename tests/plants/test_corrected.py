@@ -9,10 +9,11 @@ import pytest
 
 from ventbench.lungs import lung
 from ventbench.physics import physics
-from ventbench.plants import frozen, text_files
+from ventbench.plants import frozen
 from ventbench.plants.corrected import Corrected
+from ventbench.plants.plant_files import load_plants, save_plants
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stack import take
+from ventbench.plants.stacking import take
 from ventbench.precision import float64
 from ventbench.rollouts import open_loop
 
@@ -97,8 +98,8 @@ def test_peep_is_given_to_all_three(base, textbook):
 def test_back_from_json_to_the_bit(base, textbook, tmp_path):
     plant = Corrected(textbook, with_delay(gain=21.3), base)
     path = tmp_path / "corrected.json"
-    text_files.save(path, {"R20C50": plant})
-    found = text_files.load(path)["R20C50"]
+    save_plants(path, {"R20C50": plant})
+    found = load_plants(path)["R20C50"]
     assert type(found) is Corrected
     assert jax.tree.structure(found) == jax.tree.structure(plant)
     assert np.array_equal(run(found), run(plant))

@@ -15,7 +15,7 @@ from ventbench import files
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS, LUNGS, RECORDED_LUNGS
 from ventbench.plants import frozen
-from ventbench.plants.fingerprints import BY_ALL, Seen, fingerprints
+from ventbench.plants.frozen import BY_ALL, Seen, fingerprints
 from ventbench.precision import float64
 from ventbench.training.manifest import reference
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,11 +11,16 @@ import pytest
 from ventbench import open_loop_report
 from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
-from ventbench.plants.fingerprints import BY_NONE, fingerprints
-from ventbench.plants.labelled import single_compartments, two_balloons
+from ventbench.plants.frozen import BY_NONE, fingerprints
+from ventbench.plants.single_compartment import single_compartment
+from ventbench.plants.stacking import nominal_plants
+from ventbench.plants.two_balloon import two_balloon
 from ventbench.precision import float64
 from ventbench.recordings import join, load
 from ventbench.training.freeze import MEASURED, RECONSTRUCTED
+
+single_compartments = partial(nominal_plants, single_compartment)
+two_balloons = partial(nominal_plants, two_balloon)
 
 
 @pytest.fixture(scope="module")

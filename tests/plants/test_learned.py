@@ -10,7 +10,6 @@ import pytest
 from ventbench.lungs import lung
 from ventbench.plants.learned import HIGHEST, LOWEST, Architecture, Normalisation, learned
 from ventbench.plants.mlp import mlp
-from ventbench.plants.sensitivity import control_sensitivity
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.rollouts import open_loop
 
@@ -120,17 +119,3 @@ def test_impossible_constants_are_refused():
 def test_impossible_networks_are_refused(sizes, name, message):
     with pytest.raises(ValueError, match=message):
         mlp(jax.random.key(0), sizes, name)
-
-
-def test_control_sensitivity_is_the_derivative_and_counts_the_falls():
-    lung_ = single_compartment(lung("R20C20"))
-    u = jnp.full((2, 6), 10.0)
-    opened = jnp.asarray([[0, 0, 0, 1, 1, 1.0]] * 2)
-    found = control_sensitivity(lung_, jnp.full(2, 5.0), u, opened, jnp.full((2, 6), 0.03))
-    per_percent = 22.8e-3 * (20.0 + 0.03 / 20e-3)
-    np.testing.assert_allclose(found.derivative[:, :3], per_percent, rtol=1e-5)
-    np.testing.assert_array_equal(found.inspiratory[0], [1, 1, 1, 0, 0])
-    assert float(found.falling) == 0.0
-    backwards = replace(lung_, gain=-lung_.gain)
-    found = control_sensitivity(backwards, jnp.full(2, 5.0), u, opened, jnp.full((2, 6), 0.03))
-    assert float(found.falling) == 1.0

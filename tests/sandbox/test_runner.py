@@ -14,7 +14,7 @@ from ventbench import precision, protocol
 from ventbench.interfaces import Task
 from ventbench.lungs import LUNGS
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stack import stack
+from ventbench.plants.stacking import stack
 from ventbench.sandbox import runner as runner_module
 from ventbench.sandbox.allowance import Allowance
 from ventbench.sandbox.errors import SandboxError

@@ -11,7 +11,7 @@ import pytest
 from ventbench import precision
 from ventbench.lungs import LUNGS
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
-from ventbench.plants.stack import stack
+from ventbench.plants.stacking import stack
 
 MANIFEST = """\
 name = "mine"

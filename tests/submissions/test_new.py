@@ -25,7 +25,7 @@ NETWORKS = ("residual", "ppo", "dqn")
 def one_lung():
     from ventbench import precision
     from ventbench.plants.single_compartment import single_compartment
-    from ventbench.plants.stack import stack
+    from ventbench.plants.stacking import stack
 
     with precision.float64():
         return stack([single_compartment(LUNGS[0])])

@@ -16,7 +16,7 @@ from ventbench.interfaces import Task
 from ventbench.lungs import LUNG_IDS, LUNGS, lung
 from ventbench.metrics.waveform import run_error
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stack import take
+from ventbench.plants.stacking import take
 from ventbench.submissions import stepping
 from ventbench.submissions.errors import Failure, SubmissionError
 from ventbench.submissions.folder import open_submission

@@ -18,7 +18,7 @@ from ventbench.errors import InputError
 from ventbench.lungs import LUNGS
 from ventbench.plants.learned import Architecture
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stack import stack
+from ventbench.plants.stacking import stack
 from ventbench.recordings import write
 from ventbench.training import freeze
 from ventbench.training import learned as learning

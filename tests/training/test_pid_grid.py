@@ -10,7 +10,7 @@ from ventbench.controllers.pid import PID
 from ventbench.lungs import LUNGS
 from ventbench.metrics.waveform import run_error
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stack import stack, take
+from ventbench.plants.stacking import stack, take
 from ventbench.scenario import nominal
 from ventbench.training import pid_grid
 

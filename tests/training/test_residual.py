@@ -23,7 +23,7 @@ from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.metrics.waveform import run_error
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stack import stack, take
+from ventbench.plants.stacking import stack, take
 from ventbench.scenario import nominal
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.scoring import protocol_cells, run_protocol

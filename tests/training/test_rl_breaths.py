@@ -13,7 +13,7 @@ from ventbench.interfaces import Observation
 from ventbench.lungs import LUNGS
 from ventbench.metrics.waveform import run_error
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stack import stack
+from ventbench.plants.stacking import stack
 from ventbench.training.rl import breaths, features
 from ventbench.training.rl.networks import Dense, start
 from ventbench.training.rl.policies import Corrected

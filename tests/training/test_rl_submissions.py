@@ -13,7 +13,7 @@ import pytest
 from ventbench import precision, rollouts
 from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stack import stack
+from ventbench.plants.stacking import stack
 from ventbench.protocol import PIPS
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.scoring import protocol_cells, run_protocol

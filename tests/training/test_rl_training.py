@@ -12,7 +12,7 @@ import pytest
 from ventbench.errors import InputError
 from ventbench.lungs import LUNGS
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stack import stack
+from ventbench.plants.stacking import stack
 from ventbench.training.rl import training
 from ventbench.training.rl.dqn import DQN
 from ventbench.training.rl.policy_gradient import PolicyGradient

@@ -17,7 +17,7 @@ from ventbench.cli import app
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stack import stack
+from ventbench.plants.stacking import stack
 from ventbench.training import pid_grid, pid_tuning
 from ventbench.training.executor import InProcess, executor, results
 from ventbench.training.pid_tuning import Grid, grid

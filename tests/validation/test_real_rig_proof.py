@@ -20,8 +20,8 @@ from ventbench.diagnosis.result import Diagnosis
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS, LUNGS, lung
 from ventbench.physics import physics
-from ventbench.plants import text_files
 from ventbench.plants.corrected import Corrected
+from ventbench.plants.plant_files import save_plants
 from ventbench.recordings import join, write
 from ventbench.validation import real_rig_proof
 from ventbench.validation.real_rig_parts import (
@@ -40,7 +40,7 @@ from ventbench.validation.real_rig_proof import RECORDING, claims, cut, prove
 
 def keep(out: Path, found: Diagnosis) -> list[Path]:
     files.write_json(out / "diagnosis.json", found.as_dict())
-    text_files.save(out / "corrected.json", found.plants)
+    save_plants(out / "corrected.json", found.plants)
     return [out / "diagnosis.json", out / "corrected.json"]
 
 

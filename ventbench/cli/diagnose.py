@@ -82,7 +82,7 @@ def keep(out: Path, found: Diagnosis) -> list[Path]:
     """
     import ventbench
     from ventbench import files
-    from ventbench.plants import text_files
+    from ventbench.plants.plant_files import save_plants
     from ventbench.views.diagnosis import write_report, write_rerun
 
     recorded = found.traces.breaths
@@ -95,7 +95,7 @@ def keep(out: Path, found: Diagnosis) -> list[Path]:
     }
     diagnosis, corrected = out / "diagnosis.json", out / "corrected.json"
     files.write_json(diagnosis, found.as_dict())
-    text_files.save(corrected, found.plants, about)
+    save_plants(corrected, found.plants, about)
     report = write_report(out / "report.html", found)
     return [diagnosis, report, write_rerun(out / "diagnosis.rrd", found), corrected]
 
@@ -140,11 +140,11 @@ def _diagnose(breaths: Breaths, plant: str, lung: str | None, passive: bool) -> 
 def _plants(plant: str, breaths: Breaths) -> Any:
     """Plants of a file, which must have all lungs of the recording."""
     from ventbench.errors import InputError
-    from ventbench.plants import text_files
+    from ventbench.plants.plant_files import load_plants
 
     if not Path(plant).is_file():
         raise InputError(f"--plant {plant}: there is no such file, nor a plant of that name")
-    plants = text_files.load(Path(plant))
+    plants = load_plants(Path(plant))
     missing = [name for name in breaths.by_lung_index if name not in plants]
     if missing:
         raise InputError(

@@ -86,7 +86,7 @@ def _search(names: tuple[str, ...], out: Path, workers: int, scheduler: str | No
 
     from ventbench.lungs import LUNG_IDS
     from ventbench.plants import frozen
-    from ventbench.plants.stack import take
+    from ventbench.plants.stacking import take
     from ventbench.training.executor import executor
     from ventbench.training.pid_tuning import tune
 

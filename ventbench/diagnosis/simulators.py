@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Literal
 
 import numpy as np
 
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
-from ventbench.plants import alike
-from ventbench.plants.labelled import single_compartments
+from ventbench.plants.single_compartment import single_compartment
+from ventbench.plants.stacking import nominal_plants, stack_heterogeneous
 from ventbench.recordings.breaths import Breaths
 from ventbench.rollouts import PlantsFor, open_loop_breaths
 from ventbench.system_id.data import Data, Floats
@@ -30,7 +31,7 @@ def plants_for(plant: Given) -> PlantsFor:
         InputError: if there is no such simulator.
     """
     if plant == "physics":
-        return single_compartments
+        return partial(nominal_plants, single_compartment)
     if plant == "frozen":
         from ventbench.plants import frozen
 
@@ -45,7 +46,7 @@ def _stacked(plants: Mapping[str, Plant], breaths: Breaths) -> Plant:
     if missing:
         raise InputError(f"the simulator has no lung {missing[0]}; it has {', '.join(plants)}")
     chosen = [plants[name] for name in breaths.lung_ids.tolist()]
-    return alike.stacked(chosen)
+    return stack_heterogeneous(chosen)
 
 
 def answers(plant: Given, breaths: Breaths) -> Floats:

@@ -6,7 +6,7 @@ What is given                         What it stands for
 ``frozen`` (or ``hybrid``)            the official simulators
 ``learned``                           the paper's networks, trained on the same breaths
 ``physics``                           R-C lungs at their labels
-``two_balloon``                       the paper's balloon lungs at their labels
+``two_balloon``, ...                  another family of :mod:`~ventbench.plants.registry` at labels
 ``FILE.json``, ``FILE.npz``           plants of some lungs, such as a ``corrected.json``
 ``FOLDER``                            what ``ventbench train simulator`` wrote
 ``FILE.csv``, ``FILE.parquet``        simulated pressures of recorded breaths, in the public schema
@@ -27,7 +27,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -39,19 +39,15 @@ from ventbench.errors import InputError
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNGS, Lung, lung
 from ventbench.physics import physics
-from ventbench.plants import alike, frozen, labelled, text_files
-from ventbench.plants.each import Each
-from ventbench.plants.stack import take
-from ventbench.plants.two_balloon import two_balloon
+from ventbench.plants import frozen
+from ventbench.plants.plant_files import load_plants
+from ventbench.plants.registry import FAMILIES
+from ventbench.plants.single_compartment import single_compartment
+from ventbench.plants.stacking import VmappedPlant, nominal_plants, stack_heterogeneous, take
 from ventbench.recordings.breaths import Breaths
 from ventbench.rollouts import PlantsFor, open_loop, open_loop_breaths
 
 Floats = NDArray[np.float64]
-
-Kind = Literal["frozen", "learned", "physics", "two_balloon", "plants", "function", "pressures"]
-
-#: Simulators that need no file.
-NAMES = ("frozen", "hybrid", "learned", "physics", "two_balloon")
 
 #: Commands of a table of simulated pressures may differ from the recorded ones by rounding, %.
 _SAME_COMMAND = 0.05
@@ -98,9 +94,9 @@ class Simulators:
     """Simulators of lungs, whatever they were given as.
 
     Attributes:
-        kind: what they are. ``"frozen"``, ``"learned"``, ``"physics"``, ``"two_balloon"`` and
-            ``"plants"`` have plants; ``"function"`` answers to commands; ``"pressures"`` only to
-            the recorded commands of its own breaths.
+        kind: what they are. ``"function"`` answers to commands, ``"pressures"`` only to the
+            recorded commands of its own breaths; all others have plants: ``"plants"`` are those of
+            the caller or of a file, and else it is the name, such as ``"frozen"``.
         name: what messages and reports call them.
         about: JSON values that results keep of them: version, file, hashes.
         lungs: for which :attr:`stacked` has plants, in its order; empty where there is none.
@@ -108,7 +104,7 @@ class Simulators:
         official: the official set if they are it, else None.
     """
 
-    kind: Kind
+    kind: str
     name: str
     about: Mapping[str, Any]
     lungs: tuple[Lung, ...] = ()
@@ -118,6 +114,7 @@ class Simulators:
     _for_breaths: PlantsFor | None = None
     _cross_fitted: PlantsFor | None = None
     _training: frozen.Frozen | None = field(default=None, repr=False)
+    _make: Callable[[Lung], Plant] | None = None
     _function: PressureFunction | None = None
     _table: Mapping[int, tuple[Lung, Floats, Floats]] = field(default_factory=dict, repr=False)
 
@@ -149,8 +146,11 @@ class Simulators:
         Raises:
             InputError: if there is none.
         """
-        stacked, known = self.stacked, [entry.id for entry in self.lungs]
         wanted = lung(lung_id).id
+        if self._make is not None:
+            with precision.float64():
+                return jax.tree.map(np.asarray, self._make(lung(wanted)))
+        stacked, known = self.stacked, [entry.id for entry in self.lungs]
         if wanted not in known:
             raise InputError(
                 f"--lung {lung_id}: the simulators {self.name} have {', '.join(known)}"
@@ -181,7 +181,7 @@ class Simulators:
         """Return the plant of one recorded breath, without a leading axis; float64 leaves."""
         with precision.float64():
             stacked = self.for_breaths(breaths.select([index]))
-            inner = stacked.plants if isinstance(stacked, Each) else stacked
+            inner = stacked.plants if isinstance(stacked, VmappedPlant) else stacked
             return take(inner, 0)
 
     def held_out(self, breaths: Breaths) -> NDArray[np.bool_]:
@@ -308,6 +308,11 @@ class Simulators:
         return answers
 
 
+def names() -> tuple[str, ...]:
+    """Return the names of simulators that need no file."""
+    return tuple(_named())
+
+
 def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) -> Simulators:
     """Simulators by whatever stands for them; see the table of this module.
 
@@ -343,8 +348,8 @@ def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) 
 
 
 def _by_text(text: str) -> Simulators:
-    if text in _NAMED:
-        return _NAMED[text]()
+    if text in (named := _named()):
+        return named[text]()
     path = Path(text)
     if (path / frozen.MANIFEST).is_file():
         return _trained(path)
@@ -358,7 +363,7 @@ def _by_text(text: str) -> Simulators:
         return _imported(module, attribute)
     raise InputError(
         f"--plant {text!r}: there is no such file, nor a simulator of that name; choose "
-        f"{', '.join(NAMES)}, a file of plants (.json, .npz), a CSV or Parquet file of simulated "
+        f"{', '.join(names())}, a file of plants (.json, .npz), a CSV or Parquet file of simulated "
         "pressures, or module:function"
     )
 
@@ -391,36 +396,34 @@ def _learned() -> Simulators:
     )  # fmt: skip
 
 
-def _physics() -> Simulators:
-    def base() -> Plant:
+def _at_label(name: str, make: Callable[[Lung], Plant], for_breaths: PlantsFor) -> Simulators:
+    """Simulators that need no more than a label, and so know every lung."""
+
+    def stacked() -> Plant:
         with precision.float64():
-            return alike.stacked([physics(entry) for entry in LUNGS])
-
-    # Of recorded breaths the exact solution is quicker than the general solver.
-    return Simulators(
-        "physics", "physics", {"kind": "physics"}, LUNGS, None, None, base,
-        labelled.single_compartments,
-    )  # fmt: skip
-
-
-def _two_balloon() -> Simulators:
-    def balloons() -> Plant:
-        with precision.float64():
-            return alike.stacked([two_balloon(entry) for entry in LUNGS])
+            return stack_heterogeneous([make(entry) for entry in LUNGS])
 
     return Simulators(
-        "two_balloon", "two_balloon", {"kind": "two_balloon"}, LUNGS, None, None, balloons,
-        labelled.two_balloons,
-    )  # fmt: skip
+        name, name, {"kind": name}, LUNGS, None, None, stacked, for_breaths, _make=make
+    )
 
 
-_NAMED: dict[str, Callable[[], Simulators]] = {
-    "frozen": _official,
-    "hybrid": _official,  # the kind of plant that the official ones are
-    "learned": _learned,
-    "physics": _physics,
-    "two_balloon": _two_balloon,
-}
+def _named() -> dict[str, Callable[[], Simulators]]:
+    """By name, the simulators that need no file."""
+    found: dict[str, Callable[[], Simulators]] = {
+        "frozen": _official,
+        "hybrid": _official,  # the kind of plant that the official ones are
+        "learned": _learned,
+        # Of recorded breaths the exact solution is quicker than the general solver.
+        "physics": partial(
+            _at_label, "physics", physics, partial(nominal_plants, single_compartment)
+        ),
+    }
+    for name, family in FAMILIES.items():
+        if family.for_lung is not None:
+            for_breaths = partial(nominal_plants, family.for_lung)
+            found[name] = partial(_at_label, name, family.for_lung, for_breaths)
+    return found
 
 
 def _plants(
@@ -442,11 +445,11 @@ def _plants(
                 f"the simulator has no lung {missing[0]} of the recording ({name}); it has "
                 f"{', '.join(plants)}"
             )
-        return alike.stacked([plants[key] for key in breaths.lung_ids.tolist()])
+        return stack_heterogeneous([plants[key] for key in breaths.lung_ids.tolist()])
 
     return Simulators(
         "plants", name, about, tuple(lung(key) for key in plants), sha256, None,
-        lambda: alike.stacked(list(plants.values())), for_breaths,
+        lambda: stack_heterogeneous(list(plants.values())), for_breaths,
     )  # fmt: skip
 
 
@@ -463,14 +466,14 @@ def _single(plant: Plant, name: str, sha256: str | None = None) -> Simulators:
         about["sha256"] = sha256
     return Simulators(
         "plants", name, about, LUNGS, sha256, None, partial(repeated, len(LUNGS)),
-        lambda breaths: Each(repeated(len(breaths))),
+        lambda breaths: VmappedPlant(repeated(len(breaths))),
     )  # fmt: skip
 
 
 def _plant_file(path: Path) -> Simulators:
     digest = files.sha256(path)
     about = {"kind": "file", "file": path.name, "sha256": digest}
-    return _plants(text_files.load(path), path.name, about, digest)
+    return _plants(load_plants(path), path.name, about, digest)
 
 
 def _of_function(function: Any, name: str, sha256: str | None = None) -> Simulators:

@@ -6,6 +6,7 @@ breath is new to one of them. Member 0 is the official simulator, by which score
 
 from __future__ import annotations
 
+import hashlib
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,17 +22,38 @@ from ventbench.data_files import data_path
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNG_IDS, LUNGS, RECORDED_LUNGS
-from ventbench.plants import files as plant_files
-from ventbench.plants.each import Each
-from ventbench.plants.fingerprints import BY_ALL, Seen
 from ventbench.plants.hybrid import Hybrid
+from ventbench.plants.plant_files import load_plant
 from ventbench.plants.sessions import Sessions
+from ventbench.plants.stacking import VmappedPlant
 from ventbench.recordings.breaths import Breaths
 
 FORMAT = "ventbench-simulators-1"
 #: SHA-256 of the manifest of version 1, which holds those of all its files.
 MANIFEST_SHA256 = "10d5cc74ada5ed307dfc0f26e2b90820fe110f69437992042fd02b3735ebeed7"
 MANIFEST, MEMBERS, LEARNED, SEEN = "manifest.toml", "hybrid.npz", "learned.npz", "seen.npz"
+
+#: Fold of a breath that every member has seen, and of one that none has.
+BY_ALL, BY_NONE = -1, -2
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The breaths of the training.
+
+    Attributes:
+        key: :func:`fingerprints`, increasing, ``(k,)``.
+        fold: member that has not seen the breath, or :data:`BY_ALL`, ``(k,)``.
+    """
+
+    key: NDArray[np.uint64]
+    fold: NDArray[np.int8]
+
+    def folds(self, breaths: Breaths) -> NDArray[np.int64]:
+        """Look breaths up: a fold, :data:`BY_ALL` or :data:`BY_NONE`, shape ``(n,)``."""
+        wanted = fingerprints(breaths)
+        at = np.minimum(np.searchsorted(self.key, wanted), len(self.key) - 1)
+        return np.where(self.key[at] == wanted, self.fold[at].astype(np.int64), BY_NONE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +174,35 @@ class FrozenLearned:
                 f"no network was trained for {', '.join(unknown)}; known are {', '.join(ids)}"
             )
         at = np.array([ids.index(name) for name in breaths.lung_ids.tolist()], np.int64)
-        return Each(jax.tree.map(lambda leaf: jnp.asarray(leaf[member, at]), self.members))
+        return VmappedPlant(jax.tree.map(lambda leaf: jnp.asarray(leaf[member, at]), self.members))
+
+
+def fingerprints(breaths: Breaths) -> NDArray[np.uint64]:
+    """Short SHA-256 of each breath's lung and inspiratory commands, shape ``(n,)``.
+
+    By these it is known which breaths were in the training, without keeping the breaths. The clock
+    of a copy may have been estimated otherwise, and a published copy may lack its pressure.
+
+    Commands are rounded to 1e-4 %, so that a copy that was written with fewer digits is known.
+    """
+    out = np.empty(len(breaths), np.uint64)
+    commands = np.round(breaths.u_in * 1e4).astype("<i8")
+    for i, (lung, inspiratory) in enumerate(
+        zip(breaths.lung_ids, breaths.inspiratory, strict=True)
+    ):
+        digest = hashlib.sha256(str(lung).encode() + commands[i, inspiratory].tobytes())
+        out[i] = int.from_bytes(digest.digest()[:8], "little")
+    return out
+
+
+def seen(breaths: Breaths, fold: NDArray[np.int64]) -> Seen:
+    """Make the list; of copies of a breath, the one seen by most members decides."""
+    key = fingerprints(breaths)
+    order = np.lexsort((fold, key))
+    first = np.append(True, np.diff(key[order]) > 0)
+    kept = order[first]
+    repeated = np.isin(key[kept], key[order[~first]])
+    return Seen(key[kept], np.where(repeated, BY_ALL, fold[kept]).astype(np.int8))
 
 
 def folder(version: int = 1) -> Path:
@@ -172,7 +222,7 @@ def load(version: int = 1, path: Path | None = None) -> Frozen:
     """
     path = path or folder(version)
     manifest = _manifest(path)
-    members = plant_files.load(_checked(path, MEMBERS, manifest), as_array=np.asarray)
+    members = load_plant(_checked(path, MEMBERS, manifest), as_array=np.asarray)
     _checked(path, LEARNED, manifest)  # its hash is told with every score too
     return Frozen(
         path,
@@ -188,7 +238,7 @@ def load_learned(version: int = 1, path: Path | None = None) -> FrozenLearned:
     """Read the networks; see :func:`load`."""
     path = path or folder(version)
     manifest = _manifest(path)
-    members = plant_files.load(_checked(path, LEARNED, manifest), as_array=np.asarray)
+    members = load_plant(_checked(path, LEARNED, manifest), as_array=np.asarray)
     return FrozenLearned(members, _seen(path, manifest))
 
 

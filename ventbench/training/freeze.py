@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from ventbench import files, precision
 from ventbench.lungs import RECORDED_LUNGS, Lung
-from ventbench.plants import files as plant_files
 from ventbench.plants import frozen, sessions
-from ventbench.plants.fingerprints import BY_ALL, seen
+from ventbench.plants.frozen import BY_ALL, seen
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.learned import Architecture, Learned
+from ventbench.plants.plant_files import load_plant, save_plant
 from ventbench.recordings import Breaths, folds, join, load
 from ventbench.resume import Format, WorkFolder
 from ventbench.training import learned as networks
@@ -35,7 +35,7 @@ MEMBERS, SEED = 5, 0
 ARCHITECTURE = Architecture(width=48, depth=4)
 
 #: A plant with numpy leaves as a finished result.
-PLANT = Format(".npz", plant_files.save, partial(plant_files.load, as_array=np.asarray))
+PLANT = Format(".npz", save_plant, partial(load_plant, as_array=np.asarray))
 
 #: Called with what is being done and the share of all that is done, 0..1.
 Progress = Callable[[str, float], None]
@@ -130,8 +130,8 @@ def _write(
         join([data.measured, data.reconstructed]),
         np.append(data.fold, np.full(len(data.reconstructed), BY_ALL)),
     )
-    plant_files.save(out / frozen.MEMBERS, members)
-    plant_files.save(out / frozen.LEARNED, nets)
+    save_plant(out / frozen.MEMBERS, members)
+    save_plant(out / frozen.LEARNED, nets)
     files.write_atomically(
         out / frozen.SEEN, lambda file: np.savez(file, key=known.key, fold=known.fold)
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,9 +15,11 @@ from numpy.typing import NDArray
 from ventbench import files, open_loop_report
 from ventbench.lungs import LUNG_IDS, lung
 from ventbench.plants import frozen
-from ventbench.plants.labelled import single_compartments, two_balloons
 from ventbench.plants.learned import Architecture
 from ventbench.plants.sessions import Sessions
+from ventbench.plants.single_compartment import single_compartment
+from ventbench.plants.stacking import nominal_plants
+from ventbench.plants.two_balloon import two_balloon
 from ventbench.rollouts import PlantsFor
 
 if TYPE_CHECKING:
@@ -71,8 +74,8 @@ def judge(
     kinds: dict[str, PlantsFor] = {
         "hybrid": simulators.cross_fitted,
         "learned": learned.cross_fitted,
-        "single_compartment": single_compartments,
-        "two_balloon": two_balloons,
+        "single_compartment": partial(nominal_plants, single_compartment),
+        "two_balloon": partial(nominal_plants, two_balloon),
     }
     found = {
         kind: open_loop_report.errors(plants_for, measured) for kind, plants_for in kinds.items()

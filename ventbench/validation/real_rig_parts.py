@@ -23,8 +23,8 @@ from ventbench.interfaces import Plant
 from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter
 from ventbench.physics.model import Physics
-from ventbench.plants import text_files
 from ventbench.plants.corrected import Corrected
+from ventbench.plants.plant_files import load_plants
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.recordings.breaths import Breaths
 
@@ -95,7 +95,7 @@ def _removed(breaths: Breaths, out: Path) -> Setting | str:
         return "rc names nothing that all breaths share, so that there is nothing to remove"
     plants = {
         lung: without(plant, (name,)) if isinstance(plant, Physics) else plant
-        for lung, plant in text_files.load(corrected).items()
+        for lung, plant in load_plants(corrected).items()
     }
     about = {"removed": name, "corrected_sha256": files.sha256(corrected)}
     return Setting(breaths, plants, f"corrected R-C without {name}", name, about)

@@ -15,8 +15,8 @@ import pandas as pd
 from ventbench import files, open_loop_report
 from ventbench.lungs import LUNG_IDS, RECORDED_LUNGS
 from ventbench.metrics import bootstrap
-from ventbench.plants.each import Each
 from ventbench.plants.learned import Architecture
+from ventbench.plants.stacking import VmappedPlant
 from ventbench.recordings import Breaths
 from ventbench.resume import WorkFolder
 from ventbench.training import freeze
@@ -141,9 +141,9 @@ def _errors(nets: Any, breaths: Breaths, fold: np.ndarray) -> np.ndarray:
     """Open-loop error of each breath by the network that has not seen it, cmH2O, ``(n,)``."""
     of = {int(k): int(f) for k, f in zip(breaths.breath_id, fold, strict=True)}
 
-    def plants_for(some: Breaths) -> Each:
+    def plants_for(some: Breaths) -> VmappedPlant:
         at = np.array([LUNG_IDS.index(name) for name in some.lung_ids.tolist()])
         member = np.array([of[int(k)] for k in some.breath_id])
-        return Each(jax.tree.map(lambda leaf: jnp.asarray(leaf[member, at]), nets))
+        return VmappedPlant(jax.tree.map(lambda leaf: jnp.asarray(leaf[member, at]), nets))
 
     return open_loop_report.errors(plants_for, breaths)

@@ -19,7 +19,7 @@ from ventbench.controllers.residual import Residual
 from ventbench.interfaces import Controller, Plant
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics.waveform import run_error
-from ventbench.plants.stack import take
+from ventbench.plants.stacking import take
 from ventbench.scenario import nominal
 from ventbench.training import pid_grid
 from ventbench.training.pid_tuning.grid import tune

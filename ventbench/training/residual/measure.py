@@ -15,7 +15,7 @@ from ventbench.interfaces import Controller
 from ventbench.metrics import safety
 from ventbench.metrics.waveform import run_error
 from ventbench.plants import frozen
-from ventbench.plants.stack import take
+from ventbench.plants.stacking import take
 from ventbench.submissions.scoring import protocol_cells
 
 #: Published draws.

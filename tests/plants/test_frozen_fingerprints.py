@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ventbench.plants.fingerprints import BY_ALL, BY_NONE, fingerprints, seen
+from ventbench.plants.frozen import BY_ALL, BY_NONE, fingerprints, seen
 from ventbench.recordings import join, load, write
 
 LUNGS = ["R5C10", "R20C50", "R5C10", "R20C20"]

@@ -1,8 +1,8 @@
-"""The stitched network as a plant: windows of past pressures and controls to the next pressure."""
+"""The paper's stitched network as a plant: windows of past pressures and controls to the next."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import flax.struct
 import jax
@@ -10,8 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ventbench import protocol
-from ventbench.plants.learned.boundary import Boundary
-from ventbench.plants.mlp import MLP
+from ventbench.plants.mlp import ACTIVATIONS, MLP, layer_sizes, mlp
 
 #: Interval at which the network's rate output is an increment, s (mean of the recordings').
 REFERENCE_DT = 0.033
@@ -19,6 +18,98 @@ REFERENCE_DT = 0.033
 #: Pressures that a learned plant can reach, cmH2O: it bends towards them within 1 cmH2O and is
 #: exact (to float32) between 15 cmH2O above the lower and 15 below the upper one.
 LOWEST, HIGHEST = -15.0, 100.0
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Shape of a learned plant; the defaults are the paper's for R5C10.
+
+    Attributes:
+        pressures: length of the pressure window, H_p.
+        controls: length of the control window, H_c; the command now is its last entry.
+        width: of each hidden layer.
+        depth: number of matrices, the output's included (the authors' count).
+        boundaries: N_B, one-hidden-layer networks for the first steps of an inspiration.
+        boundary_width: their hidden width (authors' code: 100).
+        activation: ``"tanh"`` or ``"selu"``, of the general network; boundary ones are tanh.
+    """
+
+    pressures: int = 5
+    controls: int = 10
+    width: int = 150
+    depth: int = 9
+    boundaries: int = 1
+    boundary_width: int = 100
+    activation: str = "tanh"
+
+    def __post_init__(self) -> None:
+        """Refuse impossible shapes.
+
+        Raises:
+            ValueError: naming the field and its value.
+        """
+        for name in ("pressures", "controls", "width", "depth", "boundary_width"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"learned plant: {name} = {getattr(self, name)} must be >= 1")
+        if self.boundaries < 0:
+            raise ValueError(f"learned plant: boundaries = {self.boundaries} must be >= 0")
+        if self.activation not in ACTIVATIONS:
+            raise ValueError(
+                f"learned plant: activation {self.activation!r} is not one of "
+                f"{', '.join(ACTIVATIONS)}"
+            )
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """Constants of a learned plant, see :class:`Learned` for units."""
+
+    pressure_mean: float = 16.0
+    pressure_scale: float = 9.0
+    control_mean: float = 13.0
+    control_scale: float = 16.0
+    jump_scale: float = 2.0
+    rate_scale: float = 2.0
+    tau: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Refuse scales that are not positive.
+
+        Raises:
+            ValueError: naming the constant and its value.
+        """
+        for name in ("pressure_scale", "control_scale", "jump_scale", "rate_scale", "tau"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"learned plant: {name} = {getattr(self, name)} must be positive")
+
+
+@flax.struct.dataclass
+class Boundary:
+    """N_B networks of one hidden tanh layer, side by side in two matrices.
+
+    Attributes:
+        hidden: shape ``(in, N_B * width)``.
+        hidden_bias: shape ``(N_B * width,)``.
+        output: shape ``(N_B * width, 2)``.
+        output_bias: shape ``(N_B, 2)``.
+    """
+
+    hidden: Array
+    hidden_bias: Array
+    output: Array
+    output_bias: Array
+
+    def __call__(self, x: Array, index: Array) -> Array:
+        """Evaluate network ``index`` (shape ``(...)``) at inputs of shape ``(..., in)``.
+
+        All hidden layers are one matrix product; the others' units are then set to zero, so that
+        the output is one product too and no weight is gathered. Zero for an index beyond N_B.
+        """
+        count = self.output_bias.shape[0]
+        chosen = (index[..., None] == jnp.arange(count)).astype(x.dtype)
+        units = jnp.tanh(x @ self.hidden + self.hidden_bias)
+        units = units * jnp.repeat(chosen, units.shape[-1] // count, axis=-1)
+        return units @ self.output + chosen @ self.output_bias
 
 
 @flax.struct.dataclass
@@ -59,10 +150,9 @@ class Learned:
     *Bounds.* ``u_in`` is clipped to the valve's range and the pressure is bent towards ``LOWEST``
     and ``HIGHEST``, so that it stays finite for any sequence of commands.
 
-    *What it cannot promise.* Pressure need not rise with ``u_in``; see
-    :func:`ventbench.plants.sensitivity.control_sensitivity`. Where the recordings' commands come
-    from a feedback law, the command now tells the pressure now, and a network that sees both can
-    learn to read it there (the paper's does so too): its open-loop error on such recordings is
+    *What it cannot promise.* Pressure need not rise with ``u_in``. Where the recordings' commands
+    come from a feedback law, the command now tells the pressure now, and a network that sees both
+    can learn to read it there (the paper's does so too): its open-loop error on such recordings is
     then better than its physics.
 
     Source: the paper, section 4.3 and appendix B; authors' code for the boundary networks.
@@ -170,3 +260,55 @@ def _bend(pressure: Array) -> Array:
     """Bend towards ``LOWEST`` and ``HIGHEST``, the identity between."""
     raised = LOWEST + jax.nn.softplus(pressure - LOWEST)
     return HIGHEST - jax.nn.softplus(HIGHEST - raised)
+
+
+def learned(
+    key: Array, architecture: Architecture, normalisation: Normalisation | None = None
+) -> Learned:
+    """Draw an untrained learned plant; :func:`ventbench.training.learned.fit` trains one.
+
+    Args:
+        key: a JAX key that is used for nothing else.
+        architecture: its shape.
+        normalisation: its constants; the recordings' typical ones if not given.
+
+    Returns:
+        The plant with float32 leaves.
+    """
+    shape, n = architecture, normalisation or Normalisation()
+    inputs = shape.pressures + shape.controls
+    general_key, hidden_key, output_key = jax.random.split(key, 3)
+    general = mlp(
+        general_key,
+        layer_sizes(inputs, shape.width, shape.depth, 2),
+        shape.activation,
+        last_scale=0.1,
+    )
+    boundary = None
+    if shape.boundaries:
+        units = shape.boundaries * shape.boundary_width
+        hidden = jax.random.normal(hidden_key, (inputs, units), jnp.float32)
+        output = jax.random.normal(output_key, (units, 2), jnp.float32)
+        boundary = Boundary(
+            hidden * inputs**-0.5,
+            jnp.zeros(units, jnp.float32),
+            output * 0.1 * shape.boundary_width**-0.5,
+            jnp.zeros((shape.boundaries, 2), jnp.float32),
+        )
+    constants = (
+        n.pressure_mean,
+        n.pressure_scale,
+        n.control_mean,
+        n.control_scale,
+        n.jump_scale,
+        n.rate_scale,
+        n.tau,
+        1.0,
+        1.0,
+    )
+    return Learned(
+        general,
+        boundary,
+        *(jnp.asarray(x, jnp.float32) for x in constants),
+        windows=(shape.pressures, shape.controls),
+    )

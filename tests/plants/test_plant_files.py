@@ -1,0 +1,217 @@
+"""Plants in files and back, to the bit; what is no plant file is refused by name."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from ventbench import files as whole_files
+from ventbench import precision
+from ventbench.cli import app
+from ventbench.errors import InputError
+from ventbench.lungs import LUNGS, lung
+from ventbench.physics import physics
+from ventbench.plants import frozen, registry
+from ventbench.plants.corrected import Corrected
+from ventbench.plants.learned import Architecture, learned
+from ventbench.plants.plant_files import load_plant, load_plants, save_plant, save_plants
+from ventbench.plants.single_compartment import single_compartment
+from ventbench.plants.stacking import stack, stack_heterogeneous, take
+from ventbench.plants.two_balloon import two_balloon
+
+SMALL = Architecture(pressures=3, controls=4, width=8, depth=2, boundaries=1, boundary_width=4)
+PLANTS = {
+    "SingleCompartment": lambda: stack([single_compartment(lung) for lung in LUNGS]),
+    "TwoBalloon": lambda: two_balloon(LUNGS[0]),
+    "Learned": lambda: learned(jax.random.key(0), SMALL),
+    "Hybrid": lambda: frozen.load().ensemble,
+    "Corrected": lambda: Corrected(
+        single_compartment(LUNGS[0]), physics(LUNGS[0], {"valve_lag": {"tau": 0.04}}),
+        physics(LUNGS[0]),
+    ),
+    "Physics": lambda: physics(LUNGS[0], {"leak": {"conductance": 8.0}}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", PLANTS)
+def test_back_to_the_bit_with_dtype_shape_and_type(kind, tmp_path):
+    plant = PLANTS[kind]()
+    path = tmp_path / "plant.npz"
+    save_plant(path, plant)
+    found = load_plant(path, as_array=np.asarray)
+    assert type(found).__name__ == kind
+    assert jax.tree.structure(found) == jax.tree.structure(plant)
+    for leaf, wanted in zip(jax.tree.leaves(found), jax.tree.leaves(plant), strict=True):
+        assert isinstance(leaf, np.ndarray | np.generic)
+        assert leaf.dtype == np.asarray(wanted).dtype
+        np.testing.assert_array_equal(leaf, wanted)
+
+
+def test_every_family_is_tried():
+    families = {family.plant.__name__ for family in registry.FAMILIES.values()}
+    assert families == set(PLANTS)
+    for name in (*families, "Boundary", "MLP"):  # parts of a learned plant, and so in its file
+        assert registry.stored_type(name).__name__ == name
+
+
+def test_a_file_with_the_old_name_of_a_class_is_still_read(tmp_path, monkeypatch):
+    path = tmp_path / "plants.json"
+    save_plants(path, {"R5C10": single_compartment(LUNGS[0])})
+    path.write_text(path.read_text().replace('"SingleCompartment"', '"TextbookLung"'))
+    with pytest.raises(InputError, match="TextbookLung"):
+        load_plants(path)
+    monkeypatch.setitem(registry.RENAMED, "TextbookLung", "SingleCompartment")
+    assert float(load_plants(path)["R5C10"].C) == 10.0  # type: ignore[attr-defined]
+
+
+def test_equal_plants_give_equal_bytes(tmp_path):
+    for name in ("one.npz", "two.npz"):
+        save_plant(tmp_path / name, two_balloon(LUNGS[0]))
+    assert whole_files.sha256(tmp_path / "one.npz") == whole_files.sha256(tmp_path / "two.npz")
+
+
+def test_by_default_the_leaves_take_the_precision_in_force(tmp_path):
+    path = tmp_path / "plant.npz"
+    save_plant(path, take(frozen.load().plants, 0))
+    leaves = jax.tree.leaves(load_plant(path))
+    assert {leaf.dtype for leaf in leaves} == {jnp.float32.dtype}
+    with jax.enable_x64(True):
+        assert load_plant(path).R.dtype == np.float64
+
+
+def test_what_is_no_array_or_number_is_not_stored(tmp_path):
+    with pytest.raises(TypeError, match=r"\.1: a set cannot be stored"):
+        save_plant(tmp_path / "plant.npz", (1.0, {2.0}))
+    assert not list(tmp_path.iterdir())
+
+
+def altered(path, structure):
+    with np.load(path) as arrays:
+        content = {name: arrays[name] for name in arrays.files}
+    content["structure"] = np.array(structure)
+    np.savez(path, **content)
+
+
+@pytest.mark.parametrize(
+    "structure",
+    [
+        "{",
+        json.dumps({"type": "Popen", "fields": {}}),
+        json.dumps({"type": "SingleCompartment", "fields": {}}),
+        json.dumps({"type": "SingleCompartment", "fields": {"R": {"array": "nowhere"}}}),
+        json.dumps({"something": 1}),
+    ],
+)
+def test_a_wrong_structure_is_refused(structure, tmp_path):
+    path = tmp_path / "plant.npz"
+    save_plant(path, single_compartment(LUNGS[0]))
+    altered(path, structure)
+    with pytest.raises(InputError, match=r"plant\.npz is not a plant file of ventbench"):
+        load_plant(path)
+
+
+def test_other_files_are_refused(tmp_path):
+    text = tmp_path / "text.npz"
+    text.write_text("no archive")
+    with pytest.raises(InputError, match=r"text\.npz is not a plant file"):
+        load_plant(text)
+    pickled = tmp_path / "pickled.npz"
+    np.savez(pickled, structure=np.array({"a": 1}, dtype=object))
+    with pytest.raises(InputError, match=r"pickled\.npz is not a plant file"):
+        load_plant(pickled)
+    with pytest.raises(FileNotFoundError):
+        load_plant(tmp_path / "none.npz")
+
+
+def late(lung_id: str, **base: float):
+    with precision.float64():
+        return physics(lung(lung_id), {"valve_delay": {"delay": 1.0 / 24.0}}, **base)
+
+
+@pytest.mark.parametrize("suffix", [".json", ".npz"])
+@pytest.mark.parametrize("kind", ["physics", "frozen"])
+def test_plants_by_lung_come_back_to_the_bit(kind: str, suffix: str, tmp_path: Path) -> None:
+    plants = {"R20C50": late("R20C50"), "R33C7.5": late("R33C7.5", R_ex=6.1)}
+    if kind == "frozen":
+        plants = {item.id: take(frozen.load().plants, i) for i, item in enumerate(LUNGS[:2])}
+    path = tmp_path / f"corrected{suffix}"
+    save_plants(path, plants, {"recording": None})
+    found = load_plants(path)
+    assert list(found) == list(plants)
+    for name, plant in plants.items():
+        assert jax.tree.structure(found[name]) == jax.tree.structure(plant)
+        leaves, wanted = jax.tree.leaves(found[name]), jax.tree.leaves(plant)
+        for leaf, want in zip(leaves, wanted, strict=True):
+            assert leaf.dtype == np.asarray(want).dtype
+            np.testing.assert_array_equal(leaf, want)
+    save_plants(tmp_path / f"again{suffix}", plants, {"recording": None})
+    assert whole_files.sha256(path) == whole_files.sha256(tmp_path / f"again{suffix}")
+    if suffix == ".json":
+        assert json.loads(path.read_text())["about"] == {"recording": None}
+
+
+def test_what_is_no_file_of_plants_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "corrected.json"
+    save_plants(path, {"R20C50": late("R20C50")})
+    good = json.loads(path.read_text())
+    unknown = json.loads(json.dumps(good).replace('"Physics"', '"Popen"'))
+    dtype = json.loads(json.dumps(good).replace('"float64"', '"object"', 1))
+    label = {**good, "lungs": {"big": good["lungs"]["R20C50"]}}
+    for text in (
+        "", "[]", "{}", json.dumps({**good, "format": "x"}), json.dumps({**good, "lungs": {}}),
+        json.dumps(unknown), json.dumps(dtype), json.dumps(label),
+        json.dumps({**good, "arrays": {}}),
+    ):  # fmt: skip
+        path.write_text(text)
+        with pytest.raises(InputError, match=r"corrected\.json is not a file of plants"):
+            load_plants(path)
+
+
+def test_a_parameter_that_is_not_finite_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        save_plants(tmp_path / "x.json", {"R20C50": late("R20C50", gain=np.nan)})
+    assert not list(tmp_path.iterdir())
+
+
+def run(*arguments: object) -> tuple[int, str]:
+    found = CliRunner().invoke(app, [*map(str, arguments)])
+    if isinstance(found.exception, InputError):  # main() prints it and exits with 2
+        return 2, str(found.exception)
+    return found.exit_code, found.stdout
+
+
+def test_score_on_the_plants_of_a_file(tmp_path: Path) -> None:
+    """Its lungs are those of the file, and the score is that of the same plants elsewhere."""
+    from ventbench.submissions.folder import open_submission
+    from ventbench.submissions.scoring import score
+
+    plants = {name: single_compartment(lung(name)) for name in ("R20C20", "R5C10")}
+    path = tmp_path / "corrected.json"
+    save_plants(path, plants)
+    options = ("score", "pid_best", "--plant", path, "--in-process")
+    code, text = run(*options, "--json", "-")
+    plain = json.loads(text)
+    assert code == 0
+    assert list(plain["lungs"]) == ["R20C20", "R5C10"]
+    assert plain["official"] is False
+    assert plain["simulators"]["sha256"] == whole_files.sha256(path)
+    wanted, _ = score(
+        open_submission("pid_best"),
+        stack_heterogeneous(list(plants.values())),
+        lungs=[lung(name) for name in plants],
+    )
+    assert plain["score"] == pytest.approx(wanted.score, abs=1e-12)
+    code, text = run(*options)
+    assert code == 0
+    assert "R20C20" in text
+    assert "R5C20" not in text
+    code, text = run(*options, "--draws", 20, "--record", tmp_path / "records")
+    assert code == 2
+    assert "leave --plant out" in text
+    assert run("score", "pid_best", "--plant", "nothing")[0] == 2

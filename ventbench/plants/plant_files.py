@@ -1,0 +1,165 @@
+"""Plants in files: JSON that people can read, or one ``.npz`` with every array by its path.
+
+Never pickle: a file can only name the plant types of :mod:`ventbench.plants.registry`, by their
+class names. Numbers have full precision: what is read is to the bit what was written, and equal
+plants give equal bytes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ventbench import files
+from ventbench.errors import InputError
+from ventbench.interfaces import Plant
+from ventbench.lungs import lung
+from ventbench.plants import registry
+
+FORMAT = "ventbench-plants-1"
+
+_STRUCTURE = "structure"
+
+
+def save_plants(
+    path: Path, plants: Mapping[str, Plant], about: Mapping[str, Any] | None = None
+) -> None:
+    """Write plants of some lungs in one step, as JSON or, if the path ends so, as ``.npz``.
+
+    Args:
+        path: target, ``.json`` or ``.npz``.
+        plants: by the id of their lung, such as ``R20C50``.
+        about: JSON values that say where they come from.
+
+    Raises:
+        ValueError: if a parameter of a JSON file is not finite.
+        TypeError: if a plant has a part that no file can hold.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    lungs = {name: _encode(plant, name, arrays) for name, plant in plants.items()}
+    head = {"format": FORMAT, "about": dict(about or {}), "lungs": lungs}
+    if Path(path).suffix == ".npz":
+        _write_npz(path, head, arrays)
+        return
+    stored = {
+        name: {"dtype": str(array.dtype), "shape": list(array.shape), "values": array.tolist()}
+        for name, array in arrays.items()
+    }
+    files.write_json(path, {**head, "arrays": stored})
+
+
+def load_plants(path: Path, as_array: Callable[[Any], Any] = np.asarray) -> dict[str, Plant]:
+    """Read what :func:`save_plants` wrote.
+
+    Args:
+        path: of the file, ``.json`` or ``.npz``.
+        as_array: makes the leaves; those of numpy take the precision in force where they are used.
+
+    Returns:
+        Plants by the id of their lung, in the order of the file.
+
+    Raises:
+        InputError: if the file is not such a file, or names an unknown type of plant.
+        OSError: if it cannot be read.
+    """
+    try:
+        if Path(path).suffix == ".npz":
+            with np.load(path, allow_pickle=False) as npz:
+                head, arrays = json.loads(str(npz[_STRUCTURE])), dict(npz)
+        else:
+            head = json.loads(Path(path).read_bytes())
+            arrays = {}
+        if not isinstance(head, dict) or head.get("format") != FORMAT:
+            raise ValueError(f"its format is not {FORMAT}")
+        if not head["lungs"]:
+            raise ValueError("it holds no lung")
+        if "arrays" in head:
+            arrays = {name: _array(value) for name, value in head["arrays"].items()}
+        return {
+            lung(name).id: _decode(node, arrays, as_array) for name, node in head["lungs"].items()
+        }
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path} is not a file of plants ({error}); give a corrected.json that "
+            "`ventbench diagnose` wrote"
+        ) from error
+
+
+def save_plant(path: Path, plant: Any) -> None:
+    """Write one plant, or a stack of plants, as ``.npz`` in one step.
+
+    Raises:
+        TypeError: if it has a part that no file can hold.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    _write_npz(path, _encode(plant, "", arrays), arrays)
+
+
+def load_plant(path: Path, as_array: Callable[[Any], Any] = jnp.asarray) -> Any:
+    """Read what :func:`save_plant` wrote.
+
+    Args:
+        path: of the file.
+        as_array: makes the leaves; the default gives them the precision that is in force,
+            ``numpy.asarray`` that of the file.
+
+    Raises:
+        InputError: if the file is not a plant file, or names an unknown type of plant.
+        OSError: if it cannot be read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return _decode(json.loads(str(arrays[_STRUCTURE])), arrays, as_array)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} is not a plant file of ventbench: {error!r}") from error
+
+
+def _write_npz(path: Path, structure: Any, arrays: dict[str, np.ndarray]) -> None:
+    content: dict[str, Any] = {
+        **arrays,
+        _STRUCTURE: np.array(json.dumps(structure, sort_keys=True)),
+    }
+    files.write_atomically(path, lambda file: np.savez(file, **content))
+
+
+def _encode(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {
+            field.name: _encode(getattr(value, field.name), f"{path}.{field.name}", arrays)
+            for field in dataclasses.fields(value)
+        }
+        return {"type": type(value).__name__, "fields": fields}
+    if isinstance(value, tuple | list):
+        return {"tuple": [_encode(part, f"{path}.{i}", arrays) for i, part in enumerate(value)]}
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
+        name = path.removeprefix(".")
+        arrays[name] = np.asarray(value)
+        return {"array": name}
+    if isinstance(value, str | int | float | bool) or value is None:
+        return {"value": value}
+    raise TypeError(f"{path}: a {type(value).__name__} cannot be stored in a plant file")
+
+
+def _decode(node: dict[str, Any], arrays: Any, as_array: Callable[[Any], Any]) -> Any:
+    if "type" in node:
+        fields = {name: _decode(child, arrays, as_array) for name, child in node["fields"].items()}
+        return registry.stored_type(node["type"])(**fields)
+    if "tuple" in node:
+        return tuple(_decode(child, arrays, as_array) for child in node["tuple"])
+    if "array" in node:
+        return as_array(arrays[node["array"]])
+    return node["value"]
+
+
+def _array(value: dict[str, Any]) -> np.ndarray:
+    dtype = np.dtype(value["dtype"])
+    if dtype.kind not in "fiub":
+        raise ValueError(f"arrays of {dtype} have no place in it")
+    return np.array(value["values"], dtype).reshape(value["shape"])

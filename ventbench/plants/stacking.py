@@ -1,0 +1,140 @@
+"""Several plants as one: stacked along a leading axis, run side by side, made for every breath."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ventbench import precision
+from ventbench.errors import InputError
+from ventbench.interfaces import Plant
+from ventbench.lungs import Lung
+from ventbench.physics.model import Physics
+from ventbench.recordings.breaths import Breaths
+
+PlantT = TypeVar("PlantT")
+
+
+def stack(plants: Sequence[PlantT]) -> PlantT:
+    """Stack plants of equal structure along a new leading axis.
+
+    Raises:
+        ValueError: if there is none, or their structures differ.
+    """
+    if not plants:
+        raise ValueError("no plants to stack")
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *plants)
+
+
+def take(plants: PlantT, *index: int) -> PlantT:
+    """Return one plant of a stack, by its index on each of the leading axes."""
+    return jax.tree.map(lambda leaf: leaf[index], plants)
+
+
+def nominal_plants(make: Callable[[Lung], Plant], breaths: Breaths) -> Plant:
+    """Plants of recorded breaths at what their labels say: nothing is learned.
+
+    Args:
+        make: gives the plant of a lung.
+        breaths: n recorded breaths.
+
+    Returns:
+        A plant with leaves ``(n, ...)``.
+    """
+    labels = list(zip(breaths.R.tolist(), breaths.C.tolist(), strict=True))
+    different = list(dict.fromkeys(labels))
+    plants = stack([make(Lung(*label)) for label in different])
+    at = np.array([different.index(label) for label in labels])
+    return jax.tree.map(lambda leaf: leaf[at], plants)
+
+
+def stack_heterogeneous(plants: Sequence[Plant]) -> Plant:
+    """Stack plants along a new leading axis, also where their physics name different parameters.
+
+    They keep their precision. A mechanism that only some have is neutral in the others, and so
+    changes nothing there.
+
+    Raises:
+        InputError: if they are of different kinds or sizes.
+    """
+    similar = _with_equal_parameters(list(plants))
+    try:
+        return jax.tree.map(
+            lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *similar
+        )
+    except ValueError as error:
+        raise InputError(
+            "the plants of the file's lungs have different structures and cannot be run together; "
+            "make a file for each lung"
+        ) from error
+
+
+def _with_equal_parameters(plants: list[Any]) -> list[Any]:
+    """Name the union of the parameters at every place where there are physics."""
+    first = plants[0]
+    same_type = all(type(plant) is type(first) for plant in plants)
+    if not dataclasses.is_dataclass(first) or not same_type:
+        return plants
+    if isinstance(first, Physics):
+        return _physics_with_equal_parameters(plants)
+    for field in dataclasses.fields(first):
+        parts = [getattr(plant, field.name) for plant in plants]
+        if dataclasses.is_dataclass(parts[0]):
+            plants = [
+                dataclasses.replace(plant, **{field.name: part})
+                for plant, part in zip(plants, _with_equal_parameters(parts), strict=True)
+            ]
+    return plants
+
+
+def _physics_with_equal_parameters(plants: list[Physics]) -> list[Physics]:
+    names = list(dict.fromkeys(name for plant in plants for name in plant.names))
+    substeps = max(plant.substeps for plant in plants)
+    memory = max(plant.memory for plant in plants)
+    completed = []
+    for plant in plants:
+        # One that has no PEEP takes the pressure that it starts from, which no number can say.
+        missing = [name for name in names if name not in plant.names]
+        if "PEEP" in missing:
+            raise InputError("some of the file's plants have a PEEP of their own and some not")
+        with precision.float64():
+            full = plant.having(**{name: plant.get(name) for name in missing})
+        values = tuple(np.asarray(value) for value in full.values)
+        completed.append(dataclasses.replace(full, values=values, substeps=substeps, memory=memory))
+    return completed
+
+
+@flax.struct.dataclass
+class VmappedPlant:
+    """A stack of n plants as one plant, for kinds whose parameters cannot broadcast.
+
+    Every argument has shape ``(n,)``.
+
+    Attributes:
+        plants: every leaf ``(n, ...)``.
+    """
+
+    plants: Any
+
+    def init(self, pressure: Array, peep: Array | None = None) -> Any:
+        """State of lungs at rest; see :class:`~ventbench.interfaces.Plant`."""
+
+        def init(plant: Plant, pressure: Array, peep: Array) -> Any:
+            return plant.init(pressure, peep)
+
+        return jax.vmap(init)(self.plants, pressure, pressure if peep is None else peep)
+
+    def step(self, state: Any, u_in: Array, u_out: Array, dt: Array) -> tuple[Any, Array]:
+        """Hold one command each."""
+
+        def step(plant: Plant, state: Any, u_in: Array, u_out: Array, dt: Array) -> Any:
+            return plant.step(state, u_in, u_out, dt)
+
+        return jax.vmap(step)(self.plants, state, u_in, u_out, dt)

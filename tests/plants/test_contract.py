@@ -306,5 +306,5 @@ def test_a_new_family_is_one_file_and_one_line(make_recording, tmp_path, monkeyp
         save_plants(tmp_path / name, {x: simulators.plant(x) for x in STIFF_AND_SOFT})
         again = load_simulators(tmp_path / name).pressures(recording)
         np.testing.assert_array_equal(again, answers)
-    score, _ = scoring.score(open_submission("pid_best"), simulators.stacked, pips=(10.0,))
+    score = scoring.run_protocol(open_submission("pid_best"), simulators.stacked, pips=(10.0,))
     assert np.isfinite(score.score)

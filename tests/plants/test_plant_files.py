@@ -189,7 +189,7 @@ def run(*arguments: object) -> tuple[int, str]:
 def test_score_on_the_plants_of_a_file(tmp_path: Path) -> None:
     """Its lungs are those of the file, and the score is that of the same plants elsewhere."""
     from ventbench.submissions.folder import open_submission
-    from ventbench.submissions.scoring import score
+    from ventbench.submissions.scoring import run_protocol
 
     plants = {name: single_compartment(lung(name)) for name in ("R20C20", "R5C10")}
     path = tmp_path / "corrected.json"
@@ -201,7 +201,7 @@ def test_score_on_the_plants_of_a_file(tmp_path: Path) -> None:
     assert list(plain["lungs"]) == ["R20C20", "R5C10"]
     assert plain["official"] is False
     assert plain["simulators"]["sha256"] == whole_files.sha256(path)
-    wanted, _ = score(
+    wanted = run_protocol(
         open_submission("pid_best"),
         stack_heterogeneous(list(plants.values())),
         lungs=[lung(name) for name in plants],

@@ -165,7 +165,7 @@ def test_failures_are_shown_and_escaped(textbook):
 
 def textbook_lung():
     from ventbench.plants.single_compartment import single_compartment
-    from ventbench.plants.stack import stack
+    from ventbench.plants.stacking import stack
 
     with precision.float64():
         return stack([single_compartment(LUNGS[0])])

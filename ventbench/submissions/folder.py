@@ -134,7 +134,8 @@ def submission_of(controller: Any) -> Submission:
     elif callable(getattr(controller, "act", None)):
         raise SubmissionError(f"give the class {name}, not an instance: each run needs a new one")
     elif callable(controller):
-        make, tracks = (lambda: _Stateless(controller)), TRACKS[::-1]
+        function: Any = controller
+        make, tracks = (lambda: _Stateless(function)), TRACKS[::-1]
     else:
         raise SubmissionError(
             f"a {name} cannot be scored; give a folder, the name of a bundled submission, a class "

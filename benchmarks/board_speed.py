@@ -17,9 +17,8 @@ import time
 from pathlib import Path
 
 from ventbench import draws
-from ventbench.board import build, canonical, chain, create, record, store
-from ventbench.board.replay import replay
-from ventbench.board.replayed import Simulators
+from ventbench.board import build, canonical, create, record, store
+from ventbench.board.replay import Simulators, replay
 from ventbench.board.verify import verify
 from ventbench.plants import frozen
 from ventbench.submissions.folder import open_submission
@@ -54,7 +53,7 @@ def drafts(plants: Simulators) -> list[create.Draft]:
 
 def fill(folder: Path, made: list[create.Draft], count: int) -> None:
     """Write a leaderboard of that many entries; the first keeps its name, as the PID."""
-    lines, head = b"", chain.START
+    lines, head = b"", store.CHAIN_START
     for draft in made:
         draft.save(folder / store.RECORDS).unlink()
     for index in range(count):
@@ -64,9 +63,9 @@ def fill(folder: Path, made: list[create.Draft], count: int) -> None:
         content = canonical.canonical(values)
         item = record.from_bytes(content, "synthetic")
         (folder / store.RECORDS / f"{item.sha256}{record.SUFFIX}").write_bytes(content)
-        line = chain.line(index, item, head)
+        line = store.chain_line(index, item, head)
         head, lines = canonical.digest(line), lines + line
-    (folder / chain.FILE).write_bytes(lines)
+    (folder / store.CHAIN).write_bytes(lines)
 
 
 def report(what: str, seconds: float, limit: float) -> None:

@@ -16,8 +16,7 @@ import pytest
 from ventbench import draws, precision
 from ventbench.board import build, create, record, store
 from ventbench.board.record import Record
-from ventbench.board.replay import replay
-from ventbench.board.replayed import Simulators
+from ventbench.board.replay import Simulators, replay
 from ventbench.lungs import LUNG_IDS, LUNGS, Lung
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment

@@ -82,8 +82,8 @@ def test_a_correction_says_why_and_whence(leaderboard: Path, draft) -> None:
     run("build", "--folder", leaderboard)
     assert "all is well: 9 records" in run("verify", "--folder", leaderboard)
     new = store.load(leaderboard).scores[-1]
-    assert new.content["supersedes"] == old.sha256
-    assert new.content["provenance"] == {"commit": "9c1e5d0"}
+    assert new.header.supersedes == old.sha256
+    assert new.header.provenance == {"commit": "9c1e5d0"}
     page = (leaderboard / "entries/v1/performance/softer.html").read_text()
     assert "<b>counts</b>: a bug" in page
     assert '<th scope="row">commit</th><td>9c1e5d0</td>' in page

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ventbench.board import chain
+from ventbench.board import store
 from ventbench.board.verify import verify
 from ventbench.plants import frozen
 
@@ -14,7 +14,7 @@ FOLDER = Path(__file__).parents[2] / "leaderboard"
 
 
 def test_the_published_leaderboard_verifies() -> None:
-    if not (FOLDER / chain.FILE).is_file():
+    if not (FOLDER / store.CHAIN).is_file():
         pytest.skip("this copy of the project has no leaderboard")
     report = verify(FOLDER, frozen.load)
     assert report.problems == []

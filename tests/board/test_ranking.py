@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
+import msgspec
 import numpy as np
 import pytest
 from scipy import stats
 
 from ventbench.board import ranking
+from ventbench.board.ranking import Entry, Event
 from ventbench.board.record import Record
-from ventbench.board.standing import Entry, Event
 from ventbench.metrics import bootstrap
 
 from .conftest import opened
@@ -23,13 +24,13 @@ def base(drafts) -> Record:
 
 def _entry(base: Record, name: str, by_draw: np.ndarray) -> Entry:
     """An entry whose score on each draw is given."""
-    content = {**base.content}
-    manifest = {**base.manifest, "name": name}
-    content["submission"] = {**content["submission"], "manifest": manifest}
+    manifest = msgspec.structs.replace(base.manifest, name=name)
+    submission = msgspec.structs.replace(base.header.submission, manifest=manifest)
+    header = msgspec.structs.replace(base.header, submission=submission)
     drawn = np.broadcast_to(by_draw[:, None, None], base.drawn.shape).copy()
     # A fresh object: the cached properties of the old one do not come along.
     fields = {f.name: getattr(base, f.name) for f in dataclasses.fields(base)}
-    record = Record(**{**fields, "content": content, "drawn": drawn})
+    record = Record(**{**fields, "header": header, "drawn": drawn})
     return Entry(record, (Event(record, None),), ())
 
 

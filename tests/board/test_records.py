@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ventbench import draws, files, protocol
-from ventbench.board import actions, canonical, commands, create, record, standing, store
+from ventbench.board import actions, canonical, create, ranking, record, store
 from ventbench.board.record import Record
 from ventbench.errors import InputError
 
@@ -43,7 +43,7 @@ def test_a_record_is_small(drafts) -> None:
 def test_commands_come_back_bit_for_bit(drafts, scores, tmp_path: Path) -> None:
     item = record.load(drafts["pid_best"].save(tmp_path))
     assert isinstance(item, Record)
-    found = commands.load(item, tmp_path)
+    found = actions.load(item, tmp_path)
     assert found.tobytes() == scores["pid_best"].requested.tobytes()
 
 
@@ -83,10 +83,10 @@ def test_spread_is_the_deviation_of_the_ensemble(drafts, scores, simulators: Tex
 
 def test_every_failure_is_there(draft) -> None:
     item = opened(draft("weak", failed=30, texts="x" * 3000))
-    assert item.content["failed_cells"] == len(item.content["failures"]) == 30
+    assert item.header.failed_cells == len(item.header.failures) == 30
     assert np.isnan(item.nominal).sum() == 30
     assert np.isnan(item.exploitation)
-    (first, *_) = standing.reasons(standing.Event(item, None))
+    (first, *_) = ranking.reasons(ranking.Event(item, None))
     assert first.startswith("30 of 756 cells failed, the first: weak: xxx")
     assert len(first) < 400
 
@@ -216,7 +216,7 @@ def test_the_newest_official_record_counts(leaderboard: Path, draft, simulators)
     old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
     new = put(leaderboard, draft("softer", factor=0.96), simulators)
     home = put(leaderboard, draft("softer", factor=0.95, sandbox=None), simulators)
-    track = standing.standings(store.load(leaderboard).records)[1]["performance"]
+    track = ranking.standings(store.load(leaderboard).records)[1]["performance"]
     entry = next(x for x in track.ranked if x.record.name == "softer")
     assert entry.record.sha256 == new.sha256
     assert [event.record.sha256 for event in entry.history] == [
@@ -228,7 +228,7 @@ def test_the_newest_official_record_counts(leaderboard: Path, draft, simulators)
 def test_a_withdrawn_record_is_listed_with_its_reason(leaderboard: Path) -> None:
     old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
     store.withdraw(leaderboard, old.sha256[:10], "its <b>authors</b> found a bug")
-    track = standing.standings(store.load(leaderboard).records)[1]["performance"]
+    track = ranking.standings(store.load(leaderboard).records)[1]["performance"]
     assert "softer" not in [x.record.name for x in track.ranked]
     (entry,) = [x for x in track.unranked if x.record.name == "softer"]
     assert entry.reasons == ("withdrawn: its <b>authors</b> found a bug",)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ventbench import protocol
-from ventbench.board import actions, build, canonical, chain, commands, create, record, store
+from ventbench.board import actions, build, canonical, create, record, store
 from ventbench.board.verify import Report, verify
 from ventbench.errors import InputError
 from ventbench.plants import frozen
@@ -35,7 +35,7 @@ def test_all_is_well(full: Path, check) -> None:
     assert (report.records, report.replayed) == (8, 8)
     assert report.deviation <= 1e-9
     assert told[-1] == (8, 8)
-    assert report.head == canonical.digest((full / chain.FILE).read_bytes().splitlines(True)[-1])
+    assert report.head == canonical.digest((full / store.CHAIN).read_bytes().splitlines(True)[-1])
 
 
 def _flip(path: Path, index: int, bit: int = 0) -> None:
@@ -52,7 +52,7 @@ def _sound(folder: Path, only: str | None = None) -> list[str]:
         try:
             item = store.read_record(folder, link)
             if isinstance(item, record.Record):
-                commands.load(item, folder / store.RECORDS)
+                actions.load(item, folder / store.RECORDS)
         except InputError as error:
             wrong.append(str(error))
     return wrong
@@ -76,7 +76,7 @@ def test_every_flipped_byte_of_a_record_is_found(leaderboard: Path, suffix: str)
 
 
 def test_every_flipped_byte_of_the_chain_is_found(leaderboard: Path, check) -> None:
-    path = leaderboard / chain.FILE
+    path = leaderboard / store.CHAIN
     content = path.read_bytes()
     for place in range(0, len(content), 29):
         _flip(path, place)
@@ -85,7 +85,7 @@ def test_every_flipped_byte_of_the_chain_is_found(leaderboard: Path, check) -> N
         path.write_bytes(content)
     _flip(path, len(content) // 2)
     (problem,) = check(leaderboard).problems
-    assert f"{chain.FILE} line" in problem
+    assert f"{store.CHAIN} line" in problem
 
 
 def test_a_flipped_record_and_its_replay_are_named(leaderboard: Path, check) -> None:
@@ -170,7 +170,7 @@ def _forge(folder: Path, name: str, change: dict[str, Any]) -> Path:
     fresh = folder.parent / "forged"
     shutil.rmtree(fresh, ignore_errors=True)
     (fresh / store.RECORDS).mkdir(parents=True)
-    lines, head = b"", chain.START
+    lines, head = b"", store.CHAIN_START
     kept = [item for item in store.load(folder).scores if item.name in KEPT]
     for index, item in enumerate(kept):
         content = (folder / store.RECORDS / f"{item.sha256}.json").read_bytes()
@@ -182,11 +182,11 @@ def _forge(folder: Path, name: str, change: dict[str, Any]) -> Path:
         (fresh / store.RECORDS / f"{canonical.digest(content)}.json").write_bytes(content)
         new = record.from_bytes(content, "forged")
         assert isinstance(new, record.Record)
-        shutil.copy(commands.path_of(new, folder / store.RECORDS), fresh / store.RECORDS)
-        line = chain.line(index, new, head)
+        shutil.copy(actions.path_of(new, folder / store.RECORDS), fresh / store.RECORDS)
+        line = store.chain_line(index, new, head)
         head = canonical.digest(line)
         lines += line
-    (fresh / chain.FILE).write_bytes(lines)
+    (fresh / store.CHAIN).write_bytes(lines)
     build.build(fresh)
     return fresh
 
@@ -236,7 +236,7 @@ def test_a_consistent_forgery_does_not_replay(full: Path, tmp_path: Path, check,
 def test_a_noted_head_must_still_be_there(leaderboard: Path, check) -> None:
     links = store.read_chain(leaderboard)
     assert check(leaderboard, head=links[3].sha256).problems == []
-    path = leaderboard / chain.FILE
+    path = leaderboard / store.CHAIN
     path.write_bytes(b"".join(path.read_bytes().splitlines(True)[:-1]))
     build.build(leaderboard)
     problems = check(leaderboard, head=links[-1].sha256).problems

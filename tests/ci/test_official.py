@@ -53,7 +53,7 @@ def check_record(repository, commit, out, lines):
     assert isinstance(found, record.Record)
     assert (found.name, found.track) == ("demo", "robustness")
     assert not found.official, "its simulators are textbook lungs, not the frozen ones"
-    assert found.content["provenance"] == {
+    assert found.header.provenance == {
         "repository": repository.url,
         "commit": commit,
         "tree": repository.git("rev-parse", f"{commit}:{PATH}"),

@@ -1,12 +1,32 @@
 """The leaderboard: immutable records, a chain over them, pages built from nothing else.
 
 - :mod:`~ventbench.board.canonical`: the one text of a JSON value, and its hash;
+- :mod:`~ventbench.board.schema`: what a record's JSON must look like;
+- :mod:`~ventbench.board.record`: a record as arrays; :mod:`~ventbench.board.create` makes one;
 - :mod:`~ventbench.board.actions`: every command of a scored run, without loss;
-- :mod:`~ventbench.board.record`: what a record holds; :mod:`~ventbench.board.create` makes one;
 - :mod:`~ventbench.board.replay`: recorded commands through the frozen simulators again;
-- :mod:`~ventbench.board.chain`, :mod:`~ventbench.board.store`: the folder ``leaderboard/``;
-- :mod:`~ventbench.board.fit`: whether records fit together;
-- :mod:`~ventbench.board.standing`: which record of an entry counts, and why one is not ranked;
-- :mod:`~ventbench.board.ranking`: ranks, intervals, differences;
+- :mod:`~ventbench.board.store`: the folder ``leaderboard/`` and its chain;
+- :mod:`~ventbench.board.ranking`: which record of an entry counts, ranks, intervals, differences;
+- :mod:`~ventbench.board.frames`: the board as CSV and as pandas frames;
 - :mod:`~ventbench.board.build`: CSV and pages; :mod:`~ventbench.board.verify`: everything again.
+
+:func:`load_board` and :func:`load_cells` give the board as pandas frames.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ventbench.board.frames import load_board, load_cells
+
+__all__ = ["load_board", "load_cells"]
+
+
+def __getattr__(name: str) -> Any:
+    # Lazy: the parts of the board that jobs and commands use need none of the frames' imports.
+    if name in __all__:
+        from ventbench.board import frames
+
+        return getattr(frames, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""Every command of a scored run in one file, bit for bit.
+"""Every command of a scored run in one file, bit for bit, and that it is the right file.
 
 The file is zlib over byte planes: the first bytes of all little-endian float64 numbers, then their
 second bytes, and so on; sign and exponent then compress, the noisy mantissa does not. In numpy::
@@ -11,13 +11,18 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ventbench import protocol
+from ventbench.board import canonical
 from ventbench.errors import InputError
+
+if TYPE_CHECKING:
+    from ventbench.board.record import Record
 
 Floats = NDArray[np.float64]
 
@@ -27,8 +32,8 @@ ENCODING = "zlib, byte planes of little-endian float64"
 #: End of the file's name, after its SHA-256.
 SUFFIX = ".actions"
 
-#: Bytes that a file may not exceed: float64 noise does not compress, but hardly grows.
-MOST_BYTES = 2_000_000
+#: Largest file, bytes: float64 noise does not compress, but hardly grows.
+MAX_BYTES = 2_000_000
 
 
 def encode(requested: Floats) -> bytes:
@@ -70,12 +75,44 @@ def decode(content: bytes, shape: Sequence[int], label: str) -> Floats:
         raise InputError(f"{label} does not hold commands of shape {tuple(shape)}")
     planes = np.frombuffer(raw, np.uint8).reshape(8, -1)
     values: Any = np.ascontiguousarray(planes.T)
-    found = values.view("<f8").reshape(tuple(shape)).astype(np.float64)
-    if not np.all(np.isfinite(found)):
+    requested = values.view("<f8").reshape(tuple(shape)).astype(np.float64)
+    if not np.all(np.isfinite(requested)):
         raise InputError(f"{label} holds a command that is not finite")
-    return found
+    return requested
 
 
 def shape(lungs: int, draws: int, pips: int) -> tuple[int, int, int, int, int]:
     """Shape of the commands of a score: ``(L, 1 + K, P, BREATHS, INSPIRATION)``."""
     return lungs, 1 + draws, pips, protocol.BREATHS, protocol.INSPIRATION_STEPS
+
+
+def path_of(record: Record, folder: Path) -> Path:
+    """Where the commands of a record lie."""
+    return folder / f"{record.header.actions.sha256}{SUFFIX}"
+
+
+def load(record: Record, folder: Path) -> Floats:
+    """Read the commands of a record.
+
+    Args:
+        record: whose they are.
+        folder: that holds the file.
+
+    Returns:
+        %, shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``.
+
+    Raises:
+        InputError: if the file is missing, or not the one that the record names.
+    """
+    path, actions = path_of(record, folder), record.header.actions
+    if not path.is_file() or path.is_symlink():
+        raise InputError(f"{path} is missing: the commands of record {record.sha256[:12]}")
+    if path.stat().st_size > MAX_BYTES:
+        raise InputError(f"{path} is larger than {MAX_BYTES / 1e6:g} MB")
+    content = path.read_bytes()
+    sha256 = canonical.digest(content)
+    if sha256 != actions.sha256:
+        raise InputError(f"{path} has been changed: its SHA-256 is {sha256}")
+    if len(content) != actions.bytes:
+        raise InputError(f"record {record.sha256}, key actions.bytes: {path} has {len(content)}")
+    return decode(content, actions.shape, str(path))

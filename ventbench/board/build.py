@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ventbench import files
-from ventbench.board import board, entry_page, index_page, pages, store
+from ventbench.board import entry_page, frames, index_page, pages, ranking, store
 from ventbench.board.store import Store
 
 #: What a build writes, as patterns within the leaderboard's folder; anything else is left alone.
@@ -28,22 +28,25 @@ class Built:
     changed: tuple[str, ...]
 
 
-def content(found: Store) -> dict[str, bytes]:
+def content(leaderboard: Store) -> dict[str, bytes]:
     """Return every built file by its path within the leaderboard's folder.
+
+    Args:
+        leaderboard: all of its records.
 
     Raises:
         InputError: if jinja2 is not installed.
     """
-    boards = board.boards(found.records) or {pages.CURRENT: board.empty(pages.CURRENT)}
-    made = {"leaderboard.csv": board.csv_text(boards).encode()}
+    boards = ranking.boards(leaderboard.records) or {pages.CURRENT: ranking.empty(pages.CURRENT)}
+    built = {"leaderboard.csv": frames.csv_text(boards).encode()}
     environment = pages.environment()
     versions = list(boards)
     for version, tracks in boards.items():
-        page = index_page.render(environment, found, version, versions, tracks)
-        made[pages.version_path(version, versions)] = page.encode()
+        page = index_page.render(environment, leaderboard, version, versions, tracks)
+        built[pages.version_path(version, versions)] = page.encode()
         for track in tracks:
-            made.update(entry_page.render_all(environment, track, versions))
-    return made
+            built.update(entry_page.render_all(environment, track, versions))
+    return built
 
 
 def build(folder: Path) -> Built:
@@ -56,18 +59,18 @@ def build(folder: Path) -> Built:
         InputError: if a record or the chain was changed, or jinja2 is not installed.
         OSError: if a file cannot be read or written.
     """
-    found = store.load(folder)
-    made = content(found)
+    leaderboard = store.load(folder)
+    built = content(leaderboard)
     changed = []
-    for name, text in made.items():
+    for name, text in built.items():
         path = folder / name
         if not path.is_file() or path.read_bytes() != text:
             files.write_atomically(path, lambda file, text=text: file.write(text))
             changed.append(name)
-    for name in sorted(present(folder) - made.keys()):
+    for name in sorted(present(folder) - built.keys()):
         (folder / name).unlink()
         changed.append(name)
-    return Built(len(found.records), len(made), tuple(changed))
+    return Built(len(leaderboard.records), len(built), tuple(changed))
 
 
 def present(folder: Path) -> set[str]:

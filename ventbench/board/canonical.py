@@ -45,7 +45,11 @@ def parse(content: bytes, label: str) -> Any:
     Raises:
         InputError: if it is not JSON, or not canonical.
     """
-    value = parse_any(content, label)
+    try:
+        value = json.loads(content)
+    # ValueError: also not UTF-8, and integers of thousands of digits.
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{label} is not JSON: {error}") from None
     try:
         same = canonical(value) == content
     except (ValueError, TypeError, RecursionError):
@@ -58,26 +62,18 @@ def parse(content: bytes, label: str) -> Any:
     return value
 
 
-def parse_any(content: bytes, label: str) -> Any:
-    """Read any JSON; for content whose hash is known to be right.
-
-    Raises:
-        InputError: if it is not JSON.
-    """
-    try:
-        return json.loads(content)
-    # ValueError: also not UTF-8, and integers of thousands of digits.
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{label} is not JSON: {error}") from None
+def through_json(value: Any) -> Any:
+    """The value as a reader of its JSON gets it: tuples become lists."""
+    return json.loads(canonical(value))
 
 
 def _only_text_keys(value: Any) -> None:
-    """json.dumps would turn the key 1 into "1", and so two keys into one."""
+    """Refuse keys like 1: json.dumps would turn it into "1", and so two keys into one."""
     if isinstance(value, Mapping):
-        for key, item in value.items():
+        for key, part in value.items():
             if not isinstance(key, str):
                 raise TypeError(f"key {key!r} is not text")
-            _only_text_keys(item)
+            _only_text_keys(part)
     elif isinstance(value, list | tuple):
-        for item in value:
-            _only_text_keys(item)
+        for part in value:
+            _only_text_keys(part)

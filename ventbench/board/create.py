@@ -1,28 +1,40 @@
-"""From a score to a record: replayed first, so that no record can exist that does not replay."""
+"""From a score to a record: replayed first, so that no record can exist that does not replay.
+
+A record also says where it was made, and, once amended, which record it corrects.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import os
+import platform
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+import ventbench
 from ventbench import draws, files, protocol
-from ventbench.board import actions, canonical, compare, forms, provenance, record, schema
-from ventbench.board.replay import TRACE_BREATH, replay
-from ventbench.board.replayed import Replayed, Simulators
+from ventbench.board import actions, canonical, record, schema
+from ventbench.board.replay import TRACE_BREATH, Replayed, Simulators, differences, replay
 from ventbench.errors import InputError
 from ventbench.submissions.folder import combined_hash, file_hashes
 from ventbench.submissions.result import CellFailure, Score
 
 #: How many failures keep their whole text, and how much of it the others keep, characters.
 _IN_FULL, _SHORT = 40, 240
+
+_PACKAGES = ("flax", "jax", "jaxlib", "numpy", "safetensors", "scipy")
+
+#: Instruction sets that decide how matrix products round, as /proc/cpuinfo names them, widest last.
+_ISA = ("asimd", "sve", "sve2", "sse4_2", "avx", "avx2", "fma", "avx512f")
 
 
 @dataclass(frozen=True)
@@ -86,7 +98,7 @@ def create(
     hashes = file_hashes(score.submission.folder)
     if combined_hash(hashes) != score.submission.sha256:
         raise InputError(f"{label} was changed while it was scored; score it again")
-    (found,) = replay(simulators, score.pips, [score.requested])
+    (replayed,) = replay(simulators, score.pips, [score.requested])
     commands = actions.encode(score.requested)
     errors = np.concatenate([score.nominal[None], score.drawn])
     content: dict[str, Any] = {
@@ -112,18 +124,18 @@ def create(
         "safe": score.safe.tolist(),
         "peak_pressure_cmH2O": score.peak.tolist(),
         "safety": {
-            "peak_centi_cmH2O": np.round(100.0 * found.peak).astype(int).tolist(),
-            "steps_above": found.steps_above.tolist(),
+            "peak_centi_cmH2O": np.round(100.0 * replayed.peak).astype(int).tolist(),
+            "steps_above": replayed.steps_above.tolist(),
         },
         "clipped": {
-            "below": found.below.tolist(),
-            "above": found.above.tolist(),
+            "below": replayed.below.tolist(),
+            "above": replayed.above.tolist(),
             "commands": score.requested.size,
         },
-        "spread": _plain(np.where(np.isnan(score.nominal), np.nan, found.spread)),
+        "spread": _plain(np.where(np.isnan(score.nominal), np.nan, replayed.spread)),
         "failures": [_failure(score, f, n < _IN_FULL) for n, f in enumerate(score.failures)],
         "failed_cells": int(np.isnan(errors).sum()),
-        "trace": trace(found),
+        "trace": trace(replayed),
         "actions": {
             "sha256": canonical.digest(commands),
             "bytes": len(commands),
@@ -131,14 +143,14 @@ def create(
             "shape": list(score.requested.shape),
         },
         "sandbox": None if sandbox is None else dict(sandbox),
-        "versions": provenance.versions(),
-        "machine": provenance.machine(),
+        "versions": versions(),
+        "machine": machine(),
         "timing": dict(score.timing),
     }
     draft = Draft(canonical.canonical(content), commands)
     made = record.from_bytes(draft.content, f"the record of {label}")
     assert isinstance(made, record.Record)
-    problems = compare.differences(made, found)
+    problems = differences(made, replayed)
     if problems:
         raise InputError(f"{label}: the score does not replay: {'; '.join(problems)}")
     return draft
@@ -162,12 +174,101 @@ def keep(folder: Path, scores: Sequence[Score], simulators: Simulators) -> list[
     return [draft.save(folder) for draft in drafts]
 
 
-def trace(found: Replayed) -> dict[str, Any]:
+def amend(
+    path: Path,
+    *,
+    supersedes: str | None = None,
+    reason: str = "",
+    source: Mapping[str, str] | None = None,
+) -> Path:
+    """Say which record a new one corrects, and where its submission came from.
+
+    The amended record is a file of its own, beside the given one.
+
+    Args:
+        path: of the record; its commands lie beside it.
+        supersedes: SHA-256 of the record that it corrects.
+        reason: why, for the page.
+        source: where the submission came from, such as its commit; joins what is there.
+
+    Returns:
+        The new record's path; ``path`` itself if there is nothing to change.
+
+    Raises:
+        InputError: if it is not the record of a score.
+        OSError: if a file cannot be read or written.
+    """
+    if not isinstance(record.load(path), record.Record):
+        raise InputError(f"{path} is not the record of a score")
+    values = canonical.parse(path.read_bytes(), str(path))
+    if supersedes is not None:
+        values["supersedes"] = supersedes
+    if reason:
+        values["reason"] = reason
+    values["provenance"] = {**values["provenance"], **(source or {})}
+    content = canonical.canonical(values)
+    record.from_bytes(content, f"{path}, amended")
+    new = path.parent / f"{canonical.digest(content)}{record.SUFFIX}"
+    if content != path.read_bytes():
+        files.write_atomically(new, lambda file: file.write(content))
+        return new
+    return path
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and packages, and the hash of the lock file where there is one."""
+    known = {"ventbench": ventbench.__version__, "python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            known[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    lock = Path(ventbench.__file__).resolve().parent.parent / "requirements.lock"
+    if lock.is_file():
+        known["requirements.lock"] = files.sha256(lock)
+    return known
+
+
+def machine() -> dict[str, Any]:
+    """What the scorer ran on: system, kernel, processor and its instruction sets."""
+    info = _cpuinfo()
+    flags = set(info.get("flags", info.get("Features", "")).split())
+    limit = re.search(r"--xla_cpu_max_isa=(\w+)", os.environ.get("XLA_FLAGS", ""))
+    return {
+        "system": _system(),
+        "kernel": f"{platform.system()} {platform.release()}",
+        "architecture": platform.machine(),
+        "cpu": info.get("model name", platform.processor()),
+        "isa": [name for name in _ISA if name in flags],
+        "isa_limit": limit[1] if limit else None,
+        "cores": os.cpu_count() or 0,
+    }
+
+
+def _system() -> str:
+    try:
+        return platform.freedesktop_os_release()["PRETTY_NAME"]
+    except (OSError, KeyError):
+        return f"{platform.system()} {platform.release()}"
+
+
+def _cpuinfo() -> dict[str, str]:
+    """First processor of /proc/cpuinfo; empty where there is none."""
+    path = Path("/proc/cpuinfo")
+    fields: dict[str, str] = {}
+    if path.is_file():
+        for line in path.read_text(errors="replace").splitlines():
+            key, _, value = line.partition(":")
+            fields.setdefault(key.strip(), value.strip())
+    return fields
+
+
+def trace(replayed: Replayed) -> dict[str, Any]:
     """What the page draws, in whole numbers."""
     return {
         "breath": TRACE_BREATH + 1,
-        "pressure_centi_cmH2O": np.round(100.0 * found.pressure).astype(int).tolist(),
-        "u_in_tenths_percent": np.round(10.0 * found.u_in).astype(int).tolist(),
+        "pressure_centi_cmH2O": np.round(100.0 * replayed.pressure).astype(int).tolist(),
+        "u_in_tenths_percent": np.round(10.0 * replayed.u_in).astype(int).tolist(),
     }
 
 
@@ -181,9 +282,9 @@ def _plain(values: NDArray[np.float64]) -> Any:
 def _failure(score: Score, failure: CellFailure, in_full: bool) -> dict[str, Any]:
     cell = {"lung": failure.lung, "pip": failure.pip, "draw": failure.draw}
     # By its name, wherever its folder was.
-    said = failure.message.removeprefix(score.submission.label)
-    message = f"{score.submission.manifest.name}{said}"
+    description = failure.message.removeprefix(score.submission.label)
+    message = f"{score.submission.manifest.name}{description}"
     texts = {**failure.failure.to_json(), "message": message}
-    most = forms.MOST_TEXT if in_full else _SHORT
-    cut = {k: v[:most] if isinstance(v, str) else v for k, v in texts.items()}
+    length = schema.MAX_TEXT if in_full else _SHORT
+    cut = {k: v[:length] if isinstance(v, str) else v for k, v in texts.items()}
     return {**cell, **cut}

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from ventbench import protocol
-from ventbench.board import heat, pages, text, traces
-from ventbench.board.board import Track
-from ventbench.board.dumbbells import dumbbells
-from ventbench.board.ranking import BASELINES, Row
+from ventbench.board import pages, plots
+from ventbench.board.ranking import BASELINES, Row, Track
 from ventbench.board.record import Record
+from ventbench.board.schema import ScoreHeader
 from ventbench.lungs import lung as parse_lung
 
 if TYPE_CHECKING:
     import jinja2
 
 #: How many failures a page lists; the record has all.
-MOST_FAILURES = 12
+MAX_FAILURES = 12
 
 
 def render_all(
@@ -27,7 +28,7 @@ def render_all(
     """Return the pages of all entries of a track by their paths; see ``index_page.render``."""
     template = environment.get_template("entry.html.j2")
     base = track.baseline
-    other = None if base is None else traces.paths(base)
+    other = None if base is None else plots.paths(base)
     made = {}
     for status, row in track.rows:
         path = pages.entry_path(track.version, track.name, row.record.name)
@@ -43,13 +44,13 @@ def render_all(
 
 
 def _values(track: Track, status: str, row: Row, base: Record | None) -> dict[str, Any]:
-    record, content = row.record, row.record.content
+    record, header = row.record, row.record.header
     worst, lung, pip = row.worst
-    draws = dumbbells(record, base)
+    draws = plots.dumbbells(record, base)
     gap = row.score.value - row.nominal if row.score else math.nan
     return {
         "record": record,
-        "content": content,
+        "content": header,
         "manifest": record.manifest,
         "status": status,
         "reasons": row.entry.reasons,
@@ -58,45 +59,45 @@ def _values(track: Track, status: str, row: Row, base: Record | None) -> dict[st
         "rank": row.rank,
         "ranks": row.ranks,
         "count": len(track.ranked),
-        "score": text.interval(row.score),
-        "to_pid": text.difference(row.to_baseline),
-        "to_above": text.difference(row.to_above),
+        "score": pages.interval(row.score),
+        "to_pid": pages.difference(row.to_baseline),
+        "to_above": pages.difference(row.to_above),
         "above": _above(track, row),
         "baseline": BASELINES[track.name],
         "compared": base.name if base else None,
-        "nominal": text.figure(row.nominal),
-        "gap": text.signed(gap),
-        "worst": text.figure(worst),
+        "nominal": pages.figure(row.nominal),
+        "gap": pages.signed(gap),
+        "worst": pages.figure(worst),
         "worst_where": f"{lung} at PIP {pip:g}" if lung else "",
-        "exploitation": text.figure(record.exploitation),
-        "clipped": text.figure(100.0 * record.clipped_share, 1),
-        "step": text.figure(text.step_time(content["timing"]), 0),
-        "heat": heat.errors(record),
-        "limits": heat.ERRORS,
-        "differences": heat.differences(record, base) if base else None,
+        "exploitation": pages.figure(record.exploitation),
+        "clipped": pages.figure(100.0 * record.clipped_share, 1),
+        "step": pages.figure(pages.step_time(header.timing), 0),
+        "heat": plots.error_map(record),
+        "limits": plots.ERROR_LIMITS,
+        "differences": plots.difference_map(record, base) if base else None,
         "draws": draws,
         "dots": pages.trusted(draws.drawing) if draws else None,
         "safety": _safety(record),
-        "failures": content["failures"][:MOST_FAILURES],
-        "frames": [pages.trusted(traces.frame(pip)) for pip in record.pips],
+        "failures": header.failures[:MAX_FAILURES],
+        "frames": [pages.trusted(plots.frame(pip)) for pip in record.pips],
         "pips": [f"{pip:g}" for pip in record.pips],
         "lungs": [(name, *_setting(name)) for name in record.lungs],
         "breath": record.breath,
-        "provenance": _provenance(content),
+        "provenance": _provenance(header),
         "history": _history(row),
         "protocol": protocol,
-        "box": f"0 0 {traces.WIDTH} {traces.HEIGHT}",
+        "box": f"0 0 {plots.WIDTH} {plots.HEIGHT}",
     }
 
 
 def _panels(record: Record, other: list[list[tuple[str, str]]] | None) -> list[list[Any]]:
     """Traces of the entry and of the PID of each lung and PIP, ready for the page."""
-    drawn = traces.panels(traces.paths(record), other)
+    drawn = plots.panels(plots.paths(record), other)
     return [[pages.trusted(panel) for panel in row] for row in drawn]
 
 
 def _above(track: Track, row: Row) -> str | None:
-    place = next((i for i, one in enumerate(track.ranked) if one is row), 0)
+    place = next((i for i, ranked in enumerate(track.ranked) if ranked is row), 0)
     return track.ranked[place - 1].record.name if place else None
 
 
@@ -106,34 +107,34 @@ def _safety(record: Record) -> list[dict[str, Any]]:
     return [
         {
             "name": name,
-            "peak": text.figure(float(highest[i]), 1),
+            "peak": pages.figure(float(highest[i]), 1),
             "above": int(steps[i]),
-            "safe": record.content["safe"][i],
+            "safe": record.header.safe[i],
         }
         for i, name in enumerate(record.lungs)
     ]
 
 
 def _setting(name: str) -> tuple[str, str]:
-    found = parse_lung(name)
-    return f"{found.R:g}", f"{found.C:g}"
+    lung = parse_lung(name)
+    return f"{lung.R:g}", f"{lung.C:g}"
 
 
-def _provenance(content: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    submission = content["submission"]
+def _provenance(header: ScoreHeader) -> list[tuple[str, list[tuple[str, str]]]]:
+    submission = header.submission
     groups = (
-        ("Training, as the authors state it", content["submission"]["manifest"]["training"]),
-        ("Where it came from", content["provenance"]),
-        ("Files of the submission, SHA-256", submission["files"]),
-        ("Simulators", content["simulators"]),
-        ("Draws", content["draws"]),
-        ("Sandbox", content["sandbox"] or {"layers": "none: scored in the scorer's process"}),
-        ("Machine", content["machine"]),
-        ("Versions", content["versions"]),
-        ("Timing", content["timing"]),
+        ("Training, as the authors state it", submission.manifest.training),
+        ("Where it came from", header.provenance),
+        ("Files of the submission, SHA-256", submission.files),
+        ("Simulators", header.simulators),
+        ("Draws", msgspec.structs.asdict(header.draws)),
+        ("Sandbox", header.sandbox or {"layers": "none: scored in the scorer's process"}),
+        ("Machine", header.machine),
+        ("Versions", header.versions),
+        ("Timing", header.timing),
     )
-    found = [(title, text.flatten(values)) for title, values in groups]
-    return [(title, rows) for title, rows in found if rows]
+    flat = [(title, pages.flatten(values)) for title, values in groups]
+    return [(title, rows) for title, rows in flat if rows]
 
 
 def _history(row: Row) -> list[dict[str, Any]]:
@@ -141,19 +142,19 @@ def _history(row: Row) -> list[dict[str, Any]]:
     counts = row.record.sha256
     lines = []
     for event in row.entry.history:
-        item = event.record
-        state = "counts" if item.sha256 == counts else "superseded"
-        if not item.official and state != "counts":
+        record = event.record
+        state = "counts" if record.sha256 == counts else "superseded"
+        if not record.official and state != "counts":
             state = "not official"
         if event.withdrawn is not None:
             state = "withdrawn"
         lines.append(
             {
-                "sha256": item.sha256,
-                "created": item.content["created"],
-                "official": item.official,
+                "sha256": record.sha256,
+                "created": record.header.created,
+                "official": record.official,
                 "state": state,
-                "reason": event.withdrawn or item.content["reason"],
+                "reason": event.withdrawn or record.header.reason,
             }
         )
     return lines

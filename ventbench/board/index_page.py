@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ventbench import protocol
-from ventbench.board import pages, text
-from ventbench.board.board import Track
-from ventbench.board.ranking import BASELINES, Row
+from ventbench.board import pages
+from ventbench.board.ranking import BASELINES, Row, Track
 from ventbench.board.store import Store
 from ventbench.text import number
 
@@ -22,7 +21,7 @@ WIDTH, MARGIN = 120, 6
 
 def render(
     environment: jinja2.Environment,
-    found: Store,
+    store: Store,
     version: int,
     versions: Sequence[int],
     tracks: Sequence[Track],
@@ -31,12 +30,13 @@ def render(
 
     Args:
         environment: from :func:`ventbench.board.pages.environment`.
-        found: the leaderboard.
+        store: the leaderboard.
         version: of the protocol.
         versions: all of them, newest first.
         tracks: of the version.
     """
-    first = next((x for track in tracks for _, x in track.rows), None)
+    rows = [(track, status, row) for track in tracks for status, row in track.rows]
+    header = rows[0][2].record.header if rows else None
     return environment.get_template("index.html.j2").render(
         version=version,
         versions=[
@@ -44,11 +44,11 @@ def render(
             for v in versions
         ],
         tracks=[_track(track) for track in tracks],
-        aside=[_aside(track, status, row) for track in tracks for status, row in track.rows],
-        simulators=text.flatten(first.record.content["simulators"]) if first else [],
-        draws=first.record.content["draws"] if first else None,
-        head=found.head,
-        records=len(found.records),
+        aside=[_aside(*row) for row in rows],
+        simulators=pages.flatten(header.simulators) if header else [],
+        draws=header.draws if header else None,
+        head=store.head,
+        records=len(store.records),
         protocol=protocol,
     )
 
@@ -68,18 +68,18 @@ def _track(track: Track) -> dict[str, Any]:
 def _row(track: Track, row: Row, low: float, high: float) -> dict[str, Any]:
     record = row.record
     worst, lung, pip = row.worst
-    step = text.step_time(record.content["timing"])
+    step = pages.step_time(record.header.timing)
     return {
         "rank": row.rank,
         "ranks": row.ranks,
         "name": record.name,
         "path": pages.entry_path(track.version, track.name, record.name),
-        "family": record.manifest["family"],
+        "family": record.manifest.family,
         "baseline": record.name == BASELINES[track.name],
-        "score": text.interval(row.score),
+        "score": pages.interval(row.score),
         "plot": _plot(row, low, high),
-        "to_pid": text.difference(row.to_baseline),
-        "to_above": text.difference(row.to_above),
+        "to_pid": pages.difference(row.to_baseline),
+        "to_above": pages.difference(row.to_above),
         "nominal": _figure(row.nominal),
         "worst": {**_figure(worst), "where": f"{lung}, {pip:g}"},
         "exploitation": _figure(record.exploitation),
@@ -100,7 +100,7 @@ def _aside(track: Track, status: str, row: Row) -> dict[str, Any] | None:
         "track": track.name,
         "path": pages.entry_path(track.version, track.name, row.record.name),
         "official": status != "not official",
-        "score": text.interval(row.score),
+        "score": pages.interval(row.score),
         "reasons": reasons,
     }
 
@@ -123,5 +123,5 @@ def _plot(row: Row, low: float, high: float) -> dict[str, str] | None:
 def _figure(value: float, digits: int = 3) -> dict[str, str]:
     """Text of a number and what it is sorted by; empty if it does not exist."""
     if not math.isfinite(value):
-        return {"text": text.NONE, "value": ""}
+        return {"text": pages.NONE, "value": ""}
     return {"text": number(value, digits), "value": f"{value:.9g}"}

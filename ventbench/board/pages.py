@@ -1,4 +1,4 @@
-"""What all pages share: the template environment, style and script, addresses, and their policy.
+"""What all pages share: template environment, policy, addresses, and numbers and text as shown.
 
 Pages stand alone: no network, no cookie, no address outside the leaderboard. The policy in their
 head allows the one style and the one script that are in them, by hash; all text of records is
@@ -10,19 +10,27 @@ from __future__ import annotations
 import base64
 import functools
 import hashlib
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 from ventbench import protocol
-from ventbench.board import text
+from ventbench.board.ranking import Interval
 from ventbench.extras import require
+from ventbench.text import number, plain
 
 if TYPE_CHECKING:
     import jinja2
 
 #: Version that this ventbench scores.
 CURRENT = protocol.VERSION
+
+#: Shown where there is nothing to show.
+NONE = "–"
+
+#: Longest text and most rows of what a record says about itself, on a page.
+MAX_CHARACTERS, MAX_ROWS = 300, 100
 
 TITLES = {"performance": "Performance", "robustness": "Robustness"}
 
@@ -42,7 +50,7 @@ def environment() -> jinja2.Environment:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        finalize=text.plain,
+        finalize=_shown,
     )
     style, script = (_asset(name) for name in ("board.css", "board.js"))
     made.globals.update(
@@ -85,3 +93,72 @@ def trusted(content: str) -> Any:
     from markupsafe import Markup
 
     return Markup(content)
+
+
+def _shown(value: Any) -> Any:
+    """A template's value in which nothing is invisible; escaping is the template's."""
+    return plain(value) if isinstance(value, str) and not hasattr(value, "__html__") else value
+
+
+def figure(value: float, digits: int = 3) -> str:
+    """A number; a dash if it does not exist."""
+    return number(value, digits) if math.isfinite(value) else NONE
+
+
+def signed(value: float, digits: int = 3) -> str:
+    """A number with its sign; a dash if it does not exist."""
+    return number(value, digits, sign=True) if math.isfinite(value) else NONE
+
+
+def interval(estimate: Interval | None) -> dict[str, Any] | None:
+    """A score for a template: text, limits, value to sort by."""
+    if estimate is None:
+        return None
+    limits = f"{number(estimate.low, 3)} to {number(estimate.high, 3)}"
+    return {"text": number(estimate.value, 3), "limits": limits, "value": f"{estimate.value:.9f}"}
+
+
+def difference(estimate: Interval | None) -> dict[str, Any] | None:
+    """A difference for a template, and whether it is clear: below zero is better."""
+    if estimate is None:
+        return None
+    limits = f"{number(estimate.low, 3, sign=True)} to {number(estimate.high, 3, sign=True)}"
+    kind = "same" if not estimate.clear else "better" if estimate.value < 0 else "worse"
+    text = number(estimate.value, 3, sign=True)
+    return {"text": text, "limits": limits, "value": f"{estimate.value:.9f}", "kind": kind}
+
+
+def step_time(timing: Mapping[str, Any]) -> float:
+    """Median time of one ``act``, µs; NaN where the record does not say."""
+    value = timing.get("act_median_us")
+    good = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if good else math.nan  # type: ignore[arg-type]
+
+
+def flatten(value: Any, prefix: str = "") -> list[tuple[str, str]]:
+    """What a record says about itself, as pairs of text; not escaped."""
+    rows: list[tuple[str, str]] = []
+    _flatten(value, prefix, rows)
+    return rows[:MAX_ROWS]
+
+
+def _flatten(value: Any, prefix: str, rows: list[tuple[str, str]]) -> None:
+    if isinstance(value, Mapping):
+        for key, part in value.items():
+            _flatten(part, f"{prefix} {key}".strip(), rows)
+        return
+    parts = value if isinstance(value, list | tuple) else [value]
+    if any(isinstance(part, Mapping | list | tuple) for part in parts):
+        for index, part in enumerate(parts):
+            _flatten(part, f"{prefix} {index + 1}".strip(), rows)
+        return
+    text = ", ".join(_short(part) for part in parts if part is not None)
+    if text:
+        cut = text if len(text) <= MAX_CHARACTERS else text[: MAX_CHARACTERS - 1] + "…"
+        rows.append((prefix, cut))
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

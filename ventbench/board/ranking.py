@@ -1,4 +1,4 @@
-"""Ranks, intervals and differences of the entries of one track.
+"""From records to boards: which record of an entry counts, its rank, intervals and differences.
 
 The ranked score of an entry is the mean over the published draws of its mean error over all lungs
 and PIPs. The draws are common to all entries and resampled alike, so that every interval of a
@@ -7,15 +7,16 @@ difference is a paired one, and ranks can be counted within each resample.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.board.record import Record
-from ventbench.board.standing import Entry
+from ventbench.board.record import Record, Withdrawal
 from ventbench.metrics import bootstrap
+from ventbench.submissions.manifest import TRACKS
 
 Floats = NDArray[np.float64]
 
@@ -24,6 +25,52 @@ BASELINES = {"performance": "pid_best", "robustness": "pid_robust"}
 
 #: Decimals, of cmH2O, that decide: replays agree to so many, so that no machine decides a tie.
 DECIMALS = 9
+
+#: Most characters of a failure's message that a reason quotes; a submission chose them.
+MAX_QUOTED = 300
+
+
+@dataclass(frozen=True)
+class Event:
+    """One record of an entry's history.
+
+    Attributes:
+        record: the record.
+        withdrawn: why it was taken back; None if it was not.
+    """
+
+    record: Record
+    withdrawn: str | None
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A submission on one track, by the record that counts.
+
+    Attributes:
+        record: the newest one: of the official ones if there are any.
+        history: all of its records, newest first.
+        reasons: why it is not ranked; empty if it is.
+    """
+
+    record: Record
+    history: tuple[Event, ...]
+    reasons: tuple[str, ...]
+
+
+@dataclass
+class Standing:
+    """One track of one version of the board.
+
+    Attributes:
+        ranked: official, complete and safe entries, in no order yet.
+        unranked: official entries that are not ranked, with reasons.
+        unofficial: newest unofficial record of each submission without a newer official one.
+    """
+
+    ranked: list[Entry] = field(default_factory=list)
+    unranked: list[Entry] = field(default_factory=list)
+    unofficial: list[Entry] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -48,12 +95,12 @@ class Row:
     Attributes:
         entry: whose row it is.
         rank: from 1, equal for equal scores; None if it is not ranked.
-        ranks: 95 % interval of the rank; None likewise.
+        ranks: 95 % interval of the rank; None if it is not ranked.
         score: mean over draws, cmH2O; None if a cell failed.
-        to_baseline: difference to the track's PID; None for itself, or where there is none.
+        to_baseline: difference to the track's PID; None for the PID itself, or without one.
         to_above: difference to the entry above; None for the first.
         nominal: nominal score, cmH2O; NaN if a cell failed.
-        worst: highest mean over draws of one cell, cmH2O, its lung and PIP; NaN likewise.
+        worst: highest mean over draws of one cell, cmH2O, its lung and PIP; NaN if one failed.
     """
 
     entry: Entry
@@ -69,6 +116,121 @@ class Row:
     def record(self) -> Record:
         """The record that counts."""
         return self.entry.record
+
+
+@dataclass(frozen=True)
+class Track:
+    """One track of one version.
+
+    Attributes:
+        version: of the protocol.
+        name: ``"performance"`` or ``"robustness"``.
+        ranked: best first.
+        unranked: official entries that are not ranked, with reasons, by name.
+        unofficial: entries without a sandbox that deserves the word, by name.
+        baseline: record of the track's PID, that the others are compared with; None if there is no
+            ranked one.
+    """
+
+    version: int
+    name: str
+    ranked: tuple[Row, ...]
+    unranked: tuple[Row, ...]
+    unofficial: tuple[Row, ...]
+    baseline: Record | None
+
+    @property
+    def rows(self) -> list[tuple[str, Row]]:
+        """All rows with their status, in the order in which they are shown."""
+        kinds = ("ranked", "not ranked", "not official")
+        groups = (self.ranked, self.unranked, self.unofficial)
+        return [(kind, row) for kind, rows in zip(kinds, groups, strict=True) for row in rows]
+
+
+def boards(records: Sequence[Record | Withdrawal]) -> dict[int, tuple[Track, ...]]:
+    """Rank all records.
+
+    Args:
+        records: in the order of the chain.
+
+    Returns:
+        Tracks by version, newest version first.
+    """
+    by_version = standings(records)
+    return {
+        version: tuple(_track(version, *track) for track in by_version[version].items())
+        for version in sorted(by_version, reverse=True)
+    }
+
+
+def empty(version: int) -> tuple[Track, ...]:
+    """Tracks of a version without a record."""
+    return tuple(_track(version, name, Standing()) for name in TRACKS)
+
+
+def _track(version: int, name: str, standing: Standing) -> Track:
+    ranked = rank(standing.ranked, name)
+    records = [row.record for row in ranked]
+    base = baseline(records, name)
+    return Track(
+        version=version,
+        name=name,
+        ranked=tuple(ranked),
+        unranked=tuple(unranked_rows(standing.unranked)),
+        unofficial=tuple(unranked_rows(standing.unofficial)),
+        baseline=None if base is None else records[base],
+    )
+
+
+def standings(records: Sequence[Record | Withdrawal]) -> dict[int, dict[str, Standing]]:
+    """Sort records into boards.
+
+    Args:
+        records: in the order of the chain: later is newer, whatever their clocks said.
+
+    Returns:
+        By version of the protocol, oldest first, then by track.
+    """
+    withdrawn = {w.withdraws: w.reason for w in records if isinstance(w, Withdrawal)}
+    grouped: dict[tuple[int, str, str], list[Event]] = defaultdict(list)
+    for record in records:
+        if isinstance(record, Record):
+            event = Event(record, withdrawn.get(record.sha256))
+            grouped[record.version, record.track, record.name].insert(0, event)
+    boards: dict[int, dict[str, Standing]] = {}
+    for (version, track, _), history in sorted(grouped.items(), key=lambda group: group[0]):
+        tracks = boards.setdefault(version, {name: Standing() for name in TRACKS})
+        _place(tracks[track], tuple(history))
+    return boards
+
+
+def _place(standing: Standing, history: tuple[Event, ...]) -> None:
+    counts = next((event for event in history if event.record.official), None)
+    if counts is not None:
+        why = reasons(counts)
+        entry = Entry(counts.record, history, why)
+        (standing.unranked if why else standing.ranked).append(entry)
+    newest = history[0]
+    if not newest.record.official:
+        standing.unofficial.append(Entry(newest.record, history, reasons(newest)))
+
+
+def reasons(event: Event) -> tuple[str, ...]:
+    """Why a record is not ranked; empty if it is."""
+    record, why = event.record, []
+    if event.withdrawn is not None:
+        why.append(f"withdrawn: {event.withdrawn}")
+    failed = record.header.failed_cells
+    if failed:
+        cells = record.nominal.size + record.drawn.size
+        first = record.header.failures[0].message.removesuffix("; the entry is not ranked.")
+        cut = first if len(first) <= MAX_QUOTED else f"{first[:MAX_QUOTED]}…"
+        why.append(f"{failed} of {cells} cells failed, the first: {cut}")
+    safe = zip(record.lungs, record.header.safe, strict=True)
+    unsafe = [lung for lung, passed in safe if not passed]
+    if unsafe:
+        why.append(f"did not pass the safety gate on {', '.join(unsafe)}")
+    return tuple(why)
 
 
 def rank(entries: Sequence[Entry], track: str) -> list[Row]:
@@ -112,7 +274,7 @@ def rank(entries: Sequence[Entry], track: str) -> list[Row]:
     return rows
 
 
-def beside(entries: Sequence[Entry]) -> list[Row]:
+def unranked_rows(entries: Sequence[Entry]) -> list[Row]:
     """Rows of entries that are not ranked, by name; scores where they exist."""
     rows = []
     for entry in sorted(entries, key=lambda e: e.record.name):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,20 +26,22 @@ class Record:
 
     Attributes:
         sha256: of its bytes: its name.
-        content: JSON values, without those that are arrays here.
-        nominal: error of the nominal runs, cmH2O, shape ``(L, P)``; NaN where it failed.
-        drawn: error of the drawn runs, cmH2O, shape ``(K, L, P)``, likewise.
-        spread: disagreement of the ensemble, cmH2O, shape ``(L, P)``, likewise.
-        breath: that is shown, counted from 1.
-        pressure: its nominal inspirations, cmH2O, to 0.01, shape ``(L, P, S)``.
-        u_in: likewise, as applied, %, to 0.1.
-        peak: highest pressure of each run, nominal ones first, cmH2O, to 0.01, shape
+        header: everything but the tables that are arrays here.
+        nominal: error of the nominal runs, cmH2O, shape ``(L, P)``; NaN where a controller failed.
+        drawn: error of the drawn runs, cmH2O, shape ``(K, L, P)``; NaN where a controller failed.
+        spread: disagreement of the ensemble, cmH2O, shape ``(L, P)``; NaN where a controller
+            failed.
+        breath: the breath that the page shows, counted from 1.
+        pressure: nominal inspirations of that breath, cmH2O, to 0.01, shape ``(L, P, S)``.
+        u_in: commands of that breath as applied, %, to 0.1, shape ``(L, P, S)``.
+        peak: highest pressure of each run, nominal runs first, cmH2O, to 0.01, shape
             ``(1 + K, L, P)``.
-        steps_above: longest time above the safety limit of each run, steps, likewise.
+        steps_above: longest time above the safety limit of each run, steps, shape
+            ``(1 + K, L, P)``.
     """
 
     sha256: str
-    content: Mapping[str, Any]
+    header: schema.ScoreHeader
     nominal: Floats
     drawn: Floats
     spread: Floats
@@ -52,38 +53,38 @@ class Record:
 
     @property
     def name(self) -> str:
-        """Of the submission."""
-        return self.manifest["name"]
+        """Name of the submission."""
+        return self.manifest.name
 
     @property
-    def manifest(self) -> Mapping[str, Any]:
-        """Of the submission."""
-        return self.content["submission"]["manifest"]
+    def manifest(self) -> schema.Manifest:
+        """What the authors say about the submission."""
+        return self.header.submission.manifest
 
     @property
     def track(self) -> str:
         """``"performance"`` or ``"robustness"``."""
-        return self.content["track"]
+        return self.header.track
 
     @property
     def official(self) -> bool:
         """Whether it was scored in a sandbox that deserves the word."""
-        return self.content["official"]
+        return self.header.official
 
     @property
     def version(self) -> int:
-        """Of the protocol, and so of the board."""
-        return self.content["protocol"]
+        """Version of the protocol, and so of the board."""
+        return self.header.protocol
 
     @property
     def lungs(self) -> list[str]:
         """Lung ids."""
-        return self.content["lungs"]
+        return self.header.lungs
 
     @property
     def pips(self) -> list[float]:
         """Nominal PIPs, cmH2O."""
-        return self.content["pips"]
+        return self.header.pips
 
     @cached_property
     def by_draw(self) -> Floats:
@@ -98,13 +99,13 @@ class Record:
     @cached_property
     def clipped_share(self) -> float:
         """Share of all commands that were outside 0 to 100 %."""
-        clipped = self.content["clipped"]
-        return float(sum(clipped["below"]) + sum(clipped["above"])) / max(1, clipped["commands"])
+        clipped = self.header.clipped
+        return float(sum(clipped.below) + sum(clipped.above)) / max(1, clipped.commands)
 
     @property
     def basis(self) -> tuple[str, str]:
         """What its errors depend on besides commands: canonical text of simulators and draws."""
-        simulators, draws = self.content["simulators"], self.content["draws"]
+        simulators, draws = self.header.simulators, msgspec.structs.asdict(self.header.draws)
         return canonical.canonical(simulators).decode(), canonical.canonical(draws).decode()
 
 
@@ -136,26 +137,24 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> Record | W
     Raises:
         InputError: if it is not a record.
     """
-    read = canonical.parse if strict else canonical.parse_any
-    values = read(content, label)
-    schema.check(values, label)
+    if strict:
+        canonical.parse(content, label)
+    values = schema.read(content, label)
     sha256 = canonical.digest(content)
-    if values["kind"] == "withdrawal":
-        return Withdrawal(sha256, values["withdraws"], values["reason"], values["created"])
-    errors, trace, safety = (values.pop(key) for key in ("errors", "trace", "safety"))
+    if isinstance(values, schema.WithdrawalContent):
+        return Withdrawal(sha256, values.withdraws, values.reason, values.created)
+    size = len(values.lungs), len(values.pips)
     return Record(
         sha256,
-        values,
-        nominal=np.array(errors["nominal"], float),
-        drawn=np.array(errors["drawn"], float).reshape(
-            values["draws"]["count"], len(values["lungs"]), len(values["pips"])
-        ),
-        spread=np.array(values.pop("spread"), float),
-        breath=trace["breath"],
-        pressure=np.array(trace["pressure_centi_cmH2O"]) / 100.0,
-        u_in=np.array(trace["u_in_tenths_percent"]) / 10.0,
-        peak=np.array(safety["peak_centi_cmH2O"]) / 100.0,
-        steps_above=np.array(safety["steps_above"]),
+        values.header(),
+        nominal=np.array(values.errors.nominal, float),
+        drawn=np.array(values.errors.drawn, float).reshape(values.draws.count, *size),
+        spread=np.array(values.spread, float),
+        breath=values.trace.breath,
+        pressure=np.array(values.trace.pressure_centi_cmH2O) / 100.0,
+        u_in=np.array(values.trace.u_in_tenths_percent) / 10.0,
+        peak=np.array(values.safety.peak_centi_cmH2O) / 100.0,
+        steps_above=np.array(values.safety.steps_above),
     )
 
 
@@ -168,8 +167,8 @@ def load(path: Path, *, strict: bool = True) -> Record | Withdrawal:
     """
     if path.is_symlink():
         raise InputError(f"{path} is a symbolic link; give the record itself")
-    if path.stat().st_size > schema.MOST_BYTES:
-        raise InputError(f"{path} is larger than a record may be, {schema.MOST_BYTES / 1e6:.1f} MB")
+    if path.stat().st_size > schema.MAX_BYTES:
+        raise InputError(f"{path} is larger than a record may be, {schema.MAX_BYTES / 1e6:.1f} MB")
     return from_bytes(path.read_bytes(), str(path), strict=strict)
 
 

@@ -7,17 +7,19 @@ with those of the scorer to 1e-9; matrix products of another batch size may roun
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ventbench import environment as env
 from ventbench import precision, protocol
-from ventbench.board.replayed import Replayed, Simulators
+from ventbench.board.record import Record
 from ventbench.interfaces import Plant
 from ventbench.metrics import safety
 from ventbench.metrics.waveform import run_error
@@ -32,6 +34,65 @@ TRACE_BREATH = max(protocol.SCORED_BREATHS)
 
 #: Records replayed together; the last ones are padded, so that one compilation does for all.
 BATCH = 4
+
+#: How far a replayed number may be off, cmH2O; matrix products round differently elsewhere.
+TOLERANCE = 1e-9
+
+# What is rounded to 0.01 cmH2O or 0.1 %: half of that, and a little for ties.
+_CENTI, _TENTH = 0.005 + 1e-6, 0.05 + 1e-6
+
+
+class Simulators(Protocol):
+    """What :func:`ventbench.plants.frozen.load` returns.
+
+    Attributes:
+        plants: stacked over the lungs.
+        ensemble: the plants of every seed, stacked over members, then lungs.
+    """
+
+    @property
+    def plants(self) -> Any:
+        """See the class."""
+        ...
+
+    @property
+    def ensemble(self) -> Any:
+        """See the class."""
+        ...
+
+    def about(self) -> Mapping[str, Any]:
+        """Version and hashes, as they go into a record."""
+        ...
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What the commands of one record give; L lungs, P PIPs, K draws.
+
+    Attributes:
+        nominal: error of the nominal runs, cmH2O, shape ``(L, P)``.
+        drawn: error of the drawn runs, cmH2O, shape ``(K, L, P)``.
+        safe: whether all runs of a lung pass the safety gate, shape ``(L,)``.
+        peak: highest pressure of each run, nominal ones first, cmH2O, shape ``(1 + K, L, P)``.
+        steps_above: longest time above the safety limit of each run, steps, shape
+            ``(1 + K, L, P)``.
+        below: how many commands were below 0 %, nominal and drawn, shape ``(L,)``.
+        above: how many commands were above 100 %, nominal and drawn, shape ``(L,)``.
+        spread: see :func:`spread`, cmH2O, shape ``(L, P)``.
+        pressure: nominal inspiration of :data:`TRACE_BREATH`, cmH2O, shape ``(L, P, S)``.
+        u_in: commands of that inspiration as applied, %, shape ``(L, P, S)``.
+    """
+
+    nominal: Floats
+    drawn: Floats
+    safe: NDArray[np.bool_]
+    peak: Floats
+    steps_above: NDArray[np.int64]
+    below: NDArray[np.int64]
+    above: NDArray[np.int64]
+    spread: Floats
+    pressure: Floats
+    u_in: Floats
 
 
 @jax.jit
@@ -87,8 +148,8 @@ def pressures(simulators: Simulators, pips: Sequence[float], requested: Floats) 
     with precision.float64():
         cells = protocol_cells(tuple(pips), requested.shape[2] - 1)
         plants = as_float64(simulators.plants, requested.shape[1])
-        found = _pressures(plants, cells, _breaths_first(requested))
-    return _breaths_last(found, len(requested))
+        pressure = _pressures(plants, cells, _breaths_first(requested))
+    return _breaths_last(pressure, len(requested))
 
 
 def spread(simulators: Simulators, pips: Sequence[float], requested: Floats) -> Floats:
@@ -112,13 +173,13 @@ def spread(simulators: Simulators, pips: Sequence[float], requested: Floats) -> 
         return np.full(requested.shape[:3], np.nan)
     with precision.float64():
         cells = protocol_cells(tuple(pips), 0)
-        found = _members(
+        pressure = _members(
             as_float64(simulators.ensemble, members), cells, _breaths_first(requested[:, :, None])
         )
-    each = np.stack([_breaths_last(found[m], len(requested)) for m in range(members)])
-    over = np.std(each[:, :, :, 0], axis=0, ddof=1)
-    assert over.shape[1] == lungs
-    return np.mean(over[..., protocol.SCORED_BREATHS, :], axis=(-2, -1))
+    by_member = np.stack([_breaths_last(pressure[m], len(requested)) for m in range(members)])
+    deviation = np.std(by_member[:, :, :, 0], axis=0, ddof=1)
+    assert deviation.shape[1] == lungs
+    return np.mean(deviation[..., protocol.SCORED_BREATHS, :], axis=(-2, -1))
 
 
 def replay(
@@ -137,15 +198,15 @@ def replay(
         cells = protocol_cells(tuple(pips), requested[0].shape[1] - 1)
     size = min(BATCH, len(requested))
     for first in range(0, len(requested), size):
-        part = list(requested[first : first + size])
-        together = np.stack([*part, *[part[-1]] * (size - len(part))])
-        pressure = pressures(simulators, pips, together)
-        apart = spread(simulators, pips, together[:, :, 0])
-        for n, commands in enumerate(part):
-            yield _measure(cells, commands, pressure[n], apart[n])
+        batch = list(requested[first : first + size])
+        padded = np.stack([*batch, *[batch[-1]] * (size - len(batch))])
+        pressure = pressures(simulators, pips, padded)
+        spreads = spread(simulators, pips, padded[:, :, 0])
+        for n, commands in enumerate(batch):
+            yield _measure(cells, commands, pressure[n], spreads[n])
 
 
-def _measure(cells: Scenario, requested: Floats, pressure: Floats, apart: Floats) -> Replayed:
+def _measure(cells: Scenario, requested: Floats, pressure: Floats, spread: Floats) -> Replayed:
     pip, dt = np.asarray(cells.pip), np.asarray(cells.dt)
     errors = run_error(pressure, pip[..., None, None])
     gate = safety.safe(pressure, pip[..., None], dt[..., None])
@@ -158,7 +219,64 @@ def _measure(cells: Scenario, requested: Floats, pressure: Floats, apart: Floats
         steps_above=np.moveaxis(safety.longest_run(above).max(axis=-1), 1, 0),
         below=np.sum(requested < 0.0, axis=(1, 2, 3, 4)),
         above=np.sum(requested > protocol.U_MAX, axis=(1, 2, 3, 4)),
-        spread=apart,
+        spread=spread,
         pressure=pressure[:, 0, :, TRACE_BREATH],
         u_in=np.clip(requested[:, 0, :, TRACE_BREATH], 0.0, protocol.U_MAX),
     )
+
+
+def deviation(record: Record, replayed: Replayed) -> float:
+    """Largest difference of an error, cmH2O; infinity where one of them does not exist."""
+    pairs = ((record.nominal, replayed.nominal), (record.drawn, replayed.drawn))
+    return max(float(np.max(_off(*pair), initial=0.0)) for pair in pairs)
+
+
+def differences(record: Record, replayed: Replayed) -> list[str]:
+    """What differs, by key of the record; empty if the record is what its commands give.
+
+    Args:
+        record: as it was written.
+        replayed: from its commands.
+    """
+    header, clipped = record.header, record.header.clipped
+    size = int(np.prod(header.actions.shape))
+    checks: tuple[tuple[str, ArrayLike, ArrayLike, float], ...] = (
+        ("errors.nominal", record.nominal, replayed.nominal, TOLERANCE),
+        ("errors.drawn", record.drawn, replayed.drawn, TOLERANCE),
+        ("spread", record.spread, replayed.spread, TOLERANCE),
+        ("safe", header.safe, replayed.safe, 0.0),
+        (
+            "peak_pressure_cmH2O",
+            header.peak_pressure_cmH2O,
+            replayed.peak.max(axis=(0, 2)),
+            TOLERANCE,
+        ),
+        ("safety.peak_centi_cmH2O", record.peak, replayed.peak, _CENTI),
+        ("safety.steps_above", record.steps_above, replayed.steps_above, 0.0),
+        ("clipped.below", clipped.below, replayed.below, 0.0),
+        ("clipped.above", clipped.above, replayed.above, 0.0),
+        ("clipped.commands", clipped.commands, size, 0.0),
+        ("trace.pressure_centi_cmH2O", record.pressure, replayed.pressure, _CENTI),
+        ("trace.u_in_tenths_percent", record.u_in, replayed.u_in, _TENTH),
+    )
+    return [text for check in checks if (text := _difference(*check)) is not None]
+
+
+def _difference(key: str, recorded: ArrayLike, replayed: ArrayLike, tolerance: float) -> str | None:
+    """Describe the worst value of a key, if it is off by more than the tolerance."""
+    recorded, replayed = np.asarray(recorded, float), np.asarray(replayed, float)
+    if recorded.shape != replayed.shape:
+        return f"key {key} has shape {recorded.shape}, its commands give {replayed.shape}"
+    off = _off(recorded, replayed)
+    if off.size == 0 or np.all(off <= tolerance):
+        return None
+    index: Any = np.unravel_index(int(np.argmax(off)), off.shape)
+    place = "".join(f"[{i}]" for i in index)
+    return f"key {key}{place} says {recorded[index]:.12g}, its commands give {replayed[index]:.12g}"
+
+
+def _off(recorded: ArrayLike, replayed: ArrayLike) -> np.ndarray:
+    """Differences; 0 in failed cells, whose commands nobody gave, infinity where one is missing."""
+    recorded, replayed = np.asarray(recorded, float), np.asarray(replayed, float)
+    off = np.nan_to_num(np.abs(recorded - replayed), nan=np.inf)
+    return np.where(np.isnan(recorded), 0.0, off)

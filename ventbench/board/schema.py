@@ -1,187 +1,336 @@
 """What a record must look like before anything of it is used or shown.
 
 A record may come from anybody: every value is checked for its type and range here, so that ranking
-and pages need not; text is escaped where it is shown.
+and pages need not; text is escaped where it is shown. msgspec checks types and ranges, and
+:func:`read` what ties several keys together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import re
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
 
 from ventbench import protocol
-from ventbench.board import actions, forms
+from ventbench.board import actions
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS
 from ventbench.submissions.manifest import FAMILIES, NAME, TRACKS
+from ventbench.text import plain
 
-#: Version of the record's form, and its two kinds.
+#: Version of the record's form.
 FORMAT = 1
-KINDS = ("score", "withdrawal")
 
 #: Largest record, bytes.
-MOST_BYTES = 2 * 2**20
+MAX_BYTES = 2 * 2**20
 
-_HASH = forms.pattern(forms.SHA256)
+#: Longest text anywhere in a record, characters.
+MAX_TEXT = 4000
 
-_MANIFEST: dict[str, forms.Check] = {
-    "name": forms.pattern(NAME),
-    "authors": forms.listed(forms.text, None),
-    "licence": forms.text,
-    "api_version": forms.count,
-    "family": forms.one_of(*FAMILIES),
-    "tracks": forms.listed(forms.one_of(*TRACKS), None),
-    "description": forms.text,
-    "training": forms.object_,
-}
+#: Deepest nesting of what a record says freely about its machine and the like.
+MAX_DEPTH = 6
 
-_FAILURE = forms.table(
-    lung=forms.one_of(*LUNG_IDS),
-    pip=forms.number,
-    draw=forms.or_none(forms.count),
-    kind=forms.text,
-    what=forms.text,
-    detail=forms.text,
-    breath=forms.or_none(forms.count),
-    step=forms.or_none(forms.count),
-    message=forms.text,
-)
+#: Most characters of a message; a hostile record chose some of them.
+_MAX_MESSAGE = 300
 
 
-def _score_checks(lungs: int, pips: int, draws: int) -> dict[str, forms.Check]:
-    """Checks of a score's keys; errors and spread are null where a controller failed."""
-    steps = protocol.INSPIRATION_STEPS
-    return {
-        "format": forms.one_of(FORMAT),
-        "kind": forms.one_of("score"),
-        "protocol": forms.count,
-        "created": forms.pattern(forms.TIME),
-        "official": forms.flag,
-        "supersedes": forms.or_none(_HASH),
-        "reason": forms.text,
-        "provenance": forms.object_,
-        "track": forms.one_of(*TRACKS),
-        "submission": forms.table(
-            sha256=_HASH, files=forms.object_, manifest=forms.table(**_MANIFEST)
-        ),
-        "simulators": forms.object_,
-        "draws": forms.table(version=forms.count, sha256=_HASH, count=forms.count),
-        "lungs": forms.listed(forms.pattern(forms.LUNG), lungs),
-        "pips": forms.listed(forms.number, pips),
-        "errors": forms.table(
-            nominal=forms.grid(forms.number_row, lungs, pips),
-            drawn=forms.grid(forms.number_row, draws, lungs, pips),
-        ),
-        "safe": forms.listed(forms.flag, lungs),
-        "peak_pressure_cmH2O": forms.listed(forms.number, lungs),
-        "safety": forms.table(
-            peak_centi_cmH2O=forms.grid(forms.whole_row, 1 + draws, lungs, pips),
-            steps_above=forms.grid(forms.count_row, 1 + draws, lungs, pips),
-        ),
-        "clipped": forms.table(
-            below=forms.listed(forms.count, lungs),
-            above=forms.listed(forms.count, lungs),
-            commands=forms.count,
-        ),
-        "spread": forms.grid(forms.number_row, lungs, pips),
-        "failures": forms.listed(_FAILURE, None),
-        "failed_cells": forms.count,
-        "trace": forms.table(
-            breath=forms.count,
-            pressure_centi_cmH2O=forms.grid(forms.whole_row, lungs, pips, steps),
-            u_in_tenths_percent=forms.grid(forms.whole_row, lungs, pips, steps),
-        ),
-        "actions": forms.table(
-            sha256=_HASH,
-            bytes=forms.count,
-            encoding=forms.one_of(actions.ENCODING),
-            shape=forms.listed(forms.count, 5),
-        ),
-        "sandbox": forms.or_none(forms.object_),
-        "versions": forms.object_,
-        "machine": forms.object_,
-        "timing": forms.object_,
-    }
+def _matching(pattern: str) -> msgspec.Meta:
+    # msgspec searches; a record's text must match as a whole, and "$" would let a newline pass.
+    return msgspec.Meta(pattern=rf"\A(?:{pattern})\Z")
 
 
-_WITHDRAWAL: dict[str, forms.Check] = {
-    "format": forms.one_of(FORMAT),
-    "kind": forms.one_of("withdrawal"),
-    "created": forms.pattern(forms.TIME),
-    "withdraws": _HASH,
-    "reason": lambda value: forms.text(value) and bool(value.strip()),
-}
+def _among(choices: Iterable[str]) -> msgspec.Meta:
+    return _matching("|".join(map(re.escape, choices)))
 
 
-def check(content: Any, label: str) -> None:
-    """Check the content of a record.
+Text = Annotated[str, msgspec.Meta(max_length=MAX_TEXT)]
+Sha256 = Annotated[str, _matching("[0-9a-f]{64}")]
+Time = Annotated[str, _matching(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z")]
+LungName = Annotated[str, _matching(r"R[0-9]{1,4}(\.[0-9]{1,3})?C[0-9]{1,4}(\.[0-9]{1,3})?")]
+LungId = Annotated[str, _among(LUNG_IDS)]
+EntryName = Annotated[str, _matching(NAME.pattern)]
+Family = Annotated[str, _among(FAMILIES)]
+Track = Annotated[str, _among(TRACKS)]
+
+#: Whole numbers that JavaScript reads as they are, and those that fit into 32 bits.
+Count = Annotated[int, msgspec.Meta(ge=0, lt=2**53)]
+SmallInt = Annotated[int, msgspec.Meta(ge=-(2**31), le=2**31)]
+
+#: Errors are null where a controller failed.
+Error = Annotated[float, msgspec.Meta(ge=0.0)] | None
+FreeForm = dict[str, Any]
+
+T = TypeVar("T")
+
+
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A JSON object with exactly these keys."""
+
+
+class Manifest(_Table, frozen=True):
+    """What the authors say about a submission; see :class:`ventbench.submissions.manifest`."""
+
+    name: EntryName
+    authors: list[Text]
+    licence: Text
+    api_version: Count
+    family: Family
+    tracks: list[Track]
+    description: Text
+    training: FreeForm
+
+
+class Submission(_Table, frozen=True):
+    """What was scored: the SHA-256 of all files together and of each by its path."""
+
+    sha256: Sha256
+    files: FreeForm
+    manifest: Manifest
+
+
+class Draws(_Table, frozen=True):
+    """The published draws; keys in the order of pages."""
+
+    count: Annotated[int, msgspec.Meta(ge=1, lt=2**53)]
+    sha256: Sha256
+    version: Count
+
+
+class Errors(_Table, frozen=True):
+    """Mean absolute error of each cell, cmH2O: ``(L, P)`` nominal and ``(K, L, P)`` drawn."""
+
+    nominal: list[list[Error]]
+    drawn: list[list[list[Error]]]
+
+
+class Safety(_Table, frozen=True):
+    """Highest pressure, 0.01 cmH2O, and longest time above the limit, steps: ``(1 + K, L, P)``."""
+
+    peak_centi_cmH2O: list[list[list[SmallInt]]]
+    steps_above: list[list[list[Annotated[int, msgspec.Meta(ge=0, le=2**31)]]]]
+
+
+class Clipped(_Table, frozen=True):
+    """Commands below 0 % and above 100 % of each lung, ``(L,)``, and how many there were at all."""
+
+    below: list[Count]
+    above: list[Count]
+    commands: Count
+
+
+class Failure(_Table, frozen=True):
+    """A failed cell; ``draw`` is null in the nominal run."""
+
+    lung: LungId
+    pip: float
+    draw: Count | None
+    kind: Text
+    what: Text
+    detail: Text
+    breath: Count | None
+    step: Count | None
+    message: Text
+
+
+class Trace(_Table, frozen=True):
+    """A nominal inspiration of each cell, ``(L, P, S)``, for the page."""
+
+    breath: Count
+    pressure_centi_cmH2O: list[list[list[SmallInt]]]
+    u_in_tenths_percent: list[list[list[SmallInt]]]
+
+
+class Actions(_Table, frozen=True):
+    """The file of the commands; ``shape`` is ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``."""
+
+    sha256: Sha256
+    bytes: Count
+    encoding: Annotated[str, _among([actions.ENCODING])]
+    shape: Annotated[list[Count], msgspec.Meta(min_length=5, max_length=5)]
+
+
+class ScoreHeader(_Table, frozen=True):
+    """A score's record without its large tables; L lungs, P PIPs, K draws."""
+
+    format: Literal[1]
+    protocol: Count
+    created: Time
+    official: bool
+    supersedes: Sha256 | None
+    reason: Text
+    provenance: FreeForm
+    track: Track
+    submission: Submission
+    simulators: FreeForm
+    draws: Draws
+    lungs: Annotated[list[LungName], msgspec.Meta(min_length=1)]
+    pips: Annotated[list[float], msgspec.Meta(min_length=1)]
+    safe: list[bool]
+    peak_pressure_cmH2O: list[float]
+    clipped: Clipped
+    failures: list[Failure]
+    failed_cells: Count
+    actions: Actions
+    sandbox: FreeForm | None
+    versions: FreeForm
+    machine: FreeForm
+    timing: FreeForm
+
+
+class ScoreContent(ScoreHeader, frozen=True, tag_field="kind", tag="score"):
+    """The record of a score, all of it."""
+
+    errors: Errors
+    safety: Safety
+    spread: list[list[float | None]]
+    trace: Trace
+
+    def header(self) -> ScoreHeader:
+        """Everything but the large tables."""
+        keys = ScoreHeader.__struct_fields__
+        return ScoreHeader(**{key: getattr(self, key) for key in keys})
+
+
+class WithdrawalContent(_Table, frozen=True, tag_field="kind", tag="withdrawal"):
+    """The record that takes another one back."""
+
+    format: Literal[1]
+    created: Time
+    withdraws: Sha256
+    reason: Annotated[str, msgspec.Meta(max_length=MAX_TEXT, pattern=r"\S")]
+
+
+class ChainLine(_Table, frozen=True):
+    """A line of the chain; ``actions`` is null for a withdrawal."""
+
+    index: Count
+    record: Sha256
+    actions: Sha256 | None
+    previous: Sha256
+
+
+_RECORD: msgspec.json.Decoder[Any] = msgspec.json.Decoder(ScoreContent | WithdrawalContent)
+_LINE = msgspec.json.Decoder(ChainLine)
+
+
+def read(content: bytes, label: str) -> ScoreContent | WithdrawalContent:
+    """Read and check the content of a record.
 
     Args:
-        content: JSON values.
+        content: JSON, canonical or not.
         label: names the file in messages.
 
     Raises:
         InputError: naming the first key that is wrong.
     """
-    if not isinstance(content, dict) or content.get("kind") not in KINDS:
-        raise InputError(f"{label}, key kind: is not one of {', '.join(KINDS)}")
-    if content["kind"] == "withdrawal":
-        _keys(content, _WITHDRAWAL, label)
+    record = _decoded(_RECORD, content, label)
+    if isinstance(record, ScoreContent):
+        for key in ("provenance", "simulators", "sandbox", "versions", "machine", "timing"):
+            _check_free(getattr(record, key), f"{label}, key {key}")
+        _check_free(record.submission.files, f"{label}, key submission.files")
+        _check_free(record.submission.manifest.training, f"{label}, key submission.manifest")
+        _check_shapes(record, label)
+        _check_consistent(record, label)
+    return record
+
+
+def read_line(content: bytes, label: str) -> ChainLine:
+    """Read a line of the chain.
+
+    Raises:
+        InputError: if it is not one.
+    """
+    return _decoded(_LINE, content, label)
+
+
+def _decoded(decoder: msgspec.json.Decoder[T], content: bytes, label: str) -> T:
+    try:
+        return decoder.decode(content)
+    except msgspec.ValidationError as error:
+        message, _, path = str(error).rpartition(" - at `$")
+        if not path.endswith("`"):  # of the whole record
+            message, path = str(error), "`"
+        key = path[:-1].removeprefix(".")
+        where = f"{label}, key {key}" if key else label
+        raise InputError(f"{where}: {_short(message)}") from None
+    # Not JSON, not UTF-8, or nested without end.
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
+        raise InputError(f"{label} is not JSON of a record: {_short(str(error))}") from None
+
+
+def _short(message: str) -> str:
+    message = plain(message)
+    return message if len(message) <= _MAX_MESSAGE else f"{message[:_MAX_MESSAGE]}…"
+
+
+def _check_free(value: Any, where: str, depth: int = MAX_DEPTH) -> None:
+    """Bound the texts and the nesting of JSON of any form."""
+    if isinstance(value, str) and len(value) > MAX_TEXT:
+        raise InputError(f"{where}: holds a text of more than {MAX_TEXT} characters")
+    if not isinstance(value, dict | list):
         return
-    sizes = [content.get(key) for key in ("lungs", "pips")]
-    lungs, pips = (len(size) if isinstance(size, list) else -1 for size in sizes)
-    draws = content.get("draws")
-    count = draws.get("count") if isinstance(draws, dict) else None
-    count = count if isinstance(count, int) and forms.count(count) else -2
-    _keys(content, _score_checks(lungs, pips, count), label)
-    _consistent(content, label)
+    if depth == 0:
+        raise InputError(f"{where}: is nested more than {MAX_DEPTH} deep")
+    if isinstance(value, dict):
+        for key in value:
+            _check_free(key, where, depth - 1)
+    for part in value.values() if isinstance(value, dict) else value:
+        _check_free(part, where, depth - 1)
 
 
-def _keys(content: Mapping[str, Any], checks: Mapping[str, forms.Check], label: str) -> None:
-    for key in checks:
-        if key not in content:
-            raise InputError(f"{label}, key {key}: is missing")
-    for key, value in content.items():
-        if key not in checks:
-            raise InputError(f"{label}, key {key[:40]!r}: is not known")
-        if not checks[key](value):
-            raise InputError(f"{label}, key {key}: does not have the form of a record's")
+def _check_shapes(record: ScoreContent, label: str) -> None:
+    """Check the lengths of all tables, before numpy makes arrays of them."""
+    lungs, pips, draws = len(record.lungs), len(record.pips), record.draws.count
+    steps = protocol.INSPIRATION_STEPS
+    shapes: Mapping[str, tuple[Any, tuple[int, ...]]] = {
+        "errors.nominal": (record.errors.nominal, (lungs, pips)),
+        "errors.drawn": (record.errors.drawn, (draws, lungs, pips)),
+        "safe": (record.safe, (lungs,)),
+        "peak_pressure_cmH2O": (record.peak_pressure_cmH2O, (lungs,)),
+        "safety.peak_centi_cmH2O": (record.safety.peak_centi_cmH2O, (1 + draws, lungs, pips)),
+        "safety.steps_above": (record.safety.steps_above, (1 + draws, lungs, pips)),
+        "clipped.below": (record.clipped.below, (lungs,)),
+        "clipped.above": (record.clipped.above, (lungs,)),
+        "spread": (record.spread, (lungs, pips)),
+        "trace.pressure_centi_cmH2O": (record.trace.pressure_centi_cmH2O, (lungs, pips, steps)),
+        "trace.u_in_tenths_percent": (record.trace.u_in_tenths_percent, (lungs, pips, steps)),
+    }
+    for key, (table, shape) in shapes.items():
+        if not _has_shape(table, shape):
+            raise InputError(f"{label}, key {key}: does not have the shape {shape}")
 
 
-def _consistent(content: Mapping[str, Any], label: str) -> None:
-    lungs, pips, count = content["lungs"], content["pips"], content["draws"]["count"]
-    if content["protocol"] == protocol.VERSION and (
+def _has_shape(table: list[Any], shape: tuple[int, ...]) -> bool:
+    if len(table) != shape[0]:
+        return False
+    return len(shape) == 1 or all(_has_shape(part, shape[1:]) for part in table)
+
+
+def _check_consistent(record: ScoreContent, label: str) -> None:
+    lungs, pips, draws = record.lungs, record.pips, record.draws.count
+    if record.protocol == protocol.VERSION and (
         tuple(lungs) != LUNG_IDS or tuple(pips) != protocol.PIPS
     ):
         raise InputError(f"{label}: does not cover all lungs and PIPs of the protocol")
-    if content["actions"]["shape"] != list(actions.shape(len(lungs), count, len(pips))):
+    if record.actions.shape != list(actions.shape(len(lungs), draws, len(pips))):
         raise InputError(f"{label}, key actions.shape: does not fit lungs, draws and PIPs")
-    if content["track"] not in content["submission"]["manifest"]["tracks"]:
+    if record.track not in record.submission.manifest.tracks:
         raise InputError(f"{label}, key track: the submission does not enter it")
-    sandbox = content["sandbox"]
-    if content["official"] and not (sandbox and sandbox.get("official") is True):
+    if record.official and not (record.sandbox and record.sandbox.get("official") is True):
         raise InputError(f"{label}, key official: its sandbox was not official")
-    errors = content["errors"]
-    tables = [errors["nominal"], *errors["drawn"]]
-    cells = [cell for table in tables for row in table for cell in row]
-    if cells.count(None) != content["failed_cells"]:
-        raise InputError(f"{label}, key failed_cells: does not fit the errors")
-    if any(cell is not None and cell < 0 for cell in cells):
-        raise InputError(f"{label}, key errors: one is negative")
-    _failures_fit(content, label)
-
-
-def _failures_fit(content: Mapping[str, Any], label: str) -> None:
-    """Every failed cell has no error and one failure, and no other cell has either."""
-    lungs, pips, errors = content["lungs"], content["pips"], content["errors"]
-    runs = [(None, errors["nominal"]), *enumerate(errors["drawn"], 1)]
-    failed = {
+    # Every failed cell has no error and one failure, and no other cell has either.
+    runs = [(None, record.errors.nominal), *enumerate(record.errors.drawn, 1)]
+    failed = [
         (lung, pip, draw)
         for draw, table in runs
         for lung, row in zip(lungs, table, strict=True)
         for pip, error in zip(pips, row, strict=True)
         if error is None
-    }
-    listed = [(f["lung"], f["pip"], f["draw"]) for f in content["failures"]]
-    if len(listed) != len(failed) or set(listed) != failed:
+    ]
+    if len(failed) != record.failed_cells:
+        raise InputError(f"{label}, key failed_cells: does not fit the errors")
+    named = [(failure.lung, failure.pip, failure.draw) for failure in record.failures]
+    if len(named) != len(failed) or set(named) != set(failed):
         raise InputError(f"{label}, key failures: do not fit the errors")

@@ -1,19 +1,54 @@
-"""The folder of a leaderboard: records, their commands and the chain; reading and adding."""
+"""The folder of a leaderboard: records, their commands, and the chain over them.
+
+``chain.jsonl`` has one line a record in the order of arrival, each with the hash of the line
+before. It makes the order and the set of records as immutable as a record itself: nothing can be
+changed, swapped or left out in the middle without changing every later line, and the last line's
+hash (the *head*) stands for all of them. Only the end can be cut off unseen; whoever has noted a
+head can check that it is still there.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ventbench import files, protocol
-from ventbench.board import canonical, chain, commands, compare, fit, record
+from ventbench.board import actions, canonical, record, schema
 from ventbench.board.record import Record, Withdrawal
-from ventbench.board.replay import replay
-from ventbench.board.replayed import Simulators
 from ventbench.errors import InputError
+
+if TYPE_CHECKING:
+    from ventbench.board.replay import Simulators
 
 #: Folder of records and commands within the leaderboard's.
 RECORDS = "records"
+
+#: Name of the chain's file.
+CHAIN = "chain.jsonl"
+
+#: Stands for the hash of the line before the first.
+CHAIN_START = "0" * 64
+
+
+@dataclass(frozen=True)
+class Link:
+    """One line of the chain.
+
+    Attributes:
+        index: of the line, from 0.
+        record: SHA-256 of the record.
+        actions: SHA-256 of its action file; None for a withdrawal.
+        previous: SHA-256 of the line before, newline included.
+        sha256: of this line, newline included.
+    """
+
+    index: int
+    record: str
+    actions: str | None
+    previous: str
+    sha256: str
 
 
 @dataclass(frozen=True)
@@ -27,30 +62,62 @@ class Store:
     """
 
     folder: Path
-    links: tuple[chain.Link, ...]
+    links: tuple[Link, ...]
     records: tuple[Record | Withdrawal, ...]
 
     @property
     def head(self) -> str:
         """SHA-256 that stands for all records and their order."""
-        return chain.head(self.links)
+        return chain_head(self.links)
 
     @property
     def scores(self) -> list[Record]:
         """Records of scores only."""
-        return [item for item in self.records if isinstance(item, Record)]
+        return [entry for entry in self.records if isinstance(entry, Record)]
 
 
-def single(store: Store, sha256: str) -> Record:
-    """Find the record of a score by its hash, or by the unique beginning of one.
+def chain_line(index: int, added: Record | Withdrawal, previous: str) -> bytes:
+    """Return the chain's line of a record.
+
+    Args:
+        index: of the line, from 0.
+        added: the record.
+        previous: SHA-256 of the line before; :data:`CHAIN_START` for the first.
+    """
+    commands = added.header.actions.sha256 if isinstance(added, Record) else None
+    return canonical.canonical(
+        {"index": index, "record": added.sha256, "actions": commands, "previous": previous}
+    )
+
+
+def chain_head(links: Sequence[Link]) -> str:
+    """SHA-256 of the last line; :data:`CHAIN_START` if there is none."""
+    return links[-1].sha256 if links else CHAIN_START
+
+
+def parse_chain(content: bytes, label: str = CHAIN) -> list[Link]:
+    """Read and check a chain.
+
+    Args:
+        content: of the file.
+        label: names it in messages.
 
     Raises:
-        InputError: if none or several begin so.
+        InputError: naming the first line that is wrong.
     """
-    found = [item for item in store.scores if item.sha256.startswith(sha256)]
-    if len(found) != 1:
-        raise InputError(f"{store.folder} holds no single record that begins with {sha256!r}")
-    return found[0]
+    links: list[Link] = []
+    seen: set[str] = set()
+    for index, text in enumerate(content.splitlines(keepends=True)):
+        where = f"{label} line {index + 1}"
+        canonical.parse(text, where)
+        line = schema.read_line(text, where)
+        if line.index != index or line.previous != chain_head(links):
+            raise InputError(f"{where} does not follow the line before; one of them was changed")
+        if line.record in seen:
+            raise InputError(f"{where} names record {line.record} again")
+        seen.add(line.record)
+        links.append(Link(index, line.record, line.actions, line.previous, canonical.digest(text)))
+    return links
 
 
 def load(folder: Path) -> Store:
@@ -64,17 +131,17 @@ def load(folder: Path) -> Store:
     return Store(folder, tuple(links), tuple(read_record(folder, link) for link in links))
 
 
-def read_chain(folder: Path) -> list[chain.Link]:
+def read_chain(folder: Path) -> list[Link]:
     """Read the chain; empty where there is no leaderboard yet.
 
     Raises:
         InputError: if it was changed.
     """
-    path = folder / chain.FILE
-    return chain.parse(path.read_bytes(), str(path)) if path.exists() else []
+    path = folder / CHAIN
+    return parse_chain(path.read_bytes(), str(path)) if path.exists() else []
 
 
-def read_record(folder: Path, link: chain.Link, *, strict: bool = False) -> Record | Withdrawal:
+def read_record(folder: Path, link: Link, *, strict: bool = False) -> Record | Withdrawal:
     """Read the record that a line of the chain names.
 
     Args:
@@ -87,20 +154,22 @@ def read_record(folder: Path, link: chain.Link, *, strict: bool = False) -> Reco
     """
     path = folder / RECORDS / f"{link.record}{record.SUFFIX}"
     if not path.is_file() or path.is_symlink():
-        raise InputError(f"{path} is missing, but {chain.FILE} names it")
+        raise InputError(f"{path} is missing, but {CHAIN} names it")
     content = path.read_bytes()
-    found = canonical.digest(content)
-    if found != link.record:
-        raise InputError(f"{path} has been changed: its SHA-256 is {found}{_why(content)}")
+    sha256 = canonical.digest(content)
+    if sha256 != link.record:
+        raise InputError(
+            f"{path} has been changed: its SHA-256 is {sha256}{_what_changed(content)}"
+        )
     # Its canonical form was checked when it was added, and no byte has changed since.
-    item = record.from_bytes(content, str(path), strict=strict)
-    named = item.content["actions"]["sha256"] if isinstance(item, Record) else None
-    if named != link.actions:
-        raise InputError(f"{path} names other commands than {chain.FILE} line {link.index + 1}")
-    return item
+    entry = record.from_bytes(content, str(path), strict=strict)
+    commands = entry.header.actions.sha256 if isinstance(entry, Record) else None
+    if commands != link.actions:
+        raise InputError(f"{path} names other commands than {CHAIN} line {link.index + 1}")
+    return entry
 
 
-def _why(content: bytes) -> str:
+def _what_changed(content: bytes) -> str:
     """What is wrong inside a changed record, where that can be seen."""
     for strict in (False, True):
         try:
@@ -108,6 +177,18 @@ def _why(content: bytes) -> str:
         except InputError as error:
             return f"; {error}"
     return ""
+
+
+def find_record(store: Store, sha256: str) -> Record:
+    """Find the record of a score by its hash, or by the unique beginning of one.
+
+    Raises:
+        InputError: if none or several begin so.
+    """
+    matches = [entry for entry in store.scores if entry.sha256.startswith(sha256)]
+    if len(matches) != 1:
+        raise InputError(f"{store.folder} holds no single record that begins with {sha256!r}")
+    return matches[0]
 
 
 def add(folder: Path, path: Path, simulators: Simulators | None = None) -> Record:
@@ -125,32 +206,32 @@ def add(folder: Path, path: Path, simulators: Simulators | None = None) -> Recor
         InputError: if it is not a record, does not replay, or does not fit those that are there.
         OSError: if a file cannot be read or written.
     """
-    store, item = load(folder), record.load(path)
-    if not isinstance(item, Record):
+    store, added = load(folder), record.load(path)
+    if not isinstance(added, Record):
         raise InputError(f"{path} is a withdrawal; use ventbench board withdraw")
-    if item.version != protocol.VERSION:
+    if added.version != protocol.VERSION:
         raise InputError(
-            f"{path} is of protocol version {item.version}; this ventbench scores and replays "
+            f"{path} is of protocol version {added.version}; this ventbench scores and replays "
             f"version {protocol.VERSION}"
         )
-    requested = commands.load(item, path.parent)
-    problems = fit.problems([*store.records, item], start=len(store.records))
+    requested = actions.load(added, path.parent)
+    problems = conflicts([*store.records, added], start=len(store.records))
     if problems:
         raise InputError(f"{path}: {'; '.join(problems)}")
     if simulators is not None:
-        # Through JSON: tuples become lists.
-        about = canonical.parse(canonical.canonical(simulators.about()), "the simulators")
-        if item.content["simulators"] != about:
+        from ventbench.board.replay import differences, replay
+
+        if added.header.simulators != canonical.through_json(simulators.about()):
             raise InputError(f"{path} was scored on other simulators than those of this ventbench")
-        (found,) = replay(simulators, item.pips, [requested])
-        problems = compare.differences(item, found)
+        (replayed,) = replay(simulators, added.pips, [requested])
+        problems = differences(added, replayed)
         if problems:
             raise InputError(f"{path} does not replay: {'; '.join(problems)}")
-    kept = commands.path_of(item, folder / RECORDS)
-    content = commands.path_of(item, path.parent).read_bytes()
+    content = actions.path_of(added, path.parent).read_bytes()
+    kept = actions.path_of(added, folder / RECORDS)
     files.write_atomically(kept, lambda file: file.write(content))
-    _append(store, item, path.read_bytes())
-    return item
+    _append(store, added, path.read_bytes())
+    return added
 
 
 def withdraw(folder: Path, sha256: str, reason: str) -> Withdrawal:
@@ -165,21 +246,85 @@ def withdraw(folder: Path, sha256: str, reason: str) -> Withdrawal:
         InputError: if there is no such record, no reason, or it was withdrawn before.
     """
     store = load(folder)
-    found = single(store, sha256)
-    if any(isinstance(x, Withdrawal) and x.withdraws == found.sha256 for x in store.records):
-        raise InputError(f"record {found.sha256[:12]} is withdrawn already")
-    content = record.withdrawal(found.sha256, reason)
-    item = record.from_bytes(content, "the withdrawal")
-    assert isinstance(item, Withdrawal)
-    _append(store, item, content)
-    return item
+    withdrawn = find_record(store, sha256).sha256
+    if any(isinstance(x, Withdrawal) and x.withdraws == withdrawn for x in store.records):
+        raise InputError(f"record {withdrawn[:12]} is withdrawn already")
+    content = record.withdrawal(withdrawn, reason)
+    withdrawal = record.from_bytes(content, "the withdrawal")
+    assert isinstance(withdrawal, Withdrawal)
+    _append(store, withdrawal, content)
+    return withdrawal
 
 
-def _append(store: Store, item: Record | Withdrawal, content: bytes) -> None:
+def _append(store: Store, added: Record | Withdrawal, content: bytes) -> None:
     """Write the record, then the chain: a crash between leaves a file that nothing names."""
-    path = store.folder / RECORDS / f"{item.sha256}{record.SUFFIX}"
+    path = store.folder / RECORDS / f"{added.sha256}{record.SUFFIX}"
     files.write_atomically(path, lambda file: file.write(content))
-    path = store.folder / chain.FILE
+    path = store.folder / CHAIN
     before = path.read_bytes() if path.exists() else b""
-    lines = before + chain.line(len(store.links), item, store.head)
+    lines = before + chain_line(len(store.links), added, store.head)
     files.write_atomically(path, lambda file: file.write(lines))
+
+
+def conflicts(records: Sequence[Record | Withdrawal], start: int = 0) -> list[str]:
+    """Find records that contradict those before them: what no record can say by itself.
+
+    Args:
+        records: in the order of the chain.
+        start: index of the first one to check; those before are taken as they are.
+
+    Returns:
+        One sentence for each conflict, with the record's hash.
+    """
+    sentences: list[str] = []
+    first_of_version: dict[int, Record] = {}
+    known: dict[str, Record] = {}
+    withdrawn: set[str] = set()
+    for index, entry in enumerate(records):
+        if index >= start:
+            sentences += _conflicts(entry, first_of_version, known, withdrawn)
+        if isinstance(entry, Record):
+            first_of_version.setdefault(entry.version, entry)
+            known[entry.sha256] = entry
+        else:
+            withdrawn.add(entry.withdraws)
+    return sentences
+
+
+def _conflicts(
+    entry: Record | Withdrawal,
+    first_of_version: dict[int, Record],
+    known: dict[str, Record],
+    withdrawn: set[str],
+) -> list[str]:
+    name = f"record {entry.sha256}"
+    if isinstance(entry, Withdrawal):
+        if entry.withdraws not in known:
+            return [f"{name} withdraws {entry.withdraws[:12]}, which is not there"]
+        if entry.withdraws in withdrawn:
+            return [f"{name} withdraws {entry.withdraws[:12]} once more"]
+        return []
+    if entry.sha256 in known:
+        return [f"{name} is on the leaderboard already"]
+    sentences = []
+    first = first_of_version.get(entry.version)
+    if first is not None:
+        # Records of one version can only be compared over the same simulators and draws.
+        pairs = zip(("simulators", "draws"), entry.basis, first.basis, strict=True)
+        sentences = [
+            f"{name} ({entry.name}), key {key}: differs from record {first.sha256[:12]} "
+            f"({first.name}) of the same protocol version"
+            for key, own, common in pairs
+            if own != common
+        ]
+    superseded = entry.header.supersedes
+    if superseded is None:
+        return sentences
+    old = known.get(superseded)
+    if old is None:
+        sentences.append(f"{name}, key supersedes: {superseded[:12]} is not there")
+    elif (old.name, old.track, old.version) != (entry.name, entry.track, entry.version):
+        sentences.append(f"{name}, key supersedes: is of another entry, track or version")
+    elif old.official and not entry.official:
+        sentences.append(f"{name} is not official and supersedes an official record")
+    return sentences

@@ -5,13 +5,45 @@ Nothing stops at the first problem: each names its file, and the key, line or by
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from ventbench.board import actions, build, chain, fit, record, store
+import msgspec
+
+from ventbench import draws, protocol
+from ventbench.board import actions, build, canonical, record, store
 from ventbench.board.record import Record, Withdrawal
-from ventbench.board.replay_check import Load, Progress, Report, check_replay
+from ventbench.board.replay import BATCH, Simulators, deviation, differences, replay
 from ventbench.errors import InputError
+
+#: Loads the frozen simulators of a version.
+Load = Callable[[int], Simulators]
+
+#: Told how many records of how many have been replayed.
+Progress = Callable[[int, int], None]
+
+
+@dataclass
+class Report:
+    """What a verification saw.
+
+    Attributes:
+        head: SHA-256 that stands for all records and their order.
+        records: how many there are.
+        replayed: how many were replayed.
+        deviation: largest difference between a recorded error and its replay, cmH2O.
+        problems: one sentence each; empty if all is well.
+        notes: what could not be checked, which is no problem.
+    """
+
+    head: str = store.CHAIN_START
+    records: int = 0
+    replayed: int = 0
+    deviation: float = 0.0
+    problems: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 def verify(
@@ -30,67 +62,144 @@ def verify(
         OSError: if a file cannot be read.
     """
     report = Report()
-    if not (folder / chain.FILE).is_file():
-        raise InputError(f"{folder} holds no leaderboard: {chain.FILE} is missing")
+    if not (folder / store.CHAIN).is_file():
+        raise InputError(f"{folder} holds no leaderboard: {store.CHAIN} is missing")
     try:
         links = store.read_chain(folder)
     except InputError as error:
         report.problems.append(str(error))
         links = []
-    report.head = chain.head(links)
-    if head is not None and head not in {chain.START, *(link.sha256 for link in links)}:
-        report.problems.append(f"{folder / chain.FILE} does not hold the line {head}")
-    items = _read(folder, links, report)
-    report.records = len(items)
+    report.head = store.chain_head(links)
+    if head is not None and head not in {store.CHAIN_START, *(link.sha256 for link in links)}:
+        report.problems.append(f"{folder / store.CHAIN} does not hold the line {head}")
+    entries: list[Record | Withdrawal] = []
+    for link in links:
+        try:
+            entries.append(store.read_record(folder, link, strict=True))
+        except (InputError, OSError) as error:
+            report.problems.append(str(error))
+    report.records = len(entries)
     if links:
-        report.problems += _strangers(folder, links)
-    report.problems += fit.problems(items)
-    check_replay(folder, [x for x in items if isinstance(x, Record)], load, report, progress)
-    if len(items) == len(links) > 0:
-        report.problems += _rebuild(folder, store.Store(folder, tuple(links), tuple(items)))
+        report.problems += _unnamed_files(folder, links)
+    report.problems += store.conflicts(entries)
+    scores = [entry for entry in entries if isinstance(entry, Record)]
+    _check_replay(folder, scores, load, report, progress)
+    if len(entries) == len(links) > 0:
+        report.problems += _check_pages(store.Store(folder, tuple(links), tuple(entries)))
     return report
 
 
-def _read(folder: Path, links: Sequence[chain.Link], report: Report) -> list[Record | Withdrawal]:
-    """Records that are as the chain names them; the others become problems."""
-    items = []
-    for link in links:
-        try:
-            items.append(store.read_record(folder, link, strict=True))
-        except (InputError, OSError) as error:
-            report.problems.append(str(error))
-    return items
-
-
-def _strangers(folder: Path, links: Sequence[chain.Link]) -> list[str]:
+def _unnamed_files(folder: Path, links: Sequence[store.Link]) -> list[str]:
     """Files among the records that no line names."""
     named = {f"{link.record}{record.SUFFIX}" for link in links}
     named |= {f"{link.actions}{actions.SUFFIX}" for link in links}
-    found = sorted(path.name for path in (folder / store.RECORDS).iterdir())
     return [
-        f"{folder / store.RECORDS / name} is not named by {chain.FILE}; add it, or remove it"
-        for name in found
+        f"{folder / store.RECORDS / name} is not named by {store.CHAIN}; add it, or remove it"
+        for name in sorted(path.name for path in (folder / store.RECORDS).iterdir())
         if name not in named
     ]
 
 
-def _rebuild(folder: Path, found: store.Store) -> list[str]:
+def _check_pages(leaderboard: store.Store) -> list[str]:
     """Built files that are missing, stale or changed, with the first byte that differs."""
-    made, there = build.content(found), build.present(folder)
-    problems = [f"{folder / name} is missing; run `ventbench board build`" for name in
-                sorted(made.keys() - there)]  # fmt: skip
-    problems += [f"{folder / name} belongs to no record" for name in sorted(there - made.keys())]
-    for name in sorted(made.keys() & there):
+    folder = leaderboard.folder
+    built, present = build.content(leaderboard), build.present(folder)
+    missing, stale = sorted(built.keys() - present), sorted(present - built.keys())
+    problems = [f"{folder / name} is missing; run `ventbench board build`" for name in missing]
+    problems += [f"{folder / name} belongs to no record" for name in stale]
+    for name in sorted(built.keys() & present):
         now = (folder / name).read_bytes()
-        if now != made[name]:
-            problems.append(
-                f"{folder / name} is not what the records give: byte {_differs(now, made[name])}"
-            )
+        if now != built[name]:
+            byte = _first_difference(now, built[name])
+            problems.append(f"{folder / name} is not what the records give: byte {byte}")
     return problems
 
 
-def _differs(a: bytes, b: bytes) -> int:
+def _first_difference(a: bytes, b: bytes) -> int:
     """Index of the first byte that differs, or the length of the shorter one."""
-    return next(
-        (i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b))
+    pairs = enumerate(zip(a, b, strict=False))
+    return next((i for i, (x, y) in pairs if x != y), min(len(a), len(b)))
+
+
+def _check_replay(
+    folder: Path,
+    scores: Sequence[Record],
+    load: Load,
+    report: Report,
+    progress: Progress | None,
+) -> None:
+    """Replay records and note in the report what differs."""
+    for group in _by_simulators(scores, report):
+        simulators = _simulators(group[0].header.simulators, load, report)
+        if simulators is None:
+            continue
+        for first in range(0, len(group), BATCH):
+            _replay_batch(folder, group[first : first + BATCH], simulators, report)
+            if progress is not None:
+                progress(min(first + BATCH, len(group)), len(group))
+
+
+def _by_simulators(scores: Sequence[Record], report: Report) -> list[list[Record]]:
+    """Records that can be replayed together."""
+    groups: dict[str, list[Record]] = {}
+    old: set[int] = set()
+    for score in scores:
+        if score.version > protocol.VERSION:
+            report.problems.append(
+                f"record {score.sha256}, key protocol: version {score.version} is not known to "
+                "this ventbench"
+            )
+        elif score.version < protocol.VERSION:
+            old.add(score.version)
+        elif msgspec.structs.asdict(score.header.draws) != draws.about():
+            report.problems.append(f"record {score.sha256}, key draws: not the published draws")
+        else:
+            groups.setdefault(score.basis[0], []).append(score)
+    report.notes += [
+        f"records of protocol version {version} were not replayed; an older ventbench does that"
+        for version in sorted(old)
+    ]
+    return list(groups.values())
+
+
+def _simulators(recorded: Mapping[str, Any], load: Load, report: Report) -> Simulators | None:
+    """Load the simulators that records name; None, and a problem, where that is impossible."""
+    version = recorded.get("version")
+    if not isinstance(version, int):  # it becomes part of a path
+        report.problems.append(f"simulators: a record names version {version!r}, not a number")
+        return None
+    try:
+        simulators = load(version)
+        here = canonical.through_json(simulators.about())
+    # A damaged manifest can lack anything; InputError is a ValueError.
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        text = str(error) if isinstance(error, InputError) else repr(error)
+        report.problems.append(f"simulators: {text}")
+        return None
+    if here == recorded:
+        return simulators
+    keys = sorted(key for key in {*here, *recorded} if here.get(key) != recorded.get(key))
+    report.problems.append(
+        f"simulators: those of this ventbench are not those of the records; {', '.join(keys)} "
+        "differ"
     )
+    return None
+
+
+def _replay_batch(
+    folder: Path, batch: Sequence[Record], simulators: Simulators, report: Report
+) -> None:
+    sound, requested = [], []
+    for score in batch:
+        try:
+            requested.append(actions.load(score, folder / store.RECORDS))
+            sound.append(score)
+        except (InputError, OSError) as error:
+            report.problems.append(str(error))
+    if not sound:
+        return
+    for score, replayed in zip(sound, replay(simulators, sound[0].pips, requested), strict=True):
+        report.replayed += 1
+        report.deviation = max(report.deviation, deviation(score, replayed))
+        path = folder / store.RECORDS / f"{score.sha256}{record.SUFFIX}"
+        report.problems += [f"{path}, {text}" for text in differences(score, replayed)]

@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from ventbench.board.board import Track
-    from ventbench.board.ranking import Interval
+    from ventbench.board.ranking import Interval, Track
 
 app = typer.Typer(
     name="board", help="The leaderboard: records in, pages out.", no_args_is_help=True
@@ -49,19 +48,19 @@ def add(
 
     Example: `ventbench board add runs/record/3f2a....json --source commit=9c1e5d0`
     """
-    from ventbench.board import amend, store
+    from ventbench.board import create, store
     from ventbench.errors import InputError
     from ventbench.plants import frozen
 
-    parts = [item.partition("=") for item in source or ()]
+    parts = [text.partition("=") for text in source or ()]
     about = {key: text for key, _, text in parts}
     if not all(about.values()):
         raise InputError("--source needs KEY=TEXT, such as commit=9c1e5d0")
     if supersedes is not None:
-        supersedes = store.single(store.load(folder), supersedes).sha256
-    new = amend.amend(record, supersedes=supersedes, reason=reason, source=about)
-    item = store.add(folder, new, frozen.load())
-    typer.echo(f"added {item.name} ({item.track}): record {item.sha256}")
+        supersedes = store.find_record(store.load(folder), supersedes).sha256
+    new = create.amend(record, supersedes=supersedes, reason=reason, source=about)
+    added = store.add(folder, new, frozen.load())
+    typer.echo(f"added {added.name} ({added.track}): record {added.sha256}")
     typer.echo("next: ventbench board build")
 
 
@@ -77,8 +76,8 @@ def withdraw(
     """
     from ventbench.board import store
 
-    item = store.withdraw(folder, record, reason)
-    typer.echo(f"withdrew {item.withdraws}")
+    withdrawal = store.withdraw(folder, record, reason)
+    typer.echo(f"withdrew {withdrawal.withdraws}")
     typer.echo("next: ventbench board build")
 
 
@@ -163,24 +162,17 @@ def show(
     """
     from rich.console import Console
 
-    from ventbench.board import board, store, table
-    from ventbench.errors import InputError
+    from ventbench.board import frames
 
-    boards = board.boards(store.load(folder).records)
-    if not boards:
-        raise InputError(f"{folder} holds no record; add one with `ventbench board add`")
-    chosen = next(iter(boards)) if version is None else version
-    if chosen not in boards:
-        known = ", ".join(map(str, sorted(boards)))
-        raise InputError(f"{folder} has no version {chosen}; there are {known}")
+    tracks = frames.load_tracks(folder, version=version)
     rows = [
-        dict(zip(table.COLUMNS, table.row(chosen, track.name, status, row), strict=True))
-        for track in boards[chosen]
-        for status, row in track.rows
+        dict(zip(frames.COLUMNS, frames.csv_row(track, *row), strict=True))
+        for track in tracks
+        for row in track.rows
     ]
-    emit({"version": chosen, "rows": rows}, json)
+    emit({"version": tracks[0].version, "rows": rows}, json)
     console = Console(stderr=str(json) == "-")
-    for track in boards[chosen]:
+    for track in tracks:
         console.print(_table(track))
 
 

@@ -1,0 +1,233 @@
+"""The board as tables: ``leaderboard.csv``, and pandas frames for a notebook."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ventbench.board import pages, ranking, store
+from ventbench.board.ranking import Interval, Row, Track
+from ventbench.errors import InputError
+from ventbench.submissions.manifest import TRACKS
+from ventbench.text import plain
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+#: Columns of ``leaderboard.csv``.
+COLUMNS = (
+    "version", "track", "status", "rank", "rank_low", "rank_high", "name", "family",
+    "score_cmH2O", "score_low", "score_high", "to_pid_cmH2O", "to_pid_low", "to_pid_high",
+    "to_above_cmH2O", "to_above_low", "to_above_high", "nominal_cmH2O", "worst_cmH2O",
+    "worst_lung", "worst_pip", "exploitation_cmH2O", "clipped_share", "act_median_us",
+    "failed_cells", "safe", "created", "record", "submission", "reasons",
+)  # fmt: skip
+
+#: Where commands look for a leaderboard.
+FOLDER = Path("leaderboard")
+
+#: Whole numbers that an entry may lack.
+_NULLABLE_INTEGERS = ("rank", "rank_low", "rank_high")
+
+
+def load_board(
+    folder: Path | str | None = None, *, track: str | None = None, version: int | None = None
+) -> pd.DataFrame:
+    """Read a leaderboard into a frame: one row an entry, in the order of the pages.
+
+    Columns:
+
+    - ``version``, ``track``, ``status`` (``"ranked"``, ``"not ranked"``, ``"not official"``),
+      ``name``, ``family``;
+    - ``rank``, ``rank_low``, ``rank_high``: rank and its 95 % interval; missing if not ranked;
+    - ``score_cmH2O``, ``score_low``, ``score_high``: mean error over draws, lungs and PIPs with its
+      95 % interval, cmH2O;
+    - ``to_pid_cmH2O``, ``to_pid_low``, ``to_pid_high``: difference of the score to the track's PID,
+      cmH2O; ``to_above_cmH2O``, ``to_above_low``, ``to_above_high``: to the entry above, cmH2O;
+    - ``nominal_cmH2O``: the paper's score without noise, cmH2O;
+    - ``worst_cmH2O``, ``worst_lung``, ``worst_pip``: highest mean error over draws of one lung and
+      PIP, cmH2O, and which cell it is (PIP in cmH2O);
+    - ``exploitation_cmH2O``: spread of the ensemble along the nominal commands, cmH2O;
+    - ``clipped_share``: share of commands outside 0..100 %, 0 to 1;
+    - ``act_median_us``: median time of one ``act``, µs;
+    - ``failed_cells``, ``safe`` (whether all lungs pass the safety gate), ``created`` (UTC),
+      ``record`` and ``submission`` (SHA-256), ``reasons`` (why an entry is not ranked);
+    - ``score_R5C10_cmH2O``, ...: mean error over draws and PIPs of each lung, cmH2O, and
+      ``nominal_R5C10_cmH2O``, ...: mean nominal error over PIPs of each lung, cmH2O.
+
+    Example::
+
+        board = load_board("leaderboard", track="performance")
+        board[["rank", "name", "score_cmH2O", "score_R5C10_cmH2O"]]
+
+    Args:
+        folder: of the leaderboard; ``leaderboard`` in the working directory by default.
+        track: ``"performance"`` or ``"robustness"``; both by default.
+        version: of the protocol; the newest by default.
+
+    Returns:
+        A frame whose numbers are those of the records, not rounded; NaN where a cell failed.
+
+    Raises:
+        InputError: if there is no leaderboard, a record was changed, or the track or version is
+            not there.
+        OSError: if a file cannot be read.
+    """
+    import pandas as pd
+
+    frame = pd.DataFrame(
+        [
+            _values(tracks.version, tracks.name, status, row) | _by_lung(row)
+            for tracks in load_tracks(folder, track=track, version=version)
+            for status, row in tracks.rows
+        ]
+    )
+    return frame.astype({name: "Int64" for name in _NULLABLE_INTEGERS})
+
+
+def load_cells(
+    folder: Path | str | None = None, *, track: str | None = None, version: int | None = None
+) -> pd.DataFrame:
+    """Read every cell of every entry: one row a lung, PIP and draw.
+
+    Columns: ``track``, ``name``, ``lung``, ``pip`` (cmH2O), ``draw`` (0 is the nominal run, the
+    published draws count from 1), ``error_cmH2O`` (mean absolute error over the scored
+    inspirations; NaN if the cell failed), ``peak_cmH2O`` (highest pressure, to 0.01) and
+    ``steps_above`` (longest time above the safety limit, control steps).
+
+    Args:
+        folder: of the leaderboard; ``leaderboard`` in the working directory by default.
+        track: ``"performance"`` or ``"robustness"``; both by default.
+        version: of the protocol; the newest by default.
+
+    Raises:
+        InputError: if there is no leaderboard, a record was changed, or the track or version is
+            not there.
+        OSError: if a file cannot be read.
+    """
+    import numpy as np
+    import pandas as pd
+
+    parts = []
+    for tracks in load_tracks(folder, track=track, version=version):
+        for _, row in tracks.rows:
+            record = row.record
+            errors = np.concatenate([record.nominal[None], record.drawn])
+            draw, lung, pip = np.indices(errors.shape).reshape(3, -1)
+            parts.append(
+                pd.DataFrame(
+                    {
+                        "track": tracks.name,
+                        "name": record.name,
+                        "lung": np.array(record.lungs)[lung],
+                        "pip": np.array(record.pips)[pip],
+                        "draw": draw,
+                        "error_cmH2O": errors.ravel(),
+                        "peak_cmH2O": record.peak.ravel(),
+                        "steps_above": record.steps_above.ravel(),
+                    }
+                )
+            )
+    return pd.concat(parts, ignore_index=True)
+
+
+def load_tracks(
+    folder: Path | str | None = None, *, track: str | None = None, version: int | None = None
+) -> list[Track]:
+    """Read and rank a leaderboard; arguments and errors as of :func:`load_board`."""
+    path = FOLDER if folder is None else Path(folder)
+    boards = ranking.boards(store.load(path).records)
+    if not boards:
+        raise InputError(f"{path} holds no record; add one with `ventbench board add`")
+    chosen = next(iter(boards)) if version is None else version
+    if chosen not in boards:
+        known = ", ".join(map(str, sorted(boards)))
+        raise InputError(f"{path} has no version {chosen}; there are {known}")
+    if track is not None and track not in TRACKS:
+        raise InputError(f"track {track!r} is not one of {', '.join(TRACKS)}")
+    return [tracks for tracks in boards[chosen] if track in (None, tracks.name)]
+
+
+def csv_text(boards: Mapping[int, Sequence[Track]]) -> str:
+    """Text of ``leaderboard.csv``: every entry of every board."""
+    output = io.StringIO()
+    writer = csv.writer(output, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for tracks in boards.values():
+        for track in tracks:
+            writer.writerows(csv_row(track, *row) for row in track.rows)
+    return output.getvalue()
+
+
+def csv_row(track: Track, status: str, row: Row) -> list[Any]:
+    """One line of the CSV, in the order of :data:`COLUMNS`: text, or a whole number."""
+    values = _values(track.version, track.name, status, row)
+    return [_csv_cell(key, value) for key, value in values.items()]
+
+
+def _values(version: int, track: str, status: str, row: Row) -> dict[str, Any]:
+    """Values of an entry by :data:`COLUMNS`; None or NaN where there is none."""
+    record, header = row.record, row.record.header
+    worst, lung, pip = row.worst
+    rank_low, rank_high = row.ranks or (None, None)
+    values = (
+        version,
+        track,
+        status,
+        row.rank,
+        rank_low,
+        rank_high,
+        record.name,
+        record.manifest.family,
+        *_interval(row.score),
+        *_interval(row.to_baseline),
+        *_interval(row.to_above),
+        row.nominal,
+        worst,
+        lung,
+        pip,
+        record.exploitation,
+        record.clipped_share,
+        pages.step_time(header.timing),
+        header.failed_cells,
+        all(header.safe),
+        header.created,
+        record.sha256,
+        header.submission.sha256,
+        plain("; ".join(row.entry.reasons)),
+    )
+    return dict(zip(COLUMNS, values, strict=True))
+
+
+def _by_lung(row: Row) -> dict[str, float]:
+    record = row.record
+    drawn, nominal = record.drawn.mean(axis=(0, 2)), record.nominal.mean(axis=1)
+    lungs = record.lungs
+    scores = {f"score_{lung}_cmH2O": float(drawn[i]) for i, lung in enumerate(lungs)}
+    return scores | {f"nominal_{lung}_cmH2O": float(nominal[i]) for i, lung in enumerate(lungs)}
+
+
+def _interval(estimate: Interval | None) -> tuple[float, float, float]:
+    if estimate is None:
+        return math.nan, math.nan, math.nan
+    return estimate.value, estimate.low, estimate.high
+
+
+def _csv_cell(key: str, value: Any) -> Any:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if not isinstance(value, float):
+        return value
+    if not math.isfinite(value):
+        return ""
+    if key == "worst_pip":
+        return f"{value:g}"
+    digits = 2 if key == "act_median_us" else 6
+    # + 0.0: no "-0.000000".
+    return f"{round(value, digits) + 0.0:.{digits}f}"

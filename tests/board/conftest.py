@@ -4,27 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
-from ventbench import draws, precision
+from ventbench import draws
 from ventbench.board import build, create, record, store
 from ventbench.board.record import Record
 from ventbench.board.replay import Simulators, replay
-from ventbench.lungs import LUNG_IDS, LUNGS, Lung
+from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
-from ventbench.plants.single_compartment import SingleCompartment, single_compartment
-from ventbench.plants.stacking import stack
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.result import CellFailure, Score
 from ventbench.submissions.scoring import run_protocol
+
+from ..textbook import Textbook
 
 SANDBOX = {"layers": ["landlock", "seccomp"], "official": True}
 NOW = datetime(2026, 11, 20, 12, tzinfo=UTC)
@@ -33,28 +32,6 @@ NOW = datetime(2026, 11, 20, 12, tzinfo=UTC)
 HOSTILE = (
     "<script>document.title='owned'</script>\"'><img src=x onerror=alert(1)> {{ 7*7 }} \u202eevil"
 )
-
-
-class Textbook:
-    """Textbook lungs, as :func:`ventbench.plants.frozen.load` returns the frozen ones."""
-
-    # Of the frozen ones a board uses none of these; the resolver of --plant hands them on.
-    manifest_sha256 = "0" * 64
-    for_breaths = cross_fitted = None
-
-    def __init__(self) -> None:
-        with precision.float64():
-            # Numpy leaves, as the frozen ones have: they take the precision of their user.
-            self.plants = jax.tree.map(np.asarray, _lungs(1.0))
-            each = [_lungs(factor) for factor in (1.0, 0.97, 1.04)]
-            self.ensemble: SingleCompartment = jax.tree.map(np.asarray, stack(each))
-
-    def about(self) -> Mapping[str, Any]:
-        return {"version": 1, "kind": "textbook", "manifest_sha256": self.manifest_sha256}
-
-
-def _lungs(factor: float) -> SingleCompartment:
-    return stack([single_compartment(Lung(x.R * factor, x.C / factor)) for x in LUNGS])
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ from ventbench.cli import app
 from ventbench.errors import InputError
 from ventbench.plants import frozen
 
-from .conftest import Textbook
+from ..textbook import Textbook
 
 RUN = CliRunner()
 
@@ -95,7 +95,7 @@ def test_bad_input_is_explained(tmp_path: Path, full: Path) -> None:
     assert "holds no record" in run("show", "--folder", tmp_path, code=2)
     assert "has no version 9; there are 1" in run("show", "--version", 9, "--folder", full, code=2)
     (tmp_path / "x.json").write_text("{}\n")
-    assert "key kind" in run("add", tmp_path / "x.json", "--folder", tmp_path, code=2)
+    assert "field `kind`" in run("add", tmp_path / "x.json", "--folder", tmp_path, code=2)
 
 
 def test_score_keeps_a_record_that_can_be_added(tmp_path: Path) -> None:

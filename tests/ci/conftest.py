@@ -7,17 +7,12 @@ import shutil
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-import jax
-import numpy as np
 import pytest
 
-from ventbench import precision
-from ventbench.lungs import LUNGS
-from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stacking import stack
 from ventbench.submissions.scaffold import contents
+
+from ..textbook import Textbook
 
 IDENTITY = {
     "GIT_AUTHOR_NAME": "A. Name",
@@ -103,19 +98,6 @@ def repository(tmp_path: Path) -> Repository:
 def demo() -> dict[str, bytes]:
     """Files of a good submission, by path in the repository."""
     return {f"{PATH}/{name}": content for name, content in contents("demo", "ppo").items()}
-
-
-class Textbook:
-    """Textbook lungs, as :func:`ventbench.plants.frozen.load` returns the frozen ones."""
-
-    def __init__(self) -> None:
-        with precision.float64():
-            lungs = stack([single_compartment(lung) for lung in LUNGS])
-            self.plants = jax.tree.map(np.asarray, lungs)
-            self.ensemble = jax.tree.map(np.asarray, stack([lungs, lungs]))
-
-    def about(self) -> dict[str, Any]:
-        return {"version": 1, "kind": "textbook", "manifest_sha256": "0" * 64}
 
 
 @pytest.fixture(scope="session")

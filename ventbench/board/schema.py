@@ -249,12 +249,11 @@ def _decoded(decoder: msgspec.json.Decoder[T], content: bytes, label: str) -> T:
     try:
         return decoder.decode(content)
     except msgspec.ValidationError as error:
-        message, _, path = str(error).rpartition(" - at `$")
-        if not path.endswith("`"):  # of the whole record
-            message, path = str(error), "`"
+        message, at, path = str(error).rpartition(" - at `$")
+        if not at:
+            raise InputError(f"{label}: {_short(str(error))}") from None
         key = path[:-1].removeprefix(".")
-        where = f"{label}, key {key}" if key else label
-        raise InputError(f"{where}: {_short(message)}") from None
+        raise InputError(f"{label}, key {_short(key)}: {_short(message)}") from None
     # Not JSON, not UTF-8, or nested without end.
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise InputError(f"{label} is not JSON of a record: {_short(str(error))}") from None

@@ -1,0 +1,103 @@
+"""What a record holds, and that its commands give its numbers again."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ventbench import draws, files, precision, protocol, scenario
+from ventbench.board import actions, create, ranking, record
+from ventbench.board.record import Record
+from ventbench.errors import InputError
+
+from ..textbook import Textbook
+from .conftest import SANDBOX, opened
+
+
+def test_a_record_says_where_it_comes_from(drafts, scores) -> None:
+    content = json.loads(drafts["pid_best"].content)
+    assert content["protocol"] == protocol.VERSION
+    assert content["official"] is True
+    assert content["sandbox"] == SANDBOX
+    assert content["draws"] == {"version": 1, "sha256": draws.SHA256, "count": 20}
+    assert content["simulators"]["manifest_sha256"] == "0" * 64
+    root = Path(draws.__file__).parents[1]
+    assert content["versions"]["requirements.lock"] == files.sha256(root / "requirements.lock")
+    assert {"python", "jax", "numpy"} <= content["versions"].keys()
+    machine = content["machine"]
+    assert {"cpu", "isa", "system", "kernel", "architecture", "cores"} <= machine.keys()
+    hashes = content["submission"]["files"]
+    assert create.combined_hash(hashes) == content["submission"]["sha256"]
+    assert np.array(content["errors"]["drawn"]).shape == (20, 6, 6)
+    assert np.array(content["safety"]["peak_centi_cmH2O"]).shape == (21, 6, 6)
+
+
+def test_a_record_is_small(drafts) -> None:
+    for made in drafts.values():
+        assert len(made.content) + len(made.commands) < 700_000
+
+
+def test_commands_come_back_bit_for_bit(drafts, scores, tmp_path: Path) -> None:
+    item = record.load(drafts["pid_best"].save(tmp_path))
+    assert isinstance(item, Record)
+    found = actions.load(item, tmp_path)
+    assert found.tobytes() == scores["pid_best"].requested.tobytes()
+
+
+def test_replay_agrees_with_the_scorer(drafts, scores) -> None:
+    # Numbers of these records come from a replay, those of the scores from the scorer's loop.
+    content = json.loads(drafts["pid_best"].content)
+    item = opened(drafts["pid_best"])
+    assert item.nominal == pytest.approx(scores["pid_best"].nominal, abs=1e-9)
+    assert item.drawn == pytest.approx(scores["pid_best"].drawn, abs=1e-9)
+    assert content["safe"] == scores["pid_best"].safe.tolist()
+    peaks = scores["pid_best"].peak
+    assert content["peak_pressure_cmH2O"] == pytest.approx(peaks, abs=1e-9)
+    below = np.sum(scores["pid_best"].requested < 0, axis=(1, 2, 3, 4))
+    assert content["clipped"]["below"] == below.tolist()
+    highest = np.array(content["safety"]["peak_centi_cmH2O"]).max(axis=(0, 2)) / 100
+    assert highest == pytest.approx(peaks, abs=0.0051)
+
+
+def test_spread_is_the_deviation_of_the_ensemble(drafts, scores, simulators: Textbook) -> None:
+    from ventbench.plants.stacking import take
+    from ventbench.submissions.stepping import replay
+
+    pressures = []
+    with precision.float64():
+        for member in range(3):
+            plants = take(simulators.ensemble, member)
+            cells = scenario.nominal(protocol.PIPS)
+            inspired, _ = replay(plants, cells, scores["pid_best"].requested[:, 0])
+            pressures.append(np.asarray(inspired.pressure)[:, :, protocol.SCORED_BREATHS, :])
+    expected = np.std(pressures, axis=0, ddof=1).mean(axis=(-2, -1))
+    item = opened(drafts["pid_best"])
+    assert item.spread == pytest.approx(expected, abs=1e-9)
+    assert item.exploitation == pytest.approx(expected.mean(), abs=1e-9)
+    assert item.exploitation > 0
+
+
+def test_every_failure_is_there(draft) -> None:
+    item = opened(draft("weak", failed=30, texts="x" * 3000))
+    assert item.header.failed_cells == len(item.header.failures) == 30
+    assert np.isnan(item.nominal).sum() == 30
+    assert np.isnan(item.exploitation)
+    (first, *_) = ranking.reasons(ranking.Event(item, None))
+    assert first.startswith("30 of 756 cells failed, the first: weak: xxx")
+    assert len(first) < 400
+
+
+def test_an_incomplete_score_makes_no_record(scores, simulators: Textbook) -> None:
+    score = dataclasses.replace(scores["pid_best"], drawn=scores["pid_best"].drawn[:3])
+    with pytest.raises(InputError, match="--draws 20"):
+        create.create(score, simulators)
+
+
+def test_a_wrong_score_makes_no_record(scores, simulators: Textbook) -> None:
+    score = dataclasses.replace(scores["pid_best"], nominal=scores["pid_best"].nominal * 0.999)
+    with pytest.raises(InputError, match=r"does not replay: key errors\.nominal"):
+        create.create(score, simulators)

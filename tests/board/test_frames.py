@@ -1,0 +1,64 @@
+"""The board as pandas frames: the numbers of the records, in documented columns."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import ventbench.board
+from ventbench.board import frames, store
+from ventbench.errors import InputError
+from ventbench.lungs import LUNG_IDS
+
+
+def test_a_row_an_entry(full: Path) -> None:
+    board = ventbench.board.load_board(full)
+    rows = list(csv.DictReader(io.StringIO((full / "leaderboard.csv").read_text())))
+    assert list(board["name"]) == [row["name"] for row in rows]
+    assert list(board.columns[: len(frames.COLUMNS)]) == list(frames.COLUMNS)
+    for column in ("score_cmH2O", "to_pid_low", "to_above_high", "exploitation_cmH2O", "worst_pip"):
+        written = [float(row[column]) if row[column] else np.nan for row in rows]
+        np.testing.assert_allclose(board[column], written, atol=1e-6)
+    assert [("" if pd.isna(rank) else str(rank)) for rank in board["rank"]] == [
+        row["rank"] for row in rows
+    ]
+    assert board["safe"].dtype == bool
+    assert board["rank_low"].dtype == "Int64"
+
+
+def test_scores_of_lungs_give_the_score(full: Path) -> None:
+    board = frames.load_board(full, track="performance")
+    assert set(board["track"]) == {"performance"}
+    for kind in ("score", "nominal"):
+        lungs = board[[f"{kind}_{lung}_cmH2O" for lung in LUNG_IDS]]
+        np.testing.assert_allclose(lungs.mean(axis=1, skipna=False), board[f"{kind}_cmH2O"])
+
+
+def test_cells_are_those_of_the_records(full: Path) -> None:
+    cells = frames.load_cells(full)
+    record = store.load(full).scores[0]
+    own = cells[cells["name"] == record.name].set_index(["draw", "lung", "pip"]).sort_index()
+    assert len(own) == 21 * 6 * 6
+    lung, pip = record.lungs[2], record.pips[4]
+    assert own.loc[(0, lung, pip), "error_cmH2O"] == record.nominal[2, 4]
+    assert own.loc[(7, lung, pip), "error_cmH2O"] == record.drawn[6, 2, 4]
+    assert own.loc[(7, lung, pip), "peak_cmH2O"] == record.peak[7, 2, 4]
+    assert own.loc[(7, lung, pip), "steps_above"] == record.steps_above[7, 2, 4]
+    board = frames.load_board(full).set_index("name")
+    for name, score in board["score_cmH2O"].dropna().items():
+        drawn = cells[(cells["name"] == name) & (cells["draw"] > 0)]
+        np.testing.assert_allclose(drawn["error_cmH2O"].to_numpy().mean(), score)
+
+
+def test_what_is_not_there_is_said(full: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no record"):
+        frames.load_board(tmp_path)
+    with pytest.raises(InputError, match="has no version 9; there are 1"):
+        frames.load_board(full, version=9)
+    with pytest.raises(InputError, match="is not one of performance, robustness"):
+        frames.load_cells(full, track="speed")

@@ -1,0 +1,156 @@
+"""What is refused before anything of a record is used: every problem is an InputError."""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ventbench.board import canonical, record, schema, store
+from ventbench.errors import InputError
+
+
+def _without(key: str):
+    return lambda x: {k: v for k, v in x.items() if k != key}
+
+
+WRONG: dict[str, tuple[Any, str]] = {
+    "missing key": (_without("safe"), "missing required field `safe`"),
+    "unknown key": (lambda x: {**x, "rank": 1}, "unknown field `rank`"),
+    "name that leaves its folder": (
+        lambda x: {**x, "submission": {**x["submission"], "manifest": {
+            **x["submission"]["manifest"], "name": "../../index"}}},
+        "key submission.manifest.name",
+    ),
+    "negative error": (
+        lambda x: {**x, "errors": {**x["errors"], "nominal": [[-1.0] * 6] * 6}},
+        "key errors.nominal[0][0]: Expected `float` >= 0.0",
+    ),
+    "hidden failure": (
+        lambda x: {**x, "errors": {**x["errors"], "nominal": [[None] * 6] * 6}},
+        "key failed_cells",
+    ),
+    "official without a sandbox": (lambda x: {**x, "sandbox": None}, "was not official"),
+    "other lungs": (lambda x: {**x, "lungs": ["R9C9"] * 6}, "all lungs and PIPs"),
+    "shape of gigabytes": (
+        lambda x: {**x, "actions": {**x["actions"], "shape": [10**6] * 5}}, "actions.shape",
+    ),
+    "number as text": (
+        lambda x: {**x, "spread": [["1"] * 6] * 6},
+        "key spread[0][0]: Expected `float | null`, got `str`",
+    ),
+    "flag as number": (lambda x: {**x, "official": 1}, "key official: Expected `bool`, got `int`"),
+    "deep nesting": (
+        lambda x: {**x, "machine": {"a": [[[[[[[[1]]]]]]]]}},
+        "key machine: is nested more than 6 deep",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_malformed_record_is_refused(drafts, name: str) -> None:
+    change, message = WRONG[name]
+    values = change(json.loads(drafts["pid_best"].content))
+    with pytest.raises(InputError, match=re.escape(message)):
+        record.from_bytes(canonical.canonical(values), "it")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{",
+        b"[]\n",
+        b'{"a": 1}\n',
+        b'{"a":1,"a":1}\n',
+        b'{"a":NaN}\n',
+        b"[" * 100_000,
+        b"\xff",
+    ],
+)
+def test_only_canonical_text_is_read(content: bytes) -> None:
+    with pytest.raises(InputError):
+        record.from_bytes(content, "it")
+
+
+#: JSON that is meant to exhaust or to confuse a reader.
+HOSTILE = {
+    "digits": b"9" * 5000,
+    "negative digits": b"-" + b"9" * 5000,
+    "float beyond all floats": b"1e999",
+    "fraction of many digits": b"0." + b"1" * 5000,
+    "not a number": b"NaN",
+    "infinity": b"-Infinity",
+    "nesting of lists": b"[" * 100_000,
+    "nesting of objects": b'{"a":' * 100_000,
+    "closed nesting": b"[" * 900 + b"]" * 900,
+    "half a surrogate": b'"\\ud800"',
+    "bytes that are no text": b'"\xff\xfe"',
+    "text without end": b'"' + b"x" * 5000 + b'"',
+    "control characters": b'"\\u001b[2J\\u202e"',
+}
+PLACES = ("protocol", "created", "pips", "machine", "errors", "failures", "submission", "sandbox")
+
+
+@pytest.mark.parametrize("place", [*PLACES, "no such key"])
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_values_are_input_errors(drafts, name: str, place: str) -> None:
+    values = json.loads(drafts["pid_best"].content)
+    values[place] = "PLACE"
+    content = canonical.canonical(values).replace(b'"PLACE"', HOSTILE[name])
+    for strict in (True, False):
+        with pytest.raises(InputError) as caught:
+            record.from_bytes(content, "it", strict=strict)
+        assert str(caught.value).startswith("it")
+        assert str(caught.value).isprintable()
+        assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_values_within_free_objects(drafts, name: str) -> None:
+    values = json.loads(drafts["pid_best"].content)
+    values["machine"] = {"a": "PLACE"}
+    content = canonical.canonical(values).replace(b'"PLACE"', HOSTILE[name])
+    if name in ("control characters", "fraction of many digits"):  # a text, a number: both are fine
+        assert isinstance(record.from_bytes(content, "it", strict=False), record.Record)
+        return
+    with pytest.raises(InputError) as caught:
+        record.from_bytes(content, "it", strict=False)
+    assert str(caught.value).isprintable()
+
+
+def test_a_message_names_a_hostile_key_printably_and_briefly(drafts) -> None:
+    values = json.loads(drafts["pid_best"].content)
+    values["\x1b[2J" + "k" * 10_000] = 1
+    with pytest.raises(InputError) as caught:
+        record.from_bytes(canonical.canonical(values), "it")
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 400
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.binary(max_size=80))
+def test_any_bytes_are_a_record_or_an_input_error(content: bytes) -> None:
+    for read in (schema.read, schema.read_line, canonical.parse):
+        with pytest.raises(InputError):
+            read(b"{" + content, "it")
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (b"{}\n", "missing required field"),
+        (b'{"index":0}\n', "missing required field"),
+        (b"[]\n", "Expected `object`, got `array`"),
+        (b'{"actions":null,"index":0,"previous":"x","record":"y"}\n', "key previous"),
+        (b'{"actions":null,"index":true,"previous":"x","record":"y"}\n', "key index"),
+        (b"[" * 10_000, "not JSON"),
+    ],
+)
+def test_a_line_of_the_chain(line: bytes, message: str) -> None:
+    with pytest.raises(InputError, match=f"chain.jsonl line 1.*{re.escape(message)}"):
+        store.parse_chain(line)

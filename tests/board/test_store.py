@@ -1,0 +1,86 @@
+"""What may join a leaderboard, and how records follow each other."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ventbench.board import actions, canonical, create, ranking, store
+from ventbench.errors import InputError
+
+from ..textbook import Textbook
+from .conftest import put
+
+
+def test_a_bomb_of_zeros_takes_no_memory() -> None:
+    bomb = zlib.compress(bytes(10**8))
+    with pytest.raises(InputError, match="does not hold commands of shape"):
+        actions.decode(bomb, (6, 21, 6, 3, 34), "it")
+
+
+def test_a_link_is_no_record(drafts, tmp_path: Path) -> None:
+    path = drafts["pid_best"].save(tmp_path)
+    link = tmp_path / "link.json"
+    link.symlink_to(path)
+    with pytest.raises(InputError, match="symbolic link"):
+        store.add(tmp_path / "board", link)
+
+
+def test_add_refuses_what_does_not_fit(leaderboard: Path, draft, drafts, simulators) -> None:
+    with pytest.raises(InputError, match="already"):
+        put(leaderboard, drafts["softer"], simulators)
+    with pytest.raises(InputError, match="is not there"):
+        put(leaderboard, draft("new", supersedes="a" * 64), simulators)
+    robust = next(x for x in store.load(leaderboard).scores if x.name == "robust")
+    with pytest.raises(InputError, match="another entry"):
+        put(leaderboard, draft("softer", supersedes=robust.sha256), simulators)
+    softer = next(x for x in store.load(leaderboard).scores if x.name == "softer")
+    quiet = draft("softer", sandbox=None, supersedes=softer.sha256)
+    with pytest.raises(InputError, match="is not official and supersedes"):
+        put(leaderboard, quiet, simulators)
+
+    class Other(Textbook):
+        def about(self) -> dict[str, Any]:
+            return {"version": 2}
+
+    with pytest.raises(InputError, match="other simulators"):
+        put(leaderboard, draft("new"), Other())
+    assert len(store.load(leaderboard).records) == 8
+
+
+def test_a_record_that_does_not_replay_is_not_added(leaderboard: Path, drafts, simulators) -> None:
+    values = json.loads(drafts["softer"].content)
+    values["errors"]["drawn"][0][0][0] -= 1e-6
+    forged = create.Draft(canonical.canonical(values), drafts["softer"].commands)
+    with pytest.raises(InputError, match=r"does not replay: key errors\.drawn\[0\]\[0\]\[0\] says"):
+        put(leaderboard, forged, simulators)
+
+
+def test_the_newest_official_record_counts(leaderboard: Path, draft, simulators) -> None:
+    old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
+    new = put(leaderboard, draft("softer", factor=0.96), simulators)
+    home = put(leaderboard, draft("softer", factor=0.95, sandbox=None), simulators)
+    track = ranking.standings(store.load(leaderboard).records)[1]["performance"]
+    entry = next(x for x in track.ranked if x.record.name == "softer")
+    assert entry.record.sha256 == new.sha256
+    assert [event.record.sha256 for event in entry.history] == [
+        home.sha256, new.sha256, old.sha256,
+    ]  # fmt: skip
+    assert home.sha256 in [x.record.sha256 for x in track.unofficial]
+
+
+def test_a_withdrawn_record_is_listed_with_its_reason(leaderboard: Path) -> None:
+    old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
+    store.withdraw(leaderboard, old.sha256[:10], "its <b>authors</b> found a bug")
+    track = ranking.standings(store.load(leaderboard).records)[1]["performance"]
+    assert "softer" not in [x.record.name for x in track.ranked]
+    (entry,) = [x for x in track.unranked if x.record.name == "softer"]
+    assert entry.reasons == ("withdrawn: its <b>authors</b> found a bug",)
+    with pytest.raises(InputError, match="already"):
+        store.withdraw(leaderboard, old.sha256, "again")
+    with pytest.raises(InputError, match="no single record"):
+        store.withdraw(leaderboard, "f" * 64, "x")

@@ -9,8 +9,8 @@ import pytest
 from ventbench.errors import InputError
 from ventbench.physics import library, mechanism, parameter, paths, strength_path
 from ventbench.physics.catalogue import basis_terms, special_cases
+from ventbench.physics.component_curves import component_curves
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
-from ventbench.physics.shapes import drawn
 from ventbench.plants.plant_files import load_plant, save_plant
 from ventbench.precision import float64
 from ventbench.rollouts import open_loop
@@ -79,7 +79,7 @@ def rms(x):
 
 
 def mean_values(found):
-    """Of the base and of the elements, as :func:`drawn` takes them."""
+    """Of the base and of the elements, as :func:`component_curves` takes them."""
     return {path: float(found.column(path).mean()) for path in paths(found.mechanisms)}
 
 
@@ -167,8 +167,8 @@ def test_drawn_shapes_are_those_that_were_put_in(bench, slot):
     first = NONPARAMETRIC_COMPONENTS[slot].terms[0]
     given = drawn_coefficients([first], 7, 0.5)
     values = mean_values(bench.fit(bench.predict(given), [first]))
-    truth = drawn(slot, {"R": 11.0, "C": 23.0} | given, SEEN[slot])[0]
-    found = drawn(slot, values, SEEN[slot])[0]
+    truth = component_curves(slot, {"R": 11.0, "C": 23.0} | given, SEEN[slot])[0]
+    found = component_curves(slot, values, SEEN[slot])[0]
     assert found.x_unit == NONPARAMETRIC_COMPONENTS[slot].axis
     size = np.abs(truth.y).max()
     assert size > 0
@@ -241,8 +241,8 @@ def test_readings_are_understood(bench):
             item = basis_terms()[name]
             own = {p.rpartition(".")[2]: jnp.asarray(x) for p, x in given.items() if name in p}
             position = jnp.asarray(0.6)
-            meant = item.meant(own, jnp.asarray(shown), position)
-            np.testing.assert_allclose(item.shown(own, meant, position), shown, atol=1e-9)
+            meant = item.sensor_input(own, jnp.asarray(shown), position)
+            np.testing.assert_allclose(item.sensor_output(own, meant, position), shown, atol=1e-9)
             assert np.abs(meant - shown).max() > 0.1
 
 
@@ -277,29 +277,29 @@ def test_a_fit_with_a_drift_gives_a_plant_with_positions(bench):
 def test_what_base_parameters_absorb_is_not_drawn():
     """A resistance that is everywhere the same is R."""
     values = {"C": 20.0, "R": 10.0} | {f"volume_resistance.c{k}": 0.5 for k in range(1, 6)}
-    whole = drawn("R(V)", values)[0]
+    whole = component_curves("R(V)", values)[0]
     assert whole.x.max() == pytest.approx(900.0)
     assert whole.y.max() == pytest.approx(5.0)
-    cut = drawn("R(V)", values, (200.0, 600.0))[0]
+    cut = component_curves("R(V)", values, (200.0, 600.0))[0]
     assert (cut.x.min(), cut.x.max()) == pytest.approx((200.0, 600.0))
     np.testing.assert_allclose(cut.y, 0.0, atol=1e-9)
 
 
 def test_the_strongest_element_is_drawn_first():
-    shapes = drawn("measurement", {"drift_shape.c4": 3.0, "sensor_memory.c1": 0.1})
+    shapes = component_curves("measurement", {"drift_shape.c4": 3.0, "sensor_memory.c1": 0.1})
     assert shapes[0].x_unit == "position in the recording, 0..1"
     assert shapes[0].y[-1] == pytest.approx(3.0)
     assert len(shapes) == 3
-    late = drawn("exhalation path", {"outlet_memory.c2": 1.0, "outlet_shape.c1": 0.1})
+    late = component_curves("exhalation path", {"outlet_memory.c2": 1.0, "outlet_shape.c1": 0.1})
     assert late[0].y[0] == pytest.approx(1.0)
     for slot in NONPARAMETRIC_COMPONENTS:
-        for shape in drawn(slot, {}):
+        for shape in component_curves(slot, {}):
             np.testing.assert_array_equal(shape.y, 0.0)
             assert shape.x.shape == shape.y.shape
 
 
 def test_bad_drawings():
-    with pytest.raises(InputError, match="no slot 'f"):
-        drawn("f(x)", {})
+    with pytest.raises(InputError, match="no nonparametric component 'f"):
+        component_curves("f(x)", {})
     with pytest.raises(InputError, match="give a range within"):
-        drawn("f(u)", {}, (200.0, 300.0))
+        component_curves("f(u)", {}, (200.0, 300.0))

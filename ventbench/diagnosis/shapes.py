@@ -11,8 +11,8 @@ from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY, Lat
 from ventbench.diagnosis.refinement import UnnamedEffect
 from ventbench.diagnosis.screening import component_of
 from ventbench.physics.catalogue import mechanism
+from ventbench.physics.component_curves import component_curves, without_absorbed
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
-from ventbench.physics.shapes import drawn, without_absorbed
 
 _MEANINGS = {
     ALVEOLUS: "a pressure at the alveolus that moves in time and that no command explains",
@@ -69,5 +69,5 @@ def _curve(full: FittedModel, element: str) -> tuple[np.ndarray, np.ndarray, str
         for name in (*own, "R", "C", "gain", "R_ex", "PEEP")
     }
     # The slot's other elements are neutral; the strongest curve is the first.
-    curve = without_absorbed(drawn(component_of(element), values)[0])
+    curve = without_absorbed(component_curves(component_of(element), values)[0])
     return np.asarray(curve.x, float), np.asarray(curve.y, float), curve.x_unit, curve.y_unit

@@ -1,10 +1,10 @@
-"""Base model of a lung on its ventilator, the mechanisms that may be missing, and their fits."""
+"""Model of a lung on its ventilator: base model, mechanisms and nonparametric components."""
 
 from ventbench.physics.catalogue import library, mechanism, parameter, paths, strength_path
+from ventbench.physics.dead_time import resolution
 from ventbench.physics.mechanism import Description, Mechanism
 from ventbench.physics.model import Physics, PhysicsState, physics
 from ventbench.physics.parameters import Parameter
-from ventbench.physics.times import resolution
 
 __all__ = [
     "Description",

@@ -11,9 +11,9 @@ from functools import cached_property, lru_cache
 from types import ModuleType
 
 from ventbench.errors import InputError
-from ventbench.physics import base, mechanisms, nonparametric
+from ventbench.physics import mechanisms, nonparametric
 from ventbench.physics.mechanism import Mechanism
-from ventbench.physics.parameters import Parameter
+from ventbench.physics.parameters import BASE_PARAMETERS, Parameter
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,8 @@ def extended(*added: Mechanism) -> Iterator[None]:
 def library() -> dict[str, Mechanism]:
     """Every mechanism by name, in alphabetical order.
 
-    Each module of the package ``mechanisms`` defines one, as ``MECHANISM``, under its own name.
+    Each module of the package ``mechanisms`` defines one, as ``MECHANISM``, whose name is that of
+    the module.
     """
     return _catalogue().library
 
@@ -72,7 +73,8 @@ def library() -> dict[str, Mechanism]:
 def basis_terms() -> dict[str, Mechanism]:
     """Every basis term of the nonparametric components by name, in alphabetical order.
 
-    They are not in the library; a fit has those that its caller names.
+    Modules of the package ``nonparametric`` define them, as ``TERMS``. They are not in the library;
+    a fit has those that its caller names.
     """
     return _catalogue().basis_terms
 
@@ -107,7 +109,7 @@ def parameter(path: str) -> Parameter:
         InputError: if there is none.
     """
     owner, _, short = path.rpartition(".")
-    among = mechanism(owner).description.parameters if owner else base.PARAMETERS
+    among = mechanism(owner).description.parameters if owner else BASE_PARAMETERS
     for candidate in among:
         if candidate.name == short:
             return candidate
@@ -130,7 +132,7 @@ def strength_path(name: str) -> str:
 def _catalogue() -> Catalogue:
     global _current
     if _current is None:
-        _current = Catalogue(_discovered(mechanisms), _discovered(nonparametric))
+        _current = Catalogue(_library(), _basis_terms())
     return _current
 
 
@@ -142,18 +144,29 @@ def _paths(catalogue: Catalogue, names: tuple[str, ...] | None) -> tuple[str, ..
         for name, each in chosen.items()
         for parameter in each.description.parameters
     ]
-    return (*(parameter.name for parameter in base.PARAMETERS), *own)
+    return (*(parameter.name for parameter in BASE_PARAMETERS), *own)
 
 
-def _discovered(package: ModuleType) -> dict[str, Mechanism]:
-    discovered: dict[str, Mechanism] = {}
-    modules = sorted(module.name for module in pkgutil.iter_modules(package.__path__))
-    for name in (name for name in modules if not name.startswith("_")):
-        mechanism = importlib.import_module(f"{package.__name__}.{name}").MECHANISM
+def _library() -> dict[str, Mechanism]:
+    library = {module.__name__.rpartition(".")[2]: module.MECHANISM for module in _in(mechanisms)}
+    for name, mechanism in library.items():
         if mechanism.description.name != name:
             raise ValueError(f"{name}.py describes {mechanism.description.name!r}")
-        discovered[name] = mechanism
-    return discovered
+    return library
+
+
+def _basis_terms() -> dict[str, Mechanism]:
+    terms = [term for module in _in(nonparametric) for term in getattr(module, "TERMS", ())]
+    by_name = {term.description.name: term for term in terms}
+    if len(by_name) < len(terms):
+        raise ValueError("two basis terms have the same name")
+    return dict(sorted(by_name.items()))
+
+
+def _in(package: ModuleType) -> Iterator[ModuleType]:
+    """Import the modules of a package, in alphabetical order."""
+    for name in sorted(module.name for module in pkgutil.iter_modules(package.__path__)):
+        yield importlib.import_module(f"{package.__name__}.{name}")
 
 
 def _names(parameters: Iterable[Parameter]) -> str:

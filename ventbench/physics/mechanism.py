@@ -1,18 +1,23 @@
-"""What a mechanism is: a description, and what it does at its place in the physics."""
+"""What a mechanism is, where it acts, and how a model applies several."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
+import jax
+import jax.numpy as jnp
 from jax import Array
 
 from ventbench.physics.network import Network, View
-from ventbench.physics.parameters import Parameter
+from ventbench.physics.parameters import BASE_PARAMETERS, Parameter
 
-#: Its own parameters, by short name.
+#: Values of a mechanism's parameters, by short name.
 Values = Mapping[str, Array]
+
+#: What a mechanism changes: any pytree of arrays.
+Before = TypeVar("Before")
 
 #: Where in the physics a mechanism sits.
 Site = Literal[
@@ -23,22 +28,25 @@ Site = Literal[
 
 @dataclass(frozen=True)
 class Description:
-    """What is known of a mechanism, for people and for machines.
+    """What is known about a mechanism, for people and for programs.
+
+    All that other packages need to know about a mechanism stands here, so that a new one is a
+    single file.
 
     Attributes:
-        name: public name, also that of its module.
-        title: in a few words.
-        site: where in the physics it sits.
-        equation: in plain text.
-        parameters: in the order of reports; the first is its strength.
-        source: of the equation and the ranges.
-        signature: where in a recording it shows.
-        confusable: names of mechanisms, or of other things, that look alike.
-        detectable: smallest strength found in about 20 breaths of one lung, in the strength's unit,
-            or None if it was not measured.
+        name: public name; the module of a library mechanism has the same name.
+        title: the mechanism in a few words.
+        site: where in the physics it acts.
+        equation: its equation in plain text.
+        parameters: in the order of reports; the first one is the strength.
+        source: where the equation and the ranges come from.
+        signature: what it changes in a recording.
+        confusable: names of mechanisms, or of other effects, with a similar signature.
+        detectable: smallest strength that about 20 breaths of one lung reveal, in the unit of the
+            strength; None if nobody has measured it.
         equivalents: names of other structures, in or outside the library, that have the same
             impedance, so that pressure alone can never tell them from this mechanism.
-        interchangeable: pairs of its parameters whose values can be exchanged without any effect,
+        interchangeable: pairs of parameters whose values can be exchanged without any effect, such
             as the time constants of two lags in series. Reports give the larger value first.
         special_case_of: basis terms (of ``ventbench.physics.nonparametric``) that contain this
             mechanism, exactly or nearly.
@@ -63,71 +71,167 @@ class Description:
         return self.parameters[0]
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON values."""
+        """All fields as JSON values."""
         return asdict(self)
 
 
 class Mechanism:
-    """Base of all mechanisms: does nothing. A mechanism overrides what it changes.
+    """Base class of all mechanisms, which does nothing. A mechanism overrides what it changes.
 
-    All methods are pure and elementwise over arrays ``(...)``; at the neutral strength each must
-    return what the base class returns, as fits skip it where all its parameters are neutral.
-    Mechanisms at the same place act in the order of ``rank``.
+    All methods are pure and elementwise over arrays ``(...)``. At the neutral strength each method
+    must return what the base class returns, because fits skip a mechanism whose parameters are all
+    neutral. Mechanisms that change the same quantity act in the order of ``rank``.
     """
 
     description: Description
     #: Order among the mechanisms that change the same quantity.
     rank: int = 0
-    #: True if it keeps a continuous state, which starts as :meth:`rest` says.
+    #: True if it has a continuous state, which starts at :meth:`initial_state`.
     stateful: bool = False
-    #: True if it remembers something from sample to sample; it starts as the resting command.
-    remembers: bool = False
-    #: True if it looks at the breath's position in the recording.
-    positioned: bool = False
+    #: True if it keeps a memory from sample to sample, which starts as the resting command.
+    has_memory: bool = False
+    #: True if its effect depends on the position of the breath in the recording.
+    uses_position: bool = False
 
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
-        """What opens the inspiratory valve, %, and what is remembered, once a sample."""
+        """Effective command of the inspiratory valve, %, and the new memory, once a sample."""
         return u_in, memory
 
     def dead_time(self, values: Values) -> Array | float:
-        """Seconds by which the inspiratory valve answers late."""
+        """Dead time that it adds to the inspiratory valve, s."""
         return 0.0
 
     def outlet_dead_time(self, values: Values, u_out: Array) -> Array | float:
-        """Seconds by which the expiratory valve answers late to the command ``u_out``."""
+        """Dead time that it adds to the expiratory valve for the command ``u_out``, s."""
         return 0.0
 
-    def rest(self, values: Values, flow: Array, pressure: Array) -> Array:
-        """Its state at the start of a breath, from the resting inflow, L/s, and cmH2O.
+    def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
+        """State at the start of a breath, given the resting flow, L/s, and pressure, cmH2O.
 
-        One that keeps several states stacks them along a first axis, ``(K, ...)``.
+        A mechanism with several states stacks them along a first axis, ``(K, ...)``.
         """
         return flow * 0.0
 
     def inflow(
         self, values: Values, flow: Array, state: Array, length: Array
     ) -> tuple[Array, Array]:
-        """What becomes of the inspiratory valve's flow, L/s; and its own state after the step."""
+        """Flow that arrives at the airway, L/s, and the own state after the step."""
         return flow, state
 
     def network(self, values: Values, network: Network, view: View) -> Network:
-        """What it adds where the flows meet, by :meth:`Network.plus`."""
+        """Network with its contribution, made by :meth:`Network.plus`."""
         return network
 
-    def settle(self, values: Values, state: Array, flow: Array, view: View) -> Array:
-        """Its own state after a step with this flow into the lung, L/s."""
+    def next_state(self, values: Values, state: Array, flow: Array, view: View) -> Array:
+        """Own state after a step with this flow into the lung, L/s."""
         return state
 
     def reading(
         self, values: Values, pressure: Array, state: Array, length: Array
     ) -> tuple[Array, Array]:
-        """What the sensor makes of the pressure, cmH2O; and its own state after the step."""
+        """Pressure after the sensor's dynamics, cmH2O, and the own state after the step."""
         return pressure, state
 
-    def shown(self, values: Values, pressure: Array, position: Array) -> Array:
-        """What is recorded of the sensor's pressure, cmH2O: without memory, invertible."""
+    def sensor_output(self, values: Values, pressure: Array, position: Array) -> Array:
+        """Recorded pressure, cmH2O: a static and invertible function of the sensor's pressure."""
         return pressure
 
-    def meant(self, values: Values, shown: Array, position: Array) -> Array:
-        """Inverse of :meth:`shown`."""
-        return shown
+    def sensor_input(self, values: Values, recorded: Array, position: Array) -> Array:
+        """Inverse of :meth:`sensor_output`."""
+        return recorded
+
+
+def is_active(mechanism: Mechanism, values: Values) -> Array:
+    """Whether any parameter differs from its neutral value in any element, ``()``.
+
+    All parameters count: the strength of a basis term is the set of its coefficients.
+    """
+    moved = [jnp.any(values[p.name] != p.neutral) for p in mechanism.description.parameters]
+    return jnp.any(jnp.stack(moved))
+
+
+def apply_if_active(
+    active: Array | None, change: Callable[[Before], Before], before: Before
+) -> Before:
+    """Return ``change(before)``, or ``before`` if the mechanism is inactive.
+
+    Only the leaves that the change replaces pass through the branch; XLA would copy the others.
+
+    Args:
+        active: from :func:`is_active`; None computes the change unconditionally.
+        change: keeps the shapes of the leaves, and returns a leaf that it does not change itself.
+        before: any pytree of arrays.
+    """
+    if active is None:
+        return change(before)
+    leaves, tree = jax.tree.flatten(before)
+    traced = jax.make_jaxpr(change)(before).jaxpr
+    ends = zip(traced.invars, traced.outvars, strict=True)
+    replaced = [k for k, (old, new) in enumerate(ends) if new is not old]
+    if not replaced:
+        return before
+
+    def changed(*given: Array) -> tuple[Array, ...]:
+        current = list(leaves)
+        for k, leaf in zip(replaced, given, strict=True):
+            current[k] = leaf
+        after = jax.tree.leaves(change(jax.tree.unflatten(tree, current)))
+        return tuple(after[k] for k in replaced)
+
+    given = [leaves[k] for k in replaced]
+    for k, leaf in zip(replaced, jax.lax.cond(active, changed, _same, *given), strict=True):
+        leaves[k] = leaf
+    return jax.tree.unflatten(tree, leaves)
+
+
+def _same(*given: Array) -> tuple[Array, ...]:
+    return given
+
+
+_NEUTRAL_BASE = {parameter.name: parameter.neutral for parameter in BASE_PARAMETERS}
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """The mechanisms of a model in order of rank, and all parameter values by owner.
+
+    Attributes:
+        base: values of the base model's parameters.
+        mechanisms: mechanisms that have a named parameter.
+        values: parameter values of each of them.
+        active: whether each of them is active; empty if inactive ones are computed as well.
+    """
+
+    base: Values
+    mechanisms: dict[str, Mechanism]
+    values: dict[str, Values]
+    active: dict[str, Array]
+
+    def change(self, name: str, hook: Callable[..., Before], before: Before, *seen: Any) -> Before:
+        """Return ``hook(mechanism, its values, before, *seen)``, or ``before`` if inactive."""
+
+        def changed(before: Before) -> Before:
+            return hook(self.mechanisms[name], self.values[name], before, *seen)
+
+        return apply_if_active(self.active.get(name), changed, before)
+
+    def total(self, term: Callable[[Mechanism, Values], Array | float]) -> Array | float:
+        """Sum of a term over all mechanisms."""
+        return sum(term(item, self.values[name]) for name, item in self.mechanisms.items())
+
+
+def assemble(
+    named: Mapping[str, Array], library: Mapping[str, Mechanism], skip_idle: bool = False
+) -> Assembly:
+    """Sort values that are given by path, and give all other parameters their neutral value."""
+    # A dead time is recognised by the type jax.Array; files give numpy arrays.
+    named = {path: jnp.asarray(value) for path, value in named.items()}
+    owners = {path.rpartition(".")[0] for path in named}
+    chosen = sorted((n for n in library if n in owners), key=lambda n: (library[n].rank, n))
+    own = {}
+    for name in chosen:
+        items = library[name].description.parameters
+        own[name] = {p.name: named.get(f"{name}.{p.name}", jnp.asarray(p.neutral)) for p in items}
+    given = {name: named.get(name, jnp.asarray(value)) for name, value in _NEUTRAL_BASE.items()}
+    active = {name: is_active(library[name], own[name]) for name in chosen if skip_idle}
+    return Assembly(given, {name: library[name] for name in chosen}, own, active)

@@ -1,9 +1,9 @@
-"""The lung on its ventilator, with any set of mechanisms: a plant that can be fitted.
+"""A lung on its ventilator with any set of mechanisms: a plant whose parameters can be fitted.
 
-Between samples the commands are held. Dead times are exact for held commands (see ``times``).
-Everything else is integrated by the two-stage SDIRK method of Alexander (SIAM J. Numer. Anal. 14,
-1977, 1006): second order and L-stable, so that a circuit without compliance and a gas without
-inertance, whose equations are algebraic, need no case of their own.
+Commands are held from sample to sample, and dead times are exact for held commands (see
+``dead_time``). All else is integrated by a two-stage SDIRK method (see ``solver``): second order
+and L-stable, so that a circuit without compliance and a gas without inertance, whose equations are
+algebraic, need no case of their own.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from numpy.typing import ArrayLike
 
 from ventbench.errors import InputError
 from ventbench.lungs import Lung
-from ventbench.physics import stage, times
+from ventbench.physics import dead_time, solver
 from ventbench.physics.catalogue import everything, parameter, paths
-from ventbench.physics.parts import Parts, sort
-from ventbench.physics.stage import Stage
+from ventbench.physics.mechanism import Assembly, assemble
+from ventbench.physics.solver import ContinuousState
 
 
 @flax.struct.dataclass
@@ -31,17 +31,19 @@ class PhysicsState:
     """State between two samples; every array has shape ``(...)`` unless it says otherwise.
 
     Attributes:
-        now: continuous states: see :class:`~ventbench.physics.stage.Stage`.
-        memory: what mechanisms remember from sample to sample, by name.
-        commanded: flows that the last commands ask for, the latest first, L/s, ``(..., memory)``.
-        opened: expiratory valve during the last samples, likewise, 0/1.
-        past: durations of the last samples, likewise, s.
-        time: since the start of the breath, s.
-        first: volume of the lung at the start, L.
+        continuous: see :class:`~ventbench.physics.solver.ContinuousState`.
+        memory: memories of mechanisms from sample to sample, by name.
+        commanded: flows that the last commands ask for, the latest first, L/s,
+            ``(..., memory + 1)``.
+        opened: expiratory valve during the last samples, the latest first, 0/1,
+            ``(..., memory + 1)``.
+        past: durations of the last samples, the latest first, s, ``(..., memory)``.
+        time: time since the start of the breath, s.
+        first: volume of the lung at the start of the breath, L.
         peep: pressure behind the expiratory valve, cmH2O.
     """
 
-    now: Stage
+    continuous: ContinuousState
     memory: dict[str, Array]
     commanded: Array
     opened: Array
@@ -56,19 +58,19 @@ class Physics:
     """Base model and mechanisms; parameters that are not named stand at their neutral values.
 
     Attributes:
-        values: one array ``()`` or ``(...)`` a name.
-        names: paths of parameters, such as ``R`` or ``valve_delay.delay``. A mechanism acts if any
-            of its parameters is named; one at its neutral strength changes nothing.
-        substeps: of a sample.
-        memory: samples that dead times can reach back over.
-        skip_idle: skip mechanisms whose parameters are neutral in all elements. Much faster where
-            few of many act; derivatives by the parameters of the others come out as zero.
+        values: one array ``()`` or ``(...)`` for each name.
+        names: paths of parameters, such as ``R`` or ``valve_delay.delay``. A mechanism takes part
+            if any of its parameters is named; at its neutral strength it changes nothing.
+        substeps: number of substeps in a sample.
+        memory: number of past samples that a dead time can reach back over.
+        skip_idle: skip mechanisms whose parameters are neutral in all elements. This is much faster
+            where few of many are active; derivatives by the parameters of the others are zero.
     """
 
     values: tuple[Array, ...]
     names: tuple[str, ...] = flax.struct.field(pytree_node=False)
-    substeps: int = flax.struct.field(pytree_node=False, default=times.SUBSTEPS)
-    memory: int = flax.struct.field(pytree_node=False, default=times.MEMORY)
+    substeps: int = flax.struct.field(pytree_node=False, default=dead_time.SUBSTEPS)
+    memory: int = flax.struct.field(pytree_node=False, default=dead_time.MEMORY)
     skip_idle: bool = flax.struct.field(pytree_node=False, default=False)
 
     def init(self, pressure: Array, peep: Array | None = None) -> PhysicsState:
@@ -76,20 +78,20 @@ class Physics:
 
         Without ``peep``, the parameter ``PEEP`` is taken, and without that the pressure.
         """
-        parts = self._parts()
+        assembly = self._assembly()
         pressure = jnp.asarray(pressure) * 1.0
         shape = jnp.broadcast_shapes(pressure.shape, *(jnp.shape(v) for v in self.values))
         shown = jnp.broadcast_to(pressure, shape)
         if peep is None:
-            peep = parts.base["PEEP"] if "PEEP" in self.names else shown
-        u_in = parts.base["rest"] + 0.0 * shown
-        memory = {name: u_in for name, item in parts.mechanisms.items() if item.remembers}
-        # Idle ones too: what they remember takes its shape here.
-        flow, memory = stage.commanded(replace(parts, acting={}), u_in, memory)
-        now, one = stage.at_rest(parts, shown, flow), jnp.ones_like(flow)
+            peep = assembly.base["PEEP"] if "PEEP" in self.names else shown
+        u_in = assembly.base["rest"] + 0.0 * shown
+        memory = {name: u_in for name, item in assembly.mechanisms.items() if item.has_memory}
+        # Inactive mechanisms as well, because the memories get their shapes here.
+        flow, memory = solver.commanded(replace(assembly, active={}), u_in, memory)
+        rest, one = solver.at_rest(assembly, shown, flow), jnp.ones_like(flow)
         return PhysicsState(
-            now, memory, _repeat(flow, self.memory + 1), _repeat(one, self.memory + 1),
-            _repeat(0.03 * one, self.memory), 0.0 * one, now.volume, peep * one,
+            rest, memory, _repeat(flow, self.memory + 1), _repeat(one, self.memory + 1),
+            _repeat(0.03 * one, self.memory), 0.0 * one, rest.volume, peep * one,
         )  # fmt: skip
 
     def step(
@@ -102,7 +104,7 @@ class Physics:
     def observe(
         self, state: PhysicsState, u_in: Array, u_out: Array, dt: Array
     ) -> tuple[PhysicsState, tuple[Array, Array, Array]]:
-        """Hold one command, and see more than pressure.
+        """Hold one command, and return flow and volume besides pressure.
 
         Args:
             state: from ``init``, ``step`` or ``observe``.
@@ -114,34 +116,34 @@ class Physics:
             The next state; measured airway pressure, cmH2O, flow into the lung, mL/s, and volume
             above that of the first sample, mL, all at the end of ``dt``.
         """
-        parts = self._parts()
+        assembly = self._assembly()
         zero = jnp.zeros_like(state.time)
-        flow, memory = stage.commanded(parts, u_in + zero, state.memory)
+        flow, memory = solver.commanded(assembly, u_in + zero, state.memory)
         commanded = _push(flow, state.commanded)
         opened = _push(u_out + zero, state.opened)
-        late = parts.total(lambda item, own: item.dead_time(own))
-        late_out = parts.total(lambda item, own: item.outlet_dead_time(own, u_out))
-        lengths, open_for, wanted = times.windows(
+        late = assembly.total(lambda item, own: item.dead_time(own))
+        late_out = assembly.total(lambda item, own: item.outlet_dead_time(own, u_out))
+        lengths, open_for, wanted = dead_time.windows(
             dt, state.past, (late_out, late), (opened, commanded), self.substeps, self.skip_idle
         )
 
         def substep(carry: tuple[Any, Array], held: tuple[Array, ...]) -> tuple[Any, None]:
             (now, time), (wanted, opened, h) = carry, held
-            now = stage.substep(parts, now, wanted, opened, time, h, state.peep)
+            now = solver.substep(assembly, now, wanted, opened, time, h, state.peep)
             return (now, time + h), None
 
-        # A loop, since unrolled XLA compiles for minutes and computes the same thing many times.
+        # As a loop: unrolled, XLA compiles for minutes and repeats computations.
         held = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), (wanted, open_for, lengths))
-        (now, time), _ = jax.lax.scan(substep, (state.now, state.time), held)
+        (now, time), _ = jax.lax.scan(substep, (state.continuous, state.time), held)
         after = PhysicsState(
             now, memory, commanded[..., :-1], opened[..., :-1],
             _push(dt + zero, state.past)[..., :-1], time, state.first, state.peep,
         )  # fmt: skip
         volume = 1000.0 * (now.volume - state.first)
-        return after, (stage.shown(parts, now.reading), 1000.0 * now.flow, volume)
+        return after, (solver.sensor_output(assembly, now.reading), 1000.0 * now.flow, volume)
 
     def vary(self, r_scale: Array, c_scale: Array) -> Physics:
-        """Return the same lung with another resistance and compliance."""
+        """Return the model with scaled resistance and compliance."""
         scales = {"R": r_scale, "C": c_scale}
         varied = [
             value * scales.get(parameter(name).follows or "", 1.0)
@@ -150,7 +152,7 @@ class Physics:
         return self.replace(values=tuple(varied))  # type: ignore[attr-defined]
 
     def get(self, name: str) -> Array:
-        """Value of a parameter, named or not."""
+        """Value of a parameter; its neutral value if it is not named."""
         if name in self.names:
             return self.values[self.names.index(name)]
         return jnp.asarray(parameter(name).neutral)
@@ -170,9 +172,9 @@ class Physics:
             names=names, values=tuple(named[name] for name in names)
         )
 
-    def _parts(self) -> Parts:
+    def _assembly(self) -> Assembly:
         named = dict(zip(self.names, self.values, strict=True))
-        return sort(named, everything(), self.skip_idle)
+        return assemble(named, everything(), self.skip_idle)
 
 
 def physics(

@@ -1,4 +1,4 @@
-"""One number of the physics: what it means, in which unit, between which bounds."""
+"""Parameters of the physics: meaning, unit, bounds and priors; and those of the base model."""
 
 from __future__ import annotations
 
@@ -9,6 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ventbench.errors import InputError
+
+#: Flow of the PVP's inspiratory valve, mL/s per % (137 L/min fully open).
+VALVE_GAIN = 22.8
+
+#: Resistance of the expiratory path, cmH2O/(L/s).
+EXPIRATORY_RESISTANCE = 5.0
 
 
 @dataclass(frozen=True)
@@ -142,3 +148,44 @@ class Parameter:
         if self.scale == "log":
             return 0.5 * (low + high), 0.25 * (high - low)
         return self.neutral, 0.5 * (high - low)
+
+
+#: Base parameters that every fit frees, so that a wrong label cannot pass for a mechanism.
+REFITTED = ("R", "C", "R_ex", "PEEP")
+
+#: Parameters of the base model: the lung, the valves, and how a breath begins. ``neutral`` is the
+#: value in a model that does not name the parameter; a model without ``PEEP`` takes the pressure
+#: that a breath starts from. R and C stand for a label that must be given.
+BASE_PARAMETERS = (
+    Parameter(
+        "R", "cmH2O s/L", "resistance of the airway", 0.5, 200.0, 20.0, 20.0, 50.0, "log",
+        follows="R",
+    ),
+    Parameter(
+        "C", "mL/cmH2O", "compliance of the lung at low volume", 2.0, 250.0, 20.0, 20.0, 50.0,
+        "log", follows="C",
+    ),
+    Parameter(
+        "gain", "mL/s per %", "flow of the inspiratory valve", 2.0, 100.0, VALVE_GAIN, VALVE_GAIN,
+        VALVE_GAIN, "log",
+    ),
+    Parameter(
+        "R_ex", "cmH2O s/L", "resistance of the expiratory path", 0.3, 100.0,
+        EXPIRATORY_RESISTANCE, EXPIRATORY_RESISTANCE, EXPIRATORY_RESISTANCE, "log",
+    ),
+    Parameter(
+        "PEEP", "cmH2O", "pressure behind the expiratory valve", -10.0, 30.0, 5.0, 5.0, 5.0
+    ),
+    Parameter(
+        "rest", "%", "command before the first sample of a breath", 0.0, 100.0, 0.0, 0.0, 0.0,
+        shape=True,
+    ),
+    Parameter(
+        "offset", "cmH2O", "recoil minus airway pressure at the first sample", -10.0, 10.0, 0.0,
+        0.0, 0.0, shape=True,
+    ),
+    Parameter(
+        "position", "1", "of the breath in its recording, 0 first, 1 last", 0.0, 1.0, 0.0, 0.0,
+        1.0, "linear", "breath", shape=True,
+    ),
+)  # fmt: skip

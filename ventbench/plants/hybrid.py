@@ -13,7 +13,7 @@ import flax.struct
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.plants.delay import shares
+from ventbench.physics.dead_time import window_weights
 
 #: Knots of the valve's piecewise linear curve, %; the last segment ends at infinity.
 VALVE_KNOTS = (0.0, 1.0, 2.0, 3.5, 5.0, 7.0, 10.0, 14.0, 19.0, 26.0, 36.0, 50.0, 70.0)
@@ -174,11 +174,11 @@ class Hybrid:
         lag, smooth = jnp.exp(-h / self.valve_lag), jnp.exp(-h / self.sensor_lag)
         open_or_close = u_out * self.opening_delay + (1.0 - u_out) * self.closing_delay
         for k in range(SUBSTEPS):
-            held = shares(k * h - self.valve_delay, h, state.past)
+            held = window_weights(k * h - self.valve_delay, h, state.past)
             wanted = jnp.sum(held * commanded, axis=-1)
             inflow = wanted + (flow - wanted) * self.valve_lag / h * (1.0 - lag)  # mean over h
             flow = wanted + (flow - wanted) * lag
-            held = shares(k * h - open_or_close, h, state.past)
+            held = window_weights(k * h - open_or_close, h, state.past)
             outlet = conductance * jnp.sum(held * opened, axis=-1)
             elastic, drop, pressure = self._fill(elastic, drop, inflow, outlet, behind, h)
             sensor = pressure + (sensor - pressure) * smooth

@@ -8,12 +8,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ventbench.lungs import Lung
-
-#: Flow of the PVP's inspiratory valve, mL/s per % (137 L/min fully open).
-VALVE_GAIN = 22.8
-
-#: Resistance of the expiratory path, cmH2O/(L/s).
-EXPIRATORY_RESISTANCE = 5.0
+from ventbench.physics.parameters import EXPIRATORY_RESISTANCE, VALVE_GAIN
 
 
 @flax.struct.dataclass

@@ -14,8 +14,8 @@ import numpy as np
 from jax import Array
 
 from ventbench.physics.catalogue import parameter
+from ventbench.physics.dead_time import resolution
 from ventbench.physics.model import Physics
-from ventbench.physics.times import resolution
 from ventbench.precision import float64
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.together import each

@@ -72,7 +72,7 @@ class Fit:
     def plant(self, breath: int | slice = slice(None)) -> Physics:
         """The fitted plant, in float64: one breath's, or a stack over breaths."""
         names = [name for name in paths(self.mechanisms) if name != "position"]
-        names += ["position"] if any(mechanism(m).positioned for m in self.mechanisms) else []
+        names += ["position"] if any(mechanism(m).uses_position for m in self.mechanisms) else []
         simulator = self.problem.simulator
         with float64():
             given = {name: self.column(name)[breath] for name in names}

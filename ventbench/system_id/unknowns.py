@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ventbench.errors import InputError
-from ventbench.physics import base
 from ventbench.physics.catalogue import mechanism, parameter, strength_path
-from ventbench.physics.parameters import Parameter
+from ventbench.physics.parameters import REFITTED, Parameter
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.derivatives import START
 
@@ -34,7 +33,7 @@ def freed(mechanisms: Iterable[str]) -> tuple[str, ...]:
         for item in mechanism(name).description.parameters
         if not item.shape
     ]
-    return (*base.REFITTED, *own, START)
+    return (*REFITTED, *own, START)
 
 
 @dataclass(frozen=True, eq=False)

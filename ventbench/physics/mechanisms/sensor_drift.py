@@ -71,14 +71,14 @@ class SensorDrift(Mechanism):
     )
 
     rank = 1
-    positioned = True
+    uses_position = True
 
-    def shown(self, values: Values, pressure: Array, position: Array) -> Array:
+    def sensor_output(self, values: Values, pressure: Array, position: Array) -> Array:
         """Drifted pressure."""
         grown = _grown(values, position)
         return pressure * (1.0 + values["gain"] * grown) + values["drift"] * grown
 
-    def meant(self, values: Values, shown: Array, position: Array) -> Array:
+    def sensor_input(self, values: Values, shown: Array, position: Array) -> Array:
         """True pressure of a reading."""
         grown = _grown(values, position)
         return (shown - values["drift"] * grown) / (1.0 + values["gain"] * grown)

@@ -28,7 +28,7 @@ class SensorLag(Mechanism):
     )
     stateful = True
 
-    def rest(self, values: Values, flow: Array, pressure: Array) -> Array:
+    def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
         """Pressure that the sensor shows, cmH2O."""
         return pressure
 

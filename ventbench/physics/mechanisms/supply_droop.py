@@ -55,7 +55,7 @@ class SupplyDroop(Mechanism):
     rank = 1
     stateful = True
 
-    def rest(self, values: Values, flow: Array, pressure: Array) -> Array:
+    def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
         """Recent flow, L/s."""
         return flow
 

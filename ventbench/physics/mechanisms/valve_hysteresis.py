@@ -52,7 +52,7 @@ class ValveHysteresis(Mechanism):
     )
 
     rank = 1
-    remembers = True
+    has_memory = True
 
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
         """Where the valve stands, %, and that it is remembered."""

@@ -46,7 +46,7 @@ class ValveLag(Mechanism):
     )
     stateful = True
 
-    def rest(self, values: Values, flow: Array, pressure: Array) -> Array:
+    def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
         """The resting flow behind both lags, L/s."""
         return jnp.stack([flow + 0.0 * pressure] * 2)
 

@@ -64,7 +64,7 @@ class Viscoelasticity(Mechanism):
         elastance = values["ratio"] * view.elastance * left
         return network.plus(recoil=view.state * left, elastance=elastance)
 
-    def settle(self, values: Values, state: Array, flow: Array, view: View) -> Array:
+    def next_state(self, values: Values, state: Array, flow: Array, view: View) -> Array:
         """Stress, cmH2O."""
         gained = view.length * values["ratio"] * view.elastance * flow
         return (state + gained) / (1.0 + view.length / values["time"])

@@ -1,7 +1,8 @@
-"""Slots: places in the physics where an effect without a name may act, with any shape.
+"""Nonparametric components: places in the physics where an unnamed effect may act, with any shape.
 
-A slot is one element or several, each a module here under its own name, as ``MECHANISM``, with the
-hooks of a mechanism. With all coefficients at zero it does nothing.
+A component is a set of basis terms, which have the hooks of a mechanism and are linear, or nearly,
+in their coefficients. With all coefficients at zero it does nothing. A module here holds the basis
+terms that act at one place.
 """
 
 from __future__ import annotations
@@ -11,13 +12,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class NonparametricComponent:
-    """A place in the physics.
+    """A place in the physics, and the basis terms of any effect there.
 
     Attributes:
-        name: public.
-        terms: that together are the slot, to be fitted at once.
-        meaning: in words.
-        axis: what its shape depends on, with the unit.
+        name: public name, such as ``f(V)``.
+        terms: names of its basis terms, which are fitted together.
+        meaning: the component in words.
+        axis: variable that its curve depends on, with the unit.
     """
 
     name: str
@@ -41,7 +42,7 @@ NONPARAMETRIC_COMPONENTS = {
         ),
         NonparametricComponent(
             "f(p)", ("leak_shape",),
-            "gas leaves beside the lung, by the pressure at the airway", "airway pressure, cmH2O",
+            "gas leaves column the lung, by the pressure at the airway", "airway pressure, cmH2O",
         ),
         NonparametricComponent(
             "f(Q)", ("flow_shape",),

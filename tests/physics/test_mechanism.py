@@ -9,7 +9,7 @@ import pytest
 
 from ventbench.physics import library, mechanism, parameter, paths
 from ventbench.physics.catalogue import basis_terms
-from ventbench.physics.idle import acts, unless_idle
+from ventbench.physics.mechanism import apply_if_active, is_active
 from ventbench.physics.model import Physics
 from ventbench.system_id import START, Simulator, recorded, settings
 
@@ -106,11 +106,11 @@ def test_only_what_changes_passes_the_branch():
 
     (branch,) = [
         eqn
-        for eqn in jax.make_jaxpr(lambda on: unless_idle(on, change, before))(True).eqns
+        for eqn in jax.make_jaxpr(lambda on: apply_if_active(on, change, before))(True).eqns
         if eqn.primitive.name == "cond"
     ]
     assert [v.aval.shape for v in branch.outvars] == [(3,)]
-    on, off = (unless_idle(jnp.asarray(x), change, before) for x in (True, False))
+    on, off = (apply_if_active(jnp.asarray(x), change, before) for x in (True, False))
     assert on["changed"].tolist() == [2.0] * 3
     assert off["changed"].tolist() == [1.0] * 3
     assert on["kept"].tolist() == off["kept"].tolist() == [1.0] * 4
@@ -119,6 +119,6 @@ def test_only_what_changes_passes_the_branch():
 def test_acts_if_any_parameter_is_moved_anywhere():
     item = library()["valve_curve"]
     neutral = {p.name: jnp.full((2, 3), p.neutral) for p in item.description.parameters}
-    assert not bool(acts(item, neutral))
+    assert not bool(is_active(item, neutral))
     for name, values in neutral.items():
-        assert bool(acts(item, neutral | {name: values.at[1, 2].add(0.1)}))
+        assert bool(is_active(item, neutral | {name: values.at[1, 2].add(0.1)}))

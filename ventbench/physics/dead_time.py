@@ -1,4 +1,4 @@
-"""How a sample is cut into substeps, and what delayed commands are during each of them."""
+"""Dead times of held commands: substeps of a sample, and delayed commands in each of them."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.physics.idle import unless_idle
-from ventbench.plants.delay import shares
+from ventbench.physics.mechanism import apply_if_active
 
-#: Substeps of a sample of about 30 ms, and samples that a dead time may reach back over.
+#: Substeps of a sample of about 30 ms, and past samples that a dead time may reach back over.
 SUBSTEPS, MEMORY = 5, 6
 
-#: Longest dead time that must be remembered, and longest substep, s.
+#: Longest dead time, and longest substep, s.
 LONGEST_DEAD_TIME, LONGEST_SUBSTEP = 0.15, 0.007
 
 #: Length of the substep before a sample, s.
@@ -23,7 +22,7 @@ LAST_SUBSTEP = 0.001
 
 
 def resolution(dt: float) -> tuple[int, int]:
-    """Substeps and memory that samples of ``dt`` seconds need."""
+    """Numbers of substeps and of past samples that samples of ``dt`` seconds need."""
     return max(4, round(dt / LONGEST_SUBSTEP + 0.4)), math.ceil(LONGEST_DEAD_TIME / dt) + 1
 
 
@@ -31,7 +30,7 @@ def windows(
     dt: Array, past: Array, late: tuple[Array | float, ...], held: tuple[Array, ...], count: int,
     skip_idle: bool = False,
 ) -> tuple[Array, ...]:  # fmt: skip
-    """Cut a sample into substeps, and see what delayed commands are during each of them.
+    """Cut a sample into substeps, and average delayed commands over each of them.
 
     Args:
         dt: length of the sample, s, ``(...)``.
@@ -39,28 +38,28 @@ def windows(
         late: dead times, s, the most important first; numbers where no mechanism has one.
         held: the command that each of them delays, the latest first, ``(..., P + 1)``.
         count: of substeps, at least 3.
-        skip_idle: spare what dead times cost if they are zero in all elements.
+        skip_idle: skip the computation of dead times that are zero in all elements.
 
     Returns:
         Lengths, s, and the mean of each command, ``(..., count)`` each.
     """
     dt = dt + 0.0 * held[0][..., 0]
     delays = [delay for delay in late if isinstance(delay, jax.Array)]
-    cut = lengths(dt, past, (), count)
+    cut = substep_lengths(dt, past, (), count)
     if delays:
         some = _some(delays) if skip_idle else None
-        cut = unless_idle(some, lambda _: lengths(dt, past, tuple(delays), count), cut)
+        cut = apply_if_active(some, lambda _: substep_lengths(dt, past, tuple(delays), count), cut)
     means = []
     for delay, values in zip(late, held, strict=True):
         mean = values[..., :1] + 0.0 * cut
         if isinstance(delay, jax.Array):
             delayed = partial(_mean, late=delay, lengths=cut, past=past, values=values)
-            mean = unless_idle(_some([delay]) if skip_idle else None, delayed, mean)
+            mean = apply_if_active(_some([delay]) if skip_idle else None, delayed, mean)
         means.append(mean)
     return cut, *means
 
 
-def lengths(dt: Array, past: Array, late: tuple[Array, ...], count: int) -> Array:
+def substep_lengths(dt: Array, past: Array, late: tuple[Array, ...], count: int) -> Array:
     """Cut a sample into substeps.
 
     A valve that opens within a substep is not the same as one that is half open throughout, so that
@@ -95,10 +94,31 @@ def lengths(dt: Array, past: Array, late: tuple[Array, ...], count: int) -> Arra
     return jnp.maximum(jnp.diff(ends, axis=-1), 1e-6 * dt[..., None])
 
 
+def window_weights(start: Array, length: Array, past: Array) -> Array:
+    """How much of a window falls into this sample, each of P samples before, and all earlier ones.
+
+    Args:
+        start: of the window, s after the start of this sample; negative reaches back; ``(...)``.
+        length: of the window, s, positive, likewise.
+        past: durations of the P samples before, the latest first, s, ``(..., P)``.
+
+    Returns:
+        Weights that add up to one, in that order, ``(..., P + 2)``.
+    """
+    begins = -jnp.cumsum(past, axis=-1)
+    infinite = jnp.full_like(begins[..., :1], jnp.inf)
+    zero = jnp.zeros_like(infinite)
+    upper = jnp.concatenate([infinite, zero, begins], axis=-1)
+    lower = jnp.concatenate([zero, begins, -infinite], axis=-1)
+    first, last = start[..., None], (start + length)[..., None]
+    inside = jnp.minimum(last, upper) - jnp.maximum(first, lower)
+    return jnp.maximum(inside, 0.0) / length[..., None]
+
+
 def _mean(_: Array, late: Array, lengths: Array, past: Array, values: Array) -> Array:
     """Mean over each substep of what was commanded ``late`` seconds before, ``(..., K)``."""
     starts = _sums(lengths) - lengths - (late + 0.0 * lengths[..., 0])[..., None]
-    weights = shares(starts, lengths, past[..., None, :])
+    weights = window_weights(starts, lengths, past[..., None, :])
     return jnp.sum(weights * values[..., None, :], axis=-1)
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ventbench.plants.delay import shares
+from ventbench.physics.dead_time import window_weights
 from ventbench.precision import float64
 
 POINTS = 20_000
@@ -25,7 +25,7 @@ def counted(start, length, past):
 
 def found(start, length, past):
     with float64():
-        return np.asarray(shares(*(jnp.asarray(x, float) for x in (start, length, past))))
+        return np.asarray(window_weights(*(jnp.asarray(x, float) for x in (start, length, past))))
 
 
 @settings(max_examples=60, deadline=None)
@@ -60,7 +60,7 @@ def test_batches_and_gradients():
     """Piecewise linear in the start: a window of 10 ms loses 100 of its share a second."""
     starts = jnp.asarray([-0.005, -0.035])
     past = jnp.asarray([[0.03, 0.02], [0.03, 0.02]])
-    batch = shares(starts, jnp.full(2, 0.01), past)
+    batch = window_weights(starts, jnp.full(2, 0.01), past)
     assert batch.shape == (2, 4)
-    slope = jax.jacobian(lambda s: shares(s, jnp.asarray(0.01), past[0]))(starts[0])
+    slope = jax.jacobian(lambda s: window_weights(s, jnp.asarray(0.01), past[0]))(starts[0])
     np.testing.assert_allclose(slope, [100.0, -100.0, 0.0, 0.0], atol=1e-3)

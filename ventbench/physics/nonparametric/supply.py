@@ -1,4 +1,4 @@
-"""memory of u: the flow of the valve falls or rises by a factor after recent flow."""
+"""What the supply makes of the flow that was drawn from it."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ import numpy as np
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Values
-from ventbench.physics.nonparametric._curves import beside
-from ventbench.physics.nonparametric._element import Element, Shape, coefficients
+from ventbench.physics.nonparametric.basis import BasisTerm, Curve, coefficients, per_state
 
 #: Time constants, s, and the flow whose effect the coefficients are, L/s.
 _TAUS = (0.3, 1.0, 3.0)
 _FLOW = 0.5
 
 
-class SupplyMemory(Element):
+class SupplyMemory(BasisTerm):
     """A factor of the flow that depends on the flow before; to first order, any such factor."""
 
     description = Description(
@@ -26,18 +25,21 @@ class SupplyMemory(Element):
         site="supply",
         equation="q = q_valve (1 + sum_k c_k s_k / (0.5 L/s)), tau_k ds_k/dt = q_valve - s_k",
         parameters=coefficients(
-            (f"{tau:g} s" for tau in _TAUS), "1",
-            "share of the flow that is gained at a lasting 0.5 L/s, with the time constant", -0.6,
-            0.6, 0.3,
+            (f"{tau:g} s" for tau in _TAUS),
+            unit="1",
+            meaning="share of the flow that is gained at a lasting 0.5 L/s, with the time constant",
+            low=-0.6,
+            high=0.6,
+            spread=0.3,
         ),
         source="Second-order term of a Volterra series, with fixed exponentials.",
         signature="Flow is lost late in inspiration and in big breaths; after a pause it is back.",
         confusable=("supply_droop", "valve_curve"),
-    )  # fmt: skip
+    )
     rank = 3
     stateful = True
 
-    def rest(self, values: Values, flow: Array, pressure: Array) -> Array:
+    def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
         """The resting flow in all filters, L/s."""
         return jnp.stack([flow + 0.0 * pressure] * len(_TAUS))
 
@@ -45,16 +47,17 @@ class SupplyMemory(Element):
         self, values: Values, flow: Array, state: Array, length: Array
     ) -> tuple[Array, Array]:
         """Implicit step of all filters."""
-        taus = beside(_TAUS, state)
+        taus = per_state(_TAUS, state)
         after = (taus * state + length * flow) / (taus + length)
         factor = 1.0 + jnp.sum(self.stacked(values, state) * after, axis=0) / _FLOW
         return flow * factor, after
 
-    def shapes(self, values: Values, base: Mapping[str, float]) -> tuple[Shape, ...]:
+    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Flow at a constant command, over time."""
         t = np.linspace(0.0, 2.0, 401)
-        y = self.fading(values, _TAUS, np.zeros(1)) - self.fading(values, _TAUS, t)
-        return (Shape(t, y, "time since 0.5 L/s began, s", "flow that is gained, share", (0,)),)
+        y = self.decay(values, _TAUS, np.zeros(1)) - self.decay(values, _TAUS, t)
+        return (Curve(t, y, "time since 0.5 L/s began, s", "flow that is gained, share", (0,)),)
 
 
-MECHANISM = SupplyMemory()
+#: Basis terms of this module.
+TERMS = (SupplyMemory(),)

@@ -1,0 +1,161 @@
+"""Base of the basis terms: curves that are linear in their coefficients, and how to plot them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from ventbench.physics.mechanism import Mechanism, Values
+from ventbench.physics.parameters import Parameter
+
+Number = Array | float
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PiecewiseLinear:
+    """Straight lines from knot to knot, and constant beyond the first and the last.
+
+    Attributes:
+        knots: rising.
+    """
+
+    knots: tuple[float, ...]
+
+    def __call__(self, x: Array, at: Sequence[Number]) -> Array:
+        """Value at ``x``, given the values at the knots."""
+        value = at[0] + 0.0 * x
+        for j, (a, b) in _pairs(self.knots):
+            value = value + (at[j + 1] - at[j]) / (b - a) * _within(x, a, b)
+        return value
+
+    def slope(self, x: Array, at: Sequence[Number]) -> Array:
+        """Derivative by ``x``."""
+        slope = 0.0 * x
+        for j, (a, b) in _pairs(self.knots):
+            slope = slope + (at[j + 1] - at[j]) / (b - a) * ((x > a) & (x <= b))
+        return slope
+
+
+@dataclass(frozen=True)
+class PiecewiseQuadratic:
+    """A smooth curve through zero whose slope is a straight line from knot to knot.
+
+    Beyond the last knot it goes on straight, and so it does below the first, which is zero.
+
+    Attributes:
+        knots: rising, from 0.
+    """
+
+    knots: tuple[float, ...]
+
+    def __call__(self, x: Array, slopes: Sequence[Number]) -> tuple[Array, Array]:
+        """Value and slope at ``x``, given the slopes at the knots."""
+        value, slope = slopes[0] * x, slopes[0] + jnp.zeros_like(x)
+        for j, (a, b) in _pairs(self.knots):
+            bend, inside = (slopes[j + 1] - slopes[j]) / (b - a), _within(x, a, b)
+            slope = slope + bend * inside
+            value = value + bend * inside * (x - a - 0.5 * inside)
+        return value, slope
+
+
+def _pairs(knots: tuple[float, ...]) -> list[tuple[int, tuple[float, float]]]:
+    return list(enumerate(pairwise(knots)))
+
+
+def _within(x: Array, low: float, high: float) -> Array:
+    """How far ``x`` lies beyond ``low``, at most up to ``high``."""
+    bottom, top = jnp.asarray(low, x.dtype), jnp.asarray(high, x.dtype)
+    return jax.lax.clamp(bottom, x, top) - bottom
+
+
+def per_state(constants: tuple[float, ...], state: Array) -> Array:
+    """K constants in a shape that broadcasts with several states ``(K, ...)``."""
+    return jnp.asarray(constants, state.dtype).reshape(-1, *[1] * (state.ndim - 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A curve for a plot.
+
+    Attributes:
+        x: argument, ``(k,)``.
+        y: values, ``(k,)``.
+        x_unit: name and unit of the argument, such as ``volume, mL``.
+        y_unit: name and unit of the values.
+        absorbed: powers of ``x`` that a change of base parameters could produce as well.
+    """
+
+    x: Floats
+    y: Floats
+    x_unit: str
+    y_unit: str
+    absorbed: tuple[int, ...] = ()
+
+
+class BasisTerm(Mechanism):
+    """A mechanism whose parameters are the coefficients of a basis; it has no physical name."""
+
+    def coefficients(self, values: Values) -> list[Array]:
+        """Values of all coefficients, in order."""
+        return [values[item.name] for item in self.description.parameters]
+
+    def stacked(self, values: Values, state: Array) -> Array:
+        """Coefficients in the shape of several states, ``(K, ...)``."""
+        own = self.coefficients(values)[: len(state)]
+        return jnp.stack([jnp.broadcast_to(c, state.shape[1:]) for c in own])
+
+    def magnitude(self, values: Values) -> float:
+        """Largest coefficient, as a multiple of its prior standard deviation."""
+        items = self.description.parameters
+        return max(abs(float(values[p.name])) / (p.spread or 1.0) for p in items)
+
+    def decay(self, values: Values, taus: tuple[float, ...], time: Floats) -> Floats:
+        """Sum over the coefficients, each decaying with its time constant, at ``time``."""
+        rates = np.exp(-time[:, None] / np.asarray(taus))
+        return rates @ np.array([float(c) for c in self.coefficients(values)[: len(taus)]])
+
+    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
+        """Curves for a plot, given the own and the base parameters."""
+        raise NotImplementedError
+
+
+def coefficients(
+    at: Iterable[str], unit: str, meaning: str, low: float | Iterable[float],
+    high: float | Iterable[float], spread: float | Iterable[float], *,
+    follows: str | None = None, scan: tuple[float, ...] = (),
+) -> tuple[Parameter, ...]:  # fmt: skip
+    """Parameters ``c1``, ``c2`` and so on, which start at zero and have a prior around zero.
+
+    Args:
+        at: where each coefficient acts, in words.
+        unit: of all coefficients.
+        meaning: of all coefficients; each is followed by its ``at``.
+        low: lower bounds, one for all coefficients or one for each.
+        high: upper bounds, one for all coefficients or one for each.
+        spread: prior standard deviations, one for all coefficients or one for each.
+        follows: ``"R"`` or ``"C"`` if the coefficients scale with it.
+        scan: values that a search must also try.
+    """
+    at = list(at)
+
+    def repeated(value: float | Iterable[float]) -> list[float]:
+        if isinstance(value, int | float):
+            return [float(value)] * len(at)
+        return [float(one) for one in value]
+
+    rows = zip(at, repeated(low), repeated(high), repeated(spread), strict=True)
+    return tuple(
+        Parameter(
+            f"c{k}", unit, f"{meaning} {place}", bottom, top, 0.0, 0.0, 0.5 * width,
+            follows=follows, scan=scan, spread=width,
+        )
+        for k, (place, bottom, top, width) in enumerate(rows, 1)
+    )  # fmt: skip

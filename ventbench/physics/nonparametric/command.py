@@ -1,0 +1,177 @@
+"""What the inspiratory valve makes of the command: a curve, filters and plays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ventbench.physics.mechanism import Description, Values
+from ventbench.physics.nonparametric.basis import (
+    BasisTerm,
+    Curve,
+    PiecewiseLinear,
+    coefficients,
+    per_state,
+)
+
+#: Commands where the curve bends, %; at the fourth it is zero. Closest where valves begin to open.
+_VALVE_KNOTS = (0.0, 1.0, 3.0, 6.0, 12.0, 20.0, 35.0, 60.0, 100.0)
+
+#: The knot at which the curve is zero: what is left there is the valve's gain.
+_VALVE_FIXED = 20.0
+_VALVE_FREE = tuple(u for u in _VALVE_KNOTS[1:] if u != _VALVE_FIXED)
+
+
+class ValveShape(BasisTerm):
+    """A change of the effective command, which keeps it within 0..2 u.
+
+    It is zero at 0 and at 20 %, as a common factor of all flows is the valve's gain, or, from
+    pressure alone, a common scale of R, 1/C and R_ex. If no command gets near 20 %, that scale is
+    not held, and only the prior keeps it.
+    """
+
+    description = Description(
+        name="valve_shape",
+        title="f(u): any curve of the inspiratory valve",
+        site="inspiratory valve",
+        equation="q = gain (u + f(u)), f straight between knots, f(0) = f(20 %) = 0",
+        parameters=coefficients(
+            (f"{u:g} %" for u in _VALVE_FREE),
+            unit="%",
+            meaning="change of the effective command at",
+            low=[-u for u in _VALVE_FREE],
+            high=_VALVE_FREE,
+            spread=[0.5 * u for u in _VALVE_FREE],
+        ),
+        source="Straight lines between fixed knots; each effective command stays positive.",
+        signature="Error that follows the command, whatever flow and pressure are.",
+        confusable=("valve_curve", "valve_dead_band", "command_rounding"),
+    )
+    rank = 5
+
+    def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
+        """Add the curve."""
+        return u_in + self._change(values, u_in), memory
+
+    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
+        """Change of the flow over the command."""
+        u = np.linspace(0.0, 100.0, 401)
+        y = base["gain"] * np.asarray(self._change(values, jnp.asarray(u)))
+        return (Curve(u, y, "command, %", "extra flow, mL/s", (1,)),)
+
+    def _change(self, values: Values, u: Array) -> Array:
+        free = iter(self.coefficients(values))
+        return PiecewiseLinear(_VALVE_KNOTS)(
+            u, [0.0 if x in (0.0, _VALVE_FIXED) else next(free) for x in _VALVE_KNOTS]
+        )
+
+
+#: Time constants, s.
+_MEMORY_TAUS = (0.02, 0.06, 0.2, 0.7)
+
+
+class CommandMemory(BasisTerm):
+    """A bank of first-order filters on the flow of the valve.
+
+    A lasting flow is passed as it is: its factor is the gain. A dead time is met in part only.
+    """
+
+    description = Description(
+        name="command_memory",
+        title="memory of u: any linear memory of the valve",
+        site="inspiratory valve",
+        equation="q = q_asked + sum_k c_k (s_k - q_asked), tau_k ds_k/dt = q_asked - s_k",
+        parameters=coefficients(
+            (f"{1e3 * tau:g} ms" for tau in _MEMORY_TAUS),
+            unit="1",
+            meaning="share of the flow that comes late by",
+            low=[-6.0, -6.0, -3.0, -3.0],
+            high=[6.0, 6.0, 3.0, 3.0],
+            spread=[2.0, 2.0, 1.0, 1.0],
+        ),
+        source="Sum of fixed exponentials; close to any lag, rise or sag that is linear.",
+        signature="Error that follows what the command was some time ago.",
+        confusable=("valve_lag", "valve_delay", "supply_droop", "valve_hysteresis"),
+    )
+    rank = 2
+    stateful = True
+
+    def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
+        """The resting flow in all filters, L/s."""
+        return jnp.stack([flow + 0.0 * pressure] * len(_MEMORY_TAUS))
+
+    def inflow(
+        self, values: Values, flow: Array, state: Array, length: Array
+    ) -> tuple[Array, Array]:
+        """Implicit step of all filters."""
+        taus = per_state(_MEMORY_TAUS, state)
+        after = (taus * state + length * flow) / (taus + length)
+        return flow + jnp.sum(self.stacked(values, state) * (after - flow), axis=0), after
+
+    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
+        """Answer of the flow to a step of the command."""
+        t = np.linspace(0.0, 2.0, 401)
+        late = self.decay(values, _MEMORY_TAUS, t)
+        return (Curve(t, -late, "time after a step, s", "flow that is missing (-), share"),)
+
+
+#: Widths of the plays, %.
+_PLAYS_WIDTHS = (1.0, 2.5, 5.0, 10.0)
+
+
+class CommandPlays(BasisTerm):
+    """A sum of play operators (Prandtl and Ishlinskii) on the command.
+
+    While the command rises they take a constant away, which a dead band would too.
+    """
+
+    description = Description(
+        name="command_plays",
+        title="memory of u: any hysteresis of the valve",
+        site="inspiratory valve",
+        equation="u_effective = u + sum_k c_k (s_k - u), s_k = clip(s_k before, u -+ width_k / 2)",
+        parameters=coefficients(
+            (f"{width:g} %" for width in _PLAYS_WIDTHS),
+            unit="1",
+            meaning="share of the valve with a play of",
+            low=-2.0,
+            high=2.0,
+            spread=0.7,
+        ),
+        source="Sum of plays of fixed widths; holds any hysteresis that knows no time.",
+        signature="Error of one sign while the command rises and of the other while it falls.",
+        confusable=("valve_hysteresis", "valve_dead_band"),
+    )
+    rank = 4
+    has_memory = True
+
+    def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
+        """Where the plays stand, %, ``(K, ...)``, and what they make of the command."""
+        half = 0.5 * per_state(
+            _PLAYS_WIDTHS, jnp.broadcast_to(u_in, (len(_PLAYS_WIDTHS), *u_in.shape))
+        )
+        stands = jnp.minimum(jnp.maximum(memory, u_in - half), u_in + half)
+        late = jnp.sum(self.stacked(values, stands) * (stands - u_in), axis=0)
+        return u_in + late, stands
+
+    def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
+        """Change of the flow while the command rises to 30 % and falls again."""
+        u = np.concatenate([np.linspace(0.0, 30.0, 121), np.linspace(30.0, 0.0, 121)[1:]])
+        stands, change = np.zeros(len(_PLAYS_WIDTHS)), []
+        half = 0.5 * np.array(_PLAYS_WIDTHS)
+        for command in u:
+            stands = np.clip(stands, command - half, command + half)
+            late = np.array([float(c) for c in self.coefficients(values)]) @ (stands - command)
+            change.append(base["gain"] * late)
+        return (Curve(u, np.array(change), "command up and down, %", "extra flow, mL/s"),)
+
+
+#: Basis terms of this module.
+TERMS = (
+    ValveShape(),
+    CommandMemory(),
+    CommandPlays(),
+)

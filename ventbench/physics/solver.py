@@ -1,0 +1,224 @@
+"""Time integration: the two-stage SDIRK method, from the valve's flow to the sensor's output.
+
+The method is that of Alexander (SIAM J. Numer. Anal. 14, 1977, 1006).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ventbench.physics.mechanism import Assembly, Mechanism, Values
+from ventbench.physics.network import Network, View
+
+#: Place of the first stage of the SDIRK method, as a share of the substep.
+_GAMMA = 1.0 - 0.5**0.5
+
+Pair = tuple[Array, Array]
+
+
+@flax.struct.dataclass
+class ContinuousState:
+    """Continuous states of a model; every array has shape ``(...)``.
+
+    Attributes:
+        volume: of the lung, L, zero where a linear lung has no recoil.
+        flow: into the lung, L/s.
+        pressure: at the airway, cmH2O.
+        reading: pressure at the sensor's output, cmH2O.
+        internal: states of mechanisms by name; ``(K, ...)`` for one with several states.
+    """
+
+    volume: Array
+    flow: Array
+    pressure: Array
+    reading: Array
+    internal: dict[str, Array]
+
+
+def commanded(
+    assembly: Assembly, u_in: Array, memory: dict[str, Array]
+) -> tuple[Array, dict[str, Array]]:
+    """Steady-state flow of the inspiratory valve at a command, L/s, and the new memory."""
+    memory = dict(memory)
+    for name, item in assembly.mechanisms.items():
+        u_in, kept = assembly.change(name, _command, (u_in, memory.get(name, u_in)))
+        if item.has_memory:
+            memory[name] = kept
+    return assembly.base["gain"] * 1e-3 * u_in, memory
+
+
+def at_rest(assembly: Assembly, recorded: Array, flow: Array) -> ContinuousState:
+    """State of a lung at rest at a recorded pressure, cmH2O, with the valve's resting flow, L/s.
+
+    Newton's method finds the volume at which the recoil balances the pressure.
+    """
+    pressure = recorded
+    for name, item in reversed(assembly.mechanisms.items()):
+        pressure = item.sensor_input(assembly.values[name], pressure, assembly.base["position"])
+    zero = jnp.zeros_like(pressure + flow)
+    internal = {
+        name: item.initial_state(assembly.values[name], flow, pressure) + zero
+        for name, item in assembly.mechanisms.items()
+        if item.stateful
+    }
+    now = ContinuousState(zero, zero, pressure + zero, pressure + zero, internal)
+    goal = pressure + assembly.base["offset"]
+    volume = goal * 1e-3 * assembly.base["C"] + zero
+
+    def closer(volume: Array, _: None) -> tuple[Array, None]:
+        still = now.replace(volume=volume)  # type: ignore[attr-defined]
+        # A long step, in which stresses relax; before the breath, so that no muscle pulls.
+        view = _view(assembly, still, still, zero, zero - 1e3, zero + 1e6, pressure)
+        network = _network(assembly, still, flow, view, lambda name: internal.get(name, zero))
+        return volume - (network.recoil - goal) / network.elastance, None
+
+    # A loop, as unrolled it would be most of what is to be compiled.
+    volume, _ = jax.lax.scan(closer, volume, None, length=6)
+    return now.replace(volume=volume)  # type: ignore[attr-defined]
+
+
+def substep(
+    assembly: Assembly,
+    now: ContinuousState,
+    wanted: Array,
+    opened: Array,
+    time: Array,
+    h: Array,
+    peep: Array,
+) -> ContinuousState:
+    """Advance by ``h`` seconds in two stages, the second of which ends the substep."""
+
+    def advance(guess: ContinuousState, place: tuple[Array, Array]) -> tuple[ContinuousState, None]:
+        ahead, share = place
+        end = time + share * h
+        return _implicit(assembly, now, guess, ahead, wanted, opened, end, _GAMMA * h, peep), None
+
+    places = jnp.asarray([[0.0, _GAMMA], [(1.0 - _GAMMA) / _GAMMA, 1.0]], h.dtype)
+    return jax.lax.scan(advance, now, (places[:, 0], places[:, 1]))[0]
+
+
+def sensor_output(assembly: Assembly, reading: Array) -> Array:
+    """Recorded pressure, cmH2O, given the pressure after the sensor's dynamics."""
+    for name, item in assembly.mechanisms.items():
+        reading = item.sensor_output(assembly.values[name], reading, assembly.base["position"])
+    return reading
+
+
+def _implicit(
+    assembly: Assembly,
+    now: ContinuousState,
+    guess: ContinuousState,
+    ahead: Array,
+    wanted: Array,
+    opened: Array,
+    time: Array,
+    length: Array,
+    peep: Array,
+) -> ContinuousState:
+    """Backward Euler step of ``length`` seconds that ends at ``time``.
+
+    It starts at the share ``ahead`` of the way from ``now`` to ``guess``, which is near its end.
+    """
+
+    def between(before: Any, after: Any) -> Any:
+        return jax.tree.map(lambda a, b: a + ahead * (b - a), before, after)
+
+    def state(name: str) -> Array:  # hooks call it, so that inactive mechanisms compute nothing
+        return (
+            between(now.internal[name], guess.internal[name])
+            if name in now.internal
+            else 0.0 * now.volume
+        )
+
+    start = between(now.replace(internal={}), guess.replace(internal={}))  # type: ignore[attr-defined]
+    internal, flow = dict(guess.internal), wanted
+    for name, item in assembly.mechanisms.items():
+        if _has(item, "inflow"):
+            before = (flow, internal.get(name, flow))
+            flow, kept = assembly.change(name, _inflow, before, partial(state, name), length)
+            internal |= {name: kept} if item.stateful else {}
+    view = _view(assembly, start, guess, opened, time, length, peep)
+    network = _network(assembly, start, flow, view, state)
+    pressure, flow = network.solve(start.pressure, start.flow, length)
+    reading = pressure
+    for name, item in assembly.mechanisms.items():
+        if _has(item, "reading") or _has(item, "next_state"):
+            before = (reading, internal.get(name, reading))
+            first = None if _has(item, "inflow") else partial(state, name)
+            reading, kept = assembly.change(name, _after, before, first, flow, view)
+            internal |= {name: kept} if item.stateful else {}
+    return ContinuousState(start.volume + flow * length, flow, pressure, reading, internal)
+
+
+def _network(
+    assembly: Assembly,
+    start: ContinuousState,
+    inflow: Array,
+    view: View,
+    state: Callable[[str], Array],
+) -> Network:
+    zero = jnp.zeros_like(start.volume)
+    network = Network(
+        inflow=inflow, circuit=zero, leak=zero, leak_flow=zero, outlet=view.opened * view.outlet,
+        behind=view.peep, resistance=view.resistance + zero, quadratic=zero, inertance=zero,
+        recoil=view.elastance * start.volume, elastance=view.elastance + zero,
+    )  # fmt: skip
+    for name, item in assembly.mechanisms.items():
+        if _has(item, "network"):
+            network = assembly.change(name, _joined, network, partial(state, name), view)
+    return network
+
+
+def _view(
+    assembly: Assembly,
+    start: ContinuousState,
+    guess: ContinuousState,
+    opened: Array,
+    time: Array,
+    length: Array,
+    peep: Array,
+) -> View:
+    base = assembly.base
+    return View(
+        time, start.volume, guess.pressure, guess.flow, jnp.zeros_like(start.volume), length,
+        1e3 / base["C"], peep, base["position"], base["R"], 1.0 / base["R_ex"], opened,
+    )  # fmt: skip
+
+
+def _command(item: Mechanism, own: Values, before: Pair) -> Pair:
+    return item.command(own, *before)
+
+
+def _inflow(
+    item: Mechanism, own: Values, before: Pair, state: Callable[[], Array], length: Array
+) -> Pair:
+    return item.inflow(own, before[0], state() if item.stateful else before[1], length)
+
+
+def _joined(
+    item: Mechanism, own: Values, network: Network, state: Callable[[], Array], view: View
+) -> Network:
+    return item.network(own, network, view.replace(state=state()))  # type: ignore[attr-defined]
+
+
+def _after(
+    item: Mechanism, own: Values, before: Pair, state: Callable[[], Array] | None, flow: Array,
+    view: View,
+) -> Pair:  # fmt: skip
+    reading, kept = before
+    if item.stateful and state is not None:
+        kept = state()
+    reading, kept = item.reading(own, reading, kept, view.length)
+    view = view.replace(state=kept)  # type: ignore[attr-defined]
+    return reading, item.next_state(own, kept, flow, view) if item.stateful else kept
+
+
+def _has(item: Mechanism, hook: str) -> bool:
+    return getattr(type(item), hook) is not getattr(Mechanism, hook)

@@ -14,8 +14,8 @@ import numpy as np
 from ventbench import protocol
 from ventbench.interfaces import Task
 from ventbench.lungs import LUNG_IDS
+from ventbench.sandbox.child.cell import ROW
 from ventbench.sandbox.runner import SandboxRunner
-from ventbench.submissions.cell import ROW
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.runner import InProcessRunner, Runner
 

@@ -5,11 +5,11 @@ import struct
 
 import pytest
 
-from ventbench.sandbox.child import bpf, seccomp, syscalls
-from ventbench.sandbox.child.bpf import ALLOW, AUDIT, KILL
+from ventbench.sandbox.child import seccomp
+from ventbench.sandbox.child.seccomp import ALLOW, AUDIT, KILL
 
 PID = 4321
-EPERM, ENOSYS = (bpf.errno_action(e) for e in (errno.EPERM, errno.ENOSYS))
+EPERM, ENOSYS = (seccomp.errno_action(e) for e in (errno.EPERM, errno.ENOSYS))
 
 
 def kernel(program, number, arguments=(), arch="x86_64"):
@@ -53,15 +53,15 @@ def ask(machine):
 
 
 def test_plain_calls_are_allowed(ask, machine):
-    for call in syscalls.PLAIN.values():
+    for call in seccomp.PLAIN.values():
         if getattr(call, machine) is not None:
             assert ask(call, -1, -1, -1, -1, -1, -1) == ALLOW
 
 
 def test_everything_else_is_refused(machine):
     program = seccomp.cell_filter(machine, PID, threads=False)
-    named = (*syscalls.PLAIN.values(), *syscalls.CHECKED.values(), *syscalls.MISSING.values())
-    known = {getattr(call, machine) for call in (*named, syscalls.OPEN, syscalls.OPENAT)}
+    named = (*seccomp.PLAIN.values(), *seccomp.CHECKED.values(), *seccomp.MISSING.values())
+    known = {getattr(call, machine) for call in (*named, seccomp.OPEN, seccomp.OPENAT)}
     for number in set(range(1000)) - known:
         assert kernel(program, number, arch=machine) == EPERM
 
@@ -76,9 +76,9 @@ def test_another_machines_calls_end_the_process(machine):
 
 def test_files_open_for_reading_alone(ask):
     reading, cloexec, folder = 0, 0o2000000, 0o200000
-    assert ask(syscalls.OPENAT, -100, 0, reading | cloexec | folder) == ALLOW
+    assert ask(seccomp.OPENAT, -100, 0, reading | cloexec | folder) == ALLOW
     for flags in (0o1, 0o2, 0o3, 0o100, 0o1000, 0o20200000, 0o10000000):
-        assert ask(syscalls.OPENAT, -100, 0, flags | cloexec) == EPERM
+        assert ask(seccomp.OPENAT, -100, 0, flags | cloexec) == EPERM
 
 
 @pytest.mark.parametrize(
@@ -97,13 +97,13 @@ def test_files_open_for_reading_alone(ask):
     ],
 )
 def test_arguments_are_looked_at(ask, name, good, bad):
-    assert ask(syscalls.CHECKED[name], *good) == ALLOW
-    assert ask(syscalls.CHECKED[name], *bad) == EPERM
+    assert ask(seccomp.CHECKED[name], *good) == ALLOW
+    assert ask(seccomp.CHECKED[name], *bad) == EPERM
 
 
 def test_threads_only_where_they_are_needed(machine):
     thread, process = 0x10000 | 0xF00, 17
-    number = getattr(syscalls.CHECKED["clone"], machine)
+    number = getattr(seccomp.CHECKED["clone"], machine)
     with_threads = seccomp.cell_filter(machine, PID, threads=True)
     assert kernel(with_threads, number, (thread,), machine) == ALLOW
     assert kernel(with_threads, number, (process,), machine) == EPERM
@@ -112,5 +112,5 @@ def test_threads_only_where_they_are_needed(machine):
 
 
 def test_calls_that_hide_their_arguments_seem_missing(ask):
-    for call in syscalls.MISSING.values():
+    for call in seccomp.MISSING.values():
         assert ask(call) == ENOSYS

@@ -16,10 +16,9 @@ from ventbench.lungs import LUNGS
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.sandbox import runner as runner_module
-from ventbench.sandbox.allowance import Allowance
-from ventbench.sandbox.errors import SandboxError
+from ventbench.sandbox.child.cell import ROW
+from ventbench.sandbox.configuration import Allowance, SandboxError
 from ventbench.sandbox.runner import SandboxRunner, layers
-from ventbench.submissions.cell import ROW
 from ventbench.submissions.errors import SubmissionError
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.runner import InProcessRunner

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ventbench.sandbox.child import wire
+from ventbench.sandbox.child.cell import ROW
 from ventbench.sandbox.child.wire import COMMAND, FAILED, READY, Reply, WireError
-from ventbench.submissions.cell import ROW
 
 GOOD = b"VBr1" + struct.pack("<IHHd", 7, COMMAND, 0, 42.5)
 

@@ -2,7 +2,7 @@ import sys
 
 import pytest
 
-from ventbench.submissions.cell import controller_class
+from ventbench.sandbox.child.cell import controller_class
 from ventbench.submissions.errors import SubmissionError, printable
 
 

@@ -149,7 +149,7 @@ def test_modes_are_those_of_any_new_file(tmp_path):
 @pytest.mark.parametrize("family", ["ppo", "dqn"])
 def test_networks_act_as_a_pi_controller(family, tmp_path, one_lung):
     """P = 1, I = 10, to the resolution of 51 commands for dqn, within 0 to 100 %."""
-    from ventbench.submissions.cell import controller_class
+    from ventbench.sandbox.child.cell import controller_class
 
     network = controller_class(create("net", family, tmp_path))()
     network.reset(None)

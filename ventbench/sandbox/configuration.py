@@ -1,16 +1,80 @@
-"""What the scorer tells a zygote about a submission and its cells."""
+"""What a submission may use, what it imports, and what the scorer tells a zygote of both."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+from ventbench.errors import InputError
 from ventbench.interfaces import Task
-from ventbench.sandbox import packages
-from ventbench.sandbox.allowance import GIB, Allowance
+from ventbench.sandbox.child.preload import NUMPY
+
+
+class SandboxError(InputError):
+    """This machine cannot run submissions apart as was asked for; the message says what to do."""
+
+
+MIB, GIB = 1 << 20, 1 << 30
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """Limits of a session; the processor is shared by all its cells, hence patience, not a pace.
+
+    Attributes:
+        memory: bytes of one cell beyond the interpreter with its libraries.
+        cpu_s: seconds of processor time of one cell: import, reset and three breaths.
+        start_patience_s: while controllers are imported and reset, cells time out when none of
+            them has answered for this long.
+        patience_s: in one step, cells time out when none of them has answered for this long.
+        total_s: of a session; then all cells time out.
+    """
+
+    memory: int = 512 * MIB
+    cpu_s: int = 60
+    start_patience_s: float = 20.0
+    patience_s: float = 5.0
+    total_s: float = 900.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not value > 0:
+                raise ValueError(f"allowance {name} is {value}, it must be positive")
+
+
+#: Packages that may be imported besides numpy and the standard library, with what to load of each.
+OPTIONAL = {
+    "jax": ("jax", "jax.numpy", "jax.scipy", "jax.scipy.linalg"),
+    "flax": ("flax", "flax.linen", "flax.nnx"),
+    "safetensors": ("safetensors", "safetensors.numpy"),
+}
+
+#: Those that start threads and reserve much address space.
+_THREADED = ("jax", "flax")
+
+_IMPORT = re.compile(rb"^\s*(?:import|from)\s+([^\s#][^#\n]*)", re.MULTILINE)
+
+
+def modules_needed(folder: Path) -> tuple[tuple[str, ...], bool]:
+    """Modules to load before cells start, so that they share them.
+
+    Args:
+        folder: of the submission.
+
+    Returns:
+        The modules, and whether they need threads.
+    """
+    text = b"\n".join(path.read_bytes() for path in sorted(folder.rglob("*.py")) if path.is_file())
+    words = {word for line in _IMPORT.findall(text) for word in re.findall(rb"\w+", line)}
+    imported = [name for name in OPTIONAL if name.encode() in words]
+    modules = [module for name in imported for module in OPTIONAL[name]]
+    return (*NUMPY, *modules), any(name in _THREADED for name in imported)
+
 
 #: JAX reserves address space that it does not use.
-_HEAVY = 4 * GIB
+_THREADED_MEMORY = 4 * GIB
 
 
 def configuration(
@@ -24,8 +88,8 @@ def configuration(
         tasks: that its cells may have.
         allowance: what they may use.
     """
-    modules, threads = packages.needed(Path(folder))
-    memory = max(allowance.memory, _HEAVY) if threads else allowance.memory
+    modules, threads = modules_needed(Path(folder))
+    memory = max(allowance.memory, _THREADED_MEMORY) if threads else allowance.memory
     return {
         "folder": folder,
         "label": label,

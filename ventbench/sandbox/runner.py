@@ -10,17 +10,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ventbench.interfaces import Task
-from ventbench.sandbox.allowance import Allowance
 from ventbench.sandbox.child import landlock, lockdown, wire
 from ventbench.sandbox.child.lockdown import OFFICIAL
 from ventbench.sandbox.child.wire import Reply
-from ventbench.sandbox.configuration import configuration
-from ventbench.sandbox.errors import SandboxError
+from ventbench.sandbox.configuration import Allowance, SandboxError, configuration
 from ventbench.sandbox.pipes import Pipes
-from ventbench.sandbox.session import SandboxSession, said
-from ventbench.sandbox.zygote import Zygote
-from ventbench.submissions.folder import Submission
-from ventbench.submissions.runner import ControllerSession
+from ventbench.sandbox.session import SandboxSession, SubmittedFolder, said
+from ventbench.sandbox.zygote import ZygoteClient
 
 _PROBE_S = 30.0
 
@@ -34,7 +30,7 @@ def layers() -> tuple[str, ...]:
     """
     pipes = Pipes()
     with tempfile.TemporaryDirectory() as folder:
-        zygote = Zygote(configuration(os.path.realpath(folder), "probe", [], Allowance()))
+        zygote = ZygoteClient(configuration(os.path.realpath(folder), "probe", [], Allowance()))
         try:
             pipes.open(0, lambda far: zygote.start(0, None, far))
             found = pipes.collect({0}, 0, wire.LOCKED, _PROBE_S, float("inf"))
@@ -48,7 +44,7 @@ def layers() -> tuple[str, ...]:
 
 
 class SandboxRunner:
-    """Runs controllers apart; see ``submissions.runner.Runner``.
+    """Runs controllers apart: a :class:`ventbench.submissions.runner.Runner`.
 
     Args:
         require_official: refuse to run where a layer is missing that official results need.
@@ -83,8 +79,8 @@ class SandboxRunner:
             "official": not self.missing,
         }
 
-    def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
-        """See ``submissions.runner.Runner``.
+    def start(self, submission: SubmittedFolder, tasks: Sequence[Task]) -> SandboxSession:
+        """Start the cells of a submission, as :class:`ventbench.submissions.runner.Runner` says.
 
         Raises:
             SandboxError: if a cell does not show the layers of :attr:`sandbox`.

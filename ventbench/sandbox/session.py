@@ -1,28 +1,32 @@
-"""The cells of one submission, from start to close."""
+"""The cells of one submission, from start to close.
+
+While they run, this process has room for the descriptors of their pipes and cannot be read by
+other processes of the same user.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import random
+import resource
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ventbench import protocol
 from ventbench.interfaces import Task
-from ventbench.sandbox import descriptors, dumpable
-from ventbench.sandbox.allowance import Allowance
-from ventbench.sandbox.child import lockdown, wire
+from ventbench.sandbox.child import libc, lockdown, wire
+from ventbench.sandbox.child.failures import Failure, SubmissionError
 from ventbench.sandbox.child.wire import Reply
-from ventbench.sandbox.configuration import configuration
-from ventbench.sandbox.errors import SandboxError
+from ventbench.sandbox.configuration import Allowance, SandboxError, configuration
 from ventbench.sandbox.pipes import Outcome, Pipes
 from ventbench.sandbox.verdict import Verdict, ended, failed, not_answered
-from ventbench.sandbox.zygote import Zygote
-from ventbench.submissions.errors import Failure, SubmissionError
-from ventbench.submissions.folder import Submission
+from ventbench.sandbox.zygote import ZygoteClient
 
 Floats = NDArray[np.float64]
 
@@ -30,8 +34,24 @@ Floats = NDArray[np.float64]
 _GRACE_S = 0.5
 
 
+class SubmittedFolder(Protocol):
+    """What a session needs of a submission: where its code lies, and how messages name it."""
+
+    @property
+    def folder(self) -> Path:
+        """Absolute path."""
+        ...
+
+    @property
+    def label(self) -> str:
+        """As the person named it."""
+        ...
+
+
 class SandboxSession:
-    """Fresh, locked-down controllers, one process each: a ``runner.ControllerSession``.
+    """Fresh, locked-down controllers, one process each.
+
+    It is a :class:`ventbench.submissions.runner.ControllerSession`.
 
     Args:
         submission: whose code runs.
@@ -46,7 +66,7 @@ class SandboxSession:
 
     def __init__(
         self,
-        submission: Submission,
+        submission: SubmittedFolder,
         tasks: Sequence[Task],
         layers: tuple[str, ...],
         allowance: Allowance,
@@ -56,13 +76,13 @@ class SandboxSession:
         self._allowance, self._sequence = allowance, 0
         self._deadline = time.monotonic() + allowance.total_s
         with contextlib.ExitStack() as stack:
-            stack.enter_context(descriptors.room_for(2 * len(tasks)))
-            dumpable.hide()
-            stack.callback(dumpable.show)
+            stack.enter_context(descriptors_for(2 * len(tasks)))
+            hide_process()
+            stack.callback(show_process)
             self._pipes = Pipes()
             stack.callback(self._pipes.close_all)
             distinct = sorted(set(tasks), key=repr)
-            self._zygote = Zygote(
+            self._zygote = ZygoteClient(
                 configuration(str(submission.folder), submission.label, distinct, allowance)
             )
             stack.callback(self._zygote.close)
@@ -101,7 +121,7 @@ class SandboxSession:
         self._give_up(late)
 
     def act(self, observations: Floats) -> Floats:
-        """See ``submissions.runner.ControllerSession``."""
+        """Ask every controller for its next command, as of ``ControllerSession``."""
         self._sequence += 1
         for cell, outcome in self._pipes.early().items():
             self._judge(cell, outcome)
@@ -118,7 +138,7 @@ class SandboxSession:
         return commands
 
     def close(self) -> None:
-        """See ``submissions.runner.ControllerSession``."""
+        """End all controllers; may be called more than once."""
         self._live.clear()
         self._stack.close()
 
@@ -152,13 +172,13 @@ class SandboxSession:
             self._zygote.interrupt(cell)
         waiting = set(late)
         deadline = time.monotonic() + _GRACE_S + 0.01 * len(late)
-        said = self._pipes.collect(waiting, self._sequence, wire.FAILED, _GRACE_S, deadline)
+        outcomes = self._pipes.collect(waiting, self._sequence, wire.FAILED, _GRACE_S, deadline)
         total = time.monotonic() >= self._deadline
         limit = self._allowance.total_s if total else self._allowance.patience_s
-        for cell in said.keys() - late:  # had answered, and then wrote more or ended
-            self._judge(cell, said[cell])
+        for cell in outcomes.keys() - late:  # had answered, and then wrote more or ended
+            self._judge(cell, outcomes[cell])
         for cell in late:
-            self._fail(cell, not_answered(said.get(cell), limit, total))
+            self._fail(cell, not_answered(outcomes.get(cell), limit, total))
 
     def _fail(self, cell: int, verdict: Verdict) -> Failure:
         breath = step = None
@@ -177,3 +197,57 @@ def said(outcome: Outcome) -> str:
     if isinstance(outcome, Reply):
         return outcome.text.decode(errors="replace").replace("\0", " ").strip()
     return "it ended" if outcome is None else str(outcome)
+
+
+#: What else a process has open.
+_OTHER_DESCRIPTORS = 256
+
+
+@contextlib.contextmanager
+def descriptors_for(count: int) -> Iterator[None]:
+    """Raise the limit of open descriptors if need be, and restore it afterwards.
+
+    Raises:
+        SandboxError: if the system's own limit is too low.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = count + _OTHER_DESCRIPTORS
+    enough = soft == resource.RLIM_INFINITY or soft >= wanted
+    if not enough:
+        if hard != resource.RLIM_INFINITY and hard < wanted:
+            raise SandboxError(
+                f"{count} pipes are needed and the system allows {hard} open files; "
+                f"raise it (ulimit -Hn {wanted}) or score fewer cells at a time"
+            )
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    try:
+        yield
+    finally:
+        if not enough:
+            with contextlib.suppress(OSError, ValueError):
+                resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+_dumpable_lock = threading.Lock()
+_hiders = 0
+_dumpable_before = 1
+
+
+def hide_process() -> None:
+    """No tracing, no ``/proc/PID/mem`` for others; counts how often it was asked for."""
+    global _hiders, _dumpable_before
+    with _dumpable_lock:
+        if libc.LINUX and _hiders == 0:
+            _dumpable_before = libc.prctl(libc.PR_GET_DUMPABLE)
+            libc.prctl(libc.PR_SET_DUMPABLE, 0)
+        _hiders += 1
+
+
+def show_process() -> None:
+    """Undo one :func:`hide_process`; the last one restores what was before."""
+    global _hiders
+    with _dumpable_lock:
+        _hiders -= 1
+        # 2, "for root alone", cannot be set again by hand; 0 is what it means for others.
+        if libc.LINUX and _hiders == 0 and _dumpable_before == 1:
+            libc.prctl(libc.PR_SET_DUMPABLE, 1)

@@ -8,17 +8,17 @@ from __future__ import annotations
 import signal
 from typing import NamedTuple
 
+from ventbench.sandbox.child.failures import printable
 from ventbench.sandbox.child.wire import Reply
 from ventbench.sandbox.pipes import Outcome
 from ventbench.sandbox.zygote import signal_name
-from ventbench.submissions.errors import printable
 
 #: Kinds that a cell may give itself, before the first observation and after it.
 _BEFORE, _DURING = ("reset", "import", "construct"), ("act", "type", "value")
 
 
 class Verdict(NamedTuple):
-    """Kind, words and detail of a ``submissions.errors.Failure``."""
+    """Kind, words and detail of a ``child.failures.Failure``."""
 
     kind: str
     what: str

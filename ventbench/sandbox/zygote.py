@@ -1,14 +1,20 @@
-"""The scorer's end of the zygote: starts it, asks it for cells, hears how they ended."""
+"""The scorer's end of the zygote: starts it, asks it for cells, hears how they ended.
+
+Where bubblewrap is installed, the zygote starts inside it: a file system with nothing else in it.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import time
 from collections.abc import Sequence
@@ -18,18 +24,18 @@ from typing import Any
 import numpy as np
 
 import ventbench
-from ventbench.sandbox import bubblewrap
 from ventbench.sandbox.child.zygote import (
     ENDED,
     INTERRUPT,
     KILL,
     NO_TASK,
     PREPARED,
+    RANDOM,
     REQUEST,
     SIZE,
     START,
 )
-from ventbench.sandbox.errors import SandboxError
+from ventbench.sandbox.configuration import SandboxError
 
 _ROOT = str(Path(ventbench.__file__).resolve().parents[1])
 _SITE = str(Path(np.__file__).resolve().parents[1])
@@ -55,7 +61,7 @@ ENVIRONMENT = {
 _START_S = 60.0
 
 
-class Zygote:
+class ZygoteClient:
     """A running zygote.
 
     Args:
@@ -66,7 +72,7 @@ class Zygote:
     """
 
     def __init__(self, config: dict[str, Any]):
-        words = bubblewrap.prefix([_SITE, os.path.join(_ROOT, "ventbench"), config["folder"]])
+        words = bubblewrap_prefix([_SITE, os.path.join(_ROOT, "ventbench"), config["folder"]])
         config = {**config, "site": [_SITE], "bubblewrap": bool(words)}
         self._ended: dict[int, int] = {}
         self._data = b""
@@ -171,3 +177,44 @@ def signal_name(status: int) -> str:
         return signal.Signals(-status).name
     except ValueError:
         return f"signal {-status}"
+
+
+_SYSTEM = ("/lib", "/lib64", "/usr/lib", "/usr/lib64", "/etc/ld.so.cache")
+
+
+def bubblewrap_prefix(folders: Sequence[str]) -> list[str]:
+    """Words to put before the zygote's command; none where bubblewrap is missing or may not run.
+
+    Args:
+        folders: that the zygote and its cells read, besides the interpreter.
+    """
+    program = shutil.which("bwrap")
+    if program is None or sys.platform != "linux":
+        return []
+    words = [program, *_bubblewrap_options(folders), "--"]
+    return words if _works((*words, sys.executable, "-I", "-S", "-c", "")) else []
+
+
+def _bubblewrap_options(folders: Sequence[str]) -> list[str]:
+    interpreter = (
+        *(sys.prefix, sys.base_prefix, sysconfig.get_path("stdlib")),
+        *(os.path.dirname(path) for path in (sys.executable, os.path.realpath(sys.executable))),
+    )
+    options = ["--unshare-all", "--die-with-parent", "--as-pid-1", "--cap-drop", "ALL"]
+    for path in (*_SYSTEM, *interpreter, *folders):
+        options += ["--ro-bind-try", path, path]
+    for device in ("/dev/null", RANDOM):
+        options += ["--dev-bind", device, device]
+    # The zygote reads there how much memory it has; its cells cannot.
+    return [*options, "--proc", "/proc", "--chdir", "/"]
+
+
+@functools.cache
+def _works(command: tuple[str, ...]) -> bool:
+    try:
+        run = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=10, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return run.returncode == 0

@@ -2,9 +2,8 @@
 
 - :mod:`~ventbench.submissions.folder`: find a submission and hash it;
 - :mod:`~ventbench.submissions.manifest`: ``submission.toml``;
-- :mod:`~ventbench.submissions.cell`: import ``controller.py``, run one controller in one run, and
-  name every way in which it fails;
 - :mod:`~ventbench.submissions.runner`: who runs the controllers (in this process, or a sandbox);
+  one controller in one run is a :class:`ventbench.sandbox.child.cell.Cell` in both;
 - :mod:`~ventbench.submissions.stepping`: the loop between plants and runner;
 - :mod:`~ventbench.submissions.scoring`: the score, and :mod:`~ventbench.submissions.result` its
   form;

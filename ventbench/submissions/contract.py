@@ -88,7 +88,7 @@ def check(name: str, runner: Runner | None = None) -> CheckReport:
     if opened is None or any(finding.problem for finding in sources):
         return _report(name, [*findings, *sources], left_out=_TO_RUN)
     if runner is None:
-        from ventbench.sandbox.allowance import Allowance
+        from ventbench.sandbox.configuration import Allowance
         from ventbench.sandbox.runner import SandboxRunner
 
         runner = SandboxRunner(allowance=Allowance(total_s=120.0))

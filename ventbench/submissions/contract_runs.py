@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ventbench import protocol
 from ventbench.interfaces import Task
 from ventbench.lungs import LUNG_IDS
-from ventbench.submissions.cell import ROW
+from ventbench.sandbox.child.cell import ROW
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import CONTROLLER, Submission
 from ventbench.submissions.runner import Runner

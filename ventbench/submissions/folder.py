@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ventbench import data_files, files
-from ventbench.interfaces import API_VERSION, Observation, Task
+from ventbench.interfaces import API_VERSION, Task
 from ventbench.submissions.errors import SubmissionError
 from ventbench.submissions.manifest import MANIFEST, TRACKS, Manifest, read_manifest
 
@@ -156,7 +156,7 @@ def submission_of(controller: Any) -> Submission:
 class _Stateless:
     """A function of the observation as a controller."""
 
-    def __init__(self, function: Callable[[Observation], float]):
+    def __init__(self, function: Callable[..., Any]):
         self.act = function
 
     def reset(self, task: Task) -> None:

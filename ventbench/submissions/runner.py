@@ -2,7 +2,7 @@
 
 A runner starts one fresh controller for each cell and then answers a batch of observations at a
 time. Only numbers cross: a :class:`Task` for each cell at the start, then at every step
-:data:`~ventbench.submissions.cell.ROW` floats to each controller and one float back.
+:data:`~ventbench.sandbox.child.cell.ROW` floats to each controller and one float back.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.interfaces import Observation, Task
-from ventbench.submissions.cell import Cell, Failed, controller_class
+from ventbench.sandbox.child.cell import Cell, Failed, controller_class
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import Submission
 

@@ -128,6 +128,8 @@ def run_protocol(
     """
     started = time.perf_counter()
     runner = runner or InProcessRunner()
+    if submission.controller is not None and runner.sandbox is not None:
+        raise SubmissionError(f"{submission.label}: only a folder can run in a sandbox")
     entered = submission.manifest.tracks
     track = track or entered[0]
     if track not in entered:

@@ -14,8 +14,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from ventbench.sandbox.packages import OPTIONAL
-from ventbench.submissions.cell import CLASS
+from ventbench.sandbox.child.cell import CLASS
+from ventbench.sandbox.configuration import OPTIONAL
 from ventbench.submissions.errors import Finding
 from ventbench.submissions.folder import CONTROLLER, MAX_BYTES
 

@@ -13,7 +13,7 @@ import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from . import landlock, libc, namespaces, privileges, rlimits, seccomp
+from . import landlock, libc, privileges, seccomp
 
 #: Every layer, in the order of the bits of a ``LOCKED`` reply.
 LAYERS = (
@@ -33,7 +33,7 @@ OFFICIAL = ("landlock", "seccomp")
 
 
 @dataclass(frozen=True)
-class Limits:
+class CellLimits:
     """What one cell may use.
 
     Attributes:
@@ -61,7 +61,9 @@ class Lockdown:
         self._ruleset: int | None = None
         if not libc.LINUX:
             return
-        self._layers += ["namespaces", "read-only-mounts"] if bubblewrap else namespaces.enter()
+        self._layers += (
+            ["namespaces", "read-only-mounts"] if bubblewrap else privileges.enter_namespaces()
+        )
         privileges.no_new_privs()
         privileges.drop_capabilities()
         privileges.undumpable()
@@ -72,7 +74,7 @@ class Lockdown:
             self._ruleset = fcntl.fcntl(handle, fcntl.F_DUPFD_CLOEXEC, 16)
             os.close(handle)
 
-    def finish(self, limits: Limits, keep: int) -> list[str]:
+    def finish(self, limits: CellLimits, keep: int) -> list[str]:
         """Lock this process, a fork of the zygote, down for good.
 
         Args:
@@ -85,7 +87,7 @@ class Lockdown:
         Raises:
             OSError: if one that this system has does not come into force.
         """
-        rlimits.restrict(limits.memory, limits.cpu_s, limits.threads)
+        privileges.limit_resources(limits.memory, limits.cpu_s, limits.threads)
         layers = [*self._layers, "rlimits"]
         if libc.LINUX:
             privileges.undumpable()  # a fork inherits it; once more costs nothing

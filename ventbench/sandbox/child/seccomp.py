@@ -1,18 +1,216 @@
-"""The cell's filter of system calls, and how it is switched on."""
+"""The cell's filter of system calls: which may be made, the filter's program, its switching on.
+
+A cell is Python with numpy, one thread, reading what it is granted; everything not named here is
+refused. What is deliberately absent, because cells could talk to each other or leave something
+behind: files' times, modes and attributes (``utimensat``, ``fchmod``, ``setxattr``), locks
+(``flock``, ``fcntl`` beyond flags), shared futexes, ``mincore``, ``fadvise64``, ``sysinfo``.
+
+The program is classic BPF over the kernel's ``struct seccomp_data``: a list of rules tried in
+order; the first rule whose call and arguments match decides, and what no rule matches gets the
+default. Calls of another architecture's table kill the process.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import errno
 import os
+import struct
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
-from . import bpf, libc
-from .bpf import Check, Rule
-from .syscalls import CHECKED, MISSING, OPEN, OPENAT, PLAIN, SECCOMP, Number
+from . import libc
+
+
+class CallNumber(NamedTuple):
+    """Number of one system call on both machines."""
+
+    x86_64: int | None
+    aarch64: int | None
+
+
+#: Allowed with any argument.
+PLAIN = {
+    "read": CallNumber(0, 63),
+    "write": CallNumber(1, 64),
+    "readv": CallNumber(19, 65),
+    "writev": CallNumber(20, 66),
+    "pread64": CallNumber(17, 67),
+    "lseek": CallNumber(8, 62),
+    "close": CallNumber(3, 57),
+    "close_range": CallNumber(436, 436),
+    "dup": CallNumber(32, 23),
+    "dup2": CallNumber(33, None),
+    "dup3": CallNumber(292, 24),
+    "fstat": CallNumber(5, 80),
+    "mmap": CallNumber(9, 222),
+    "mprotect": CallNumber(10, 226),
+    "munmap": CallNumber(11, 215),
+    "mremap": CallNumber(25, 216),
+    "brk": CallNumber(12, 214),
+    "rt_sigaction": CallNumber(13, 134),
+    "rt_sigprocmask": CallNumber(14, 135),
+    "rt_sigreturn": CallNumber(15, 139),
+    "sigaltstack": CallNumber(131, 132),
+    "getpid": CallNumber(39, 172),
+    "gettid": CallNumber(186, 178),
+    "getppid": CallNumber(110, 173),
+    "getuid": CallNumber(102, 174),
+    "geteuid": CallNumber(107, 175),
+    "getgid": CallNumber(104, 176),
+    "getegid": CallNumber(108, 177),
+    "getrusage": CallNumber(98, 165),
+    "getrlimit": CallNumber(97, 163),
+    "uname": CallNumber(63, 160),
+    "times": CallNumber(100, 153),
+    "time": CallNumber(201, None),
+    "gettimeofday": CallNumber(96, 169),
+    "clock_gettime": CallNumber(228, 113),
+    "clock_getres": CallNumber(229, 114),
+    "clock_nanosleep": CallNumber(230, 115),
+    "nanosleep": CallNumber(35, 101),
+    "restart_syscall": CallNumber(219, 128),
+    "sched_yield": CallNumber(24, 124),
+    "sched_getaffinity": CallNumber(204, 123),
+    "getcpu": CallNumber(309, 168),
+    "getrandom": CallNumber(318, 278),
+    "poll": CallNumber(7, None),
+    "ppoll": CallNumber(271, 73),
+    "select": CallNumber(23, None),
+    "pselect6": CallNumber(270, 72),
+    "arch_prctl": CallNumber(158, None),
+    "set_robust_list": CallNumber(273, 99),
+    "set_tid_address": CallNumber(218, 96),
+    "rseq": CallNumber(334, 293),
+    "exit": CallNumber(60, 93),
+    "exit_group": CallNumber(231, 94),
+    "stat": CallNumber(4, None),
+    "lstat": CallNumber(6, None),
+    "newfstatat": CallNumber(262, 79),
+    "statx": CallNumber(332, 291),
+    "access": CallNumber(21, None),
+    "faccessat": CallNumber(269, 48),
+    "faccessat2": CallNumber(439, 439),
+    "readlink": CallNumber(89, None),
+    "readlinkat": CallNumber(267, 78),
+    "getdents64": CallNumber(217, 61),
+    "getcwd": CallNumber(79, 17),
+}
+
+#: Opening files, for reading only.
+OPENAT, OPEN = CallNumber(257, 56), CallNumber(2, None)
+
+#: Sets filters; not for cells.
+SECCOMP = CallNumber(317, 277)
+
+#: Allowed with the arguments that :func:`_checked` names.
+CHECKED = {
+    "ioctl": CallNumber(16, 29),
+    "fcntl": CallNumber(72, 25),
+    "futex": CallNumber(202, 98),
+    "madvise": CallNumber(28, 233),
+    "prlimit64": CallNumber(302, 261),
+    "tgkill": CallNumber(234, 131),
+    "clone": CallNumber(56, 220),
+}
+
+#: Answered with "no such call", so that the C library falls back to one that is looked into.
+MISSING = {"clone3": CallNumber(435, 435), "openat2": CallNumber(437, 437)}
+
+#: What becomes of a call.
+ALLOW, KILL = 0x7FFF0000, 0x80000000
+
+_LOAD, _AND, _RETURN = 0x20, 0x54, 0x06  # ld [k]; and #k; ret #k
+_EQUAL, _AT_LEAST = 0x15, 0x35  # jeq #k, true, false; jge
+_NUMBER, _ARCHITECTURE, _ARGUMENTS = 0, 4, 16  # offsets in struct seccomp_data
+
+#: Name of the architecture in the kernel's audit table.
+AUDIT = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
+
+#: x86-64 answers to a second table of calls (x32) from here on.
+_X32 = 0x40000000
+
+
+def errno_action(error: int) -> int:
+    """Action: the call fails with this error number."""
+    return 0x00050000 | error
+
+
+class Condition(NamedTuple):
+    """Holds when ``argument & mask`` is one of the values.
+
+    Attributes:
+        argument: index of the argument.
+        values: what may be left.
+        mask: bits of its lower 32 that count.
+        whole: the upper 32 bits must be zero (pointers); elsewhere the kernel drops them.
+    """
+
+    argument: int
+    values: Sequence[int]
+    mask: int = 0xFFFFFFFF
+    whole: bool = False
+
+
+class Rule(NamedTuple):
+    """For one call: the action if all conditions hold; else later rules are tried."""
+
+    number: int
+    action: int
+    conditions: tuple[Condition, ...] = ()
+
+
+def _instruction(code: int, k: int, true: int = 0, false: int = 0) -> bytes:
+    return struct.pack("<HBBI", code, true, false, k)
+
+
+def _test(condition: Condition, skip: int) -> list[bytes]:
+    """Instructions of a condition: fall through if it holds, else jump over ``skip`` more."""
+    low = _ARGUMENTS + 8 * condition.argument
+    code = [_instruction(_LOAD, low), _instruction(_AND, condition.mask)]
+    for left, value in zip(range(len(condition.values) - 1, -1, -1), condition.values, strict=True):
+        # A match jumps over the other values; the last one that fails leaves the rule.
+        code.append(_instruction(_EQUAL, value, left, 0 if left else skip))
+    if condition.whole:
+        # Checked first, so that its failure skips the code above too.
+        high = [_instruction(_LOAD, low + 4), _instruction(_EQUAL, 0, 0, len(code) + skip)]
+        code = high + code
+    return code
+
+
+def _rule(rule: Rule) -> list[bytes]:
+    body = [_instruction(_RETURN, rule.action)]
+    for condition in reversed(rule.conditions):
+        body = _test(condition, len(body)) + body
+    reload = [_instruction(_LOAD, _NUMBER)] if rule.conditions else []
+    # The accumulator holds the number again for the next rule, whichever way this one is left.
+    return [_instruction(_EQUAL, rule.number, 0, len(body)), *body, *reload]
+
+
+def assemble(machine: str, rules: Iterable[Rule], default: int) -> bytes:
+    """Return the filter as an array of ``struct sock_filter``.
+
+    Args:
+        machine: ``"x86_64"`` or ``"aarch64"``.
+        rules: tried in order.
+        default: action for calls that no rule decides.
+    """
+    kill = _instruction(_RETURN, KILL)
+    code = [_instruction(_LOAD, _ARCHITECTURE), _instruction(_EQUAL, AUDIT[machine], 1, 0), kill]
+    code.append(_instruction(_LOAD, _NUMBER))
+    if machine == "x86_64":
+        code += [_instruction(_AT_LEAST, _X32, 0, 1), kill]
+    for rule in rules:
+        code += _rule(rule)
+    code.append(_instruction(_RETURN, default))
+    if len(code) > 4096:
+        raise ValueError(f"a filter of {len(code)} instructions; the kernel takes 4096")
+    return b"".join(code)
+
 
 _SET_MODE_FILTER, _GET_ACTION_AVAILABLE, _TSYNC = 1, 2, 1
 
-_REFUSED, _NO_SUCH_CALL = bpf.errno_action(errno.EPERM), bpf.errno_action(errno.ENOSYS)
+_REFUSED, _NO_SUCH_CALL = errno_action(errno.EPERM), errno_action(errno.ENOSYS)
 
 # Linux's numbers, equal on x86-64 and aarch64 (os.O_* of the running system may differ).
 _O_TMPFILE, _O_PATH = 0o20000000, 0o10000000
@@ -28,9 +226,9 @@ _Rules = list[Rule]
 
 def available() -> bool:
     """Whether this kernel filters and this machine has a table here."""
-    if libc.MACHINE not in bpf.AUDIT:
+    if libc.MACHINE not in AUDIT:
         return False
-    action = ctypes.c_uint32(bpf.ALLOW)
+    action = ctypes.c_uint32(ALLOW)
     try:
         number = getattr(SECCOMP, libc.MACHINE)
         libc.syscall(number, _GET_ACTION_AVAILABLE, 0, ctypes.byref(action))
@@ -39,27 +237,28 @@ def available() -> bool:
     return True
 
 
-def _allow(machine: str, call: Number, *checks: Check) -> _Rules:
+def _allow(machine: str, call: CallNumber, *conditions: Condition) -> _Rules:
     number = getattr(call, machine)
-    return [] if number is None else [Rule(number, bpf.ALLOW, checks)]
+    return [] if number is None else [Rule(number, ALLOW, conditions)]
 
 
 def _checked(machine: str, pid: int, threads: bool) -> _Rules:
     rules = []
-    for name, checks in (
-        ("ioctl", [Check(1, (_TERMINAL_QUESTION, *_CLOSE_ON_EXEC))]),
-        ("fcntl", [Check(1, _FCNTL)]),
+    for name, conditions in (
+        ("ioctl", [Condition(1, (_TERMINAL_QUESTION, *_CLOSE_ON_EXEC))]),
+        ("fcntl", [Condition(1, _FCNTL)]),
         # A futex in a file's page would reach every process that maps the file; waiting for a
         # thread of one's own to end is the one shared use, and alone it says nothing.
-        ("futex", [Check(1, (_FUTEX_PRIVATE,), _FUTEX_PRIVATE)]),
-        ("futex", [Check(1, (_FUTEX_JOIN,))]),
-        ("madvise", [Check(2, _MADVISE)]),
-        ("prlimit64", [Check(0, (0,)), Check(2, (0,), whole=True)]),  # one's own, reading
-        ("tgkill", [Check(0, (pid,))]),  # abort()
+        ("futex", [Condition(1, (_FUTEX_PRIVATE,), _FUTEX_PRIVATE)]),
+        ("futex", [Condition(1, (_FUTEX_JOIN,))]),
+        ("madvise", [Condition(2, _MADVISE)]),
+        # One's own limits, to be read.
+        ("prlimit64", [Condition(0, (0,)), Condition(2, (0,), whole=True)]),
+        ("tgkill", [Condition(0, (pid,))]),  # abort()
     ):
-        rules += _allow(machine, CHECKED[name], *checks)
+        rules += _allow(machine, CHECKED[name], *conditions)
     if threads:
-        rules += _allow(machine, CHECKED["clone"], Check(0, (_CLONE_THREAD,), _CLONE_THREAD))
+        rules += _allow(machine, CHECKED["clone"], Condition(0, (_CLONE_THREAD,), _CLONE_THREAD))
     return rules
 
 
@@ -75,14 +274,14 @@ def cell_filter(machine: str, pid: int, threads: bool) -> bytes:
     for call in PLAIN.values():
         rules += _allow(machine, call)
     for call, flags in ((OPENAT, 2), (OPEN, 1)):
-        rules += _allow(machine, call, Check(flags, (0,), _WRITING))
+        rules += _allow(machine, call, Condition(flags, (0,), _WRITING))
     rules += _checked(machine, pid, threads)
     rules += [
         Rule(number, _NO_SUCH_CALL)
         for call in MISSING.values()
         if (number := getattr(call, machine)) is not None
     ]
-    return bpf.assemble(machine, rules, _REFUSED)
+    return assemble(machine, rules, _REFUSED)
 
 
 class _Program(ctypes.Structure):

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
 from dataclasses import dataclass
+from importlib.machinery import FileFinder, SourceFileLoader
 from pathlib import Path
-from types import FrameType
+from types import CodeType, FrameType
 from typing import NoReturn
 
 from ventbench.interfaces import Task
-from ventbench.submissions.cell import Cell, Failed, controller_class, describe
-from ventbench.submissions.errors import SubmissionError
 
-from . import lockdown, sources, wire
-from .lockdown import Limits, Lockdown
-from .printed import Tail
+from . import lockdown, wire
+from .cell import Cell, Failed, controller_class, describe
+from .failures import SubmissionError
+from .lockdown import CellLimits, Lockdown
 
 #: Descriptors of a cell: 0 to 2 are /dev/null.
 OBSERVATIONS, REPLIES, END = 3, 4, 5
@@ -34,7 +35,7 @@ class Setup:
 
     folder: Path
     label: str
-    limits: Limits
+    limits: CellLimits
 
 
 class _Replies:
@@ -83,7 +84,7 @@ def run(setup: Setup, prepared: Lockdown, task: Task | None) -> NoReturn:
     if task is None or os.read(OBSERVATIONS, len(wire.BEGIN)) != wire.BEGIN:
         os._exit(0)
     try:
-        sources.only_sources(setup.folder)
+        only_sources(setup.folder)
         cell = Cell(controller_class(setup.folder, setup.label), task, setup.folder)
         replies.send(wire.READY)
         _answer(replies, cell)
@@ -103,3 +104,44 @@ def _answer(replies: _Replies, cell: Cell) -> NoReturn:
         replies.sequence += 1
         value = cell.act(wire.unpack_observation(frame, replies.sequence))
         replies.send(wire.COMMAND, value)
+
+
+class _SourceLoader(SourceFileLoader):
+    def get_code(self, fullname: str) -> CodeType:
+        path = self.get_filename(fullname)
+        return self.source_to_code(self.get_data(path), path)
+
+
+def only_sources(folder: Path) -> None:
+    """Let modules of a folder and all below be imported from their sources alone.
+
+    What was reviewed and hashed is then what runs: no ``__pycache__`` that says something else, no
+    compiled extension.
+    """
+
+    def hook(path: str) -> FileFinder:
+        if not Path(path).is_relative_to(folder):
+            raise ImportError(path)
+        return FileFinder(path, (_SourceLoader, [".py"]))
+
+    sys.path_hooks.insert(0, hook)
+
+
+#: Characters kept of the last that was printed.
+_PRINTED = 2000
+
+
+class Tail(io.TextIOBase):
+    """What a submission prints: only the end is kept, for the message if it fails."""
+
+    def __init__(self) -> None:
+        self.kept = ""
+
+    def writable(self) -> bool:
+        """Say that one may write to it."""
+        return True
+
+    def write(self, text: str) -> int:
+        """Add text."""
+        self.kept = (self.kept + text[-_PRINTED:])[-_PRINTED:]
+        return len(text)

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ventbench.submissions.cell import ROW
+from .cell import ROW
 
 #: First bytes of every frame to a cell, and of every frame from a cell.
 OBSERVATION_MAGIC, REPLY_MAGIC = b"VBo1", b"VBr1"

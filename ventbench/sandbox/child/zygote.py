@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 from ventbench.interfaces import Task
 
 from . import libc, preload, privileges, serve
-from .lockdown import Limits, Lockdown
+from .lockdown import CellLimits, Lockdown
 
 #: Request: what to do, cell, index of its task. A start brings the cell's ends of two pipes.
 REQUEST = struct.Struct("<cIH")
@@ -161,7 +161,7 @@ def main(descriptor: int) -> None:
     prepared = Lockdown(
         [config["folder"], RANDOM, *readable], listable, bubblewrap=config["bubblewrap"]
     )
-    setup = serve.Setup(Path(config["folder"]), config["label"], Limits(**config["limits"]))
+    setup = serve.Setup(Path(config["folder"]), config["label"], CellLimits(**config["limits"]))
     sys.argv[:] = [""]
     zygote = Zygote(control, setup, prepared, [Task(*task) for task in config["tasks"]])
     gc.collect()

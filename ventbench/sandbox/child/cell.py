@@ -16,7 +16,8 @@ from typing import Any
 
 from ventbench.interfaces import Observation, Task
 from ventbench.protocol import TARGETS_AHEAD
-from ventbench.submissions.errors import Failure, SubmissionError, printable
+
+from .failures import Failure, SubmissionError, printable
 
 #: Floats of one observation on the way to a controller, in the order of :class:`Observation`.
 ROW = 5 + TARGETS_AHEAD

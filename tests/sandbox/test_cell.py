@@ -4,7 +4,7 @@ import sys
 import pytest
 
 from ventbench.interfaces import Observation, Task
-from ventbench.submissions.cell import ROW, Cell, Failed, controller_class, unpack
+from ventbench.sandbox.child.cell import ROW, Cell, Failed, controller_class, unpack
 
 ROBUSTNESS = Task("robustness", None, 0.03, 34)
 ROWS = [float(i) for i in range(ROW)]
@@ -118,7 +118,7 @@ def test_before_the_first_step(make, method, raised):
 def test_needs_the_standard_library_alone():
     # A sandbox's child must come up without numpy and JAX.
     code = (
-        "import sys, ventbench.submissions.cell\n"
+        "import sys, ventbench.sandbox.child.cell\n"
         "heavy = {'numpy', 'jax', 'flax', 'pandas'} & set(sys.modules)\n"
         "assert not heavy, heavy"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 
 def number(value: float | None, digits: int = 2, sign: bool = False) -> str:
@@ -22,3 +23,8 @@ def plain(text: str) -> str:
     return "".join(
         c if c.isprintable() else " " if c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in text
     )
+
+
+def escape_markdown(text: str) -> str:
+    """Make text plain in Markdown: no link, image, table or heading can come from it."""
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(text.split()))

@@ -13,8 +13,8 @@ from ventbench import protocol
 from ventbench.errors import InputError
 from ventbench.text import number
 from ventbench.trajectories import Trajectories
+from ventbench.views import report, scores, svg, write_figure, write_report
 from ventbench.views import runs as shared
-from ventbench.views import scores, svg, write_figure, write_report
 
 pytest.importorskip("jinja2", reason="needs the extra ventbench[view]")
 
@@ -157,8 +157,6 @@ def test_wrong_score_files(best: Trajectories, tmp_path: Path) -> None:
 
 
 def test_best_and_differences(best: Trajectories, robust: Trajectories) -> None:
-    from ventbench.views import report
-
     numbers = scores.collect([best, robust])
     row = report.table(best.lungs, numbers)[0]
     ours, base = row["cells"]

@@ -10,7 +10,7 @@ import pytest
 from ventbench import protocol
 from ventbench.errors import InputError
 from ventbench.trajectories import Trajectories
-from ventbench.views import about, runs, write_rerun
+from ventbench.views import runs, write_rerun
 
 pytest.importorskip("rerun", reason="needs the extra ventbench[view]")
 chunk = pytest.importorskip("rerun.chunk", reason="reads files back with rerun >= 0.41")
@@ -93,7 +93,9 @@ def test_one_blueprint(best: Trajectories, tmp_path: Path) -> None:
 
 
 def test_text_panel(best: Trajectories, failed: Trajectories) -> None:
-    text = about.markdown([best, failed], ["pid_best", failed.name])
+    from ventbench.views.rerun_log import markdown
+
+    text = markdown([best, failed], ["pid_best", failed.name])
     errors = runs.errors(best).mean(axis=1)
     for lung, error in zip(best.lungs[:2], errors[:2], strict=True):
         assert f"| {lung} | **{error:.2f}** |" in text

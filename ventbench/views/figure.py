@@ -7,15 +7,20 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from matplotlib import font_manager
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+from PIL import Image
 
 from ventbench import protocol
 from ventbench.lungs import lung as parse_lung
 from ventbench.text import number
 from ventbench.trajectories import Trajectories
 from ventbench.views import panels, scores, style
-from ventbench.views.drawing import Drawing
 from ventbench.views.runs import Floats, labels
 
 #: Width, pixels.
@@ -26,6 +31,12 @@ MARGIN, GAP, HEAD, ROW_HEAD = 14.0, 6.0, 50.0, 40.0
 
 #: Height of one row of the legend, panel units.
 LEGEND = 19.0
+
+#: The font that comes with matplotlib.
+FONT = "DejaVu Sans"
+
+#: Resolution, dots an inch.
+DPI = 150
 
 INK, QUIET, RULE, BAND = "#16191d", "#5b636d", "#d9dde2", "#eef1f4"
 
@@ -87,9 +98,9 @@ def _row_head(draw: Drawing, lung: str, names: Sequence[str], errors: Floats, to
     draw.text(MARGIN + 70, top + 21, text, 10, QUIET)
     x = draw.width - MARGIN - 2
     for k in reversed(range(min(2, len(names)))):
-        said = f"{names[k]} {number(errors[k])}"
-        draw.text(x, top + 21, said, 10, _color(k), ha="right")
-        x -= draw.text_width(said, 10) + 14
+        label = f"{names[k]} {number(errors[k])}"
+        draw.text(x, top + 21, label, 10, _color(k), ha="right")
+        x -= draw.text_width(label, 10) + 14
 
 
 def _panel(
@@ -152,3 +163,84 @@ def _color(run: int) -> str:
 
 def _width(run: int) -> float:
     return 1.9 if run == 0 else 1.4
+
+
+class Drawing:
+    """Collects lines and areas by look, so that each look is one collection.
+
+    Args:
+        width: of the picture in units; all lengths are in these, y downwards.
+        height: of the picture in units.
+        pixels: the width in pixels.
+    """
+
+    def __init__(self, width: float, height: float, pixels: int):
+        scale = pixels / width
+        self.width, self.points = width, scale * 72.0 / DPI
+        size = (pixels / DPI, round(height * scale) / DPI)
+        figure = Figure(figsize=size, dpi=DPI, facecolor="white")
+        self.canvas = FigureCanvasAgg(figure)
+        self.axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0.0, width), ylim=(height, 0.0))
+        self.axes.set_axis_off()
+        self.lines: dict[tuple[int, str, float, float], list[Floats]] = {}
+        self.fills: dict[tuple[str, float], list[Floats]] = {}
+        self.font = font_manager.get_font(font_manager.findfont(FONT))
+
+    def known(self, text: str) -> str:
+        """Text with a question mark for characters that the font lacks."""
+        return "".join(c if self.font.get_char_index(ord(c)) else "?" for c in text)
+
+    def text(self, x: float, y: float, text: str, size: float, color: str, **look: Any) -> None:
+        """Text at its baseline; names are never taken for mathematics."""
+        self.axes.text(
+            x,
+            y,
+            text,
+            fontsize=size * self.points,
+            color=color,
+            family=FONT,
+            parse_math=False,
+            **look,
+        )
+
+    def line(self, line: Floats, color: str, width: float, order: int, alpha: float = 1.0) -> None:
+        """Polyline, shape ``(n, 2)``; a higher order lies above."""
+        self.lines.setdefault((order, color, width, alpha), []).append(line)
+
+    def fill(self, outline: Floats, color: str, alpha: float) -> None:
+        """Area within an outline, shape ``(n, 2)``; below all lines."""
+        self.fills.setdefault((color, alpha), []).append(outline)
+
+    def text_width(self, text: str, size: float) -> float:
+        """Width of a text in units, generously."""
+        self.font.set_size(size, 72.0)
+        self.font.set_text(text)
+        return 1.03 * self.font.get_width_height()[0] / 64.0
+
+    def image(self) -> Image.Image:
+        """Draw everything; a picture of 256 colours, a third of the size and not to be told."""
+        self._collect()
+        self.canvas.draw()
+        pixels = np.asarray(self.canvas.buffer_rgba())[..., :3]
+        return Image.fromarray(np.ascontiguousarray(pixels)).quantize(
+            256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+        )
+
+    def _collect(self) -> None:
+        for order, ((color, alpha), outlines) in enumerate(self.fills.items()):
+            self.axes.add_collection(
+                PolyCollection(outlines, facecolor=color, alpha=alpha, linewidth=0, zorder=order),
+                autolim=False,
+            )
+        for (order, color, width, alpha), lines in self.lines.items():
+            self.axes.add_collection(
+                LineCollection(
+                    lines,
+                    colors=color,
+                    linewidths=width * self.points,
+                    alpha=alpha,
+                    zorder=10 + order,
+                    capstyle="round",
+                ),
+                autolim=False,
+            )

@@ -40,8 +40,9 @@ class Panel:
         pip: cmH2O.
         ticks: of the pressure axis, value in cmH2O and y.
         target: polyline, shape ``(SHOWN + 1, 2)``.
-        pressures: one polyline a run, likewise; NaN where there is no finite pressure.
-        valves: likewise, u_in as a staircase.
+        pressures: one polyline a run, shape ``(SHOWN + 1, 2)``; NaN where there is no finite
+            pressure.
+        valves: one polyline a run, u_in as a staircase, shape ``(2 * SHOWN + 1, 2)``.
         valve_limit: top of the u_in axis, %.
         above: highest pressure of the first run if that is above the frame, cmH2O.
     """

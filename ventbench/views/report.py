@@ -101,7 +101,7 @@ def frame() -> dict[str, Any]:
 
 
 def _panel(panel: panels.Panel, names: Sequence[str], errors: Floats) -> dict[str, Any]:
-    said = "; ".join(
+    errors_text = "; ".join(
         f"{name} {number(e)}{' cmH2O' if np.isfinite(e) else ''}"
         for name, e in zip(names, errors, strict=True)
     )
@@ -109,7 +109,7 @@ def _panel(panel: panels.Panel, names: Sequence[str], errors: Floats) -> dict[st
     return {
         "pip": f"{panel.pip:g}",
         "alt": f"{panel.lung} at PIP {panel.pip:g} cmH2O: pressure and u_in over one breath. "
-        f"Mean absolute error: {said}.",
+        f"Mean absolute error: {errors_text}.",
         "errors": [number(error) for error in errors],
         "ticks": [(f"{value:g}", round(y, 1)) for value, y in panel.ticks],
         "target": svg.path(panel.target),

@@ -1,22 +1,58 @@
-"""A scored run as a rerun recording: one ``log_*`` function an idea."""
+"""A scored run as a rerun recording: what is logged, how the viewer shows it, and the text beside.
+
+One ``log_*`` function an idea. The blueprint shows all lungs at once first, then one lung in full a
+tab.
+"""
 
 from __future__ import annotations
 
 import tempfile
 import uuid
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
+import ventbench
+from ventbench import protocol
 from ventbench.errors import InputError
+from ventbench.lungs import lung as parse_lung
+from ventbench.text import escape_markdown, number
 from ventbench.trajectories import Trajectories
-from ventbench.views import about, style
-from ventbench.views.blueprint import ABOUT, TIMELINE, blueprint, reference_path
-from ventbench.views.runs import Floats, distinct, labels, scored
+from ventbench.views import style
+from ventbench.views.runs import Floats, distinct, errors, labels, scored
 
 APPLICATION = "ventbench"
+
+#: Name of the timeline; its values are seconds since the start of the run.
+TIMELINE = "run_time"
+
+#: Entity of the text panel.
+ABOUT = "/about"
+
+#: Longest name over a column of the score table, characters.
+COLUMN = 16
+
+
+@dataclass(frozen=True)
+class Plot:
+    """How one quantity is shown.
+
+    Attributes:
+        quantity: last part of the entity path.
+        title: with the unit.
+        range: of the axis; None to fit the data.
+        share: of a lung tab's height.
+    """
+
+    quantity: str
+    title: str
+    range: tuple[float, float] | None
+    share: float
 
 
 def recording(runs: Sequence[Trajectories]) -> bytes:
@@ -61,7 +97,7 @@ def shown_names(runs: Sequence[Trajectories]) -> list[str]:
 
 def log_about(stream: rr.RecordingStream, runs: Sequence[Trajectories], names: list[str]) -> None:
     """The text panel: what is seen, and the score table."""
-    text = about.markdown(runs, names)
+    text = markdown(runs, names)
     stream.log(ABOUT, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
 
 
@@ -89,7 +125,7 @@ def log_run(stream: rr.RecordingStream, run: Trajectories) -> None:
 
 
 def log_reference(stream: rr.RecordingStream, run: Trajectories, name: str, index: int) -> None:
-    """The same of a run to compare with: thin, one colour, under its name."""
+    """Pressure, valves and error of a run to compare with: thin, one colour, under its name."""
     colors = [style.REFERENCE_COLORS[index % len(style.REFERENCE_COLORS)]]
     for quantity, unit, array in _quantities(run):
         series = [f"{name}, {unit}"] * len(run.pips)
@@ -131,3 +167,162 @@ def _send(
         indexes=[rr.TimeColumn(TIMELINE, duration=time)],
         columns=rr.Scalars.columns(scalars=np.ascontiguousarray(values.T, dtype=float)),
     )
+
+
+def _plots(runs: Sequence[Trajectories]) -> tuple[Plot, ...]:
+    """Pressure, u_in, error and u_out, on axes that hold all runs."""
+    highest = _top([x for run in runs for x in (run.pressure, run.target)])
+    pressure = min(1.06 * highest, 2.0 * protocol.SAFETY_PRESSURE)
+    u_in = max(10.0, min(1.06 * _top([run.u_in for run in runs]), 1.06 * protocol.U_MAX))
+    return (
+        Plot("pressure", "airway pressure, cmH2O", (-0.05 * pressure, pressure), 4.0),
+        Plot("u_in", "inspiratory valve u_in, %", (-0.06 * u_in, u_in), 2.2),
+        Plot("error", "error = pressure - target, cmH2O", None, 2.2),
+        Plot("u_out", "expiratory valve u_out, 1 open", (-0.1, 1.1), 1.3),
+    )
+
+
+def blueprint(runs: Sequence[Trajectories], names: Sequence[str], tab: int = 0) -> rrb.Blueprint:
+    """Return the one blueprint.
+
+    Args:
+        runs: matching runs, the one to look at first.
+        names: of the runs.
+        tab: the one to open at: pressure, u_in, error, then the lungs.
+    """
+    lungs = runs[0].lungs
+    columns = len({parse_lung(lung).C for lung in lungs})
+    *overview, u_out = _plots(runs)
+    grids = [
+        rrb.Grid(
+            *(_view(lung, plot, _last_scored_breath(), legend=lung == lungs[-1]) for lung in lungs),
+            grid_columns=columns,
+            name=f"All lungs: {plot.quantity}",
+        )
+        for plot in overview
+    ]
+    details = [_lung_tab(lung, (*overview, u_out), names[1:]) for lung in lungs]
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Tabs(*grids, *details, active_tab=tab, name="Run"),
+            rrb.TextDocumentView(origin=ABOUT, name="What you see"),
+            column_shares=[3.6, 1],
+        ),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def reference_path(name: str, lung: str, quantity: str) -> str:
+    """Entity of a reference run's quantity; the name may hold any character."""
+    return f"/compare/{rr.escape_entity_path_part(name)}/{lung}/{quantity}"
+
+
+def _lung_tab(lung: str, shown: Sequence[Plot], references: Sequence[str]) -> rrb.Vertical:
+    """One lung in full with the references: the whole run, all plots on one time axis."""
+    linked = rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
+    views = [_view(lung, plot, linked, references, plot is shown[0]) for plot in shown]
+    return rrb.Vertical(*views, row_shares=[plot.share for plot in shown], name=lung)
+
+
+def _view(
+    lung: str, plot: Plot, time: rrb.TimeAxis, references: Sequence[str] = (), legend: bool = False
+) -> rrb.TimeSeriesView:
+    contents = [f"/{lung}/{plot.quantity}", f"/{lung}/scored"]
+    if plot.quantity == "pressure":
+        contents.append(f"/{lung}/target")
+    contents += [reference_path(name, lung, plot.quantity) for name in references]
+    # Where 0 is not the bottom, the bar is a thin zero line over the scored part.
+    thin: dict[Any, Any] = {
+        f"/{lung}/scored": rr.SeriesLines.from_fields(widths=[1.5]).visualizer()
+    }
+    return rrb.TimeSeriesView(
+        origin=f"/{lung}",
+        contents=contents,
+        overrides=None if plot.range else thin,
+        name=f"{lung}: {plot.title}",
+        axis_x=time,
+        axis_y=rrb.ScalarAxis(range=plot.range) if plot.range else None,
+        # Errors are mostly negative, what else there is positive.
+        plot_legend=rrb.PlotLegend(
+            rrb.Corner2D.RightTop if plot.range else rrb.Corner2D.RightBottom, visible=legend
+        ),
+    )
+
+
+def _last_scored_breath() -> rrb.TimeAxis:
+    """One breath: over more time, small plots lose the labels of their time axes."""
+    breath = protocol.BREATH_STEPS * protocol.DT
+    start = max(protocol.SCORED_BREATHS) * breath
+    at = rr.TimeRangeBoundary.absolute
+    return rrb.TimeAxis(
+        view_range=rr.TimeRange(start=at(seconds=start - 0.15), end=at(seconds=start + breath))
+    )
+
+
+def _top(arrays: Sequence[np.ndarray]) -> float:
+    """Highest finite value, 0 at least."""
+    return max(float(np.max(array, initial=0.0, where=np.isfinite(array))) for array in arrays)
+
+
+def markdown(runs: Sequence[Trajectories], names: Sequence[str]) -> str:
+    """Say what is seen and how the runs scored.
+
+    Args:
+        runs: matching runs, the one to look at first.
+        names: their labels; they are strangers' text and are escaped here.
+    """
+    given, names = names, [escape_markdown(name) for name in names]
+    first, last = min(protocol.SCORED_BREATHS) + 1, max(protocol.SCORED_BREATHS) + 1
+    track = runs[0].track if runs[0].track in ("performance", "robustness") else "unknown"
+    breath = protocol.BREATH_STEPS * protocol.DT
+    compared = f"- **thin lines** in a lung's tab: {', '.join(names[1:])}\n" if names[1:] else ""
+    lines = [
+        f"# {names[0]}",
+        "",
+        f"{track} track, protocol {protocol.VERSION}",
+        "",
+        "## Score, cmH2O",
+        "",
+        *_score_table(runs, given),
+        "",
+        f"Mean absolute error, abs(pressure - target), over the inspirations of breaths {first} "
+        f"and {last}, without noise. Lower is better.",
+        "",
+        "## What you see",
+        "",
+        f"- **one colour a PIP**, {min(runs[0].pips):g} to {max(runs[0].pips):g} cmH2O",
+        "- **thin grey**: target",
+        f"{compared}- **green bar** at the bottom: scored part",
+        "",
+        f"**All lungs**: one plot a lung, breath {last}. "
+        "R is resistance, cmH2O/(L/s); C compliance, mL/cmH2O.",
+        "",
+        f"**A lung's tab**: the whole run, {protocol.BREATHS} breaths of {breath:g} s, with "
+        "pressure, valves and error above each other.",
+        "",
+        "The time axis is seconds since the run began. Hover to read values, drag to move, "
+        "Ctrl + scroll to zoom, double-click to reset, click a legend entry to hide it.",
+        "",
+        f"ventbench {ventbench.__version__}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _score_table(runs: Sequence[Trajectories], names: Sequence[str]) -> list[str]:
+    """Lungs by runs, the best of each lung in bold."""
+    scores = np.stack([errors(run).mean(axis=1) for run in runs], axis=1)
+    rows = [*zip(runs[0].lungs, scores, strict=True), ("mean", scores.mean(axis=0))]
+    heads = [
+        escape_markdown(name if len(name) <= COLUMN else name[: COLUMN - 2] + "..")
+        for name in names
+    ]
+    lines = ["| lung | " + " | ".join(heads) + " |", "|---|" + "---:|" * len(names)]
+    for lung, row in rows:
+        best = np.nanmin(row) if np.isfinite(row).any() else np.nan
+        cells = [f"**{number(x)}**" if x == best and len(row) > 1 else number(x) for x in row]
+        lines.append(f"| {lung} | " + " | ".join(cells) + " |")
+    return lines

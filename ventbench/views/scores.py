@@ -19,7 +19,7 @@ NOT_PROVENANCE = frozenset(
 )
 
 #: Rows of provenance shown for one score, and characters of one of them.
-MOST_ROWS, MOST_CHARACTERS = 60, 200
+MAX_ROWS, MAX_CHARACTERS = 60, 200
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,11 @@ def collect(
 
 def draws(score: Mapping[str, Any]) -> str:
     """Mean over the published draws with its interval, cmH2O; empty if there were none."""
-    found = score.get("draws")
-    if not isinstance(found, Mapping):
+    drawn = score.get("draws")
+    if not isinstance(drawn, Mapping):
         return ""
     name = str(score.get("name", "a run"))
-    mean, limits = _number(name, found.get("score")), found.get("ci95") or ()
+    mean, limits = _number(name, drawn.get("score")), drawn.get("ci95") or ()
     if not np.isfinite(mean) or len(limits) != 2 or None in limits:
         return number(mean)
     low, high = (number(_number(name, limit)) for limit in limits)
@@ -75,8 +75,8 @@ def draws(score: Mapping[str, Any]) -> str:
 
 def failures(score: Mapping[str, Any]) -> list[str]:
     """Why a score does not count: safety gate and failed cells, each message once."""
-    items = score.get("failures") or ()
-    messages = [str(x.get("message", x)) if isinstance(x, Mapping) else str(x) for x in items]
+    failed = score.get("failures") or ()
+    messages = [str(x.get("message", x)) if isinstance(x, Mapping) else str(x) for x in failed]
     unsafe = ["did not pass the safety gate"] if score.get("safe") is False else []
     return list(dict.fromkeys([*unsafe, *messages]))
 
@@ -85,18 +85,18 @@ def provenance(score: Mapping[str, Any]) -> list[tuple[str, str]]:
     """What a score says about its origin, as flat pairs of text; not escaped."""
     rows: list[tuple[str, str]] = []
     _flatten("", {k: v for k, v in score.items() if k not in NOT_PROVENANCE}, rows)
-    return rows[:MOST_ROWS]
+    return rows[:MAX_ROWS]
 
 
 def _flatten(prefix: str, value: Any, rows: list[tuple[str, str]]) -> None:
     if isinstance(value, Mapping):
-        for key, item in value.items():
+        for key, part in value.items():
             if key not in NOT_PROVENANCE and (prefix, key) != ("draws", "ci95"):
-                _flatten(f"{prefix} {key}".strip(), item, rows)
+                _flatten(f"{prefix} {key}".strip(), part, rows)
     elif value not in (None, "", [], ()):
-        items = value if isinstance(value, list | tuple) else [value]
-        text = ", ".join(f"{x:.6g}" if isinstance(x, float) else str(x) for x in items)
-        cut = text[: MOST_CHARACTERS - 1] + "…" if len(text) > MOST_CHARACTERS else text
+        parts = value if isinstance(value, list | tuple) else [value]
+        text = ", ".join(f"{x:.6g}" if isinstance(x, float) else str(x) for x in parts)
+        cut = text[: MAX_CHARACTERS - 1] + "…" if len(text) > MAX_CHARACTERS else text
         rows.append((prefix, cut))
 
 

@@ -44,7 +44,7 @@ def write_report(
 
     Args:
         path: target, ``.html`` by custom.
-        runs: as for :func:`write_rerun`; differences are to the second one.
+        runs: the run to look at, then references; differences are to the first reference.
         scores: what ``ventbench score --json`` wrote for each run, in the same order: the table
             then shows these scores, and the provenance all that they say. Without them the table
             shows the mean absolute error of the runs themselves.
@@ -53,7 +53,8 @@ def write_report(
         The path; equal input gives equal bytes.
 
     Raises:
-        InputError: as for :func:`write_rerun`, or if the scores do not belong to the runs.
+        InputError: if there is no run, the runs do not match, the scores do not belong to them, or
+            the extra is missing.
         OSError: if the file cannot be written.
     """
     path = Path(path)
@@ -70,13 +71,13 @@ def write_figure(path: Path | str, runs: Sequence[Trajectories]) -> Path:
 
     Args:
         path: target, ``.png`` by custom.
-        runs: as for :func:`write_rerun`.
+        runs: the run to look at, then references.
 
     Returns:
         The path.
 
     Raises:
-        InputError: as for :func:`write_rerun`.
+        InputError: if there is no run, the runs do not match, or the extra is missing.
         OSError: if the file cannot be written.
     """
     path = Path(path)

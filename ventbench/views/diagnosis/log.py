@@ -12,8 +12,8 @@ import rerun as rr
 from ventbench.diagnosis import report_text
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.errors import InputError
+from ventbench.text import escape_markdown
 from ventbench.views import style
-from ventbench.views.about import escape
 from ventbench.views.diagnosis.breaths import STAGES, rmse
 from ventbench.views.diagnosis.layout import ABOUT, TIMELINE, blueprint, span
 from ventbench.views.runs import Floats
@@ -67,9 +67,10 @@ def plain(text: str) -> str:
 
 def markdown(found: Diagnosis) -> str:
     """The text panel: the diagnosis in words, and what is seen."""
-    verdict, *others = (escape(plain(text)) for text in report_text.sentences(found))
+    verdict, *others = (escape_markdown(plain(text)) for text in report_text.sentences(found))
     places = [
-        escape(report_text.error_region(place, found.noise[0])) for place in found.location[:5]
+        escape_markdown(report_text.error_region(place, found.noise[0]))
+        for place in found.location[:5]
     ]
     lines = [f"## {verdict}", "", *(f"{text}\n" for text in others)]
     if places:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ventbench.recordings.folder import VARIABLE, recordings_dir
+from ventbench.recordings.read import VARIABLE, recordings_dir
 
 #: Set by `.ci/run` where the recordings are: then no test may skip for want of them.
 REQUIRED = "VENTBENCH_REQUIRE_RECORDINGS"

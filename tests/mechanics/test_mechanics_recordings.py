@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ventbench import mechanics
-from ventbench.recordings import Run, load_respiraworks
+from ventbench.recordings import RespiraWorksRun, load_respiraworks
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +22,7 @@ def test_a_run_becomes_breaths():
     target = np.where((time % 4) < 1, 30.0, 5.0)
     signals = {name: np.full(1000, np.nan) for name in ("flow", "volume")}
     signals |= {"pressure": time, "target": target, "volume": 10.0 * time}
-    run = Run("day", 1, "blower", 20.0, 50.0, breath, time, signals)
+    run = RespiraWorksRun("day", 1, "blower", 20.0, 50.0, breath, time, signals)
     breaths = mechanics.breaths_of(run)
     # Cut 0.25 s before each breath, so that the steep rise lies within; the stub is left out.
     assert breaths.breath_id.tolist() == [1, 2, 3]
@@ -70,8 +72,7 @@ def test_another_label_is_refused(public_recordings):
     runs = load_respiraworks(public_recordings / "respiraworks_quicklung.parquet")
     tried = 0
     for run in (r for r in runs if r.name == "2020-06-17-covent-tests-QuickLung" and r.test < 6):
-        wrong = Run(run.name, run.test, run.drive, other[run.R], run.C, run.breath, run.time,
-                    run.signals)  # fmt: skip
+        wrong = replace(run, R=other[run.R])
         (found,) = mechanics.identify(mechanics.breaths_of(wrong))
         assert not found.match.label_matches
         assert found.settings[0].id == f"R{run.R:g}C{run.C:g}"

@@ -1,9 +1,10 @@
-"""The container, padding, batches and round trips."""
+"""The container, padding, batches, round trips and joins."""
 
 from __future__ import annotations
 
 import gzip
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ventbench.errors import InputError
-from ventbench.recordings import Breaths, iter_breaths, load, make_breaths, write
+from ventbench.recordings import Breaths, iter_breaths, join, load, make_breaths, write
+from ventbench.recordings.csv_source import CsvSource
+from ventbench.recordings.parquet_source import ParquetSource
+from ventbench.recordings.problems import ProblemLog
+from ventbench.recordings.scan import join_blocks, scan
 
 FIELDS = [
     "breath_id",
@@ -117,18 +122,23 @@ def test_batches_are_the_file_in_pieces(make, tmp_path, batch):
             np.testing.assert_array_equal(joined, getattr(whole, field))
 
 
-def test_batches_do_not_depend_on_the_blocks_read(make, tmp_path, monkeypatch):
+@pytest.mark.parametrize("batch", [None, 1, 3, 16])
+def test_blocks_do_not_depend_on_how_much_is_read_at_a_time(make, tmp_path, batch):
     whole = make(40)
-    write(whole, tmp_path / "a.csv")
-    write(whole, tmp_path / "a.parquet")
-    monkeypatch.setattr("ventbench.recordings.csv_in.BLOCK", 700)
-    monkeypatch.setattr("ventbench.recordings.parquet_in.BATCH", 11)
-    for name in ("a.csv", "a.parquet"):
-        same(load(tmp_path / name), whole)
-        for batch in (1, 3, 16):
-            parts = list(iter_breaths(tmp_path / name, batch=batch))
-            assert [len(part) for part in parts][:-1] == [batch] * (len(parts) - 1)
-            np.testing.assert_array_equal(np.concatenate([p.u_in for p in parts]), whole.u_in)
+    paths = tmp_path / "a.csv", tmp_path / "a.parquet"
+    for path in paths:
+        write(whole, path)
+    csv, parquet = (str(path) for path in paths)
+    for source in (CsvSource(csv, "csv", block=700), ParquetSource(parquet, batch=11)):
+        blocks = list(scan(source, ProblemLog(source.file), batch=batch))
+        assert len(blocks) > 1
+        if batch:
+            assert [len(block.lengths) for block in blocks][:-1] == [batch] * (len(blocks) - 1)
+        joined = join_blocks(blocks)
+        np.testing.assert_array_equal(joined.breath_id, whole.breath_id)
+        np.testing.assert_array_equal(joined.times.time, whole.time.ravel())
+        for name in ("u_in", "u_out", "pressure"):
+            np.testing.assert_array_equal(joined.samples[name], getattr(whole, name).ravel())
 
 
 def test_batches_raise_when_they_reach_the_problem(rows, write_csv):
@@ -228,3 +238,37 @@ def test_arrays_that_do_not_fit(change, text):
     assert len(make_breaths(**good)) == 2
     with pytest.raises(ValueError, match=text):
         make_breaths(**(good | change))
+
+
+JOINED = (
+    "breath_id", "R", "C", "time", "dt", "u_in", "u_out", "pressure", "valid", "time_inferred",
+)  # fmt: skip
+
+
+def test_joined_breaths_are_in_order_and_without_a_source(make):
+    one = replace(make(3, optional=True), source="a.csv", sha256="aa", notes=("first",))
+    two = replace(make(2, seed=1), source="b.csv", notes=("second", "third"))
+    both = join([one, two])
+    assert len(both) == 5
+    for name in JOINED:
+        np.testing.assert_array_equal(getattr(both.select([0, 1, 2]), name), getattr(one, name))
+        np.testing.assert_array_equal(getattr(both.select([3, 4]), name), getattr(two, name))
+        assert not getattr(both, name).flags.writeable
+    assert both.lung_ids.tolist() == [*one.lung_ids, *two.lung_ids]
+    assert (both.source, both.sha256, both.flow, both.volume) == (None, None, None, None)
+    assert both.notes == ("first", "second", "third")
+
+
+def test_join_of_one_recording_leaves_it_as_it_is(make):
+    one = replace(make(3, optional=True), source="a.csv")
+    alone = join([one])
+    np.testing.assert_array_equal(alone.pressure, one.pressure)
+    assert one.flow is not None
+    assert one.source == "a.csv"
+
+
+def test_join_refuses_nothing_and_unequal_lengths(make):
+    with pytest.raises(InputError, match="no recordings to join"):
+        join([])
+    with pytest.raises(InputError, match=r"breaths of \[6, 8\] samples.*cut them to 6 samples"):
+        join([make(2), make(2, samples=6)])

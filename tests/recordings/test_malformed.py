@@ -8,7 +8,7 @@ import pickle
 import pytest
 
 from ventbench.recordings import RecordingError, check, load
-from ventbench.recordings.csv_in import BLOCK
+from ventbench.recordings.csv_source import BLOCK
 
 ID, BREATH, R, C, TIME, U_IN, U_OUT, PRESSURE = range(8)
 NAMES = ["id", "breath_id", "R", "C", "time_step", "u_in", "u_out", "pressure"]

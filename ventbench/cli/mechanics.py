@@ -54,7 +54,7 @@ def _is_respiraworks(path: Path) -> bool:
     import pyarrow as pa
     from pyarrow import parquet
 
-    from ventbench.recordings.files import kind_of
+    from ventbench.recordings.scan import kind_of
 
     if kind_of(path) != "parquet":
         return False

@@ -28,7 +28,7 @@ TIMES = tuple(float(x) for x in np.geomspace(0.3, 3.0, 11))
 
 
 @dataclass(frozen=True)
-class Column:
+class RegressionColumn:
     """A column of the regression; a term may have several columns to choose from.
 
     Attributes:
@@ -64,22 +64,22 @@ def _relaxing_volume(time: float, periodic: bool) -> Callable[[Segment], Floats]
 
 #: Columns of R and 1/C, which every fit has.
 BASE = (
-    Column("resistance", lambda s: s.flow),
-    Column("elastance", lambda s: s.volume),
+    RegressionColumn("resistance", lambda s: s.flow),
+    RegressionColumn("elastance", lambda s: s.volume),
 )
 
 #: All columns.
 COLUMNS = (
     *BASE,
-    Column("turbulent_resistance", lambda s: s.flow * np.abs(s.flow)),
-    Column("nonlinear_compliance", lambda s: s.volume**2),
-    Column("inertance", lambda s: s.slope),
-    Column("leak", lambda s: -s.dose),
-    Column("direction_resistance", lambda s: np.minimum(s.flow, 0.0)),
-    Column("volume_resistance", lambda s: s.flow * s.volume),
-    Column("expiratory_flow", lambda s: np.minimum(s.flow, 0.0) * np.abs(s.flow)),
+    RegressionColumn("turbulent_resistance", lambda s: s.flow * np.abs(s.flow)),
+    RegressionColumn("nonlinear_compliance", lambda s: s.volume**2),
+    RegressionColumn("inertance", lambda s: s.slope),
+    RegressionColumn("leak", lambda s: -s.dose),
+    RegressionColumn("direction_resistance", lambda s: np.minimum(s.flow, 0.0)),
+    RegressionColumn("volume_resistance", lambda s: s.flow * s.volume),
+    RegressionColumn("expiratory_flow", lambda s: np.minimum(s.flow, 0.0) * np.abs(s.flow)),
     *(
-        Column("viscoelasticity", _relaxing_volume(time, periodic), time)
+        RegressionColumn("viscoelasticity", _relaxing_volume(time, periodic), time)
         for periodic in (False, True)
         for time in TIMES
     ),

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ventbench.mechanics.identify import Mechanics, identify
-from ventbench.recordings.breaths import Breaths
-from ventbench.recordings.build import FILL, stack, stack_times, valid_mask
-from ventbench.recordings.respiraworks import Run, load_respiraworks
+from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
+from ventbench.recordings.respiraworks import RespiraWorksRun, load_respiraworks
 
 #: Shortest breath that is kept, s.
 _SHORTEST = 0.5
@@ -28,11 +27,11 @@ class SurveyedRun:
         mechanics: None if the run has neither flow nor volume.
     """
 
-    run: Run
+    run: RespiraWorksRun
     mechanics: Mechanics | None
 
 
-def breaths_of(run: Run) -> Breaths:
+def breaths_of(run: RespiraWorksRun) -> Breaths:
     """Split a run into breaths; breaths shorter than 0.5 s are left out.
 
     Commands of this ventilator's valves are unknown: u_in is 0, and u_out is 1 where the target is

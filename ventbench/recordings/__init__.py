@@ -1,16 +1,16 @@
 """Recordings of breaths: the public schema, checks, CSV and Parquet in and out, splits."""
 
 from ventbench.recordings.breaths import Breaths as Breaths
-from ventbench.recordings.build import make_breaths as make_breaths
-from ventbench.recordings.errors import Problem as Problem
-from ventbench.recordings.errors import RecordingError as RecordingError
-from ventbench.recordings.folder import recordings_dir as recordings_dir
-from ventbench.recordings.join import join as join
+from ventbench.recordings.breaths import join as join
+from ventbench.recordings.breaths import make_breaths as make_breaths
+from ventbench.recordings.problems import Problem as Problem
+from ventbench.recordings.problems import RecordingError as RecordingError
 from ventbench.recordings.read import check as check
 from ventbench.recordings.read import iter_breaths as iter_breaths
 from ventbench.recordings.read import load as load
+from ventbench.recordings.read import recordings_dir as recordings_dir
 from ventbench.recordings.report import CheckReport as CheckReport
-from ventbench.recordings.respiraworks import Run as Run
+from ventbench.recordings.respiraworks import RespiraWorksRun as RespiraWorksRun
 from ventbench.recordings.respiraworks import load_respiraworks as load_respiraworks
 from ventbench.recordings.schema import COLUMNS as COLUMNS
 from ventbench.recordings.schema import Column as Column

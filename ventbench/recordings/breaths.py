@@ -1,21 +1,24 @@
-"""Breaths in memory: a frozen record of numpy arrays, n breaths of T samples."""
+"""Breaths in memory: n breaths of T samples as numpy arrays; making, padding, joining them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from ventbench.errors import InputError
 from ventbench.lungs import Lung
 
 
 @dataclass(frozen=True, eq=False)
 class Breaths:
-    """n breaths of T samples; the arrays cannot be written to.
+    """n breaths of T samples; the arrays are read-only.
 
-    Padding (`valid` False) stands after a short breath: u_in 0, u_out 1, pressure, flow and volume
-    NaN, time going on at the last interval.
+    Padding (`valid` False) follows a short breath: u_in is 0, u_out 1, pressure, flow and volume
+    NaN, and time continues at the last interval.
 
     Attributes:
         breath_id: int64, (n,).
@@ -31,7 +34,7 @@ class Breaths:
         flow: mL/s, NaN where blank, float64, (n, T), or None.
         volume: mL, NaN where blank, float64, (n, T), or None.
         source: path of the file, or None.
-        sha256: of the file, hex, or None (not from a file, or from a part of one).
+        sha256: of the file, hex, or None if the breaths are not those of a whole file.
         notes: what a reader of the file should know, a sentence each.
     """
 
@@ -74,29 +77,29 @@ class Breaths:
 
     @cached_property
     def by_lung_index(self) -> dict[str, np.ndarray]:
-        """Which breaths each lung has, int64, by R then C."""
+        """Indices of the breaths of each lung, int64, by R then C."""
         order = np.lexsort((self.C, self.R))
         names = dict.fromkeys(self.lung_ids[order].tolist())
         return {name: np.flatnonzero(self.lung_ids == name) for name in names}
 
     @cached_property
     def inspiratory(self) -> np.ndarray:
-        """Samples of inspiration: u_out is 0 and no padding, bool, (n, T)."""
+        """Samples of inspiration: u_out is 0 and valid, bool, (n, T)."""
         mask = (self.u_out == 0) & self.valid
         mask.setflags(write=False)
         return mask
 
     def select(self, which: np.ndarray | slice | list[int]) -> Breaths:
-        """Some of the breaths, as copies.
+        """Return some of the breaths, as copies.
 
         Args:
-            which: a mask (n,), indices (k,) in the order wanted, or a slice.
+            which: a mask (n,), indices (k,) in any order, or a slice.
 
         Returns:
-            The breaths; `source` and `sha256` still name the file they come from.
+            The breaths; `source` and `sha256` still name their file.
 
         Raises:
-            IndexError: an index or the length of the mask does not fit.
+            IndexError: if an index is out of range, or the mask has another length.
         """
         index = which if isinstance(which, slice) else np.asarray(which)
         if isinstance(index, np.ndarray) and index.size == 0 and index.dtype != bool:
@@ -105,9 +108,163 @@ class Breaths:
         return replace(self, **chosen)
 
     def by_lung(self) -> dict[str, Breaths]:
-        """The breaths of each lung, by R then C."""
+        """Return the breaths of each lung, by R then C."""
         return {name: self.select(index) for name, index in self.by_lung_index.items()}
 
     def _arrays(self) -> dict[str, np.ndarray]:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+FILL = {"u_in": 0.0, "u_out": 1, "pressure": np.nan, "flow": np.nan, "volume": np.nan}
+"""Values of padding."""
+
+
+def stack(values: np.ndarray, lengths: np.ndarray, fill: float) -> np.ndarray:
+    """Arrange consecutive breaths in rows.
+
+    Args:
+        values: samples of all breaths, (m,).
+        lengths: samples of each breath, (n,), summing to m.
+        fill: value after a short breath.
+
+    Returns:
+        An array (n, T) of the same type, T the longest length; a view if all are equal.
+    """
+    width = int(lengths.max(initial=0))
+    if (lengths == width).all():
+        return values.reshape(len(lengths), width)
+    rows, columns = _places(lengths)
+    out = np.full((len(lengths), width), fill, dtype=values.dtype)
+    out[rows, columns] = values
+    return out
+
+
+def stack_times(time: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Arrange times in rows, with intervals; in padding, time continues at the last interval.
+
+    Args:
+        time: s, (m,).
+        lengths: samples of each breath, at least 2, (n,).
+
+    Returns:
+        time and dt, s, each (n, T).
+    """
+    padded = stack(time, lengths, np.nan)
+    if (lengths != padded.shape[1]).any():
+        every = np.arange(len(lengths))
+        last = padded[every, lengths - 1]
+        step = last - padded[every, lengths - 2]
+        beyond = np.arange(padded.shape[1]) - (lengths - 1)[:, None]
+        padded = np.where(beyond > 0, last[:, None] + beyond * step[:, None], padded)
+    dt = np.empty_like(padded)
+    np.subtract(padded[:, 1:], padded[:, :-1], out=dt[:, :-1])
+    dt[:, -1] = dt[:, -2]
+    return padded, dt
+
+
+def valid_mask(lengths: np.ndarray) -> np.ndarray:
+    """True for samples, False for padding, (n, T)."""
+    return np.arange(int(lengths.max(initial=0))) < lengths[:, None]
+
+
+def make_breaths(
+    breath_id: ArrayLike,
+    R: ArrayLike,
+    C: ArrayLike,
+    time: ArrayLike,
+    u_in: ArrayLike,
+    u_out: ArrayLike,
+    pressure: ArrayLike,
+    *,
+    flow: ArrayLike | None = None,
+    volume: ArrayLike | None = None,
+) -> Breaths:
+    """Make breaths of equal length from arrays, for instance from a simulation.
+
+    Args:
+        breath_id: whole numbers, each once, (n,).
+        R: cmH2O/(L/s), (n,).
+        C: mL/cmH2O, (n,).
+        time: s, increasing in each breath and starting at 0, (n, T).
+        u_in: %, (n, T).
+        u_out: 0 or 1, (n, T).
+        pressure: cmH2O, (n, T).
+        flow: mL/s, (n, T), or None.
+        volume: mL, (n, T), or None.
+
+    Returns:
+        The breaths, as copies, all valid.
+
+    Raises:
+        ValueError: if shapes differ, an id occurs twice, or time does not start at 0 and increase.
+    """
+    ids = np.array(breath_id, dtype=np.int64)
+    times = np.array(time, dtype=np.float64)
+    if times.ndim != 2 or times.shape[1] < 2:
+        raise ValueError(f"time has shape {times.shape}, but (n, T) with T >= 2 is needed")
+    if len(np.unique(ids)) != len(ids):
+        raise ValueError("breath_id holds the same id twice; give each breath its own")
+    if (times[:, 0] != 0.0).any() or not (np.diff(times, axis=1) > 0.0).all():
+        raise ValueError("time must start at 0 in each breath and increase")
+    per_breath = {"R": np.array(R, np.float64), "C": np.array(C, np.float64), "breath_id": ids}
+    samples = {
+        "u_in": np.array(u_in, np.float64),
+        "u_out": np.array(u_out, np.int8),
+        "pressure": np.array(pressure, np.float64),
+        "flow": None if flow is None else np.array(flow, np.float64),
+        "volume": None if volume is None else np.array(volume, np.float64),
+    }
+    for name, array in (per_breath | samples).items():
+        shape = times.shape if name in samples else times.shape[:1]
+        if array is not None and array.shape != shape:
+            raise ValueError(f"{name} has shape {array.shape}, but {shape} is needed")
+    lengths = np.full(len(ids), times.shape[1])
+    times, dt = stack_times(times.ravel(), lengths)
+    return Breaths(
+        **per_breath,
+        **samples,  # type: ignore[arg-type]
+        time=times,
+        dt=dt,
+        valid=valid_mask(lengths),
+        time_inferred=np.zeros(len(ids), dtype=bool),
+    )
+
+
+def _places(lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    starts = np.cumsum(lengths) - lengths
+    rows = np.repeat(np.arange(len(lengths)), lengths)
+    return rows, np.arange(len(rows)) - np.repeat(starts, lengths)
+
+
+#: Arrays that every recording has.
+_ALWAYS = (
+    "breath_id", "R", "C", "time", "dt", "u_in", "u_out", "pressure", "valid", "time_inferred",
+)  # fmt: skip
+
+
+def join(parts: Sequence[Breaths]) -> Breaths:
+    """Join recordings; flow and volume are left out.
+
+    Args:
+        parts: at least one; breaths of equally many samples.
+
+    Returns:
+        All breaths, without ``source`` and ``sha256``. Ids may occur twice.
+
+    Raises:
+        InputError: if there is nothing to join, or the numbers of samples differ.
+    """
+    if not parts:
+        raise InputError("there are no recordings to join")
+    lengths = sorted({part.pressure.shape[1] for part in parts})
+    if len(lengths) > 1:
+        raise InputError(
+            f"recordings with breaths of {lengths} samples cannot be joined; cut them to "
+            f"{lengths[0]} samples, or use one at a time"
+        )
+    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ALWAYS}
+    notes = tuple(note for part in parts for note in part.notes)
+    return replace(
+        parts[0], **arrays, flow=None, volume=None, source=None, sha256=None, notes=notes
+    )

@@ -1,38 +1,38 @@
-"""Checks of values and of breaths. All are pure but for what they add to `Findings`."""
+"""Checks of values, breaths and times. They only add to a `ProblemLog`."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ventbench.recordings.findings import Findings
+from ventbench.recordings.problems import ProblemLog
 from ventbench.recordings.rows import Rows
 from ventbench.recordings.schema import COLUMNS, Column
 
 
-def check_values(rows: Rows, findings: Findings, *, clip: bool = False) -> dict[str, np.ndarray]:
-    """Check each cell by itself: blank, infinite, out of range.
+def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str, np.ndarray]:
+    """Check each cell: blank, infinite, out of range.
 
     Args:
         rows: whole breaths.
-        findings: takes the problems.
-        clip: bring u_in into 0..100 % and warn, where it is a problem otherwise.
+        log: receives the problems.
+        clip: clip u_in to 0..100 % with a warning; otherwise it is a problem.
 
     Returns:
-        The columns, with u_in clipped if asked.
+        The columns, with u_in clipped on request.
     """
     columns = dict(rows.columns)
-    _add_blank(rows, findings, "breath_id", rows.blank_id)
+    _add_blank(rows, log, "breath_id", rows.blank_id)
     for name, values in rows.columns.items():
         column = COLUMNS[name]
         if column.whole:
             continue
         if not column.blank:
-            _add_blank(rows, findings, name, np.isnan(values))
+            _add_blank(rows, log, name, np.isnan(values))
         infinite = np.isinf(values)
         if infinite.any():
             at = np.flatnonzero(infinite)
             what = "{value} is infinite"
-            findings.add(rows.row0 + at, name, what, "Fix the row.", values=values[at])
+            log.add(rows.row0 + at, name, what, "Fix the row.", values=values[at])
         outside = _outside(values, column) & ~infinite
         if not outside.any():
             continue
@@ -46,16 +46,16 @@ def check_values(rows: Rows, findings: Findings, *, clip: bool = False) -> dict[
             what = "{value} is neither 0 nor 1"
         elif column.positive:
             what = f"{{value}} is not in {column.span}"
-        findings.add(rows.row0 + at, name, what, advice, values=values[at], level=level)
+        log.add(rows.row0 + at, name, what, advice, values=values[at], level=level)
     return columns
 
 
-def _add_blank(rows: Rows, findings: Findings, name: str, blank: np.ndarray) -> None:
+def _add_blank(rows: Rows, log: ProblemLog, name: str, blank: np.ndarray) -> None:
     if blank.any():
         what = f"the cell is blank, but {name} is needed in every row"
         at = rows.row0 + np.flatnonzero(blank)
         values = np.full(len(at), np.nan)
-        findings.add(at, name, what, "Fill it in or remove the breath.", values=values)
+        log.add(at, name, what, "Fill it in or remove the breath.", values=values)
 
 
 def _outside(values: np.ndarray, column: Column) -> np.ndarray:
@@ -65,13 +65,13 @@ def _outside(values: np.ndarray, column: Column) -> np.ndarray:
     return low | (values > column.high)
 
 
-def check_ids(rows: Rows, findings: Findings, seen: dict[int, int]) -> None:
-    """Check that no breath comes back after another one.
+def check_ids(rows: Rows, log: ProblemLog, seen: dict[int, int]) -> None:
+    """Check that the rows of each breath follow one another.
 
     Args:
         rows: whole breaths.
-        findings: takes the problems.
-        seen: first row of each breath so far, by breath_id; the new ones are added to it.
+        log: receives the problems.
+        seen: first row of each breath so far, by breath_id; new breaths are added.
     """
     again, first = [], []
     starts = rows.row0 + rows.starts
@@ -81,7 +81,7 @@ def check_ids(rows: Rows, findings: Findings, seen: dict[int, int]) -> None:
         if earlier != row:
             again.append(row)
             first.append(earlier)
-    findings.add(
+    log.add(
         np.array(again, dtype=np.int64),
         "breath_id",
         "breath {value} comes again, it is already at {other}",
@@ -91,7 +91,7 @@ def check_ids(rows: Rows, findings: Findings, seen: dict[int, int]) -> None:
     )
 
 
-def check_lung(rows: Rows, findings: Findings) -> None:
+def check_lung(rows: Rows, log: ProblemLog) -> None:
     """Check that R and C stay the same within each breath."""
     breath = np.repeat(np.arange(len(rows.starts)), rows.lengths)
     for name in ("R", "C"):
@@ -102,7 +102,7 @@ def check_lung(rows: Rows, findings: Findings) -> None:
         if len(at) == 0:
             continue
         at = at[np.unique(breath[at], return_index=True)[1]]
-        findings.add(
+        log.add(
             rows.row0 + at,
             name,
             f"{name} changes to {{value}} within the breath, which starts at {{other}}",
@@ -112,10 +112,10 @@ def check_lung(rows: Rows, findings: Findings) -> None:
         )
 
 
-def check_single(rows: Rows, findings: Findings) -> None:
+def check_single(rows: Rows, log: ProblemLog) -> None:
     """Check that each breath has at least two samples."""
     at = rows.starts[rows.lengths == 1]
-    findings.add(
+    log.add(
         rows.row0 + at,
         "breath_id",
         "breath {value} has one sample, at least two are needed",
@@ -124,12 +124,12 @@ def check_single(rows: Rows, findings: Findings) -> None:
     )
 
 
-def check_row_ids(rows: Rows, findings: Findings, last: int | None) -> int:
-    """Warn where the column id does not increase; it is not used otherwise.
+def check_row_ids(rows: Rows, log: ProblemLog, last: int | None) -> int:
+    """Warn where the column id, which is not used otherwise, does not increase.
 
     Args:
         rows: whole breaths.
-        findings: takes the warnings.
+        log: receives the warnings.
         last: id of the row before, or None at the start.
 
     Returns:
@@ -140,5 +140,72 @@ def check_row_ids(rows: Rows, findings: Findings, last: int | None) -> int:
     at = np.flatnonzero(ids <= before)
     what = "id {value} is not greater than the one before"
     advice = "Number the rows 1, 2, 3, ...; the column is not used for anything else."
-    findings.add(rows.row0 + at, "id", what, advice, values=ids[at], level="warning")
+    log.add(rows.row0 + at, "id", what, advice, values=ids[at], level="warning")
     return int(ids[-1])
+
+
+_SORT = "Sort the rows of the breath by time_step, and remove rows that are there twice."
+
+
+def check_times(rows: Rows, log: ProblemLog) -> None:
+    """Check that the known times increase within each breath.
+
+    Repeated rows are reported as such. In breaths without times, a row is a repeat if it equals the
+    row before in every column, including `id`.
+
+    Args:
+        rows: whole breaths.
+        log: receives the problems.
+    """
+    time = rows.columns["time_step"]
+    breath = np.repeat(np.arange(len(rows.starts)), rows.lengths)
+    known = np.flatnonzero(np.isfinite(time))
+    previous, here = known[:-1], known[1:]
+    late = (time[here] <= time[previous]) & (breath[here] == breath[previous])
+    if late.any():
+        _add_order(rows, log, previous[late], here[late])
+    blank = np.isnan(time)
+    at = np.flatnonzero(blank[1:] & blank[:-1] & (breath[1:] == breath[:-1])) + 1
+    at = at[_same(rows, at - 1, at, rows.columns)] if len(at) else at
+    _add_repeat(rows, log, at - 1, at, "id", rows.columns["id"])
+
+
+def _add_order(rows: Rows, log: ProblemLog, previous: np.ndarray, here: np.ndarray) -> None:
+    time = rows.columns["time_step"]
+    equal = time[previous] == time[here]
+    names = [name for name in rows.columns if name != "id"]
+    repeat = equal & _same(rows, previous, here, names)
+    _add_repeat(rows, log, previous[repeat], here[repeat], "time_step", time)
+    for chosen, what in (
+        (equal & ~repeat, "two rows of the breath have the time {value} s, the other is {other}"),
+        (~equal, "time goes back to {value} s from {other}"),
+    ):
+        at, before = here[chosen], previous[chosen]
+        log.add(rows.row0 + at, "time_step", what, _SORT, values=time[at],
+                     others=rows.row0 + before)  # fmt: skip
+
+
+def _add_repeat(
+    rows: Rows,
+    log: ProblemLog,
+    previous: np.ndarray,
+    here: np.ndarray,
+    column: str,
+    values: np.ndarray,
+) -> None:
+    log.add(
+        rows.row0 + here,
+        column,
+        "the row repeats {other}",
+        "Remove one of the two.",
+        values=values[here],
+        others=rows.row0 + previous,
+    )
+
+
+def _same(rows: Rows, one: np.ndarray, other: np.ndarray, names: object) -> np.ndarray:
+    same = np.ones(len(one), dtype=bool)
+    for name in names:  # type: ignore[attr-defined]
+        a, b = rows.columns[name][one], rows.columns[name][other]
+        same &= (a == b) | ((a != a) & (b != b))
+    return same

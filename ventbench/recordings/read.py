@@ -1,4 +1,4 @@
-"""Reading recordings: all of a file, batch by batch, or only to check it."""
+"""Reading recordings: a whole file, batch by batch, or only to check it."""
 
 from __future__ import annotations
 
@@ -6,58 +6,64 @@ import os
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
-from ventbench.recordings.blocks import Block, join, scan
-from ventbench.recordings.breaths import Breaths
-from ventbench.recordings.build import FILL, stack, stack_times, valid_mask
-from ventbench.recordings.errors import Problem, RecordingError
-from ventbench.recordings.files import fail
-from ventbench.recordings.findings import Findings
-from ventbench.recordings.report import CheckReport, describe, unit_warning
-from ventbench.recordings.source import Source, locate, open_source
-from ventbench.recordings.tally import Tally, check_inferable, check_lengths
+from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
+from ventbench.recordings.problems import Problem, ProblemLog, RecordingError, fail
+from ventbench.recordings.report import (
+    CheckReport,
+    Tally,
+    check_inferable,
+    check_lengths,
+    describe,
+    unit_warning,
+)
+from ventbench.recordings.scan import Block, Source, join_blocks, locate, open_source, scan
 from ventbench.recordings.times import IntervalTable
 
-Path = str | os.PathLike[str]
+#: Environment variable that names the folder of public recordings.
+VARIABLE = "VENTBENCH_RECORDINGS"
+
+FilePath = str | os.PathLike[str]
 
 
-def load(path: Path, *, clip: bool = False, pad: bool = False) -> Breaths:
+def load(path: FilePath, *, clip: bool = False, pad: bool = False) -> Breaths:
     """Read a recording (CSV, gzipped CSV or Parquet) into memory.
 
     Args:
         path: the file.
-        clip: bring u_in into 0..100 % where it is outside.
-        pad: allow breaths of unequal length and fill the short ones (see `Breaths`).
+        clip: clip u_in to 0..100 %.
+        pad: accept breaths of unequal length and pad the short ones (see `Breaths`).
 
     Returns:
-        All breaths; `notes` says what was inferred, filled in or ignored.
+        All breaths; `notes` says what was inferred, interpolated or ignored.
 
     Raises:
-        RecordingError: the file cannot be used; it carries every kind of problem found.
+        RecordingError: if the file cannot be used; the error carries its problems.
     """
     source = open_source(path)
-    findings = Findings(source.file)
+    log = ProblemLog(source.file)
     tally = Tally()
     blocks: list[Block] = []
-    for block in scan(source, findings, clip=clip):
+    for block in scan(source, log, clip=clip):
         tally.add(block)
-        if findings.counts["problem"]:
+        if log.counts["problem"]:
             blocks.clear()
         else:
             blocks.append(block)
-    _check_whole(source, tally, findings, pad=pad)
-    findings.raise_problems(partial(locate, source), source.place)
-    notes = _report(source, findings, tally).notes()
-    whole = join(blocks)
+    _check_whole(source, tally, log, pad=pad)
+    log.raise_problems(partial(locate, source), source.place)
+    notes = _report(source, log, tally).notes()
+    whole = join_blocks(blocks)
     blocks.clear()
     breaths = _assemble(whole, tally.table(), source.file)
     return replace(breaths, sha256=source.sha256, notes=notes)
 
 
-def check(path: Path, *, clip: bool = False, pad: bool = False) -> CheckReport:
-    """Check a recording without keeping it; needs about 80 bytes a breath.
+def check(path: FilePath, *, clip: bool = False, pad: bool = False) -> CheckReport:
+    """Check a recording; needs about 80 bytes of memory a breath.
 
     Args:
         path: the file.
@@ -65,16 +71,16 @@ def check(path: Path, *, clip: bool = False, pad: bool = False) -> CheckReport:
         pad: as in `load`.
 
     Returns:
-        What the file holds and what is wrong. Nothing is raised for a bad file.
+        What the file holds and what is wrong with it; also for a file that cannot be read.
     """
     tally = Tally()
-    findings = Findings(str(path))
+    log = ProblemLog(str(path))
     source: Source | None = None
     try:
         source = open_source(path)
-        for block in scan(source, findings, clip=clip):
+        for block in scan(source, log, clip=clip):
             tally.add(block)
-        _check_whole(source, tally, findings, pad=pad)
+        _check_whole(source, tally, log, pad=pad)
     except RecordingError as error:
         kind = source.kind if source else None
         warnings = source.warnings if source else ()
@@ -86,15 +92,15 @@ def check(path: Path, *, clip: bool = False, pad: bool = False) -> CheckReport:
             warnings=warnings,
             warning_count=len(warnings),
         )
-    return _report(source, findings, tally)
+    return _report(source, log, tally)
 
 
 def iter_breaths(
-    path: Path, *, batch: int = 1024, clip: bool = False, pad: bool = False
+    path: FilePath, *, batch: int = 1024, clip: bool = False, pad: bool = False
 ) -> Iterator[Breaths]:
-    """Read a recording of any size, some breaths at a time.
+    """Read a recording of any size in batches.
 
-    Memory is that of a batch and about 100 bytes for each breath read so far. If a breath has no
+    Needs the memory of a batch and about 100 bytes for each breath read so far. If a breath has no
     times, the file is read once more to estimate its interval from all breaths, as `load` does.
 
     Args:
@@ -107,66 +113,66 @@ def iter_breaths(
         Breaths in file order, without `sha256`.
 
     Raises:
-        ValueError: batch is below 1.
-        RecordingError: the batch that comes next cannot be used; those before were sound.
+        ValueError: if batch is below 1.
+        RecordingError: if the next batch cannot be used; those before it are sound.
     """
     if batch < 1:
         raise ValueError(f"batch is {batch}, but at least 1 is needed")
     source = open_source(path)
-    findings = Findings(source.file)
+    log = ProblemLog(source.file)
     table: IntervalTable | None = None
     expected = 0
-    for block in scan(source, findings, clip=clip, batch=batch):
+    for block in scan(source, log, clip=clip, batch=batch):
         tally = Tally()
         tally.add(block)
-        check_lengths(tally, findings, pad=pad, expected=expected)
+        check_lengths(tally, log, pad=pad, expected=expected)
         expected = expected or int(np.bincount(block.lengths).argmax())
         if block.times.blank.any() and table is None:
             table = _table_of(path, clip=clip)
         if table is not None and table.overall is None:
-            check_inferable(tally, findings)
-        findings.raise_problems(partial(locate, source), source.place)
+            check_inferable(tally, log)
+        log.raise_problems(partial(locate, source), source.place)
         yield _assemble(block, table or tally.table(), source.file)
     if expected == 0:
         raise _no_rows(source)
 
 
-def _table_of(path: Path, *, clip: bool) -> IntervalTable:
+def _table_of(path: FilePath, *, clip: bool) -> IntervalTable:
     tally = Tally()
-    for block in scan(open_source(path), Findings(str(path)), clip=clip):
+    for block in scan(open_source(path), ProblemLog(str(path)), clip=clip):
         tally.add(block)
     return tally.table()
 
 
-def _check_whole(source: Source, tally: Tally, findings: Findings, *, pad: bool) -> None:
+def _check_whole(source: Source, tally: Tally, log: ProblemLog, *, pad: bool) -> None:
     if len(tally) == 0:
         raise _no_rows(source)
-    check_lengths(tally, findings, pad=pad)
-    check_inferable(tally, findings)
+    check_lengths(tally, log, pad=pad)
+    check_inferable(tally, log)
 
 
 def _no_rows(source: Source) -> RecordingError:
     return fail(source.file, "the file has a header but no rows", "Write at least one breath.")
 
 
-def _report(source: Source, findings: Findings, tally: Tally) -> CheckReport:
+def _report(source: Source, log: ProblemLog, tally: Tally) -> CheckReport:
     find = partial(locate, source)
     whole: tuple[Problem, ...] = source.warnings + unit_warning(source.file, tally)
-    warnings = whole + findings.listed("warning", find, source.place)
+    warnings = whole + log.listed("warning", find, source.place)
     return CheckReport(
         source.file,
         source.kind,
         source.sha256,
-        findings.listed("problem", find, source.place),
-        findings.counts["problem"],
+        log.listed("problem", find, source.place),
+        log.counts["problem"],
         warnings,
-        len(whole) + findings.counts["warning"],
+        len(whole) + log.counts["warning"],
         **describe(tally),
     )
 
 
 def _assemble(block: Block, table: IntervalTable, file: str) -> Breaths:
-    """Make breaths of a sound block, with times for those that have none."""
+    """Make breaths of a sound block; blank times are inferred."""
     time = block.times.time
     blank = np.flatnonzero(block.times.blank)
     if len(blank):
@@ -196,3 +202,22 @@ def _assemble(block: Block, table: IntervalTable, file: str) -> Breaths:
         flow=samples.get("flow"),
         volume=samples.get("volume"),
     )
+
+
+def recordings_dir() -> Path | None:
+    """Find the folder of public recordings, which are never part of the checkout.
+
+    Returns:
+        The folder that the environment variable `VENTBENCH_RECORDINGS` names. If it is not set, the
+        first `shared/recordings` in the current folder, the checkout, or a folder above them. None
+        if there is no such folder.
+    """
+    named = os.environ.get(VARIABLE)
+    if named:
+        return Path(named) if Path(named).is_dir() else None
+    for base in (Path.cwd(), Path(__file__).resolve().parents[2]):
+        for above in (base, *base.parents):
+            folder = above / "shared" / "recordings"
+            if folder.is_dir():
+                return folder
+    return None

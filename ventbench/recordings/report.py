@@ -1,4 +1,4 @@
-"""What a check of a recording found, for people and for machines."""
+"""The report of a check: what a file holds, counted block by block, and what is wrong with it."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ from typing import Any
 import numpy as np
 
 from ventbench.lungs import Lung
-from ventbench.recordings.errors import Problem
-from ventbench.recordings.tally import Tally
+from ventbench.recordings.problems import Problem, ProblemLog
+from ventbench.recordings.scan import Block
+from ventbench.recordings.times import IntervalTable, interval_table
 
 SLOW = 0.5
-"""A median sampling interval above this, s, suggests another unit."""
+"""Median sampling interval, s, above which times are probably not in seconds."""
+
+PAD_LIMIT = 10
+"""Largest factor by which padding may enlarge a file in memory."""
 
 
 @dataclass(frozen=True)
@@ -21,22 +25,22 @@ class CheckReport:
 
     Attributes:
         file: the path as the caller wrote it.
-        kind: `csv`, `csv.gz` or `parquet`, or None if that could not be told.
-        sha256: of the file, hex, or None if it could not be read to its end.
+        kind: `csv`, `csv.gz` or `parquet`, or None if the file cannot be read.
+        sha256: of the file, hex, or None if it cannot be read to its end.
         problems: the first problems, in file order.
-        problem_count: how many problems there are in all.
+        problem_count: number of all problems.
         warnings: the first warnings.
-        warning_count: how many warnings there are in all.
+        warning_count: number of all warnings.
         rows: data rows read.
         breaths: breaths read.
         lengths: smallest and largest number of samples in a breath.
         lungs: breaths for each lung, by R then C.
-        interval: s: `min` and `max` between two samples, `p5`, `median`, `p95` of the breaths' mean
-            intervals; empty if no times are known.
+        interval: `min` and `max` between two samples and `p5`, `median`, `p95` of the breaths' mean
+            intervals, s; empty if no times are known.
         time_inferred: interval, s, inferred for each breath without times, by breath_id.
-        time_interpolated: single blank times that were filled in.
-        time_shifted: breaths that do not start at time 0 and were moved there.
-        blank_pressures: samples without pressure.
+        time_interpolated: number of single blank times that are interpolated.
+        time_shifted: number of breaths that are shifted to start at time 0.
+        blank_pressures: number of samples without pressure.
         optional: optional columns in the file.
     """
 
@@ -64,7 +68,7 @@ class CheckReport:
         return self.problem_count == 0
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """JSON values."""
         plain = {name: getattr(self, name) for name in self.__dataclass_fields__}
         plain["ok"] = self.ok
         plain["problems"] = [problem.to_dict() for problem in self.problems]
@@ -75,7 +79,7 @@ class CheckReport:
         return plain
 
     def notes(self) -> tuple[str, ...]:
-        """What was filled in, changed or ignored, a sentence each."""
+        """What was inferred, changed or ignored, a sentence each."""
         notes = []
         if self.time_inferred:
             listed = [f"breath {i}: {1e3 * dt:.1f} ms" for i, dt in self.time_inferred.items()]
@@ -98,7 +102,7 @@ class CheckReport:
         return tuple(notes)
 
     def lines(self) -> list[str]:
-        """The report for a person."""
+        """The report as lines of text."""
         lines = []
         if self.breaths:
             lines.append(f"{self.file}: {self.breaths} breaths, {self.rows} rows ({self.kind})")
@@ -121,7 +125,7 @@ class CheckReport:
 
 
 def describe(tally: Tally) -> dict[str, Any]:
-    """The fields of a report that count what the file holds.
+    """Return the fields of a report that describe the content of a file.
 
     Args:
         tally: all breaths.
@@ -150,7 +154,7 @@ def describe(tally: Tally) -> dict[str, Any]:
 
 
 def unit_warning(file: str, tally: Tally) -> tuple[Problem, ...]:
-    """A warning if times look like milliseconds."""
+    """Return a warning if times look like milliseconds."""
     median = tally.table().overall
     if median is None or median <= SLOW:
         return ()
@@ -166,3 +170,111 @@ def _intervals(tally: Tally) -> dict[str, float]:
         return {}
     p5, median, p95 = (float(q) for q in np.quantile(means, [0.05, 0.5, 0.95]))
     return {"min": tally.dt_min, "p5": p5, "median": median, "p95": p95, "max": tally.dt_max}
+
+
+@dataclass
+class Tally:
+    """Counts over the blocks that were added; keeps a few numbers a breath and no samples.
+
+    Attributes:
+        blank_pressures: samples without pressure.
+        dt_min: shortest known interval between two samples, s.
+        dt_max: longest known interval, s.
+        optional: optional columns in the file.
+    """
+
+    blank_pressures: int = 0
+    dt_min: float = float("inf")
+    dt_max: float = float("-inf")
+    optional: tuple[str, ...] = ()
+    _parts: dict[str, list[np.ndarray]] = field(default_factory=dict)
+
+    def add(self, block: Block) -> None:
+        """Count a block."""
+        for name in ("breath_id", "R", "C", "first_row", "lengths", "n_inspiratory", "interval"):
+            self._parts.setdefault(name, []).append(getattr(block, name))
+        for name in ("blank", "interpolated", "shifted"):
+            self._parts.setdefault(name, []).append(getattr(block.times, name))
+        self.blank_pressures += int(np.isnan(block.samples["pressure"]).sum())
+        self.optional = tuple(name for name in ("flow", "volume") if name in block.samples)
+        with np.errstate(invalid="ignore"):
+            steps = np.diff(block.times.time)
+        steps[np.cumsum(block.lengths)[:-1] - 1] = np.nan
+        steps = steps[np.isfinite(steps)]
+        self.dt_min = min(self.dt_min, float(steps.min(initial=np.inf)))
+        self.dt_max = max(self.dt_max, float(steps.max(initial=-np.inf)))
+
+    def column(self, name: str) -> np.ndarray:
+        """One number a breath, (n,), by the name of a field of `Block` or `KnownTimes`."""
+        parts = self._parts.get(name)
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    def __len__(self) -> int:
+        """Number of breaths."""
+        return sum(len(part) for part in self._parts.get("breath_id", []))
+
+    def table(self) -> IntervalTable:
+        """Sampling intervals of the breaths whose times are known."""
+        return interval_table(self.column("n_inspiratory"), self.column("interval"))
+
+    def inferred(self) -> dict[int, float]:
+        """Interval, s, estimated for each breath without times, by breath_id."""
+        table = self.table()
+        at = np.flatnonzero(self.column("blank"))
+        columns = (self.column(name)[at] for name in ("breath_id", "n_inspiratory", "lengths"))
+        estimates = {
+            int(breath): table.estimate(int(n_inspiratory), int(length))
+            for breath, n_inspiratory, length in zip(*columns, strict=True)
+        }
+        return {breath: dt for breath, dt in estimates.items() if dt is not None}
+
+
+def check_lengths(tally: Tally, log: ProblemLog, *, pad: bool, expected: int = 0) -> None:
+    """Check that all breaths have the same number of samples.
+
+    Args:
+        tally: all breaths.
+        log: receives the problems.
+        pad: allow shorter breaths, unless padding would need far more memory than the file.
+        expected: samples that a breath should have; 0 for the most common length.
+    """
+    lengths, first_row = tally.column("lengths").astype(np.int64), tally.column("first_row")
+    if len(lengths) == 0:
+        return
+    ids = tally.column("breath_id")
+    if pad:
+        longest = int(lengths.max())
+        size = longest * len(lengths)
+        if size > max(PAD_LIMIT * int(lengths.sum()), 10_000_000):
+            at = np.flatnonzero(lengths == longest)[:1]
+            what = (
+                f"breath {{value}} has {longest} samples, so padding {len(lengths)} breaths to it "
+                f"would make {size} samples of {lengths.sum()}"
+            )
+            advice = "Put breaths of very different lengths into files of their own."
+            log.add(first_row[at], "breath_id", what, advice, values=ids[at])
+        return
+    usual = expected or int(np.bincount(lengths).argmax())
+    for length in np.unique(lengths[lengths != usual]):
+        at = np.flatnonzero(lengths == length)
+        what = f"breath {{value}} has {length} samples, the others have {usual}"
+        advice = "Fix the breath, or pass --pad to fill short ones."
+        log.add(first_row[at], "breath_id", what, advice, values=ids[at])
+
+
+def check_inferable(tally: Tally, log: ProblemLog) -> None:
+    """Check that the interval of every breath without times can be inferred."""
+    blank = tally.column("blank").astype(bool)
+    if not blank.any():
+        return
+    inferred = np.array(list(tally.inferred()), dtype=np.int64)
+    ids = tally.column("breath_id")
+    unknown = blank & ~np.isin(ids, inferred)
+    first_row = tally.column("first_row")
+    for at in np.flatnonzero(unknown):
+        what = (
+            f"the times of breath {ids[at]} are blank and cannot be inferred: no breath of the "
+            "file has times, and u_out does not switch from 0 to 1 in this one"
+        )
+        advice = "Fill in time_step, in seconds."
+        log.add(first_row[at : at + 1], "time_step", what, advice, values=np.array([np.nan]))

@@ -1,7 +1,7 @@
 """Recordings of the RespiraWorks ventilator: another schema, 100 Hz, several breaths a run.
 
-Its valves are not those of the ventilator that ventbench simulates, so its commands are kept as
-they are and not turned into u_in and u_out. Lung mechanics can be read from pressure and flow.
+Its valves are not those of the ventilator that ventbench simulates: its commands are kept as they
+are and not converted to u_in and u_out. Lung mechanics follow from pressure and flow.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ventbench.recordings.files import fail, kind_of
+from ventbench.recordings.problems import fail
+from ventbench.recordings.scan import kind_of
 
 SIGNALS = {
     "pressure": "cmH2O",
@@ -29,15 +30,15 @@ _LABELS = ("run", "test", "breath", "time_step", "R", "C", "drive")
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class RespiraWorksRun:
     """One test of one day: consecutive breaths on one lung.
 
     Attributes:
         name: name of the test day or gas supply.
         test: number of the ISO test condition.
-        drive: what drives the gas.
-        R: resistance the operators wrote down, cmH2O/(L/s).
-        C: compliance the operators wrote down, mL/cmH2O.
+        drive: source of the gas, such as a blower.
+        R: resistance that the operators noted, cmH2O/(L/s).
+        C: compliance that the operators noted, mL/cmH2O.
         breath: number of each sample's breath, int64, (T,).
         time: s, float64, (T,).
         signals: by the names of `SIGNALS`, float64, NaN where not logged, each (T,).
@@ -53,7 +54,7 @@ class Run:
     signals: dict[str, np.ndarray]
 
 
-def load_respiraworks(path: str | os.PathLike[str]) -> tuple[Run, ...]:
+def load_respiraworks(path: str | os.PathLike[str]) -> tuple[RespiraWorksRun, ...]:
     """Read a RespiraWorks Parquet file.
 
     Args:
@@ -63,7 +64,7 @@ def load_respiraworks(path: str | os.PathLike[str]) -> tuple[Run, ...]:
         Its runs in file order.
 
     Raises:
-        RecordingError: the file cannot be read, lacks a column, or its times do not increase.
+        RecordingError: if the file cannot be read, lacks a column, or its times do not increase.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -88,7 +89,7 @@ def load_respiraworks(path: str | os.PathLike[str]) -> tuple[Run, ...]:
         signals = {column: rows[column].to_numpy(np.float64) for column in SIGNALS}
         first = rows.iloc[0]
         runs.append(
-            Run(
+            RespiraWorksRun(
                 str(run),
                 int(str(test)),
                 str(first["drive"]),

@@ -1,22 +1,28 @@
-"""Rows as flat arrays: pieces of a file, cut where a breath ends."""
+"""Rows of a file as flat arrays: chunks as they are read, regrouped into whole breaths."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+from ventbench.recordings.schema import COLUMNS
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Some consecutive rows of a file, as read.
+    """Consecutive rows of a file, as read.
 
     Attributes:
         row0: the first row's number in the file, 0 for the first data row.
         columns: arrays by column name, each (m,): int64 for id and breath_id, float64 with NaN for
             blank otherwise, in the units of the schema.
-        blank_id: where breath_id is blank, (m,) bool; breath_id then repeats the one before.
+        blank_id: rows with a blank breath_id, (m,) bool; breath_id then repeats the one before.
     """
 
     row0: int
@@ -50,11 +56,11 @@ class Rows(Chunk):
 
 
 def whole_breaths(chunks: Iterable[Chunk], batch: int | None = None) -> Iterator[Rows]:
-    """Regroup pieces of a file so that none ends inside a breath.
+    """Regroup chunks of a file so that none ends inside a breath.
 
     Args:
         chunks: the file in order.
-        batch: breaths in each group (the last may have fewer), or None for whatever is convenient.
+        batch: breaths in each group (the last may have fewer); None for groups of any size.
 
     Yields:
         Rows of whole breaths, in order.
@@ -84,7 +90,7 @@ def _starts(chunk: Chunk) -> np.ndarray:
 
 
 def _stops(rows: Chunk, batch: int | None) -> np.ndarray:
-    """Where groups end for certain: the last breath may go on in the next chunk."""
+    """Rows at which groups can end: the last breath may continue in the next chunk."""
     starts = _starts(rows)
     return starts[-1:] if batch is None else starts[batch::batch]
 
@@ -107,3 +113,44 @@ def _join(chunks: list[Chunk]) -> Chunk:
     }
     blank = np.concatenate([chunk.blank_id for chunk in chunks])
     return Chunk(chunks[0].row0, columns, blank)
+
+
+def chunk_of_batch(batch: pa.RecordBatch, row0: int, last_id: int | None) -> Chunk:
+    """Convert an Arrow batch.
+
+    Args:
+        batch: known columns only, in any numeric type.
+        row0: number of its first row in the file.
+        last_id: breath_id of the row before, used where the first ones are blank; None at the
+            start, where the first id that is not blank is used.
+
+    Returns:
+        The rows as int64 (id, breath_id) and float64 arrays.
+
+    Raises:
+        pyarrow.ArrowInvalid: a whole number does not fit 64 bits.
+    """
+    columns = {}
+    blank_id = np.zeros(batch.num_rows, dtype=bool)
+    for name in batch.schema.names:
+        values, blank = _numpy(batch.column(name), COLUMNS[name].whole)
+        if name == "breath_id" and blank is not None:
+            blank_id = blank
+            before = np.maximum.accumulate(np.where(blank, -1, np.arange(len(values))))
+            first = values[int(np.argmin(blank))] if last_id is None else last_id
+            values = np.where(before < 0, first, values[before])
+        columns[name] = values
+    return Chunk(row0, columns, blank_id)
+
+
+def _numpy(array: pa.Array, whole: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    import pyarrow as pa
+
+    if whole:
+        blank = array.is_null().to_numpy(zero_copy_only=False) if array.null_count else None
+        filled = array.fill_null(0) if array.null_count else array
+        return filled.cast(pa.int64()).to_numpy(zero_copy_only=False), blank
+    if array.type != pa.float64():
+        array = array.cast(pa.int8()) if pa.types.is_boolean(array.type) else array
+        array = array.cast(pa.float64())
+    return array.to_numpy(zero_copy_only=False), None

@@ -1,4 +1,4 @@
-"""What a recording holds: the columns, their units, ranges and types.
+"""The schema of a recording: columns with units, ranges and types, and the check of a header.
 
 One row is one sample. The rows of a breath follow one another, in time order. The header is
 `id,breath_id,R,C,time_step,u_in,u_out,pressure`, and `flow` or `volume` may be added. Parquet files
@@ -7,7 +7,15 @@ have columns of the same names.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Literal
+
+from ventbench.recordings.problems import Problem, RecordingError
+
+#: Formats of files.
+Kind = Literal["csv", "csv.gz", "parquet"]
 
 
 @dataclass(frozen=True)
@@ -20,8 +28,8 @@ class Column:
         low: smallest value that is accepted, in `unit`.
         high: largest value that is accepted, in `unit`.
         blank: whether a cell may be blank (read as NaN).
-        whole: whether the column holds whole numbers (64 bit).
-        positive: whether `low` itself is refused.
+        whole: whether the column holds integers of 64 bits.
+        positive: whether `low` itself is outside the range.
         advice: what to do about a value outside the range.
     """
 
@@ -96,3 +104,58 @@ COLUMNS: dict[str, Column] = {
 OPTIONAL: tuple[str, ...] = ("flow", "volume")
 REQUIRED: tuple[str, ...] = tuple(name for name in COLUMNS if name not in OPTIONAL)
 HEADER: str = ",".join(REQUIRED) + "[,flow][,volume]"
+
+#: Columns by which a RespiraWorks file is recognised.
+_RESPIRAWORKS = {"run", "test", "breath", "cmd_inh_valve", "cmd_exh_valve"}
+
+
+def check_header(file: str, names: Sequence[str], line: int | None) -> tuple[Problem, ...]:
+    """Check the names of the columns.
+
+    Args:
+        file: the path as the caller wrote it.
+        names: the column names in file order.
+        line: line of the header, or None in Parquet.
+
+    Returns:
+        A warning for each unknown column, which is ignored.
+
+    Raises:
+        RecordingError: a column is missing or occurs twice.
+    """
+    problems = []
+    for name in dict.fromkeys(names):
+        if name in COLUMNS and names.count(name) > 1:
+            what = f"the header names {name} {names.count(name)} times"
+            problems.append(Problem(file, what, "Keep one of them.", line, name, name))
+    missing = [name for name in REQUIRED if name not in names]
+    if missing:
+        column = missing[0] if len(missing) == 1 else None
+        what = f"missing column{'s' if len(missing) > 1 else ''} {', '.join(missing)}"
+        problems.append(Problem(file, what, _advice(names, missing), line, column))
+    if problems:
+        raise RecordingError(problems)
+    advice = f"Rename it if it is one of {HEADER}."
+    return tuple(
+        Problem(file, f"column {name!r} is not known and is ignored", advice, line, name)
+        for name in dict.fromkeys(names)
+        if name not in COLUMNS
+    )
+
+
+def _advice(names: Sequence[str], missing: Sequence[str]) -> str:
+    if set(names) >= _RESPIRAWORKS:
+        return (
+            "This is a RespiraWorks file, of another ventilator and with other columns: read it "
+            "with ventbench.recordings.load_respiraworks."
+        )
+    if len(names) == 1 and any(mark in names[0] for mark in ";\t|"):
+        return "The columns must be separated by commas."
+    hints = []
+    for name in missing:
+        plain = {other.strip().lower(): other for other in names if other not in COLUMNS}
+        for match in get_close_matches(name.lower(), plain, n=1, cutoff=0.75):
+            hints.append(f"rename {plain[match]!r} to {name}")
+    if hints:
+        return f"Perhaps {', '.join(hints)}."
+    return f"The header is {HEADER}."

@@ -1,4 +1,4 @@
-"""Splitting recordings into training and held-out breaths: by breath, seeded, recorded."""
+"""Splitting recordings into training and held-out breaths, by a seed and the ids of the breaths."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ FORMAT = "ventbench-split-1"
 
 @dataclass(frozen=True)
 class Split:
-    """Which breaths are for training and which are held out.
+    """Training and held-out breaths of a recording.
 
     Attributes:
         train_ids: breath ids for training, increasing.
         held_out_ids: breath ids held out, increasing; none of them is in `train_ids`.
-        seed: the seed it was made with.
-        fraction: the fraction held out that was asked for.
-        sha256: of the file the breaths came from, hex, or None.
+        seed: of the split.
+        fraction: share that was requested to be held out.
+        sha256: of the file of the breaths, hex, or None.
     """
 
     train_ids: tuple[int, ...]
@@ -39,10 +39,10 @@ class Split:
     sha256: str | None
 
     def __post_init__(self) -> None:
-        """Refuse an id that is there twice.
+        """Refuse an id that occurs twice.
 
         Raises:
-            InputError: an id is in both parts, or twice in one.
+            InputError: if an id is in both parts, or twice in one.
         """
         counts = Counter(self.train_ids + self.held_out_ids)
         twice = [breath for breath, count in counts.items() if count > 1]
@@ -53,16 +53,16 @@ class Split:
             )
 
     def apply(self, breaths: Breaths) -> tuple[Breaths, Breaths]:
-        """Divide breaths as the split says.
+        """Split breaths.
 
         Args:
-            breaths: from the file that was split; a selection of it is fine.
+            breaths: of the file that was split, or a selection of them.
 
         Returns:
             Training and held-out breaths, each in the order of `breaths`.
 
         Raises:
-            InputError: the breaths are from another file, or the split does not know one of them.
+            InputError: if the breaths are from another file, or the split lacks one of them.
         """
         if self.sha256 and breaths.sha256 and self.sha256 != breaths.sha256:
             raise InputError(
@@ -80,15 +80,15 @@ class Split:
         return breaths.select(train), breaths.select(held_out)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """JSON values."""
         return {"format": FORMAT, **asdict(self)}
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any]) -> Split:
-        """Read what `to_dict` gave.
+        """Return the split of these JSON values.
 
         Raises:
-            InputError: it is no split, or one that overlaps.
+            InputError: if they are no split, or an id occurs twice.
         """
         if plain.get("format") != FORMAT:
             raise InputError(f"this is no split: format is {plain.get('format')!r}, not {FORMAT!r}")
@@ -120,7 +120,7 @@ def split_by_breath(breaths: Breaths, *, held_out: float = 0.2, seed: int = 0) -
         The split.
 
     Raises:
-        InputError: the fraction is not between 0 and 1, or an id is there twice.
+        InputError: if the fraction is not between 0 and 1, or an id occurs twice.
     """
     if not 0.0 < held_out < 1.0:
         raise InputError(f"held_out is {held_out}, but it must lie between 0 and 1")
@@ -136,21 +136,20 @@ def split_by_breath(breaths: Breaths, *, held_out: float = 0.2, seed: int = 0) -
 
 
 def folds(breaths: Breaths, *, count: int = 5, seed: int = 0) -> np.ndarray:
-    """Deal the breaths of each lung out to folds for a cross-validation.
+    """Assign the breaths of each lung to the folds of a cross-validation, in turn.
 
-    In the order of :func:`split_by_breath`, one to each fold in turn; so, for equal sizes, a fold
-    is about what one split holds out.
+    The order is that of :func:`split_by_breath`.
 
     Args:
         breaths: ids must differ.
-        count: of folds, at least 2.
+        count: number of folds, at least 2.
         seed: any whole number.
 
     Returns:
         Fold of each breath, 0 to ``count - 1``, int64, shape ``(n,)``.
 
     Raises:
-        InputError: fewer than two folds, or an id is there twice.
+        InputError: if there are fewer than two folds, or an id occurs twice.
     """
     if count < 2:
         raise InputError(f"a cross-validation needs at least 2 folds, not {count}")
@@ -173,8 +172,8 @@ def load_split(path: str | os.PathLike[str]) -> Split:
     """Read a split from JSON.
 
     Raises:
-        InputError: the file holds no split.
-        OSError: the file cannot be read.
+        InputError: if the file holds no split.
+        OSError: if the file cannot be read.
     """
     try:
         return Split.from_dict(json.loads(Path(path).read_text("utf-8")))
@@ -183,8 +182,9 @@ def load_split(path: str | os.PathLike[str]) -> Split:
 
 
 def _shuffled(seed: int, ids: list[int], lung: str) -> list[int]:
-    return sorted(ids, key=lambda breath: _key(seed, breath, lung))
+    """Ids in the order of their hashes."""
 
+    def digest(breath_id: int) -> bytes:
+        return hashlib.sha256(f"{seed}:{breath_id}:{lung}".encode()).digest()
 
-def _key(seed: int, breath_id: int, lung: str) -> bytes:
-    return hashlib.sha256(f"{seed}:{breath_id}:{lung}".encode()).digest()
+    return sorted(ids, key=digest)

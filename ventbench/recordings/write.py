@@ -1,4 +1,4 @@
-"""Writing recordings: a temporary file first, then a rename."""
+"""Writing recordings as CSV, gzipped CSV or Parquet."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 BATCH = 4096
-"""Breaths turned into a table at a time."""
+"""Breaths that are converted to a table at a time."""
 
 
 def write(breaths: Breaths, path: str | os.PathLike[str], *, blank_inferred: bool = True) -> None:
-    """Write breaths to CSV, gzipped CSV or Parquet, told by the name.
+    """Write breaths to CSV, gzipped CSV or Parquet, by the ending of the name.
 
-    Numbers are written so that they read back exactly. Padding is left out; NaN is written blank.
+    Numbers read back exactly. Padding is left out; NaN is written blank.
     The same breaths give the same bytes.
 
     Args:
-        breaths: what to write, at least one breath.
+        breaths: at least one.
         path: ends in .csv, .csv.gz, .parquet or .pq; an existing file is replaced,
             a missing folder is made.
         blank_inferred: write inferred times blank, as they were read, so that nobody takes them for
-            measured ones; False writes the estimates.
+            measurements; False writes the estimates.
 
     Raises:
-        InputError: there are no breaths, or the name has another ending.
-        OSError: the file cannot be written.
+        InputError: if there are no breaths, or the name has another ending.
+        OSError: if the file cannot be written.
     """
     name = str(path)
     if len(breaths) == 0:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ventbench import files
 from ventbench.errors import InputError
-from ventbench.recordings.join import join
+from ventbench.recordings.breaths import join
 from ventbench.recordings.read import load
 from ventbench.recordings.write import write as write_recording
 from ventbench.validation.challenge.folder import ChallengeFolder, random_generator

@@ -1,4 +1,4 @@
-"""Reading Parquet in pieces."""
+"""Reading Parquet in batches."""
 
 from __future__ import annotations
 
@@ -8,12 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ventbench.files import sha256
-from ventbench.recordings.arrow import to_chunk
-from ventbench.recordings.errors import Problem, RecordingError
-from ventbench.recordings.files import Kind, fail
-from ventbench.recordings.header import check_names
-from ventbench.recordings.rows import Chunk
-from ventbench.recordings.schema import COLUMNS
+from ventbench.recordings.problems import Problem, RecordingError, fail
+from ventbench.recordings.rows import Chunk, chunk_of_batch
+from ventbench.recordings.schema import COLUMNS, Kind, check_header
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -24,14 +21,15 @@ BATCH = 1 << 17
 
 @dataclass
 class ParquetSource:
-    """A Parquet file being read, once.
+    """A Parquet file that is read once, in order.
 
     Attributes:
         file: the path as the caller wrote it.
         kind: `parquet`.
         names: column names.
-        warnings: columns that are ignored.
-        sha256: of the file, known once all chunks were read.
+        warnings: about columns that are ignored.
+        sha256: of the file; None until all chunks are read.
+        batch: rows that are read at a time.
     """
 
     file: str
@@ -40,6 +38,7 @@ class ParquetSource:
     warnings: tuple[Problem, ...] = ()
     sha256: str | None = None
     place: str = field(default="row", init=False)
+    batch: int = BATCH
 
     def __post_init__(self) -> None:
         """Read and check names and types.
@@ -55,7 +54,7 @@ class ParquetSource:
         except (pa.ArrowException, OSError) as error:
             raise _damaged(self.file, error) from None
         self.names = tuple(schema.names)
-        self.warnings = check_names(self.file, self.names, None)
+        self.warnings = check_header(self.file, self.names, None)
         problems = [
             problem
             for name in self.names
@@ -78,9 +77,9 @@ class ParquetSource:
         try:
             with parquet.ParquetFile(self.file) as stream:
                 columns = [name for name in COLUMNS if name in self.names]
-                for batch in stream.iter_batches(BATCH, columns=columns):
+                for batch in stream.iter_batches(self.batch, columns=columns):
                     if batch.num_rows:
-                        chunk = to_chunk(batch, row0, last_id)
+                        chunk = chunk_of_batch(batch, row0, last_id)
                         yield chunk
                         row0 += len(chunk)
                         last_id = int(chunk.columns["breath_id"][-1])

@@ -1,0 +1,185 @@
+"""A file as checked blocks of whole breaths, which `load`, `iter_breaths` and `check` share."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from ventbench.recordings.checks import (
+    check_ids,
+    check_lung,
+    check_row_ids,
+    check_single,
+    check_times,
+    check_values,
+)
+from ventbench.recordings.csv_source import CsvSource, locate_rows
+from ventbench.recordings.parquet_source import ParquetSource
+from ventbench.recordings.problems import Place, ProblemLog, fail
+from ventbench.recordings.rows import Rows, whole_breaths
+from ventbench.recordings.schema import Kind
+from ventbench.recordings.times import KnownTimes, known_times, leading_zeros
+
+Source = CsvSource | ParquetSource
+
+
+def open_source(path: str | os.PathLike[str]) -> Source:
+    """Open a file and check its header.
+
+    Raises:
+        RecordingError: the file cannot be read or is no recording.
+    """
+    kind = kind_of(path)
+    return ParquetSource(str(path)) if kind == "parquet" else CsvSource(str(path), kind)
+
+
+def locate(source: Source, rows: Collection[int]) -> Mapping[int, Place]:
+    """Find data rows (0 for the first) in a file: CSV lines and cells, or Parquet rows from 1."""
+    if isinstance(source, ParquetSource):
+        return {row: (row + 1, {}) for row in rows}
+    return locate_rows(source.file, source.kind, source.names, rows)
+
+
+def kind_of(path: str | os.PathLike[str]) -> Kind:
+    """Return the format of a file by its first bytes; its name only improves the error message.
+
+    Raises:
+        RecordingError: no such file, a folder, no permission, empty, or another format.
+    """
+    name = str(path)
+    try:
+        if Path(path).is_dir():
+            raise fail(name, "this is a folder", "Name one file in it.")
+        with open(path, "rb") as stream:
+            first = stream.read(4)
+    except FileNotFoundError:
+        raise fail(name, "there is no such file", "Check the path.") from None
+    except OSError as error:
+        advice = "Check its permissions."
+        raise fail(name, f"the file cannot be read ({error.strerror})", advice) from None
+    if not first:
+        raise fail(name, "the file is empty", "Write a header and at least one breath.")
+    if first == b"PAR1":
+        return "parquet"
+    if name.endswith((".parquet", ".pq")):
+        advice = "Write it again, or name it .csv if it is text."
+        raise fail(name, "this is not a Parquet file", advice)
+    if first.startswith(b"\x1f\x8b"):
+        return "csv.gz"
+    if first.startswith(b"PK\x03\x04"):
+        raise fail(name, "this is a zip archive", "Unpack it and name the CSV file in it.")
+    if first.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise fail(name, "this is UTF-16 text", "Save the file as UTF-8.")
+    return "csv"
+
+
+@dataclass(frozen=True)
+class Block:
+    """k whole breaths with m samples in all.
+
+    Attributes:
+        breath_id: (k,) int64.
+        R: cmH2O/(L/s), (k,).
+        C: mL/cmH2O, (k,).
+        first_row: each breath's first data row in the file, from 0, (k,).
+        lengths: samples, (k,).
+        n_inspiratory: leading samples with u_out = 0, (k,).
+        interval: mean sampling interval, s, NaN if times are blank, (k,).
+        times: of the samples, and what was interpolated or shifted.
+        samples: u_in %, u_out 0/1 (int8), pressure cmH2O, and flow mL/s and volume mL if the file
+            has them, each (m,).
+    """
+
+    breath_id: np.ndarray
+    R: np.ndarray
+    C: np.ndarray
+    first_row: np.ndarray
+    lengths: np.ndarray
+    n_inspiratory: np.ndarray
+    interval: np.ndarray
+    times: KnownTimes
+    samples: dict[str, np.ndarray]
+
+
+def scan(
+    source: Source, log: ProblemLog, *, clip: bool = False, batch: int | None = None
+) -> Iterator[Block]:
+    """Read and check a file.
+
+    Args:
+        source: an open file.
+        log: receives all problems and warnings except those of the whole file (unequal lengths).
+        clip: bring u_in into 0..100 %.
+        batch: breaths in a block; None for blocks of any size.
+
+    Yields:
+        Blocks in file order, also after a problem; their values must not be used then.
+
+    Raises:
+        RecordingError: the file cannot be parsed.
+    """
+    seen: dict[int, int] = {}
+    last: int | None = None
+    for rows in whole_breaths(source.chunks(), batch):
+        check_ids(rows, log, seen)
+        check_single(rows, log)
+        check_lung(rows, log)
+        check_times(rows, log)
+        last = check_row_ids(rows, log, last)
+        columns = check_values(rows, log, clip=clip)
+        with np.errstate(all="ignore"):  # infinite values are problems already
+            block = _block(rows, columns)
+        yield block
+
+
+def _block(rows: Rows, columns: dict[str, np.ndarray]) -> Block:
+    starts, lengths = rows.starts, rows.lengths
+    times = known_times(columns["time_step"], starts, lengths)
+    keep = ("u_in", "pressure", "flow", "volume")
+    samples = {name: columns[name] for name in keep if name in columns}
+    samples["u_out"] = (columns["u_out"] == 1.0).astype(np.int8)
+    return Block(
+        breath_id=columns["breath_id"][starts],
+        R=columns["R"][starts],
+        C=columns["C"][starts],
+        first_row=rows.row0 + starts,
+        lengths=lengths,
+        n_inspiratory=leading_zeros(samples["u_out"], starts, lengths),
+        interval=times.time[starts + lengths - 1] / np.maximum(lengths - 1, 1),
+        times=times,
+        samples=samples,
+    )
+
+
+def join_blocks(blocks: Sequence[Block]) -> Block:
+    """Join blocks.
+
+    Args:
+        blocks: at least one.
+
+    Returns:
+        One block with all breaths in order.
+    """
+    if len(blocks) == 1:
+        return blocks[0]
+
+    def merged(values: Iterable[np.ndarray]) -> np.ndarray:
+        return np.concatenate(list(values))
+
+    times = KnownTimes(
+        **{
+            field.name: merged(getattr(block.times, field.name) for block in blocks)
+            for field in fields(KnownTimes)
+        }
+    )
+    samples = {name: merged(block.samples[name] for block in blocks) for name in blocks[0].samples}
+    others = {
+        field.name: merged(getattr(block, field.name) for block in blocks)
+        for field in fields(Block)
+        if field.name not in ("times", "samples")
+    }
+    return Block(**others, times=times, samples=samples)

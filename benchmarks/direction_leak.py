@@ -27,11 +27,10 @@ from ventbench.files import write_json
 from ventbench.plants import frozen
 from ventbench.plants.sessions import Sessions
 from ventbench.recordings import Breaths, recordings_dir
-from ventbench.training import freeze
 from ventbench.training.hybrid.data import inspirations
-from ventbench.training.hybrid.fit import Recipe, fit, mean_absolute_errors
-from ventbench.training.hybrid.member import training_set
+from ventbench.training.hybrid.fit import HybridConfig, fit, mean_absolute_errors, training_set
 from ventbench.training.hybrid.parameters import direction
+from ventbench.training.simulator import TrainingRecordings, load_recordings
 
 #: Of the simulated breaths: sensor noise, cmH2O; spread of the valves' gain; the PI's constants.
 NOISE, SPREAD = 0.22, 0.1
@@ -77,17 +76,17 @@ def simulated(breaths: Breaths, simulators: frozen.Frozen, seed: int) -> Breaths
     )
 
 
-def held_out(data: freeze.Recordings, table: Sessions, directed: bool, folds: int) -> Any:
+def held_out(data: TrainingRecordings, table: Sessions, directed: bool, folds: int) -> Any:
     """Held-out errors of the measured breaths, cmH2O, and the mean sum of the plays' weights."""
-    recipe = Recipe(directed=directed)
-    arranged = training_set(data.measured, data.reconstructed, data.fold, table, recipe)
+    config = HybridConfig(directed=directed)
+    arranged = training_set(data.measured, data.reconstructed, data.fold, table, config)
     measured = inspirations(data.measured, table)
     error = np.full(len(data.measured), np.nan)
     weights = []
     for fold in range(folds):
         weight = jnp.where(arranged.fold == fold, 0.0, arranged.weight)
-        pooled, _ = fit(arranged.inspirations, weight, recipe)
-        found = np.asarray(mean_absolute_errors(pooled, measured, recipe))
+        pooled, _ = fit(arranged.inspirations, weight, config)
+        found = np.asarray(mean_absolute_errors(pooled, measured, config))
         new = (data.fold == fold) & np.isfinite(data.measured.pressure[:, 0])
         error[new] = found[new]
         weights.append(np.asarray(direction(pooled)).sum(axis=-1).mean())
@@ -106,7 +105,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.recordings is None:
         parser.error("give --recordings DIR, the folder of the public recordings")
-    real = freeze.recordings(options.recordings)
+    real = load_recordings(options.recordings)
     simulators = frozen.load()
     table = simulators.sessions
     with precision.float64():

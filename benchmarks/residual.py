@@ -18,14 +18,16 @@ import numpy as np
 
 from ventbench import precision
 from ventbench.controllers.pid import PID
+from ventbench.controllers.residual import load_weights
 from ventbench.files import write_json
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics import bootstrap
 from ventbench.plants import frozen
 from ventbench.submissions.folder import open_submission
 from ventbench.training import pid_grid
-from ventbench.training.residual import ALL, bound, load
-from ventbench.training.residual.measure import measure
+from ventbench.training.ablation.controllers import score_controllers
+from ventbench.training.residual import bound
+from ventbench.training.trained import ALL
 
 
 def row(name: str, one: np.ndarray, other: np.ndarray) -> dict[str, Any]:
@@ -48,13 +50,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    simulators, gains = frozen.load(), pid_grid.gains()
+    simulators, gains = frozen.load(), pid_grid.paper_gains()
     error = pid_grid.errors(simulators.plants, gains).mean(axis=-1)
     best = [PID(*map(float, gains[k])) for k in error.argmin(axis=1)]
     single = [PID(*map(float, gains[int(error.mean(axis=0).argmin())]))] * len(LUNG_IDS)
     with precision.float64():
-        each = load(open_submission("residual_mlp").folder / "weights.npz")
-        for_all = load(open_submission("residual_mlp_all").folder / "weights.npz")[ALL]
+        each = load_weights(open_submission("residual_mlp").folder / "weights.npz")
+        for_all = load_weights(open_submission("residual_mlp_all").folder / "weights.npz")[ALL]
     result: dict[str, Any] = {}
 
     print(f"{'lung':8} {'rise':>7} {'reached':>7}   cmH2O")
@@ -71,7 +73,7 @@ def main() -> None:
     }
     for title, (residuals, pids) in pairs.items():
         (one, index, safe), (other, pid_index, _) = (
-            measure(simulators, controllers) for controllers in (residuals, pids)
+            score_controllers(simulators, controllers) for controllers in (residuals, pids)
         )
         print(f"\n{title}: nominal, PID's, differences on PIPs and on draws")
         rows = {name: row(name, one[k], other[k]) for k, name in enumerate(LUNG_IDS)}

@@ -20,7 +20,7 @@ from ventbench.plants.stacking import nominal_plants
 from ventbench.precision import float64
 from ventbench.recordings import Breaths, load, make_breaths, write
 from ventbench.rollouts import open_loop
-from ventbench.training.freeze import MEASURED
+from ventbench.training.simulator import MEASURED
 
 single_compartments = partial(nominal_plants, single_compartment)
 

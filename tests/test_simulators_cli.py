@@ -24,7 +24,7 @@ from ventbench.plants import frozen
 from ventbench.plants.stacking import take
 from ventbench.rollouts import open_loop
 from ventbench.simulation import read_controls, simulate
-from ventbench.training import freeze
+from ventbench.training import simulator
 
 
 def run(*arguments: object, code: int = 0) -> str:
@@ -119,7 +119,7 @@ def test_train_needs_recordings(tmp_path, monkeypatch):
     monkeypatch.setenv("VENTBENCH_RECORDINGS", str(tmp_path / "gone"))
     assert "no folder holds no recordings" in run("train", "simulator", code=2)
     message = run("train", "simulator", "--recordings", tmp_path, "--out", tmp_path / "x", code=2)
-    assert f"{freeze.MEASURED}: there is no such file" in message
+    assert f"{simulator.MEASURED}: there is no such file" in message
     assert not (tmp_path / "x").exists()
 
 
@@ -130,7 +130,7 @@ def test_train_hands_over_folder_target_and_progress(tmp_path, monkeypatch):
         progress("half", 0.5)
         called.append((folder, out))
 
-    monkeypatch.setattr(freeze, "train", train)
+    monkeypatch.setattr(simulator, "train_simulator", train)
     out = tmp_path / "out"
     text = run("train", "simulator", "--recordings", tmp_path, "--out", out)
     assert called == [(tmp_path, out)]

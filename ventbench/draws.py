@@ -11,13 +11,15 @@ import functools
 import hashlib
 import io
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from numpy.typing import NDArray
 
 from ventbench import data_files, files, protocol
@@ -135,18 +137,82 @@ def scenarios(pips: Sequence[float] = protocol.PIPS, n: int = COUNT) -> Scenario
         )
     columns = [protocol.PIPS.index(pip) for pip in pips]
     drawn = {name: values[:n, columns] for name, values in _frozen().items()}
-    pip = np.asarray(pips, float) + drawn["pip_shift"]
-    peep = protocol.PEEP + drawn["peep_shift"]
+    pip = np.asarray(pips, float)
+    noise = drawn.pop("noise")
+    found = _deviate(pip, drawn, np.full((n, len(pips)), QUANTUM), noise)
+    return jax.tree.map(jnp.asarray, found)
+
+
+def random_scenarios(
+    key: Array,
+    pip: Array,
+    *,
+    spread: Array | float | None = None,
+    breaths: int = protocol.BREATHS,
+    smooth: bool = False,
+) -> Scenario:
+    """Draw new cells from the distributions of the published draws, for training.
+
+    The published draws themselves are never among them. Pure, so that it can be compiled.
+
+    Args:
+        key: of all random numbers.
+        pip: nominal PIP of each cell, cmH2O, shape ``(n,)``.
+        spread: how far the deviations of each cell reach, as a multiple of the draws' ranges, shape
+            ``(n,)`` or ``()``; 0 for nominal cells. The delay stays below one step. If not given,
+            the ranges themselves.
+        breaths: how many breaths have noise.
+        smooth: represent the converter by noise of one step's width, since rounding has no
+            derivative; else the cells round.
+
+    Returns:
+        Cells of batch shape ``(n,)``.
+    """
+    n = pip.shape[0]
+    keys = jax.random.split(key, len(RANGES) + 3)
+    drawn = {}
+    for deviation_key, (name, (low, high)) in zip(keys, RANGES.items(), strict=False):
+        if spread is None:
+            drawn[name] = jax.random.uniform(deviation_key, (n,), minval=low, maxval=high)
+        else:
+            middle = _nominal(name)
+            low, high = low - middle, high - middle
+            value = jax.random.uniform(deviation_key, (n,), minval=low, maxval=high)
+            drawn[name] = middle + spread * value
+    # The order of these two keys is that with which the published weights were trained.
+    sd_key, noise_key = (keys[-3], keys[-2]) if smooth else (keys[-2], keys[-3])
+    sd = jax.random.uniform(sd_key, (n, 1, 1), minval=NOISE_SD[0], maxval=NOISE_SD[1])
+    shape = (n, breaths, protocol.INSPIRATION_STEPS)
+    noise = sd * jax.random.normal(noise_key, shape)
+    if smooth:
+        noise += QUANTUM * jax.random.uniform(keys[-1], shape, minval=-0.5, maxval=0.5)
+    quantum = jnp.full(n, 0.0 if smooth else QUANTUM)
+    if spread is not None:
+        scale = jnp.broadcast_to(spread, (n,))
+        noise = scale[:, None, None] * noise
+        quantum = jnp.where(scale > 0, quantum, 0.0)
+        drawn["delay"] = jnp.minimum(drawn["delay"], 0.99)
+    return _deviate(pip, drawn, quantum, noise)
+
+
+def _nominal(name: str) -> float:
+    """Value of a deviation that changes nothing."""
+    return 1.0 if name.endswith("scale") else 0.0
+
+
+def _deviate(pip: Any, deviations: Mapping[str, Any], quantum: Any, noise: Any) -> Scenario:
+    """Cells of a nominal PIP, cmH2O, with the deviations of :data:`RANGES`."""
+    peep = protocol.PEEP + deviations["peep_shift"]
     return Scenario(
-        pip=jnp.asarray(pip),
-        peep=jnp.asarray(peep),
-        start=jnp.asarray(peep + drawn["start_shift"]),
-        dt=jnp.asarray(protocol.DT * drawn["dt_scale"]),
-        r_scale=jnp.asarray(drawn["r_scale"]),
-        c_scale=jnp.asarray(drawn["c_scale"]),
-        delay=jnp.asarray(drawn["delay"]),
-        quantum=jnp.full(pip.shape, QUANTUM),
-        noise=jnp.asarray(drawn["noise"]),
+        pip=pip + deviations["pip_shift"],
+        peep=peep,
+        start=peep + deviations["start_shift"],
+        dt=protocol.DT * deviations["dt_scale"],
+        r_scale=deviations["r_scale"],
+        c_scale=deviations["c_scale"],
+        delay=deviations["delay"],
+        quantum=quantum,
+        noise=noise,
     )
 
 

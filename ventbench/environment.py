@@ -31,7 +31,7 @@ def _table(values: NDArray[np.float64], scenario: Scenario) -> Array:
 
 
 @flax.struct.dataclass
-class Bench:
+class LoopState:
     """A batch of plants in mid-breath.
 
     Attributes:
@@ -56,10 +56,10 @@ def vary(plant: Plant, scenario: Scenario) -> Plant:
     return plant.vary(scenario.r_scale, scenario.c_scale)  # type: ignore[attr-defined]
 
 
-def start_breath(plant: Plant, scenario: Scenario) -> Bench:
+def start_breath(plant: Plant, scenario: Scenario) -> LoopState:
     """Lungs at rest at the start of an inspiration, the bias flow of the expiration still on."""
     bias = _table(_EXPIRATORY, scenario)[-1]
-    return Bench(
+    return LoopState(
         plant.init(scenario.start, scenario.peep),
         scenario.start,
         jnp.full_like(scenario.start, bias),
@@ -72,33 +72,35 @@ def target(scenario: Scenario, step: Array | int) -> Array:
 
 
 def observe(
-    scenario: Scenario, bench: Bench, breath: Array | int, step: Array | int
+    scenario: Scenario, loop: LoopState, breath: Array | int, step: Array | int
 ) -> Observation:
     """What the controller sees at a step of an inspiration.
 
     Args:
         scenario: the cells.
-        bench: their plants now.
+        loop: their plants now.
         breath: index of the breath.
         step: index of the step in the breath, below ``INSPIRATION_STEPS``.
     """
-    measured = bench.pressure + scenario.noise[..., breath, step]
+    measured = loop.pressure + scenario.noise[..., breath, step]
     quantum = jnp.where(scenario.quantum > 0, scenario.quantum, 1.0)
     measured = jnp.where(scenario.quantum > 0, jnp.round(measured / quantum) * quantum, measured)
     ahead = jnp.stack(
         [target(scenario, step + 1 + k) for k in range(protocol.TARGETS_AHEAD)], axis=-1
     )
     now = jnp.broadcast_to(target(scenario, step), measured.shape)
-    return Observation(step * scenario.dt, scenario.dt, measured, now, ahead, bench.previous)
+    return Observation(step * scenario.dt, scenario.dt, measured, now, ahead, loop.previous)
 
 
-def inspire(plant: Plant, scenario: Scenario, bench: Bench, u_in: Array) -> tuple[Bench, Array]:
+def inspire(
+    plant: Plant, scenario: Scenario, loop: LoopState, u_in: Array
+) -> tuple[LoopState, Array]:
     """Apply one inspiratory command, clipped to the valve's range.
 
     Args:
         plant: the varied plants.
         scenario: the cells.
-        bench: their plants now.
+        loop: their plants now.
         u_in: what the controller asked for, %, shape ``(...)``.
 
     Returns:
@@ -106,15 +108,15 @@ def inspire(plant: Plant, scenario: Scenario, bench: Bench, u_in: Array) -> tupl
     """
     applied = jnp.clip(u_in, 0.0, protocol.U_MAX)
     # The held command reaches the valve `delay` of a step late: over this step it averages to
-    late = (1.0 - scenario.delay) * applied + scenario.delay * bench.previous
-    state, pressure = plant.step(bench.plant, late, jnp.zeros_like(late), scenario.dt)
-    return Bench(state, pressure, applied), applied
+    late = (1.0 - scenario.delay) * applied + scenario.delay * loop.previous
+    state, pressure = plant.step(loop.plant, late, jnp.zeros_like(late), scenario.dt)
+    return LoopState(state, pressure, applied), applied
 
 
 def expire(
-    plant: Plant, scenario: Scenario, bench: Bench, step: Array | int
-) -> tuple[Bench, Array]:
+    plant: Plant, scenario: Scenario, loop: LoopState, step: Array | int
+) -> tuple[LoopState, Array]:
     """Apply the hard-coded expiratory command of a step; likewise."""
-    u_in = jnp.broadcast_to(_table(_EXPIRATORY, scenario)[step], bench.pressure.shape)
-    state, pressure = plant.step(bench.plant, u_in, jnp.ones_like(u_in), scenario.dt)
-    return Bench(state, pressure, u_in), u_in
+    u_in = jnp.broadcast_to(_table(_EXPIRATORY, scenario)[step], loop.pressure.shape)
+    state, pressure = plant.step(loop.plant, u_in, jnp.ones_like(u_in), scenario.dt)
+    return LoopState(state, pressure, u_in), u_in

@@ -24,7 +24,7 @@ from ventbench.interfaces import Plant
 from ventbench.lungs import LUNG_IDS, scored_lung
 from ventbench.plants import frozen
 from ventbench.scenario import Scenario
-from ventbench.training.rl import breaths
+from ventbench.training.rl import episodes
 
 #: What an observation holds, in order, each of the order of 1: pressure / 40, target / 40, the
 #: next ten targets / 40, command before / 50 - 1, time in s, control step / 0.03.
@@ -34,29 +34,29 @@ Floats = NDArray[np.float32]
 
 
 @jax.jit
-def _start(plant: Plant, cell: Scenario) -> tuple[env.Bench, Array]:
-    bench = env.start_breath(env.vary(plant, cell), cell)
-    return bench, _seen(cell, bench, 0)
+def _start(plant: Plant, cell: Scenario) -> tuple[env.LoopState, Array]:
+    loop = env.start_breath(env.vary(plant, cell), cell)
+    return loop, _seen(cell, loop, 0)
 
 
 @jax.jit
 def _step(
-    plant: Plant, cell: Scenario, bench: env.Bench, u_in: Array, step: Array
-) -> tuple[env.Bench, Array, Array]:
-    bench, _ = env.inspire(env.vary(plant, cell), cell, bench, u_in)
+    plant: Plant, cell: Scenario, loop: env.LoopState, u_in: Array, step: Array
+) -> tuple[env.LoopState, Array, Array]:
+    loop, _ = env.inspire(env.vary(plant, cell), cell, loop, u_in)
     # The target holds to the last step; the observation after it is of the same kind.
     after = jnp.minimum(step + 1, protocol.INSPIRATION_STEPS - 1)
-    return bench, _seen(cell, bench, after), jnp.abs(bench.pressure - cell.pip)
+    return loop, _seen(cell, loop, after), jnp.abs(loop.pressure - cell.pip)
 
 
 @partial(jax.jit, static_argnames="vary")
 def _cell(key: Array, pip: Array, vary: bool) -> Scenario:
-    cells = breaths.sample(key, 1, first=pip, vary=vary)
+    cells = episodes.sample(key, 1, first=pip, vary=vary)
     return jax.tree.map(lambda leaf: leaf[0], cells)
 
 
-def _seen(cell: Scenario, bench: env.Bench, step: Array | int) -> Array:
-    seen = env.observe(cell, bench, 0, step)
+def _seen(cell: Scenario, loop: env.LoopState, step: Array | int) -> Array:
+    seen = env.observe(cell, loop, 0, step)
     values = [
         seen.pressure / 40.0,
         seen.target / 40.0,
@@ -108,7 +108,7 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
         low, high = np.full(OBSERVATION, -5.0, np.float32), np.full(OBSERVATION, 5.0, np.float32)
         self.observation_space = spaces.Box(low, high, dtype=np.float32)
-        self._bench: env.Bench | None = None
+        self._loop: env.LoopState | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -125,7 +125,7 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
                 cell = cell.replace(pip=self._pip + shift)  # type: ignore[attr-defined]
             self._cell: Scenario = cell
             self._plant = self._plants[LUNG_IDS.index(self._lung)]
-            self._bench, seen = _start(self._plant, cell)
+            self._loop, seen = _start(self._plant, cell)
         self._count = 0
         self._total = abs(float(cell.start) - float(cell.pip))
         return np.asarray(seen), self._info()
@@ -136,25 +136,25 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
         Raises:
             InputError: if no breath is under way, or the action is not finite.
         """
-        if self._bench is None or self._count >= breaths.STEPS:
+        if self._loop is None or self._count >= episodes.STEPS:
             raise InputError("no breath is under way: call reset() first")
         value = float(np.asarray(action, np.float32).reshape(-1)[0])
         if not np.isfinite(value):
             raise InputError(f"the action is {value}; it must be a number from -1 to 1")
         with precision.float32():
             u_in, step = jnp.asarray(50.0 + 50.0 * value), jnp.asarray(self._count)
-            self._bench, seen, error = _step(self._plant, self._cell, self._bench, u_in, step)
+            self._loop, seen, error = _step(self._plant, self._cell, self._loop, u_in, step)
         self._count += 1
         self._total += float(error)
-        ended = self._count == breaths.STEPS
+        ended = self._count == episodes.STEPS
         info = self._info()
         if ended:
             info["error"] = self._total / protocol.INSPIRATION_STEPS
-        return np.asarray(seen), -float(error) / breaths.REWARD_SCALE, ended, False, info
+        return np.asarray(seen), -float(error) / episodes.REWARD_SCALE, ended, False, info
 
     def _info(self) -> dict[str, Any]:
-        assert self._bench is not None
-        pressure = float(self._bench.pressure)
+        assert self._loop is not None
+        pressure = float(self._loop.pressure)
         return {"lung": self._lung, "pip": float(self._cell.pip), "pressure": pressure}
 
 

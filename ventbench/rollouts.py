@@ -103,22 +103,22 @@ class Expirations:
 def _breath(
     plant: Plant, controller: Controller, scenario: Scenario, whole: bool, state: Any, breath: Array
 ) -> tuple[Any, tuple[Inspirations, Expirations | None]]:
-    def inspire(carry: tuple[env.Bench, Any], step: Array) -> tuple[Any, Inspirations]:
-        bench, state = carry
-        state, requested = controller.step(state, env.observe(scenario, bench, breath, step))
-        after, applied = env.inspire(plant, scenario, bench, requested)
-        return (after, state), Inspirations(bench.pressure, requested, applied)
+    def inspire(carry: tuple[env.LoopState, Any], step: Array) -> tuple[Any, Inspirations]:
+        loop, state = carry
+        state, requested = controller.step(state, env.observe(scenario, loop, breath, step))
+        after, applied = env.inspire(plant, scenario, loop, requested)
+        return (after, state), Inspirations(loop.pressure, requested, applied)
 
-    def expire(bench: env.Bench, step: Array) -> tuple[env.Bench, Expirations]:
-        after, u_in = env.expire(plant, scenario, bench, step)
-        return after, Expirations(bench.pressure, u_in)
+    def expire(loop: env.LoopState, step: Array) -> tuple[env.LoopState, Expirations]:
+        after, u_in = env.expire(plant, scenario, loop, step)
+        return after, Expirations(loop.pressure, u_in)
 
     steps = jnp.arange(protocol.BREATH_STEPS)
     start = (env.start_breath(plant, scenario), state)
-    (bench, state), inspirations = jax.lax.scan(inspire, start, steps[:INSPIRATION])
+    (loop, state), inspirations = jax.lax.scan(inspire, start, steps[:INSPIRATION])
     expirations = None
     if whole:
-        _, expirations = jax.lax.scan(expire, bench, steps[INSPIRATION:])
+        _, expirations = jax.lax.scan(expire, loop, steps[INSPIRATION:])
     return state, (inspirations, expirations)
 
 

@@ -17,7 +17,7 @@ from ventbench.lungs import LUNG_IDS, LUNGS, RECORDED_LUNGS
 from ventbench.plants import frozen
 from ventbench.plants.frozen import BY_ALL, Seen, fingerprints
 from ventbench.precision import float64
-from ventbench.training.manifest import reference
+from ventbench.training.simulator import reference_session
 
 NAMES = (frozen.MEMBERS, frozen.LEARNED, frozen.SEEN)
 
@@ -143,7 +143,7 @@ def test_lungs_tells_settings_and_errors(official):
         low, high = about["held_out_ci95"]
         assert 0.0 < low < about["held_out_mae"] < high
         assert official.sessions.table[about["session"]].lung == setting.id
-        assert about["session"] == reference(official.sessions, setting.id)
+        assert about["session"] == reference_session(official.sessions, setting.id)
     lungs["R5C10"]["R"] = 0.0  # a copy
     assert official.lungs()["R5C10"]["R"] == 5.0
 

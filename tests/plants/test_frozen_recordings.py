@@ -17,7 +17,7 @@ from ventbench.plants.stacking import nominal_plants
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.precision import float64
 from ventbench.recordings import join, load
-from ventbench.training.freeze import MEASURED, RECONSTRUCTED
+from ventbench.training.simulator import MEASURED, RECONSTRUCTED
 
 single_compartments = partial(nominal_plants, single_compartment)
 two_balloons = partial(nominal_plants, two_balloon)

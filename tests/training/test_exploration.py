@@ -16,12 +16,19 @@ from ventbench.lungs import LUNG_IDS, lung
 from ventbench.metrics.safety import longest_run
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.recordings import load, write
-from ventbench.training.disturbances import RANGES, Disturbance, Ranges, draw
-from ventbench.training.exploration import Limits, PlantBench, explore
+from ventbench.training.exploration import (
+    RANGES,
+    Disturbance,
+    ExplorationRanges,
+    Limits,
+    SimulatedVentilator,
+    draw_disturbances,
+    explore,
+)
 
 INSPIRATION = protocol.INSPIRATION_STEPS
-HELD = Ranges((0.0, 0.0, 0.0), (50.0, 50.0), (0.5, 0.5), (50.0, 50.0))
-STILL = Ranges((1.0, 0.5, 0.2), (0.0, 0.0), (0.3, 0.6), (0.0, 0.0))
+HELD = ExplorationRanges((0.0, 0.0, 0.0), (50.0, 50.0), (0.5, 0.5), (50.0, 50.0))
+STILL = ExplorationRanges((1.0, 0.5, 0.2), (0.0, 0.0), (0.3, 0.6), (0.0, 0.0))
 
 
 def disturbance(boundary, u, begin, end) -> Disturbance:
@@ -49,7 +56,7 @@ def test_a_triangle_rises_to_its_middle_and_falls():
 
 def test_draws_stay_in_their_ranges_and_have_their_share():
     ranges = RANGES["R5C20"]
-    found = draw(np.random.default_rng(0), ranges, 4000)
+    found = draw_disturbances(np.random.default_rng(0), ranges, 4000)
     assert np.mean(found.boundary) == pytest.approx(0.25, abs=0.03)
     for boundary, low, high in ((True, *ranges.boundary_u), (False, *ranges.triangular_u)):
         u = found.u[found.boundary == boundary]
@@ -63,12 +70,12 @@ def test_draws_stay_in_their_ranges_and_have_their_share():
     assert inner.max() <= 0.5 + 1e-3
 
 
-def bench(lung_id="R20C50", width=6, **options) -> PlantBench:
-    return PlantBench(single_compartment(lung(lung_id)), width, **options)
+def ventilator(lung_id="R20C50", width=6, **options) -> SimulatedVentilator:
+    return SimulatedVentilator(single_compartment(lung(lung_id)), width, **options)
 
 
 def test_without_disturbance_it_is_the_pid():
-    found = explore(bench(), "R20C50", 6, ranges=STILL)
+    found = explore(ventilator(), "R20C50", 6, ranges=STILL)
     pid, state = PID(*STILL.gains), None
     with precision.float64():
         for step in range(INSPIRATION):
@@ -81,7 +88,7 @@ def test_without_disturbance_it_is_the_pid():
 
 
 def test_expirations_are_the_hard_coded_ones():
-    found = explore(bench(), "R20C50", 6)
+    found = explore(ventilator(), "R20C50", 6)
     steps = np.arange(INSPIRATION, protocol.BREATH_STEPS)
     np.testing.assert_array_equal(found.u_in[:, INSPIRATION:], [expiratory.u_in(steps)] * 6)
     np.testing.assert_array_equal(found.u_out[:, INSPIRATION:], 1)
@@ -90,7 +97,7 @@ def test_expirations_are_the_hard_coded_ones():
 
 @pytest.mark.parametrize("lung_id", LUNG_IDS)
 def test_breaths_of_every_lung_are_varied_and_safe(lung_id):
-    found = explore(bench(lung_id, width=48, noise=0.2), lung_id, 48, seed=3)
+    found = explore(ventilator(lung_id, width=48, noise=0.2), lung_id, 48, seed=3)
     assert found.notes == ()
     assert set(found.lung_ids) == {lung_id}
     assert np.ptp(found.u_in[:, 5]) > 20.0
@@ -101,14 +108,14 @@ def test_breaths_of_every_lung_are_varied_and_safe(lung_id):
 
 
 def test_the_same_seed_gives_the_same_breaths_and_another_others():
-    first, again, other = (explore(bench(), "R5C20", 12, seed=seed) for seed in (1, 1, 2))
+    first, again, other = (explore(ventilator(), "R5C20", 12, seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first.u_in, again.u_in)
     np.testing.assert_array_equal(first.pressure, again.pressure)
     assert np.abs(first.u_in - other.u_in).max() > 1.0
 
 
 def test_breaths_can_be_written_and_read(tmp_path):
-    found = explore(bench(width=5), "R20C50", 7)
+    found = explore(ventilator(width=5), "R20C50", 7)
     assert len(found) == 7
     write(found, tmp_path / "explored.csv")
     again = load(tmp_path / "explored.csv")
@@ -161,9 +168,9 @@ def test_exploring_stops_after_three_vented_breaths():
 
 def test_unknown_lungs_and_no_breaths_are_errors():
     with pytest.raises(InputError, match="no ranges to explore R50C10 in; they exist for R5C10"):
-        explore(bench(), "R50C10", 1)
+        explore(ventilator(), "R50C10", 1)
     with pytest.raises(InputError, match="ask for one at least"):
-        explore(bench(), "R5C10", 0)
+        explore(ventilator(), "R5C10", 0)
 
 
 @pytest.mark.parametrize("plant", ["frozen", "physics"])

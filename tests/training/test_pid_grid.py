@@ -1,22 +1,199 @@
-"""The compiled grid against the scorer's rollout, one PID after the other."""
+"""The PID grid: against the scorer's rollout, in parts, its table, picture, result and command."""
 
 from __future__ import annotations
 
+import io
+import json
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from ventbench import precision, protocol, rollouts
+from ventbench.cli import app
 from ventbench.controllers.pid import PID
-from ventbench.lungs import LUNGS
+from ventbench.errors import InputError
+from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.metrics.waveform import run_error
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, take
 from ventbench.scenario import nominal
 from ventbench.training import pid_grid
+from ventbench.training.executor import executor
+from ventbench.training.pid_grid import PIDGrid
+
+GAINS = np.array([(p, i, d) for p in (0.0, 2.0, 5.0) for i in (0.0, 4.0) for d in (0.0, 1.0)])
+PLANTS = {lung.id: single_compartment(lung) for lung in LUNGS[:3]}
+SETTINGS = {"version": "textbook"}
+
+
+def search(**options) -> PIDGrid:
+    return pid_grid.search(PLANTS, settings=SETTINGS, gains=GAINS, part=5, **options)
+
+
+@pytest.fixture(scope="module")
+def whole() -> PIDGrid:
+    return search()
+
+
+def test_parts_make_up_the_whole_grid(whole):
+    expected = pid_grid.errors(stack(list(PLANTS.values())), GAINS)
+    np.testing.assert_allclose(whole.error, expected, rtol=1e-6)
+    assert whole.lungs == tuple(PLANTS)
+    assert whole.pips == protocol.PIPS
+
+
+def test_tells_how_far_it_is():
+    told = []
+    search(progress=lambda done, total: told.append((done, total)))
+    sizes = 6 * np.array([0, 5, 5, 2] + 2 * [5, 5, 2])
+    assert told == [(done, 3 * 12 * 6) for done in np.cumsum(sizes)]
+
+
+def test_goes_on_after_ctrl_c_without_computing_anything_twice(whole, tmp_path):
+    calls = []
+
+    def counted(plant, gains):
+        calls.append(len(gains))
+        return pid_grid.errors(stack([plant]), gains)[0]
+
+    def stop(done, total):
+        if done >= total / 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        search(folder=tmp_path, errors_of=counted, progress=stop)
+    assert sorted(path.name for path in tmp_path.glob("*.npy"))[:2] == [
+        "R5C10-0.npy", "R5C10-10.npy",
+    ]  # fmt: skip
+    before = len(calls)
+    assert 0 < before < 9
+    found = search(folder=tmp_path, errors_of=counted)
+    np.testing.assert_array_equal(found.error, whole.error)
+    assert len(calls) == 9
+    assert sum(calls) == 3 * len(GAINS)
+    search(folder=tmp_path, errors_of=counted)
+    assert len(calls) == 9
+
+
+def test_parts_of_another_search_are_refused(tmp_path):
+    search(folder=tmp_path)
+    with pytest.raises(InputError, match=r"other settings \(simulators\); delete it"):
+        pid_grid.search(PLANTS, settings={"version": "x"}, gains=GAINS, part=5, folder=tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"not an array"], ids=["empty", "text"])
+def test_a_damaged_part_is_named(tmp_path, content):
+    search(folder=tmp_path)
+    (tmp_path / "R5C20-5.npy").write_bytes(content)
+    with pytest.raises(InputError, match=r"R5C20-5\.npy is damaged, delete it"):
+        search(folder=tmp_path)
+    np.save(tmp_path / "R5C20-5.npy", np.zeros((5, 5), np.float32))
+    with pytest.raises(InputError, match=r"R5C20-5\.npy holds float32 \(5, 5\)"):
+        search(folder=tmp_path)
+
+
+def test_parts_may_end_in_any_order(whole):
+    with ThreadPoolExecutor(3) as pool:
+        np.testing.assert_allclose(search(pool=pool).error, whole.error, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_processes_give_the_same(whole):
+    with executor(2) as pool:
+        np.testing.assert_allclose(search(pool=pool).error, whole.error, rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_dask_gives_the_same_grid(whole, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="the extra ventbench[dask] is missing")
+    started = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None,
+        host="127.0.0.1", local_directory=str(tmp_path),
+    )  # fmt: skip
+    with started as cluster, executor(0, cluster.scheduler_address) as pool:
+        found = search(pool=pool, folder=tmp_path / "parts")
+    np.testing.assert_allclose(found.error, whole.error, rtol=1e-6)
+    assert len(list((tmp_path / "parts").glob("*.npy"))) == 9
+
+
+def test_the_table_is_the_grid(whole, tmp_path):
+    whole.save(tmp_path / "grid.parquet")
+    found = pid_grid.load_grid(tmp_path / "grid.parquet")
+    assert (found.lungs, found.pips) == (whole.lungs, whole.pips)
+    np.testing.assert_array_equal(found.gains, whole.gains)
+    np.testing.assert_array_equal(found.error, whole.error)
+
+
+def test_another_table_is_refused(tmp_path):
+    path = tmp_path / "x.parquet"
+    path.write_bytes(b"PAR1")
+    with pytest.raises(InputError, match=r"x\.parquet is not a table of `ventbench tune pid`"):
+        pid_grid.load_grid(path)
+
+
+def test_the_summary_names_the_least_errors():
+    error = np.array([[[1.0, 5.0], [2.0, 2.0]], [[1.0, 1.0], [1.5, 1.5]]], np.float32)
+    gains = np.array([(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)])
+    found = PIDGrid(("R5C10", "R5C20"), (10.0, 15.0), gains, error).summary()
+    assert found["lungs"]["R5C10"] == {"gains": [4.0, 5.0, 6.0], "error": 2.0}
+    assert found["lungs"]["R5C20"] == {"gains": [1.0, 2.0, 3.0], "error": 1.0}
+    assert found["single"] == {
+        "gains": [4.0, 5.0, 6.0], "error": 1.75, "lungs": {"R5C10": 2.0, "R5C20": 1.5},
+    }  # fmt: skip
+    assert found["trajectories"] == 8
+
+
+def test_the_picture_has_a_row_a_lung_and_one_for_all(whole):
+    pytest.importorskip("matplotlib", reason="the extra ventbench[view] is missing")
+    from matplotlib.image import imread
+
+    from ventbench.views import gain_map
+
+    pictures = [gain_map.png(whole), gain_map.png(whole), gain_map.png(whole, each=False)]
+    assert pictures[0] == pictures[1]
+    heights = [imread(io.BytesIO(picture)).shape[0] for picture in pictures]
+    assert heights[0] > 2 * heights[2]
+
+
+@pytest.fixture
+def small(monkeypatch):
+    monkeypatch.setattr(pid_grid, "paper_gains", lambda: GAINS)
+
+
+def test_the_command_writes_table_plot_and_result(small, tmp_path):
+    run = CliRunner().invoke(app, ["tune", "pid", "--all", "--out", str(tmp_path), "--json", "-"])
+    assert run.exit_code == 0, run.output
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["best.json", "grid.parquet", "grid.png"]
+    result = json.loads((tmp_path / "best.json").read_text())
+    assert tuple(result["lungs"]) == LUNG_IDS
+    table = pid_grid.load_grid(tmp_path / "grid.parquet")
+    gains, error = table.best()
+    assert result["single"]["gains"] == list(gains)
+    assert result["single"]["error"] == pytest.approx(error)
+    assert result["simulators"]["version"] == 1
+
+
+def test_the_command_for_one_lung(small, tmp_path):
+    arguments = ["tune", "pid", "--lung", "R20C50", "--out", str(tmp_path)]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    result = json.loads((tmp_path / "best.json").read_text())
+    assert tuple(result["lungs"]) == ("R20C50",)
+    assert "single" not in result
+
+
+@pytest.mark.parametrize("which", [[], ["--all", "--robust"], ["--lung", "R5C10", "--all"]])
+def test_the_command_wants_to_know_which_lungs(which):
+    run = CliRunner().invoke(app, ["tune", "pid", *which])
+    assert isinstance(run.exception, InputError)
+    assert "one of them" in str(run.exception)
 
 
 def test_the_papers_values():
-    gains = pid_grid.gains()
+    gains = pid_grid.paper_gains()
     assert gains.shape == (8000, 3)
     for column in gains.T:
         expected = [*np.arange(10) / 10, *range(1, 11)]
@@ -43,25 +220,17 @@ def test_an_error_is_that_of_the_scored_run():
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)
 
 
-def test_the_last_batch_may_be_short(monkeypatch):
+def test_the_last_batch_may_be_short():
     plants = stack([single_compartment(LUNGS[0])])
     gains = np.array([(p, 1.0, 0.0) for p in range(5)], float)
-    whole, told = pid_grid.errors(plants, gains), []
-    monkeypatch.setattr(pid_grid, "BATCH", 2)
-    np.testing.assert_allclose(pid_grid.errors(plants, gains, progress=told.append), whole, 1e-6)
-    assert told == [12, 24, 30]
-
-
-def test_best_is_the_least_mean():
-    error = np.array([[[1.0, 5.0], [2.0, 2.0]], [[1.0, 1.0], [1.5, 1.5]]])
-    assert pid_grid.best(error) == 1
-    assert pid_grid.best(error[1:]) == 0
+    whole = pid_grid.errors(plants, gains)
+    np.testing.assert_allclose(pid_grid.errors(plants, gains, batch=2), whole, 1e-6)
 
 
 @pytest.mark.slow
 def test_the_best_single_set_on_the_frozen_simulators_is_that_of_the_submission():
     from ventbench.plants import frozen
 
-    gains = pid_grid.gains()
-    error = pid_grid.errors(frozen.load().plants, gains)
-    assert gains[pid_grid.best(error)].tolist() == [6.0, 6.0, 0.3]
+    error = pid_grid.errors(frozen.load().plants, gains := pid_grid.paper_gains())
+    grid = pid_grid.PIDGrid(LUNG_IDS, protocol.PIPS, gains, error)
+    assert grid.best()[0] == (6.0, 6.0, 0.3)

@@ -7,7 +7,7 @@ import pytest
 
 from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
-from ventbench.training import freeze
+from ventbench.training.simulator import train_simulator
 
 
 @pytest.mark.slow
@@ -20,7 +20,7 @@ def test_leads_to_the_frozen_simulators(public_recordings, tmp_path):
     which are float32, 0.02 cmH2O.
     """
     official = frozen.load()
-    found = freeze.train(public_recordings, tmp_path)
+    found = train_simulator(public_recordings, tmp_path)
     for key in ("format", "version", "kind", "recordings", "split", "recipe", "sessions"):
         assert found.manifest[key] == official.manifest[key], key
     np.testing.assert_array_equal(found.seen.key, official.seen.key)

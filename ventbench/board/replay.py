@@ -103,8 +103,8 @@ def _pressures(plants: Plant, cells: Scenario, requested: Array) -> Array:
         varied = env.vary(plant, cells)
         start = env.start_breath(varied, cells)
 
-        def step(bench: env.Bench, u_in: Array) -> tuple[env.Bench, Array]:
-            after, _ = env.inspire(varied, cells, bench, u_in)
+        def step(loop: env.LoopState, u_in: Array) -> tuple[env.LoopState, Array]:
+            after, _ = env.inspire(varied, cells, loop, u_in)
             return after, after.pressure
 
         def inspiration(commands: Array) -> Array:

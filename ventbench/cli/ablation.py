@@ -35,15 +35,15 @@ def controllers(
     """
     from ventbench.plants import frozen
     from ventbench.training.ablation import controllers as work
-    from ventbench.training.residual import Recipe
+    from ventbench.training.residual import ResidualConfig
 
-    recipe = Recipe(updates=updates)
-    known = work.variants(recipe)
+    config = ResidualConfig(updates=updates)
+    known = work.variants(config)
     _check(only, known)
     with bars() as shown:
         task = shown.add_task("controllers", total=1.0)
         runs = work.compare(
-            frozen.load(), out, range(seeds), recipe=recipe, only=only,
+            frozen.load(), out, range(seeds), config=config, only=only,
             progress=lambda what, share: shown.update(task, completed=share, description=what),
         )  # fmt: skip
     table = work.summary(runs)
@@ -77,11 +77,11 @@ def networks(
 
     Example: `ventbench study networks --recordings ../shared/recordings`
     """
-    from ventbench.training import freeze
+    from ventbench.training import simulator
     from ventbench.training.ablation import networks as work
 
     folder = recordings_folder(recordings)
-    _check(only, work.variants(freeze.ARCHITECTURE))
+    _check(only, work.variants(simulator.ARCHITECTURE))
     with bars() as shown:
         task = shown.add_task("networks", total=1.0)
         breaths = work.compare(

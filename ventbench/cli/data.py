@@ -68,8 +68,10 @@ def explore(
     from ventbench.training import exploration
 
     chosen = load_simulators(plant).plant(lung)
-    bench = exploration.PlantBench(chosen, min(breaths, _TOGETHER), noise=noise, seed=seed)
-    made = exploration.explore(bench, lung, breaths, seed=seed)
+    ventilator = exploration.SimulatedVentilator(
+        chosen, min(breaths, _TOGETHER), noise=noise, seed=seed
+    )
+    made = exploration.explore(ventilator, lung, breaths, seed=seed)
     recordings.write(made, out)
     for note in made.notes:
         typer.echo(f"note: {note}", err=True)

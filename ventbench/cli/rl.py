@@ -75,13 +75,14 @@ def _train(
     from rich.console import Console
 
     from ventbench.errors import InputError
-    from ventbench.lungs import LUNG_IDS, scored_lung
-    from ventbench.training.rl import command
+    from ventbench.lungs import scored_lung
+    from ventbench.training.rl.train import train_dqn, train_ppo
+    from ventbench.training.trained import ALL, NETWORKS
 
     if lung is not None and all_lungs:
         raise InputError("--lung and --all exclude each other; give one, or none for all seven")
-    targets = [command.ALL] if all_lungs else [*LUNG_IDS, command.ALL]
-    targets = targets if lung is None else [scored_lung(lung).id]
+    networks = (ALL,) if all_lungs else NETWORKS if lung is None else (scored_lung(lung).id,)
+    train = {"ppo": train_ppo, "dqn": train_dqn}[method]
     with bars() as shown:
         tasks: dict[str, Any] = {}
 
@@ -91,12 +92,12 @@ def _train(
             said = f"{method}, {label}: {best:.3f} cmH2O"
             shown.update(tasks[label], completed=share, description=said)
 
-        about = command.run(
-            method, targets, range(seed, seed + seeds), out, steps=steps, progress=progress
+        trained = train(
+            networks, out, seeds=range(seed, seed + seeds), steps=steps, progress=progress
         )
-    emit(about, json)
+    emit(trained.report, json)
     console = Console(stderr=str(json) == "-")
-    console.print(_trained(about))
+    console.print(_trained(trained.report))
     console.print(f"wrote {out}", markup=False, highlight=False)
 
 

@@ -100,9 +100,9 @@ def simulator(
 
     Example: `ventbench train simulator --recordings ../shared/recordings --out runs/simulators`
     """
-    from ventbench.training import freeze
+    from ventbench.training.simulator import train_simulator
 
-    _train(freeze.train, recordings_folder(recordings), out)
+    _train(train_simulator, recordings_folder(recordings), out)
 
 
 def _train(run: Any, folder: Path, out: Path) -> None:

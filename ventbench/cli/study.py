@@ -59,10 +59,12 @@ def samples(
             said = f"{method}: {best:.3f} cmH2O"
             shown.update(tasks[method], completed=done, description=said)
 
-        found = work.samples(scored_lung(lung), range(seeds), out, share=share, progress=progress)
-    from ventbench.training import study_plot
+        found = work.sample_efficiency(
+            scored_lung(lung), range(seeds), out, share=share, progress=progress
+        )
+    from ventbench.views import learning_curves
 
-    picture = study_plot.png(found)
+    picture = learning_curves.png(found)
     files.write_atomically(out / "study-samples.png", lambda file: file.write(picture))
     table = found.summary()
     emit({"lung": found.lung, "methods": _plain(table)}, json)

@@ -53,13 +53,14 @@ def residual(
 
     from ventbench.errors import InputError
     from ventbench.lungs import LUNG_IDS, scored_lung
-    from ventbench.training.residual import ALL, Recipe
+    from ventbench.training.residual import ResidualConfig
+    from ventbench.training.trained import ALL
 
     if lung is not None and every:
         raise InputError("give --lung ID or --all, not both")
     names = (ALL,) if every else LUNG_IDS if lung is None else (scored_lung(lung).id,)
-    standard = Recipe()
-    recipe = Recipe(
+    standard = ResidualConfig()
+    config = ResidualConfig(
         updates=updates or standard.updates,
         members=members,
         spread=randomise,
@@ -67,20 +68,18 @@ def residual(
         lam=penalty,
         round_robin=round_robin,
     )
-    result = _train(names, out, recipe, seed)
+    result = _train(names, out, config, seed)
     emit(result, json)
     console = Console(stderr=str(json) == "-")
     console.print(_table(result))
     console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
 
 
-def _train(names: tuple[str, ...], out: Path, recipe: Any, seed: int) -> dict[str, Any]:
+def _train(names: tuple[str, ...], out: Path, config: Any, seed: int) -> dict[str, Any]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from ventbench.plants import frozen
-    from ventbench.training.residual.command import train
+    from ventbench.training.residual import train_residual
 
-    simulators = frozen.load()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
     with Progress(*columns, transient=True) as bars:
         tasks: dict[str, Any] = {}
@@ -89,19 +88,12 @@ def _train(names: tuple[str, ...], out: Path, recipe: Any, seed: int) -> dict[st
             if what not in tasks:
                 tasks[what] = bars.add_task(what, total=None)
             if progress is not None:
-                text = f"{what}: {progress.loss:.3f} cmH2O"
-                done, total = progress.update, progress.updates
+                done, total, loss = progress
+                text = f"{what}: {loss:.3f} cmH2O"
                 bars.update(tasks[what], description=text, completed=done, total=total)
 
-        return train(
-            simulators.ensemble,
-            names,
-            out,
-            simulators=simulators.about(),
-            recipe=recipe,
-            seed=seed,
-            report=report,
-        )
+        trained = train_residual(names, out, config=config, seed=seed, progress=report)
+    return trained.report
 
 
 def _table(result: dict[str, Any]) -> Any:

@@ -11,7 +11,7 @@ from ventbench.cli.options import JsonFile, emit
 
 app = typer.Typer(name="tune", help="Search for gains.", no_args_is_help=True)
 
-TABLE, PLOT, RESULT, PARTS = "grid.parquet", "grid.png", "best.json", "parts"
+PLOT = "grid.png"
 
 
 @app.callback()
@@ -51,23 +51,13 @@ def pid(
 
     from ventbench.errors import InputError
     from ventbench.lungs import LUNG_IDS, scored_lung
+    from ventbench.training.pid_grid import RESULT, TABLE
 
     if (lung is not None) + every + robust != 1:
         raise InputError("say for which lungs: --lung LUNG, --all or --robust, one of them")
     names = (scored_lung(lung).id,) if lung is not None else LUNG_IDS
-    grid = _search(names, out, workers, scheduler)
-    import shutil
-
-    from ventbench import files
-    from ventbench.plants import frozen
-    from ventbench.training import pid_tuning
-
-    result = pid_tuning.summary(grid, each=not robust, single=lung is None)
-    result["simulators"] = frozen.load().about()
-    pid_tuning.write(out / TABLE, grid)
-    files.write_json(out / RESULT, result)
+    grid, result = _search(names, out, workers, scheduler, not robust)
     written = [TABLE, RESULT, *_plot(out / PLOT, grid, not robust, lung is None)]
-    shutil.rmtree(out / PARTS)
     emit(result, json)
     console = Console(stderr=str(json) == "-")
     console.print(_table(result))
@@ -75,7 +65,9 @@ def pid(
         console.print(f"wrote {out / name}", markup=False, highlight=False, soft_wrap=True)
 
 
-def _search(names: tuple[str, ...], out: Path, workers: int, scheduler: str | None) -> Any:
+def _search(
+    names: tuple[str, ...], out: Path, workers: int, scheduler: str | None, each: bool
+) -> tuple[Any, dict[str, Any]]:
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -84,29 +76,19 @@ def _search(names: tuple[str, ...], out: Path, workers: int, scheduler: str | No
         TimeRemainingColumn,
     )
 
-    from ventbench.lungs import LUNG_IDS
-    from ventbench.plants import frozen
-    from ventbench.plants.stacking import take
-    from ventbench.training.executor import executor
-    from ventbench.training.pid_tuning import tune
+    from ventbench.training.pid_grid import tune_pid
 
-    simulators = frozen.load()
-    plants = {name: take(simulators.plants, LUNG_IDS.index(name)) for name in names}
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     )  # fmt: skip
-    with executor(workers, scheduler) as pool, Progress(*columns, transient=True) as bars:
+    with Progress(*columns, transient=True) as bars:
         task = bars.add_task("trajectories", total=None)
 
         def progress(done: int, total: int) -> None:
             bars.update(task, completed=done, total=total)
 
-        return tune(
-            plants,
-            identity=simulators.about(),
-            folder=out / PARTS,
-            pool=pool,
-            progress=progress,
+        return tune_pid(
+            names, out, workers=workers, scheduler=scheduler, each=each, progress=progress
         )
 
 

@@ -1,8 +1,16 @@
-"""A PID and a network that corrects it, which looks back at this breath and at the one before."""
+"""A PID and a network that corrects it, which looks back at this breath and at the one before.
+
+Its weights file is an ``.npz`` of plain arrays, as the submissions read it. For each network, by
+the id of its lung or ``all``: ``ID.gains`` (P, I, D), ``ID.limit``, ``ID.windows`` (pressures,
+commands, ahead) and the layers ``ID.w0``, ``ID.b0``, ``ID.w1``, ...
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import pairwise
+from pathlib import Path
+from typing import Any
 
 import flax.struct
 import jax
@@ -10,9 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench import protocol
+from ventbench import files, protocol
 from ventbench.controllers.expiratory import BIAS
 from ventbench.controllers.pid import PID, PIDState
+from ventbench.errors import InputError
 from ventbench.interfaces import Observation
 
 #: Scales that bring the features to the order of 1: cmH2O of errors and of targets, % of commands,
@@ -197,3 +206,51 @@ def _push(value: Array, before: Array) -> Array:
 def _append(trace: Array, value: Array) -> Array:
     """Latest last."""
     return jnp.concatenate([trace, value[..., None]], axis=-1)[..., 1:]
+
+
+def save_weights(path: Path, controllers: Mapping[str, Residual]) -> None:
+    """Write controllers, by lung id or ``all``, in one step; equal ones give equal bytes."""
+    arrays: dict[str, Any] = {}
+    for name, controller in controllers.items():
+        pid, windows = controller.pid, (controller.pressures, controller.commands, controller.ahead)
+        arrays[f"{name}.gains"] = np.array([float(gain) for gain in (pid.P, pid.I, pid.D)])
+        arrays[f"{name}.limit"] = np.array(controller.limit)
+        arrays[f"{name}.windows"] = np.array(windows, np.int64)
+        for k, (weights, biases) in enumerate(controller.layers):
+            arrays[f"{name}.w{k}"] = np.asarray(weights, np.float32)
+            arrays[f"{name}.b{k}"] = np.asarray(biases, np.float32)
+    files.write_atomically(path, lambda file: np.savez(file, **arrays))
+
+
+def load_weights(path: Path) -> dict[str, Residual]:
+    """Read what :func:`save_weights` wrote, with leaves of the precision that is in force.
+
+    Raises:
+        InputError: if it is not such a file.
+        OSError: if it cannot be read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            names = [key.removesuffix(".gains") for key in arrays.files if key.endswith(".gains")]
+            return {name: _read_network(arrays, name) for name in names}
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} holds no residual controllers: {error!r}") from error
+
+
+def _read_network(arrays: Any, name: str) -> Residual:
+    count = sum(key.startswith(f"{name}.w") for key in arrays.files) - 1  # without `windows`
+    dtype = jnp.zeros(()).dtype
+    layers = tuple(
+        (jnp.asarray(arrays[f"{name}.w{k}"], dtype), jnp.asarray(arrays[f"{name}.b{k}"], dtype))
+        for k in range(count)
+    )
+    P, I, D = arrays[f"{name}.gains"]  # noqa: E741
+    pressures, commands, ahead = (int(x) for x in arrays[f"{name}.windows"])
+    return Residual(
+        PID(P, I, D),
+        layers,
+        pressures=pressures,
+        commands=commands,
+        ahead=ahead,
+        limit=float(arrays[f"{name}.limit"]),
+    )

@@ -75,8 +75,8 @@ def _strong(tree: Any) -> Any:
 
 
 @jax.jit
-def _begin(plants: Plant, scenario: Scenario) -> tuple[Plant, env.Bench]:
-    def begin(plant: Plant) -> tuple[Plant, env.Bench]:
+def _begin(plants: Plant, scenario: Scenario) -> tuple[Plant, env.LoopState]:
+    def begin(plant: Plant) -> tuple[Plant, env.LoopState]:
         varied = env.vary(plant, scenario)
         return varied, env.start_breath(varied, scenario)
 
@@ -84,18 +84,18 @@ def _begin(plants: Plant, scenario: Scenario) -> tuple[Plant, env.Bench]:
 
 
 @jax.jit
-def _observe(scenario: Scenario, bench: env.Bench, breath: Array, step: Array) -> Observation:
-    return jax.vmap(lambda bench: env.observe(scenario, bench, breath, step))(bench)
+def _observe(scenario: Scenario, loop: env.LoopState, breath: Array, step: Array) -> Observation:
+    return jax.vmap(lambda loop: env.observe(scenario, loop, breath, step))(loop)
 
 
 @jax.jit
 def _inspire(
-    plants: Plant, scenario: Scenario, bench: env.Bench, u_in: Array
-) -> tuple[env.Bench, Array]:
-    def inspire(plant: Plant, bench: env.Bench, u_in: Array) -> tuple[env.Bench, Array]:
-        return env.inspire(plant, scenario, bench, u_in)
+    plants: Plant, scenario: Scenario, loop: env.LoopState, u_in: Array
+) -> tuple[env.LoopState, Array]:
+    def inspire(plant: Plant, loop: env.LoopState, u_in: Array) -> tuple[env.LoopState, Array]:
+        return env.inspire(plant, scenario, loop, u_in)
 
-    return _strong(jax.vmap(inspire)(plants, bench, u_in))
+    return _strong(jax.vmap(inspire)(plants, loop, u_in))
 
 
 def step_through(
@@ -129,9 +129,9 @@ def step_through(
         session = runner.start(submission, each)
     try:
         for breath in range(protocol.BREATHS):
-            bench = rest
+            loop = rest
             for step in range(protocol.INSPIRATION_STEPS):
-                rows = pack(_observe(scenario, bench, breath, step))
+                rows = pack(_observe(scenario, loop, breath, step))
                 live = max(1, cells - len(session.failures))
                 start = time.perf_counter()
                 with precision.float32():
@@ -139,8 +139,8 @@ def step_through(
                 seconds.append((time.perf_counter() - start) / live)
                 commands = commands.reshape(batch)
                 now = (..., breath, step)
-                pressure[now], requested[now] = bench.pressure, commands
-                bench, applied[now] = _inspire(varied, scenario, bench, commands)
+                pressure[now], requested[now] = loop.pressure, commands
+                loop, applied[now] = _inspire(varied, scenario, loop, commands)
         failures = dict(session.failures)
     finally:
         session.close()

@@ -1,4 +1,9 @@
-"""Breaths to learn a simulator from: a safe PID, disturbed as in the paper, on any plant."""
+"""Breaths to learn a simulator from: a safe PID with the paper's disturbances, on any ventilator.
+
+Paper, section 4.2 and its table. A *boundary* disturbance falls linearly to zero from the start of
+the breath. A *triangular* one rises linearly from zero at a first time and falls back to zero at a
+second one. Where the paper's text ends at "t_min", t_max is meant.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +23,83 @@ from ventbench.interfaces import Plant
 from ventbench.lungs import lung as parse_lung
 from ventbench.metrics.safety import limit
 from ventbench.recordings import Breaths, make_breaths
-from ventbench.training.disturbances import RANGES, Disturbance, Ranges, draw
+
+Floats = NDArray[np.float64]
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class ExplorationRanges:
+    """How one lung is explored.
+
+    Attributes:
+        gains: P, I, D of the PID, %/cmH2O.
+        boundary_u: what is added at the start of a breath, %.
+        boundary_s: how long it takes to fall to zero, s.
+        triangular_u: the largest of what is added, %.
+        triangular_s: where its two ends lie, s.
+        boundary_share: of breaths with the boundary disturbance.
+    """
+
+    gains: tuple[float, float, float]
+    boundary_u: Range
+    boundary_s: Range
+    triangular_u: Range
+    triangular_s: Range = (0.1, 0.5)
+    boundary_share: float = 0.25
+
+
+#: The paper's table.
+RANGES = {
+    "R5C10": ExplorationRanges((1.0, 0.5, 0.0), (50.0, 100.0), (0.3, 0.6), (-20.0, 40.0)),
+    "R5C20": ExplorationRanges((1.0, 3.0, 0.0), (50.0, 100.0), (0.4, 0.8), (-20.0, 60.0)),
+    "R5C50": ExplorationRanges((2.0, 4.0, 0.0), (75.0, 100.0), (1.0, 1.5), (-20.0, 60.0)),
+    "R20C10": ExplorationRanges((1.0, 0.5, 0.0), (50.0, 100.0), (0.3, 0.6), (-20.0, 40.0)),
+    "R20C20": ExplorationRanges((0.0, 3.0, 0.0), (30.0, 60.0), (0.5, 1.0), (-20.0, 40.0)),
+    "R20C50": ExplorationRanges((0.0, 4.0, 0.0), (70.0, 100.0), (1.0, 1.5), (-20.0, 40.0)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Disturbance:
+    """One a breath; every array has shape ``(n,)``.
+
+    Attributes:
+        boundary: of which kind.
+        u: the largest of what is added, %.
+        begin: where it begins, s; 0 for a boundary.
+        end: where it ends, s.
+    """
+
+    boundary: NDArray[np.bool_]
+    u: Floats
+    begin: Floats
+    end: Floats
+
+    def at(self, time: float) -> Floats:
+        """What is added to the PID's command, %, ``(n,)``."""
+        width = self.end - self.begin
+        falling = (self.end - time) / width
+        rising = (time - self.begin) / width
+        tent = 2.0 * np.minimum(rising, falling)
+        return self.u * np.clip(np.where(self.boundary, falling, tent), 0.0, 1.0)
+
+
+def draw_disturbances(
+    random: np.random.Generator, ranges: ExplorationRanges, n: int
+) -> Disturbance:
+    """Draw disturbances; the ends of a triangular one are two times drawn from its range."""
+    boundary = random.random(n) < ranges.boundary_share
+    u = np.where(
+        boundary, random.uniform(*ranges.boundary_u, n), random.uniform(*ranges.triangular_u, n)
+    )
+    ends = np.sort(random.uniform(*ranges.triangular_s, (n, 2)), axis=1)
+    ends[:, 1] = np.maximum(ends[:, 1], ends[:, 0] + 1e-3)  # never of no width
+    fall = random.uniform(*ranges.boundary_s, n)
+    return Disturbance(
+        boundary, u, np.where(boundary, 0.0, ends[:, 0]), np.where(boundary, fall, ends[:, 1])
+    )
+
 
 Floats = NDArray[np.float64]
 
@@ -40,7 +121,7 @@ class Limits:
     vented: int = 3
 
 
-class Bench(Protocol):
+class Ventilator(Protocol):
     """What can be explored, ``width`` lungs side by side; a ventilator has one.
 
     Attributes:
@@ -60,8 +141,8 @@ class Bench(Protocol):
         ...
 
 
-class PlantBench:
-    """A plant as a bench.
+class SimulatedVentilator:
+    """A plant as a ventilator.
 
     Args:
         plant: one lung.
@@ -95,20 +176,20 @@ class PlantBench:
 
 
 def explore(
-    bench: Bench,
+    ventilator: Ventilator,
     lung_id: str,
     breaths: int,
     *,
     seed: int = 0,
-    ranges: Ranges | None = None,
+    ranges: ExplorationRanges | None = None,
     limits: Limits | None = None,
     pips: tuple[float, ...] = protocol.PIPS,
     peep: float = protocol.PEEP,
 ) -> Breaths:
-    """Explore a bench; the PIPs take turns.
+    """Explore a ventilator; the PIPs take turns.
 
     Args:
-        bench: see :class:`Bench`.
+        ventilator: see :class:`Ventilator`.
         lung_id: the setting of its lung, written with the breaths.
         breaths: how many.
         seed: of all disturbances; the same ones for the same seed and width.
@@ -132,16 +213,16 @@ def explore(
     columns: list[tuple[Floats, Floats, Floats]] = []
     done = vented = 0
     while done < breaths and vented < limits.vented:
-        pip = np.array([pips[(done + k) % len(pips)] for k in range(bench.width)])
-        added = draw(random, ranges, bench.width)
-        found = _breaths(bench, pip, peep, ranges, limits, added)
+        pip = np.array([pips[(done + k) % len(pips)] for k in range(ventilator.width)])
+        added = draw_disturbances(random, ranges, ventilator.width)
+        found = _breaths(ventilator, pip, peep, ranges, limits, added)
         columns.append(found)
-        done += bench.width
+        done += ventilator.width
         vented += int(np.sum(found[1][:, : protocol.INSPIRATION_STEPS].any(axis=1)))
     together = zip(*columns, strict=True)
     u_in, u_out, pressure = (np.concatenate(column)[:breaths] for column in together)
     n = len(u_in)
-    time = np.tile(bench.dt * np.arange(protocol.BREATH_STEPS), (n, 1))
+    time = np.tile(ventilator.dt * np.arange(protocol.BREATH_STEPS), (n, 1))
     made = make_breaths(
         np.arange(n) + 1, np.full(n, setting.R), np.full(n, setting.C), time, u_in, u_out, pressure
     )
@@ -152,15 +233,20 @@ def explore(
 
 
 def _breaths(
-    bench: Bench, pip: Floats, peep: float, ranges: Ranges, limits: Limits, added: Disturbance
+    ventilator: Ventilator,
+    pip: Floats,
+    peep: float,
+    ranges: ExplorationRanges,
+    limits: Limits,
+    added: Disturbance,
 ) -> tuple[Floats, Floats, Floats]:
-    """One breath on each lung of the bench: u_in, u_out and pressure, ``(width, steps)``."""
+    """One breath on each lung of the ventilator: u_in, u_out and pressure, ``(width, steps)``."""
     ease = np.minimum(limit(pip), limits.ease)
-    vented = np.zeros(bench.width, bool)
-    before = integral = derivative = np.zeros(bench.width)
-    a = bench.dt / (bench.dt + TIME_CONSTANT)
+    vented = np.zeros(ventilator.width, bool)
+    before = integral = derivative = np.zeros(ventilator.width)
+    a = ventilator.dt / (ventilator.dt + TIME_CONSTANT)
     P, I, D = ranges.gains  # noqa: E741
-    pressure, rows = bench.start(peep), []
+    pressure, rows = ventilator.start(peep), []
     for step in range(protocol.BREATH_STEPS):
         if step < protocol.INSPIRATION_STEPS:
             # A sensor that gives no number must not poison the averages; it vents, see below.
@@ -168,16 +254,16 @@ def _breaths(
             integral = integral + a * (error - integral)
             derivative = derivative + a * (error - before - derivative)
             before = error
-            wanted = P * error + I * integral + D * derivative + added.at(step * bench.dt)
+            wanted = P * error + I * integral + D * derivative + added.at(step * ventilator.dt)
             # "Not below" instead of "above", so that a sensor that gives no number is unsafe.
             vented |= ~(pressure <= limits.vent)
             closed = vented | ~(pressure <= ease)
             u_in = np.where(closed, 0.0, np.clip(wanted, 0.0, protocol.U_MAX))
             u_out = vented.astype(float)
         else:
-            u_in = np.full(bench.width, float(expiratory.u_in(step)))
-            u_out = np.ones(bench.width)
+            u_in = np.full(ventilator.width, float(expiratory.u_in(step)))
+            u_out = np.ones(ventilator.width)
         rows.append((u_in, u_out, pressure))
-        pressure = bench.step(u_in, u_out)
+        pressure = ventilator.step(u_in, u_out)
     u_in, u_out, pressure = (np.stack(column, axis=1) for column in zip(*rows, strict=True))
     return u_in, u_out, pressure

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from ventbench.training.pid_tuning import Grid
+    from ventbench.training.pid_grid import PIDGrid
 
 #: Values of D that are shown beside the best one, %/cmH2O.
 SLICES = (0.0, 0.3, 1.0, 3.0, 10.0)
@@ -20,7 +20,7 @@ SATURATION = 3.0
 DPI = 110
 
 
-def png(grid: Grid, *, each: bool = True, single: bool = True) -> bytes:
+def png(grid: PIDGrid, *, each: bool = True, single: bool = True) -> bytes:
     """Return the PNG: one row a lung, and one for the mean of all.
 
     Args:

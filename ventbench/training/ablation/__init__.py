@@ -1,1 +1,1 @@
-"""What each part of a design is worth: variants that differ in one thing, beside one base."""
+"""Ablations: variants of a design that differ from a base in one thing."""

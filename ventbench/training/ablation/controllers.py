@@ -1,4 +1,4 @@
-"""Parts of the residual controller: what is left when one is taken away or changed."""
+"""Ablation of the residual controller: its score when one part is removed or changed."""
 
 from __future__ import annotations
 
@@ -8,18 +8,28 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
-from ventbench import files, precision, protocol
+from ventbench import files, precision, protocol, rollouts
+from ventbench.board.replay import spread
+from ventbench.interfaces import Controller
 from ventbench.lungs import LUNG_IDS
+from ventbench.metrics import safety
+from ventbench.metrics.waveform import run_error
 from ventbench.plants import frozen
+from ventbench.plants.stacking import take
 from ventbench.resume import WorkFolder
+from ventbench.submissions.scoring import protocol_cells
 from ventbench.training import pid_grid
-from ventbench.training.residual import Recipe, fit
-from ventbench.training.residual.measure import DRAWS, measure
+from ventbench.training.residual import ResidualConfig, fit
 
-#: What the others are compared with.
+#: Published draws to score on.
+DRAWS = 20
+
+#: Name of the variant that all others are compared with.
 BASE = "base"
 
 #: Figures of one training.
@@ -37,25 +47,25 @@ class Variant:
 
     Attributes:
         meaning: in words.
-        recipe: of the training.
+        config: settings of the training.
         direct: whether the network commands alone, without a PID to correct.
     """
 
     meaning: str
-    recipe: Recipe
+    config: ResidualConfig
     direct: bool = False
 
 
-def variants(recipe: Recipe) -> dict[str, Variant]:
-    """Variants of a recipe by name, each other in one thing than the base."""
+def variants(config: ResidualConfig) -> dict[str, Variant]:
+    """Variants of the settings by name; each differs from the base in one thing."""
 
     def changed(meaning: str, **fields: Any) -> Variant:
-        return Variant(meaning, replace(recipe, **fields))
+        return Variant(meaning, replace(config, **fields))
 
-    wide = max(recipe.widths)
+    wide = max(config.widths)
     return {
-        BASE: Variant("as the submission is trained", recipe),
-        "direct": Variant("no PID: the network commands alone", recipe, direct=True),
+        BASE: Variant("as the submission is trained", config),
+        "direct": Variant("no PID: the network commands alone", config, direct=True),
         "one simulator": changed("the official simulator of each lung alone", members=1),
         "no deviations": changed("benches without noise, delay or other R and C", spread=0.0),
         "no agreement": changed("what the simulators disagree about is free", agreement=0.0),
@@ -64,10 +74,10 @@ def variants(recipe: Recipe) -> dict[str, Variant]:
         "no commands before": changed("it sees no earlier commands of this breath", commands=0),
         "twice as far back": changed(
             "twice as many errors and commands",
-            pressures=2 * recipe.pressures, commands=2 * recipe.commands,
+            pressures=2 * config.pressures, commands=2 * config.commands,
         ),
-        "narrow": changed("a quarter of the width", widths=(wide // 4,) * len(recipe.widths)),
-        "wide": changed("twice the width", widths=(2 * wide,) * len(recipe.widths)),
+        "narrow": changed("a quarter of the width", widths=(wide // 4,) * len(config.widths)),
+        "wide": changed("twice the width", widths=(2 * wide,) * len(config.widths)),
         "shallow": changed("one hidden layer", widths=(wide,)),
         "deep": changed("four hidden layers", widths=(wide,) * 4),
     }  # fmt: skip
@@ -78,7 +88,7 @@ def compare(
     out: Path,
     seeds: Sequence[int],
     *,
-    recipe: Recipe,
+    config: ResidualConfig,
     only: Sequence[str] | None = None,
     draws: int = DRAWS,
     gains: Gains | None = None,
@@ -86,14 +96,14 @@ def compare(
 ) -> pd.DataFrame:
     """Train one network for all six lungs by each variant with each seed.
 
-    What is finished is read from ``out``, where ``runs.csv`` and ``summary.csv`` are written.
+    Finished trainings are read from ``out``, where ``runs.csv`` and ``summary.csv`` are written.
 
     Args:
         simulators: to train through and to score on.
         out: folder.
         seeds: of the trainings.
-        recipe: of the base.
-        only: names of variants; all if not given. The base is always there.
+        config: settings of the base.
+        only: names of variants; all if not given. The base is always included.
         draws: published draws to score on.
         gains: P, I, D of the PID; the best single set of the paper's grid if not given.
         progress: see :data:`Progress`.
@@ -105,13 +115,13 @@ def compare(
         InputError: if ``out`` holds other trainings.
         FloatingPointError: if a training diverges.
     """
-    chosen = {k: v for k, v in variants(recipe).items() if only is None or k in (BASE, *only)}
+    chosen = {k: v for k, v in variants(config).items() if only is None or k in (BASE, *only)}
     gains = gains or best_single(simulators)
     about = {
-        "recipe": asdict(recipe), "gains": list(gains), "draws": draws,
+        "config": asdict(config), "gains": list(gains), "draws": draws,
         "simulators": simulators.about(),
     }  # fmt: skip
-    work, found = WorkFolder(out / "rows", about), []
+    work, rows = WorkFolder(out / "rows", about), []
     todo = [(name, seed) for name in chosen for seed in seeds]
     for number, (name, seed) in enumerate(todo):
         variant = chosen[name]
@@ -126,11 +136,11 @@ def compare(
             tell: Callable[[float], None] = tell,
         ) -> dict[str, float]:  # fmt: skip
             checkpoint = work.checkpoint(part)
-            return _trained(simulators, own, variant.recipe, seed, draws, checkpoint, tell)
+            return _trained(simulators, own, variant.config, seed, draws, checkpoint, tell)
 
         tell(0.0)
-        found.append({"variant": name, "seed": seed} | work.get(part, make))
-    runs = pd.DataFrame(found)
+        rows.append({"variant": name, "seed": seed} | work.get(part, make))
+    runs = pd.DataFrame(rows)
     files.write_text(out / "runs.csv", runs.round(5).to_csv(index=False))
     files.write_text(out / "summary.csv", summary(runs).round(4).to_csv(index=False))
     return runs
@@ -138,7 +148,7 @@ def compare(
 
 def best_single(simulators: frozen.Frozen) -> Gains:
     """P, I, D of the paper's grid with the lowest mean error over the six lungs."""
-    grid = pid_grid.gains()
+    grid = pid_grid.paper_gains()
     error = pid_grid.errors(simulators.plants, grid).mean(axis=(0, 2))
     P, I, D = (float(x) for x in grid[int(np.argmin(error))])  # noqa: E741
     return P, I, D
@@ -161,19 +171,54 @@ def summary(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def _trained(
-    simulators: frozen.Frozen, gains: Gains, recipe: Recipe, seed: int, draws: int,
+    simulators: frozen.Frozen, gains: Gains, config: ResidualConfig, seed: int, draws: int,
     checkpoint: Path, tell: Callable[[float], None],
 ) -> dict[str, float]:  # fmt: skip
     with precision.float32():
         controller = fit(
-            jax.tree.map(np.asarray, simulators.ensemble), gains, recipe=recipe, seed=seed,
-            checkpoint=checkpoint, progress=lambda told: tell(told.update / told.updates),
+            jax.tree.map(np.asarray, simulators.ensemble), gains, config=config, seed=seed,
+            checkpoint=checkpoint, progress=lambda done, total, loss: tell(done / total),
             keep=True,
         )  # fmt: skip
-    error, exploitation, _ = measure(simulators, [controller] * len(LUNG_IDS), protocol.PIPS, draws)
+    error, exploitation, _ = score_controllers(
+        simulators, [controller] * len(LUNG_IDS), protocol.PIPS, draws
+    )
     checkpoint.unlink()
     return {
         "nominal": float(error[:, 0].mean()),
         "draws": float(error[:, 1:].mean()) if draws else float("nan"),
         "exploitation": exploitation,
     }
+
+
+def score_controllers(
+    simulators: frozen.Frozen,
+    controllers: Sequence[Controller],
+    pips: Sequence[float] = protocol.PIPS,
+    draws: int = DRAWS,
+) -> tuple[NDArray[np.float64], float, bool]:
+    """Score pure controllers.
+
+    Args:
+        simulators: six lungs.
+        controllers: one a lung.
+        pips: cmH2O, length P.
+        draws: published draws to score on as well.
+
+    Returns:
+        Errors, cmH2O, ``(6, 1 + draws, P)``, the nominal ones first; the exploitation index,
+        cmH2O; whether all runs were safe.
+    """
+    errors, requested, safe = [], [], True
+    with precision.float64():
+        cells = jax.tree.map(jnp.asarray, protocol_cells(tuple(pips), draws))
+        pip, dt = np.asarray(cells.pip)[..., None], np.asarray(cells.dt)[..., None]
+        for index, controller in enumerate(controllers):
+            plant = jax.tree.map(jnp.asarray, take(simulators.plants, index))
+            wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), controller)
+            run, _ = rollouts.closed_loop(plant, wide, cells)
+            errors.append(run_error(run.pressure, pip[..., None]))
+            requested.append(np.asarray(run.requested))
+            safe &= bool(np.all(safety.safe(run.pressure, pip, dt)))
+    nominal = np.stack(requested)[None][:, :, 0]
+    return np.stack(errors), float(spread(simulators, tuple(pips), nominal).mean()), safe

@@ -1,4 +1,4 @@
-"""Parts of the paper's simulator: windows, width, depth and boundary networks, on real breaths."""
+"""Ablation of the paper's simulator: windows, width, depth and boundary networks."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from ventbench.plants.learned import Architecture
 from ventbench.plants.stacking import VmappedPlant
 from ventbench.recordings import Breaths
 from ventbench.resume import WorkFolder
-from ventbench.training import freeze
-from ventbench.training import learned as networks
+from ventbench.training import simulator
+from ventbench.training.learned import LearnedConfig
 
-#: What the others are compared with.
+#: Name of the variant that all others are compared with.
 BASE = "base"
 
 #: Called with what is trained and the share of all that is done.
@@ -45,8 +45,9 @@ def compare(
     folder: Path,
     out: Path,
     *,
-    base: Architecture = freeze.ARCHITECTURE,
-    recipe: networks.Recipe | None = None,
+    base: Architecture = simulator.ARCHITECTURE,
+    config: LearnedConfig | None = None,
+    members: int = simulator.MEMBERS,
     only: Sequence[str] | None = None,
     progress: Progress = lambda *_: None,
 ) -> pd.DataFrame:
@@ -59,8 +60,9 @@ def compare(
         folder: of the public recordings.
         out: folder.
         base: architecture that the others differ from in one thing.
-        recipe: of all trainings.
-        only: names of variants; all if not given. The base is always there.
+        config: settings of all trainings.
+        members: folds of the measured breaths, and networks of each lung.
+        only: names of variants; all if not given. The base is always included.
         progress: see :data:`Progress`.
 
     Returns:
@@ -70,17 +72,19 @@ def compare(
         InputError: if a recording is malformed, or ``out`` is of other trainings.
         OSError: if a file cannot be read or written.
     """
-    recipe = recipe or networks.Recipe()
-    data = freeze.recordings(folder)
+    config = config or LearnedConfig()
+    data = simulator.load_recordings(folder, members)
     scored = np.isin(data.measured.lung_ids, LUNG_IDS)
     judged, fold = data.measured.select(scored), data.fold[scored]
-    hashes = {name: files.sha256(folder / name) for name in (freeze.MEASURED, freeze.RECONSTRUCTED)}
+    hashes = {
+        name: files.sha256(folder / name) for name in (simulator.MEASURED, simulator.RECONSTRUCTED)
+    }
     chosen = {k: v for k, v in variants(base).items() if only is None or k in (BASE, *only)}
     about = {
-        "architecture": asdict(base), "recipe": asdict(recipe), "recordings": hashes,
-        "members": freeze.MEMBERS,
+        "architecture": asdict(base), "config": asdict(config), "recordings": hashes,
+        "members": members,
     }  # fmt: skip
-    work, found = WorkFolder(out / "rows", about), []
+    work, tables = WorkFolder(out / "rows", about), []
     for number, (name, architecture) in enumerate(chosen.items()):
 
         def tell(share: float, name: str = name, number: int = number) -> None:
@@ -89,14 +93,14 @@ def compare(
         def make(
             architecture: Architecture = architecture, tell: Callable[[float], None] = tell
         ) -> list[float]:
-            nets = _nets(data, architecture, recipe, work.checkpoint("network"), tell)
+            nets = _nets(data, architecture, config, members, work.checkpoint("network"), tell)
             return _errors(nets, judged, fold).tolist()
 
         tell(0.0)
         errors = work.get(name.replace(" ", "-"), make)
         columns = {"breath_id": judged.breath_id, "lung": judged.lung_ids, "error": errors}
-        found.append(pd.DataFrame({"variant": name} | columns))
-    breaths = pd.concat(found, ignore_index=True)
+        tables.append(pd.DataFrame({"variant": name} | columns))
+    breaths = pd.concat(tables, ignore_index=True)
     files.write_text(out / "breaths.csv", breaths.round(5).to_csv(index=False))
     files.write_text(out / "summary.csv", summary(breaths).round(4).to_csv(index=False))
     return breaths
@@ -119,20 +123,22 @@ def summary(breaths: pd.DataFrame) -> pd.DataFrame:
 
 
 def _nets(
-    data: freeze.Recordings, architecture: Architecture, recipe: networks.Recipe,
-    checkpoint: Path, tell: Callable[[float], None],
+    data: simulator.TrainingRecordings, architecture: Architecture, config: LearnedConfig,
+    count: int, checkpoint: Path, tell: Callable[[float], None],
 ) -> Any:  # fmt: skip
     """Networks of the scored lungs, leaves ``(members, 6, ...)``."""
     ids = [lung.id for lung in RECORDED_LUNGS]
     members = []
-    for member in range(freeze.MEMBERS):
+    for member in range(count):
         nets = []
         for name in LUNG_IDS:
             at = ids.index(name)
             number = member * len(ids) + at
-            net = freeze.network(data, RECORDED_LUNGS[at], number, architecture, recipe, checkpoint)
+            net = simulator.train_network(
+                data, RECORDED_LUNGS[at], number, architecture, config, checkpoint
+            )
             nets.append(net)
-            tell((member + len(nets) / len(LUNG_IDS)) / freeze.MEMBERS)
+            tell((member + len(nets) / len(LUNG_IDS)) / count)
         members.append(jax.tree.map(lambda *leaves: np.stack(leaves), *nets))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *members)
 

@@ -1,4 +1,4 @@
-"""Recorded inspirations as the arrays that the fit wants."""
+"""Recorded breaths as the arrays that the fit of the hybrid plant takes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SAMPLES = 33
 
 
 @flax.struct.dataclass
-class Inspirations:
+class InspirationData:
     """n inspirations, float64; what comes after the inspiration is not counted.
 
     Attributes:
@@ -63,7 +63,7 @@ def groups_of_sessions(sessions: Sessions) -> Groups:
     return Groups(jnp.asarray(lung), jnp.asarray(sessions.rigs()), jnp.asarray(index))
 
 
-def inspirations(breaths: Breaths, sessions: Sessions) -> Inspirations:
+def inspirations(breaths: Breaths, sessions: Sessions) -> InspirationData:
     """Arrange breaths for the fit; the pressure of each inspiratory sample but the first counts.
 
     Raises:
@@ -89,10 +89,44 @@ def inspirations(breaths: Breaths, sessions: Sessions) -> Inspirations:
         "pressure": np.where(counted, pressure, 0.0),
         "share": counted / total,
     }
-    return Inspirations(
+    return InspirationData(
         groups_of(breaths, sessions),
         **{name: jnp.asarray(value, float) for name, value in arrays.items()},
     )
+
+
+@flax.struct.dataclass
+class WholeBreaths:
+    """n measured breaths of T samples, float64; pressure 0 where none is known.
+
+    Attributes:
+        groups: setting, kind of rig and session.
+        pressure: cmH2O, shape ``(n, T)``.
+        u_in: %, likewise.
+        u_out: 0/1, likewise.
+        dt: s, likewise.
+        share: weight of each sample in its breath's error, likewise: the inspiration adds up to
+            one, and so does the expiration; all 0 for a breath that cannot be used.
+    """
+
+    groups: Groups
+    pressure: Array
+    u_in: Array
+    u_out: Array
+    dt: Array
+    share: Array
+
+
+def whole_breaths(breaths: Breaths, sessions: Sessions) -> WholeBreaths:
+    """Arrange whole breaths; one without a first pressure or an expiration counts for nothing."""
+    known = breaths.valid & np.isfinite(breaths.pressure)
+    opened = known & (breaths.u_out == 1)
+    usable = known[:, :1] & opened.any(axis=1, keepdims=True)
+    share = np.zeros(known.shape)
+    for part in (opened, known & (breaths.u_out == 0)):
+        share += usable * part / np.maximum(part.sum(axis=1, keepdims=True), 1)
+    arrays = (np.nan_to_num(breaths.pressure), breaths.u_in, breaths.u_out, breaths.dt, share)
+    return WholeBreaths(groups_of(breaths, sessions), *(jnp.asarray(x, float) for x in arrays))
 
 
 def _first(values: NDArray, fill: float) -> NDArray:

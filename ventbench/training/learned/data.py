@@ -1,4 +1,4 @@
-"""Recorded breaths, arranged for training."""
+"""Recorded inspirations as the arrays that the training of the learned plant takes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PAD_BREATHS, _PAD_STEPS = 128, 32
 
 
 @flax.struct.dataclass
-class Inspirations:
+class WindowedInspirations:
     """Training data: inspirations, step by step, padded; every array float32.
 
     Attributes:
@@ -50,7 +50,7 @@ def inspirations(
     pressure: Floats,
     window: int,
     weight: Floats | None = None,
-) -> Inspirations:
+) -> WindowedInspirations:
     """Arrange recorded breaths for training.
 
     Args:
@@ -117,10 +117,10 @@ def inspirations(
     arrays = {
         name: jnp.asarray(x, bool if x.dtype == bool else jnp.float32) for name, x in fields.items()
     }
-    return Inspirations(**arrays, count=jnp.asarray(n, jnp.int32))
+    return WindowedInspirations(**arrays, count=jnp.asarray(n, jnp.int32))
 
 
-def normalisation(data: Inspirations, tau: float) -> Normalisation:
+def normalisation(data: WindowedInspirations, tau: float) -> Normalisation:
     """Constants for the inputs and outputs of a network from what it will be trained on.
 
     Args:

@@ -1,7 +1,6 @@
 """A network that corrects a PID, trained through the simulators (the paper's controller)."""
 
-from ventbench.training.residual.fit import fit
-from ventbench.training.residual.recipe import Progress, Recipe
-from ventbench.training.residual.weights import ALL, load, save
+from ventbench.training.residual.fit import ResidualConfig, fit
+from ventbench.training.residual.train import train_residual
 
-__all__ = ["ALL", "Progress", "Recipe", "fit", "load", "save"]
+__all__ = ["ResidualConfig", "fit", "train_residual"]

@@ -75,9 +75,9 @@ def _pressures(plant: Plant, cells: Scenario, u_in: Array) -> Array:
     """Of one inspiration, cmH2O, ``(P, steps)``, from commands likewise."""
     varied = env.vary(plant, cells)
 
-    def step(bench: env.Bench, u_in: Array) -> tuple[env.Bench, Array]:
-        after, _ = env.inspire(varied, cells, bench, u_in)
-        return after, bench.pressure
+    def step(loop: env.LoopState, u_in: Array) -> tuple[env.LoopState, Array]:
+        after, _ = env.inspire(varied, cells, loop, u_in)
+        return after, loop.pressure
 
     return jax.lax.scan(step, env.start_breath(varied, cells), u_in.T)[1].T
 

@@ -1,94 +1,287 @@
-"""Training of the residual controller: gradients through simulators, Adam, one compiled scan."""
+"""Training of the residual controller: gradients through the simulators, Adam, one compiled scan.
+
+The paper's objective, the mean of ``|pressure - PIP| + lambda |correction|`` over inspirations, is
+differentiated through the controller, the valve and the simulator. Each update runs every lung at
+every PIP: once on the official simulator without noise, and several times with deviations drawn as
+those of the published draws are.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
 
+from ventbench import environment as env
 from ventbench import protocol
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import Residual, untrained
+from ventbench.draws import random_scenarios
 from ventbench.interfaces import Plant
 from ventbench.resume import Checkpoint, fingerprint
-from ventbench.training.residual.loss import disagreement
-from ventbench.training.residual.loss import loss as objective
-from ventbench.training.residual.randomise import scenarios
-from ventbench.training.residual.recipe import Progress, Recipe
+from ventbench.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class ResidualConfig:
+    """How a residual controller is trained; hashable, as it is part of what is compiled.
+
+    Attributes:
+        updates: of the network; the schedule stretches over them.
+        copies: runs of each lung at each PIP in an update: the first on the official simulator
+            without noise, the others on deviating benches.
+        learning_rate: peak of the cosine schedule of Adam.
+        weight_decay: of its weights.
+        lam: weight of the mean absolute correction, cmH2O for each %; the paper's lambda.
+        agreement: weight of the disagreement of the ensemble along the controller's own commands;
+            0 to let it live on what one simulator alone says.
+        first_breath: weight of the breath that is not scored; each scored one has 1.
+        widths: of the network's hidden layers.
+        pressures: errors of earlier steps that it sees.
+        commands: earlier commands that it sees.
+        ahead: steps of the breath before that it sees; 0 for none.
+        limit: largest correction, %.
+        members: of the ensemble of simulators, 1 (the official ones) to 5.
+        spread: how far deviations reach, as a multiple of the draws' ranges; 0 for none.
+        round_robin: whether each update takes one lung at one PIP, in turn, as in the paper,
+            instead of all of them.
+    """
+
+    updates: int = 3000
+    copies: int = 4
+    learning_rate: float = 4e-3
+    weight_decay: float = 1e-5
+    lam: float = 0.0
+    agreement: float = 1.0
+    first_breath: float = 0.25
+    widths: tuple[int, ...] = (64, 64)
+    pressures: int = 5
+    commands: int = 6
+    ahead: int = 6
+    limit: float = 100.0
+    members: int = 5
+    spread: float = 1.0
+    round_robin: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that cannot work.
+
+        Raises:
+            ValueError: naming the field and its value.
+        """
+        for name in ("updates", "copies", "learning_rate", "limit", "members"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"training: {name} = {getattr(self, name)} must be positive")
+        for name in (
+            "weight_decay",
+            "lam",
+            "agreement",
+            "first_breath",
+            "pressures",
+            "commands",
+            "ahead",
+        ):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"training: {name} = {getattr(self, name)} must not be negative")
+        if not 0 <= self.spread <= 4:
+            raise ValueError(f"training: spread = {self.spread} is outside 0..4")
+
+
+@jax.custom_vjp
+def valve(u_in: Array) -> Array:
+    """Clip a command to the valve's range, %, with a derivative where it leads back into it."""
+    return jnp.clip(u_in, 0.0, protocol.U_MAX)
+
+
+def _valve_forward(u_in: Array) -> tuple[Array, Array]:
+    return valve(u_in), u_in
+
+
+def _valve_backward(u_in: Array, gradient: Array) -> tuple[Array]:
+    # Beyond an end only what a step down the gradient can mend is told.
+    stuck = ((u_in > protocol.U_MAX) & (gradient < 0)) | ((u_in < 0) & (gradient > 0))
+    return (jnp.where(stuck, 0.0, gradient),)
+
+
+valve.defvjp(_valve_forward, _valve_backward)
+
+
+@flax.struct.dataclass
+class DifferentiableRun:
+    """One run of three inspirations; every array ``(..., BREATHS, INSPIRATION_STEPS)``.
+
+    Attributes:
+        pressure: true, cmH2O.
+        correction: of the PID's command, %.
+        u_in: command as applied, %.
+    """
+
+    pressure: Array
+    correction: Array
+    u_in: Array
+
+
+def run(controller: Residual, plant: Plant, cell: Scenario) -> DifferentiableRun:
+    """Run a controller.
+
+    Args:
+        controller: which.
+        plant: one lung.
+        cell: one cell, batch shape ``()``.
+    """
+    varied = env.vary(plant, cell)
+    start = env.start_breath(varied, cell)
+
+    def step(
+        carry: tuple[Any, env.LoopState], at: tuple[Array, Array]
+    ) -> tuple[Any, DifferentiableRun]:
+        state, loop = carry
+        breath, index = at
+        # In one scan over all breaths: half the compilation of a scan of scans.
+        loop = jax.tree.map(lambda new, old: jnp.where(index == 0, new, old), start, loop)
+        seen = env.observe(cell, loop, breath, index)
+        state, base, correction = controller.parts(state, seen)
+        after, applied = env.inspire(varied, cell, loop, valve(base + correction))
+        return (state, after), DifferentiableRun(loop.pressure, correction, applied)
+
+    count = jnp.arange(protocol.BREATHS * protocol.INSPIRATION_STEPS)
+    at = (count // protocol.INSPIRATION_STEPS, count % protocol.INSPIRATION_STEPS)
+    _, found = jax.lax.scan(step, (controller.init(()), start), at)
+    shape = (protocol.BREATHS, protocol.INSPIRATION_STEPS)
+    return jax.tree.map(lambda x: x.reshape(shape), found)
+
+
+def objective(
+    controller: Residual, plants: Plant, cells: Scenario, first_breath: float, lam: float
+) -> tuple[Array, Array]:
+    """Mean of ``|pressure - PIP| + lam |correction|`` over inspirations and runs.
+
+    Args:
+        controller: which.
+        plants: leaves ``(n, ...)``.
+        cells: batch shape ``(n,)``.
+        first_breath: weight of the first breath; the others have 1.
+        lam: cmH2O for each %.
+
+    Returns:
+        The loss, cmH2O, and the applied commands, %, ``(n, BREATHS, INSPIRATION_STEPS)``.
+    """
+    found = jax.vmap(run, (None, 0, 0))(controller, plants, cells)
+    scored = jnp.isin(jnp.arange(protocol.BREATHS), jnp.array(protocol.SCORED_BREATHS))
+    weight = jnp.where(scored, 1.0, first_breath)[:, None]
+    each = jnp.abs(found.pressure - cells.pip[:, None, None]) + lam * jnp.abs(found.correction)
+    return jnp.mean(each * weight) / jnp.mean(weight), found.u_in
+
+
+def disagreement(ensemble: Plant, cells: Scenario, u_in: Array) -> Array:
+    """How far the members of an ensemble answer differently to the same commands.
+
+    Args:
+        ensemble: leaves ``(members, n, ...)``, two members at least.
+        cells: batch shape ``(n,)``.
+        u_in: of one inspiration, %, shape ``(n, INSPIRATION_STEPS)``.
+
+    Returns:
+        Sample standard deviation over members of the pressure, mean over steps and cells, cmH2O:
+        the exploitation index, but for one breath.
+    """
+
+    def pressures(plant: Plant, cell: Scenario, u_in: Array) -> Array:
+        varied = env.vary(plant, cell)
+
+        def step(loop: env.LoopState, u_in: Array) -> tuple[env.LoopState, Array]:
+            after, _ = env.inspire(varied, cell, loop, u_in)
+            return after, loop.pressure
+
+        return jax.lax.scan(step, env.start_breath(varied, cell), u_in)[1]
+
+    each = jax.vmap(jax.vmap(pressures), (0, None, None))(ensemble, cells, u_in)
+    variance = jnp.var(each, axis=0, ddof=1)
+    # 1e-6 keeps the derivative finite where all members agree, as in the first step.
+    return jnp.mean(jnp.sqrt(variance + 1e-6))
+
+
+#: Called with the number of updates done, the number of all updates, and the mean loss since the
+#: last call, cmH2O.
+Progress = Callable[[int, int, float], None]
 
 #: Updates compiled into one scan; a checkpoint or a Ctrl-C falls between two of them.
 CHUNK = 50
 
 
-def _optimiser(recipe: Recipe) -> optax.GradientTransformation:
-    warm = max(recipe.updates // 50, 1)
+def _optimiser(config: ResidualConfig) -> optax.GradientTransformation:
+    warm = max(config.updates // 50, 1)
     schedule = optax.warmup_cosine_decay_schedule(
-        0.0, recipe.learning_rate, warm, max(recipe.updates, warm + 1)
+        0.0, config.learning_rate, warm, max(config.updates, warm + 1)
     )
     return optax.chain(
-        optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=recipe.weight_decay)
+        optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=config.weight_decay)
     )
 
 
-def _cells(number: Array, lungs: int, pips: int, recipe: Recipe) -> tuple[Array, Array]:
+def _cells(number: Array, lungs: int, pips: int, config: ResidualConfig) -> tuple[Array, Array]:
     """Lung and PIP of each run of an update."""
-    if recipe.round_robin:
-        cell = jnp.full(recipe.copies, number % (lungs * pips))
+    if config.round_robin:
+        cell = jnp.full(config.copies, number % (lungs * pips))
     else:
-        cell = jnp.repeat(jnp.arange(lungs * pips), recipe.copies)
+        cell = jnp.repeat(jnp.arange(lungs * pips), config.copies)
     return cell // pips, cell % pips
 
 
-@partial(jax.jit, static_argnames="recipe")
+@partial(jax.jit, static_argnames="config")
 def _advance(
     carry: tuple[Any, Any],
     controller: Residual,
     plants: Plant,
     key: Array,
     first: Array,
-    recipe: Recipe,
+    config: ResidualConfig,
 ) -> tuple[tuple[Any, Any], Array]:
     """``CHUNK`` updates, fewer at the end; returns layers, the optimiser's state and mean loss."""
-    optimiser = _optimiser(recipe)
+    optimiser = _optimiser(config)
     members, lungs = jax.tree.leaves(plants)[0].shape[:2]
     pips = jnp.asarray(protocol.PIPS, jnp.float32)
 
     def update(carry: tuple[Any, Any], number: Array) -> tuple[tuple[Any, Any], Array]:
         layers, state = carry
-        member_key, bench_key = jax.random.split(jax.random.fold_in(key, number))
-        lung, pip = _cells(number, lungs, len(protocol.PIPS), recipe)
-        nominal = jnp.arange(lung.size) % recipe.copies == 0
+        member_key, scenario_key = jax.random.split(jax.random.fold_in(key, number))
+        lung, pip = _cells(number, lungs, len(protocol.PIPS), config)
+        nominal = jnp.arange(lung.size) % config.copies == 0
         member = jax.random.randint(member_key, lung.shape, 0, members) * ~nominal
-        cells = scenarios(bench_key, pips[pip], nominal, recipe.spread)
+        cells = random_scenarios(
+            scenario_key, pips[pip], spread=config.spread * ~nominal, smooth=True
+        )
         those = jax.tree.map(lambda leaf: leaf[member, lung], plants)
 
         def value(layers: Any) -> Array:
             corrected = controller.replace(layers=layers)  # type: ignore[attr-defined]
-            error, u_in = objective(corrected, those, cells, recipe.first_breath, recipe.lam)
-            if recipe.agreement == 0 or members == 1:
+            error, u_in = objective(corrected, those, cells, config.first_breath, config.lam)
+            if config.agreement == 0 or members == 1:
                 return error
-            some = slice(None, None, recipe.copies)  # the official runs
+            some = slice(None, None, config.copies)  # the official runs
             every = jax.tree.map(lambda leaf: leaf[:, lung[some]], plants)
             cell = jax.tree.map(lambda x: x[some], cells)
             apart = disagreement(every, cell, u_in[some, protocol.SCORED_BREATHS[0]])
-            return error + recipe.agreement * apart
+            return error + config.agreement * apart
 
-        loss, gradient = jax.value_and_grad(value)(layers)
+        mean, gradient = jax.value_and_grad(value)(layers)
         updates, state = optimiser.update(gradient, state, layers)
         new = (optax.apply_updates(layers, updates), state)
-        last = number >= recipe.updates
-        return jax.tree.map(lambda a, b: jnp.where(last, a, b), carry, new), loss
+        last = number >= config.updates
+        return jax.tree.map(lambda a, b: jnp.where(last, a, b), carry, new), mean
 
     carry, losses = jax.lax.scan(update, carry, first + jnp.arange(CHUNK))
-    inside = first + jnp.arange(CHUNK) < recipe.updates
+    inside = first + jnp.arange(CHUNK) < config.updates
     return carry, jnp.sum(losses * inside) / jnp.maximum(jnp.sum(inside), 1)
 
 
@@ -96,10 +289,10 @@ def fit(
     plants: Plant,
     gains: tuple[float, float, float],
     *,
-    recipe: Recipe | None = None,
+    config: ResidualConfig | None = None,
     seed: int = 0,
     checkpoint: Path | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Progress | None = None,
     keep: bool = False,
 ) -> Residual:
     """Train the correction of a PID on one lung, or on several at once.
@@ -108,10 +301,10 @@ def fit(
     the update, so that an interrupted training continues as if it had not been.
 
     Args:
-        plants: simulators, leaves ``(members, lungs, ...)``; members beyond the recipe's are left
+        plants: simulators, leaves ``(members, lungs, ...)``; members beyond the settings' are left
             out.
         gains: P, I, D of the PID, %/cmH2O; they stay.
-        recipe: of the training.
+        config: settings of the training.
         seed: of the weights and the benches.
         checkpoint: file that the training is saved to every ``CHUNK`` updates and resumed from;
             deleted at the end.
@@ -125,36 +318,36 @@ def fit(
         InputError: if the checkpoint belongs to another training.
         FloatingPointError: if the loss is not finite; the checkpoint stays at the last good one.
     """
-    recipe = recipe or Recipe()
-    plants = jax.tree.map(lambda leaf: jnp.asarray(leaf[: recipe.members], jnp.float32), plants)
+    config = config or ResidualConfig()
+    plants = jax.tree.map(lambda leaf: jnp.asarray(leaf[: config.members], jnp.float32), plants)
     start_key, key = jax.random.split(jax.random.key(seed))
     like = Residual(
         PID(*(jnp.asarray(gain, jnp.float32) for gain in gains)),
         (),
-        pressures=recipe.pressures,
-        commands=recipe.commands,
-        ahead=recipe.ahead,
-        limit=recipe.limit,
+        pressures=config.pressures,
+        commands=config.commands,
+        ahead=config.ahead,
+        limit=config.limit,
     )
-    controller = untrained(start_key, like, recipe.widths)
-    carry: Any = (controller.layers, _optimiser(recipe).init(controller.layers))
+    controller = untrained(start_key, like, config.widths)
+    carry: Any = (controller.layers, _optimiser(config).init(controller.layers))
     settings = {
-        "recipe": dataclasses.asdict(recipe), "gains": list(gains), "seed": seed,
+        "config": dataclasses.asdict(config), "gains": list(gains), "seed": seed,
         "simulators": fingerprint(plants),
     }  # fmt: skip
     stored = Checkpoint(checkpoint, settings)
     carry, first = stored.restore(carry)
-    while first < recipe.updates:
-        new, loss = _advance(carry, like, plants, key, jnp.asarray(first), recipe)
+    while first < config.updates:
+        new, loss = _advance(carry, like, plants, key, jnp.asarray(first), config)
         loss = float(loss)
         if not np.isfinite(loss):
             raise FloatingPointError(
                 f"training diverged between updates {first} and {first + CHUNK}"
             )
-        carry, first = new, min(first + CHUNK, recipe.updates)
+        carry, first = new, min(first + CHUNK, config.updates)
         stored.save(carry, first)
         if progress is not None:
-            progress(Progress(first, recipe.updates, loss))
+            progress(first, config.updates, loss)
     if not keep:
         stored.delete()
     return controller.replace(layers=carry[0])  # type: ignore[attr-defined]

@@ -1,1 +1,1 @@
-"""Learning a correction of the PID: policy gradient through the simulator, PPO, DQN."""
+"""Reinforcement learning of a correction of the PID: policy gradient, PPO and DQN."""

@@ -11,9 +11,16 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from ventbench.controllers import rl_policy
+from ventbench.controllers.rl_policy import (
+    CHOICES,
+    FEATURES,
+    GreedyPolicy,
+    Parameters,
+    TanhNetwork,
+)
 from ventbench.interfaces import Plant
-from ventbench.training.rl import breaths, features, networks, returns
-from ventbench.training.rl.policies import CHOICES, Greedy
+from ventbench.training.rl import episodes
 
 
 @flax.struct.dataclass
@@ -21,11 +28,11 @@ class Replay:
     """Steps to learn from, the oldest overwritten first; N of them.
 
     Attributes:
-        features: before the choice, ``(N, COUNT)``.
+        features: before the choice, ``(N, FEATURES)``.
         choice: index into the corrections, ``(N,)``.
         reward: discounted sum of the next rewards, ``(N,)``.
         discount: of what follows them; 0 where the breath ends, ``(N,)``.
-        following: features then, ``(N, COUNT)``.
+        following: features then, ``(N, FEATURES)``.
     """
 
     features: Array
@@ -36,11 +43,11 @@ class Replay:
 
 
 @flax.struct.dataclass
-class State:
+class DQNState:
     """One training: both networks, optimiser, replay, key, iteration."""
 
-    online: networks.Parameters
-    target: networks.Parameters
+    online: Parameters
+    target: Parameters
     optimiser: Any
     replay: Replay
     key: Array
@@ -82,38 +89,38 @@ class DQN:
     explored: float = 0.4
 
     @property
-    def network(self) -> networks.Dense:
+    def network(self) -> TanhNetwork:
         """One output for each choice."""
-        return networks.Dense(self.widths, len(CHOICES), first=0.01)
+        return TanhNetwork(self.widths, len(CHOICES), first=0.01)
 
     @property
     def _optimiser(self) -> optax.GradientTransformation:
         schedule = optax.cosine_decay_schedule(self.learning_rate, self.iterations * self.updates)
         return optax.chain(optax.clip_by_global_norm(10.0), optax.adam(schedule))
 
-    def init(self, key: Array) -> State:
+    def init(self, key: Array) -> DQNState:
         """Start one training."""
         network_key, key = jax.random.split(key)
-        parameters = networks.start(self.network, network_key)
-        size = self.memory * breaths.STEPS
-        seen, zero = jnp.zeros((size, features.COUNT)), jnp.zeros((size,))
+        parameters = rl_policy.init_parameters(self.network, network_key)
+        size = self.memory * episodes.STEPS
+        seen, zero = jnp.zeros((size, FEATURES)), jnp.zeros((size,))
         replay = Replay(seen, jnp.zeros((size,), jnp.int32), zero, zero, seen)
         iteration = jnp.zeros((), jnp.int32)
         optimiser = self._optimiser.init(parameters)
-        return State(parameters, parameters, optimiser, replay, key, iteration)
+        return DQNState(parameters, parameters, optimiser, replay, key, iteration)
 
-    def iterate(self, state: State, plants: Plant) -> State:
+    def iterate(self, state: DQNState, plants: Plant) -> DQNState:
         """Collect breaths on lungs with leaves ``(L, ...)`` and learn from the replay."""
         collect_key, learn_key, key = jax.random.split(state.key, 3)
         new = self._collect(state, plants, collect_key)
-        count = self.breaths * breaths.STEPS
+        count = self.breaths * episodes.STEPS
         first = state.iteration % (self.memory // self.breaths) * count
         replay = jax.tree.map(
             lambda old, some: jax.lax.dynamic_update_slice_in_dim(old, some, first, 0),
             state.replay,
             new,
         )
-        known = jnp.minimum((state.iteration + 1) * count, self.memory * breaths.STEPS)
+        known = jnp.minimum((state.iteration + 1) * count, self.memory * episodes.STEPS)
 
         def update(carry: Any, key: Array) -> tuple[Any, None]:
             rows = jax.random.randint(key, (self.batch,), 0, known)
@@ -122,19 +129,19 @@ class DQN:
         carry = (state.online, state.target, state.optimiser)
         keys = jax.random.split(learn_key, self.updates)
         (online, target, optimiser), _ = jax.lax.scan(update, carry, keys)
-        return State(online, target, optimiser, replay, key, state.iteration + 1)
+        return DQNState(online, target, optimiser, replay, key, state.iteration + 1)
 
-    def policy(self, state: State) -> Greedy:
+    def policy(self, state: DQNState) -> GreedyPolicy:
         """What has been learned: the choices of the target network, which is the smoother one."""
-        return Greedy(state.target, self.network)
+        return GreedyPolicy(state.target, self.network)
 
     def _values(self, parameters: Any, x: Array) -> Array:
         return self.network.apply(parameters, x)  # type: ignore[return-value]
 
-    def _collect(self, state: State, plants: Plant, key: Array) -> Replay:
+    def _collect(self, state: DQNState, plants: Plant, key: Array) -> Replay:
         cells_key, roll_key = jax.random.split(key)
         lungs = jax.tree.leaves(plants)[0].shape[0]
-        cells = breaths.sample(
+        cells = episodes.sample(
             cells_key, self.breaths, lungs, state.iteration * (self.breaths // lungs), self.vary
         )
         start, end = self.explore
@@ -149,26 +156,26 @@ class DQN:
             choice = jnp.where(explore, random, greedy)
             return base + jnp.asarray(CHOICES, base.dtype)[choice], choice
 
-        each = breaths.of_cells(plants, self.breaths)
-        x, choice, rewards = breaths.roll(each, cells, act, roll_key)
-        steps = jnp.arange(breaths.STEPS) + self.steps
-        inside = steps < breaths.STEPS
+        each = episodes.plants_of_cells(plants, self.breaths)
+        x, choice, rewards = episodes.roll(each, cells, act, roll_key)
+        steps = jnp.arange(episodes.STEPS) + self.steps
+        inside = steps < episodes.STEPS
         discount = jnp.where(inside, self.discount**self.steps, 0.0)
         replay = Replay(
             x,
             choice.astype(jnp.int32),
-            returns.n_step(rewards, self.discount, self.steps),
+            episodes.n_step(rewards, self.discount, self.steps),
             jnp.broadcast_to(discount[:, None], rewards.shape),
-            x[jnp.minimum(steps, breaths.STEPS - 1)],
+            x[jnp.minimum(steps, episodes.STEPS - 1)],
         )
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), replay)
 
     def _update(self, carry: Any, part: Replay) -> Any:
         online, target, optimiser = carry
         after = [self._values(p, part.following) for p in (online, target)]
-        wanted = returns.double_q_target(part.reward, part.discount, *after)
+        wanted = episodes.double_q_target(part.reward, part.discount, *after)
 
-        def loss(parameters: networks.Parameters) -> Array:
+        def loss(parameters: Parameters) -> Array:
             values = self._values(parameters, part.features)
             chosen = jnp.take_along_axis(values, part.choice[:, None], axis=-1)[:, 0]
             return jnp.mean(optax.huber_loss(chosen, wanted))

@@ -11,16 +11,22 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from ventbench.controllers import rl_policy
+from ventbench.controllers.rl_policy import (
+    SCALE,
+    GaussianPolicy,
+    Parameters,
+    TanhNetwork,
+)
 from ventbench.interfaces import Plant
-from ventbench.training.rl import breaths, networks
-from ventbench.training.rl.policies import SCALE, Corrected
+from ventbench.training.rl import episodes
 
 
 @flax.struct.dataclass
-class State:
+class PolicyGradientState:
     """One training: parameters, the optimiser's state, key, number of the iteration."""
 
-    parameters: networks.Parameters
+    parameters: Parameters
     optimiser: Any
     key: Array
     iteration: Array
@@ -45,42 +51,44 @@ class PolicyGradient:
     widths: tuple[int, ...] = (32, 32)
 
     @property
-    def network(self) -> networks.Dense:
+    def network(self) -> TanhNetwork:
         """One output."""
-        return networks.Dense(self.widths, 1)
+        return TanhNetwork(self.widths, 1)
 
     @property
     def _optimiser(self) -> optax.GradientTransformation:
         schedule = optax.cosine_decay_schedule(self.learning_rate, self.iterations)
         return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
 
-    def init(self, key: Array) -> State:
+    def init(self, key: Array) -> PolicyGradientState:
         """Start one training."""
         network_key, key = jax.random.split(key)
-        parameters = networks.start(self.network, network_key)
-        return State(parameters, self._optimiser.init(parameters), key, jnp.zeros((), jnp.int32))
+        parameters = rl_policy.init_parameters(self.network, network_key)
+        return PolicyGradientState(
+            parameters, self._optimiser.init(parameters), key, jnp.zeros((), jnp.int32)
+        )
 
-    def iterate(self, state: State, plants: Plant) -> State:
+    def iterate(self, state: PolicyGradientState, plants: Plant) -> PolicyGradientState:
         """One update on lungs with leaves ``(L, ...)``."""
         cells_key, roll_key, key = jax.random.split(state.key, 3)
         lungs = jax.tree.leaves(plants)[0].shape[0]
-        cells = breaths.sample(
+        cells = episodes.sample(
             cells_key, self.breaths, lungs, state.iteration * (self.breaths // lungs), self.vary
         )
-        each = breaths.of_cells(plants, self.breaths)
+        each = episodes.plants_of_cells(plants, self.breaths)
 
-        def loss(parameters: networks.Parameters) -> Array:
+        def loss(parameters: Parameters) -> Array:
             def act(key: Array, x: Array, base: Array) -> tuple[Array, None]:
                 mean: Array = self.network.apply(parameters, x)  # type: ignore[assignment]
                 return base + SCALE * mean[..., 0], None
 
-            return -jnp.mean(breaths.roll(each, cells, act, roll_key)[2])
+            return -jnp.mean(episodes.roll(each, cells, act, roll_key)[2])
 
         gradient = jax.grad(loss)(state.parameters)
         updates, optimiser = self._optimiser.update(gradient, state.optimiser, state.parameters)
         parameters = optax.apply_updates(state.parameters, updates)
-        return State(parameters, optimiser, key, state.iteration + 1)
+        return PolicyGradientState(parameters, optimiser, key, state.iteration + 1)
 
-    def policy(self, state: State) -> Corrected:
+    def policy(self, state: PolicyGradientState) -> GaussianPolicy:
         """What has been learned."""
-        return Corrected(state.parameters, self.network)
+        return GaussianPolicy(state.parameters, self.network)

@@ -11,13 +11,18 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from ventbench.controllers import rl_policy
+from ventbench.controllers.rl_policy import (
+    SCALE,
+    GaussianPolicy,
+    TanhNetwork,
+)
 from ventbench.interfaces import Plant
-from ventbench.training.rl import breaths, networks, returns
-from ventbench.training.rl.policies import SCALE, Corrected
+from ventbench.training.rl import episodes
 
 
 @flax.struct.dataclass
-class State:
+class PPOState:
     """One training: parameters of both networks and the spread, optimiser, key, iteration."""
 
     parameters: dict[str, Any]
@@ -27,8 +32,8 @@ class State:
 
 
 @flax.struct.dataclass
-class Batch:
-    """Steps of breaths; ``features`` ``(N, COUNT)``, all others ``(N,)``."""
+class PPOBatch:
+    """Steps of breaths; ``features`` ``(N, FEATURES)``, all others ``(N,)``."""
 
     features: Array
     action: Array
@@ -81,13 +86,13 @@ class PPO:
     entropy: float = 0.0
 
     @property
-    def network(self) -> networks.Dense:
+    def network(self) -> TanhNetwork:
         """Of the policy: the mean."""
-        return networks.Dense(self.widths, 1)
+        return TanhNetwork(self.widths, 1)
 
     @property
-    def _critic(self) -> networks.Dense:
-        return networks.Dense(self.widths, 1, first=1.0)
+    def _critic(self) -> TanhNetwork:
+        return TanhNetwork(self.widths, 1, first=1.0)
 
     @property
     def _optimiser(self) -> optax.GradientTransformation:
@@ -95,17 +100,17 @@ class PPO:
         schedule = optax.linear_schedule(self.learning_rate, 0.0, updates)
         return optax.chain(optax.clip_by_global_norm(0.5), optax.adam(schedule, eps=1e-5))
 
-    def init(self, key: Array) -> State:
+    def init(self, key: Array) -> PPOState:
         """Start one training."""
         actor_key, critic_key, key = jax.random.split(key, 3)
         parameters = {
-            "actor": networks.start(self.network, actor_key),
-            "critic": networks.start(self._critic, critic_key),
+            "actor": rl_policy.init_parameters(self.network, actor_key),
+            "critic": rl_policy.init_parameters(self._critic, critic_key),
             "log_spread": jnp.log(jnp.asarray(self.spread)),
         }
-        return State(parameters, self._optimiser.init(parameters), key, jnp.zeros((), jnp.int32))
+        return PPOState(parameters, self._optimiser.init(parameters), key, jnp.zeros((), jnp.int32))
 
-    def iterate(self, state: State, plants: Plant) -> State:
+    def iterate(self, state: PPOState, plants: Plant) -> PPOState:
         """Collect breaths on lungs with leaves ``(L, ...)`` and learn from them."""
         collect_key, learn_key, key = jax.random.split(state.key, 3)
         batch = self._collect(state, plants, collect_key)
@@ -119,11 +124,11 @@ class PPO:
 
         keys = jax.random.split(learn_key, self.epochs)
         (parameters, optimiser), _ = jax.lax.scan(epoch, (state.parameters, state.optimiser), keys)
-        return State(parameters, optimiser, key, state.iteration + 1)
+        return PPOState(parameters, optimiser, key, state.iteration + 1)
 
-    def policy(self, state: State) -> Corrected:
+    def policy(self, state: PPOState) -> GaussianPolicy:
         """What has been learned: the mean."""
-        return Corrected(state.parameters["actor"], self.network)
+        return GaussianPolicy(state.parameters["actor"], self.network)
 
     def _mean(self, parameters: Any, x: Array) -> Array:
         return self.network.apply(parameters["actor"], x)[..., 0]  # type: ignore[index]
@@ -131,11 +136,11 @@ class PPO:
     def _value(self, parameters: Any, x: Array) -> Array:
         return self._critic.apply(parameters["critic"], x)[..., 0]  # type: ignore[index]
 
-    def _collect(self, state: State, plants: Plant, key: Array) -> Batch:
+    def _collect(self, state: PPOState, plants: Plant, key: Array) -> PPOBatch:
         parameters = state.parameters
         cells_key, roll_key = jax.random.split(key)
         lungs = jax.tree.leaves(plants)[0].shape[0]
-        cells = breaths.sample(
+        cells = episodes.sample(
             cells_key, self.breaths, lungs, state.iteration * (self.breaths // lungs), self.vary
         )
 
@@ -145,20 +150,20 @@ class PPO:
             action = mean + jnp.exp(log_spread) * jax.random.normal(key, mean.shape)
             return base + SCALE * action, (action, log_probability(action, mean, log_spread))
 
-        each = breaths.of_cells(plants, self.breaths)
-        x, (action, before), rewards = breaths.roll(each, cells, act, roll_key)
+        each = episodes.plants_of_cells(plants, self.breaths)
+        x, (action, before), rewards = episodes.roll(each, cells, act, roll_key)
         value = self._value(parameters, x)
-        advantage = returns.advantages(rewards, value, self.discount, self.trace)
-        batch = Batch(x, action, before, advantage, value)
+        advantage = episodes.advantages(rewards, value, self.discount, self.trace)
+        batch = PPOBatch(x, action, before, advantage, value)
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
 
-    def _update(self, carry: Any, part: Batch) -> tuple[Any, None]:
+    def _update(self, carry: Any, part: PPOBatch) -> tuple[Any, None]:
         parameters, optimiser = carry
         gradient = jax.grad(self._loss)(parameters, part)
         updates, optimiser = self._optimiser.update(gradient, optimiser, parameters)
         return (optax.apply_updates(parameters, updates), optimiser), None
 
-    def _loss(self, parameters: Any, part: Batch) -> Array:
+    def _loss(self, parameters: Any, part: PPOBatch) -> Array:
         log_spread = parameters["log_spread"]
         now = log_probability(part.action, self._mean(parameters, part.features), log_spread)
         advantage = part.advantage - jnp.mean(part.advantage)

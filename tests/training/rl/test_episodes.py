@@ -1,0 +1,115 @@
+"""Cells that are learned from, features, and breaths in a scan."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ventbench import draws, precision, protocol, rollouts, scenario
+from ventbench.controllers import rl_policy
+from ventbench.controllers.pid import PID
+from ventbench.controllers.rl_policy import GaussianPolicy, TanhNetwork, init_parameters
+from ventbench.interfaces import Observation
+from ventbench.lungs import LUNGS
+from ventbench.metrics.waveform import run_error
+from ventbench.plants.single_compartment import single_compartment
+from ventbench.plants.stacking import stack
+from ventbench.training.rl import episodes
+
+
+@pytest.fixture(scope="module")
+def lungs():
+    return stack([single_compartment(lung) for lung in LUNGS])
+
+
+@pytest.fixture(scope="module")
+def cells():
+    return episodes.sample(jax.random.key(3), 1200, lungs=6)
+
+
+def test_deviations_have_the_distributions_of_the_draws(cells):
+    nominal = np.asarray(protocol.PIPS)[np.arange(1200) // 6 % 6]
+    found = {
+        "pip_shift": cells.pip - nominal,
+        "peep_shift": cells.peep - protocol.PEEP,
+        "start_shift": cells.start - cells.peep,
+        "dt_scale": cells.dt / protocol.DT,
+        "r_scale": cells.r_scale,
+        "c_scale": cells.c_scale,
+        "delay": cells.delay,
+    }
+    assert found.keys() == draws.RANGES.keys()
+    for name, (low, high) in draws.RANGES.items():
+        values = np.asarray(found[name], float)
+        assert low - 1e-5 <= values.min() < low + 0.02 * (high - low), name
+        assert high - 0.02 * (high - low) < values.max() <= high + 1e-5, name
+        assert abs(values.mean() - (low + high) / 2) < 0.03 * (high - low), name
+    spread = np.std(np.asarray(cells.noise), axis=(1, 2))
+    assert abs(spread.mean() - np.mean(draws.NOISE_SD)) < 0.005
+    assert np.all(np.asarray(cells.quantum, float) == np.float32(draws.QUANTUM))
+
+
+def test_the_published_draws_are_not_among_them(cells):
+    published = np.asarray(draws.scenarios().r_scale, float).ravel()
+    nearest = np.abs(np.asarray(cells.r_scale, float)[:, None] - published).min(axis=1)
+    assert np.mean(nearest < 1e-7) < 0.05
+
+
+def test_nominal_cells_are_the_protocols():
+    found = episodes.sample(jax.random.key(0), 6, vary=False)
+    wanted = scenario.nominal(protocol.PIPS)
+    for name in ("pip", "peep", "start", "dt", "r_scale", "c_scale", "delay", "quantum"):
+        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-6)
+    assert not np.any(found.noise)
+
+
+def test_the_pid_inside_the_features_is_the_pid(lungs):
+    with precision.float64():
+        cells = scenario.nominal(np.asarray(protocol.PIPS))
+        network = TanhNetwork((4,), 1)
+        untrained = GaussianPolicy(init_parameters(network, jax.random.key(0)), network)
+        lung = jax.tree.map(lambda x: x[2], lungs)
+        found, _ = rollouts.closed_loop(lung, untrained, cells)
+        wanted, _ = rollouts.closed_loop(lung, PID(*rl_policy.GAINS), cells)
+    # Its command is cut to the valve's range before the correction, of zero here, is added.
+    cut = np.clip(wanted.requested, 0.0, protocol.U_MAX)
+    np.testing.assert_allclose(found.requested, cut, atol=1e-9)
+    np.testing.assert_allclose(found.pressure, wanted.pressure, atol=1e-9)
+
+
+def test_features_by_hand():
+    def observed(time, pressure, before):
+        return Observation(
+            jnp.asarray(time), 0.03, jnp.asarray(pressure), jnp.asarray(20.0),
+            jnp.full((10,), 15.0), jnp.asarray(before),
+        )  # fmt: skip
+
+    memory, first, base = rl_policy.features(rl_policy.init_features(()), observed(0.0, 5.0, 5.0))
+    a = 0.03 / 0.53
+    u = 6 * 15 + 6 * a * 15 + 0.3 * a * 15
+    np.testing.assert_allclose(base, u, rtol=1e-6)
+    wanted = [1.5, a * 1.5, a * 15, u / 50 - 1, 0.5, 0.375, 0.0, *4 * [1.5], *4 * [-0.9]]
+    np.testing.assert_allclose(first, wanted, rtol=1e-5)
+    _, second, _ = rl_policy.features(memory, observed(0.03, 12.0, 95.0))
+    i = a * 15 + a * (8 - a * 15)
+    np.testing.assert_allclose(second[:2], [0.8, i / 10], rtol=1e-5)
+    np.testing.assert_allclose(second[7:], [*4 * [1.5], 0.9, *3 * [-0.9]], rtol=1e-5)
+
+
+def test_rewards_and_errors_are_the_scores(lungs):
+    cells = episodes.sample(jax.random.key(0), 6, vary=False)
+    lung = jax.tree.map(lambda x: jnp.asarray(x[2:3], jnp.float32), lungs)
+    pid = PID(*rl_policy.GAINS)
+    plants = episodes.plants_of_cells(lung, 6)
+    _, _, rewards = episodes.roll(plants, cells, lambda k, x, base: (base, None), jax.random.key(1))
+    start = np.asarray(cells.pip - cells.start)
+    from_rewards = (start - episodes.REWARD_SCALE * rewards.sum(axis=0)) / 34
+    errors = episodes.errors(lung, pid, cells, 6)
+    run, _ = rollouts.closed_loop(
+        jax.tree.map(lambda x: x[2], lungs), pid, scenario.nominal(np.asarray(protocol.PIPS))
+    )
+    wanted = run_error(run.pressure, np.asarray(protocol.PIPS)[:, None, None])
+    np.testing.assert_allclose(errors, wanted, rtol=1e-4)
+    np.testing.assert_allclose(from_rewards, wanted, rtol=1e-4)

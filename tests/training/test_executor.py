@@ -1,0 +1,77 @@
+"""Jobs in this process, in others and on a cluster: every result once, every failure told."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import numpy as np
+import pytest
+
+from ventbench import protocol
+from ventbench.errors import InputError
+from ventbench.training.executor import InProcess, executor, results
+
+
+def test_an_error_of_a_job_is_that_of_the_search():
+    running = results(InProcess(), lambda x: 1 / x, {"a": (1,), "b": (0,), "c": (2,)})
+    assert next(running) == ("a", 1.0)
+    with pytest.raises(ZeroDivisionError):
+        next(running)
+
+
+def test_in_this_process_each_result_is_told_before_the_next_job_begins():
+    begun = []
+
+    def job(name):
+        begun.append(name)
+        return name
+
+    for name, result in results(InProcess(), job, {"a": ("a",), "b": ("b",)}):
+        assert name == result
+        assert begun[-1] == name
+
+
+def test_an_executor_is_one_or_the_other():
+    with pytest.raises(InputError, match="one of the two"), executor(2, "tcp://x:1"):
+        pass
+    with pytest.raises(InputError, match="must not be negative"), executor(-1):
+        pass
+
+
+def _die(_: int) -> None:
+    os._exit(3)
+
+
+@pytest.mark.slow
+def test_a_dead_worker_process_is_told():
+    with pytest.raises(InputError, match="a worker process died"), executor(1) as pool:
+        list(results(pool, _die, {"a": (1,)}))
+
+
+def _slowly(plant, gains):
+    """A part that takes long enough to be interrupted, and leaves a mark."""
+    time.sleep(0.4)
+    return np.full((len(gains), len(protocol.PIPS)), gains.sum(), np.float32)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")  # of Dask's own, about ports and closing
+def test_a_dask_worker_that_is_killed_loses_nothing_and_counts_nothing_twice(tmp_path):
+    distributed = pytest.importorskip("distributed", reason="the extra ventbench[dask] is missing")
+    started = distributed.LocalCluster(
+        n_workers=3, threads_per_worker=1, processes=True, dashboard_address=None,
+        host="127.0.0.1", local_directory=str(tmp_path),
+    )  # fmt: skip
+    with started as cluster:
+        jobs = {f"{n}": (None, np.full((2, 3), float(n))) for n in range(24)}
+        found, killed = [], None
+        with executor(0, cluster.scheduler_address) as pool:
+            for name, error in results(pool, _slowly, jobs):
+                found.append(name)
+                np.testing.assert_array_equal(error, 6.0 * float(name))
+                if len(found) == 3:
+                    killed = next(iter(cluster.workers.values()))
+                    os.kill(killed.pid, 9)
+        assert killed is not None
+    assert sorted(found, key=int) == list(jobs)

@@ -1,0 +1,202 @@
+"""The PID with a correction by a small network, the policy of the reinforcement learners.
+
+All methods share the features that the network sees, the PID that it corrects, and the kind of
+network. The policy of PPO and of the policy gradient adds the network's output to the PID's
+command; the policy of DQN adds the one of 19 corrections that has the highest value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import flax.linen as nn
+import flax.struct
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ventbench import protocol
+from ventbench.controllers.pid import PID, PIDState
+from ventbench.files import write_atomically
+from ventbench.interfaces import Observation
+
+#: The PID that is corrected: the best single one of the grid for all six lungs, (P, I, D).
+GAINS = (6.0, 6.0, 0.3)
+
+#: Errors and commands before this step that are shown.
+PAST = 4
+
+#: Number of features.
+FEATURES = 2 * PAST + 7
+
+#: What makes the features of the order of 1: cmH2O and %.
+ERROR_SCALE, TARGET_SCALE, COMMAND_SCALE = 10.0, 40.0, 50.0
+
+
+@flax.struct.dataclass
+class FeatureState:
+    """What the features need of earlier steps.
+
+    Attributes:
+        pid: state of the PID, ``(...)``.
+        errors: of the last steps, the latest first, cmH2O, ``(..., PAST)``.
+        commands: applied in the last steps, the latest first, %, ``(..., PAST)``.
+    """
+
+    pid: PIDState
+    errors: Array
+    commands: Array
+
+
+def init_features(shape: tuple[int, ...]) -> FeatureState:
+    """State before the first breath; each breath begins with a new one."""
+    past = jnp.zeros((*shape, PAST))
+    return FeatureState(PID(*GAINS).init(shape), past, past)
+
+
+def features(state: FeatureState, observation: Observation) -> tuple[FeatureState, Array, Array]:
+    """Take in one observation.
+
+    Returns:
+        The next state, the features, shape ``(..., FEATURES)``, and the command of the PID, clipped
+        to the valve's range, %, shape ``(...)``.
+    """
+    restart = jnp.broadcast_to(observation.time == 0, jnp.shape(observation.pressure))[..., None]
+    error = observation.target - observation.pressure
+    before = jnp.where(restart, error[..., None], state.errors)
+    bias = observation.previous_u_in[..., None]
+    commands = jnp.concatenate([bias, state.commands[..., :-1]], axis=-1)
+    commands = jnp.where(restart, bias, commands)
+    pid, asked = PID(*GAINS).step(state.pid, observation)
+    base = jnp.clip(asked, 0.0, protocol.U_MAX)
+    now: list[Any] = [
+        error / ERROR_SCALE,
+        pid.integral / ERROR_SCALE,
+        pid.derivative,
+        base / COMMAND_SCALE - 1.0,
+        observation.target / TARGET_SCALE,
+        observation.targets_ahead[..., -1] / TARGET_SCALE,
+        jnp.broadcast_to(observation.time, error.shape),
+    ]
+    features = jnp.concatenate(
+        [jnp.stack(now, axis=-1), before / ERROR_SCALE, commands / COMMAND_SCALE - 1.0], axis=-1
+    )
+    errors = jnp.concatenate([error[..., None], before[..., :-1]], axis=-1)
+    return FeatureState(pid, errors, commands), features, base
+
+
+#: Parameters of a network, as flax keeps them.
+Parameters = Any
+
+
+class TanhNetwork(nn.Module):
+    """Dense layers with tanh, then a linear one that starts as zero.
+
+    Attributes:
+        widths: units of each hidden layer.
+        outputs: of the last layer.
+        first: scale of the last layer's weights at the start; 0 for none.
+    """
+
+    widths: tuple[int, ...]
+    outputs: int
+    first: float = 0.0
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        """Outputs, shape ``(..., outputs)``, of features, shape ``(..., features)``."""
+        for width in self.widths:
+            x = nn.tanh(nn.Dense(width, kernel_init=nn.initializers.orthogonal(2.0**0.5))(x))
+        start = nn.initializers.orthogonal(self.first) if self.first else nn.initializers.zeros
+        return nn.Dense(self.outputs, kernel_init=start)(x)
+
+
+def init_parameters(network: TanhNetwork, key: Array) -> Parameters:
+    """Parameters at the start of a training."""
+    return network.init(key, jnp.zeros((1, FEATURES)))
+
+
+def layers(parameters: Parameters) -> list[tuple[Array, Array]]:
+    """Weights, shape ``(inputs, units)``, and biases of each layer in order."""
+    named = parameters["params"]
+    return [(named[f"Dense_{k}"]["kernel"], named[f"Dense_{k}"]["bias"]) for k in range(len(named))]
+
+
+#: Correction that an output of 1 stands for, %.
+SCALE = 20.0
+
+#: Corrections that DQN chooses from, %: fine about zero, coarse to the whole range of the valve.
+CHOICES = (
+    -90.0, -60.0, -40.0, -25.0, -15.0, -9.0, -5.0, -2.5, -1.0,
+    0.0, 1.0, 2.5, 5.0, 9.0, 15.0, 25.0, 40.0, 60.0, 90.0,
+)  # fmt: skip
+
+
+@flax.struct.dataclass
+class GaussianPolicy:
+    """The PID plus the network's output, times :data:`SCALE`: the mean of a Gaussian policy.
+
+    Attributes:
+        parameters: of the network.
+        network: one output.
+    """
+
+    parameters: Parameters
+    network: TanhNetwork = flax.struct.field(pytree_node=False)
+
+    def init(self, shape: tuple[int, ...]) -> FeatureState:
+        """State at the start of a run."""
+        return init_features(shape)
+
+    def step(self, state: FeatureState, observation: Observation) -> tuple[FeatureState, Array]:
+        """Return the next state and ``u_in``, %."""
+        state, x, base = features(state, observation)
+        mean: Array = self.network.apply(self.parameters, x)  # type: ignore[assignment]
+        return state, base + SCALE * mean[..., 0]
+
+
+@flax.struct.dataclass
+class GreedyPolicy:
+    """The PID plus the choice of the highest value.
+
+    Attributes:
+        parameters: of the network.
+        network: one output for each of :data:`CHOICES`.
+    """
+
+    parameters: Parameters
+    network: TanhNetwork = flax.struct.field(pytree_node=False)
+
+    def init(self, shape: tuple[int, ...]) -> FeatureState:
+        """State at the start of a run."""
+        return init_features(shape)
+
+    def step(self, state: FeatureState, observation: Observation) -> tuple[FeatureState, Array]:
+        """Return the next state and ``u_in``, %."""
+        state, x, base = features(state, observation)
+        values: Array = self.network.apply(self.parameters, x)  # type: ignore[assignment]
+        return state, base + jnp.asarray(CHOICES, base.dtype)[jnp.argmax(values, axis=-1)]
+
+
+def arrays(policies: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Weights and biases by name, float32: ``R20C50.w0``, ``R20C50.b0``, ``R20C50.w1``, ...
+
+    Layer k does ``x @ wk + bk``, with tanh between the layers.
+
+    Args:
+        policies: by the lung that they are for, ``all`` for one that does not know it.
+    """
+    named = {}
+    for name, policy in policies.items():
+        for k, layer in enumerate(layers(policy.parameters)):
+            for kind, array in zip("wb", layer, strict=True):
+                named[f"{name}.{kind}{k}"] = np.asarray(array, np.float32)
+    return named
+
+
+def save_weights(path: Path, policies: Mapping[str, Any]) -> None:
+    """Write policies, by lung id or ``all``, as an ``.npz``; equal networks give equal bytes."""
+    content: dict[str, Any] = arrays(policies)
+    write_atomically(path, lambda file: np.savez(file, **content))

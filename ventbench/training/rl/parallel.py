@@ -1,0 +1,214 @@
+"""Several trainings side by side in one compiled step, with their learning curves."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from ventbench import precision, protocol, scenario
+from ventbench.interfaces import Plant
+from ventbench.resume import Checkpoint
+from ventbench.scenario import Scenario
+from ventbench.training.rl import episodes
+
+
+class Method(Protocol):
+    """A recipe: hashable, so that it can be a static argument of ``jit``; its methods are pure."""
+
+    @property
+    def breaths(self) -> int:
+        """Episodes in an iteration."""
+        ...
+
+    @property
+    def iterations(self) -> int:
+        """Of the whole training."""
+        ...
+
+    def init(self, key: Array) -> Any:
+        """State at the start."""
+        ...
+
+    def iterate(self, state: Any, plants: Plant) -> Any:
+        """State one iteration later, on lungs with leaves ``(L, ...)``."""
+        ...
+
+    def policy(self, state: Any) -> Any:
+        """What has been learned so far, as a pure controller."""
+        ...
+
+
+#: Cells on each lung by which the best policy of a training is chosen, and the seed they come from.
+VALIDATION_CELLS, VALIDATION_SEED = 48, 2021
+
+#: At least this many seconds lie between two checkpoints: what an interruption may cost.
+SAVE_SECONDS = 5.0
+
+#: Called with the share that is done and the lowest error of each run, cmH2O, shape ``(R,)``.
+Progress = Callable[[float, NDArray[np.float32]], None]
+
+
+@flax.struct.dataclass
+class _Run:
+    """One training under way; ``best`` is the policy with the lowest validation error so far."""
+
+    state: Any
+    best: Any
+    error: Array
+
+
+@dataclass(frozen=True)
+class TrainedPolicies:
+    """R finished trainings.
+
+    Attributes:
+        policies: the best of each, leaves ``(R, ...)``.
+        validation: their errors on fresh cells with noise, cmH2O, ``(R,)``.
+        episodes: breaths that a run had seen at each point of its curve, ``(points,)``.
+        curves: nominal error of the policy then, cmH2O, ``(R, points)``.
+        validation_curves: likewise on the fresh cells.
+        seconds: for all runs together until each point, without compiling, ``(points,)``.
+        compile_seconds: for compiling, before that, with the chunk that is run to that end.
+    """
+
+    policies: Any
+    validation: NDArray[np.float32]
+    episodes: NDArray[np.int64]
+    curves: NDArray[np.float32]
+    validation_curves: NDArray[np.float32]
+    seconds: NDArray[np.float64]
+    compile_seconds: float
+
+
+def nominal_cells(lungs: int) -> Scenario:
+    """The six PIPs without deviation on each lung in turn, ``(6 * lungs,)``."""
+    return scenario.nominal(np.repeat(np.asarray(protocol.PIPS), lungs))
+
+
+def nominal_error(plants: Plant, policy: Any) -> Array:
+    """Score without noise of a policy on lungs with leaves ``(L, ...)``, cmH2O."""
+    lungs = jax.tree.leaves(plants)[0].shape[0]
+    return jnp.mean(episodes.errors(plants, policy, nominal_cells(lungs), 6 * lungs))
+
+
+def _fresh_error(plants: Plant, policy: Any) -> Array:
+    lungs = jax.tree.leaves(plants)[0].shape[0]
+    count = VALIDATION_CELLS * lungs
+    cells = episodes.sample(jax.random.key(VALIDATION_SEED), count, lungs)
+    return jnp.mean(episodes.errors(plants, policy, cells, count))
+
+
+@partial(jax.jit, static_argnames=("method", "count"))
+def _advance(method: Method, runs: _Run, plants: Plant, count: int) -> tuple[_Run, Array]:
+    """``count`` iterations of each run, then both errors, shape ``(R, 2)``."""
+
+    def one(run: _Run, plant: Plant) -> tuple[_Run, Array]:
+        def iterate(state: Any, _: None) -> tuple[Any, None]:
+            return method.iterate(state, plant), None
+
+        state, _ = jax.lax.scan(iterate, run.state, None, length=count)
+        policy = method.policy(state)
+        fresh = _fresh_error(plant, policy)
+        better = fresh < run.error
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), policy, run.best)
+        errors = jnp.stack([nominal_error(plant, policy), fresh])
+        return _Run(state, best, jnp.where(better, fresh, run.error)), errors
+
+    return jax.vmap(one)(runs, plants)
+
+
+def _start(method: Method, seeds: Sequence[int], plants: Plant) -> tuple[_Run, NDArray[np.float32]]:
+    numbers = jnp.asarray(np.asarray(seeds, np.uint32))
+    keys = jax.vmap(jax.random.key)(numbers)
+    states = jax.vmap(method.init)(keys)
+    best = jax.vmap(method.policy)(states)
+    errors = np.asarray(jax.jit(jax.vmap(nominal_error))(plants, best))
+    return _Run(states, best, jnp.full(len(seeds), jnp.inf)), errors
+
+
+def train(
+    method: Method,
+    plants: Plant,
+    seeds: Sequence[int],
+    *,
+    chunk: int,
+    about: str = "",
+    file: Path | None = None,
+    progress: Progress | None = None,
+    save_seconds: float = SAVE_SECONDS,
+) -> TrainedPolicies:
+    """Train R policies side by side.
+
+    Bit-reproducible on one machine: all random numbers come from the seeds, and an interrupted
+    training goes on as if it had not been.
+
+    Args:
+        method: the recipe, common to all.
+        plants: lungs of each run, leaves ``(R, L, ...)``; taken in float32.
+        seeds: one a run.
+        chunk: iterations between two points of the curves.
+        about: text that tells one training from another, such as the simulators' hash.
+        file: checkpoint that is resumed from and written to; kept at the end.
+        progress: see :data:`Progress`.
+        save_seconds: least time between two checkpoints, s.
+
+    Raises:
+        InputError: if the checkpoint belongs to another training.
+        FloatingPointError: if a policy diverges.
+    """
+    with precision.float32():
+        plants = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), plants)
+        runs, first = _start(method, seeds, plants)
+        points = -(-method.iterations // chunk)
+        curves = np.full((len(seeds), points + 1, 2), np.nan, np.float32)
+        curves[:, 0, 0] = first
+        seconds, compiling = np.zeros(points + 1), np.zeros(())
+        carry: Any = (runs, curves, seconds, compiling)
+        settings = {
+            "method": type(method).__name__,
+            "recipe": asdict(method),  # type: ignore[call-overload]
+            "seeds": list(map(int, seeds)),
+            "chunk": chunk,
+            "about": about,
+            "jax": jax.__version__,
+        }
+        stored = Checkpoint(file, settings)
+        (runs, curves, seconds, compiling), done = stored.restore(carry)
+        began = time.perf_counter()
+        if done < points:  # once for nothing, so that no point's time contains the compiling
+            jax.block_until_ready(_advance(method, runs, plants, chunk))
+        saved = now = time.perf_counter()
+        compiling = compiling + (now - began)
+        while done < points:
+            runs, errors = _advance(method, runs, plants, chunk)
+            done += 1
+            curves[:, done] = np.asarray(errors)
+            before, now = now, time.perf_counter()
+            seconds[done] = seconds[done - 1] + now - before
+            if not np.isfinite(curves[:, done]).all():
+                raise FloatingPointError(f"training diverged before point {done} of {points}")
+            if now - saved > save_seconds or done == points:
+                stored.save((runs, curves, seconds, compiling), done)
+                saved = time.perf_counter()
+            if progress is not None:
+                progress(done / points, np.asarray(runs.error))
+        return TrainedPolicies(
+            policies=jax.tree.map(np.asarray, runs.best),
+            validation=np.asarray(runs.error),
+            episodes=np.arange(points + 1) * chunk * method.breaths,
+            curves=curves[..., 0],
+            validation_curves=curves[..., 1],
+            seconds=seconds,
+            compile_seconds=float(compiling),
+        )

@@ -35,3 +35,26 @@ def data_path(name: str) -> Path:
 def submissions_folder() -> Path:
     """Folder of the submissions that travel with ventbench; may be missing."""
     return _folder("submissions")
+
+
+def example(name: str) -> Path:
+    """Path of an example recording: synthetic breaths, described in ``manifest.toml`` beside them.
+
+    Args:
+        name: ``"concealed"`` (an effect that R-C lungs lack), ``"sound"`` (nothing is missing) or
+            ``"flow"`` (pressure and flow of a lung with a wrong label); or a file of the folder.
+
+    Raises:
+        InputError: if there is no such example.
+
+    Example:
+        >>> import ventbench
+        >>> ventbench.example("sound").name
+        'sound.csv'
+    """
+    folder = data_path("examples")
+    path = folder / (name if "." in name else f"{name}.csv")
+    if not path.is_file():
+        known = ", ".join(sorted(file.stem for file in folder.glob("*.csv")))
+        raise InputError(f"there is no example {name!r}; choose one of {known}")
+    return path

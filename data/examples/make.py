@@ -1,4 +1,4 @@
-"""Make the example recordings of this folder and their manifest; the same code gives the same bytes.
+"""Make the example recordings and their manifest; the same code gives the same bytes.
 
 Usage: ``python data/examples/make.py [DIR]``
 
@@ -62,10 +62,7 @@ def with_flow(seed: int, breaths: int = 12, samples: int = 100) -> Breaths:
     pressure, flow = np.empty((breaths, samples)), np.empty((breaths, samples))
     decay = np.exp(-dt / ((FLOW_R + 6.0) * FLOW_C / 1000.0))
     for k in range(samples):
-        if opened[k]:
-            q = -(elastic - FLOW_PEEP) / (FLOW_R + 6.0)
-        else:
-            q = 22.8 * u_in[:, k] / 1000.0
+        q = -(elastic - FLOW_PEEP) / (FLOW_R + 6.0) if opened[k] else 22.8 * u_in[:, k] / 1000.0
         pressure[:, k], flow[:, k] = elastic + FLOW_R * q, 1000.0 * q
         if opened[k]:
             elastic = FLOW_PEEP + (elastic - FLOW_PEEP) * decay

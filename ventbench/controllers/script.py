@@ -1,4 +1,4 @@
-"""Commands written down beforehand: replays a run, whoever the controller was."""
+"""Commands written down beforehand: replays a run, whichever controller made it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from ventbench.interfaces import Observation
 
 @flax.struct.dataclass
 class Script:
-    """A controller that looks at nothing.
+    """A controller that ignores what it observes.
 
     Attributes:
-        u_in: commands of a run in order, %, shape ``(..., BREATHS * INSPIRATION_STEPS)``.
+        u_in: commands of a run in order, %, shape ``(BREATHS * INSPIRATION_STEPS,)`` or
+            ``(..., BREATHS * INSPIRATION_STEPS)`` for different ones in each cell of a batch.
     """
 
     u_in: Array
@@ -24,5 +25,6 @@ class Script:
         return jnp.zeros((), int)
 
     def step(self, state: Array, observation: Observation) -> tuple[Array, Array]:
-        """Return the index of the next command, and this one."""
-        return state + 1, jnp.take(self.u_in, state, axis=-1)
+        """Return the index of the next command, and the present command, %, shape ``(...)``."""
+        command = jnp.take(self.u_in, state, axis=-1)
+        return state + 1, jnp.broadcast_to(command, jnp.shape(observation.pressure))

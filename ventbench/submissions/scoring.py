@@ -15,7 +15,8 @@ from ventbench import draws as published
 from ventbench import precision, protocol, scenario, waveform
 from ventbench.interfaces import Plant, Task
 from ventbench.lungs import LUNGS, Lung
-from ventbench.metrics import effort, safety, step_response
+from ventbench.metrics import safety
+from ventbench.metrics.figures import InspirationSignals, figures
 from ventbench.metrics.waveform import run_error
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import Hybrid
@@ -217,19 +218,7 @@ def _figures(run: ProtocolRun, cells: Scenario) -> dict[str, Floats]:
         x[:, 0][:, :, protocol.SCORED_BREATHS, :] for x in (run.pressure, run.u_in, run.requested)
     )
     peep, pip, dt = (x[0, :, None] for x in (cells.peep, cells.pip, cells.dt))
-    return {
-        "rise_time_s": step_response.rise_time(pressure, peep, pip, dt),
-        "overshoot_cmH2O": step_response.overshoot(pressure, pip),
-        "overshoot_percent": step_response.overshoot_percent(pressure, peep, pip),
-        "settling_time_s": step_response.settling_time(pressure, peep, pip, dt),
-        "steady_error_cmH2O": step_response.steady_error(pressure, pip),
-        "swings": step_response.swings(pressure, pip),
-        "ripple_cmH2O": step_response.ripple(pressure),
-        "time_above_alarm_s": safety.time_above_alarm(pressure, pip, dt),
-        "mean_u_in_percent": effort.mean_command(u_in),
-        "mean_change_percent_per_step": effort.mean_change(u_in),
-        "clipped_share": effort.clipped_share(requested),
-    }
+    return figures(InspirationSignals(pressure, u_in, requested, peep, pip, dt))
 
 
 def _failures(

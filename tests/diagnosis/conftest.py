@@ -1,4 +1,4 @@
-"""What the tests of naming share: one recording without any effect, fitted once."""
+"""A recording without any effect, fitted once for all tests."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from . import small
 
 
 class Plain(NamedTuple):
-    """A recording in which nothing is missing."""
+    """A recording in which nothing is missing, and the base model."""
 
     evaluator: Evaluator
-    null: FittedModel
+    base: FittedModel
 
 
 @pytest.fixture(scope="session")
@@ -26,7 +26,14 @@ def plain() -> Plain:
     return Plain(evaluator, fit_with_noise(evaluator, Hypothesis()))
 
 
-@pytest.fixture
-def few_slots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave a few slots to choose from, since all of them take a minute to compile."""
-    small.limit_slots(monkeypatch)
+@pytest.fixture(scope="session")
+def turbulent() -> Evaluator:
+    """A recording with one strong effect."""
+    return small.split(small.made(small.effect("turbulent_resistance", quadratic=10.0)))
+
+
+@pytest.fixture(scope="session")
+def both(turbulent) -> tuple[FittedModel, FittedModel]:
+    """The recording's mechanism, fitted with its noise, and the base model at this noise."""
+    named = fit_with_noise(turbulent, Hypothesis(("turbulent_resistance",)))
+    return named, turbulent.fit(Hypothesis(), named.noise, named)

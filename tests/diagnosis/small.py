@@ -9,12 +9,11 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-import pytest
 
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
-from ventbench.diagnosis.settings import DataSettings, SelectionConfig
-from ventbench.physics import library, paths
-from ventbench.physics.catalogue import basis_terms
+from ventbench.diagnosis.screening import all_parameter_paths
+from ventbench.diagnosis.settings import DataSettings, ScreeningSettings, SelectionConfig
+from ventbench.physics import paths
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import recorded
 from ventbench.validation.challenge.cases import Base, Case, Effect
@@ -23,15 +22,24 @@ from ventbench.validation.challenge.rig import record
 #: The lung as it is labelled, and the rig as it is.
 LABEL, RIG = "R20C20", Base(21.0, 19.5)
 
-#: One size of array for training, judging and all breaths.
+#: One size of array for training, held-out and all breaths.
 BREATHS, SAMPLES = 16, 40
 HELD = np.arange(BREATHS) % 2 == 1
 
-#: One compilation for all of these breaths.
-SETTINGS = SelectionConfig(data=DataSettings(batch_size=BREATHS))
-
-#: A few elements of slots, whose derivatives take a quarter of the time to compile.
+#: A few nonparametric terms, whose derivatives take a quarter of the time to compile.
 FEW = ("volume_resistance", "flow_shape")
+
+#: One compilation for all of these breaths, and a few terms to choose from.
+SETTINGS = SelectionConfig(
+    data=DataSettings(batch_size=BREATHS),
+    screening=ScreeningSettings(nonparametric_terms=FEW),
+)
+
+
+def with_terms(*terms: str) -> SelectionConfig:
+    """The settings with other nonparametric terms to choose from; with none given, all of them."""
+    screening = ScreeningSettings(nonparametric_terms=terms or None)
+    return dataclasses.replace(SETTINGS, screening=screening)
 
 
 def effect(name: str, form: str = "library", /, **parameters: float) -> Effect:
@@ -45,25 +53,17 @@ def made(*effects: Effect, seed: int = 0, **changed: Any) -> Breaths:
     return record(one, np.random.default_rng(seed), steps=16)
 
 
-def split(breaths: Breaths, names: tuple[str, ...] | None = None) -> Evaluator:
-    """On the bench, with the library's parameters or some."""
-    return make_evaluator(
-        recorded(breaths), HELD[: len(breaths)], names or paths(), settings=SETTINGS
-    )
+def split(breaths: Breaths, settings: SelectionConfig = SETTINGS) -> Evaluator:
+    """Training and held-out breaths, with the library's parameters."""
+    return make_evaluator(recorded(breaths), HELD[: len(breaths)], paths(), settings=settings)
 
 
-def with_few() -> tuple[str, ...]:
-    """Parameters of the library and of a few slots."""
-    return paths((*library(), *FEW))
-
-
-def limit_slots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave a few slots to choose from."""
-    few = {name: basis_terms()[name] for name in FEW}
-    monkeypatch.setattr("ventbench.diagnosis.screening.basis_terms", lambda: few)
-    monkeypatch.setattr("ventbench.diagnosis.found.all_parameter_paths", with_few)
+def split_wide(breaths: Breaths, settings: SelectionConfig = SETTINGS) -> Evaluator:
+    """Training and held-out breaths, with the parameters of the nonparametric terms as well."""
+    names = all_parameter_paths(settings)
+    return make_evaluator(recorded(breaths), HELD[: len(breaths)], names, settings=settings)
 
 
 def numbered(breaths: Breaths, first: int) -> Breaths:
-    """The same with ids from ``first``, so that recordings can be joined."""
+    """The breaths with ids from ``first``, so that recordings can be joined."""
     return dataclasses.replace(breaths, breath_id=first + np.arange(len(breaths)))

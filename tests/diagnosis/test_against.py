@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -22,14 +21,6 @@ from . import small
 
 NAME = "turbulent_resistance"
 PASSIVE = ("patient_effort",)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_problems() -> Iterator[None]:
-    """One size of array and a few slots: the rest would take minutes to compile."""
-    with pytest.MonkeyPatch.context() as patch:
-        small.limit_slots(patch)
-        yield
 
 
 def strange(breaths: Breaths) -> np.ndarray:

@@ -13,7 +13,7 @@ from ventbench.mechanics.lung_match import Estimate
 
 
 def conclusion(**nats: float) -> Any:
-    return SimpleNamespace(names=tuple(nats), nats=nats)
+    return SimpleNamespace(names=tuple(nats), held_out_gains=nats)
 
 
 @pytest.fixture

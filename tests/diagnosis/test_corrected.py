@@ -33,7 +33,7 @@ def plants(**base: float) -> dict[str, Plant]:
 def something(pressure: np.ndarray, plant: dict[str, Plant]) -> Any:
     """What is asked of something found: pressures and plants."""
     return SimpleNamespace(
-        conclusion=SimpleNamespace(full=None, null=None),
+        conclusion=SimpleNamespace(full=None, base=None),
         evaluator=SimpleNamespace(training=SimpleNamespace(data=None)),
         pressures=lambda fitted, held, first: pressure,
         plants=lambda: plant,
@@ -64,21 +64,21 @@ def test_a_simulator_that_would_err_more_is_left_as_it_is(breaths, monkeypatch, 
 
 @pytest.mark.parametrize(
     ("full", "named", "kept"),
-    [(0.1, 0.2, "full"), (0.6, 0.2, "named"), (0.6, 0.7, "null")],
+    [(0.1, 0.2, "full"), (0.6, 0.2, "named"), (0.6, 0.7, "base")],
 )
 def test_of_the_base_model_is_kept_what_does_not_throw_breaths_far_off(
     breaths, monkeypatch, full, named, kept
 ):
     before = simulators.answers(plants(R=10.0), breaths)
     error = breaths.pressure - before
-    gains = {"null": 0.5, "full": 1.0 - full, "named": 1.0 - named}
+    gains = {"base": 0.5, "full": 1.0 - full, "named": 1.0 - named}
 
     def pressures(fitted: Any, held: Any, first: Any) -> np.ndarray:
         return before + gains[fitted.which] * error
 
     fitted = {key: SimpleNamespace(which=key, names=("leak",)) for key in gains}
     found: Any = SimpleNamespace(
-        conclusion=SimpleNamespace(**fitted, place=object()), evaluator=None, pressures=pressures,
+        conclusion=SimpleNamespace(**fitted, unnamed=object()), evaluator=None, pressures=pressures,
         fit=fitted["full"],
     )  # fmt: skip
     monkeypatch.setattr(module.estimates, "plants", lambda fit: fit.which)
@@ -101,11 +101,11 @@ def test_a_few_breaths_far_off_are_enough(breaths, monkeypatch):
     left[np.flatnonzero(~held)[0]] = 2.5
 
     def pressures(fitted: Any, held: Any, first: Any) -> np.ndarray:
-        return breaths.pressure - {"null": 0.5, "full": left, "named": 0.3}[fitted.which] * error
+        return breaths.pressure - {"base": 0.5, "full": left, "named": 0.3}[fitted.which] * error
 
-    fitted = {k: SimpleNamespace(which=k, names=("leak",)) for k in ("null", "full", "named")}
+    fitted = {k: SimpleNamespace(which=k, names=("leak",)) for k in ("base", "full", "named")}
     found: Any = SimpleNamespace(
-        conclusion=SimpleNamespace(**fitted, place=object()), evaluator=None, pressures=pressures,
+        conclusion=SimpleNamespace(**fitted, unnamed=object()), evaluator=None, pressures=pressures,
         fit=fitted["full"],
     )  # fmt: skip
     fitted = ~held[:, None] & breaths.valid & (breaths.time > 0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ventbench.diagnosis.hypothesis import Hypothesis, has_own
+from ventbench.diagnosis.hypothesis import Hypothesis, varies_by_breath
 from ventbench.physics import library
 from ventbench.system_id import START
 
@@ -69,4 +69,4 @@ def test_shapes_are_fitted_only_if_freed():
 
 
 def test_only_an_effort_is_each_breaths_own():
-    assert [name for name in NAMES if has_own(name)] == ["patient_effort"]
+    assert [name for name in NAMES if varies_by_breath(name)] == ["patient_effort"]

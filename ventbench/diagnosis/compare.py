@@ -39,7 +39,7 @@ def lacking(
         What is missing, the most important first; and sentences about what the simulator has and
         the recording does not show.
     """
-    order = sorted(wanted.names, key=lambda name: -wanted.nats.get(name, 0.0))
+    order = sorted(wanted.names, key=lambda name: -wanted.held_out_gains.get(name, 0.0))
     if simulated is None or had is None:
         return [Lack(name, False) for name in order], []
     missing = []

@@ -1,4 +1,10 @@
-"""From a bench to a conclusion: names, a slot, or neither."""
+"""What a recording needs: mechanisms of the library, an unnamed effect beside them, or neither.
+
+:func:`conclude` selects mechanisms (:mod:`ventbench.diagnosis.selection`), looks for what they
+leave unexplained with nonparametric terms and latent inputs, drops the mechanisms that this makes
+idle (:mod:`ventbench.diagnosis.refinement`), and compares the remaining ones with alternatives. If
+the valve's gain scatters between breaths, all is repeated with a gain of each breath's own.
+"""
 
 from __future__ import annotations
 
@@ -7,53 +13,55 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from ventbench.diagnosis.evaluator import Evaluator
-from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, has_own
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.latent_inputs import (
-    GAIN,
-    LATENT_INPUTS,
+    GAIN_SCATTER,
     MEASUREMENT,
+    PLACES,
     LatentInput,
     fit_latent_inputs,
     log_likelihood_without_input,
 )
 from ventbench.diagnosis.refinement import (
-    PROMISING,
     Alternatives,
     NonparametricFit,
     SingleTermAlternative,
-    UnnamedEffect,
-    alternatives,
     backward_elimination,
+    compare_nonparametric_terms,
     drop_compensating_terms,
     eliminate_beside_input,
-    without_effort,
+    find_alternatives,
+    without_breath_terms,
 )
-from ventbench.diagnosis.screening import (
-    component_of,
-    score_nonparametric_terms,
-)
+from ventbench.diagnosis.screening import component_of
 from ventbench.diagnosis.selection import (
-    MUCH,
     Comparison,
     Progress,
-    compare_candidates,
     fit_with_noise,
     forward_selection,
     passes_heldout_test,
 )
-from ventbench.diagnosis.settings import GATE
+from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.together import each
 
-#: A source at the sensor is noise unless it is of one frequency and this large, cmH2O.
-_HUM = 0.3
 
-#: Nats on held-out breaths from which a source is believed: places, scales and sizes are searched.
-_SOURCE = 8.0
+@dataclass(frozen=True, eq=False)
+class UnnamedEffect:
+    """An effect for which the library has no mechanism.
 
-#: Share of what sources explain from which it is the gain that differs between breaths.
-_SCATTERED = 1.0
+    Attributes:
+        name: public name of the nonparametric component, or of the latent input's place.
+        term: the component's basis term, or None for a latent input.
+        latent_input: the input, or None for a basis term.
+        nats: held-out log-likelihood that it gains.
+    """
+
+    name: str
+    term: str | None
+    latent_input: LatentInput | None
+    nats: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,187 +69,207 @@ class Conclusion:
     """What a recording needs.
 
     Attributes:
-        null: the base model, refitted.
-        named: with the names alone.
-        full: with the slot's element too; ``named`` if there is none.
-        place: the slot, or None.
+        base: the base model with its noise.
+        named: the selected mechanisms.
+        full: the mechanisms and the nonparametric term; ``named`` if there is none.
+        unnamed: the unnamed effect, or None.
         noise: that is left.
-        nats: held-out log-likelihood that is lost without each name.
-        alternatives: to each name.
-        gain_sd: standard deviation of the logarithm of the breaths' valve gains, 0 if all are one.
-        hidden: whether much is missing, and neither a name nor a place is believed.
+        held_out_gains: held-out log-likelihood that each mechanism gains, nats, by name.
+        alternatives: to each mechanism, by name.
+        gain_sd: standard deviation of the logarithm of the breaths' valve gains; 0 if all breaths
+            have the same gain.
+        unresolved: whether much is missing, and neither mechanism nor unnamed effect is accepted.
     """
 
-    null: FittedModel
+    base: FittedModel
     named: FittedModel
     full: FittedModel
-    place: UnnamedEffect | None
+    unnamed: UnnamedEffect | None
     noise: Noise
-    nats: dict[str, float]
+    held_out_gains: dict[str, float]
     alternatives: dict[str, Alternatives]
     gain_sd: float = 0.0
-    hidden: bool = False
+    unresolved: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Mechanisms of the library."""
-        return self.named.hypothesis.names
+        """The selected mechanisms."""
+        return self.named.names
 
 
 def conclude(evaluator: Evaluator, wider: Callable[[], Evaluator], tell: Progress) -> Conclusion:
-    """Name what is missing.
+    """Find what a recording needs beyond the base model.
 
     Args:
         evaluator: with the library's parameters.
-        wider: makes the same bench with those of all slots too.
-        tell: is told what is done.
+        wider: makes the evaluator with the parameters of the nonparametric terms as well.
+        tell: is told what is being done.
     """
-    null = fit_with_noise(evaluator, Hypothesis())
+    base = fit_with_noise(evaluator, Hypothesis())
     wider = cache(wider)
-    named, steps = forward_selection(
-        evaluator, null, tell, SingleTermAlternative(evaluator, wider, null)
-    )
+    single = SingleTermAlternative(evaluator, wider, base)
+    selected, comparisons = forward_selection(evaluator, base, tell, single)
     tell("looking for what has no name")
     wide = wider()
-    trimmed = drop_compensating_terms(evaluator, wide, named, tell)
-    left = _left(evaluator, wide, trimmed)
-    if trimmed is not named and not left.shaped:
-        # What explains the names away must be there in their place.
-        left = _left(evaluator, wide, named)
+    reduced = drop_compensating_terms(evaluator, wide, selected, tell)
+    rest = _explain_rest(evaluator, wide, reduced)
+    if reduced is not selected and not rest.prefers_term:
+        # The term that explains the dropped mechanisms away must be there in their place.
+        rest = _explain_rest(evaluator, wide, selected)
     else:
-        named = trimmed
-    if not evaluator.gain_sd and left.scatter:
-        # Everything is asked anew, with a valve whose gain may differ between breaths.
-        size = left.scatter
-        return conclude(replace(evaluator, gain_sd=size), lambda: replace(wide, gain_sd=size), tell)
-    source, shape = left.source, left.shape
-    place, full = None, named
-    if source is not None and not left.shaped:
-        place, named = source, eliminate_beside_input(evaluator, named, source)
-        full = named
-    elif shape is not None:
-        named, shape = backward_elimination(evaluator, wide, named, shape)
-        place, full = (
-            UnnamedEffect(component_of(shape.element), shape.element, None, shape.nats),
-            shape.full,
-        )
+        selected = reduced
+    if not evaluator.gain_sd and rest.gain_sd:
+        sd = rest.gain_sd
+        return conclude(replace(evaluator, gain_sd=sd), lambda: replace(wide, gain_sd=sd), tell)
+    unnamed, full = None, selected
+    if rest.latent is not None and not rest.prefers_term:
+        unnamed = rest.latent
+        assert unnamed.latent_input is not None
+        selected = eliminate_beside_input(evaluator, selected, unnamed.latent_input, unnamed.nats)
+        full = selected
+    elif rest.term is not None:
+        selected, fit = backward_elimination(evaluator, wide, selected, rest.term)
+        unnamed, full = UnnamedEffect(component_of(fit.term), fit.term, None, fit.nats), fit.full
     tell("comparing alternatives")
-    named, other = alternatives(evaluator, named, steps, swap=place is None)
-    full = named if place is None else full
-    noise = place.source.noise if place and place.source else full.noise
-    hidden = place is None and not named.names and is_hidden(evaluator, steps)
+    selected, alternatives = find_alternatives(
+        evaluator, selected, comparisons, swap=unnamed is None
+    )
+    full = selected if unnamed is None else full
+    latent = None if unnamed is None else unnamed.latent_input
     return Conclusion(
-        null, named, full, place, noise, _losses(evaluator, named), other, evaluator.gain_sd, hidden
+        base,
+        selected,
+        full,
+        unnamed,
+        full.noise if latent is None else latent.noise,
+        _held_out_gains(evaluator, selected),
+        alternatives,
+        evaluator.gain_sd,
+        unnamed is None and not selected.names and is_unresolved(evaluator, comparisons),
     )
 
 
-def is_hidden(evaluator: Evaluator, steps: Sequence[Comparison]) -> bool:
-    """Whether something explains much in training, and a little of held-out breaths, unbelieved.
+def is_unresolved(evaluator: Evaluator, comparisons: Sequence[Comparison]) -> bool:
+    """Whether a candidate explains much of the training breaths but was not accepted.
 
-    So do effects that hide each other, each of which alone helps some breaths and harms others.
-    What is each breath's own does not count: it explains coloured noise as well.
+    Effects that hide each other do so: each alone helps some breaths and harms others. The
+    candidate must also gain a little on held-out breaths. Patient effort does not count, since it
+    explains coloured noise as well.
+
+    Args:
+        evaluator: of the recording.
+        comparisons: of the forward selection; the last one counts.
     """
-    if not steps:
+    if not comparisons:
         return False
-    last = steps[-1]
-    least = evaluator.criterion(last.before) - MUCH
+    last = comparisons[-1]
+    least = evaluator.criterion(last.base) - evaluator.settings.forward.large_gain
+    threshold = evaluator.settings.held_out_test.threshold
+
+    def gain(fitted: FittedModel) -> float:
+        before = evaluator.held_out_log_likelihood(last.base)
+        return float((evaluator.held_out_log_likelihood(fitted) - before).sum())
+
     return any(
-        one.criterion < least
-        and float(
-            (
-                evaluator.held_out_log_likelihood(one.fitted)
-                - evaluator.held_out_log_likelihood(last.before)
-            ).sum()
-        )
-        > GATE
-        for one in last.rivals
-        if not has_own(one.name)
+        model.criterion < least and gain(model.fitted) > threshold
+        for model in last.ranked
+        if not varies_by_breath(model.name)
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _Left:
-    """What names leave unexplained.
+class _Rest:
+    """What explains the rest that the mechanisms leave.
 
     Attributes:
-        shape: best element of a slot, or None.
-        source: best source that moves in time, or None.
-        scatter: standard deviation of the logarithm of the breaths' gains, 0 if all are one.
+        term: best nonparametric term, or None.
+        latent: best latent input, or None.
+        gain_sd: standard deviation of the logarithm of the breaths' gains; 0 if it does not matter.
     """
 
-    shape: NonparametricFit | None
-    source: UnnamedEffect | None
-    scatter: float
+    term: NonparametricFit | None
+    latent: UnnamedEffect | None
+    gain_sd: float
 
     @property
-    def shaped(self) -> bool:
-        """Whether a shape explains the most."""
-        nats = 0.0 if self.source is None else self.source.nats
-        return self.shape is not None and self.shape.nats >= nats
+    def prefers_term(self) -> bool:
+        """Whether the nonparametric term explains the most."""
+        nats = 0.0 if self.latent is None else self.latent.nats
+        return self.term is not None and self.term.nats >= nats
 
 
-def _left(evaluator: Evaluator, wide: Evaluator, named: FittedModel) -> _Left:
-    shape = _shape(wide, named)
-    found = fit_latent_inputs(evaluator, without_effort(evaluator, named), (GAIN, *LATENT_INPUTS))
-    reference = log_likelihood_without_input(evaluator, named)[1]
-    gain = found.pop(GAIN)
-    scatter = gain.size if _scattered(gain, found, reference, shape) else 0.0
-    return _Left(shape, _source(found, reference), scatter)
+def _explain_rest(evaluator: Evaluator, wide: Evaluator, selected: FittedModel) -> _Rest:
+    term = _best_term(wide, selected)
+    passive = without_breath_terms(evaluator, selected)
+    inputs = fit_latent_inputs(evaluator, passive, (GAIN_SCATTER, *PLACES))
+    reference = log_likelihood_without_input(evaluator, selected)[1]
+    scatter, settings = inputs.pop(GAIN_SCATTER), evaluator.settings
+    scattered = _gain_scatters(scatter, inputs, reference, term, settings)
+    gain_sd = scatter.size if scattered else 0.0
+    return _Rest(term, _best_input(inputs, reference, settings), gain_sd)
 
 
-def _shape(wide: Evaluator, named: FittedModel) -> NonparametricFit | None:
-    """The element that explains most of what the names leave, if held-out breaths ask for it."""
-    here = wide.fit(named.hypothesis, named.noise, named, iterations=3)
-    found = compare_candidates(wide, here, score_nonparametric_terms(here)[:PROMISING])
-    if found is None or not passes_heldout_test(found.gained):
+def _best_term(wide: Evaluator, selected: FittedModel) -> NonparametricFit | None:
+    """The nonparametric term that explains most, if held-out breaths and BIC ask for it."""
+    iterations = wide.settings.fit.start_iterations
+    start = wide.fit(selected.hypothesis, selected.noise, selected, iterations=iterations)
+    comparison = compare_nonparametric_terms(wide, start)
+    if comparison is None or not passes_heldout_test(
+        comparison.held_out_gain, wide.settings.held_out_test
+    ):
         return None
-    best = found.rivals[0]
-    if wide.criterion(best.fitted) > wide.criterion(found.before):
+    best = comparison.ranked[0]
+    if wide.criterion(best.fitted) > wide.criterion(comparison.base):
         return None
-    nats = float(
-        (wide.held_out_log_likelihood(best.fitted) - wide.held_out_log_likelihood(here)).sum()
-    )
-    return NonparametricFit(best.name, best.fitted, nats)
+    gained = wide.held_out_log_likelihood(best.fitted) - wide.held_out_log_likelihood(start)
+    return NonparametricFit(best.name, best.fitted, float(gained.sum()))
 
 
-def _scattered(
-    gain: LatentInput,
-    sources: dict[str, LatentInput],
+def _gain_scatters(
+    scatter: LatentInput,
+    inputs: dict[str, LatentInput],
     reference: Floats,
-    shape: NonparametricFit | None,
+    term: NonparametricFit | None,
+    settings: SelectionConfig,
 ) -> bool:
-    """Whether the breaths' valve gains differ.
-
-    That must explain more than any shape, and most of what sources do that move within breaths.
-    """
-    gained = gain.held_out - reference
+    """Whether scatter of the valve's gain explains more than any term or latent input."""
+    gained = scatter.held_out_log_likelihood - reference
     nats = float(gained.sum())
-    others = [float((one.held_out - reference).sum()) for one in sources.values()]
-    if not passes_heldout_test(gained) or (shape is not None and shape.nats > nats):
+    if not passes_heldout_test(gained, settings.held_out_test):
         return False
-    return nats > _SCATTERED * max(others)
+    if term is not None and term.nats > nats:
+        return False
+    others = [
+        float((latent.held_out_log_likelihood - reference).sum()) for latent in inputs.values()
+    ]
+    return nats > settings.latent_inputs.scatter_share * max(others)
 
 
-def _losses(evaluator: Evaluator, named: FittedModel) -> dict[str, float]:
-    here = evaluator.held_out_log_likelihood(named)
-
-    def lost(name: str) -> float:
-        left = evaluator.fit(named.hypothesis.without(name), named.noise, named)
-        return float((here - evaluator.held_out_log_likelihood(left)).sum())
-
-    return dict(zip(named.names, each(lost, named.names), strict=True))
-
-
-def _source(found: dict[str, LatentInput], reference: Floats) -> UnnamedEffect | None:
-    """A source that moves in time and explains more than the names and than coloured noise."""
-    others = dict(found)
-    sensor = others.pop(MEASUREMENT)
-    best = max(others.values(), key=lambda one: one.training)
-    gained = best.held_out - reference
-    ahead = float((best.held_out - sensor.held_out).sum())
-    if passes_heldout_test(gained, _SOURCE) and ahead > GATE:
-        return UnnamedEffect(best.source, None, best, float(gained.sum()))
-    gained = sensor.held_out - reference
-    if passes_heldout_test(gained) and sensor.periodic and sensor.size >= _HUM:
+def _best_input(
+    inputs: dict[str, LatentInput], reference: Floats, settings: SelectionConfig
+) -> UnnamedEffect | None:
+    """The latent input that explains more than the mechanisms and than coloured noise, if any."""
+    test, limits = settings.held_out_test, settings.latent_inputs
+    physical = dict(inputs)
+    sensor = physical.pop(MEASUREMENT)
+    best = max(physical.values(), key=lambda latent: latent.training_log_likelihood)
+    gained = best.held_out_log_likelihood - reference
+    ahead = float((best.held_out_log_likelihood - sensor.held_out_log_likelihood).sum())
+    if passes_heldout_test(gained, test, limits.threshold) and ahead > test.threshold:
+        return UnnamedEffect(best.place, None, best, float(gained.sum()))
+    gained = sensor.held_out_log_likelihood - reference
+    hum = sensor.periodic and sensor.size >= limits.sensor_amplitude
+    if passes_heldout_test(gained, test) and hum:
         return UnnamedEffect(MEASUREMENT, None, sensor, float(gained.sum()))
     return None
+
+
+def _held_out_gains(evaluator: Evaluator, selected: FittedModel) -> dict[str, float]:
+    """Held-out log-likelihood that is lost without each mechanism, nats."""
+    here = evaluator.held_out_log_likelihood(selected)
+
+    def lost(name: str) -> float:
+        left = evaluator.fit(selected.hypothesis.without(name), selected.noise, selected)
+        return float((here - evaluator.held_out_log_likelihood(left)).sum())
+
+    return dict(zip(selected.names, each(lost, selected.names), strict=True))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ventbench.diagnosis import estimates, simulators
 from ventbench.diagnosis.against import refitted
 from ventbench.diagnosis.found import Found
-from ventbench.diagnosis.hypothesis import has_own
+from ventbench.diagnosis.hypothesis import varies_by_breath
 from ventbench.diagnosis.residual_analysis import open_loop_error
 from ventbench.diagnosis.simulators import Given
 from ventbench.interfaces import Plant
@@ -67,7 +67,7 @@ def corrected(
     after = found.pressures(found.conclusion.full, held, first)
     seen = breaths.valid & (breaths.time > 0) & ~held[:, None]
     if had is None:
-        refit = found.pressures(found.conclusion.null, held, first)
+        refit = found.pressures(found.conclusion.base, held, first)
         answers = {"before": before, "refit": refit, "after": after}
         return _physics(breaths, found, held, answers, seen)
     # Its own physics, then the same with the recording's R, C, R_ex and PEEP.
@@ -98,16 +98,16 @@ def _physics(
         )  # the square sees what few breaths hide
         return errs.mae <= _FAR * least.mae and errs.rmse <= _FAR * least.rmse
 
-    own = any(has_own(name) for name in found.conclusion.full.names)
+    own = any(varies_by_breath(name) for name in found.conclusion.full.names)
     if own or serves(answers["after"]):
         return Correction(answers, _errs(breaths, answers, seen), estimates.plants(found.fit))
-    conclusion, kept, what = found.conclusion, found.conclusion.null, "what was found"
-    if conclusion.place is not None and conclusion.named.names:
+    conclusion, kept, what = found.conclusion, found.conclusion.base, "what was found"
+    if conclusion.unnamed is not None and conclusion.named.names:
         pressure = found.pressures(conclusion.named, held, breaths.pressure[:, 0])
         if serves(pressure):
             kept, what = conclusion.named, "what has no name"
             answers = answers | {"after": pressure}
-    if kept is conclusion.null:
+    if kept is conclusion.base:
         answers = answers | {"after": answers["refit"]}
     note = (
         f"With {what} the simulator would err more on the breaths that were fitted than with R "

@@ -88,7 +88,7 @@ def _diagnosis(
     correction = corrected(breaths, held, before, found, had, plant)
     answers = correction.answers
     place = shapes.slot(conclusion)
-    own = had.conclusion.place if had is not None else None
+    own = had.conclusion.unnamed if had is not None else None
     if own is not None and place is not None and own.name == place.name:
         removed.append(f"The simulator has something without a name at {place.name} as well.")
     useless = correction.left and (bool(names) or place is not None)
@@ -101,7 +101,7 @@ def _diagnosis(
     location = locate(
         breaths.select(here), answers["refit"][here], noise.sigma[0], flow[here], volume[here]
     )
-    unnamed = place is not None or conclusion.hidden or (useless and location)
+    unnamed = place is not None or conclusion.unresolved or (useless and location)
     verdict: Verdict = "named" if names else "unnamed" if unnamed else "nothing_missing"
     return Diagnosis(
         verdict=verdict,
@@ -145,13 +145,18 @@ def _named(one: Lack, conclusion: Conclusion, fit: Fit, had: Found | None) -> Mi
     other = conclusion.alternatives.get(one.name, Alternatives((), 1.0, ()))
     own = estimates.parameters(had.fit, one.name) if had is not None and one.changed else {}
     return MissingMechanism(
-        one.name, estimates.parameters(fit, one.name), other.confidence, other.names,
-        conclusion.nats.get(one.name, 0.0), one.changed, {key: x.value for key, x in own.items()},
-    )  # fmt: skip
+        one.name,
+        estimates.parameters(fit, one.name),
+        other.confidence,
+        other.names,
+        conclusion.held_out_gains.get(one.name, 0.0),
+        one.changed,
+        {key: x.value for key, x in own.items()},
+    )
 
 
 def _request(conclusion: Conclusion) -> BreathRequest | None:
-    rivals = [one.fitted for other in conclusion.alternatives.values() for one in other.rivals]
+    rivals = [one.fitted for other in conclusion.alternatives.values() for one in other.models]
     return request_breaths(
         conclusion.named, rivals, noise=Noise((conclusion.noise.sigma[0],), (0.0,))
     )

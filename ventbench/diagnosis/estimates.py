@@ -9,7 +9,7 @@ import numpy as np
 
 from ventbench import mechanics
 from ventbench.diagnosis.evaluator import Evaluator
-from ventbench.diagnosis.hypothesis import FittedModel, Partition, has_own
+from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
 from ventbench.diagnosis.patient_effort import EFFORT
 from ventbench.interfaces import Plant
 from ventbench.mechanics.lung_match import Estimate, LungMatch
@@ -35,7 +35,7 @@ def estimated(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
     free = [path for path in own if parameter(path).uncertain]
     start: dict[str, Any] = {}
     for path in fitted.problem.unknowns.paths:
-        if path != START and not ("." in path and has_own(path.rpartition(".")[0])):
+        if path != START and not ("." in path and varies_by_breath(path.rpartition(".")[0])):
             start[path] = float(np.median(fitted.column(path)))
     for name in hypothesis.names:
         for pair in mechanism(name).description.interchangeable:
@@ -133,7 +133,7 @@ def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
 def _by_label(
     data: Data, simulator: Simulator, mechanisms: tuple[str, ...], values: Floats
 ) -> dict[str, Plant]:
-    own = [name for name in library() if has_own(name)]
+    own = [name for name in library() if varies_by_breath(name)]
     names = [path for path in paths(mechanisms) if path.rpartition(".")[0] not in own]
     names.remove("position")
     columns = [simulator.names.index(name) for name in names]

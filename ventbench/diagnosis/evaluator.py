@@ -1,12 +1,9 @@
-"""One recording on the bench: training and held-out breaths, and hypotheses fitted to them.
+"""Fits of hypotheses to a recording, and what held-out breaths say of them.
 
-Dead times on the far side of a sample.
-
-The likelihood of a dead time is nearly flat between two samples and falls off steeply where an edge
-passes one, so that a search stays on the side where it began. The other sides are looked at with
-all else refitted to first order.
-
-Every breath as a judge: the gain of a term in each, by fits to the other breaths.
+:func:`fit` finds the maximum-likelihood parameters of a hypothesis on some breaths. An
+:class:`Evaluator` holds a recording that is split into training and held-out breaths; it fits
+hypotheses to the former and gives their information criterion there, and their log-likelihood on
+the latter.
 """
 
 from __future__ import annotations
@@ -21,42 +18,162 @@ from numpy.typing import ArrayLike, NDArray
 
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, make_partition
 from ventbench.diagnosis.linearisation import linearise
-from ventbench.diagnosis.patient_effort import (
-    AMPLITUDE,
-    DURATION,
-    EFFORT,
-    ONSET,
-    effort_log_likelihood_gain,
-    marginal_log_likelihood,
-    restart_efforts,
-)
+from ventbench.diagnosis.patient_effort import BreathTerm, breath_term
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.physics.catalogue import library
+from ventbench.system_id import problem as problems
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.derivatives import START
 from ventbench.system_id.least_squares import minimise
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.problem import Problem
-from ventbench.system_id.problem import settings as parameter_values
 from ventbench.system_id.together import each
 from ventbench.system_id.unknowns import described, unknowns
 
-#: Expected fall of the cost, nats, at which a comparison's search ends, and its most steps.
-_TOLERANCE, _ITERATIONS = 0.02, 14
+
+def fit(
+    partition: Partition,
+    hypothesis: Hypothesis,
+    noise: Noise,
+    *,
+    warm_start: FittedModel | None = None,
+    start: Mapping[str, ArrayLike] | None = None,
+    restart: bool = False,
+    gain_sd: float = 0.0,
+    tolerance: float | None = None,
+    iterations: int | None = None,
+    settings: SelectionConfig = DEFAULT,
+) -> FittedModel:
+    """Find the maximum-likelihood parameters of a hypothesis.
+
+    Args:
+        partition: the breaths.
+        hypothesis: the terms.
+        noise: of the measurement.
+        warm_start: a model of the same breaths whose parameters the search starts from.
+        start: physical values to start from, by path; they precede those of ``warm_start``.
+        restart: also look for dead times and each breath's effort beyond the nearest optimum.
+        gain_sd: prior standard deviation of the logarithm of each breath's valve gain; 0 if all
+            breaths have the same gain.
+        tolerance: expected fall of the cost, nats, at which the search ends; as in ``settings`` if
+            None.
+        iterations: most steps; as in ``settings`` if None.
+        settings: every threshold.
+    """
+    extra = ("gain",) if gain_sd else ()
+    paths = tuple(dict.fromkeys((*hypothesis.paths, *extra)))
+    problem = make_problem(partition, paths, noise, dict(hypothesis.fixed), gain_sd)
+    layout = problem.unknowns
+    columns = (*partition.simulator.names, START)
+    first = {p: problem.fixed[:, columns.index(p)] for p in layout.paths if "." not in p}
+    first |= {p: described(p).mild for p in layout.paths if "." in p}
+    before: tuple[str, ...] = ()
+    if warm_start is not None:
+        before = warm_start.names
+        known = set(warm_start.problem.unknowns.paths)
+        first |= {p: warm_start.column(p) for p in layout.paths if p in known}
+    first |= {p: value for p, value in (start or {}).items() if p in layout.paths}
+    low, high = layout.bounds()
+    x = layout.pack(first)
+    if restart:
+        x = delay_restarts(problem, x, settings)
+    x = breath_term(hypothesis.names, settings).start(problem, x, before, refit=restart)
+    minimum = minimise(
+        problem.cost, problem.normal, x, low, high,
+        tolerance=settings.fit.tolerance if tolerance is None else tolerance,
+        iterations=settings.fit.iterations if iterations is None else iterations,
+    )  # fmt: skip
+    return FittedModel(hypothesis, problem, minimum, float(problem.log_likelihood(minimum.x).sum()))
+
+
+def make_problem(
+    partition: Partition,
+    paths: tuple[str, ...],
+    noise: Noise,
+    fixed: Mapping[str, ArrayLike],
+    gain_sd: float,
+) -> Problem:
+    """Lay out the unknowns of a fit.
+
+    Args:
+        partition: the breaths.
+        paths: parameters that are fitted.
+        noise: of the measurement.
+        fixed: values of others, by path; those that are not given are neutral.
+        gain_sd: prior standard deviation of the logarithm of each breath's valve gain, or 0.
+    """
+    data = partition.data
+    groups = {"gain": np.arange(len(data))} if gain_sd else {}
+    groups |= groups_by_label(data, paths)
+    layout = unknowns(data, paths, groups)
+    base = problems.settings(data, partition.simulator.names, fixed)
+    neutral = float(np.log(described("gain").neutral))
+    mean, precision = layout.prior({"gain": (neutral, gain_sd)} if gain_sd else {})
+    return Problem(data, partition.simulator, layout, base, noise, mean, precision)
+
+
+def groups_by_label(data: Data, paths: tuple[str, ...]) -> dict[str, NDArray[np.int64]]:
+    """Group the breaths by R or C for the parameters that depend on that label.
+
+    Returns:
+        For each such path, the group of each breath, ``(n,)``.
+    """
+    groups = {}
+    for path in paths:
+        follows = described(path).follows if "." in path else None
+        if follows:
+            label = data.R if follows == "R" else data.C
+            groups[path] = np.unique(label, return_inverse=True)[1].reshape(-1)
+    return groups
+
+
+def delay_restarts(problem: Problem, x: Floats, settings: SelectionConfig = DEFAULT) -> Floats:
+    """Move each dead time to the value of its grid that is the likeliest, if it clearly is.
+
+    The likelihood of a dead time is nearly flat between two samples and falls steeply where an edge
+    passes one, so that a local search stays between the samples where it began. Other values are
+    compared with all other parameters refitted to first order.
+
+    Args:
+        problem: of any hypothesis.
+        x: its unknowns, ``(U,)``.
+        settings: every threshold.
+    """
+    for path in problem.unknowns.paths:
+        parameter = described(path)
+        if parameter.kinked and parameter.scan:
+            x = _best_delay(problem, x, path, settings)
+    return x
+
+
+def _best_delay(problem: Problem, x: Floats, path: str, settings: SelectionConfig) -> Floats:
+    linear = linearise(problem, x, settings.screening, clip=np.inf)
+    column = problem.simulator.names.index(path)
+    loss = float(np.sum(problem.noise.loss(linear.residual)))
+    best, least = x, loss - settings.fit.delay_gain
+    for value in described(path).scan:
+        trial = linear.values.copy()
+        trial[:, column] = value
+        left = linear.residual + linear.template(problem.simulator.predict(trial))
+        loss = float(np.sum(problem.noise.loss(left)))
+        if loss < least:
+            best, least = x.copy(), loss
+            best[problem.unknowns.of(path)] = described(path).coordinate(value)
+    return best
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluator:
-    """A recording, split.
+    """A recording that is split into training and held-out breaths.
 
     Attributes:
         training: breaths that hypotheses are fitted to.
-        held_out: breaths that they are judged by.
-        gain_sd: prior standard deviation of each breath's own valve gain (of its logarithm), 0 if
-            all breaths have the same.
+        held_out: breaths that evaluate them.
+        gain_sd: prior standard deviation of the logarithm of each breath's valve gain; 0 if all
+            breaths have the same gain.
         excluded: mechanisms that cannot act, as efforts in a passive test lung.
-        folds: other splits of the same breaths, training and judging, so that with this one every
-            breath judges once.
+        folds: further splits of the same breaths, training and held-out, such that every breath is
+            held out exactly once in all splits together.
         settings: every threshold.
     """
 
@@ -66,7 +183,7 @@ class Evaluator:
     excluded: tuple[str, ...] = ()
     folds: tuple[tuple[Partition, Partition], ...] = ()
     settings: SelectionConfig = DEFAULT
-    _known: WeakKeyDictionary[FittedModel, Floats] = field(
+    _held_out: WeakKeyDictionary[FittedModel, Floats] = field(
         init=False, repr=False, default_factory=WeakKeyDictionary
     )
 
@@ -79,174 +196,131 @@ class Evaluator:
         self,
         hypothesis: Hypothesis,
         noise: Noise,
-        near: FittedModel | None = None,
+        warm_start: FittedModel | None = None,
         start: Mapping[str, ArrayLike] | None = None,
         *,
         partition: Partition | None = None,
         restart: bool = False,
-        iterations: int = _ITERATIONS,
-        tolerance: float = _TOLERANCE,
+        iterations: int | None = None,
+        tolerance: float | None = None,
     ) -> FittedModel:
-        """Fit a hypothesis from one start.
-
-        Args:
-            hypothesis: what acts.
-            noise: of the measurement.
-            near: another hypothesis, fitted to the same breaths, to start from.
-            start: physical values to start from, by path; before those of ``near``.
-            partition: breaths; the training ones if not given.
-            restart: look for dead times and each breath's effort beyond the next minimum.
-            iterations: most steps.
-            tolerance: expected fall of the cost, nats, at which the search ends.
-        """
-        partition = partition or self.training
-        problem = self._problem(partition, self._paths(hypothesis), noise, dict(hypothesis.fixed))
-        layout = problem.unknowns
-        order = (*partition.simulator.names, START)
-        first = {p: problem.fixed[:, order.index(p)] for p in layout.paths if "." not in p}
-        first |= {p: described(p).mild for p in layout.paths if "." in p}
-        if near is not None:
-            known = set(near.problem.unknowns.paths)
-            first |= {p: near.column(p) for p in layout.paths if p in known}
-        first |= {p: value for p, value in (start or {}).items() if p in layout.paths}
-        low, high = layout.bounds()
-        x = layout.pack(first)
-        if restart:
-            x = delay_restarts(problem, x)
-        if EFFORT in hypothesis.names and (restart or near is None or EFFORT not in near.names):
-            x = restart_efforts(problem, x, refined=restart)
-        found = minimise(
-            problem.cost, problem.normal, x, low, high, tolerance=tolerance, iterations=iterations
-        )
-        return FittedModel(hypothesis, problem, found, float(problem.log_likelihood(found.x).sum()))
+        """Fit a hypothesis to the training breaths, or to ``partition``; see :func:`fit`."""
+        return fit(
+            partition or self.training, hypothesis, noise, warm_start=warm_start, start=start,
+            restart=restart, gain_sd=self.gain_sd, tolerance=tolerance, iterations=iterations,
+            settings=self.settings,
+        )  # fmt: skip
 
     def held_out_log_likelihood(self, fitted: FittedModel) -> Floats:
-        """Log-likelihood of each judging breath, ``(n,)``.
+        """Log-likelihood of each held-out breath, nats, ``(n,)``.
 
-        Starts (and valve gains, where each breath has its own) are fitted to the breaths
-        themselves; efforts are integrated out.
+        Starting pressures (and valve gains, where each breath has its own) are fitted to the
+        held-out breaths themselves; patient effort is integrated out.
         """
-        if fitted not in self._known:
+        if fitted not in self._held_out:
             problem, x = self.refit_breath_parameters(fitted)
             found = problem.log_likelihood(x)
-            if EFFORT in fitted.names:
-                found = found + effort_log_likelihood_gain(
-                    problem, x, float(fitted.column(DURATION)[0])
-                )
-            self._known[fitted] = found
-        return self._known[fitted]
-
-    def refit_breath_parameters(
-        self, fitted: FittedModel, partition: Partition | None = None
-    ) -> tuple[Problem, Floats]:
-        """Put what some breaths gave to others; see :meth:`held_out_log_likelihood`."""
-        partition = partition or self.held_out
-        own = (START, "gain") if self.gain_sd else (START,)
-        values = self.transferred_values(fitted, partition)
-        names = partition.simulator.names
-        taken = {name: values[:, k] for k, name in enumerate(names) if name != "position"}
-        problem = self._problem(partition, own, fitted.noise, taken)
-        columns = (*names, START)
-        layout = problem.unknowns
-        first = {p: problem.fixed[:, columns.index(p)] for p in own}
-        low, high = layout.bounds()
-        found = minimise(
-            problem.cost, problem.normal, layout.pack(first), low, high, tolerance=0.1,
-            iterations=4,
-        )  # fmt: skip
-        return problem, found.x
+            term = self.breath_term(fitted)
+            self._held_out[fitted] = found + term.log_likelihood_gain(problem, x, fitted)
+        return self._held_out[fitted]
 
     def training_log_likelihood(self, fitted: FittedModel, noise: Noise | None = None) -> float:
-        """Log-likelihood of the training breaths, efforts of the patient integrated out.
+        """Log-likelihood of the training breaths, nats; patient effort is integrated out.
 
         Args:
-            fitted: fitted to the training breaths.
-            noise: at which it is judged, if not its own.
+            fitted: a model of the training breaths.
+            noise: the likelihood's; that of the fit if None.
         """
-        if EFFORT in fitted.names:
-            return float(marginal_log_likelihood(fitted, noise or fitted.noise).sum())
-        return fitted.log_likelihood if noise is None else fitted.log_likelihood_at(noise)
+        term = self.breath_term(fitted)
+        return float(term.marginal_log_likelihood(fitted, noise or fitted.noise).sum())
 
     def criterion(self, fitted: FittedModel, noise: Noise | None = None) -> float:
-        """Bayesian information criterion on the training breaths; less is better.
+        """Bayesian information criterion (BIC) on the training breaths; less is better.
 
-        Without what each breath has of its own, which is fitted alike or integrated out.
+        Only shared unknowns count: each breath's own are integrated out, or the same in all
+        hypotheses.
 
         Args:
-            fitted: fitted to the training breaths.
-            noise: at which it is judged, if not its own.
+            fitted: a model of the training breaths.
+            noise: the likelihood's; that of the fit if None.
         """
-        likelihood = self.training_log_likelihood(fitted, noise)
         count = float(self.training.data.weight.sum())
-        return -2.0 * likelihood + fitted.shared * float(np.log(count))
+        penalty = fitted.shared_count * float(np.log(count))
+        return -2.0 * self.training_log_likelihood(fitted, noise) + penalty
 
     def predict(
         self, fitted: FittedModel, partition: Partition, first: Floats | None = None
     ) -> Floats:
-        """Open-loop answers to breaths' commands, ``(n, c, T)``.
-
-        Of a breath to come nobody knows the patient's effort: what is expected is the mean over the
-        efforts of the breaths that were fitted.
+        """Open-loop response to the breaths' commands, ``(n, c, T)``.
 
         Args:
-            fitted: a hypothesis.
+            fitted: a model.
             partition: the breaths.
             first: pressures that they start from, cmH2O, ``(n,)``; their first readings if None.
         """
         values = self.transferred_values(fitted, partition)
         if first is not None:
             values[:, -1] = first
-        if EFFORT not in fitted.names:
-            return partition.simulator.predict(values)
-        columns = [partition.simulator.names.index(path) for path in (AMPLITUDE, ONSET)]
-        total, efforts = 0.0, zip(fitted.column(AMPLITUDE), fitted.column(ONSET), strict=True)
-        for effort in efforts:
-            values[:, columns] = effort
-            total = total + partition.simulator.predict(values)
-        return np.asarray(total) / len(fitted.column(AMPLITUDE))
+        return self.breath_term(fitted).predict(fitted, partition.simulator, values)
+
+    def refit_breath_parameters(
+        self, fitted: FittedModel, partition: Partition | None = None
+    ) -> tuple[Problem, Floats]:
+        """Fit only the breaths' own starting pressures and gains; all else stays as fitted.
+
+        Args:
+            fitted: a model.
+            partition: the breaths; the held-out ones if None.
+
+        Returns:
+            The problem without patient effort, and its unknowns.
+        """
+        partition, settings = partition or self.held_out, self.settings.fit
+        own = (START, "gain") if self.gain_sd else (START,)
+        values, names = self.transferred_values(fitted, partition), partition.simulator.names
+        fixed = {name: values[:, k] for k, name in enumerate(names) if name != "position"}
+        problem = make_problem(partition, own, fitted.noise, fixed, self.gain_sd)
+        columns, layout = (*names, START), problem.unknowns
+        first = {p: problem.fixed[:, columns.index(p)] for p in own}
+        low, high = layout.bounds()
+        minimum = minimise(
+            problem.cost, problem.normal, layout.pack(first), low, high,
+            tolerance=settings.breath_tolerance, iterations=settings.breath_iterations,
+        )  # fmt: skip
+        return problem, minimum.x
 
     def transferred_values(self, fitted: FittedModel, partition: Partition) -> Floats:
-        """Physical values of breaths, ``(n, P + 1)``: what those of a label share.
+        """Values of shared parameters for other breaths of the same lungs, ``(n, P + 1)``.
 
-        What is a breath's own, or unknown to the fit's simulator, is neutral, and its start the
-        first reading.
+        Parameters that differ from breath to breath, or that the model's simulator does not have,
+        are neutral. Breaths start at their first reading.
+
+        Args:
+            fitted: a model.
+            partition: the other breaths. Those of a label that the model has not seen take the
+                values of its first breath.
         """
         data, known = partition.data, fitted.problem.data
         names = fitted.problem.simulator.names
-        values = parameter_values(data, partition.simulator.names, {})
+        values = problems.settings(data, partition.simulator.names, {})
         same = (data.R[:, None] == known.R) & (data.C[:, None] == known.C)
         same |= ~same.any(axis=1, keepdims=True)
         first = np.argmax(same, axis=1)
         for column, name in enumerate(partition.simulator.names):
-            if name != "position" and name in names and not self._own(name):
-                item = described(name)  # rounding must not carry a value beyond its bound
+            if name != "position" and name in names and not self._differs_by_breath(name):
+                parameter = described(name)  # rounding must not carry a value beyond its bound
                 found = fitted.values[first, names.index(name)]
-                values[:, column] = np.clip(found, item.low, item.high)
+                values[:, column] = np.clip(found, parameter.low, parameter.high)
         return values
 
-    def _problem(
-        self,
-        partition: Partition,
-        free: tuple[str, ...],
-        noise: Noise,
-        fixed: Mapping[str, ArrayLike],
-    ) -> Problem:
-        groups = {"gain": np.arange(len(partition.data))} if self.gain_sd else {}
-        groups |= by_label(partition.data, free)
-        layout = unknowns(partition.data, free, groups)
-        base = parameter_values(partition.data, partition.simulator.names, fixed)
-        gain = float(np.log(described("gain").neutral))
-        mean, precision = layout.prior({"gain": (gain, self.gain_sd)} if self.gain_sd else {})
-        return Problem(partition.data, partition.simulator, layout, base, noise, mean, precision)
+    def breath_term(self, fitted: FittedModel) -> BreathTerm:
+        """What differs from breath to breath in a model."""
+        return breath_term(fitted.names, self.settings)
 
-    def _own(self, path: str) -> bool:
+    def _differs_by_breath(self, path: str) -> bool:
         if path == "gain":
             return self.gain_sd > 0
         return path == START or ("." in path and described(path).scope == "breath")
-
-    def _paths(self, hypothesis: Hypothesis) -> tuple[str, ...]:
-        extra = ("gain",) if self.gain_sd else ()
-        return tuple(dict.fromkeys((*hypothesis.paths, *extra)))
 
 
 def make_evaluator(
@@ -260,8 +334,8 @@ def make_evaluator(
 
     Args:
         data: all n breaths.
-        held_out: those that evaluate hypotheses, bool, ``(n,)``.
-        names: parameters that hypotheses may have.
+        held_out: which breaths evaluate hypotheses, bool, ``(n,)``.
+        names: paths of the parameters that hypotheses may have.
         excluded: mechanisms that cannot act.
         settings: every threshold.
     """
@@ -276,78 +350,25 @@ def make_evaluator(
     return Evaluator(*split(held_out), excluded=excluded, folds=others, settings=settings)
 
 
-def by_label(data: Data, free: tuple[str, ...]) -> dict[str, NDArray[np.int64]]:
-    """Groups of parameters that belong to the lung's R or C: one for each label."""
-    groups = {}
-    for path in free:
-        follows = described(path).follows if "." in path else None
-        if follows:
-            label = data.R if follows == "R" else data.C
-            groups[path] = np.unique(label, return_inverse=True)[1].reshape(-1)
-    return groups
-
-
-#: Nats by which another side must be likelier.
-_JUMP = 2.0
-
-
-def delay_restarts(problem: Problem, x: Floats) -> Floats:
-    """Move each dead time to the value of its scan that is the likeliest, if it clearly is.
-
-    Args:
-        problem: of any hypothesis.
-        x: its unknowns, ``(U,)``.
-    """
-    for path in problem.unknowns.paths:
-        item = described(path)
-        if item.kinked and item.scan:
-            x = _elsewhere(problem, x, path)
-    return x
-
-
-def _elsewhere(problem: Problem, x: Floats, path: str) -> Floats:
-    place = linearise(problem, x, np.inf)
-    column = problem.simulator.names.index(path)
-    best, reached = x, float(np.sum(problem.noise.loss(place.residual))) - _JUMP
-    for value in described(path).scan:
-        trial = place.values.copy()
-        trial[:, column] = value
-        left = place.residual + place.template(problem.simulator.predict(trial))
-        loss = float(np.sum(problem.noise.loss(left)))
-        if loss < reached:
-            best, reached = x.copy(), loss
-            best[problem.unknowns.of(path)] = described(path).coordinate(value)
-    return best
-
-
 def cross_validated_gain(
-    evaluator: Evaluator, current: FittedModel, without: FittedModel
+    evaluator: Evaluator, with_term: FittedModel, without_term: FittedModel
 ) -> Floats:
-    """Log-likelihood that a term gains in each breath, in the order of the folds, ``(n,)``.
+    """Log-likelihood that a term gains in each breath, by fits to other breaths, ``(n,)``.
 
     Args:
-        evaluator: of the recording.
-        current: with the term, fitted to the training breaths.
-        without: the same hypothesis without it, at the same noise.
+        evaluator: of the recording; the gains are in the order of its folds.
+        with_term: fitted to the training breaths.
+        without_term: the hypothesis without the term, at the same noise.
     """
 
-    def judged(work: tuple[tuple[Partition, Partition], FittedModel]) -> Floats:
-        (training, judging), fitted = work
-        fold = replace(evaluator, training=training, held_out=judging, folds=())
-        return fold.held_out_log_likelihood(_again(fold, fitted, training))
+    def evaluate(work: tuple[tuple[Partition, Partition], FittedModel]) -> Floats:
+        (training, held_out), fitted = work
+        fold = replace(evaluator, training=training, held_out=held_out, folds=())
+        values, names = fold.transferred_values(fitted, training), training.simulator.names
+        start = {path: values[:, k] for k, path in enumerate(names) if path != START}
+        return fold.held_out_log_likelihood(fold.fit(fitted.hypothesis, fitted.noise, start=start))
 
-    found = each(judged, product(evaluator.folds, (current, without)))
+    found = each(evaluate, product(evaluator.folds, (with_term, without_term)))
     gains = [new - old for new, old in zip(found[::2], found[1::2], strict=True)]
-    return np.concatenate(
-        [
-            evaluator.held_out_log_likelihood(current) - evaluator.held_out_log_likelihood(without),
-            *gains,
-        ]
-    )
-
-
-def _again(fold: Evaluator, fitted: FittedModel, training: Partition) -> FittedModel:
-    """The same hypothesis fitted to other breaths, from where it was."""
-    values, names = fold.transferred_values(fitted, training), training.simulator.names
-    start = {path: values[:, k] for k, path in enumerate(names) if path != START}
-    return fold.fit(fitted.hypothesis, fitted.noise, start=start)
+    first = evaluator.held_out_log_likelihood(with_term)
+    return np.concatenate([first - evaluator.held_out_log_likelihood(without_term), *gains])

@@ -72,7 +72,7 @@ def found_in(
     wide: list[Evaluator] = []
 
     def wider() -> Evaluator:
-        wide.append(make_evaluator(data, held, all_parameter_paths(), excluded, settings))
+        wide.append(make_evaluator(data, held, all_parameter_paths(settings), excluded, settings))
         return wide[0]
 
     found = conclude(narrow, wider, tell)
@@ -82,7 +82,7 @@ def found_in(
         [replace(one, gain_sd=found.gain_sd) for one in wide],
     )
     partition = make_partition(data, paths(), settings)
-    if found.place is not None and found.place.element is not None:
+    if found.unnamed is not None and found.unnamed.term is not None:
         # With a slot, the training breaths alone: all of them would be one more compilation.
         return Found(wide[0], found, estimates.estimated(found.full, wide[0].training, wide[0]))
     return Found(narrow, found, estimates.estimated(found.named, partition, narrow))

@@ -1,7 +1,4 @@
-"""What is taken to act: mechanisms, and which of their parameters are fitted.
-
-Breaths with their simulator, and a hypothesis fitted to them.
-"""
+"""A hypothesis, the breaths that it is fitted to, and the fitted model."""
 
 from __future__ import annotations
 
@@ -20,12 +17,12 @@ from ventbench.system_id.unknowns import freed
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What is taken to act.
+    """The base model plus a set of terms: mechanisms, and basis terms of nonparametric components.
 
     Attributes:
-        names: mechanisms, and elements of slots.
-        free: shape parameters that are fitted too, by path.
-        fixed: parameters that stand at a value other than their neutral one, by path.
+        names: the terms, in the order in which they were added.
+        free: shape parameters that are fitted as well, by path.
+        fixed: parameters that keep a value other than their neutral one, by path.
     """
 
     names: tuple[str, ...] = ()
@@ -33,7 +30,7 @@ class Hypothesis:
     fixed: tuple[tuple[str, float], ...] = ()
 
     def plus(self, other: Hypothesis) -> Hypothesis:
-        """Both together."""
+        """The union of two hypotheses; ``other`` wins where both fix a parameter."""
         return Hypothesis(
             tuple(dict.fromkeys(self.names + other.names)),
             tuple(dict.fromkeys(self.free + other.free)),
@@ -41,7 +38,7 @@ class Hypothesis:
         )
 
     def without(self, *names: str) -> Hypothesis:
-        """The same without some mechanisms and what is theirs."""
+        """The hypothesis without some terms and their parameters."""
 
         def kept(path: str) -> bool:
             return path.rpartition(".")[0] not in names
@@ -52,35 +49,53 @@ class Hypothesis:
             tuple((path, value) for path, value in self.fixed if kept(path)),
         )
 
+    @property
+    def breath_terms(self) -> tuple[str, ...]:
+        """Terms with parameters that differ from breath to breath."""
+        return tuple(name for name in self.names if varies_by_breath(name))
+
     @cached_property
     def paths(self) -> tuple[str, ...]:
-        """Of everything that is fitted."""
+        """Paths of all parameters that are fitted."""
         fixed = dict(self.fixed)
         return tuple(p for p in dict.fromkeys((*freed(self.names), *self.free)) if p not in fixed)
 
 
-def has_own(name: str) -> bool:
-    """Whether a mechanism has parameters that are each breath's own."""
+def varies_by_breath(name: str) -> bool:
+    """Whether a term has parameters that differ from breath to breath."""
     return any(item.scope == "breath" for item in mechanism(name).description.parameters)
 
 
 @dataclass(frozen=True, eq=False)
 class Partition:
-    """Some breaths and the simulator of their commands."""
+    """Breaths, such as the training breaths, with the simulator that predicts them."""
 
     data: Data
     simulator: Simulator
 
 
+def make_partition(
+    data: Data, names: tuple[str, ...], settings: SelectionConfig = DEFAULT
+) -> Partition:
+    """Combine breaths with a simulator of their commands.
+
+    Args:
+        data: the breaths.
+        names: paths of the simulator's parameters.
+        settings: give the number of breaths that are simulated at once.
+    """
+    return Partition(data, Simulator(data, names, sizes=(settings.data.batch_size,)))
+
+
 @dataclass(frozen=True, eq=False)
 class FittedModel:
-    """A hypothesis fitted to some breaths.
+    """A hypothesis at its maximum-likelihood parameters.
 
     Attributes:
-        hypothesis: what acts.
-        problem: of the breaths.
-        minimum: of the cost.
-        log_likelihood: of the breaths, sum.
+        hypothesis: the terms.
+        problem: data, noise and unknowns of the fit.
+        minimum: of the problem's cost.
+        log_likelihood: of all its breaths, nats.
     """
 
     hypothesis: Hypothesis
@@ -91,7 +106,7 @@ class FittedModel:
 
     @cached_property
     def values(self) -> Floats:
-        """Physical values of everything, ``(n, P + 1)``."""
+        """Physical values of all parameters and of the start, ``(n, P + 1)``."""
         return self.problem.values(self.minimum.x)
 
     @cached_property
@@ -101,7 +116,7 @@ class FittedModel:
 
     @cached_property
     def jacobian(self) -> tuple[Floats, Floats]:
-        """Residual and its derivatives by the coordinates of each path; see :class:`Problem`."""
+        """Residual and its derivative by the free parameters; see :meth:`Problem.jacobian`."""
         return self.problem.jacobian(self.minimum.x)
 
     def residual_without(self, name: str) -> Floats:
@@ -114,36 +129,23 @@ class FittedModel:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Mechanisms, and elements of slots."""
+        """The hypothesis's terms."""
         return self.hypothesis.names
 
     @property
     def noise(self) -> Noise:
-        """Noise at which it was fitted."""
+        """Noise that was assumed in the fit."""
         return self.problem.noise
 
     @property
-    def shared(self) -> int:
-        """Unknowns that are not one breath's own."""
+    def shared_count(self) -> int:
+        """Number of unknowns that several breaths share."""
         return int(self.problem.unknowns.shared.sum())
 
     def column(self, path: str) -> Floats:
-        """Physical value of a parameter in each breath, ``(n,)``."""
+        """Physical value of one parameter in each breath, ``(n,)``."""
         return self.values[:, (*self.problem.simulator.names, START).index(path)]
 
     def log_likelihood_at(self, noise: Noise) -> float:
-        """Log-likelihood of its residuals if the noise is another."""
+        """Log-likelihood of the residuals under another noise, nats."""
         return float(noise.log_likelihood(self.residual, self.problem.data.weight).sum())
-
-
-def make_partition(
-    data: Data, names: tuple[str, ...], settings: SelectionConfig = DEFAULT
-) -> Partition:
-    """Combine breaths with a simulator of their commands.
-
-    Args:
-        data: the breaths.
-        names: parameters of the simulator.
-        settings: gives the breaths that are simulated at once.
-    """
-    return Partition(data, Simulator(data, names, sizes=(settings.data.batch_size,)))

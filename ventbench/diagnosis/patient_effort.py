@@ -1,46 +1,135 @@
-"""Evidence for efforts of the patient, which differ from breath to breath.
+"""Patient effort: the one mechanism whose parameters differ from breath to breath.
 
-Amplitude and onset are each breath's own, so that a likelihood at their best values proves nothing.
-They are integrated out: amplitude is Gaussian, onset one of a grid, and a breath may have none.
+Each breath has an effort of its own amplitude and onset, so that the likelihood at the best values
+proves nothing. Both are integrated out: the amplitude is Gaussian, the onset uniform, and a breath
+has no effort at all with some probability. Where efforts are weak, sums over a grid of onsets are
+exact to first order (:class:`Evidence`). Where they are strong, an onset that is late by a tenth of
+a second is off by more than the noise, and no small step of a fit mends an effort that is put where
+there is none: each breath's effort is then started where the breath is likeliest, fitted, and
+integrated out around the fit (Laplace's method).
 
-Efforts of the patient fitted to each breath, and what they make of its likelihood.
-
-A strong effort that is taken to begin a tenth of a second late is off by more than the noise, and
-no small step of a fit mends one that is put where there is none. Each breath's effort is therefore
-started where the breath is likeliest, and integrated out around where it ends (Laplace's method).
+The rest of the diagnosis treats a hypothesis with efforts and one without alike, through
+:class:`BreathTerm`.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import NamedTuple
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from ventbench.diagnosis.hypothesis import FittedModel
-from ventbench.diagnosis.linearisation import CLIP, Linearisation, linearise
+from ventbench.diagnosis.linearisation import Linearisation, linearise
+from ventbench.diagnosis.settings import PatientEffortSettings, SelectionConfig
 from ventbench.system_id.data import Floats
-from ventbench.system_id.derivatives import START
+from ventbench.system_id.derivatives import START, Simulator
 from ventbench.system_id.least_squares import Minimum, minimise
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.problem import Problem
 from ventbench.system_id.unknowns import unknowns
 
 EFFORT = "patient_effort"
+AMPLITUDE, ONSET, DURATION = (f"{EFFORT}.{p}" for p in ("amplitude", "onset", "duration"))
 
-#: Onsets, s, durations, s, amplitude of a template and its prior standard deviation, cmH2O, and
-#: the share of breaths that have an effort.
-ONSETS = tuple(0.1 * k for k in range(0, 17))
-_DURATIONS = (0.4, 0.6, 0.8, 1.0, 1.3)
-_AMPLITUDE, WIDTH, SHARE = 1.0, 3.0, 0.6
+
+class ScreenedTerm(NamedTuple):
+    """What a term that differs from breath to breath promises.
+
+    Attributes:
+        nats: log-likelihood that it is expected to gain, for each linearisation.
+        start: values to start a fit from, by path.
+    """
+
+    nats: tuple[float, ...]
+    start: dict[str, float]
+
+
+class BreathTerm(Protocol):
+    """The part of a hypothesis that differs from breath to breath."""
+
+    def screen(self, linearisations: list[Linearisation]) -> ScreenedTerm | None:
+        """Expected gain by integration over each breath; None if nothing is integrated out."""
+        ...
+
+    def start(
+        self, problem: Problem, x: Floats, fitted_names: Iterable[str], *, refit: bool
+    ) -> Floats:
+        """Unknowns ``(U,)`` with each breath's own parameters where the breath is likelier.
+
+        Args:
+            problem: of the hypothesis.
+            x: its unknowns.
+            fitted_names: terms of the model that the unknowns come from.
+            refit: fit what is tried to each breath before it is compared, as ``x`` is.
+        """
+        ...
+
+    def marginal_log_likelihood(self, fitted: FittedModel, noise: Noise) -> Floats:
+        """Log-likelihood of the breaths of a fit under a noise, ``(n,)``."""
+        ...
+
+    def log_likelihood_gain(self, problem: Problem, x: Floats, fitted: FittedModel) -> Floats:
+        """Log-likelihood that the term gains in breaths that no fit has seen, ``(n,)``.
+
+        Args:
+            problem: of these breaths, without the term.
+            x: its unknowns, which differ from breath to breath.
+            fitted: the model, fitted to other breaths.
+        """
+        ...
+
+    def linear_gain(self, linearisation: Linearisation, fitted: FittedModel) -> Floats:
+        """Log-likelihood that the term gains to first order, ``(n,)``."""
+        ...
+
+    def predict(self, fitted: FittedModel, simulator: Simulator, values: Floats) -> Floats:
+        """Expected readings of breaths to come, ``(n, c, T)``, at values ``(n, P + 1)``."""
+        ...
+
+
+def breath_term(names: Iterable[str], settings: SelectionConfig) -> BreathTerm:
+    """The breath term of a hypothesis with the terms ``names``."""
+    return PatientEffort(settings) if EFFORT in tuple(names) else NoBreathTerm()
+
+
+class NoBreathTerm:
+    """All terms have the same parameters in all breaths."""
+
+    def screen(self, linearisations: list[Linearisation]) -> ScreenedTerm | None:
+        """Nothing is integrated out."""
+        return None
+
+    def start(
+        self, problem: Problem, x: Floats, fitted_names: Iterable[str], *, refit: bool
+    ) -> Floats:
+        """Leave the unknowns as they are."""
+        return x
+
+    def marginal_log_likelihood(self, fitted: FittedModel, noise: Noise) -> Floats:
+        """Log-likelihood of the residuals."""
+        return noise.log_likelihood(fitted.residual, fitted.problem.data.weight)
+
+    def log_likelihood_gain(self, problem: Problem, x: Floats, fitted: FittedModel) -> Floats:
+        """Zero."""
+        return np.zeros(len(problem.data))
+
+    def linear_gain(self, linearisation: Linearisation, fitted: FittedModel) -> Floats:
+        """Zero."""
+        return np.zeros(len(linearisation.values))
+
+    def predict(self, fitted: FittedModel, simulator: Simulator, values: Floats) -> Floats:
+        """Simulate the values as they are."""
+        return simulator.predict(values)
 
 
 class Evidence(NamedTuple):
-    """Log Bayes factor of efforts in each breath, and the likeliest effort.
+    """Log Bayes factor of an effort in each breath, and the likeliest effort.
 
     Attributes:
         nats: ``(n,)``.
-        duration: s, that of the largest sum.
+        duration: s, the one with the largest sum.
         amplitude: cmH2O, expected at the likeliest onset, ``(n,)``.
         onset: s, the likeliest, ``(n,)``.
     """
@@ -51,185 +140,195 @@ class Evidence(NamedTuple):
     onset: Floats
 
 
-def evidence(place: Linearisation, duration: float | None = None) -> Evidence:
-    """Integrate efforts out of the breaths of a linearised hypothesis.
+@dataclass(frozen=True)
+class PatientEffort:
+    """Efforts of a patient, integrated out in each breath."""
 
-    Args:
-        place: of the breaths.
-        duration: of the efforts, s; the best of a grid if not given.
-    """
-    return of_all([place], duration)[0]
+    settings: SelectionConfig
 
+    @property
+    def prior(self) -> PatientEffortSettings:
+        """Prior of the efforts."""
+        return self.settings.patient_effort
 
-def of_all(places: list[Linearisation], duration: float | None = None) -> list[Evidence]:
-    """The same of one hypothesis at several noises, which share what is predicted."""
-    best: list[Evidence] = []
-    for length in _DURATIONS if duration is None else (duration,):
-        found = _at(places, length)
-        best = best or found
-        best = [new if new.nats.sum() > old.nats.sum() else old
-                for new, old in zip(found, best, strict=True)]  # fmt: skip
-    return best
+    def screen(self, linearisations: list[Linearisation]) -> ScreenedTerm:
+        """Sums over the grid of onsets, at the best duration of a grid."""
+        evidence = [self.evidence([each])[0] for each in linearisations]
+        nats = [max(float(each.nats.sum()), 0.0) for each in evidence]
+        return ScreenedTerm(tuple(nats), {DURATION: evidence[int(np.argmax(nats))].duration})
 
+    def start(
+        self, problem: Problem, x: Floats, fitted_names: Iterable[str], *, refit: bool
+    ) -> Floats:
+        """Move each breath's effort to where the breath is clearly likelier."""
+        if EFFORT in fitted_names and not refit:
+            return x
+        layout, names = problem.unknowns, problem.simulator.names
+        values = problem.values(x)
+        duration = float(values[0, names.index(DURATION)])
+        passive = values.copy()
+        passive[:, names.index(AMPLITUDE)] = 0.0
+        own, none = unknowns(problem.data, (START,)), np.zeros(len(values))
+        still = replace(problem, unknowns=own, fixed=passive, mean=none, precision=none)
+        at = own.pack({START: values[:, -1]})
+        evidence = self.evidence([self._linearise(still, at, np.inf)], duration)[0]
+        tried = {AMPLITUDE: evidence.amplitude, ONSET: evidence.onset}
+        if refit:
+            breathwise, minimum = self._fit_each_breath(still, at, evidence)
+            tried = {p: minimum.x[breathwise.unknowns.of(p)] for p in (*tried, START)}
+        trial = x.copy()
+        columns = [layout.index[:, layout.paths.index(path)] for path in tried]
+        for column, value in zip(columns, tried.values(), strict=True):
+            trial[column] = value
+        trial = np.clip(trial, *layout.bounds())
+        least = problem.log_likelihood(x) + self.prior.restart_gain
+        likelier = problem.log_likelihood(trial) > least
+        for column in columns:
+            trial[column] = np.where(likelier, trial[column], x[column])
+        return trial
 
-def _at(places: list[Linearisation], duration: float) -> list[Evidence]:
-    answers = _answers(places[0], duration)
-    return [_of(place, duration, answers) for place in places]
+    def log_likelihood_gain(self, problem: Problem, x: Floats, fitted: FittedModel) -> Floats:
+        """Integrate efforts out of breaths without any, at the fitted duration, ``(n,)``."""
+        duration = float(fitted.column(DURATION)[0])
+        clipped = self._linearise(problem, x, None)
+        grid, start = self.evidence([clipped, self._linearise(problem, x, np.inf)], duration)
+        breathwise, minimum = self._fit_each_breath(problem, x, start)
+        curvature = minimum.hessian[
+            breathwise.unknowns.index[:, :, None], breathwise.unknowns.index[:, None, :]
+        ]
+        amplitude = minimum.x[breathwise.unknowns.of(AMPLITUDE)]
+        with_effort = breathwise.log_likelihood(minimum.x) + self._log_volume(curvature, amplitude)
+        gained = with_effort - problem.log_likelihood(x)
+        share = self.prior.probability
+        laplace = np.logaddexp(np.log(1.0 - share), np.log(share) + gained)
+        # A weak effort's onset is free, as on the grid; for a strong one that is too coarse.
+        return np.maximum(grid.nats, laplace)
 
+    def marginal_log_likelihood(self, fitted: FittedModel, noise: Noise) -> Floats:
+        """Integrate efforts out around the efforts that the fit found, ``(n,)``."""
+        problem = replace(fitted.problem, noise=noise)
+        layout, data = problem.unknowns, problem.data
+        every = range(len(layout.paths))
+        own = [k for k in every if len(np.unique(layout.index[:, k])) == len(data)]
+        own = [k for k in own if layout.paths[k] not in (AMPLITUDE, ONSET)]
+        columns = [*own, layout.paths.index(AMPLITUDE), layout.paths.index(ONSET)]
+        residual, slopes = fitted.jacobian
+        white = noise.whiten(residual, data.weight).reshape(len(data), -1)
+        rows = noise.whiten(slopes[:, columns], data.weight)
+        rows = rows.reshape(*rows.shape[:2], -1)
+        curvature = np.matmul(rows * noise.influence(white)[:, None], rows.swapaxes(1, 2))
+        index = layout.index[:, columns]
+        prior = np.concatenate([problem.precision[index[:, :-2]], np.zeros((len(data), 2))], axis=1)
+        prior[:, -2:] = self._precision
+        curvature = curvature + prior[:, :, None] * np.eye(len(columns))
+        active = noise.log_likelihood(residual, data.weight)
+        active = active + self._log_volume(curvature, fitted.column(AMPLITUDE))
+        passive = noise.log_likelihood(fitted.residual_without(EFFORT), data.weight)
+        share = self.prior.probability
+        return np.logaddexp(np.log(1.0 - share) + passive, np.log(share) + active)
 
-def _answers(place: Linearisation, duration: float) -> list[Floats]:
-    """What an effort at each onset changes, ``(n, c, T)``."""
-    simulator = place.problem.simulator
-    columns = [simulator.names.index(f"{EFFORT}.{p}") for p in ("amplitude", "onset", "duration")]
-    points = np.repeat(place.values[None], len(ONSETS), axis=0)
-    for point, onset in zip(points, ONSETS, strict=True):
-        point[:, columns] = (_AMPLITUDE, onset, duration)
-    return list(simulator.predict_all(points) - place.seen)
+    def linear_gain(self, linearisation: Linearisation, fitted: FittedModel) -> Floats:
+        """Sums over the grid of onsets at the fitted duration, ``(n,)``."""
+        return self.evidence([linearisation], float(fitted.column(DURATION)[0]))[0].nats
 
+    def predict(self, fitted: FittedModel, simulator: Simulator, values: Floats) -> Floats:
+        """Mean over the efforts of the fitted breaths: nobody knows the effort of a new breath."""
+        columns = [simulator.names.index(path) for path in (AMPLITUDE, ONSET)]
+        total, efforts = 0.0, zip(fitted.column(AMPLITUDE), fitted.column(ONSET), strict=True)
+        for effort in efforts:
+            values[:, columns] = effort
+            total = total + simulator.predict(values)
+        return np.asarray(total) / len(fitted.column(AMPLITUDE))
 
-def _of(place: Linearisation, duration: float, answers: list[Floats]) -> Evidence:
-    logs, means = [], []
-    for answer in answers:
-        white = place.whitened(answer)
-        template = place.without_own(white[:, None])[:, 0]
-        power = np.sum(template**2, axis=1)
-        match = -np.sum(place.residual * template, axis=1)
-        precision = (_AMPLITUDE / WIDTH) ** 2
-        logs.append(0.5 * match**2 / (power + precision) - 0.5 * np.log1p(power / precision))
-        means.append(match / (power + precision) * _AMPLITUDE)
-    log_factors, amplitudes = np.stack(logs, 1), np.stack(means, 1)
-    mixed = np.logaddexp.reduce(log_factors, axis=1) - np.log(len(ONSETS)) + np.log(SHARE)
-    top = np.argmax(log_factors, axis=1)
-    nats = np.logaddexp(np.log(1.0 - SHARE), mixed)
-    rows = np.arange(len(top))
-    return Evidence(nats, duration, amplitudes[rows, top], np.asarray(ONSETS)[top])
+    def evidence(
+        self, linearisations: list[Linearisation], duration: float | None = None
+    ) -> list[Evidence]:
+        """Integrate efforts out of the breaths of one model at several noises.
 
+        Args:
+            linearisations: of the model; they share its predictions.
+            duration: of the efforts, s; the best of the grid if not given.
+        """
+        best: list[Evidence] = []
+        for length in self.prior.durations if duration is None else (duration,):
+            effects = self._effects(linearisations[0], length)
+            new = [self._grid_evidence(each, length, effects) for each in linearisations]
+            best = best or new
+            best = [
+                after if after.nats.sum() > before.nats.sum() else before
+                for after, before in zip(new, best, strict=True)
+            ]
+        return best
 
-AMPLITUDE, ONSET, DURATION = (f"{EFFORT}.{p}" for p in ("amplitude", "onset", "duration"))
+    def _effects(self, linearisation: Linearisation, duration: float) -> list[Floats]:
+        """Change of the prediction by an effort at each onset of the grid, ``(n, c, T)`` each."""
+        simulator = linearisation.problem.simulator
+        columns = [simulator.names.index(path) for path in (AMPLITUDE, ONSET, DURATION)]
+        points = np.repeat(linearisation.values[None], len(self.prior.onsets), axis=0)
+        for point, onset in zip(points, self.prior.onsets, strict=True):
+            point[:, columns] = (self.prior.template, onset, duration)
+        return list(simulator.predict_all(points) - linearisation.prediction)
 
-#: Nats by which another effort must be likelier to be moved to.
-_CLEARLY = 1.0
+    def _grid_evidence(
+        self, linearisation: Linearisation, duration: float, effects: list[Floats]
+    ) -> Evidence:
+        prior, logs, means = self.prior, [], []
+        for effect in effects:
+            white = linearisation.whiten(effect)
+            template = linearisation.without_own(white[:, None])[:, 0]
+            power = np.sum(template**2, axis=1)
+            match = -np.sum(linearisation.residual * template, axis=1)
+            precision = (prior.template / prior.amplitude_sd) ** 2
+            logs.append(0.5 * match**2 / (power + precision) - 0.5 * np.log1p(power / precision))
+            means.append(match / (power + precision) * prior.template)
+        log_factors, amplitudes = np.stack(logs, 1), np.stack(means, 1)
+        mixed = np.logaddexp.reduce(log_factors, axis=1)
+        mixed = mixed - np.log(len(prior.onsets)) + np.log(prior.probability)
+        top = np.argmax(log_factors, axis=1)
+        nats = np.logaddexp(np.log(1.0 - prior.probability), mixed)
+        rows = np.arange(len(top))
+        return Evidence(nats, duration, amplitudes[rows, top], np.asarray(prior.onsets)[top])
 
-#: Length of time in which efforts begin, s; most steps of a fit to each breath.
-_SPAN, _STEPS = ONSETS[-1] - ONSETS[0] + 0.1, 7
+    def _fit_each_breath(
+        self, still: Problem, x: Floats, start: Evidence
+    ) -> tuple[Problem, Minimum]:
+        """Fit an effort to each breath, together with the breath's other own parameters."""
+        paths, none = still.unknowns.paths, np.zeros(len(still.data))
+        every = np.arange(len(none))
+        layout = unknowns(still.data, (*paths, AMPLITUDE, ONSET), dict.fromkeys(paths, every))
+        precision = self._precision
+        problem = replace(
+            still,
+            unknowns=layout,
+            mean=np.concatenate([still.mean, none, none + np.mean(self.prior.onsets)]),
+            precision=np.concatenate([still.precision, none + precision[0], none + precision[1]]),
+        )
+        first = dict(zip(paths, still.unknowns.unpack(x).T, strict=True))
+        first |= {AMPLITUDE: start.amplitude, ONSET: start.onset}
+        low, high = layout.bounds()
+        return problem, minimise(
+            problem.cost, problem.normal, layout.pack(first), low, high,
+            tolerance=self.prior.tolerance, iterations=self.prior.iterations,
+        )  # fmt: skip
 
-#: 1 / variance of amplitudes and onsets before any data, 1 / cmH2O2 and 1 / s2.
-_KNOWN = (WIDTH**-2.0, 12.0 / _SPAN**2)
+    def _log_volume(self, curvature: Floats, amplitude: Floats) -> Floats:
+        """Logarithm of prior density times posterior volume around the best effort, ``(n,)``.
 
+        Args:
+            curvature: by each breath's own unknowns, amplitude and onset last, with the prior's
+                precision, ``(n, k, k)``.
+            amplitude: the best, cmH2O, ``(n,)``.
+        """
+        across, own = curvature[:, -2:, :-2], curvature[:, :-2, :-2]
+        inner = curvature[:, -2:, -2:] - across @ np.linalg.solve(own, across.swapaxes(1, 2))
+        width, span = self.prior.amplitude_sd, self.prior.onset_span
+        prior = -0.5 * (amplitude / width) ** 2 - np.log(np.sqrt(2.0 * np.pi) * width * span)
+        return np.log(2.0 * np.pi) - 0.5 * np.linalg.slogdet(inner)[1] + prior
 
-def restart_efforts(problem: Problem, x: Floats, *, refined: bool) -> Floats:
-    """Move each breath's effort to where it is likelier, if it clearly is.
+    @property
+    def _precision(self) -> tuple[float, float]:
+        """1 / variance of amplitude, 1 / cmH2O^2, and of a uniform onset, 1 / s^2."""
+        return (self.prior.amplitude_sd**-2.0, 12.0 / self.prior.onset_span**2)
 
-    Args:
-        problem: of a hypothesis with efforts.
-        x: its unknowns, ``(U,)``.
-        refined: fit what is tried to each breath before it is compared, as ``x`` is.
-    """
-    layout, names = problem.unknowns, problem.simulator.names
-    values = problem.values(x)
-    duration = float(values[0, names.index(DURATION)])
-    quiet = values.copy()
-    quiet[:, names.index(AMPLITUDE)] = 0.0
-    own, none = unknowns(problem.data, (START,)), np.zeros(len(values))
-    still = replace(problem, unknowns=own, fixed=quiet, mean=none, precision=none)
-    at = own.pack({START: values[:, -1]})
-    found = of_all([linearise(still, at, np.inf)], duration)[0]
-    tried = {AMPLITUDE: found.amplitude, ONSET: found.onset}
-    if refined:
-        each, fitted = _fitted(still, at, found)
-        tried = {path: fitted.x[each.unknowns.of(path)] for path in (*tried, START)}
-    trial = x.copy()
-    places = [layout.index[:, layout.paths.index(path)] for path in tried]
-    for place, value in zip(places, tried.values(), strict=True):
-        trial[place] = value
-    trial = np.clip(trial, *layout.bounds())
-    likelier = problem.log_likelihood(trial) > problem.log_likelihood(x) + _CLEARLY
-    for place in places:
-        trial[place] = np.where(likelier, trial[place], x[place])
-    return trial
-
-
-def effort_log_likelihood_gain(still: Problem, x: Floats, duration: float) -> Floats:
-    """Log-likelihood that efforts gain in each breath, where there is one or none, ``(n,)``.
-
-    Args:
-        still: without efforts; its unknowns are each breath's own.
-        x: these.
-        duration: of the efforts, s.
-    """
-    grid, start = of_all([linearise(still, x, CLIP), linearise(still, x, np.inf)], duration)
-    gained = _around(*_fitted(still, x, start)) - still.log_likelihood(x)
-    pulled = np.logaddexp(np.log(1.0 - SHARE), np.log(SHARE) + gained)
-    # A weak effort's onset is free, as on the grid; for a strong one that is too coarse.
-    return np.maximum(grid.nats, pulled)
-
-
-def marginal_log_likelihood(fitted: FittedModel, noise: Noise) -> Floats:
-    """Log-likelihood of the breaths that efforts were fitted to, efforts integrated out, ``(n,)``.
-
-    As :func:`effort_log_likelihood_gain`, around the efforts that the fit found.
-
-    Args:
-        fitted: a hypothesis with efforts.
-        noise: at which it is judged.
-    """
-    problem = replace(fitted.problem, noise=noise)
-    layout, data = problem.unknowns, problem.data
-    own = [k for k in range(len(layout.paths)) if len(np.unique(layout.index[:, k])) == len(data)]
-    own = [k for k in own if layout.paths[k] not in (AMPLITUDE, ONSET)]
-    columns = [*own, layout.paths.index(AMPLITUDE), layout.paths.index(ONSET)]
-    residual, slopes = fitted.jacobian
-    white = noise.whiten(residual, data.weight).reshape(len(data), -1)
-    rows = noise.whiten(slopes[:, columns], data.weight)
-    rows = rows.reshape(*rows.shape[:2], -1)
-    curvature = np.matmul(rows * noise.influence(white)[:, None], rows.swapaxes(1, 2))
-    index = layout.index[:, columns]
-    known = np.concatenate([problem.precision[index[:, :-2]], np.zeros((len(data), 2))], axis=1)
-    known[:, -2:] = _KNOWN
-    curvature = curvature + known[:, :, None] * np.eye(len(columns))
-    loud = noise.log_likelihood(residual, data.weight)
-    loud = loud + _volume(curvature, fitted.column(AMPLITUDE))
-    quiet = noise.log_likelihood(fitted.residual_without(EFFORT), data.weight)
-    return np.logaddexp(np.log(1.0 - SHARE) + quiet, np.log(SHARE) + loud)
-
-
-def _fitted(still: Problem, x: Floats, start: Evidence) -> tuple[Problem, Minimum]:
-    """Fit an effort to each breath, with what else is the breath's own."""
-    paths, none = still.unknowns.paths, np.zeros(len(still.data))
-    every = np.arange(len(none))
-    layout = unknowns(still.data, (*paths, AMPLITUDE, ONSET), dict.fromkeys(paths, every))
-    problem = replace(
-        still,
-        unknowns=layout,
-        mean=np.concatenate([still.mean, none, none + np.mean(ONSETS)]),
-        precision=np.concatenate([still.precision, none + _KNOWN[0], none + _KNOWN[1]]),
-    )
-    known = dict(zip(paths, still.unknowns.unpack(x).T, strict=True))
-    known |= {AMPLITUDE: start.amplitude, ONSET: start.onset}
-    low, high = layout.bounds()
-    return problem, minimise(
-        problem.cost, problem.normal, layout.pack(known), low, high, tolerance=0.2,
-        iterations=_STEPS,
-    )  # fmt: skip
-
-
-def _around(problem: Problem, found: Minimum) -> Floats:
-    """Likelihood of each breath with an effort, integrated around its best one, ``(n,)``."""
-    layout = problem.unknowns
-    curvature = found.hessian[layout.index[:, :, None], layout.index[:, None, :]]
-    amplitude = found.x[layout.of(AMPLITUDE)]
-    return problem.log_likelihood(found.x) + _volume(curvature, amplitude)
-
-
-def _volume(curvature: Floats, amplitude: Floats) -> Floats:
-    """Logarithm of prior density times volume of efforts around the best one, ``(n,)``.
-
-    Args:
-        curvature: by each breath's own unknowns, the efforts' amplitude and onset the last, with
-            what is known before, ``(n, k, k)``.
-        amplitude: the best, cmH2O, ``(n,)``.
-    """
-    across, own = curvature[:, -2:, :-2], curvature[:, :-2, :-2]
-    inner = curvature[:, -2:, -2:] - across @ np.linalg.solve(own, across.swapaxes(1, 2))
-    prior = -0.5 * (amplitude / WIDTH) ** 2 - np.log(np.sqrt(2.0 * np.pi) * WIDTH * _SPAN)
-    return np.log(2.0 * np.pi) - 0.5 * np.linalg.slogdet(inner)[1] + prior
+    def _linearise(self, problem: Problem, x: Floats, clip: float | None) -> Linearisation:
+        return linearise(problem, x, self.settings.screening, clip=clip)

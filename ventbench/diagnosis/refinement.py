@@ -1,18 +1,17 @@
-"""Which names are needed beside something that has none.
+"""What becomes of selected terms beside effects that the library has no mechanism for.
 
-Names that only trim the form of another one.
+Forward selection can only choose mechanisms of the library. Where the recording contains something
+else, a sum of mechanisms may imitate it. Four questions separate the two:
 
-Where the recording's leak is linear and the library's is a root, a second mechanism may bend one
-into the other, and held-out breaths believe it. An element of a slot of the first name's own kind
-then does as well or better, and with it the second name is not needed any more. A mechanism that
-acts passes the test: no element of another's kind explains it away.
+- :class:`SingleTermAlternative`: does one nonparametric term alone do better than many mechanisms?
+- :func:`drop_compensating_terms`: does a nonparametric term related to one mechanism explain a
+  second mechanism away, which then only compensated for the first one's form?
+- :func:`backward_elimination`: which mechanisms are needed beside a nonparametric term or a latent
+  input that explains what is left?
+- :func:`find_alternatives`: which other mechanism could take the place of a selected one?
 
-One shape instead of many names.
-
-What the library has no name for can be imitated by a sum of names, each of which the breaths
-believe. If one element of a slot does better alone, the sum is an imitation.
-
-Which other names the recording cannot tell from the ones that were chosen.
+The ``evaluator`` has simulators with the library's parameters; ``wide`` is the same recording with
+the parameters of the nonparametric terms as well, which take longer to compile.
 """
 
 from __future__ import annotations
@@ -25,18 +24,14 @@ from operator import itemgetter
 import numpy as np
 
 from ventbench.diagnosis.evaluator import Evaluator
-from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.latent_inputs import (
     ALVEOLUS,
     LatentInput,
     fit_latent_inputs,
     log_likelihood_without_input,
 )
-from ventbench.diagnosis.patient_effort import EFFORT
-from ventbench.diagnosis.screening import (
-    score_nonparametric_terms,
-    screen_mechanisms,
-)
+from ventbench.diagnosis.screening import score_nonparametric_terms, screen_mechanisms
 from ventbench.diagnosis.selection import (
     Comparison,
     Progress,
@@ -47,349 +42,376 @@ from ventbench.diagnosis.selection import (
     is_needed,
     passes_heldout_test,
 )
-from ventbench.diagnosis.settings import GATE
 from ventbench.physics.catalogue import mechanism, special_cases
 from ventbench.system_id.data import Floats
 from ventbench.system_id.together import each
 
-#: Share of what a slot of the same kind explains from which a name stands, its form apart; and
-#: share below which a name beside a slot is only its trimming.
-_FAMILY, _COMPENSATING_SHARE = 0.5, 0.1
-
-#: Elements of slots that are refitted: the first-order ranking has the right one near its top.
-PROMISING = 5
-
-
-@dataclass(frozen=True, eq=False)
-class UnnamedEffect:
-    """Where something without a name sits.
-
-    Attributes:
-        name: public name of the slot.
-        element: of the physics that has its shape, or None for a source that moves in time.
-        source: that source, or None.
-        nats: held-out log-likelihood that it gains.
-    """
-
-    name: str
-    element: str | None
-    source: LatentInput | None
-    nats: float
-
 
 @dataclass(frozen=True, eq=False)
 class NonparametricFit:
-    """An element of a slot beside names.
+    """A nonparametric basis term beside mechanisms.
 
     Attributes:
-        element: its name.
-        full: fitted with the names.
-        nats: held-out log-likelihood that it gains.
+        term: its name.
+        full: the model with the term and the mechanisms.
+        nats: held-out log-likelihood that the term gains.
     """
 
-    element: str
+    term: str
     full: FittedModel
     nats: float
 
 
-def without_effort(evaluator: Evaluator, named: FittedModel) -> FittedModel:
-    """The same names without efforts of the patient, which sources take the place of."""
-    if EFFORT not in named.hypothesis.names:
-        return named
-    return evaluator.fit(named.hypothesis.without(EFFORT), named.noise, named)
+def compare_nonparametric_terms(wide: Evaluator, current: FittedModel) -> Comparison | None:
+    """Fit the most promising nonparametric terms beside a model; None if none is promising."""
+    candidates = score_nonparametric_terms(current, wide.settings)
+    return compare_candidates(wide, current, candidates[: wide.settings.refinement.fitted_terms])
 
 
-def eliminate_beside_input(
-    evaluator: Evaluator, named: FittedModel, place: UnnamedEffect
-) -> FittedModel:
-    """Keep the names that are needed beside a source, and those that explain more than it does.
+class SingleTermAlternative:
+    """The best nonparametric term alone, fitted when it is first asked for."""
 
-    A source is each breath's own and takes over what is the same in all breaths as well.
-    """
-    assert place.source is not None
-    current, here = without_effort(evaluator, named), place.source
-    gains = each(partial(_gain, evaluator, current), current.names)
-    firm = {name for name, gain in zip(current.names, gains, strict=True) if gain > place.nats}
-    if _is_effort(evaluator, named, current, here):
-        current = named
-    while True:
-        asked = [name for name in current.names if name != EFFORT and name not in firm]
-        idle = [x for x in each(partial(_idle, evaluator, current, here), asked) if x is not None]
-        if not idle:
-            return current
-        # The least needed one first: others may be needed once it has gone.
-        _, current, here = min(idle, key=lambda found: found[0])
+    def __init__(
+        self, evaluator: Evaluator, wider: Callable[[], Evaluator], base: FittedModel
+    ) -> None:
+        """Keep what the term is compared on.
 
+        Args:
+            evaluator: with the library's parameters.
+            wider: gives the evaluator with those of the nonparametric terms as well.
+            base: the base model, fitted with its noise.
+        """
+        self._evaluator, self._wider, self._base = evaluator, wider, base
 
-def _gain(evaluator: Evaluator, named: FittedModel, name: str) -> float:
-    """Held-out log-likelihood that a name gains beside the others."""
-    left = evaluator.fit(named.hypothesis.without(name), named.noise, named)
-    return float(
-        (evaluator.held_out_log_likelihood(named) - evaluator.held_out_log_likelihood(left)).sum()
-    )
+    def __call__(self, selected: FittedModel) -> FittedModel | None:
+        """What replaces many mechanisms if one nonparametric term alone does better; else None.
 
+        The replacement has the mechanisms that are special cases of the term, or none.
+        """
+        evaluator = self._evaluator
+        least = evaluator.settings.refinement.imitation_terms
+        if len(selected.names) < least or self._best is None:
+            return None
+        wide, single = self._wider(), self._best.fitted
+        if wide.criterion(single) > evaluator.criterion(selected):
+            return None
+        held_out = evaluator.held_out_log_likelihood(selected).sum()
+        if wide.held_out_log_likelihood(single).sum() < held_out:
+            return None
+        related = special_cases(self._best.name)
+        kept = tuple(name for name in selected.names if name in related)
+        if not kept:
+            return self._base
+        dropped = set(selected.names) - set(kept)
+        return fit_with_noise(evaluator, selected.hypothesis.without(*dropped), selected)
 
-def _idle(
-    evaluator: Evaluator, current: FittedModel, here: LatentInput, name: str
-) -> tuple[float, FittedModel, LatentInput] | None:
-    """Nats that are lost without a name beside a source, and what is left, if it is not needed."""
-    left = evaluator.fit(current.hypothesis.without(name), current.noise, current)
-    other = fit_latent_inputs(evaluator, without_effort(evaluator, left), (here.source,))[
-        here.source
-    ]
-    lost = here.held_out - other.held_out
-    return None if passes_heldout_test(lost) else (float(lost.sum()), left, other)
-
-
-def _is_effort(
-    evaluator: Evaluator, named: FittedModel, without: FittedModel, source: LatentInput
-) -> bool:
-    """Whether a source is an effort of another form: efforts explain most of what it does."""
-    if EFFORT not in named.hypothesis.names or source.periodic or source.source != ALVEOLUS:
-        return False
-    none = log_likelihood_without_input(evaluator, without)[1].sum()
-    by_name = log_likelihood_without_input(evaluator, named)[1].sum() - none
-    return bool(by_name >= _FAMILY * (source.held_out.sum() - none))
-
-
-def backward_elimination(
-    evaluator: Evaluator, wide: Evaluator, named: FittedModel, shape: NonparametricFit
-) -> tuple[FittedModel, NonparametricFit]:
-    """Keep the names that are needed beside a shape, and those whose form it only trims."""
-    element, full, nats = shape.element, shape.full, shape.nats
-    kept = named.hypothesis
-    for name in named.hypothesis.names:
-        left = wide.fit(full.hypothesis.without(name), full.noise, full)
-        whole = full.log_likelihood - _null(wide, full)
-        if name in special_cases(element):
-            least = evaluator.fit(kept.without(name), named.noise, named)
-            by_name = named.log_likelihood_at(full.noise) - least.log_likelihood_at(full.noise)
-            by_both = full.log_likelihood - least.log_likelihood_at(full.noise)
-            if by_name >= _FAMILY * by_both:
-                continue
-        share = (full.log_likelihood - left.log_likelihood) / max(whole, 1e-9)
-        if not is_needed(wide, full, left) or share < _COMPENSATING_SHARE:
-            full, kept = fit_with_noise(wide, left.hypothesis, left), kept.without(name)
-    if kept != named.hypothesis:
-        named = fit_with_noise(evaluator, kept, named)
-    if not kept.names:
-        # Chosen anew, without names that took part of the effect.
-        null = wide.fit(Hypothesis(), named.noise, named)
-        again = compare_candidates(wide, null, score_nonparametric_terms(null)[:PROMISING])
-        if again is not None and passes_heldout_test(again.gained):
-            element, full = again.rivals[0].name, again.rivals[0].fitted
-            nats = float(again.gained.sum())
-    return named, NonparametricFit(element, full, nats)
-
-
-def _null(wide: Evaluator, full: FittedModel) -> float:
-    """Log-likelihood of the base model at the noise of a hypothesis."""
-    return wide.fit(Hypothesis(), full.noise, full).log_likelihood
-
-
-#: Share of all that is explained up to which a name may be a trimming.
-_MOST_COMPENSATED = 0.5
-
-#: Share of a name's gain, and nats, that an element may fall short by; and share of the gain that
-#: the name may still have beside it.
-_SHORT, _NATS, _LEFT = 0.05, 3.0 * GATE, 0.1
-
-#: Share of a name's gain that an element must promise to first order to be fitted.
-_PROMISE = 0.4
+    @cached_property
+    def _best(self) -> RankedModel | None:
+        wide, base = self._wider(), self._base
+        start = wide.fit(
+            Hypothesis(), base.noise, base, iterations=wide.settings.fit.start_iterations
+        )
+        comparison = compare_nonparametric_terms(wide, start)
+        if comparison is None:
+            return None
+        best = comparison.ranked[0]
+        fitted = fit_with_noise(wide, best.fitted.hypothesis, best.fitted)
+        return RankedModel(best.name, fitted, best.criterion)
 
 
 def drop_compensating_terms(
-    evaluator: Evaluator, wide: Evaluator, named: FittedModel, tell: Progress
+    evaluator: Evaluator, wide: Evaluator, selected: FittedModel, tell: Progress
 ) -> FittedModel:
-    """Drop the names that an element of another name's own kind explains away.
+    """Drop mechanisms that only compensate for the form of another one.
+
+    Where the recording's leak is linear and the library's a square root, a second mechanism may
+    bend one into the other, and held-out breaths accept it. A nonparametric term that contains the
+    first mechanism then does as well or better, and beside it the second is no longer needed. A
+    mechanism that acts passes this test: no term related to another one explains it away.
 
     Args:
         evaluator: with the library's parameters.
-        wide: with those of all slots too.
-        named: the names, fitted.
-        tell: is told what is done.
+        wide: with those of the nonparametric terms as well.
+        selected: the selected mechanisms.
+        tell: is told what is being done.
     """
-    while len(named.hypothesis.names) > 1:
+    while len(selected.names) > 1:
         tell("looking for names that trim others")
-        trimming = _first(wide, named)
-        if trimming is None:
+        name = _compensating_term(wide, selected)
+        if name is None:
             break
-        named = fit_with_noise(evaluator, named.hypothesis.without(trimming), named)
-    return named
+        selected = fit_with_noise(evaluator, selected.hypothesis.without(name), selected)
+    return selected
 
 
-def _first(wide: Evaluator, named: FittedModel) -> str | None:
-    """The least of the names that trim another one."""
-    null = wide.fit(Hypothesis(), named.noise)
-    here = wide.training_log_likelihood(named)
-    whole = max(here - null.log_likelihood, 1e-9)
-    base = wide.held_out_log_likelihood(named)
-    lefts = each(
-        lambda name: wide.fit(named.hypothesis.without(name), named.noise, named),
-        named.hypothesis.names,
+def _compensating_term(wide: Evaluator, selected: FittedModel) -> str | None:
+    """The weakest of the mechanisms that only compensate for another one."""
+    base = wide.fit(Hypothesis(), selected.noise)
+    here = wide.training_log_likelihood(selected)
+    whole = max(here - base.log_likelihood, 1e-9)
+    most = wide.settings.refinement.max_compensating_share * whole
+    reduced = each(
+        lambda name: wide.fit(selected.hypothesis.without(name), selected.noise, selected),
+        selected.names,
     )
-    lost = [here - wide.training_log_likelihood(left) for left in lefts]
-    for name, left, nats in sorted(zip(named.names, lefts, lost, strict=True), key=itemgetter(2)):
-        if nats < _MOST_COMPENSATED * whole and _explained_away(
-            wide, named, left, name, nats, base
-        ):
+    lost = [here - wide.training_log_likelihood(model) for model in reduced]
+    for name, model, nats in sorted(
+        zip(selected.names, reduced, lost, strict=True), key=itemgetter(2)
+    ):
+        if nats < most and _is_explained_away(wide, selected, model, name, nats):
             return name
     return None
 
 
-def _explained_away(
-    wide: Evaluator, named: FittedModel, left: FittedModel, name: str, nats: float, base: Floats
+def _is_explained_away(
+    wide: Evaluator, selected: FittedModel, reduced: FittedModel, name: str, nats: float
 ) -> bool:
-    gained = float((base - wide.held_out_log_likelihood(left)).sum())
-    for candidate in score_nonparametric_terms(left):
-        element = candidate.name
-        kin = special_cases(element)
-        if not set(kin) & set(left.hypothesis.names):
+    """Whether a related nonparametric term makes a mechanism idle.
+
+    Args:
+        wide: with the parameters of the nonparametric terms.
+        selected: with the mechanism.
+        reduced: without it.
+        name: of the mechanism.
+        nats: training log-likelihood that it gains.
+    """
+    settings = wide.settings.refinement
+    held_out = wide.held_out_log_likelihood(selected)
+    gained = float((held_out - wide.held_out_log_likelihood(reduced)).sum())
+    for candidate in score_nonparametric_terms(reduced, wide.settings):
+        related = special_cases(candidate.name)
+        if not set(related) & set(reduced.names):
             continue
-        if max(candidate.nats, candidate.white) < _PROMISE * nats:
+        if candidate.promise < settings.promise_share * nats:
             continue
-        instead = wide.fit(left.hypothesis.plus(Hypothesis((element,))), left.noise, left)
-        ahead = wide.held_out_log_likelihood(instead) - base
-        # An element that holds both can always stand for one: only if both have another form.
-        short = -min(_SHORT * gained, _NATS)
-        if not passes_heldout_test(ahead) if name in kin else ahead.sum() < short:
+        term = Hypothesis((candidate.name,))
+        instead = wide.fit(reduced.hypothesis.plus(term), reduced.noise, reduced)
+        ahead = wide.held_out_log_likelihood(instead) - held_out
+        # A term that contains both mechanisms can always stand for one of them. It counts only if
+        # it does better, so that both have another form.
+        shortfall = -min(settings.shortfall_share * gained, settings.shortfall_nats)
+        if name in related:
+            if not passes_heldout_test(ahead, wide.settings.held_out_test):
+                continue
+        elif ahead.sum() < shortfall:
             continue
-        both = wide.fit(named.hypothesis.plus(Hypothesis((element,))), named.noise, instead)
-        if (
-            float(
-                (wide.held_out_log_likelihood(both) - wide.held_out_log_likelihood(instead)).sum()
-            )
-            < _LEFT * gained
-        ):
+        both = wide.fit(selected.hypothesis.plus(term), selected.noise, instead)
+        beside = wide.held_out_log_likelihood(both) - wide.held_out_log_likelihood(instead)
+        if float(beside.sum()) < settings.remaining_share * gained:
             return True
     return False
 
 
-#: Names from which a sum may be an imitation.
-_MANY = 3
+def backward_elimination(
+    evaluator: Evaluator, wide: Evaluator, selected: FittedModel, unnamed: NonparametricFit
+) -> tuple[FittedModel, NonparametricFit]:
+    """Drop the mechanisms that are not needed beside a nonparametric term.
 
+    Args:
+        evaluator: with the library's parameters.
+        wide: with those of the nonparametric terms as well.
+        selected: the selected mechanisms.
+        unnamed: the term beside them.
 
-class SingleTermAlternative:
-    """The best shape alone, found when it is first asked for."""
-
-    def __init__(
-        self, evaluator: Evaluator, wider: Callable[[], Evaluator], null: FittedModel
-    ) -> None:
-        """Remember what to look at.
-
-        Args:
-            evaluator: with the library's parameters.
-            wider: gives the same bench with those of all slots too.
-            null: nothing but R, C, R_ex and PEEP, settled.
-        """
-        self._bench, self._wider, self._null = evaluator, wider, null
-
-    def __call__(self, named: FittedModel) -> FittedModel | None:
-        """What is left of many names if one shape does better alone; else None."""
-        if len(named.names) < _MANY or self._best is None:
-            return None
-        wide, shape = self._wider(), self._best.fitted
-        if wide.criterion(shape) > self._bench.criterion(named):
-            return None
-        if (
-            wide.held_out_log_likelihood(shape).sum()
-            < self._bench.held_out_log_likelihood(named).sum()
+    Returns:
+        The mechanisms that are kept, and the term beside these. If none is kept, the term is chosen
+        anew.
+    """
+    settings = wide.settings.refinement
+    term, full, nats = unnamed.term, unnamed.full, unnamed.nats
+    kept = selected.hypothesis
+    for name in selected.names:
+        left = wide.fit(full.hypothesis.without(name), full.noise, full)
+        base = wide.fit(Hypothesis(), full.noise, full)
+        whole = full.log_likelihood - base.log_likelihood
+        if name in special_cases(term):
+            least = evaluator.fit(kept.without(name), selected.noise, selected)
+            without = least.log_likelihood_at(full.noise)
+            by_name = selected.log_likelihood_at(full.noise) - without
+            if by_name >= settings.related_share * (full.log_likelihood - without):
+                continue
+        share = (full.log_likelihood - left.log_likelihood) / max(whole, 1e-9)
+        if not is_needed(wide, full, left) or share < settings.compensating_share:
+            full, kept = fit_with_noise(wide, left.hypothesis, left), kept.without(name)
+    if kept != selected.hypothesis:
+        selected = fit_with_noise(evaluator, kept, selected)
+    if not kept.names:
+        # The mechanisms took part of the effect when the term was chosen.
+        comparison = compare_nonparametric_terms(
+            wide, wide.fit(Hypothesis(), selected.noise, selected)
+        )
+        if comparison is not None and passes_heldout_test(
+            comparison.held_out_gain, wide.settings.held_out_test
         ):
-            return None
-        kin = special_cases(self._best.name)
-        kept = tuple(name for name in named.names if name in kin)
-        if not kept:
-            return self._null
-        return fit_with_noise(
-            self._bench, named.hypothesis.without(*set(named.names) - set(kept)), named
-        )
-
-    @cached_property
-    def _best(self) -> RankedModel | None:
-        wide = self._wider()
-        here = wide.fit(Hypothesis(), self._null.noise, self._null, iterations=3)
-        found = compare_candidates(wide, here, score_nonparametric_terms(here)[:PROMISING])
-        if found is None:
-            return None
-        best = found.rivals[0]
-        return RankedModel(
-            best.name, fit_with_noise(wide, best.fitted.hypothesis, best.fitted), best.criterion
-        )
+            term, full = comparison.ranked[0].name, comparison.ranked[0].fitted
+            nats = float(comparison.held_out_gain.sum())
+    return selected, NonparametricFit(term, full, nats)
 
 
-#: Criterion (twice the nats) within which a name is an alternative, and most that are listed.
-_CLOSE, _LISTED = 10.0, 2
+def eliminate_beside_input(
+    evaluator: Evaluator, selected: FittedModel, latent: LatentInput, nats: float
+) -> FittedModel:
+    """Drop the mechanisms that are not needed beside a latent input.
+
+    An input differs from breath to breath and can take over what is the same in all breaths.
+    Mechanisms that explain more than the input are therefore kept in any case.
+
+    Args:
+        evaluator: of the recording.
+        selected: the selected mechanisms.
+        latent: the input.
+        nats: held-out log-likelihood that the input gains.
+    """
+    current = without_breath_terms(evaluator, selected)
+    gains = each(partial(_held_out_gain, evaluator, current), current.names)
+    strong = {name for name, gain in zip(current.names, gains, strict=True) if gain > nats}
+    if _is_effort(evaluator, selected, current, latent):
+        current = selected
+    while True:
+        asked = [
+            name for name in current.names if not varies_by_breath(name) and name not in strong
+        ]
+        idle = [
+            removal
+            for removal in each(partial(_without_idle, evaluator, current, latent), asked)
+            if removal is not None
+        ]
+        if not idle:
+            return current
+        # The least needed one first: others may be needed once it has gone.
+        _, current, latent = min(idle, key=itemgetter(0))
+
+
+def without_breath_terms(evaluator: Evaluator, selected: FittedModel) -> FittedModel:
+    """The model without terms that differ from breath to breath: a latent input replaces them."""
+    own = selected.hypothesis.breath_terms
+    if not own:
+        return selected
+    return evaluator.fit(selected.hypothesis.without(*own), selected.noise, selected)
+
+
+def _held_out_gain(evaluator: Evaluator, selected: FittedModel, name: str) -> float:
+    """Held-out log-likelihood that a mechanism gains beside the others, nats."""
+    left = evaluator.fit(selected.hypothesis.without(name), selected.noise, selected)
+    held_out = evaluator.held_out_log_likelihood(selected)
+    return float((held_out - evaluator.held_out_log_likelihood(left)).sum())
+
+
+def _without_idle(
+    evaluator: Evaluator, current: FittedModel, latent: LatentInput, name: str
+) -> tuple[float, FittedModel, LatentInput] | None:
+    """Nats lost without a mechanism beside an input, and what is left; None if it is needed."""
+    left = evaluator.fit(current.hypothesis.without(name), current.noise, current)
+    shared = without_breath_terms(evaluator, left)
+    other = fit_latent_inputs(evaluator, shared, (latent.place,))[latent.place]
+    lost = latent.held_out_log_likelihood - other.held_out_log_likelihood
+    needed = passes_heldout_test(lost, evaluator.settings.held_out_test)
+    return None if needed else (float(lost.sum()), left, other)
+
+
+def _is_effort(
+    evaluator: Evaluator, selected: FittedModel, without: FittedModel, latent: LatentInput
+) -> bool:
+    """Whether an input is patient effort of another form: effort explains most of it."""
+    if not selected.hypothesis.breath_terms or latent.periodic or latent.place != ALVEOLUS:
+        return False
+    none = log_likelihood_without_input(evaluator, without)[1].sum()
+    by_effort = log_likelihood_without_input(evaluator, selected)[1].sum() - none
+    by_input = latent.held_out_log_likelihood.sum() - none
+    return bool(by_effort >= evaluator.settings.refinement.related_share * by_input)
 
 
 @dataclass(frozen=True, eq=False)
 class Alternatives:
-    """To one name.
+    """What else could explain the effect of a selected mechanism.
 
     Attributes:
-        names: the likeliest first.
-        confidence: share of the posterior of equal priors that falls on the name itself.
-        rivals: fitted, of mechanisms of the library.
+        names: other mechanisms, the likeliest first.
+        confidence: posterior probability of the selected mechanism, with equal priors.
+        models: the fitted alternatives among the library's mechanisms.
     """
 
     names: tuple[str, ...]
     confidence: float
-    rivals: tuple[RankedModel, ...]
+    models: tuple[RankedModel, ...]
 
 
-def alternatives(
-    evaluator: Evaluator, named: FittedModel, steps: list[Comparison], *, swap: bool = True
+def find_alternatives(
+    evaluator: Evaluator,
+    selected: FittedModel,
+    comparisons: list[Comparison],
+    *,
+    swap: bool = True,
 ) -> tuple[FittedModel, dict[str, Alternatives]]:
-    """Replace each name by every other one, and keep what is better.
+    """Replace each mechanism by every other one.
+
+    Args:
+        evaluator: of the recording.
+        selected: the selected mechanisms.
+        comparisons: of the forward selection, which answer part of the question.
+        swap: whether a better mechanism takes the place of a selected one.
 
     Returns:
-        The best set of names, and for each the alternatives.
+        The best model, and the alternatives to each of its mechanisms.
     """
     for last in (False, False, True):
-        criterion, names = evaluator.criterion(named), named.names
-        rivals = each(partial(_rivals, evaluator, named, steps), names)
-        better = [one[0].fitted for one in rivals if one and one[0].criterion < criterion]
+        criterion, names = evaluator.criterion(selected), selected.names
+        ranked = each(partial(_ranked_instead, evaluator, selected, comparisons), names)
+        better = [
+            models[0].fitted for models in ranked if models and models[0].criterion < criterion
+        ]
         if last or not swap or not better:
             break
-        named, steps = better[0], []
-    return named, {
-        name: _close(name, others, criterion) for name, others in zip(names, rivals, strict=True)
+        selected, comparisons = better[0], []
+    return selected, {
+        name: _alternatives(evaluator, name, models, criterion)
+        for name, models in zip(names, ranked, strict=True)
     }
 
 
-def _rivals(
-    evaluator: Evaluator, named: FittedModel, steps: list[Comparison], name: str
+def _ranked_instead(
+    evaluator: Evaluator, selected: FittedModel, comparisons: list[Comparison], name: str
 ) -> list[RankedModel]:
-    rest = named.hypothesis.without(name)
-    known = [s for s in steps if s.before.hypothesis == rest and s.rivals[0].name == name]
+    """Models with another mechanism in the place of one, at the noise of the selected model."""
+    count = evaluator.settings.refinement.compared_alternatives
+    rest = selected.hypothesis.without(name)
+    known = [
+        comparison
+        for comparison in comparisons
+        if comparison.base.hypothesis == rest and comparison.ranked[0].name == name
+    ]
     if known:
         # Those that stayed far behind were not fitted to the end.
-        return _again(evaluator, known[-1].rivals[1:4], named)
-    base = evaluator.fit(rest, named.noise, named)
-    white = fit_with_white_noise(evaluator, base)
-    candidates = [
-        one
-        for one in screen_mechanisms(base, white, evaluator.allowed_mechanisms)
-        if one.name != name
-    ]
-    found = compare_candidates(evaluator, base, candidates, white)
-    if found is None or not passes_heldout_test(found.gained):
-        return []
-    return _again(evaluator, found.rivals[:3], named)
-
-
-def _again(
-    evaluator: Evaluator, rivals: tuple[RankedModel, ...], named: FittedModel
-) -> list[RankedModel]:
-    """The same at the noise of the names, the best first."""
+        models = known[-1].ranked[1 : count + 1]
+    else:
+        base = evaluator.fit(rest, selected.noise, selected)
+        white = fit_with_white_noise(evaluator, base)
+        candidates = screen_mechanisms(
+            base, white, evaluator.settings, evaluator.allowed_mechanisms
+        )
+        others = [candidate for candidate in candidates if candidate.name != name]
+        comparison = compare_candidates(evaluator, base, others, white)
+        if comparison is None or not passes_heldout_test(
+            comparison.held_out_gain, evaluator.settings.held_out_test
+        ):
+            return []
+        models = comparison.ranked[:count]
     again = [
-        RankedModel(one.name, one.fitted, evaluator.criterion(one.fitted, named.noise))
-        for one in rivals
+        RankedModel(model.name, model.fitted, evaluator.criterion(model.fitted, selected.noise))
+        for model in models
     ]
-    return sorted(again, key=lambda one: one.criterion)
+    return sorted(again, key=lambda model: model.criterion)
 
 
-def _close(name: str, rivals: list[RankedModel], criterion: float) -> Alternatives:
-    near = [one for one in rivals if one.criterion < criterion + _CLOSE][:_LISTED]
-    odds = np.exp(-0.5 * np.array([max(one.criterion - criterion, 0.0) for one in near]))
-    names = tuple(one.name for one in near) + mechanism(name).description.equivalents
-    return Alternatives(names[:_LISTED], float(1.0 / (1.0 + odds.sum())), tuple(near))
+def _alternatives(
+    evaluator: Evaluator, name: str, models: list[RankedModel], criterion: float
+) -> Alternatives:
+    settings = evaluator.settings.refinement
+    limit = criterion + settings.close_criterion
+    close = [model for model in models if model.criterion < limit]
+    close = close[: settings.listed_alternatives]
+    behind = np.array([max(model.criterion - criterion, 0.0) for model in close])
+    odds: Floats = np.exp(-0.5 * behind)
+    names = tuple(model.name for model in close) + mechanism(name).description.equivalents
+    confidence = float(1.0 / (1.0 + odds.sum()))
+    return Alternatives(names[: settings.listed_alternatives], confidence, tuple(close))

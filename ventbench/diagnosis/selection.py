@@ -1,8 +1,17 @@
-"""Whether breaths that no fit has seen ask for a term.
+"""Forward selection of terms, by information criterion and held-out log-likelihood.
 
-One comparison: what could be added to a hypothesis, each fitted, at one noise.
-
-Forward selection with a gate on held-out breaths.
+The search starts from the base model (lung, valves, PEEP). In each round, the mechanisms that the
+hypothesis does not have are ranked to first order (:mod:`ventbench.diagnosis.screening`), and the
+most promising ones are fitted. Fits are compared by BIC at one common noise: the noise that the
+best candidate leaves, since noise that was estimated with an effect still in the residual explains
+the effect away. The best candidate is fitted together with its noise and kept if held-out breaths
+ask for it: its log-likelihood ratio there must pass a test that chance passes in at most 1 % of
+recordings (:func:`passes_heldout_test`), or, where the training breaths ask for it clearly, a
+cross-validated one; and it must not be a negligible strength that trims other terms. Shape
+parameters of the new term are freed if both criteria ask for it, and earlier terms that the new one
+makes redundant are dropped. Patient effort has parameters of its own in each breath and can imitate
+any sum of effects, so effects that are the same in all breaths come first, and effort has to
+explain more than slowly varying sensor noise would. The search ends when no candidate passes.
 """
 
 from __future__ import annotations
@@ -13,108 +22,31 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
-from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, has_own
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.latent_inputs import exceeds_sensor_noise
-from ventbench.diagnosis.patient_effort import EFFORT
 from ventbench.diagnosis.screening import Candidate, screen_mechanisms
-from ventbench.diagnosis.settings import GATE
+from ventbench.diagnosis.settings import DEFAULT, HeldOutTestSettings
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import Noise, estimate
 from ventbench.system_id.together import each
 
-#: How far the sum over breaths must exceed its own scatter.
-_CONSISTENT = 1.3
+#: Is told what is being done.
+Progress = Callable[[str], None]
 
-#: Quantile of the gains' sizes that is usual, and times that beyond which they are cut off.
-_USUAL, _FAR = 0.8, 1.5
-
-#: Criterion from which the training breaths plainly ask for a term, and times the gate that it then
-#: has to pass, as judgements of several splits hang together.
-_PLAIN, _CROSSED = 20.0, 1.5
-
-#: Share of a mild strength, and of all that is explained, below both of which a term is a trace.
-WEAK, LITTLE = 0.2, 0.1
-
-
-def passes_heldout_test(gained: Floats, gate: float = GATE) -> bool:
-    """Whether held-out breaths ask for a term, by the log-likelihood that it gains in each.
-
-    A split likelihood ratio: whatever the term, and however it was chosen, it exceeds the gate by
-    chance in at most 1 % of the recordings. It must not hang on a few breaths either, nor may a few
-    that fit nothing, as those of another rig, outvote the rest: with what is far from the others
-    cut off, half of the gate must be left, and more than the sum's own scatter.
-    """
-    if float(gained.sum()) <= gate:
-        return False
-    far = _FAR * float(np.quantile(np.abs(gained), _USUAL))
-    usual = np.clip(gained, -far, far)
-    total, scatter = float(usual.sum()), float(np.sqrt(np.sum(usual**2)))
-    return total > 0.5 * gate and total > _CONSISTENT * scatter
-
-
-def is_needed(evaluator: Evaluator, current: FittedModel, without: FittedModel) -> bool:
-    """Whether both the training breaths and the held-out ones ask for what the other one lacks.
-
-    Where the training breaths plainly do and the held-out ones are too few to tell, every breath
-    judges once, by fits to the others.
-
-    Args:
-        evaluator: of the recording.
-        current: a hypothesis.
-        without: with a term less, at the same noise.
-    """
-    gained = evaluator.criterion(without) - evaluator.criterion(current)
-    if gained < 0:
-        return False
-    if passes_heldout_test(
-        evaluator.held_out_log_likelihood(current) - evaluator.held_out_log_likelihood(without)
-    ):
-        return True
-    return gained > _PLAIN and passes_heldout_test(
-        cross_validated_gain(evaluator, current, without), _CROSSED * GATE
-    )
-
-
-def is_negligible(
-    evaluator: Evaluator, current: FittedModel, without: FittedModel, name: str
-) -> bool:
-    """Whether a term is far weaker than a mild one and explains little beside the others.
-
-    What another term's form or the integrator leaves, a tiny effect of almost any kind can trim,
-    and enough breaths will believe it: a valve that is late by 1 ms beside four strong effects.
-
-    Args:
-        evaluator: of the recording.
-        current: a hypothesis.
-        without: with the term less, at the same noise.
-        name: of the term.
-    """
-    item = mechanism(name).description.strength
-    strength = float(np.max(np.abs(current.column(f"{name}.{item.name}") - item.neutral)))
-    if has_own(name) or strength > WEAK * abs(item.mild - item.neutral):
-        return False
-    here = evaluator.criterion(current)
-    nothing = evaluator.criterion(evaluator.fit(Hypothesis(), current.noise, current))
-    return evaluator.criterion(without) - here < LITTLE * (nothing - here)
-
-
-#: Nats from which a hypothesis explains much.
-MUCH = 100.0
-
-#: Candidates that are refitted, unless much is missing; nats below which one is not looked at.
-_REFITTED, _FAINT = 6, 3.0
-
-#: Steps of a first fit; nats of criterion, and share of the gain, within which one may still win.
-_FEW, _NEAR, _SHARE = 12, 60.0, 0.1
-
-#: Criterion that another noise must gain; most times that a fit and its noise take turns.
-_LIKELIER, _SETTLED = 2.0, 5
+#: Gives a simpler model that ends the search in place of the current one, or None.
+Replacement = Callable[[FittedModel], FittedModel | None]
 
 
 @dataclass(frozen=True, eq=False)
 class RankedModel:
-    """A hypothesis that was compared with the one that was chosen, at the same noise."""
+    """A hypothesis in a comparison, by its last term.
+
+    Attributes:
+        name: of the term.
+        fitted: the hypothesis with the term.
+        criterion: BIC at the comparison's noise.
+    """
 
     name: str
     fitted: FittedModel
@@ -123,298 +55,361 @@ class RankedModel:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """One comparison: what could be added to a hypothesis.
+    """What could be added to a hypothesis, compared at one noise.
 
     Attributes:
-        before: without, at the same noise.
-        rivals: the candidates, best first.
-        gained: held-out log-likelihood of the best, less that without, by breath.
+        base: the hypothesis without any candidate.
+        ranked: the candidates, the best first.
+        held_out_gain: held-out log-likelihood that the best gains, nats, ``(n,)``.
     """
 
-    before: FittedModel
-    rivals: tuple[RankedModel, ...]
-    gained: Floats
+    base: FittedModel
+    ranked: tuple[RankedModel, ...]
+    held_out_gain: Floats
 
-    @property
-    def nats(self) -> float:
-        """Held-out log-likelihood that the best gains."""
-        return float(self.gained.sum())
+
+def forward_selection(
+    evaluator: Evaluator,
+    start: FittedModel,
+    tell: Progress,
+    replacement: Replacement = lambda _: None,
+) -> tuple[FittedModel, list[Comparison]]:
+    """Add terms while held-out breaths ask for them, and drop terms that become redundant.
+
+    Args:
+        evaluator: of the recording.
+        start: the model that terms are added to.
+        tell: is told what is being done.
+        replacement: is asked for a simpler model once there are several terms, and at the end.
+
+    Returns:
+        The selected model and all comparisons; no comparisons if the model is a replacement.
+    """
+    current, comparisons = start, []
+    settings = evaluator.settings
+    for _ in range(settings.forward.max_rounds):
+        if len(current.names) == settings.forward.max_terms:
+            break
+        tell(f"comparing mechanisms ({len(current.names)} named)")
+        white = fit_with_white_noise(evaluator, current)
+        candidates = screen_mechanisms(current, white, settings, evaluator.allowed_mechanisms)
+        comparison = compare_candidates(evaluator, current, candidates, white)
+        if comparison is None:
+            break
+        comparisons.append(comparison)
+        best = _accepted(evaluator, comparison)
+        if best is None:
+            break
+        current = drop_redundant_terms(evaluator, free_shape_parameters(evaluator, best))
+        if len(current.names) < settings.forward.replacement_terms:
+            continue
+        instead = replacement(current)
+        if instead is not None:
+            return instead, []
+    instead = replacement(current)
+    return (current, comparisons) if instead is None else (instead, [])
 
 
 def estimate_noise(fitted: FittedModel) -> Noise:
-    """Noise that a hypothesis leaves on the training breaths."""
+    """Noise that a model leaves in the breaths that it was fitted to."""
     return estimate(fitted.residual, fitted.problem.data.weight)
 
 
 def fit_with_noise(
-    evaluator: Evaluator, hypothesis: Hypothesis, near: FittedModel | None = None
+    evaluator: Evaluator, hypothesis: Hypothesis, warm_start: FittedModel | None = None
 ) -> FittedModel:
-    """Fit a hypothesis and its noise in turn."""
-    fitted = evaluator.fit(hypothesis, near.problem.noise if near else Noise(), near)
-    for _ in range(_SETTLED):
+    """Fit a hypothesis to the training breaths, and its noise, in turn."""
+    settings = evaluator.settings.fit
+    noise = warm_start.problem.noise if warm_start else Noise()
+    fitted = evaluator.fit(hypothesis, noise, warm_start)
+    for _ in range(settings.noise_rounds):
         noise = estimate_noise(fitted)
         again = evaluator.fit(hypothesis, noise, fitted, restart=True)
         gained = again.log_likelihood - fitted.log_likelihood_at(noise)
         fitted = again if gained > 0 else evaluator.fit(hypothesis, noise, fitted)
-        if gained < _LIKELIER:
+        if gained < settings.noise_gain:
             break
     return fitted
 
 
 def fit_with_white_noise(evaluator: Evaluator, current: FittedModel) -> FittedModel:
-    """The same hypothesis at white noise.
+    """Refit a model at white noise.
 
-    Coloured noise excuses an error that is slow, and R, C and PEEP may go anywhere for it.
+    Coloured noise excuses slow errors, so that R, C and PEEP may drift anywhere to reduce it.
     """
     white = replace(current.noise, ar=(0.0, 0.0))
-    near = current if current.names else None
-    return evaluator.fit(current.hypothesis, white, near)
+    return evaluator.fit(current.hypothesis, white, current if current.names else None)
+
+
+def passes_heldout_test(
+    gains: Floats,
+    settings: HeldOutTestSettings = DEFAULT.held_out_test,
+    threshold: float | None = None,
+) -> bool:
+    """Whether held-out breaths ask for a term.
+
+    The sum of the gains is a split likelihood ratio: whatever the term and however it was chosen,
+    chance exceeds the threshold in at most 1 % of recordings. The sum must not depend on a few
+    breaths either, and a few breaths that no model fits, as those of another rig, must not outvote
+    the rest. With gains far beyond the typical ones cut off, half of the threshold must be left,
+    and more than the sum's own scatter.
+
+    Args:
+        gains: log-likelihood that the term gains in each held-out breath, nats, ``(n,)``.
+        settings: of the test.
+        threshold: nats that the sum must exceed; as in ``settings`` if None.
+    """
+    threshold = settings.threshold if threshold is None else threshold
+    if float(gains.sum()) <= threshold:
+        return False
+    typical = float(np.quantile(np.abs(gains), settings.typical_quantile))
+    far = settings.outlier_factor * typical
+    clipped = np.clip(gains, -far, far)
+    total, scatter = float(clipped.sum()), float(np.sqrt(np.sum(clipped**2)))
+    return total > settings.kept_share * threshold and total > settings.consistency * scatter
+
+
+def is_needed(evaluator: Evaluator, with_term: FittedModel, without_term: FittedModel) -> bool:
+    """Whether both training and held-out breaths ask for a term.
+
+    Where the training breaths ask for it clearly and the held-out breaths are too few to tell, the
+    test is repeated by cross-validation.
+
+    Args:
+        evaluator: of the recording.
+        with_term: a hypothesis.
+        without_term: the hypothesis without the term, at the same noise.
+    """
+    settings = evaluator.settings.held_out_test
+    gained = evaluator.criterion(without_term) - evaluator.criterion(with_term)
+    if gained < 0:
+        return False
+    held_out = evaluator.held_out_log_likelihood(with_term)
+    if passes_heldout_test(held_out - evaluator.held_out_log_likelihood(without_term), settings):
+        return True
+    return gained > settings.clear_criterion and passes_heldout_test(
+        cross_validated_gain(evaluator, with_term, without_term),
+        settings,
+        settings.cross_validation_factor * settings.threshold,
+    )
+
+
+def is_negligible(
+    evaluator: Evaluator, with_term: FittedModel, without_term: FittedModel, name: str
+) -> bool:
+    """Whether a term is far weaker than a mild one and explains little beside the others.
+
+    A tiny effect of almost any kind can reduce an error of the integrator, or of another term's
+    form, and with enough breaths it passes the held-out test: a valve that is late by 1 ms beside
+    four strong effects.
+
+    Args:
+        evaluator: of the recording.
+        with_term: a hypothesis.
+        without_term: the hypothesis without the term, at the same noise.
+        name: of the term.
+    """
+    settings = evaluator.settings.held_out_test
+    about = mechanism(name).description.strength
+    strength = float(np.max(np.abs(with_term.column(f"{name}.{about.name}") - about.neutral)))
+    weak = settings.negligible_strength * abs(about.mild - about.neutral)
+    if varies_by_breath(name) or strength > weak:
+        return False
+    here = evaluator.criterion(with_term)
+    base = evaluator.criterion(evaluator.fit(Hypothesis(), with_term.noise, with_term))
+    return evaluator.criterion(without_term) - here < settings.negligible_share * (base - here)
 
 
 def compare_candidates(
     evaluator: Evaluator,
     current: FittedModel,
     candidates: list[Candidate],
-    near: FittedModel | None = None,
+    warm_start: FittedModel | None = None,
 ) -> Comparison | None:
-    """Compare what could be added; None if nothing is worth a look.
+    """Fit the candidates and rank them by BIC at one noise; None if none is promising.
 
     Args:
         evaluator: of the recording.
-        current: the hypothesis that is added to.
-        candidates: what could be.
-        near: where fits start; ``current`` if not given.
+        current: the model that candidates are added to.
+        candidates: the most promising first.
+        warm_start: the model that fits start from; ``current`` if None.
     """
-    found = [one for one in candidates if max(one.nats, one.white) > _FAINT]
-    if not found:
+    settings = evaluator.settings.forward
+    chosen = [
+        candidate for candidate in candidates if candidate.promise > settings.min_expected_gain
+    ]
+    if not chosen:
         return None
-    # Templates are linear: where much is missing they rank badly, and all are refitted.
-    if max(one.nats for one in found) < MUCH:
-        found = found[:_REFITTED]
-    # Whitened by what an effect leaves in the residual, its own fit would hardly see it.
+    # Templates are linear: where much is missing they rank badly, and all are fitted.
+    if max(candidate.nats for candidate in chosen) < settings.large_gain:
+        chosen = chosen[: settings.fitted_candidates]
+    # Noise that was estimated with an effect in the residual would hide the effect from its fit.
     white = replace(current.noise, ar=(0.0, 0.0))
-    rivals = each(
-        lambda one: evaluator.fit(
-            current.hypothesis.plus(one.hypothesis), white, near or current, one.start,
-            iterations=_FEW, tolerance=0.1,
+    models = each(
+        lambda candidate: evaluator.fit(
+            current.hypothesis.plus(candidate.hypothesis),
+            white,
+            warm_start or current,
+            candidate.start,
+            iterations=evaluator.settings.fit.quick_iterations,
+            tolerance=evaluator.settings.fit.quick_tolerance,
         ),
-        found,
-    )  # fmt: skip
-    criterion = _Criteria(evaluator)
-    own = each(lambda one: criterion(one, estimate_noise(one)), rivals)
-    noise = criterion.likelier(rivals[int(np.argmin(own))], current.noise)
-    order = criterion.order(rivals, noise)
-    for _ in range(3):
-        # At the noise of the best, all that may still win is fitted further.
+        chosen,
+    )
+    criteria = _Criteria(evaluator)
+    own = each(lambda model: criteria(model, estimate_noise(model)), models)
+    noise = criteria.better_noise(models[int(np.argmin(own))], current.noise)
+    order = criteria.order(models, noise)
+    for _ in range(settings.noise_rounds):
+        # At the noise of the best, all that may still win are fitted on.
         order[0] = evaluator.fit(order[0].hypothesis, noise, order[0])
-        noise = criterion.likelier(order[0], noise)
-        order = criterion.order(order, noise)
-        best = criterion(order[0], noise)
-        limit = best + max(_NEAR, _SHARE * (criterion(current, noise) - best))
-        order = criterion.order(_further(evaluator, order, noise, criterion, limit), noise)
-        if criterion.likelier(order[0], noise) is noise:
+        noise = criteria.better_noise(order[0], noise)
+        order = criteria.order(order, noise)
+        best = criteria(order[0], noise)
+        gained = criteria(current, noise) - best
+        limit = best + max(settings.contender_criterion, settings.contender_share * gained)
+        order = criteria.order(_fit_contenders(evaluator, order, noise, criteria, limit), noise)
+        if criteria.better_noise(order[0], noise) is noise:
             break
     if noise is not current.noise:
         current = evaluator.fit(current.hypothesis, noise, current)
-    listed = tuple(RankedModel(x.hypothesis.names[-1], x, criterion(x, noise)) for x in order)
-    return Comparison(
-        current,
-        listed,
-        evaluator.held_out_log_likelihood(order[0]) - evaluator.held_out_log_likelihood(current),
+    ranked = tuple(
+        RankedModel(model.hypothesis.names[-1], model, criteria(model, noise)) for model in order
     )
+    gains = evaluator.held_out_log_likelihood(order[0])
+    return Comparison(current, ranked, gains - evaluator.held_out_log_likelihood(current))
 
 
-def _further(
-    evaluator: Evaluator, order: list[FittedModel], noise: Noise, criterion: _Criteria, limit: float
+def _fit_contenders(
+    evaluator: Evaluator,
+    models: list[FittedModel],
+    noise: Noise,
+    criteria: _Criteria,
+    limit: float,
 ) -> list[FittedModel]:
-    """The same, those below a limit fitted on at a noise."""
+    """Continue the fits of the models whose criterion is below a limit, at a noise."""
 
-    def further(one: FittedModel) -> FittedModel:
-        return evaluator.fit(one.hypothesis, noise, one) if criterion(one, noise) < limit else one
+    def continued(model: FittedModel) -> FittedModel:
+        if criteria(model, noise) < limit:
+            return evaluator.fit(model.hypothesis, noise, model)
+        return model
 
-    return each(further, order)
+    return each(continued, models)
 
 
 class _Criteria:
-    """Criteria of fits at several noises, each computed once."""
+    """Criteria of models at several noises, each computed once."""
 
     def __init__(self, evaluator: Evaluator) -> None:
-        self._bench = evaluator
+        self._evaluator = evaluator
         self._known: dict[tuple[int, Noise], tuple[FittedModel, float]] = {}
 
     def __call__(self, fitted: FittedModel, noise: Noise) -> float:
         key = (id(fitted), noise)
-        if key not in self._known:  # which keeps the fit, and thereby its identity
-            self._known[key] = (fitted, self._bench.criterion(fitted, noise))
+        if key not in self._known:  # which keeps the model, and thereby its identity
+            self._known[key] = (fitted, self._evaluator.criterion(fitted, noise))
         return self._known[key][1]
 
-    def likelier(self, fitted: FittedModel, noise: Noise) -> Noise:
-        """The noise that a fit leaves, if it makes the fit clearly likelier than another one."""
+    def better_noise(self, fitted: FittedModel, noise: Noise) -> Noise:
+        """The noise that a model leaves, if it has a clearly lower criterion; else ``noise``."""
         own = estimate_noise(fitted)
-        return own if self(fitted, own) < self(fitted, noise) - _LIKELIER else noise
+        better = self(fitted, own) < self(fitted, noise) - self._evaluator.settings.fit.noise_gain
+        return own if better else noise
 
-    def order(self, rivals: list[FittedModel], noise: Noise) -> list[FittedModel]:
-        """The best first."""
-        return sorted(rivals, key=lambda one: self(one, noise))
-
-
-#: Most terms, and comparisons: a term that was dropped may come back, but not for ever.
-_MOST, _ROUNDS = 6, 14
-
-#: Names from which it is asked whether something else does better; of fewer, the next may be what
-#: is missing.
-_SEVERAL = 4
-
-#: Share of what efforts explain from which an effect that all breaths share goes first.
-_MOSTLY = 0.5
-
-#: Candidates that are tried where the best one is not believed.
-_OTHERS = 3
-
-#: Nats from which a shape is freed.
-_SHAPE = 2.0
-
-Progress = Callable[[str], None]
-Simpler = Callable[[FittedModel], FittedModel | None]
+    def order(self, models: list[FittedModel], noise: Noise) -> list[FittedModel]:
+        """The models by their criterion at a noise, the best first."""
+        return sorted(models, key=lambda model: self(model, noise))
 
 
-def forward_selection(
-    evaluator: Evaluator, start: FittedModel, tell: Progress, simpler: Simpler = lambda _: None
-) -> tuple[FittedModel, list[Comparison]]:
-    """Add terms while held-out breaths ask for them, and drop those that a later one replaces.
-
-    Args:
-        evaluator: of the recording.
-        start: what terms are added to.
-        tell: is told what is done.
-        simpler: gives what ends the search if something else does better than all terms.
-    """
-    current, steps = start, []
-    for _ in range(_ROUNDS):
-        if len(current.hypothesis.names) == _MOST:
-            break
-        tell(f"comparing mechanisms ({len(current.hypothesis.names)} named)")
-        white = fit_with_white_noise(evaluator, current)
-        found = compare_candidates(
-            evaluator,
-            current,
-            screen_mechanisms(current, white, evaluator.allowed_mechanisms),
-            white,
-        )
-        if found is None:
-            break
-        steps.append(found)
-        best = _best(evaluator, found)
-        if best is None:
-            break
-        current = drop_redundant_terms(evaluator, free_shape_parameters(evaluator, best))
-        if len(current.names) < _SEVERAL:
-            continue
-        instead = simpler(current)
-        if instead is not None:
-            return instead, []
-    instead = simpler(current)
-    return (current, steps) if instead is None else (instead, [])
-
-
-def _best(evaluator: Evaluator, found: Comparison) -> FittedModel | None:
-    """The candidate to go on with, or None if none is believed.
-
-    What is free in each breath looks like any sum of effects, so that efforts wait for what is the
-    same in all breaths.
-    """
-    first = found.rivals[0]
-    if has_own(first.name):
-        nothing = evaluator.criterion(found.before)
-        enough = nothing - _MOSTLY * (nothing - first.criterion)
-        shared = (x for x in found.rivals if x.criterion < enough and not has_own(x.name))
-        with_it = _beyond(evaluator, found, next(shared, None))
-        if with_it is not None:
-            return with_it
-    if not passes_heldout_test(found.gained) and not is_needed(
-        evaluator, first.fitted, found.before
-    ):
-        return _other(evaluator, found)
-    best = _settled(evaluator, first)
-    if is_negligible(evaluator, best, _without(evaluator, found, best), first.name):
-        return _other(evaluator, found)
-    if first.name != EFFORT or exceeds_sensor_noise(evaluator, best):
+def _accepted(evaluator: Evaluator, comparison: Comparison) -> FittedModel | None:
+    """The model to continue with, or None if no candidate passes."""
+    first = comparison.ranked[0]
+    shared = [model for model in comparison.ranked if not varies_by_breath(model.name)]
+    if varies_by_breath(first.name):
+        nothing = evaluator.criterion(comparison.base)
+        share = evaluator.settings.forward.shared_effect_share
+        enough = nothing - share * (nothing - first.criterion)
+        strong = next((model for model in shared if model.criterion < enough), None)
+        preferred = _if_needed(evaluator, comparison, strong)
+        if preferred is not None:
+            return preferred
+    passes = passes_heldout_test(comparison.held_out_gain, evaluator.settings.held_out_test)
+    if not passes and not is_needed(evaluator, first.fitted, comparison.base):
+        return _fallback(evaluator, comparison)
+    best = _refit(evaluator, first)
+    without = _without(evaluator, comparison, best)
+    if is_negligible(evaluator, best, without, first.name):
+        return _fallback(evaluator, comparison)
+    if not varies_by_breath(first.name) or exceeds_sensor_noise(evaluator, best):
         return best
-    return _beyond(evaluator, found, next((x for x in found.rivals if not has_own(x.name)), None))
+    return _if_needed(evaluator, comparison, next(iter(shared), None))
 
 
-def _beyond(
-    evaluator: Evaluator, found: Comparison, rival: RankedModel | None
+def _if_needed(
+    evaluator: Evaluator, comparison: Comparison, candidate: RankedModel | None
 ) -> FittedModel | None:
-    """With a rival, settled, if it is needed there."""
-    if rival is None:
+    """A candidate, fitted with its noise, if it is needed there."""
+    if candidate is None:
         return None
-    with_it = _settled(evaluator, rival)
-    without = _without(evaluator, found, with_it)
-    if not is_needed(evaluator, with_it, without) or is_negligible(
-        evaluator, with_it, without, rival.name
-    ):
+    fitted = _refit(evaluator, candidate)
+    without = _without(evaluator, comparison, fitted)
+    if not is_needed(evaluator, fitted, without):
         return None
-    return with_it
+    return None if is_negligible(evaluator, fitted, without, candidate.name) else fitted
 
 
-def _without(evaluator: Evaluator, found: Comparison, with_it: FittedModel) -> FittedModel:
-    """What a step added to, at the noise of what it gives."""
-    return evaluator.fit(found.before.hypothesis, with_it.noise, found.before)
+def _without(evaluator: Evaluator, comparison: Comparison, fitted: FittedModel) -> FittedModel:
+    """A comparison's base at the noise of another model."""
+    return evaluator.fit(comparison.base.hypothesis, fitted.noise, comparison.base)
 
 
-def _settled(evaluator: Evaluator, rival: RankedModel) -> FittedModel:
-    """Fitted at its own noise: that of a step still holds much of the effect."""
-    return fit_with_noise(evaluator, rival.fitted.hypothesis, rival.fitted)
+def _refit(evaluator: Evaluator, candidate: RankedModel) -> FittedModel:
+    """A candidate with its own noise: the comparison's still contains much of the effect."""
+    return fit_with_noise(evaluator, candidate.fitted.hypothesis, candidate.fitted)
 
 
-def _other(evaluator: Evaluator, found: Comparison) -> FittedModel | None:
-    """Another candidate that explains much and is believed, where the best one is not.
+def _fallback(evaluator: Evaluator, comparison: Comparison) -> FittedModel | None:
+    """Another candidate that explains much and is needed, where the best one fails.
 
-    So does a sum of several effects look to what is free in each breath: large, and never twice
-    alike.
+    The best one is then often patient effort that imitates a sum of several effects.
     """
-    least = evaluator.criterion(found.before) - MUCH
-    own = [(evaluator.criterion(x.fitted, estimate_noise(x.fitted)), x) for x in found.rivals[1:]]
+    settings = evaluator.settings.forward
+    least = evaluator.criterion(comparison.base) - settings.large_gain
+    own = [
+        (evaluator.criterion(model.fitted, estimate_noise(model.fitted)), model)
+        for model in comparison.ranked[1:]
+    ]
     promising = sorted((pair for pair in own if pair[0] < least), key=lambda pair: pair[0])
-    for _, rival in promising[:_OTHERS]:
-        with_it = _beyond(evaluator, found, rival)
-        if with_it is not None:
-            return with_it
+    for _, candidate in promising[: settings.fallback_candidates]:
+        fitted = _if_needed(evaluator, comparison, candidate)
+        if fitted is not None:
+            return fitted
     return None
 
 
 def free_shape_parameters(evaluator: Evaluator, current: FittedModel) -> FittedModel:
-    """Free what shapes the newest term's effect, if the recording asks for it."""
+    """Free the shape parameters of the newest term that the recording asks for."""
     name = current.hypothesis.names[-1]
-    for item in mechanism(name).description.parameters:
-        path = f"{name}.{item.name}"
-        if not item.shape or item.discrete:
+    for about in mechanism(name).description.parameters:
+        path = f"{name}.{about.name}"
+        if not about.shape or about.discrete:
             continue
-        freer = evaluator.fit(
-            current.hypothesis.plus(Hypothesis((name,), (path,))), current.noise, current
-        )
+        freed = current.hypothesis.plus(Hypothesis((name,), (path,)))
+        freer = evaluator.fit(freed, current.noise, current)
         if evaluator.criterion(freer) > evaluator.criterion(current):
             continue
-        if (
-            float(
-                (
-                    evaluator.held_out_log_likelihood(freer)
-                    - evaluator.held_out_log_likelihood(current)
-                ).sum()
-            )
-            > _SHAPE
-        ):
+        before = evaluator.held_out_log_likelihood(current)
+        gained = float((evaluator.held_out_log_likelihood(freer) - before).sum())
+        if gained > evaluator.settings.forward.shape_gain:
             current = freer
     return current
 
 
 def drop_redundant_terms(evaluator: Evaluator, current: FittedModel) -> FittedModel:
-    """Leave out terms that are not needed any more."""
+    """Drop earlier terms that are no longer needed, or have become negligible."""
     for name in current.hypothesis.names[:-1]:
         without = evaluator.fit(current.hypothesis.without(name), current.noise, current)
-        if not is_needed(evaluator, current, without) or is_negligible(
-            evaluator, current, without, name
-        ):
+        needed = is_needed(evaluator, current, without)
+        if not needed or is_negligible(evaluator, current, without, name):
             current = without
     return current

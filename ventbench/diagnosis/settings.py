@@ -71,7 +71,6 @@ class ScreeningSettings:
         clip: whitened residuals are cut off here, in standard deviations, so that no single sample
             decides.
         ridge: eigenvalues of a projection below this share of the largest count as zero.
-        weak_share: the weakest strength that is tried, as a share of a mild one.
         min_step: least multiple of a template that starts a fit.
         max_step: largest multiple of a template that starts a fit; first order does not hold far.
         derivatives_at_once: directions of one compiled derivative.
@@ -80,7 +79,6 @@ class ScreeningSettings:
 
     clip: float = 4.0
     ridge: float = 1e-9
-    weak_share: float = 0.3
     min_step: float = 0.2
     max_step: float = 3.0
     derivatives_at_once: int = 16
@@ -217,6 +215,11 @@ class PatientEffortSettings:
     restart_gain: float = 1.0
     tolerance: float = 0.2
     iterations: int = 7
+
+    @property
+    def onset_span(self) -> float:
+        """Length of time in which efforts begin, s: the grid and one step."""
+        return self.onsets[-1] - self.onsets[0] + 0.1
 
 
 @dataclass(frozen=True)
@@ -380,6 +383,3 @@ class SelectionConfig:
 
 #: What a diagnosis uses unless it is told otherwise.
 DEFAULT = SelectionConfig()
-
-#: Log-likelihood on held-out breaths, nats, from which a term is accepted: log(1 / 0.01).
-GATE = DEFAULT.held_out_test.threshold

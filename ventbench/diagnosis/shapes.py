@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ventbench.diagnosis.conclusion import Conclusion
+from ventbench.diagnosis.conclusion import Conclusion, UnnamedEffect
 from ventbench.diagnosis.findings import NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel
 from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY, LatentInput
-from ventbench.diagnosis.refinement import UnnamedEffect
 from ventbench.diagnosis.screening import component_of
 from ventbench.physics.catalogue import mechanism
 from ventbench.physics.component_curves import component_curves, without_absorbed
@@ -23,14 +22,14 @@ _MEANINGS = {
 
 def slot(conclusion: Conclusion) -> NonparametricTerm | None:
     """Slot of a conclusion, or None."""
-    place = conclusion.place
+    place = conclusion.unnamed
     if place is None:
         return None
     explains = _share(conclusion)
-    if place.source is not None:
-        return _moving(place, place.source, explains)
-    assert place.element is not None
-    x, y, x_unit, y_unit = _curve(conclusion.full, place.element)
+    if place.latent_input is not None:
+        return _moving(place, place.latent_input, explains)
+    assert place.term is not None
+    x, y, x_unit, y_unit = _curve(conclusion.full, place.term)
     meaning = NONPARAMETRIC_COMPONENTS[place.name].meaning
     return NonparametricTerm(place.name, meaning, explains, place.nats, x, x_unit, y, y_unit)
 
@@ -41,7 +40,7 @@ def _share(conclusion: Conclusion) -> float:
     weight = named.problem.data.weight
     before = float(np.sum(named.residual**2) / weight.sum())
     floor = float(conclusion.noise.sigma[0] ** 2)
-    if conclusion.place is not None and conclusion.place.source is not None:
+    if conclusion.unnamed is not None and conclusion.unnamed.latent_input is not None:
         after = floor
     else:
         after = float(np.sum(conclusion.full.residual**2) / weight.sum())
@@ -49,8 +48,8 @@ def _share(conclusion: Conclusion) -> float:
 
 
 def _moving(place: UnnamedEffect, source: LatentInput, explains: float) -> NonparametricTerm:
-    size = np.sqrt(np.mean(source.shape**2, axis=1))
-    course = source.shape[int(np.argmax(size))]
+    size = np.sqrt(np.mean(source.course**2, axis=1))
+    course = source.course[int(np.argmax(size))]
     unit = "share of the flow, 1" if place.name == SUPPLY else "pressure, cmH2O"
     meaning = _MEANINGS[place.name]
     if source.periodic:

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ventbench.diagnosis.evaluator import Evaluator, by_label
+from ventbench.diagnosis.evaluator import Evaluator, groups_by_label
 from ventbench.diagnosis.found import Found
-from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, has_own
-from ventbench.diagnosis.selection import LITTLE, WEAK, passes_heldout_test
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, varies_by_breath
+from ventbench.diagnosis.selection import passes_heldout_test
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id import Fit, fit
 from ventbench.system_id.unknowns import described, freed
@@ -35,11 +35,12 @@ def steadied(
         mechanisms that are missing then; None if held-out breaths ask for others.
     """
     full, own = found.conclusion.full, had.conclusion.full
-    if any(has_own(name) for name in (*full.names, *own.names)):
+    if any(varies_by_breath(name) for name in (*full.names, *own.names)):
         return None
-    place = found.conclusion.place
-    element = (place.element,) if place is not None and place.element else ()
+    place = found.conclusion.unnamed
+    element = (place.term,) if place is not None and place.term else ()
     evaluator = _widest(found.evaluator, had.evaluator)
+    settings = evaluator.settings.held_out_test
 
     def having(names: Sequence[str]) -> tuple[Fit, FittedModel]:
         asked = (*names, *element)
@@ -50,7 +51,8 @@ def steadied(
 
     names, (one, fitted) = tuple(missing), having(missing)
     if passes_heldout_test(
-        found.evaluator.held_out_log_likelihood(full) - evaluator.held_out_log_likelihood(fitted)
+        found.evaluator.held_out_log_likelihood(full) - evaluator.held_out_log_likelihood(fitted),
+        settings,
     ):
         return None
     nothing = evaluator.held_out_log_likelihood(having(())[1])
@@ -64,20 +66,21 @@ def steadied(
         least = int(np.argmin([nats.sum() for nats in lost]))
         name, one_less, less = fewer[least]
         whole = float((evaluator.held_out_log_likelihood(fitted) - nothing).sum())
-        trace = is_faint(fitted, own, name) and lost[least].sum() < LITTLE * whole
-        if passes_heldout_test(lost[least]) and not trace:
+        faint = is_faint(fitted, own, name, settings.negligible_strength)
+        trace = faint and lost[least].sum() < settings.negligible_share * whole
+        if passes_heldout_test(lost[least], settings) and not trace:
             break
         one, fitted = one_less, less
         names = tuple(other for other in names if other != name)
     return Found(evaluator, replace(found.conclusion, full=fitted), one), names
 
 
-def is_faint(fitted: FittedModel, own: FittedModel, name: str) -> bool:
+def is_faint(fitted: FittedModel, own: FittedModel, name: str, share: float) -> bool:
     """Whether a mechanism is by far less than a mild one beyond what the simulator has of it."""
     item = mechanism(name).description.strength
     path = f"{name}.{item.name}"
     beyond = np.abs(fitted.column(path) - own.column(path)[0])
-    return bool(beyond.max() < WEAK * abs(item.mild - item.neutral))
+    return bool(beyond.max() < share * abs(item.mild - item.neutral))
 
 
 def _of(full: Hypothesis, own: Hypothesis, asked: tuple[str, ...]) -> Hypothesis:
@@ -109,7 +112,7 @@ def _fitted(
         free=(*free, *loose),
         fixed={p: x for p, x in (fixed | given).items() if p not in loose},
         start={p: float(np.median(full.column(p))) for p in free},
-        groups=by_label(partition.data, tuple(free))
+        groups=groups_by_label(partition.data, tuple(free))
         | {p: np.arange(len(partition.data)) for p in loose},
         prior={p: (neutral, evaluator.gain_sd) for p in loose},
         noise=full.noise,

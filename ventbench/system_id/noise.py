@@ -63,6 +63,11 @@ class Noise:
         terms = -self.loss(white) - weight * (np.log(scale) + self.log_norm())
         return terms.sum(axis=(1, 2))
 
+    def log_scale(self, weight: Floats) -> Floats:
+        """Logarithm of the product of all scales by which residuals are whitened, ``(n,)``."""
+        _, scale, weight = self._chain(weight)
+        return np.sum(weight * np.log(scale), axis=(1, 2))
+
     def _chain(self, weight: Floats) -> tuple[Floats, Floats, Floats]:
         """Coupling to the sample before, what is new in each sample, and the weight."""
         channels = weight.shape[1]

@@ -1,4 +1,4 @@
-"""Slots as candidates, and the gain that each is expected to bring."""
+"""First-order ranking of mechanisms and of nonparametric terms."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from ventbench.diagnosis.screening import (
     all_parameter_paths,
     component_of,
     score_nonparametric_terms,
+    screen_mechanisms,
 )
-from ventbench.diagnosis.selection import fit_with_noise
+from ventbench.diagnosis.selection import fit_with_noise, fit_with_white_noise
+from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.physics import library, parameter
 from ventbench.physics.catalogue import basis_terms
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
@@ -32,48 +34,45 @@ def test_every_basis_term_belongs_to_a_component():
 
 
 def test_all_paths_are_those_of_the_library_and_of_all_slots():
-    found = all_parameter_paths()
+    found = all_parameter_paths(SelectionConfig())
     owners = {path.rpartition(".")[0] for path in found} - {""}
     assert owners == set(library()) | set(basis_terms())
     assert len(set(found)) == len(found)
 
 
 def scanned(*effects, seed=0, **changed):
-    evaluator = small.split(small.made(*effects, seed=seed, **changed), small.with_few())
+    evaluator = small.split_wide(small.made(*effects, seed=seed, **changed))
     null = fit_with_noise(evaluator, Hypothesis())
-    return evaluator, null, score_nonparametric_terms(null)
+    return evaluator, null, score_nonparametric_terms(null, small.SETTINGS)
 
 
-@pytest.mark.usefixtures("few_slots")
 @pytest.mark.parametrize("change", [0.65, -0.65])
 def test_resistance_that_follows_volume_is_found(change):
     effect = small.effect("volume_resistance", "R(V)", change=change)
     _, null, found = scanned(effect)
     assert {one.name for one in found} == set(small.FEW)
     assert found[0].name == "volume_resistance"
-    assert max(found[0].nats, found[0].white) > 20.0
-    best = [max(one.nats, one.white) for one in found]
+    assert found[0].promise > 20.0
+    best = [one.promise for one in found]
     assert best == sorted(best, reverse=True)
     assert all(one.hypothesis == Hypothesis((one.name,)) for one in found)
     again = dataclasses.replace(null, hypothesis=Hypothesis((found[0].name,)))
-    assert {one.name for one in score_nonparametric_terms(again)} == set(small.FEW) - {
-        found[0].name
-    }
+    assert {one.name for one in score_nonparametric_terms(again, small.SETTINGS)} == set(
+        small.FEW
+    ) - {found[0].name}
 
 
-@pytest.mark.usefixtures("few_slots")
 def test_nothing_is_promised_where_nothing_is():
     *_, found = scanned(seed=3)
     # A slot has up to ten coefficients, each worth half a nat by chance.
-    assert max(max(one.nats, one.white) for one in found) < 10.0
+    assert max(one.promise for one in found) < 10.0
 
 
-@pytest.mark.usefixtures("few_slots")
 def test_promised_nats_are_what_a_refit_gains():
     effect = small.effect("turbulent_resistance", quadratic=1.0)
-    evaluator = small.split(small.made(effect), small.with_few())
+    evaluator = small.split_wide(small.made(effect))
     null = evaluator.fit(Hypothesis(), NOISE, tolerance=1e-4, iterations=30)
-    found = {one.name: one.nats for one in score_nonparametric_terms(null)}
+    found = {one.name: one.nats for one in score_nonparametric_terms(null, small.SETTINGS)}
     assert max(found, key=lambda name: found[name]) == "flow_shape"
     refitted = evaluator.fit(
         Hypothesis(("flow_shape",)), NOISE, null, iterations=30, tolerance=1e-4
@@ -85,3 +84,49 @@ def test_promised_nats_are_what_a_refit_gains():
     first = next(path for path in refitted.problem.unknowns.paths if path.startswith("flow_shape"))
     assert np.ptp(refitted.column(first)) == 0.0
     assert refitted.column(first)[0] != parameter(first).neutral
+
+
+#: Mild effects.
+MILD = {
+    "valve_delay": {"delay": 0.04},
+    "valve_dead_band": {"width": 1.5},
+    "supply_droop": {"drop": 0.1, "recovery": 1.0},
+    "sensor_lag": {"tau": 0.05},
+    "sensor_drift": {"drift": 1.2},
+    "turbulent_resistance": {"quadratic": 4.0},
+    "nonlinear_compliance": {"stiffening": 1 / 40},
+    "patient_effort": {"amplitude": 2.0, "duration": 0.8},
+}
+
+
+@pytest.mark.parametrize("name", MILD)
+def test_screening_ranks_a_mild_effect_among_the_first(name):
+    evaluator = small.split(small.made(small.effect(name, **MILD[name]), seed=3))
+    null = fit_with_noise(evaluator, Hypothesis())
+    found = screen_mechanisms(null, fit_with_white_noise(evaluator, null), small.SETTINGS)
+    assert {one.name for one in found} == set(library())
+    place = [one.name for one in found].index(name)
+    assert place < 5, [one.name for one in found]
+    one = found[place]
+    assert one.promise > 10.0
+    assert one.hypothesis.names == (name,)
+    for path, value in one.start.items():
+        item = parameter(path)
+        assert item.low <= value <= item.high
+
+
+def test_screening_leaves_out_what_is_there_and_looks_only_at_what_it_is_told(plain):
+    named = plain.evaluator.fit(Hypothesis(("leak",)), plain.base.noise, plain.base, iterations=1)
+    assert "leak" not in {
+        one.name
+        for one in screen_mechanisms(
+            named, fit_with_white_noise(plain.evaluator, named), small.SETTINGS
+        )
+    }
+    some = screen_mechanisms(
+        plain.base,
+        fit_with_white_noise(plain.evaluator, plain.base),
+        small.SETTINGS,
+        ("leak", "inertance"),
+    )
+    assert {one.name for one in some} == {"leak", "inertance"}

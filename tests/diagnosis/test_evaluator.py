@@ -1,4 +1,4 @@
-"""Fits on the bench, and what the breaths that no fit has seen say of them."""
+"""Fits of hypotheses, and what held-out breaths say of them."""
 
 from __future__ import annotations
 
@@ -7,10 +7,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.evaluator import Evaluator, by_label, make_evaluator
+from ventbench.diagnosis.evaluator import (
+    Evaluator,
+    cross_validated_gain,
+    delay_restarts,
+    groups_by_label,
+    make_evaluator,
+)
 from ventbench.diagnosis.hypothesis import Hypothesis, Partition
-from ventbench.diagnosis.patient_effort import ONSETS, SHARE, WIDTH
-from ventbench.diagnosis.selection import fit_with_noise
+from ventbench.diagnosis.selection import estimate_noise, fit_with_noise
+from ventbench.diagnosis.settings import PatientEffortSettings
 from ventbench.physics import paths
 from ventbench.system_id import START, Data, Noise, recorded, settings
 
@@ -18,6 +24,7 @@ from . import small
 
 #: Without tails, so that sums of squares are all there is.
 GAUSSIAN = Noise((0.2,), (0.0,), np.inf)
+PRIOR = PatientEffortSettings()
 DELAY, LAG = Hypothesis(("valve_delay",)), Hypothesis(("sensor_lag",))
 
 
@@ -133,8 +140,8 @@ def test_criterion_at_another_noise(late):
     square = np.sum(fitted.residual**2)
     want = -0.5 * square / 0.16 - size * (np.log(0.4) + 0.5 * np.log(2 * np.pi))
     assert fitted.log_likelihood_at(loud) == pytest.approx(want, rel=1e-9)
-    penalty = fitted.shared * np.log(size)
-    assert fitted.shared == 5
+    penalty = fitted.shared_count * np.log(size)
+    assert fitted.shared_count == 5
     assert late.criterion(fitted, loud) == pytest.approx(-2 * want + penalty, rel=1e-9)
 
 
@@ -163,11 +170,18 @@ def brute_force(made: Evaluator, values: np.ndarray, duration: float, which: int
         return float(-0.5 * np.sum((error / size) ** 2 + np.log(2 * np.pi * size**2)))
 
     grid = np.linspace(-4.0, 4.0, 33)
-    prior = np.exp(-0.5 * (grid / WIDTH) ** 2) / (WIDTH * np.sqrt(2 * np.pi))
-    logs = np.array([[likelihood(a, onset) for a in grid] for onset in ONSETS])
+    prior = np.exp(-0.5 * (grid / PRIOR.amplitude_sd) ** 2) / (
+        PRIOR.amplitude_sd * np.sqrt(2 * np.pi)
+    )
+    logs = np.array([[likelihood(a, onset) for a in grid] for onset in PRIOR.onsets])
     top = logs.max()
     mixed = np.mean(np.sum(np.exp(logs - top) * prior, axis=1)) * (grid[1] - grid[0])
-    return float(np.logaddexp(np.log1p(-SHARE) + likelihood(0.0, 0.0), np.log(SHARE * mixed) + top))
+    return float(
+        np.logaddexp(
+            np.log1p(-PRIOR.probability) + likelihood(0.0, 0.0),
+            np.log(PRIOR.probability * mixed) + top,
+        )
+    )
 
 
 @pytest.mark.parametrize("which", [2, 3])
@@ -189,7 +203,9 @@ def two_lungs() -> Data:
 
 def test_what_belongs_to_R_is_one_for_each_label():
     data = two_lungs()
-    groups = by_label(data, ("R", "turbulent_resistance.quadratic", "leak.conductance", START))
+    groups = groups_by_label(
+        data, ("R", "turbulent_resistance.quadratic", "leak.conductance", START)
+    )
     assert list(groups) == ["turbulent_resistance.quadratic"]
     found = groups["turbulent_resistance.quadratic"]
     assert np.array_equal(found, np.where(data.R == 5.0, 0, 1))
@@ -221,3 +237,53 @@ def test_settling_finds_the_noise():
     assert np.array_equal(
         fitted.values[:, paths().index("gain")], neutral[:, paths().index("gain")]
     )
+
+
+PATH = "exhalation_valve_delay.opening"
+
+
+@pytest.fixture(scope="module")
+def exhaling_late() -> Evaluator:
+    return small.split(
+        small.made(small.effect("exhalation_valve_delay", opening=0.1), samples=64, noise=0.1)
+    )
+
+
+def test_a_search_that_stays_on_its_side_is_carried_over(exhaling_late):
+    late_by = Hypothesis(("exhalation_valve_delay",))
+    stuck = exhaling_late.fit(
+        late_by, fit_with_noise(exhaling_late, late_by).noise, start={PATH: 0.02}
+    )
+    moved = delay_restarts(stuck.problem, stuck.minimum.x)
+    there = moved[stuck.problem.unknowns.of(PATH)]
+    assert there == pytest.approx(0.1, abs=0.025)
+    fitted = fit_with_noise(exhaling_late, late_by, stuck)
+    assert fitted.column(PATH)[0] == pytest.approx(0.1, abs=0.02)
+    assert estimate_noise(fitted).sigma[0] == pytest.approx(0.1, rel=0.3)
+
+
+def test_a_dead_time_that_is_right_stays(exhaling_late):
+    fitted = fit_with_noise(exhaling_late, Hypothesis(("exhalation_valve_delay",)))
+    assert delay_restarts(fitted.problem, fitted.minimum.x) == pytest.approx(fitted.minimum.x)
+
+
+def test_without_dead_times_there_is_nothing_to_leap_over(exhaling_late):
+    fitted = exhaling_late.fit(
+        Hypothesis(("sensor_lag",)), fit_with_noise(exhaling_late, Hypothesis()).noise
+    )
+    assert delay_restarts(fitted.problem, fitted.minimum.x) is fitted.minimum.x
+
+
+def test_every_breath_is_held_out_once(turbulent, both):
+    assert len(turbulent.folds) == 2
+    seen = [turbulent.held_out, *(held_out for _, held_out in turbulent.folds)]
+    pressures = np.concatenate([partition.data.seen[:, 0] for partition in seen])
+    assert len(np.unique(pressures, axis=0)) == small.BREATHS
+    for training, held_out in turbulent.folds:
+        assert len(training.data) + len(held_out.data) == small.BREATHS
+    gained = cross_validated_gain(turbulent, *both)
+    assert gained.shape == (small.BREATHS,)
+    assert gained[: len(turbulent.held_out.data)] == pytest.approx(
+        turbulent.held_out_log_likelihood(both[0]) - turbulent.held_out_log_likelihood(both[1])
+    )
+    assert gained.sum() > 50.0

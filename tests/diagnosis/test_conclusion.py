@@ -1,4 +1,4 @@
-"""From a recording to names, a place, or neither."""
+"""From a recording to mechanisms, an unnamed effect, or neither."""
 
 from __future__ import annotations
 
@@ -9,50 +9,50 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.conclusion import conclude, is_hidden
+from ventbench.diagnosis.conclusion import conclude, is_unresolved
 from ventbench.diagnosis.latent_inputs import ALVEOLUS, SUPPLY
-from ventbench.diagnosis.screening import all_parameter_paths
 from ventbench.diagnosis.shapes import slot
 from ventbench.recordings import join
 
 from . import small
 
 
-def concluded(breaths, names=small.with_few):
-    said: list[str] = []
+def concluded(breaths, settings=small.SETTINGS):
+    told: list[str] = []
     found = conclude(
-        small.split(breaths), lambda: small.split(breaths, names()), said.append
-    )  # fmt: skip
-    assert said
+        small.split(breaths, settings), lambda: small.split_wide(breaths, settings), told.append
+    )
+    assert told
     return found
 
 
-@pytest.mark.usefixtures("few_slots")
 def test_nothing_is_missing():
     found = concluded(small.made(seed=1))
     assert found.names == ()
-    assert found.place is None
-    assert not found.hidden
+    assert found.unnamed is None
+    assert not found.unresolved
     assert found.full is found.named
-    assert (found.nats, found.alternatives, found.gain_sd) == ({}, {}, 0.0)
+    assert (found.held_out_gains, found.alternatives, found.gain_sd) == ({}, {}, 0.0)
     assert found.noise.sigma[0] == pytest.approx(0.2, rel=0.15)
     assert slot(found) is None
 
 
-def compared(nats: dict[str, tuple[float, float]]) -> tuple[Any, list[Any]]:
-    """A bench, and a last comparison of names with what they gain in training and held out."""
+def compared(gains: dict[str, tuple[float, float]]) -> tuple[Any, list[Any]]:
+    """An evaluator and a comparison of mechanisms by their training and held-out gains, nats."""
 
-    def fitted(name: str, train: float, held: float) -> SimpleNamespace:
-        return SimpleNamespace(name=name, criterion=-train, held_out=np.full(4, held / 4))
+    def model(training: float, held_out: float) -> SimpleNamespace:
+        return SimpleNamespace(criterion=-training, held_out=np.full(4, held_out / 4))
 
     evaluator = SimpleNamespace(
-        criterion=lambda one: one.criterion, held_out_log_likelihood=lambda one: one.held_out
+        criterion=lambda fitted: fitted.criterion,
+        held_out_log_likelihood=lambda fitted: fitted.held_out,
+        settings=small.SETTINGS,
     )
-    rivals = [
-        SimpleNamespace(name=name, fitted=fitted(name, *gain), criterion=-gain[0])
-        for name, gain in nats.items()
+    ranked = [
+        SimpleNamespace(name=name, fitted=model(*gain), criterion=-gain[0])
+        for name, gain in gains.items()
     ]
-    return evaluator, [SimpleNamespace(before=fitted("", 0.0, 0.0), rivals=rivals)]
+    return evaluator, [SimpleNamespace(base=model(0.0, 0.0), ranked=ranked)]
 
 
 @pytest.mark.parametrize(
@@ -66,33 +66,31 @@ def compared(nats: dict[str, tuple[float, float]]) -> tuple[Any, list[Any]]:
     ],
 )
 def test_what_explains_much_and_is_not_believed_is_not_nothing(nats, hidden):
-    assert is_hidden(*compared(nats)) is hidden
+    assert is_unresolved(*compared(nats)) is hidden
 
 
-def test_without_a_comparison_nothing_is_hidden():
-    assert not is_hidden(compared({})[0], [])
+def test_without_a_comparison_nothing_is_unresolved():
+    assert not is_unresolved(compared({})[0], [])
 
 
-@pytest.mark.usefixtures("few_slots")
 def test_a_name_is_enough():
     found = concluded(small.made(small.effect("turbulent_resistance", quadratic=10.0)))
     assert found.names == ("turbulent_resistance",)
-    assert found.place is None
-    assert found.nats["turbulent_resistance"] > 50.0
+    assert found.unnamed is None
+    assert found.held_out_gains["turbulent_resistance"] > 50.0
     assert set(found.alternatives) == {"turbulent_resistance"}
     # The noise is what the name leaves, not what the base model does.
     assert found.noise.sigma[0] == pytest.approx(0.2, rel=0.15)
-    assert found.null.hypothesis.names == ()
+    assert found.base.hypothesis.names == ()
 
 
-@pytest.mark.usefixtures("few_slots")
 def test_resistance_that_follows_volume_has_no_name_but_a_place():
     found = concluded(small.made(small.effect("volume_resistance", "R(V)", change=0.65)))
     assert found.names == ()
-    assert found.place is not None
-    assert (found.place.name, found.place.element) == ("R(V)", "volume_resistance")
-    assert found.place.source is None
-    assert found.place.nats > 20.0
+    assert found.unnamed is not None
+    assert (found.unnamed.name, found.unnamed.term) == ("R(V)", "volume_resistance")
+    assert found.unnamed.latent_input is None
+    assert found.unnamed.nats > 20.0
     assert found.full.hypothesis.names == ("volume_resistance",)
     shown = slot(found)
     assert shown is not None
@@ -104,16 +102,15 @@ def test_resistance_that_follows_volume_has_no_name_but_a_place():
 
 
 @pytest.mark.slow  # many refits
-@pytest.mark.usefixtures("few_slots")
 def test_a_beating_heart_is_at_the_alveolus():
     beats = small.effect("cardiogenic", "oscillation", amplitude=1.3, frequency=1.4)
     found = concluded(small.made(beats))
     assert found.names == ()
-    assert found.place is not None
-    assert (found.place.name, found.place.element) == (ALVEOLUS, None)
-    assert found.place.source is not None
-    assert found.place.source.scale == pytest.approx(1.4, abs=0.2)
-    assert found.place.nats > 20.0
+    assert found.unnamed is not None
+    assert (found.unnamed.name, found.unnamed.term) == (ALVEOLUS, None)
+    assert found.unnamed.latent_input is not None
+    assert found.unnamed.latent_input.scale == pytest.approx(1.4, abs=0.2)
+    assert found.unnamed.nats > 20.0
     assert found.full is found.named
     shown = slot(found)
     assert shown is not None
@@ -123,20 +120,18 @@ def test_a_beating_heart_is_at_the_alveolus():
 
 
 @pytest.mark.slow  # many refits
-@pytest.mark.usefixtures("few_slots")
 def test_a_name_stands_beside_a_place():
     beats = small.effect("pulsating_supply", "oscillation", amplitude=0.175, frequency=5.0)
     name = small.effect("turbulent_resistance", quadratic=10.0)
     found = concluded(small.made(beats, name, noise=0.1))
     assert found.names == ("turbulent_resistance",)
-    assert found.place is not None
-    assert found.place.name == SUPPLY
+    assert found.unnamed is not None
+    assert found.unnamed.name == SUPPLY
     shown = slot(found)
     assert shown is not None
     assert shown.y_unit.startswith("share of the flow")
 
 
-@pytest.mark.usefixtures("few_slots")
 def test_breaths_whose_valves_differ_are_no_physics():
     rng = np.random.default_rng(4)
     rows = []
@@ -145,7 +140,7 @@ def test_breaths_whose_valves_differ_are_no_physics():
         rows.append(small.numbered(small.made(seed=100 + i, base=rig, breaths=1), i + 1))
     found = concluded(join(rows))
     assert found.names == ()
-    assert found.place is None
+    assert found.unnamed is None
     assert 0.03 < found.gain_sd < 0.2
     assert found.noise.sigma[0] == pytest.approx(0.2, rel=0.2)
 
@@ -161,19 +156,19 @@ def test_breaths_whose_valves_differ_are_no_physics():
 )
 def test_places_are_found_among_all(name, form, parameters, place):
     breaths = small.made(small.effect(name, form, **parameters), samples=60)
-    found = concluded(breaths, all_parameter_paths)
+    found = concluded(breaths, small.with_terms())
     assert found.names == ()
-    assert found.place is not None
-    assert found.place.name == place
+    assert found.unnamed is not None
+    assert found.unnamed.name == place
 
 
 @pytest.mark.slow  # all slots take minutes to compile
 def test_a_name_or_nothing_is_enough_among_all_places():
     named = concluded(
-        small.made(small.effect("viscoelasticity", ratio=0.7, time=1.0)), all_parameter_paths
+        small.made(small.effect("viscoelasticity", ratio=0.7, time=1.0)), small.with_terms()
     )
     assert named.names == ("viscoelasticity",)
-    assert named.place is None
-    nothing = concluded(small.made(seed=1), all_parameter_paths)
+    assert named.unnamed is None
+    nothing = concluded(small.made(seed=1), small.with_terms())
     assert nothing.names == ()
-    assert nothing.place is None
+    assert nothing.unnamed is None

@@ -1,4 +1,4 @@
-"""Efforts of each breath, whose likelihood has many peaks."""
+"""Patient effort, whose likelihood has many peaks in each breath."""
 
 from __future__ import annotations
 
@@ -9,16 +9,14 @@ import pytest
 
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
-from ventbench.diagnosis.latent_inputs import (
-    exceeds_sensor_noise,
-)
+from ventbench.diagnosis.latent_inputs import exceeds_sensor_noise
 from ventbench.diagnosis.patient_effort import (
     AMPLITUDE,
     DURATION,
     ONSET,
-    effort_log_likelihood_gain,
-    marginal_log_likelihood,
-    restart_efforts,
+    NoBreathTerm,
+    PatientEffort,
+    breath_term,
 )
 from ventbench.diagnosis.selection import fit_with_noise
 from ventbench.system_id import Noise
@@ -26,6 +24,7 @@ from ventbench.system_id import Noise
 from . import small
 
 EFFORT = Hypothesis(("patient_effort",))
+TERM = PatientEffort(small.SETTINGS)
 NOISE = Noise((0.1,), (0.0,), np.inf)
 
 
@@ -55,11 +54,11 @@ def test_all_efforts_are_found_from_a_poor_start(active, fitted):
     assert not strong.all()
 
 
-@pytest.mark.parametrize("refined", [False, True])
-def test_efforts_that_begin_elsewhere_are_moved_back(fitted, refined):
+@pytest.mark.parametrize("refit", [False, True])
+def test_efforts_that_begin_elsewhere_are_moved_back(fitted, refit):
     problem = fitted.problem
     wrong = misplaced(fitted, 1.7)
-    mended = restart_efforts(problem, wrong, refined=refined)
+    mended = TERM.start(problem, wrong, EFFORT.names if refit else (), refit=refit)
     gained = problem.log_likelihood(mended) - problem.log_likelihood(wrong)
     strong = np.abs(fitted.column(AMPLITUDE)) > 2.0
     assert np.all(gained[strong] > 100.0)
@@ -69,15 +68,14 @@ def test_efforts_that_begin_elsewhere_are_moved_back(fitted, refined):
 
 def test_efforts_that_are_the_likeliest_stay(fitted):
     x = fitted.minimum.x
-    assert restart_efforts(fitted.problem, x, refined=False) == pytest.approx(x)
+    assert TERM.start(fitted.problem, x, (), refit=False) == pytest.approx(x)
 
 
 def test_evidence_of_a_breath_is_the_integral_over_its_efforts(active, fitted):
     """Against a sum over a fine grid of amplitudes and onsets, at the fitted parameters."""
     still, x = active.refit_breath_parameters(fitted)
     still = dataclasses.replace(still, noise=NOISE)
-    duration = float(fitted.column(DURATION)[0])
-    found = effort_log_likelihood_gain(still, x, duration)
+    found = TERM.log_likelihood_gain(still, x, fitted)
     names = still.simulator.names
     columns = [names.index(path) for path in (AMPLITUDE, ONSET)]
     amplitudes, onsets = np.arange(-8.0, 8.01, 0.25), np.arange(0.0, 1.7, 0.04)
@@ -101,8 +99,9 @@ def test_evidence_of_a_breath_is_the_integral_over_its_efforts(active, fitted):
 
 def test_what_a_fit_found_is_integrated_alike(active, fitted):
     training = dataclasses.replace(active, held_out=active.training)
-    restart = training.held_out_log_likelihood(fitted)
-    assert marginal_log_likelihood(fitted, fitted.noise) == pytest.approx(restart, abs=4.0)
+    held_out = training.held_out_log_likelihood(fitted)
+    marginal = TERM.marginal_log_likelihood(fitted, fitted.noise)
+    assert marginal == pytest.approx(held_out, abs=4.0)
 
 
 def test_a_patient_who_pulls_is_told_from_noise_that_wanders(active, fitted):
@@ -123,3 +122,13 @@ def test_of_breaths_to_come_the_mean_over_efforts_is_expected(active, fitted):
     expected = active.predict(fitted, active.held_out)
     assert expected == pytest.approx(np.mean(answers, axis=0))
     assert np.abs(expected - active.predict(passive, active.held_out)).max() > 0.2
+
+
+def test_only_a_hypothesis_with_effort_has_a_breath_term(active, fitted):
+    assert active.breath_term(fitted) == TERM
+    assert isinstance(breath_term(("leak",), small.SETTINGS), NoBreathTerm)
+
+
+def test_a_warm_start_with_efforts_is_left_alone_unless_it_is_refitted(fitted):
+    x = misplaced(fitted, 1.7)
+    assert TERM.start(fitted.problem, x, EFFORT.names, refit=False) is x

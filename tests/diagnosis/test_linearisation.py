@@ -1,4 +1,4 @@
-"""What the unknowns absorb is taken out, and what is left counts what a refit would gain."""
+"""What the parameters absorb is projected out; the rest tells what a refit would gain."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import pytest
 
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
-from ventbench.diagnosis.linearisation import Linearisation, gain, linearise
+from ventbench.diagnosis.linearisation import Linearisation, linearise
 from ventbench.system_id import START, Noise
 
 from . import small
+
+SCREENING = small.SETTINGS.screening
 
 #: Coloured, and without tails.
 NOISE = Noise((0.2,), (0.5,), np.inf)
@@ -21,7 +23,7 @@ NOISE = Noise((0.2,), (0.5,), np.inf)
 
 class Linear(NamedTuple):
     evaluator: Evaluator
-    null: FittedModel
+    base: FittedModel
     place: Linearisation
 
 
@@ -32,7 +34,7 @@ def bent() -> Linear:
         small.made(small.effect("turbulent_resistance", quadratic=1.0), noise=0.1)
     )
     null = evaluator.fit(Hypothesis(), NOISE, tolerance=1e-6, iterations=30)
-    return Linear(evaluator, null, linearise(null.problem, null.minimum.x, np.inf))
+    return Linear(evaluator, null, linearise(null.problem, null.minimum.x, SCREENING, clip=np.inf))
 
 
 def whitened(difference: np.ndarray) -> np.ndarray:
@@ -45,12 +47,12 @@ def whitened(difference: np.ndarray) -> np.ndarray:
 
 def changed(found: Linear, path: str, breath: int | None = None) -> np.ndarray:
     """Whitened change of the prediction by a small change of a parameter, by a difference."""
-    problem = found.null.problem
+    problem = found.base.problem
     column = (*problem.simulator.names, START).index(path)
     rows = slice(None) if breath is None else slice(breath, breath + 1)
     ends = []
     for sign in (1.0, -1.0):
-        values = found.null.values.copy()
+        values = found.base.values.copy()
         values[rows, column] *= 1.0 + 1e-5 * sign
         ends.append(problem.simulator.predict(values)[:, 0])
     return whitened((ends[0] - ends[1]) * 1e4)
@@ -62,10 +64,10 @@ def test_residual_and_templates_are_orthogonal_to_what_is_refitted(bent, path):
     scale = np.linalg.norm(slope) * np.linalg.norm(bent.place.residual)
     assert abs(np.sum(slope * bent.place.residual)) < 1e-4 * scale
     # A template of the same change is absorbed nearly whole.
-    values = bent.null.values.copy()
-    values[:, bent.null.problem.simulator.names.index(path)] *= 1.001
-    seen = bent.null.problem.simulator.predict(values)
-    raw = bent.place.whitened(seen - bent.place.seen)
+    values = bent.base.values.copy()
+    values[:, bent.base.problem.simulator.names.index(path)] *= 1.001
+    seen = bent.base.problem.simulator.predict(values)
+    raw = bent.place.whiten(seen - bent.place.prediction)
     assert np.linalg.norm(bent.place.template(seen)) < 0.01 * np.linalg.norm(raw)
 
 
@@ -78,7 +80,7 @@ def test_each_breath_absorbs_its_own_start(bent, breath):
 
 
 def test_bases_are_orthonormal(bent):
-    own, shared = bent.place.own, bent.place.shared
+    own, shared = bent.place.own_basis, bent.place.shared_basis
     np.testing.assert_allclose(own @ own.swapaxes(1, 2), np.ones((8, 1, 1)), atol=1e-6)
     np.testing.assert_allclose(shared @ shared.T, np.eye(4), atol=1e-6)
     again = bent.place.without_shared(bent.place.without_own(bent.place.residual[:, None]))
@@ -86,15 +88,15 @@ def test_bases_are_orthonormal(bent):
 
 
 def test_gain_is_the_fall_of_the_cost_after_a_refit(bent):
-    values = bent.null.values.copy()
-    names = bent.null.problem.simulator.names
+    values = bent.base.values.copy()
+    names = bent.base.problem.simulator.names
     values[:, names.index("turbulent_resistance.quadratic")] = 0.2
-    seen = bent.null.problem.simulator.predict(values)
-    nats, share = gain(bent.place, bent.place.template(seen))
+    seen = bent.base.problem.simulator.predict(values)
+    nats, share = bent.place.gain(bent.place.template(seen))
     refitted = bent.evaluator.fit(
-        Hypothesis(("turbulent_resistance",)), NOISE, bent.null, tolerance=1e-6, iterations=30
+        Hypothesis(("turbulent_resistance",)), NOISE, bent.base, tolerance=1e-6, iterations=30
     )
-    fallen = bent.null.minimum.cost - refitted.minimum.cost
+    fallen = bent.base.minimum.cost - refitted.minimum.cost
     assert fallen > 8.0
     assert nats == pytest.approx(fallen, rel=0.1)
     found = refitted.column("turbulent_resistance.quadratic")[0]
@@ -103,25 +105,25 @@ def test_gain_is_the_fall_of_the_cost_after_a_refit(bent):
 
 def test_gain_of_the_wrong_sign_and_of_nothing(bent):
     template = np.random.default_rng(0).normal(size=bent.place.residual.shape)
-    nats, share = gain(bent.place, template)
-    other = gain(bent.place, -2.0 * template)
+    nats, share = bent.place.gain(template)
+    other = bent.place.gain(-2.0 * template)
     assert other[0] == pytest.approx(nats)
     assert other[1] == pytest.approx(-0.5 * share)
-    assert gain(bent.place, 0.0 * template) == (0.0, 0.0)
+    assert bent.place.gain(0.0 * template) == (0.0, 0.0)
     # A template that is the residual, turned round, explains it whole.
-    nats, share = gain(bent.place, -bent.place.residual)
+    nats, share = bent.place.gain(-bent.place.residual)
     assert share == pytest.approx(1.0)
     assert nats == pytest.approx(0.5 * np.sum(bent.place.residual**2))
 
 
 def test_far_samples_are_cut_off(bent):
-    seen = bent.null.problem.data.seen.copy()
+    seen = bent.base.problem.data.seen.copy()
     seen[2, 0, 10] += 5.0  # 25 standard deviations
     problem = dataclasses.replace(
-        bent.null.problem, data=dataclasses.replace(bent.null.problem.data, seen=seen)
+        bent.base.problem, data=dataclasses.replace(bent.base.problem.data, seen=seen)
     )
-    at = bent.null.minimum.x
-    free, cut = (linearise(problem, at, clip).residual for clip in (np.inf, 4.0))
+    at = bent.base.minimum.x
+    free, cut = (linearise(problem, at, SCREENING, clip=clip).residual for clip in (np.inf, 4.0))
     assert np.abs(free).max() > 15.0
     assert np.abs(cut).max() < 5.0
 
@@ -129,6 +131,6 @@ def test_far_samples_are_cut_off(bent):
 def test_a_gain_of_each_breath_is_its_own(bent):
     evaluator = dataclasses.replace(bent.evaluator, gain_sd=0.1)
     fitted = evaluator.fit(Hypothesis(), NOISE, iterations=2)
-    place = linearise(fitted.problem, fitted.minimum.x)
-    assert place.own.shape[1] == 2
-    assert place.shared.shape[0] == 4
+    place = linearise(fitted.problem, fitted.minimum.x, SCREENING)
+    assert place.own_basis.shape[1] == 2
+    assert place.shared_basis.shape[0] == 4

@@ -1,4 +1,4 @@
-"""Sources that move in time: what they would do to the pressure, and whether they are found."""
+"""Latent inputs: their response, and whether they are found and told from noise."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import pytest
 from ventbench.diagnosis.hypothesis import Hypothesis, Partition
 from ventbench.diagnosis.latent_inputs import (
     ALVEOLUS,
-    GAIN,
+    GAIN_SCATTER,
     MEASUREMENT,
     SUPPLY,
+    _GaussianProcess,
     _Kernel,
     fit_latent_inputs,
     input_responses,
@@ -31,7 +32,7 @@ INSPIRED = 30
 def clean(plain):
     """The training breaths, the values of a fit to them, and its prediction, ``(n, T)``."""
     partition = plain.evaluator.training
-    values = plain.evaluator.transferred_values(plain.null, partition)
+    values = plain.evaluator.transferred_values(plain.base, partition)
     return partition, values, partition.simulator.predict(values)[:, 0]
 
 
@@ -73,7 +74,7 @@ def test_a_gain_is_all_the_commands(clean):
     more = values.copy()
     more[:, column] *= 1.0001
     slope = (partition.simulator.predict(more)[:, 0] - before) / 0.0001
-    found = input_responses(partition, values, GAIN)
+    found = input_responses(partition, values, GAIN_SCATTER)
     assert found.shape == (8, 1, small.SAMPLES)
     np.testing.assert_allclose(found[:, 0], slope, atol=1e-3 * np.abs(slope).max())
 
@@ -100,20 +101,20 @@ def test_a_beating_heart_is_found_at_its_rate(frequency):
     assert best.scale == pytest.approx(frequency, abs=0.2)
     # A sine of amplitude 1.3.
     assert best.size in (0.8, 1.6)
-    assert best.training > training + 40.0
-    assert np.sum(best.held_out - judged) > 20.0
+    assert best.training_log_likelihood > training + 40.0
+    assert np.sum(best.held_out_log_likelihood - judged) > 20.0
     # In the physics, not in the sensor: exhalation tells.
-    assert best.training > found[MEASUREMENT].training
-    assert best.shape.shape == (8, small.SAMPLES)
-    assert np.std(best.shape[:, :INSPIRED]) == pytest.approx(1.3 / np.sqrt(2), rel=0.25)
+    assert best.training_log_likelihood > found[MEASUREMENT].training_log_likelihood
+    assert best.course.shape == (8, small.SAMPLES)
+    assert np.std(best.course[:, :INSPIRED]) == pytest.approx(1.3 / np.sqrt(2), rel=0.25)
 
 
 def test_a_pulsating_supply_is_found_at_the_supply():
     effect = small.effect("pulsating_supply", "oscillation", amplitude=0.175, frequency=5.0)
     evaluator, null, _ = heard(effect)
     found = fit_latent_inputs(evaluator, null)
-    best = max(found.values(), key=lambda one: one.training)
-    assert best.source == SUPPLY
+    best = max(found.values(), key=lambda one: one.training_log_likelihood)
+    assert best.place == SUPPLY
     assert best.periodic
     assert best.scale == pytest.approx(5.0, abs=0.26)
     assert 0.05 < best.size < 0.4
@@ -124,15 +125,15 @@ def test_noise_is_no_source_in_the_physics(coloured):
     evaluator, null, (_, judged) = heard(coloured=coloured, correlation=0.8, seed=7)
     found = fit_latent_inputs(evaluator, null)
     sensor = found.pop(MEASUREMENT)
-    best = max(found.values(), key=lambda one: one.training)
-    gained = float((best.held_out - judged).sum())
-    ahead = float((best.held_out - sensor.held_out).sum())
+    best = max(found.values(), key=lambda one: one.training_log_likelihood)
+    gained = float((best.held_out_log_likelihood - judged).sum())
+    ahead = float((best.held_out_log_likelihood - sensor.held_out_log_likelihood).sum())
     assert min(gained, ahead) < 4.6
 
 
 def test_likelihood_without_a_source_is_that_of_the_breaths(plain):
-    noise = dataclasses.replace(plain.null.noise, tail=np.inf)
-    null = plain.evaluator.fit(Hypothesis(), noise, plain.null)
+    noise = dataclasses.replace(plain.base.noise, tail=np.inf)
+    null = plain.evaluator.fit(Hypothesis(), noise, plain.base)
     _, judged = log_likelihood_without_input(plain.evaluator, null)
     constant = 0.5 * np.log(2 * np.pi) * small.SAMPLES
     np.testing.assert_allclose(
@@ -142,14 +143,18 @@ def test_likelihood_without_a_source_is_that_of_the_breaths(plain):
 
 def test_kernel_of_a_source_is_the_ratio_of_two_gaussians(plain):
     """Against the determinant and the inverse of the whole covariance of a breath."""
-    noise = dataclasses.replace(plain.null.noise, ar=(0.4,), tail=np.inf)
-    problem, x = plain.evaluator.refit_breath_parameters(plain.null)
-    place = linearise(dataclasses.replace(problem, noise=noise), x, np.inf)
+    noise = dataclasses.replace(plain.base.noise, ar=(0.4,), tail=np.inf)
+    problem, x = plain.evaluator.refit_breath_parameters(plain.base)
+    place = linearise(
+        dataclasses.replace(problem, noise=noise), x, small.SETTINGS.screening, clip=np.inf
+    )
     partition: Partition = plain.evaluator.held_out
     answers = input_responses(partition, place.values, MEASUREMENT)
-    gained = _Kernel(place, partition, answers, True, 1.3).gained(0.7)
+    settings = small.SETTINGS.latent_inputs
+    kernel = _Kernel(True, 1.3, 0.7)
+    gained = _GaussianProcess(place, partition, answers, kernel, settings).gained()
     time = np.cumsum(partition.data.dt, axis=1) - partition.data.dt
-    own = place.own.swapaxes(1, 2)
+    own = place.own_basis.swapaxes(1, 2)
     for i in (0, 6):
         waves = np.stack([f(2 * np.pi * 1.3 * time[i]) for f in (np.cos, np.sin)])
         rows = waves.copy()

@@ -1,0 +1,152 @@
+"""Mechanisms beside nonparametric terms and latent inputs, and their alternatives."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ventbench.diagnosis import refinement
+from ventbench.diagnosis.hypothesis import Hypothesis
+from ventbench.diagnosis.refinement import (
+    SingleTermAlternative,
+    drop_compensating_terms,
+    find_alternatives,
+)
+from ventbench.diagnosis.selection import fit_with_noise, forward_selection
+
+from . import small
+
+NAMES = ("turbulent_resistance", "leak")
+
+
+@pytest.fixture(scope="module")
+def named():
+    evaluator = small.split(
+        small.made(
+            small.effect("turbulent_resistance", quadratic=10.0),
+            small.effect("leak", conductance=20.0),
+        )
+    )
+    return evaluator, fit_with_noise(evaluator, Hypothesis(NAMES))
+
+
+@pytest.mark.parametrize(("nats", "kept"), [(1.0, NAMES), (1e9, ())])
+def test_a_source_takes_over_only_what_explains_less_than_itself(named, monkeypatch, nats, kept):
+    evaluator, fitted = named
+
+    def idle(evaluator, current, here, name):
+        return 0.0, evaluator.fit(current.hypothesis.without(name), current.noise, current), here
+
+    monkeypatch.setattr(refinement, "_without_idle", idle)
+    latent: Any = SimpleNamespace(place="f(t) at the supply")
+    assert refinement.eliminate_beside_input(evaluator, fitted, latent, nats).names == kept
+
+
+BOTH = Hypothesis(("leak", "viscoelasticity"))
+
+
+def left(*effects):
+    breaths = small.made(*effects, noise=0.1, seed=2)
+    settings = small.with_terms("leak_shape")
+    evaluator, wide = small.split(breaths, settings), small.split_wide(breaths, settings)
+    said: list[str] = []
+    named = drop_compensating_terms(evaluator, wide, fit_with_noise(evaluator, BOTH), said.append)
+    assert said
+    return named
+
+
+def test_a_name_that_bends_anothers_form_is_dropped():
+    """A linear leak is no root, and a viscous lung makes up for that."""
+    named = left(small.effect("leak", "linear", conductance=20.0))
+    assert named.hypothesis.names == ("leak",)
+
+
+def test_two_that_act_both_stay():
+    named = left(
+        small.effect("leak", conductance=20.0),
+        small.effect("viscoelasticity", ratio=0.7, time=1.0),
+    )
+    assert named.hypothesis.names == BOTH.names
+
+
+def test_a_single_name_trims_nothing(plain):
+    one = plain.evaluator.fit(Hypothesis(("leak",)), plain.base.noise, plain.base, iterations=1)
+    said: list[str] = []
+    assert drop_compensating_terms(plain.evaluator, plain.evaluator, one, said.append) is one
+    assert not said
+
+
+SUM = Hypothesis(("turbulent_resistance", "viscoelasticity", "leak"))
+
+
+def one_shape(breaths):
+    narrow = small.split(breaths)
+    null = fit_with_noise(narrow, Hypothesis())
+    return (
+        narrow,
+        null,
+        SingleTermAlternative(narrow, lambda: small.split_wide(breaths), null),
+    )
+
+
+def test_names_that_imitate_a_shape_give_way():
+    effect = small.effect("volume_resistance", "R(V)", change=0.65)
+    narrow, null, simpler = one_shape(small.made(effect, noise=0.1))
+    assert simpler(fit_with_noise(narrow, Hypothesis(SUM.names[:2]))) is None  # too few to ask
+    assert simpler(fit_with_noise(narrow, SUM)) is null
+
+
+def test_names_that_act_stay():
+    narrow, _, simpler = one_shape(
+        small.made(
+            small.effect("turbulent_resistance", quadratic=10.0),
+            small.effect("leak", conductance=20.0),
+            small.effect("viscoelasticity", ratio=0.7, time=1.0),
+            noise=0.1,
+        )
+    )
+    assert simpler(fit_with_noise(narrow, SUM)) is None
+
+
+@pytest.fixture(scope="module")
+def alike():
+    """A recording from which a lag of the valve and a compliant circuit look the same."""
+    effect = small.effect("valve_lag", tau=0.04)
+    evaluator = small.split(small.made(effect, noise=0.3, style="pi"))
+    return evaluator, *forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), print)
+
+
+def test_a_rival_that_is_nearly_as_good_is_listed(alike):
+    evaluator, named, steps = alike
+    named, other = find_alternatives(evaluator, named, steps)
+    (name,) = named.hypothesis.names
+    assert {name, *other[name].names} == {"valve_lag", "circuit_compliance"}
+    assert 0.5 <= other[name].confidence < 0.9
+    rival = other[name].models[0]
+    gap = rival.criterion - evaluator.criterion(named)
+    assert other[name].confidence == pytest.approx(1.0 / (1.0 + np.exp(-0.5 * gap)))
+
+
+@pytest.mark.slow  # many refits
+def test_a_worse_name_is_swapped_for_the_better_one(alike):
+    evaluator, named, _ = alike
+    wrong = evaluator.fit(Hypothesis(("viscoelasticity",)), named.noise)
+    swapped, other = find_alternatives(evaluator, wrong, [])
+    assert set(swapped.hypothesis.names) <= {"valve_lag", "circuit_compliance"}
+    assert evaluator.criterion(swapped) < evaluator.criterion(wrong) - 20.0
+    assert set(other) == set(swapped.hypothesis.names)
+    kept, _ = find_alternatives(evaluator, wrong, [], swap=False)
+    assert kept.hypothesis.names == ("viscoelasticity",)
+
+
+def test_an_effect_like_no_other_has_no_alternative():
+    evaluator = small.split(small.made(small.effect("viscoelasticity", ratio=0.7, time=1.0)))
+    named, steps = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), print)
+    named, other = find_alternatives(evaluator, named, steps)
+    # But for what pressure alone can never tell from it.
+    assert other["viscoelasticity"].names == ("second_compartment",)
+    assert other["viscoelasticity"].confidence > 0.99
+    assert other["viscoelasticity"].models == ()

@@ -1,0 +1,33 @@
+"""The settings of a diagnosis."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import pytest
+
+from ventbench.diagnosis.settings import DEFAULT, VERSION, SelectionConfig
+
+
+def test_settings_are_frozen_versioned_json_values():
+    values = json.loads(json.dumps(DEFAULT.as_dict()))
+    assert values["version"] == VERSION
+    assert values["held_out_test"]["threshold"] == 4.6
+    assert set(values) == {field.name for field in dataclasses.fields(SelectionConfig)}
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        DEFAULT.fit.tolerance = 1.0  # type: ignore[misc]
+
+
+def test_every_setting_is_described_in_its_group():
+    for field in dataclasses.fields(SelectionConfig):
+        group = getattr(DEFAULT, field.name)
+        if not dataclasses.is_dataclass(group):
+            continue
+        described = type(group).__doc__ or ""
+        for setting in dataclasses.fields(group):
+            assert f"    {setting.name}: " in described, f"{field.name}.{setting.name}"
+
+
+def test_efforts_begin_within_the_grid_and_one_step():
+    assert DEFAULT.patient_effort.onset_span == pytest.approx(1.7)

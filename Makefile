@@ -34,9 +34,10 @@ test: lint ## lint, type check and the fast tests
 test-slow: setup ## the tests that take minutes
 	$(PY) -m pytest -n auto -m slow $(PYTEST_ARGS)
 
-lint: setup ## ruff and pyright, changing nothing
+lint: setup ## ruff, arrows between rooms and pyright, changing nothing
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
+	$(VENV)/bin/lint-imports --no-cache --no-logo
 	$(PY) -m pyright --pythonpath $(PY)
 
 format: setup ## let ruff mend and format the code

@@ -34,7 +34,7 @@ FACTORS = (1.0, 0.99, 0.98, 0.97, 0.96, 0.95, 0.94, 0.93)
 def drafts(plants: Simulators) -> list[create.Draft]:
     """Real records: commands of the PID times a factor."""
     result = run_protocol(open_submission("pid_best"), plants.plants, draws=draws.COUNT)
-    found = []
+    made = []
     for factor in FACTORS:
         requested = result.requested * factor
         (new,) = replay(plants, result.pips, [requested])
@@ -47,8 +47,8 @@ def drafts(plants: Simulators) -> list[create.Draft]:
             peak=new.peak.max(axis=(0, 2)),
             sandbox=SANDBOX,
         )
-        found.append(create.create(varied, plants))
-    return found
+        made.append(create.create(varied, plants))
+    return made
 
 
 def fill(folder: Path, made: list[create.Draft], count: int) -> None:
@@ -61,9 +61,9 @@ def fill(folder: Path, made: list[create.Draft], count: int) -> None:
         if index:
             values["submission"]["manifest"]["name"] = f"entry{index}"
         content = canonical.canonical(values)
-        item = record.from_bytes(content, "synthetic")
-        (folder / store.RECORDS / f"{item.sha256}{record.SUFFIX}").write_bytes(content)
-        line = store.chain_line(index, item, head)
+        added = record.from_bytes(content, "synthetic")
+        (folder / store.RECORDS / f"{added.sha256}{record.SUFFIX}").write_bytes(content)
+        line = store.chain_line(index, added, head)
         head, lines = canonical.digest(line), lines + line
     (folder / store.CHAIN).write_bytes(lines)
 

@@ -81,6 +81,8 @@ def score_taken(
         )
         path = create.create(result, simulators, source=where).save(out)
         lines.append(f"{taken.name}: {track}: {result.score:.3f} cmH2O nominal; {path.name}")
+        if result.not_official_because:
+            lines.append(f"{taken.name}: not official: {'; '.join(result.not_official_because)}")
         failed = [failure.message for failure in result.failures[:3]]
         lines += [message.replace(str(taken.folder), taken.name) for message in failed]
     return lines

@@ -100,8 +100,8 @@ def test_bad_input_is_explained(tmp_path: Path, full: Path) -> None:
 
 def test_score_keeps_a_record_that_can_be_added(tmp_path: Path) -> None:
     folder = tmp_path / "board"
-    arguments = ["score", "pid_robust", "--draws", "20", "--record", str(tmp_path / "records")]
-    found = RUN.invoke(app, arguments)
+    arguments = ["score", "pid_robust", "--in-process", "--draws", "20", "--record"]
+    found = RUN.invoke(app, [*arguments, str(tmp_path / "records")])
     assert found.exit_code == 0, found.output
     (path,) = (tmp_path / "records").glob("*.json")
     assert path.name in found.output

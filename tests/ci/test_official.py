@@ -27,13 +27,16 @@ def checked_out(repository, folder):
     return folder
 
 
-def test_from_a_commit_to_the_pages(repository, simulators, tmp_path):
+@pytest.mark.parametrize(
+    "runner", [InProcessRunner, pytest.param(SandboxRunner, marks=pytest.mark.slow)]
+)
+def test_from_a_commit_to_the_pages(repository, simulators, tmp_path, runner):
     """Everything in one, as scoring takes its time."""
     files = {f"{PATH}/{name}": content for name, content in contents("demo", "pid").items()}
     commit = repository.commit(files, repository.base)
     taken = take(repository.url, repository.base, commit, "demo", tmp_path / "taken")
-    out, runner = tmp_path / "records", SandboxRunner()
-    lines = official.score_taken(taken, repository.url, "robustness", simulators, runner, out)
+    out, wanted = tmp_path / "records", "robustness"
+    lines = official.score_taken(taken, repository.url, wanted, simulators, runner(), out)
     path = check_record(repository, commit, out, lines)
 
     leaderboard = checked_out(repository, tmp_path / "checkout") / "leaderboard"
@@ -41,7 +44,7 @@ def test_from_a_commit_to_the_pages(repository, simulators, tmp_path):
         propose.add(forged(path, tmp_path / "forged"), leaderboard, simulators)
     assert not (leaderboard / "records").exists()
     added = propose.add(out, leaderboard, simulators)
-    assert [item.name for item in store.load(leaderboard).scores] == ["demo"]
+    assert [record.name for record in store.load(leaderboard).scores] == ["demo"]
     check_branch_and_pages(leaderboard.parent, added)
     with pytest.raises(InputError):
         propose.add(out, leaderboard, simulators)  # a second time
@@ -58,7 +61,9 @@ def check_record(repository, commit, out, lines):
         "commit": commit,
         "tree": repository.git("rev-parse", f"{commit}:{PATH}"),
     }
-    assert path.name in lines[-1]
+    assert path.name in lines[-2]
+    assert "not official: " in lines[-1]
+    assert "not on the frozen simulators" in lines[-1]
     assert not any("/tmp" in line for line in lines)
     return path
 

@@ -8,7 +8,7 @@ import pytest
 from ventbench.sandbox.child import wire
 from ventbench.sandbox.pipes import Pipes
 
-PATIENCE_S = 10.0
+PATIENCE_S = 300.0
 
 
 @pytest.fixture
@@ -70,6 +70,20 @@ def test_with_the_reply(pipes, cell):
 def test_instead_of_the_next_reply(pipes, cell):
     os.write(cell(0), reply(1))
     assert str(collect(pipes, {0}, 2)[0]) == "a reply to observation 1 came, not to 2"
+
+
+def test_silence_is_waited_out(pipes, cell):
+    cell(0)
+    due = {0}
+    before = time.monotonic()
+    assert pipes.collect(due, 1, wire.COMMAND, 0.05, float("inf")) == {}
+    assert due == {0}
+    assert time.monotonic() - before >= 0.05
+
+
+def test_a_deadline_ends_patience(pipes, cell):
+    cell(0)
+    assert pipes.collect({0}, 1, wire.COMMAND, 300.0, time.monotonic() + 0.05) == {}
 
 
 def test_an_ended_cell_is_none(pipes):

@@ -7,7 +7,7 @@ import os
 import random
 import selectors
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 
 from ventbench.sandbox.child import wire
 from ventbench.sandbox.child.wire import Reply, WireError
@@ -19,10 +19,42 @@ _UNASKED = "bytes came after the reply"
 Outcome = Reply | WireError | None
 
 
-class Pipes:
-    """Two pipes for each cell."""
+class Clock:
+    """The time of a session, and waiting in it; a test can put another in its place."""
 
-    def __init__(self) -> None:
+    #: How long the exit status of a cell may take to arrive once its pipe has ended, s.
+    status_s = 2.0
+
+    def now(self) -> float:
+        """Return the time of a clock that never goes back, s."""
+        return time.monotonic()
+
+    def wait(
+        self, selector: selectors.BaseSelector, timeout_s: float, due: Set[int], kind: int
+    ) -> list[tuple[selectors.SelectorKey, int]]:
+        """Wait until a pipe can be read, or the time is over.
+
+        Args:
+            selector: of the pipes.
+            timeout_s: at most this long.
+            due: cells whose reply is waited for.
+            kind: of that reply.
+
+        Returns:
+            As of ``selector.select``; empty if the time is over.
+        """
+        return selector.select(timeout_s)
+
+
+class Pipes:
+    """Two pipes for each cell.
+
+    Args:
+        clock: by which it waits.
+    """
+
+    def __init__(self, clock: Clock | None = None) -> None:
+        self._clock = clock or Clock()
         self._ends: dict[int, tuple[int, int]] = {}  # cell -> observations, replies
         self._selector = selectors.DefaultSelector()
         self._random = random.Random()  # seeded by the system; nobody else's stream is touched
@@ -93,17 +125,17 @@ class Pipes:
             sequence: number of the observation that they answer.
             kind: of reply that is due, besides a failure.
             patience_s: how long to wait for the next cell to answer.
-            deadline: when to stop waiting altogether, as of ``time.monotonic``.
+            deadline: when to stop waiting altogether, by the clock, s.
 
         Returns:
             By cell, what came.
         """
         found: dict[int, Outcome] = {}
         partial: dict[int, bytes] = {}
-        progress = time.monotonic()
+        progress = self._clock.now()
         while due:
-            wait = min(progress + patience_s, deadline) - time.monotonic()
-            events = self._selector.select(max(wait, 0.0))
+            wait = min(progress + patience_s, deadline) - self._clock.now()
+            events = self._clock.wait(self._selector, max(wait, 0.0), due, kind)
             if not events and wait <= 0:
                 break
             for key, _ in events:
@@ -121,7 +153,7 @@ class Pipes:
                 # A cell that has answered and then ends, or writes more, is found here too.
                 found[cell] = outcome
                 due.discard(cell)
-                progress = time.monotonic()
+                progress = self._clock.now()
                 if not isinstance(outcome, Reply) or outcome.kind == wire.FAILED:
                     self._selector.unregister(key.fd)  # nothing that follows counts
         return found

@@ -14,7 +14,7 @@ from ventbench.sandbox.child import landlock, lockdown, wire
 from ventbench.sandbox.child.lockdown import OFFICIAL
 from ventbench.sandbox.child.wire import Reply
 from ventbench.sandbox.configuration import Allowance, SandboxError, configuration
-from ventbench.sandbox.pipes import Pipes
+from ventbench.sandbox.pipes import Clock, Pipes
 from ventbench.sandbox.session import SandboxSession, SubmittedFolder, said
 from ventbench.sandbox.zygote import ZygoteClient
 
@@ -49,15 +49,23 @@ class SandboxRunner:
     Args:
         require_official: refuse to run where a layer is missing that official results need.
         allowance: what a submission may use.
+        clock: by which its cells time out; the system's if not given.
 
     Raises:
         SandboxError: if a cell cannot be locked down, or not far enough.
     """
 
-    def __init__(self, *, require_official: bool = False, allowance: Allowance | None = None):
+    def __init__(
+        self,
+        *,
+        require_official: bool = False,
+        allowance: Allowance | None = None,
+        clock: Clock | None = None,
+    ):
         if not hasattr(os, "fork"):
             raise SandboxError(f"the sandbox needs Linux or macOS, this is {platform.system()}")
         self._layers, self._allowance = layers(), allowance or Allowance()
+        self._clock = clock
         if require_official and self.missing:
             raise SandboxError(
                 f"an official score needs {' and '.join(OFFICIAL)}; missing here: "
@@ -86,4 +94,4 @@ class SandboxRunner:
             SandboxError: if a cell does not show the layers of :attr:`sandbox`.
             SubmissionError: if the code cannot be imported.
         """
-        return SandboxSession(submission, tasks, self._layers, self._allowance)
+        return SandboxSession(submission, tasks, self._layers, self._allowance, self._clock)

@@ -10,7 +10,6 @@ import contextlib
 import random
 import resource
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -24,7 +23,7 @@ from ventbench.sandbox.child import libc, lockdown, wire
 from ventbench.sandbox.child.failures import Failure, SubmissionError
 from ventbench.sandbox.child.wire import Reply
 from ventbench.sandbox.configuration import Allowance, SandboxError, configuration
-from ventbench.sandbox.pipes import Outcome, Pipes
+from ventbench.sandbox.pipes import Clock, Outcome, Pipes
 from ventbench.sandbox.verdict import Verdict, ended, failed, not_answered
 from ventbench.sandbox.zygote import ZygoteClient
 
@@ -58,6 +57,7 @@ class SandboxSession:
         tasks: one for each cell.
         layers: what every cell must show to be in force.
         allowance: what they may use.
+        clock: by which they time out.
 
     Raises:
         SandboxError: if a cell does not lock itself down.
@@ -70,16 +70,18 @@ class SandboxSession:
         tasks: Sequence[Task],
         layers: tuple[str, ...],
         allowance: Allowance,
+        clock: Clock | None = None,
     ):
         self.failures: dict[int, Failure] = {}
         self._count, self._live = len(tasks), set(range(len(tasks)))
         self._allowance, self._sequence = allowance, 0
-        self._deadline = time.monotonic() + allowance.total_s
+        self._clock = clock or Clock()
+        self._deadline = self._clock.now() + allowance.total_s
         with contextlib.ExitStack() as stack:
             stack.enter_context(descriptors_for(2 * len(tasks)))
             hide_process()
             stack.callback(show_process)
-            self._pipes = Pipes()
+            self._pipes = Pipes(self._clock)
             stack.callback(self._pipes.close_all)
             distinct = sorted(set(tasks), key=repr)
             self._zygote = ZygoteClient(
@@ -159,7 +161,7 @@ class SandboxSession:
         if isinstance(outcome, Reply):
             return self._fail(cell, failed(outcome.text, self._sequence))
         if outcome is None:
-            return self._fail(cell, ended(self._zygote.status(cell, 2.0)))
+            return self._fail(cell, ended(self._zygote.status(cell, self._clock.status_s)))
         return self._fail(
             cell, Verdict("wire", "the controller broke the wire's rules", str(outcome))
         )
@@ -171,9 +173,9 @@ class SandboxSession:
         for cell in late:
             self._zygote.interrupt(cell)
         waiting = set(late)
-        deadline = time.monotonic() + _GRACE_S + 0.01 * len(late)
+        deadline = self._clock.now() + _GRACE_S + 0.01 * len(late)
         outcomes = self._pipes.collect(waiting, self._sequence, wire.FAILED, _GRACE_S, deadline)
-        total = time.monotonic() >= self._deadline
+        total = self._clock.now() >= self._deadline
         limit = self._allowance.total_s if total else self._allowance.patience_s
         for cell in outcomes.keys() - late:  # had answered, and then wrote more or ended
             self._judge(cell, outcomes[cell])

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,17 +17,21 @@ from ventbench.validation.challenge.answer import answer
 from ventbench.validation.challenge.folder import ChallengeFolder
 from ventbench.validation.challenge.make import make
 from ventbench.validation.challenge.reveal import reveal
+from ventbench.validation.challenge.rig import record
 
 from .truths import Found, mechanism, request, sees_nothing
 from .truths import answer as made_up
 
 SECRET = "for the test"
 
+# These tests are about files and rounds, not about the accuracy of the integration.
+coarsely = partial(record, steps=8)
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     out = tmp_path_factory.mktemp("challenge") / "c"
-    promised = make(SECRET, out, "masked", 3)
+    promised = make(SECRET, out, "masked", 3, record=coarsely)
     return out, promised
 
 
@@ -62,10 +67,12 @@ def test_public_files_tell_nothing(made):
 
 def test_the_same_secret_makes_the_same_files(tmp_path):
     first, again, other = (tmp_path / name for name in "abc")
-    assert make(SECRET, first, "null", 1) == make(SECRET, again, "null", 1)
+    assert make(SECRET, first, "null", 1, record=coarsely) == make(
+        SECRET, again, "null", 1, record=coarsely
+    )
     for path in (p for p in first.rglob("*") if p.is_file()):
         assert (again / path.relative_to(first)).read_bytes() == path.read_bytes()
-    make("another", other, "null", 1)
+    make("another", other, "null", 1, record=coarsely)
     assert (other / "cases.json").read_bytes() != (first / "cases.json").read_bytes()
 
 
@@ -103,7 +110,7 @@ def test_processes_make_room_for_new_ones(made, tmp_path):
 
 def test_a_recording_that_cannot_be_read_does_not_stop_the_others(tmp_path):
     folder = ChallengeFolder(tmp_path / "c")
-    make(SECRET, folder.path, "null", 2)
+    make(SECRET, folder.path, "null", 2, record=coarsely)
     text = folder.recording("case_0001").read_text().splitlines()
     text[5] = text[5].rpartition(",")[0] + ",259.2"
     folder.recording("case_0001").write_text("\n".join(text) + "\n")

@@ -34,10 +34,13 @@ PRESSURE = COLUMNS["pressure"]
 #: gentler ones, each this share of the attempt before.
 _USUAL_ATTEMPTS, _GENTLE_ATTEMPTS, _GENTLER = 10, 10, 0.85
 
+#: Records a case; has the arguments of :func:`~ventbench.validation.challenge.rig.record`.
+Record = Callable[..., Breaths]
+
 
 def make(
     secret: str, out: Path, kind: Kind | Literal["all"], count: int, *, jobs: int = 1,
-    progress: Callable[[int], None] = lambda done: None,
+    record: Record = record, progress: Callable[[int], None] = lambda done: None,
 ) -> str:  # fmt: skip
     """Write a challenge.
 
@@ -49,6 +52,7 @@ def make(
         kind: of the cases.
         count: number of cases.
         jobs: number of processes.
+        record: see :data:`Record`; a function of a module if there are processes.
         progress: called with the number of finished recordings.
 
     Returns:
@@ -67,7 +71,7 @@ def make(
     names = [question.case.name for question in drawn]
     nats: dict[str, list[float]] = {}
     with executor(jobs if jobs > 1 else 0) as pool:
-        work = {question.case.name: (secret, folder, question) for question in drawn}
+        work = {question.case.name: (secret, folder, question, record) for question in drawn}
         for name, of_effects in results(pool, _make_case, work):
             nats[name] = of_effects
             progress(len(nats))
@@ -87,17 +91,19 @@ def make(
     return commitment(text)
 
 
-def _make_case(secret: str, folder: ChallengeFolder, drawn: DrawnCase) -> list[float]:
+def _make_case(
+    secret: str, folder: ChallengeFolder, drawn: DrawnCase, record: Record
+) -> list[float]:
     """Record one case; returns the nats of each of its effects."""
     case = drawn.case
-    breaths = record_within_limits(secret, drawn)
+    breaths = record_within_limits(secret, drawn, record=record)
     write(breaths, folder.recording(case.name))
     return [round(log_likelihood_loss(case, breaths, k), 1) for k in range(len(case.effects))]
 
 
 def record_within_limits(
     secret: str, drawn: DrawnCase, *, usual: int = _USUAL_ATTEMPTS, gentle: int = _GENTLE_ATTEMPTS,
-    record: Callable[..., Breaths] = record,
+    record: Record = record,
 ) -> Breaths:  # fmt: skip
     """Record a case, repeatedly until the pressures are within the limits of a recording.
 
@@ -108,7 +114,7 @@ def record_within_limits(
         drawn: the case.
         usual: number of attempts with commands of the usual size.
         gentle: number of attempts with smaller and smaller ones after these.
-        record: simulates a case; see :func:`~ventbench.validation.challenge.rig.record`.
+        record: see :data:`Record`.
 
     Raises:
         InputError: if every attempt leaves the limits.

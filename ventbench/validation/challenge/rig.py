@@ -130,7 +130,7 @@ class _GivenCommands:
 
 def record_commands(
     case: Case, time: Floats, u_in: Floats, u_out: NDArray[np.int8],
-    rng: np.random.Generator,
+    rng: np.random.Generator, *, steps: int | None = None,
 ) -> Breaths:  # fmt: skip
     """Record given commands on the case's rig, open loop, after the case's own breaths.
 
@@ -140,6 +140,7 @@ def record_commands(
         u_in: %, ``(k, T)``.
         u_out: 0/1, ``(k, T)``.
         rng: source of noise and efforts.
+        steps: as in :func:`record`.
 
     Raises:
         InputError: if the case has no base: a new one would be another rig.
@@ -147,15 +148,8 @@ def record_commands(
     if case.base is None:
         raise InputError(f"{case.name}: the rig of this case is not known")
     sized = replace(case, samples=time.shape[1])
-    return _run(
-        sized,
-        case.base,
-        time,
-        u_out,
-        _GivenCommands(u_in),
-        case.breaths + np.arange(len(time)),
-        rng,
-    )
+    number = case.breaths + np.arange(len(time))
+    return _run(sized, case.base, time, u_out, _GivenCommands(u_in), number, rng, steps)
 
 
 def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 8) -> Floats:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ventbench.diagnosis.conclusion import conclude, is_unresolved
+from ventbench.diagnosis.estimates import nonparametric_term
 from ventbench.diagnosis.latent_inputs import ALVEOLUS, SUPPLY
-from ventbench.diagnosis.shapes import slot
 from ventbench.recordings import join
 
 from . import small
@@ -34,7 +34,7 @@ def test_nothing_is_missing():
     assert found.full is found.named
     assert (found.held_out_gains, found.alternatives, found.gain_sd) == ({}, {}, 0.0)
     assert found.noise.sigma[0] == pytest.approx(0.2, rel=0.15)
-    assert slot(found) is None
+    assert nonparametric_term(found) is None
 
 
 def compared(gains: dict[str, tuple[float, float]]) -> tuple[Any, list[Any]]:
@@ -92,7 +92,7 @@ def test_resistance_that_follows_volume_has_no_name_but_a_place():
     assert found.unnamed.latent_input is None
     assert found.unnamed.nats > 20.0
     assert found.full.hypothesis.names == ("volume_resistance",)
-    shown = slot(found)
+    shown = nonparametric_term(found)
     assert shown is not None
     assert shown.name == "R(V)"
     assert 0.5 < shown.explains <= 1.0
@@ -112,7 +112,7 @@ def test_a_beating_heart_is_at_the_alveolus():
     assert found.unnamed.latent_input.scale == pytest.approx(1.4, abs=0.2)
     assert found.unnamed.nats > 20.0
     assert found.full is found.named
-    shown = slot(found)
+    shown = nonparametric_term(found)
     assert shown is not None
     assert "1.4 times a second" in shown.meaning
     assert shown.explains > 0.5
@@ -127,7 +127,7 @@ def test_a_name_stands_beside_a_place():
     assert found.names == ("turbulent_resistance",)
     assert found.unnamed is not None
     assert found.unnamed.name == SUPPLY
-    shown = slot(found)
+    shown = nonparametric_term(found)
     assert shown is not None
     assert shown.y_unit.startswith("share of the flow")
 

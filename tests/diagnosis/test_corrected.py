@@ -10,11 +10,13 @@ import pytest
 
 from ventbench import precision
 from ventbench.diagnosis import corrected as module
-from ventbench.diagnosis import simulators, split
-from ventbench.diagnosis.corrected import corrected
+from ventbench.diagnosis.corrected import correct
+from ventbench.diagnosis.identification import held_out
+from ventbench.diagnosis.settings import DEFAULT
 from ventbench.interfaces import Plant
 from ventbench.lungs import lung
 from ventbench.physics import physics
+from ventbench.plants.catalog import load_simulators
 from ventbench.recordings.breaths import Breaths
 
 from . import small
@@ -33,7 +35,7 @@ def plants(**base: float) -> dict[str, Plant]:
 def something(pressure: np.ndarray, plant: dict[str, Plant]) -> Any:
     """What is asked of something found: pressures and plants."""
     return SimpleNamespace(
-        conclusion=SimpleNamespace(full=None, base=None),
+        conclusion=SimpleNamespace(full=None, base=None, noise=None),
         evaluator=SimpleNamespace(training=SimpleNamespace(data=None)),
         pressures=lambda fitted, held, first: pressure,
         plants=lambda: plant,
@@ -43,23 +45,25 @@ def something(pressure: np.ndarray, plant: dict[str, Plant]) -> Any:
 @pytest.mark.parametrize("worse", [False, True], ids=["better", "worse"])
 def test_a_simulator_that_would_err_more_is_left_as_it_is(breaths, monkeypatch, worse):
     given, own, other = plants(R=10.0), plants(R=20.0), plants(R=30.0)
-    before = simulators.answers(given, breaths)
+    before = load_simulators(given).pressures(breaths)
     # The found physics is the simulator's own plus the whole error, or minus it.
     error = breaths.pressure - before
     after = before - error if worse else before + 0.9 * error
-    monkeypatch.setattr(module, "refitted", lambda *_: None)
-    held = split.held_out(breaths)
+    monkeypatch.setattr(module, "refit_base_parameters", lambda *_: None)
+    held = held_out(breaths)
     found, had = something(after, other), something(before, own)
-    one = corrected(breaths, held, before, found, had, given)
-    assert one.left is worse
-    np.testing.assert_allclose(one.answers["after"], before if worse else after)
-    assert one.errs[1] == pytest.approx((2.0 if worse else 0.1) * one.errs[0])
+    one = correct(breaths, held, before, found, had, load_simulators(given))
+    assert one.unchanged is worse
+    np.testing.assert_allclose(one.pressures["after"], before if worse else after)
+    assert one.training_errors[1] == pytest.approx((2.0 if worse else 0.1) * one.training_errors[0])
     plant: Any = one.plants[small.LABEL]
     assert float(plant.simulator.get("R")) == 10.0
     assert float(plant.had.get("R")) == 20.0
     assert float(plant.wanted.get("R")) == (20.0 if worse else 30.0)
     if worse:  # the plant too
-        np.testing.assert_allclose(simulators.answers(one.plants, breaths), before, atol=1e-9)
+        np.testing.assert_allclose(
+            load_simulators(one.plants).pressures(breaths), before, atol=1e-9
+        )
 
 
 @pytest.mark.parametrize(
@@ -69,7 +73,7 @@ def test_a_simulator_that_would_err_more_is_left_as_it_is(breaths, monkeypatch, 
 def test_of_the_base_model_is_kept_what_does_not_throw_breaths_far_off(
     breaths, monkeypatch, full, named, kept
 ):
-    before = simulators.answers(plants(R=10.0), breaths)
+    before = load_simulators(plants(R=10.0)).pressures(breaths)
     error = breaths.pressure - before
     gains = {"base": 0.5, "full": 1.0 - full, "named": 1.0 - named}
 
@@ -78,25 +82,25 @@ def test_of_the_base_model_is_kept_what_does_not_throw_breaths_far_off(
 
     fitted = {key: SimpleNamespace(which=key, names=("leak",)) for key in gains}
     found: Any = SimpleNamespace(
-        conclusion=SimpleNamespace(**fitted, unnamed=object()), evaluator=None, pressures=pressures,
-        fit=fitted["full"],
+        conclusion=SimpleNamespace(**fitted, unnamed=object()), pressures=pressures,
+        evaluator=SimpleNamespace(settings=DEFAULT), fit=fitted["full"],
     )  # fmt: skip
     monkeypatch.setattr(module.estimates, "plants", lambda fit: fit.which)
     monkeypatch.setattr(module.estimates, "plants_of", lambda one, evaluator: one.which)
-    one = corrected(breaths, split.held_out(breaths), before, found, None, "physics")
+    one = correct(breaths, held_out(breaths), before, found, None, load_simulators("physics"))
     assert one.plants == kept
-    np.testing.assert_allclose(one.answers["after"], before + gains[kept] * error)
+    np.testing.assert_allclose(one.pressures["after"], before + gains[kept] * error)
     assert bool(one.notes) is (kept != "full")
-    assert not one.left
+    assert not one.unchanged
     fitted["full"].names = ("patient_effort",)  # the mean of all breaths' is no breath's
-    one = corrected(breaths, split.held_out(breaths), before, found, None, "physics")
+    one = correct(breaths, held_out(breaths), before, found, None, load_simulators("physics"))
     assert (one.plants, one.notes) == ("full", ())
 
 
 def test_a_few_breaths_far_off_are_enough(breaths, monkeypatch):
     """Though most are better than refitted, and the mean error with them."""
-    before = simulators.answers(plants(R=10.0), breaths)
-    error, held = breaths.pressure - before, split.held_out(breaths)
+    before = load_simulators(plants(R=10.0)).pressures(breaths)
+    error, held = breaths.pressure - before, held_out(breaths)
     left = np.full((len(breaths), 1), 0.1)
     left[np.flatnonzero(~held)[0]] = 2.5
 
@@ -105,24 +109,31 @@ def test_a_few_breaths_far_off_are_enough(breaths, monkeypatch):
 
     fitted = {k: SimpleNamespace(which=k, names=("leak",)) for k in ("base", "full", "named")}
     found: Any = SimpleNamespace(
-        conclusion=SimpleNamespace(**fitted, unnamed=object()), evaluator=None, pressures=pressures,
-        fit=fitted["full"],
+        conclusion=SimpleNamespace(**fitted, unnamed=object()), pressures=pressures,
+        evaluator=SimpleNamespace(settings=DEFAULT), fit=fitted["full"],
     )  # fmt: skip
     fitted = ~held[:, None] & breaths.valid & (breaths.time > 0)
     means = [np.abs(x * error)[fitted].mean() for x in (left, 0.5)]
     assert means[0] < means[1]
     monkeypatch.setattr(module.estimates, "plants_of", lambda one, evaluator: one.which)
-    one = corrected(breaths, held, before, found, None, "physics")
+    one = correct(breaths, held, before, found, None, load_simulators("physics"))
     assert (one.plants, len(one.notes)) == ("named", 1)
 
 
 def test_held_out_breaths_do_not_decide(breaths, monkeypatch):
     given = plants(R=10.0)
-    before = simulators.answers(given, breaths)
-    held = split.held_out(breaths)
+    before = load_simulators(given).pressures(breaths)
+    held = held_out(breaths)
     error = breaths.pressure - before
     after = before + np.where(held[:, None], -9.0, 0.5) * error
-    monkeypatch.setattr(module, "refitted", lambda *_: None)
-    one = corrected(breaths, held, before, something(after, given), something(before, given), given)
-    assert not one.left
-    assert one.errs[1] == pytest.approx(0.5 * one.errs[0])
+    monkeypatch.setattr(module, "refit_base_parameters", lambda *_: None)
+    one = correct(
+        breaths,
+        held,
+        before,
+        something(after, given),
+        something(before, given),
+        load_simulators(given),
+    )
+    assert not one.unchanged
+    assert one.training_errors[1] == pytest.approx(0.5 * one.training_errors[0])

@@ -4,34 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
 from ventbench import precision
-from ventbench.diagnosis import simulators
 from ventbench.diagnosis.diagnose import diagnose
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
 from ventbench.lungs import lung
 from ventbench.physics import physics
-from ventbench.plants.plant_files import load_plants, save_plants
+from ventbench.plants.catalog import load_simulators
+from ventbench.plants.plant_files import save_plants
 from ventbench.recordings import join
 from ventbench.recordings.breaths import Breaths
 
 from . import small
 
 NAME = "turbulent_resistance"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def another_seed() -> Iterator[None]:
-    """Another seed: with the usual one, a strength here is three intervals too high."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulators, "_SEED", 1)
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +45,7 @@ def turbulent(quadratic: float) -> dict[str, Plant]:
 @pytest.fixture(scope="module")
 def own(breaths) -> Diagnosis:
     """Of a user's simulator that has the effect."""
-    return diagnose(breaths, plant=turbulent(10.0), settings=small.SETTINGS)
+    return diagnose(breaths, simulator=turbulent(10.0), settings=small.SETTINGS)
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +100,9 @@ def test_traces_start_at_the_first_reading(found, breaths):
         trace = getattr(found.traces, stage)
         assert trace.shape == breaths.pressure.shape
         np.testing.assert_allclose(trace[:, 0], breaths.pressure[:, 0], atol=1e-9)
-    np.testing.assert_array_equal(found.traces.before, simulators.answers("physics", breaths))
+    np.testing.assert_array_equal(
+        found.traces.before, load_simulators("physics").pressures(breaths)
+    )
     flow, volume = found.traces.flow, found.traces.volume
     assert flow is not None
     assert volume is not None
@@ -163,7 +156,7 @@ def test_the_corrected_plant_in_its_file_gives_the_same_answers(which, request, 
     diagnosis: Diagnosis = request.getfixturevalue(which)
     path, held = tmp_path / "corrected.json", diagnosis.traces.held_out
     save_plants(path, diagnosis.plants)
-    answer = simulators.answers(load_plants(path), diagnosis.traces.breaths)
+    answer = load_simulators(path).pressures(diagnosis.traces.breaths)
     # Its parameters are fitted to all breaths, those of the traces to the training breaths.
     apart = answer[held] - diagnosis.traces.after[held]
     assert np.sqrt(np.mean(apart**2)) < 0.25
@@ -182,13 +175,13 @@ def test_a_simulator_that_lacks_nothing_is_not_made_worse(own):
 
 
 def test_the_corrected_plant_answers_as_the_report_says(own, breaths):
-    answer = simulators.answers(own.plants, breaths)
+    answer = load_simulators(own.plants).pressures(breaths)
     np.testing.assert_allclose(answer, own.traces.after, atol=1e-3)
 
 
 @pytest.mark.slow  # two more conclusions
 def test_another_strength_than_the_simulators_is_missing(breaths):
-    much = diagnose(breaths, plant=turbulent(20.0), settings=small.SETTINGS)
+    much = diagnose(breaths, simulator=turbulent(20.0), settings=small.SETTINGS)
     assert much.verdict == "named"
     (one,) = much.mechanisms
     assert (one.name, one.changed) == (NAME, True)
@@ -242,7 +235,8 @@ def test_what_cannot_be_diagnosed_is_refused(breaths):
         diagnose(breaths.select(np.arange(3)), settings=small.SETTINGS)
     with pytest.raises(InputError, match=r"0 usable breaths"):
         diagnose(breaths, lung="R50C50", settings=small.SETTINGS)
-    with pytest.raises(InputError, match=r"no simulator 'phisics'"):
-        diagnose(breaths, plant="phisics", settings=small.SETTINGS)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"the simulator has no lung R20C20; it has R5C10"):
-        diagnose(breaths, plant={"R5C10": turbulent(1.0)[small.LABEL]}, settings=small.SETTINGS)
+    with pytest.raises(InputError, match=r"nor a simulator of that name"):
+        diagnose(breaths, simulator="phisics", settings=small.SETTINGS)
+    other = {"R5C10": turbulent(1.0)[small.LABEL]}
+    with pytest.raises(InputError, match=r"no lung R20C20 of the recording .*; it has R5C10"):
+        diagnose(breaths, simulator=other, settings=small.SETTINGS)

@@ -30,7 +30,7 @@ def test_the_larger_of_two_lags_comes_first(monkeypatch, found):
     )  # fmt: skip
     monkeypatch.setattr(estimates, "fit", lambda *_, start, **__: start)
     partition: Any = SimpleNamespace(data=None, simulator=None)
-    start: Any = estimates.estimated(fitted, partition, partition)
+    start: Any = estimates.final_fit(fitted, partition, partition)
     assert start["R"] == 20.0
     assert start[LAGS[0]] == 0.08
     assert start.get(LAGS[1]) == (None if found[1] is None else 0.01)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from ventbench.diagnosis.residual_analysis import (
-    MATERIAL,
     compare_open_loop,
     locate,
     open_loop_error,
@@ -17,6 +16,7 @@ from ventbench.diagnosis.residual_analysis import (
     statistic,
 )
 from ventbench.diagnosis.residual_axes import axes, before, round_edges, since_edge
+from ventbench.diagnosis.settings import DEFAULT
 from ventbench.recordings import join
 from ventbench.recordings.breaths import Breaths
 
@@ -119,7 +119,7 @@ def test_an_error_of_volume_is_found_along_it():
 
 def test_noise_that_differs_a_little_from_place_to_place_is_no_place():
     """A quarter more variance in expiration stays below what is material; three times do not."""
-    assert MATERIAL > 0.25
+    assert DEFAULT.residuals.min_excess > 0.25
     for seed, times, wanted in ((8, 1.25, False), (9, 3.0, True)):
         recorded, pressure, *_ = exact(seed, n=200)
         noise = SD * np.random.default_rng(seed).standard_normal(pressure.shape)

@@ -7,26 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ventbench.cli.options import Clip, JsonFile, Pad, emit
+from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, emit
 
 if TYPE_CHECKING:
     from ventbench.diagnosis.result import Diagnosis
     from ventbench.recordings.breaths import Breaths
 
-#: Simulators that need no file.
-KINDS = ("physics", "frozen")
-
 
 def diagnose(
     recordings: Annotated[Path, typer.Argument(help="CSV, CSV.GZ or Parquet, public schema.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write the four files.")],
-    plant: Annotated[
-        str,
-        typer.Option(
-            metavar="physics|frozen|FILE",
-            help="Simulator: R-C lungs at their labels, the official ones, or a corrected.json.",
-        ),
-    ] = "physics",
+    plant: PlantName = "physics",
     lung: Annotated[
         str | None, typer.Option(metavar="R20C50", help="Only the breaths of this lung.")
     ] = None,
@@ -116,16 +107,15 @@ def _only(recordings: Path, breaths: Breaths, name: str) -> tuple[str, Breaths]:
 
 def _diagnose(breaths: Breaths, plant: str, lung: str | None, passive: bool) -> Diagnosis:
     """Run it under a bar of progress."""
-    import dataclasses
-
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from ventbench import compilation
     from ventbench.diagnosis.diagnose import diagnose as find
+    from ventbench.plants.catalog import load_simulators
 
     compilation.keep()
-    simulator: Any = plant if plant in KINDS else _plants(plant, breaths)
+    simulators = load_simulators(plant)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
         task = bars.add_task("diagnosing", total=1.0)
@@ -133,25 +123,7 @@ def _diagnose(breaths: Breaths, plant: str, lung: str | None, passive: bool) -> 
         def progress(what: str, share: float) -> None:
             bars.update(task, description=what, completed=share)
 
-        found = find(breaths, plant=simulator, lung=lung, passive=passive, progress=progress)
-    return found if plant in KINDS else dataclasses.replace(found, simulator=Path(plant).name)
-
-
-def _plants(plant: str, breaths: Breaths) -> Any:
-    """Plants of a file, which must have all lungs of the recording."""
-    from ventbench.errors import InputError
-    from ventbench.plants.plant_files import load_plants
-
-    if not Path(plant).is_file():
-        raise InputError(f"--plant {plant}: there is no such file, nor a plant of that name")
-    plants = load_plants(Path(plant))
-    missing = [name for name in breaths.by_lung_index if name not in plants]
-    if missing:
-        raise InputError(
-            f"{plant} has no lung {missing[0]} of the recording; it has {', '.join(plants)}. "
-            "Choose one of them with --lung"
-        )
-    return plants
+        return find(breaths, simulator=simulators, lung=lung, passive=passive, progress=progress)
 
 
 def _say(console: Any, found: Diagnosis) -> None:

@@ -8,19 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.diagnosis.settings import DEFAULT, ExperimentSettings
+
 Floats = NDArray[np.float64]
-
-#: Breaths in a family; they differ in size or in seed.
-VARIANTS = 5
-
-#: Ends of inspiration, s: of most families; of fast inflations; of slow ones.
-_INSPIRED, _FAST, _SLOW = 1.0, 0.35, 1.5
-
-#: Length of a hold with both valves shut, s, and of the shutters of an interrupted expiration.
-_HOLD, _SHUTTER = 2.0, 0.16
-
-#: Largest command of the inspiratory valve, %.
-_LARGEST = 100.0
 
 
 @dataclass(frozen=True)
@@ -65,93 +55,112 @@ class Family:
         return Family(self.name, self.title, self.u_in[which], self.u_out[which])
 
 
-def families(rig: Rig, samples: int, dt: float) -> tuple[Family, ...]:
+#: Makes commands ``u_in`` (of any size) and ``u_out``, ``(k, T)``, and peak pressures, cmH2O,
+#: ``(k,)``, from times, s, ``(k, T)``.
+_Shape = Callable[[Rig, Floats, ExperimentSettings], tuple[Floats, Floats, Floats]]
+
+
+def families(
+    rig: Rig, samples: int, dt: float, settings: ExperimentSettings = DEFAULT.experiments
+) -> tuple[Family, ...]:
     """Make all families, sized so that an R-C lung stays at or below 35 cmH2O.
 
     Args:
         rig: lung and valve that the breaths are for.
         samples: number of samples of a breath.
         dt: time between samples, s.
+        settings: number of breaths in a family, and their times.
     """
-    t = np.arange(samples, dtype=np.float64) * dt
-    return tuple(
-        Family(name, title, *_sized(rig, dt, *shape(rig, t))) for name, title, shape in _KINDS
-    )
+    times = np.arange(samples, dtype=np.float64) * dt
+    t = np.broadcast_to(times, (settings.variants, samples))
+    made = []
+    for name, title, shape in _KINDS:
+        u_in, u_out, peaks = shape(rig, t, settings)
+        made.append(Family(name, title, _sized(rig, dt, u_in, peaks, settings), u_out))
+    return tuple(made)
 
 
-def _sized(rig: Rig, dt: float, u: Floats, out: Floats, peaks: Floats) -> tuple[Floats, Floats]:
+def _sized(rig: Rig, dt: float, u: Floats, peaks: Floats, settings: ExperimentSettings) -> Floats:
     """Scale inspirations to the peak pressures, cmH2O, that an R-C lung would reach."""
     flow = rig.gain * u
     rise = np.cumsum(flow, axis=1) * dt / rig.C + rig.R * flow / 1000.0
     wanted = np.maximum(peaks - rig.peep, 2.0)
-    return np.clip(u * (wanted / rise.max(axis=1))[:, None], 0.0, _LARGEST), out
-
-
-def _rows(t: Floats) -> Floats:
-    return np.broadcast_to(t, (VARIANTS, len(t)))
+    return np.clip(u * (wanted / rise.max(axis=1))[:, None], 0.0, settings.max_opening)
 
 
 def _opens(t: Floats, at: float) -> Floats:
-    return (_rows(t) >= at - 1e-9).astype(float)
+    return (t >= at - 1e-9).astype(float)
 
 
-def _levels(low: float, high: float) -> Floats:
-    return np.linspace(high, low, VARIANTS)
+def _levels(t: Floats, low: float, high: float) -> Floats:
+    return np.linspace(high, low, len(t))
 
 
-def _pressure_steps(rig: Rig, t: Floats) -> tuple[Floats, Floats, Floats]:
+def _pressure_steps(
+    rig: Rig, t: Floats, settings: ExperimentSettings
+) -> tuple[Floats, Floats, Floats]:
     """Flow of a controller that steps the pressure: it falls with the lung's time constant."""
     slow = max(rig.R * rig.C / 1000.0, 0.05)
-    u = np.exp(-_rows(t) / slow) * (1.0 - np.exp(-(_rows(t) + 0.03) / 0.06)) + 0.02
-    return u * (_rows(t) < _INSPIRED), _opens(t, _INSPIRED), _levels(12.0, 32.0)
+    u = np.exp(-t / slow) * (1.0 - np.exp(-(t + 0.03) / 0.06)) + 0.02
+    return u * (t < settings.inspiration), _opens(t, settings.inspiration), _levels(t, 12.0, 32.0)
 
 
-def _pulses(peak: float, seed: int) -> Callable[[Rig, Floats], tuple[Floats, Floats, Floats]]:
-    def shape(rig: Rig, t: Floats) -> tuple[Floats, Floats, Floats]:
+def _pulses(peak: float, seed: int) -> _Shape:
+    def shape(rig: Rig, t: Floats, settings: ExperimentSettings) -> tuple[Floats, Floats, Floats]:
         """Valve positions that last 2 to 5 samples, a third of them shut."""
-        rng = np.random.default_rng(seed)
-        u = np.zeros((VARIANTS, len(t)))
+        rng, samples = np.random.default_rng(seed), t.shape[1]
+        u = np.zeros(t.shape)
         for row in u:
             at = int(rng.integers(1, 3))
-            while at < len(t):
+            while at < samples:
                 length = int(rng.integers(2, 6))
                 shut = at > 3 and rng.uniform() < 0.35
                 row[at : at + length] = 0.0 if shut else rng.uniform(0.15, 1.0)
                 at += length
-        return u * (_rows(t) < _INSPIRED), _opens(t, _INSPIRED), np.full(VARIANTS, peak)
+        return (
+            u * (t < settings.inspiration),
+            _opens(t, settings.inspiration),
+            np.full(len(t), peak),
+        )
 
     return shape
 
 
-def _hold(rig: Rig, t: Floats) -> tuple[Floats, Floats, Floats]:
-    u = (_rows(t) < _FAST).astype(float)
-    return u, _opens(t, _FAST + _HOLD), _levels(12.0, 32.0)
+def _hold(rig: Rig, t: Floats, settings: ExperimentSettings) -> tuple[Floats, Floats, Floats]:
+    u = (t < settings.fast_inspiration).astype(float)
+    return u, _opens(t, settings.fast_inspiration + settings.hold), _levels(t, 12.0, 32.0)
 
 
-def _ramp(rig: Rig, t: Floats) -> tuple[Floats, Floats, Floats]:
-    u = np.clip(_rows(t) / _SLOW, 0.0, 1.0) * (_rows(t) < _SLOW)
-    return u, _opens(t, _SLOW), _levels(12.0, 32.0)
+def _ramp(rig: Rig, t: Floats, settings: ExperimentSettings) -> tuple[Floats, Floats, Floats]:
+    u = np.clip(t / settings.slow_inspiration, 0.0, 1.0) * (t < settings.slow_inspiration)
+    return u, _opens(t, settings.slow_inspiration), _levels(t, 12.0, 32.0)
 
 
-def _staircase(rig: Rig, t: Floats) -> tuple[Floats, Floats, Floats]:
+def _staircase(rig: Rig, t: Floats, settings: ExperimentSettings) -> tuple[Floats, Floats, Floats]:
     """Small steps up, down and up again, so that the valve turns round."""
     heights = np.array([1.0, 2.0, 3.0, 4.0, 2.5, 1.0, 3.0, 0.5])
-    step = np.minimum(_rows(t) / (_SLOW / len(heights)), len(heights) - 1).astype(int)
-    return heights[step] * (_rows(t) < _SLOW), _opens(t, _SLOW), _levels(10.0, 25.0)
+    step = np.minimum(t / (settings.slow_inspiration / len(heights)), len(heights) - 1).astype(int)
+    return (
+        heights[step] * (t < settings.slow_inspiration),
+        _opens(t, settings.slow_inspiration),
+        _levels(t, 10.0, 25.0),
+    )
 
 
-def _long_expiration(rig: Rig, t: Floats) -> tuple[Floats, Floats, Floats]:
-    u = (_rows(t) < _FAST).astype(float)
-    return u, _opens(t, _FAST), _levels(15.0, 35.0)
+def _long_expiration(
+    rig: Rig, t: Floats, settings: ExperimentSettings
+) -> tuple[Floats, Floats, Floats]:
+    u = (t < settings.fast_inspiration).astype(float)
+    return u, _opens(t, settings.fast_inspiration), _levels(t, 15.0, 35.0)
 
 
-def _shutters(rig: Rig, t: Floats) -> tuple[Floats, Floats, Floats]:
+def _shutters(rig: Rig, t: Floats, settings: ExperimentSettings) -> tuple[Floats, Floats, Floats]:
     """Open and shut the expiratory valve in turn, at another pace in each breath."""
-    u = (_rows(t) < _FAST).astype(float)
-    pace = _SHUTTER * np.linspace(0.7, 1.6, VARIANTS)[:, None]
-    late = _rows(t) - _FAST
+    u = (t < settings.fast_inspiration).astype(float)
+    pace = settings.shutter * np.linspace(0.7, 1.6, len(t))[:, None]
+    late = t - settings.fast_inspiration
     out = (late >= -1e-9) & ((late // pace).astype(int) % 2 == 0)
-    return u, out.astype(float), _levels(20.0, 32.0)
+    return u, out.astype(float), _levels(t, 20.0, 32.0)
 
 
 _KINDS = (

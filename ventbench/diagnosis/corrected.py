@@ -1,140 +1,148 @@
-"""The corrected simulator: what it answers to the recorded commands, and as a plant."""
+"""The corrected simulator: its pressures for the recorded commands, and its plants."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.diagnosis import estimates, simulators
-from ventbench.diagnosis.against import refitted
-from ventbench.diagnosis.found import Found
+from ventbench.diagnosis import estimates
 from ventbench.diagnosis.hypothesis import varies_by_breath
+from ventbench.diagnosis.identification import IdentifiedModel
 from ventbench.diagnosis.residual_analysis import open_loop_error
-from ventbench.diagnosis.simulators import Given
+from ventbench.diagnosis.simulator_comparison import refit_base_parameters
 from ventbench.interfaces import Plant
+from ventbench.plants.catalog import Simulators
 from ventbench.plants.corrected import Corrected
-from ventbench.precision import float64
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id.data import Floats
-
-#: Times the refitted error beyond which a few breaths must be far off: what is mild may change less
-#: than coloured noise excuses.
-_FAR = 1.05
 
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What is made of a simulator.
+    """What becomes of a simulator.
 
     Attributes:
-        answers: pressures ``before``, ``refit`` and ``after``, cmH2O, ``(n, T)`` each.
-        errs: mean absolute error of ``before`` and ``after`` on the training breaths, inspirations
-            and expirations, cmH2O.
-        plants: the corrected simulator of each lung, by label.
-        left: whether the simulator was left as it is, as it errs more by what was found.
-        notes: what the reader should know of it, a sentence each.
+        pressures: of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n, T)`` each.
+        training_errors: mean absolute error of ``before`` and ``after`` on the training breaths,
+            inspirations and expirations, cmH2O.
+        plants: the corrected simulator of each lung, by label; empty if the simulator has none.
+        unchanged: True if the simulator is left as it is, because a correction would be worse.
+        notes: for the reader.
     """
 
-    answers: dict[str, Floats]
-    errs: tuple[float, float]
+    pressures: dict[str, Floats]
+    training_errors: tuple[float, float]
     plants: dict[str, Plant]
-    left: bool = False
+    unchanged: bool = False
     notes: tuple[str, ...] = ()
 
 
-def corrected(
-    breaths: Breaths, held: NDArray[np.bool_], before: Floats, found: Found, had: Found | None,
-    plant: Given,
+def correct(
+    breaths: Breaths, held: NDArray[np.bool_], before: Floats, recording_model: IdentifiedModel,
+    simulator_model: IdentifiedModel | None, simulators: Simulators,
 ) -> Correction:  # fmt: skip
-    """Correct a simulator by the difference of what was found in the recording and in itself.
+    """Correct a simulator by the difference of the models of the recording and of itself.
 
-    One that has physics of its own and errs more by that on the breaths that were fitted is left
-    as it is. Likelihoods of coloured noise excuse slow errors, which a learned simulator may not
-    make; the mean error does not.
+    A simulator that is not the base model stays as it is if the correction raises its mean error on
+    the training breaths. Likelihoods of coloured noise excuse slow errors, which a learned
+    simulator may not make; the mean error does not.
 
     Args:
         breaths: n recorded ones.
         held: which of them are held out, ``(n,)``.
-        before: the simulator's answers, cmH2O, ``(n, T)``.
-        found: in the recording.
-        had: found in the simulator; None for the base model.
-        plant: the simulator.
+        before: pressures of the simulator, cmH2O, ``(n, T)``.
+        recording_model: identified from the recording.
+        simulator_model: identified from the simulator's response; None for the base model.
+        simulators: what was diagnosed.
     """
     first = breaths.pressure[:, 0]  # where every simulation starts
-    after = found.pressures(found.conclusion.full, held, first)
-    seen = breaths.valid & (breaths.time > 0) & ~held[:, None]
-    if had is None:
-        refit = found.pressures(found.conclusion.base, held, first)
-        answers = {"before": before, "refit": refit, "after": after}
-        return _physics(breaths, found, held, answers, seen)
-    # Its own physics, then the same with the recording's R, C, R_ex and PEEP.
-    own = had.pressures(had.conclusion.full, held, first)
-    refit = had.pressures(refitted(had, found.evaluator.training.data, found), held, first)
-    answers = {"before": before, "refit": before + refit - own, "after": before + after - own}
-    errs, wanted = _errs(breaths, answers, seen), found.plants()
-    if left := bool(errs[1] >= errs[0]):
-        answers, wanted = dict.fromkeys(answers, before), had.plants()
-    return Correction(answers, errs, _beside(breaths, plant, wanted, had.plants()), left)
+    after = recording_model.pressures(recording_model.conclusion.full, held, first)
+    training = breaths.valid & (breaths.time > 0) & ~held[:, None]
+    if simulator_model is None:
+        refit = recording_model.pressures(recording_model.conclusion.base, held, first)
+        pressures = {"before": before, "refit": refit, "after": after}
+        return _correct_base_model(breaths, recording_model, held, pressures, training)
+    # The simulator's own model, and the same with the recording's R, C, R_ex and PEEP.
+    own = simulator_model.pressures(simulator_model.conclusion.full, held, first)
+    data, noise = recording_model.evaluator.training.data, recording_model.conclusion.noise
+    refitted = refit_base_parameters(simulator_model, data, noise)
+    refit = simulator_model.pressures(refitted, held, first)
+    pressures = {"before": before, "refit": before + refit - own, "after": before + after - own}
+    errors, wanted = _training_errors(breaths, pressures, training), recording_model.plants()
+    if unchanged := bool(errors[1] >= errors[0]):
+        pressures, wanted = dict.fromkeys(pressures, before), simulator_model.plants()
+    if not simulators.has_plants:
+        note = (
+            f"{simulators.name} has no plant that could be corrected, so there is no "
+            "corrected.json; the corrected pressures of the recorded breaths are in the diagnosis."
+        )
+        return Correction(pressures, errors, {}, unchanged, (_capital(note),))
+    plants = _corrected_plants(breaths, simulators, wanted, simulator_model.plants())
+    return Correction(pressures, errors, plants, unchanged)
 
 
-def _physics(
-    breaths: Breaths, found: Found, held: NDArray[np.bool_], answers: dict[str, Floats],
-    seen: NDArray[np.bool_],
+def _correct_base_model(
+    breaths: Breaths, recording_model: IdentifiedModel, held: NDArray[np.bool_],
+    pressures: dict[str, Floats], training: NDArray[np.bool_],
 ) -> Correction:  # fmt: skip
-    """The base model with all that was found, or with less if that makes it err more.
+    """The base model with everything that was identified, or with less if that errs less.
 
-    Robust likelihoods excuse breaths that a shape throws far off; who uses the plant does not.
-    Efforts of a patient are each breath's own: their mean, which is what others are expected to
-    have, may be off in all of them.
+    Robust likelihoods excuse breaths that a term throws far off, but whoever uses the plant does
+    not. Patient efforts belong to single breaths: their mean, which is the prediction for other
+    breaths, may be off in all of them, so they are kept without this check.
     """
-    least = open_loop_error(breaths.pressure, answers["refit"], seen)
+    least = open_loop_error(breaths.pressure, pressures["refit"], training)
+    # A mild mechanism may raise the error a little, since the fit discounts coloured noise.
+    ratio = recording_model.evaluator.settings.simulator.max_error_ratio
 
-    def serves(pressure: Floats) -> bool:
-        errs = open_loop_error(
-            breaths.pressure, pressure, seen
-        )  # the square sees what few breaths hide
-        return errs.mae <= _FAR * least.mae and errs.rmse <= _FAR * least.rmse
+    def is_acceptable(pressure: Floats) -> bool:
+        # The mean square sees a few breaths that are far off; the mean error hides them.
+        error = open_loop_error(breaths.pressure, pressure, training)
+        return error.mae <= ratio * least.mae and error.rmse <= ratio * least.rmse
 
-    own = any(varies_by_breath(name) for name in found.conclusion.full.names)
-    if own or serves(answers["after"]):
-        return Correction(answers, _errs(breaths, answers, seen), estimates.plants(found.fit))
-    conclusion, kept, what = found.conclusion, found.conclusion.base, "what was found"
+    conclusion = recording_model.conclusion
+    has_efforts = any(varies_by_breath(name) for name in conclusion.full.names)
+    if has_efforts or is_acceptable(pressures["after"]):
+        errors = _training_errors(breaths, pressures, training)
+        return Correction(pressures, errors, estimates.plants(recording_model.fit))
+    kept, left_out = conclusion.base, "the identified mechanisms"
     if conclusion.unnamed is not None and conclusion.named.names:
-        pressure = found.pressures(conclusion.named, held, breaths.pressure[:, 0])
-        if serves(pressure):
-            kept, what = conclusion.named, "what has no name"
-            answers = answers | {"after": pressure}
+        pressure = recording_model.pressures(conclusion.named, held, breaths.pressure[:, 0])
+        if is_acceptable(pressure):
+            kept, left_out = conclusion.named, "the nonparametric term"
+            pressures = pressures | {"after": pressure}
     if kept is conclusion.base:
-        answers = answers | {"after": answers["refit"]}
+        pressures = pressures | {"after": pressures["refit"]}
     note = (
-        f"With {what} the simulator would err more on the breaths that were fitted than with R "
-        "and C refitted, so the corrected simulator is without it."
+        f"With {left_out}, the simulator would err more on the training breaths than with R and C "
+        "refitted alone, so the corrected simulator does without."
     )
-    plants = estimates.plants_of(kept, found.evaluator)
-    return Correction(answers, _errs(breaths, answers, seen), plants, notes=(note,))
+    plants = estimates.plants_of(kept, recording_model.evaluator)
+    errors = _training_errors(breaths, pressures, training)
+    return Correction(pressures, errors, plants, notes=(note,))
 
 
-def _errs(
-    breaths: Breaths, answers: dict[str, Floats], seen: NDArray[np.bool_]
+def _training_errors(
+    breaths: Breaths, pressures: dict[str, Floats], training: NDArray[np.bool_]
 ) -> tuple[float, float]:
     before, after = (
-        open_loop_error(breaths.pressure, answers[key], seen).mae for key in ("before", "after")
+        open_loop_error(breaths.pressure, pressures[key], training).mae
+        for key in ("before", "after")
     )
     return before, after
 
 
-def _beside(
-    breaths: Breaths, plant: Given, wanted: dict[str, Plant], own: dict[str, Plant]
+def _corrected_plants(
+    breaths: Breaths, simulators: Simulators, wanted: dict[str, Plant], own: dict[str, Plant]
 ) -> dict[str, Plant]:
     """The given plant of each lung plus the difference of two physics."""
-    make = simulators.plants_for(plant)
-    result: dict[str, Plant] = {}
-    for name, index in breaths.by_lung_index.items():
-        with float64():
-            stacked = make(breaths.select(index[:1]))
-            one = jax.tree.map(lambda leaf: leaf[0], stacked)
-        result[name] = Corrected(one, wanted[name], own[name])
-    return result
+    return {
+        name: Corrected(simulators.plant_of_breath(breaths, int(index[0])), wanted[name], own[name])
+        for name, index in breaths.by_lung_index.items()
+    }
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]

@@ -1,162 +1,200 @@
-"""A whole diagnosis: what a simulator lacks, by a recording."""
+"""A whole diagnosis: which mechanisms a simulator lacks, by a recording."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ventbench.diagnosis import estimates, shapes, simulators, split
-from ventbench.diagnosis.against import against
-from ventbench.diagnosis.compare import Lack, lacking
+from ventbench.diagnosis import estimates
 from ventbench.diagnosis.conclusion import Conclusion
-from ventbench.diagnosis.corrected import Correction, corrected
+from ventbench.diagnosis.corrected import Correction, correct
 from ventbench.diagnosis.experiment_design import request_breaths
 from ventbench.diagnosis.findings import BreathRequest, MissingMechanism, Traces, Verdict
-from ventbench.diagnosis.found import Found, found_in
+from ventbench.diagnosis.identification import IdentifiedModel, held_out, identify, usable
 from ventbench.diagnosis.refinement import Alternatives
 from ventbench.diagnosis.residual_analysis import compare_open_loop, flow_and_volume, locate
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
-from ventbench.diagnosis.simulators import Given
-from ventbench.diagnosis.steady import steadied
+from ventbench.diagnosis.simulator_comparison import (
+    identify_both,
+    missing_mechanisms,
+    refit_at_simulator_parameters,
+)
 from ventbench.errors import InputError
 from ventbench.mechanics.lung_match import LungMatch
+from ventbench.plants.catalog import Given, Simulators, load_simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit, Noise, recorded
-from ventbench.system_id.data import Floats
 
-Progress = Callable[[str, float], None]
+#: Receives the current step in words, and the share of the whole that is done.
+Progress: TypeAlias = Callable[[str, float], None]
 
 
 def diagnose(
     breaths: Breaths,
     *,
-    plant: Given = "physics",
+    simulator: Given = "physics",
     lung: str | None = None,
     passive: bool = False,
     progress: Progress | None = None,
     settings: SelectionConfig = DEFAULT,
 ) -> Diagnosis:
-    """Find what a simulator lacks.
+    """Find which mechanisms a simulator lacks.
 
-    The same language is fitted to the recording and, unless the simulator is the base model itself,
-    to its answers to the same commands: what only the recording needs is missing.
+    The same candidate mechanisms are fitted to the recording and, unless the simulator is the base
+    model, to the simulator's response to the recorded commands. What only the recording needs is
+    missing.
 
     Args:
-        breaths: n recorded breaths; every third one of a lung is held out.
-        plant: see :data:`~ventbench.diagnosis.simulators.Given`.
+        breaths: n recorded breaths; every third breath of a lung is held out.
+        simulator: what to diagnose. A name (``"physics"``, ``"frozen"``, ``"learned"``,
+            ``"two_balloon"``), a path to a plant file, a plant, plants by lung id, an array of
+            simulated pressures of these breaths, cmH2O, ``(n, T)``, or a Python function of one
+            breath's commands, ``f(u_in, u_out, dt, *, R, C, initial_pressure)``, that returns the
+            pressures, cmH2O, ``(T,)``; see :class:`~ventbench.plants.catalog.PressureFunction`.
         lung: use only the breaths of this label.
-        passive: nobody breathes, as in a test lung: efforts are out of the question.
-        progress: is told what is done and which share of the whole is behind.
+        passive: True if nobody breathes, as with a test lung: patient efforts are excluded.
+        progress: receives the current step in words, and the share that is done.
         settings: every threshold.
+
+    Returns:
+        The diagnosis. Functions and arrays have no plants, so that ``plants`` is empty; the
+        corrected pressures are in ``corrected_pressures``.
 
     Raises:
         InputError: if there are too few breaths, or no simulator for their lung.
+
+    Example:
+        >>> import numpy as np
+        >>> def ideal(u_in, u_out, dt, *, R, C, initial_pressure):
+        ...     flow = 22.8 * u_in / 1000.0  # L/s
+        ...     volume = np.concatenate([[0.0], np.cumsum(flow * dt)[:-1]])
+        ...     pressure = initial_pressure + 1000.0 * volume / C + R * flow
+        ...     return np.where(u_out == 1, initial_pressure, pressure)
+        >>> diagnosis = diagnose(breaths, simulator=ideal)  # doctest: +SKIP
+        >>> print(diagnosis)  # doctest: +SKIP
     """
     began = time.perf_counter()
     tell = progress or (lambda what, share: None)
+    simulators = load_simulators(simulator, breaths=breaths)
     if lung is not None:
         breaths = breaths.select(np.flatnonzero(breaths.lung_ids == lung))
-    breaths, notes = split.usable(breaths)
-    held = split.held_out(breaths)
+    breaths, notes = usable(breaths, settings.data)
+    held = held_out(breaths, settings.data)
     tell("simulating", 0.02)
-    before = simulators.answers(plant, breaths)
+    before = simulators.pressures(breaths)
     data = recorded(breaths)
     excluded = ("patient_effort",) if passive else ()
-    alone = found_in(data, held, excluded, lambda what: tell(what, 0.3), settings)
-    found, had = alone, None
-    if plant != "physics":
-        tell("the same questions to the simulator", 0.6)
-        found, had = against(data, held, before, alone, excluded, lambda what: tell(what, 0.7))
+    recording_only_model = identify(data, held, excluded, lambda what: tell(what, 0.3), settings)
+    recording_model, simulator_model = recording_only_model, None
+    if not simulators.is_base_physics:
+        tell("fitting the simulator's response", 0.6)
+        recording_model, simulator_model = identify_both(
+            data, held, before, recording_only_model, excluded, lambda what: tell(what, 0.7)
+        )
     tell("drawing conclusions", 0.9)
-    return _diagnosis(breaths, held, before, found, had, alone.fit, plant, notes, began)
-
-
-def _diagnosis(
-    breaths: Breaths, held: NDArray[np.bool_], before: Floats, found: Found, had: Found | None,
-    alone: Fit, plant: Given, notes: list[str], began: float,
-) -> Diagnosis:  # fmt: skip
-    names, removed = lacking(found.fit, found.conclusion, had and had.fit, had and had.conclusion)
-    steady = None if had is None else steadied(found, had, [one.name for one in names])
-    if steady is not None:  # of what the recording does not show nothing is taken away
-        (found, kept), removed = steady, []
-        names = [one for one in names if one.name in kept]
-    conclusion = found.conclusion
-    correction = corrected(breaths, held, before, found, had, plant)
-    answers = correction.answers
-    place = shapes.slot(conclusion)
-    own = had.conclusion.unnamed if had is not None else None
-    if own is not None and place is not None and own.name == place.name:
-        removed.append(f"The simulator has something without a name at {place.name} as well.")
-    useless = correction.left and (bool(names) or place is not None)
-    if useless:
-        names, place, removed = [], None, [_left(correction)]
-    noise = conclusion.noise
-    lungs, more = _lungs(breaths, alone)
-    flow, volume = flow_and_volume(breaths, found.fit, answers["refit"])
-    here = np.flatnonzero(~np.isnan(answers["refit"]).all(axis=1))
+    missing, notes_on_simulator = missing_mechanisms(recording_model, simulator_model)
+    if simulator_model is not None:
+        steady = refit_at_simulator_parameters(recording_model, simulator_model, tuple(missing))
+        if steady is not None:  # the simulator keeps its mechanisms, shown by the recording or not
+            (recording_model, kept), notes_on_simulator = steady, []
+            missing = {name: changed for name, changed in missing.items() if name in kept}
+    conclusion = recording_model.conclusion
+    correction = correct(breaths, held, before, recording_model, simulator_model, simulators)
+    term = estimates.nonparametric_term(conclusion)
+    own = simulator_model.conclusion.unnamed if simulator_model is not None else None
+    if own is not None and term is not None and own.name == term.name:
+        notes_on_simulator.append(f"The simulator needs a nonparametric term at {term.name} too.")
+    rejected = correction.unchanged and (bool(missing) or term is not None)
+    if rejected:
+        missing, term, notes_on_simulator = {}, None, [_note_on_unchanged(correction)]
+    lungs, notes_on_lungs = _lungs(breaths, recording_only_model.fit)
+    noise, pressures = conclusion.noise, correction.pressures
+    flow, volume = flow_and_volume(breaths, recording_model.fit, pressures["refit"])
+    here = np.flatnonzero(~np.isnan(pressures["refit"]).all(axis=1))
     location = locate(
-        breaths.select(here), answers["refit"][here], noise.sigma[0], flow[here], volume[here]
-    )
-    unnamed = place is not None or conclusion.unresolved or (useless and location)
-    verdict: Verdict = "named" if names else "unnamed" if unnamed else "nothing_missing"
+        breaths.select(here), pressures["refit"][here], noise.sigma[0], flow[here], volume[here],
+        settings=settings.residuals,
+    )  # fmt: skip
+    unnamed = term is not None or conclusion.unresolved or (rejected and location)
+    verdict: Verdict = "named" if missing else "unnamed" if unnamed else "nothing_missing"
     return Diagnosis(
         verdict=verdict,
-        mechanisms=tuple(_named(one, conclusion, found.fit, had) for one in names),
-        nonparametric=place,
+        mechanisms=tuple(
+            _missing_mechanism(name, changed, recording_model, simulator_model)
+            for name, changed in missing.items()
+        ),
+        nonparametric=term,
         location=location,
-        open_loop=compare_open_loop(breaths, held, answers, float(noise.sigma[0])),
+        open_loop=compare_open_loop(
+            breaths, held, pressures, float(noise.sigma[0]), settings.residuals
+        ),
         lungs=lungs,
-        request=None if useless else _request(conclusion),
-        traces=Traces(breaths, held, answers["before"], answers["refit"], answers["after"], flow,
-                      volume),
+        request=None if rejected else _request(conclusion, settings),
+        traces=Traces(breaths, held, pressures["before"], pressures["refit"], pressures["after"],
+                      flow, volume),
         plants=correction.plants,
-        simulator=plant if isinstance(plant, str) else "given",
+        simulator=_name(simulator, simulators),
         noise=(float(noise.sigma[0]), float(noise.ar[0])),
-        notes=(*notes, *removed, *correction.notes, *more),
+        notes=(*notes, *notes_on_simulator, *correction.notes, *notes_on_lungs),
+        settings=settings,
         seconds=time.perf_counter() - began,
     )  # fmt: skip
 
 
-def _left(correction: Correction) -> str:
+def _name(given: Given, simulators: Simulators) -> str:
+    """What the reports call a simulator."""
+    has_name = isinstance(given, str | Path | Simulators) or simulators.kind == "function"
+    return simulators.name if has_name else "given"
+
+
+def _note_on_unchanged(correction: Correction) -> str:
     """Why a simulator is left as it is."""
-    before, after = correction.errs
+    before, after = correction.training_errors
     return (
-        "What could be found would make the simulator err more on the breaths that were fitted "
-        f"({after:.2f} instead of {before:.2f} cmH2O, mean), so it is left as it is."
+        "The identified correction would raise the simulator's mean absolute error on the training "
+        f"breaths from {before:.2f} to {after:.2f} cmH2O, so the simulator is left as it is."
     )
 
 
 def _lungs(breaths: Breaths, fit: Fit) -> tuple[tuple[LungMatch, ...], list[str]]:
-    """The lungs: by flow or volume where they are recorded, which needs no model of the valve."""
+    """The lungs; from flow or volume where they are recorded, which needs no model of the valve."""
     if breaths.flow is not None or breaths.volume is not None:
         try:
-            matches, notes = estimates.lungs_by_flow(breaths)
+            matches, notes = estimates.lung_matches_by_flow(breaths)
             return matches, list(notes)
         except InputError as error:
-            return estimates.lungs(fit), [f"R and C are from pressure alone: {error}."]
-    return estimates.lungs(fit), []
+            return estimates.lung_matches(fit), [f"R and C are from pressure alone: {error}."]
+    return estimates.lung_matches(fit), []
 
 
-def _named(one: Lack, conclusion: Conclusion, fit: Fit, had: Found | None) -> MissingMechanism:
-    other = conclusion.alternatives.get(one.name, Alternatives((), 1.0, ()))
-    own = estimates.parameters(had.fit, one.name) if had is not None and one.changed else {}
+def _missing_mechanism(
+    name: str,
+    changed: bool,
+    recording_model: IdentifiedModel,
+    simulator_model: IdentifiedModel | None,
+) -> MissingMechanism:
+    conclusion = recording_model.conclusion
+    alternatives = conclusion.alternatives.get(name, Alternatives((), 1.0, ()))
+    own = {}
+    if simulator_model is not None and changed:
+        own = estimates.parameter_estimates(simulator_model.fit, name)
     return MissingMechanism(
-        one.name,
-        estimates.parameters(fit, one.name),
-        other.confidence,
-        other.names,
-        conclusion.held_out_gains.get(one.name, 0.0),
-        one.changed,
-        {key: x.value for key, x in own.items()},
+        name=name,
+        parameters=estimates.parameter_estimates(recording_model.fit, name),
+        confidence=alternatives.confidence,
+        alternatives=alternatives.names,
+        nats=conclusion.held_out_gains.get(name, 0.0),
+        changed=changed,
+        simulator_values={key: estimate.value for key, estimate in own.items()},
     )
 
 
-def _request(conclusion: Conclusion) -> BreathRequest | None:
-    rivals = [one.fitted for other in conclusion.alternatives.values() for one in other.models]
-    return request_breaths(
-        conclusion.named, rivals, noise=Noise((conclusion.noise.sigma[0],), (0.0,))
-    )
+def _request(conclusion: Conclusion, settings: SelectionConfig) -> BreathRequest | None:
+    rivals = [rival.fitted for other in conclusion.alternatives.values() for rival in other.models]
+    noise = Noise((conclusion.noise.sigma[0],), (0.0,))
+    return request_breaths(conclusion.named, rivals, noise=noise, settings=settings.experiments)

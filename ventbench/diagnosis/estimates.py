@@ -1,4 +1,4 @@
-"""Parameters with intervals, lungs and plants of a conclusion."""
+"""What is reported of a conclusion: estimates with intervals, lungs, plants, nonparametric term."""
 
 from __future__ import annotations
 
@@ -8,27 +8,40 @@ from typing import Any
 import numpy as np
 
 from ventbench import mechanics
+from ventbench.diagnosis.conclusion import Conclusion, UnnamedEffect
 from ventbench.diagnosis.evaluator import Evaluator
+from ventbench.diagnosis.findings import NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
+from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY, LatentInput
 from ventbench.diagnosis.patient_effort import EFFORT
+from ventbench.diagnosis.screening import component_of
 from ventbench.interfaces import Plant
 from ventbench.mechanics.lung_match import Estimate, LungMatch
 from ventbench.physics.catalogue import library, mechanism, parameter, paths
+from ventbench.physics.component_curves import component_curves, without_absorbed
 from ventbench.physics.model import Physics
+from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.precision import float64
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit, fit, interval
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.derivatives import START, Simulator
 
+#: What a latent input is, by the place where it enters.
+_LATENT_INPUTS = {
+    ALVEOLUS: "a pressure at the alveolus that varies in time and that no command explains",
+    SUPPLY: "a flow of the supply that varies in time and that no command explains",
+    MEASUREMENT: "a pressure at the sensor that varies in time and that is not in the airway",
+}
 
-def estimated(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -> Fit:
-    """Fit a conclusion's hypothesis to a side's breaths, with covariance.
+
+def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -> Fit:
+    """Fit the hypothesis of a conclusion to breaths, with covariance.
 
     Args:
-        fitted: the conclusion, on some of the breaths.
+        fitted: the concluded model, fitted to some of the breaths.
         partition: breaths to fit.
-        evaluator: that it was found on.
+        evaluator: with which the model was fitted.
     """
     hypothesis = fitted.hypothesis
     own = [path for path in paths(hypothesis.names) if "." in path]
@@ -46,7 +59,7 @@ def estimated(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
     if len(np.unique(known.lung)) > 1:
         same = (partition.data.R[:, None] == known.R) & (partition.data.C[:, None] == known.C)
         start |= {path: fitted.column(path)[np.argmax(same, axis=1)] for path in ("R", "C")}
-    if EFFORT in hypothesis.names:  # each breath's own are looked for where it is likeliest
+    if EFFORT in hypothesis.names:  # the efforts of each breath start where they are likeliest
         near = evaluator.fit(
             hypothesis, fitted.noise, start=start, partition=partition, restart=True
         )
@@ -62,65 +75,71 @@ def estimated(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
     )
 
 
-def parameters(found: Fit, name: str) -> dict[str, Estimate]:
-    """Values and intervals of a mechanism; of what is each breath's own, over the breaths."""
+def parameter_estimates(fitted: Fit, name: str) -> dict[str, Estimate]:
+    """Estimates of a mechanism's free parameters, by short name.
+
+    Of a parameter that differs between breaths: median and central 95 % over the breaths.
+    """
     values = {}
-    for item in mechanism(name).description.parameters:
-        path = f"{name}.{item.name}"
-        if path not in found.problem.unknowns.paths:
+    for about in mechanism(name).description.parameters:
+        path = f"{name}.{about.name}"
+        if path not in fitted.problem.unknowns.paths:
             continue
-        if item.scope == "breath":
-            column = found.column(path)
+        if about.scope == "breath":
+            column = fitted.column(path)
             low, middle, high = np.quantile(column, [0.025, 0.5, 0.975])
-            values[item.name] = Estimate(float(middle), item.unit, (float(low), float(high)))
+            values[about.name] = Estimate(float(middle), about.unit, (float(low), float(high)))
         else:
-            one = interval(found, path)
-            values[item.name] = Estimate(one.value, item.unit, (one.low, one.high))
+            ends = interval(fitted, path)
+            values[about.name] = Estimate(ends.value, about.unit, (ends.low, ends.high))
     return values
 
 
-def lungs(found: Fit) -> tuple[LungMatch, ...]:
-    """R and C of each label as the model has them, and whether the label can be right.
+def lung_matches(fitted: Fit) -> tuple[LungMatch, ...]:
+    """Fitted R and C of each lung, and whether its label can be right.
 
-    Judged as :func:`~ventbench.mechanics.match_labels` does, at the flow that labels hold for.
+    The label is judged by :func:`~ventbench.mechanics.match_labels`, at the flow of its definition.
     """
-    settings, matches = mechanics.settings_by_label(found), []
-    for group, one in enumerate(mechanics.match_labels(found)):
-        ends = {path: found.ci95(path)[group] for path in ("R", "C")}
+    settings, matches = mechanics.settings_by_label(fitted), []
+    for group, match in enumerate(mechanics.match_labels(fitted)):
+        ends = {path: fitted.ci95(path)[group] for path in ("R", "C")}
         matches.append(
             replace(
-                one,
-                fitted_R=float(found.value("R")[group]),
-                fitted_C=float(found.value("C")[group]),
+                match,
+                fitted_R=float(fitted.value("R")[group]),
+                fitted_C=float(fitted.value("C")[group]),
                 ci95_R=(float(ends["R"][0]), float(ends["R"][1])),
                 ci95_C=(float(ends["C"][0]), float(ends["C"][1])),
-                settings=tuple(item.id for item in settings[one.label]),
+                settings=tuple(setting.id for setting in settings[match.label]),
             )
         )
     return tuple(matches)
 
 
-def lungs_by_flow(breaths: Breaths) -> tuple[tuple[LungMatch, ...], tuple[str, ...]]:
-    """The same from pressure and flow or volume, whatever the valve did; and what to know of it.
+def lung_matches_by_flow(breaths: Breaths) -> tuple[tuple[LungMatch, ...], tuple[str, ...]]:
+    """R and C of each lung from pressure and flow or volume, and notes.
+
+    Needs no model of the valve.
 
     Raises:
-        InputError: if too little of them is recorded.
+        InputError: if too little flow or volume is recorded.
     """
-    found = mechanics.identify(breaths)
+    lungs = mechanics.identify(breaths)
     matches = [
-        replace(one.match, settings=tuple(item.id for item in one.settings)) for one in found
+        replace(lung.match, settings=tuple(setting.id for setting in lung.settings))
+        for lung in lungs
     ]
-    return tuple(matches), tuple(note for one in found for note in one.notes)
+    return tuple(matches), tuple(note for lung in lungs for note in lung.notes)
 
 
-def plants(found: Fit) -> dict[str, Plant]:
-    """The fitted plant of each lung, by label, without what each breath has of its own."""
-    problem = found.problem
-    return _by_label(problem.data, problem.simulator, found.mechanisms, found.values)
+def plants(fitted: Fit) -> dict[str, Plant]:
+    """The fitted plant of each lung, by label, without parameters that differ between breaths."""
+    problem = fitted.problem
+    return _by_label(problem.data, problem.simulator, fitted.mechanisms, fitted.values)
 
 
 def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
-    """The same of a hypothesis as it was fitted to the training breaths of a bench."""
+    """The plant of each lung, by label, of a model that was fitted to the training breaths."""
     partition = evaluator.training
     return _by_label(
         partition.data,
@@ -145,3 +164,55 @@ def _by_label(
             plant = Physics((), (), simulator.substeps, simulator.memory).having(**given)
         result[f"R{R:g}C{C:g}"] = plant
     return result
+
+
+def nonparametric_term(conclusion: Conclusion) -> NonparametricTerm | None:
+    """Describe the nonparametric term of a conclusion; None if there is none."""
+    place = conclusion.unnamed
+    if place is None:
+        return None
+    explains = _share(conclusion)
+    if place.latent_input is not None:
+        return _latent_input(place, place.latent_input, explains)
+    assert place.term is not None
+    x, y, x_unit, y_unit = _curve(conclusion.full, place.term)
+    meaning = NONPARAMETRIC_COMPONENTS[place.name].meaning
+    return NonparametricTerm(place.name, meaning, explains, place.nats, x, x_unit, y, y_unit)
+
+
+def _share(conclusion: Conclusion) -> float:
+    """Share of the squared error above the noise that the term explains, 0..1."""
+    named = conclusion.named
+    weight = named.problem.data.weight
+    before = float(np.sum(named.residual**2) / weight.sum())
+    floor = float(conclusion.noise.sigma[0] ** 2)
+    if conclusion.unnamed is not None and conclusion.unnamed.latent_input is not None:
+        after = floor
+    else:
+        after = float(np.sum(conclusion.full.residual**2) / weight.sum())
+    return float(np.clip((before - after) / max(before - min(floor, after), 1e-9), 0.0, 1.0))
+
+
+def _latent_input(place: UnnamedEffect, source: LatentInput, explains: float) -> NonparametricTerm:
+    size = np.sqrt(np.mean(source.course**2, axis=1))
+    course = source.course[int(np.argmax(size))]
+    unit = "share of the flow, 1" if place.name == SUPPLY else "pressure, cmH2O"
+    meaning = _LATENT_INPUTS[place.name]
+    if source.periodic:
+        meaning += f", {source.scale:.1f} times a second"
+    x = np.arange(len(course), dtype=float)
+    return NonparametricTerm(
+        place.name, meaning, explains, place.nats, x, "sample of the breath where it is largest",
+        course, unit,
+    )  # fmt: skip
+
+
+def _curve(full: FittedModel, element: str) -> tuple[np.ndarray, np.ndarray, str, str]:
+    own = [f"{element}.{p.name}" for p in mechanism(element).description.parameters]
+    values = {
+        name: float(np.median(full.column(name)))
+        for name in (*own, "R", "C", "gain", "R_ex", "PEEP")
+    }
+    # The component's other terms are neutral; the strongest curve is the first.
+    curve = without_absorbed(component_curves(component_of(element), values)[0])
+    return np.asarray(curve.x, float), np.asarray(curve.y, float), curve.x_unit, curve.y_unit

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ventbench.diagnosis.candidate_breaths import Family, Rig, families
 from ventbench.diagnosis.findings import BreathRequest
+from ventbench.diagnosis.settings import DEFAULT, ExperimentSettings
 from ventbench.lungs import Lung
 from ventbench.physics.catalogue import parameter, strength_path
 from ventbench.system_id.data import Data, Floats
@@ -24,16 +25,6 @@ from ventbench.system_id.least_squares import Minimum
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.problem import Problem
 from ventbench.system_id.unknowns import described
-
-#: Pressures, cmH2O, that every hypothesis must predict for a breath: 0 to 50, with allowance for
-#: the noise of the starting pressure.
-SAFE = (-1.0, 50.0)
-
-#: Nats below which new breaths would not distinguish the hypotheses.
-LEAST = 1.0
-
-#: Factor by which a breath that is not safe is weakened, and how often that is tried.
-_WEAKER, _TRIES = 0.75, 3
 
 #: Share of the diagonal that keeps a Hessian invertible where data say nothing.
 _RIDGE = 1e-9
@@ -61,7 +52,7 @@ def request_breaths(
     alternatives: Sequence[FittedHypothesis],
     *,
     noise: Noise | None = None,
-    breaths: int = 5,
+    settings: ExperimentSettings = DEFAULT.experiments,
 ) -> BreathRequest | None:
     """Find the breaths to record next.
 
@@ -73,7 +64,7 @@ def request_breaths(
         chosen: the best hypothesis, on the recorded breaths.
         alternatives: hypotheses to distinguish it from.
         noise: of the measurement; that of ``chosen`` if not given.
-        breaths: number of breaths to record.
+        settings: number of breaths, limits and thresholds.
 
     Returns:
         Commands with what to do in words, or None if no safe breaths would distinguish them.
@@ -86,10 +77,10 @@ def request_breaths(
         here = np.flatnonzero((data.lung == label) & (data.weight[:, 0].any(axis=1)))
         if not here.size:
             continue
-        design = _best_on_lung(chosen, alternatives, noise, breaths, here)
+        design = _best_on_lung(chosen, alternatives, noise, settings, here)
         if design and (best is None or design.nats > best.nats):
             best = design
-    if best is None or best.nats < LEAST:
+    if best is None or best.nats < settings.min_information:
         return None
     return _worded(best, (chosen, *alternatives), float(np.median(data.dt)))
 
@@ -247,8 +238,8 @@ class _Design:
 
 
 def _best_on_lung(
-    chosen: FittedHypothesis, alternatives: Sequence[FittedHypothesis], noise: Noise, breaths: int,
-    here: NDArray[np.intp],
+    chosen: FittedHypothesis, alternatives: Sequence[FittedHypothesis], noise: Noise,
+    settings: ExperimentSettings, here: NDArray[np.intp],
 ) -> _Design | None:  # fmt: skip
     """The best design on the lung of the recorded breaths ``here``."""
     problem = chosen.problem
@@ -258,7 +249,7 @@ def _best_on_lung(
     start = float(np.median(values[:, -1]))
     samples, dt = problem.data.u_in.shape[1], float(np.median(problem.data.dt))
     every = (chosen, *alternatives)
-    kinds = _safe(families(rig, samples, dt), every, problem.data, here, start)
+    kinds = _safe(families(rig, samples, dt, settings), every, problem.data, here, start, settings)
     if not kinds:
         return None
     data = _data(kinds, problem.data, here)
@@ -273,7 +264,7 @@ def _best_on_lung(
         )
     ]
     lung = Lung(float(problem.data.R[here[0]]), float(problem.data.C[here[0]]))
-    return _best(kinds, pairs, breaths, lung)
+    return _best(kinds, pairs, settings.breaths, lung)
 
 
 def _best(
@@ -299,23 +290,24 @@ def _best(
 
 def _safe(
     kinds: tuple[Family, ...], hypotheses: Sequence[FittedHypothesis], recorded: Data,
-    here: NDArray[np.intp], start: float,
+    here: NDArray[np.intp], start: float, settings: ExperimentSettings,
 ) -> tuple[Family, ...]:  # fmt: skip
-    """Breaths that every hypothesis predicts within :data:`SAFE`, weakened where needed."""
-    for attempt in range(_TRIES + 1):
+    """Breaths that every hypothesis predicts within the pressure limits, weakened where needed."""
+    low, high = settings.pressure_limits
+    for attempt in range(settings.attempts + 1):
         data = _data(kinds, recorded, here)
         safe = np.ones(len(data), bool)
         for hypothesis in hypotheses:
             known = hypothesis.problem.simulator
             simulator = Simulator(data, known.names, known.substeps)
             pressure = simulator.predict(values_of(hypothesis, data, here, start))[:, 0]
-            inside = (pressure >= SAFE[0]) & (pressure <= SAFE[1])  # False where it is not finite
+            inside = (pressure >= low) & (pressure <= high)  # False where it is not finite
             safe &= inside.all(axis=1)
         parts = np.split(safe, np.cumsum([len(kind.u_in) for kind in kinds])[:-1])
-        if safe.all() or attempt == _TRIES:
+        if safe.all() or attempt == settings.attempts:
             break
         kinds = tuple(
-            kind.scaled(np.where(part, 1.0, _WEAKER))
+            kind.scaled(np.where(part, 1.0, settings.weaker))
             for kind, part in zip(kinds, parts, strict=True)
         )
     left = (kind.select(part) for kind, part in zip(kinds, parts, strict=True))

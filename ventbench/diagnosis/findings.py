@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.interfaces import Plant
 from ventbench.mechanics.lung_match import Estimate, LungMatch
 from ventbench.recordings.breaths import Breaths
@@ -183,6 +184,7 @@ class Findings:
             neighbouring samples.
         notes: further information for the reader, a sentence each.
         seconds: computing time.
+        settings: every threshold of the diagnosis.
     """
 
     verdict: Verdict
@@ -198,3 +200,4 @@ class Findings:
     noise: tuple[float, float]
     notes: tuple[str, ...]
     seconds: float
+    settings: SelectionConfig = DEFAULT

@@ -15,30 +15,11 @@ from numpy.typing import NDArray
 
 from ventbench.diagnosis.findings import ErrorRegion, OpenLoopComparison, OpenLoopError
 from ventbench.diagnosis.residual_axes import Axis, axes
+from ventbench.diagnosis.settings import DEFAULT, ResidualSettings
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit
 
 Floats = NDArray[np.float64]
-
-#: Random sign flips; a p-value is at least one over one more than these.
-FLIPS = 2000
-
-#: Fewest breaths that a range must have.
-FEWEST = 5
-
-#: Excess of the squared error that matters, as a share of the noise's variance. Noise that differs
-#: a little from range to range is no missing physics.
-MATERIAL = 0.3
-
-#: Part of the permitted false alarms that the test of the mean gets. The test of the square, whose
-#: differences are skewed, errs less often than it may: it would waste half.
-MEAN = 0.8
-
-#: Below this p-value regions are ordered by their share of the error, not by their p-values.
-SURE = 0.01
-
-#: Length of what counts as the beginning of a breath, s.
-_BEGINNING = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +48,11 @@ def open_loop_error(recorded: Floats, simulated: Floats, mask: NDArray[np.bool_]
 
 
 def compare_open_loop(
-    breaths: Breaths, held_out: NDArray[np.bool_], pressures: dict[str, Floats], noise_floor: float
+    breaths: Breaths,
+    held_out: NDArray[np.bool_],
+    pressures: dict[str, Floats],
+    noise_floor: float,
+    settings: ResidualSettings = DEFAULT.residuals,
 ) -> OpenLoopComparison:
     """Open-loop errors of a simulator before and after its correction.
 
@@ -76,6 +61,7 @@ def compare_open_loop(
         held_out: breaths that no fit has seen, ``(n,)``.
         pressures: of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n, T)``.
         noise_floor: standard deviation of the noise, cmH2O.
+        settings: length of the beginning of inspiration.
     """
     # The first sample is where every simulation starts.
     inspiration = breaths.inspiratory & (breaths.time > 0) & held_out[:, None]
@@ -86,10 +72,10 @@ def compare_open_loop(
             for stage, simulated in pressures.items()
         }
 
-    whole = by_stage(inspiration)
+    whole, beginning = by_stage(inspiration), settings.beginning
     parts = {
-        f"first {_BEGINNING:g} s of inspiration": inspiration & (breaths.time <= _BEGINNING),
-        "rest of inspiration": inspiration & (breaths.time > _BEGINNING),
+        f"first {beginning:g} s of inspiration": inspiration & (breaths.time <= beginning),
+        "rest of inspiration": inspiration & (breaths.time > beginning),
         "expiration": (breaths.u_out == 1) & breaths.valid & held_out[:, None],
     }
     lungs = breaths.by_lung_index
@@ -132,7 +118,7 @@ def locate(
     flow: Floats | None = None,
     volume: Floats | None = None,
     *,
-    level: float = 0.05,
+    settings: ResidualSettings = DEFAULT.residuals,
     seed: int = 0,
 ) -> tuple[ErrorRegion, ...]:
     """Find the ranges of phase, command, pressure and other quantities in which a simulator errs.
@@ -140,7 +126,7 @@ def locate(
     There are two tests for each range, over breaths: whether the mean error is zero, and whether
     the squared error exceeds that outside the range, which catches errors whose sign changes from
     breath to breath. The p-values are corrected for all ranges of all axes and for both tests: if
-    nothing is missing, the probability that any region is returned is ``level``.
+    nothing is missing, the probability that any region is returned is ``settings.level``.
 
     Args:
         breaths: n breaths of T samples.
@@ -148,26 +134,30 @@ def locate(
         noise_sd: standard deviation of the measurement, cmH2O; NaN to take it from the errors.
         flow: of the refitted simulator, mL/s, ``(n, T)``, or None.
         volume: of the refitted simulator, mL, ``(n, T)``, or None.
-        level: largest p-value that is returned.
+        settings: ranges and levels.
         seed: of the random sign flips.
 
     Returns:
-        Regions; first those with a p-value of at most :data:`SURE`, each group by its share of the
-        error. Neighbouring ranges with errors of one sign are merged.
+        Regions; first those with a p-value of at most ``settings.certain``, each group by its share
+        of the error. Neighbouring ranges with errors of one sign are merged.
     """
     error, usable = errors(breaths, refit)
-    all_axes = axes(breaths, refit, flow, volume)
-    if len(breaths) < FEWEST or not all_axes or not usable.any():
+    all_axes = axes(breaths, refit, flow, volume, settings)
+    if len(breaths) < settings.min_breaths or not all_axes or not usable.any():
         return ()
     columns = [_test_columns(axis, error, usable) for axis in all_axes]
     mean, excess, outside = (np.concatenate(part, axis=1) for part in zip(*columns, strict=True))
     variance = _noise_variance(noise_sd, error, usable)
-    by_mean = p_values(mean, two_sided=True, seed=seed)
-    by_square = p_values(excess, two_sided=False, seed=seed + 1, weight=outside[0])
+    by_mean = p_values(mean, two_sided=True, seed=seed, settings=settings)
+    by_square = p_values(
+        excess, two_sided=False, seed=seed + 1, weight=outside[0], settings=settings
+    )
     with np.errstate(invalid="ignore"):
-        by_square = np.where(_nanmean(excess) > MATERIAL * variance, by_square, 1.0)
-    p_value = np.minimum(1.0, np.minimum(by_mean / MEAN, by_square / (1.0 - MEAN)))
-    sign = np.where(by_mean / MEAN <= level, np.sign(np.nan_to_num(_nanmean(mean))), 0.0)
+        is_material = _nanmean(excess) > settings.min_excess * variance
+        by_square = np.where(is_material, by_square, 1.0)
+    by_mean = by_mean / settings.mean_share
+    p_value = np.minimum(1.0, np.minimum(by_mean, by_square / (1.0 - settings.mean_share)))
+    sign = np.where(by_mean <= settings.level, np.sign(np.nan_to_num(_nanmean(mean))), 0.0)
 
     regions: list[ErrorRegion] = []
     squares = np.where(usable, error**2 - variance, 0.0)
@@ -175,7 +165,7 @@ def locate(
     for axis in all_axes:
         own = slice(offset, offset + len(axis))
         offset += len(axis)
-        for first, last in _runs(p_value[own] <= level, sign[own], axis.merge):
+        for first, last in _runs(p_value[own] <= settings.level, sign[own], axis.merge):
             if axis.merge and len(axis) > 1 and _is_whole_axis(axis, usable, first, last):
                 continue  # the whole of an axis is no place
             inside = usable & (axis.bins >= first) & (axis.bins <= last)
@@ -191,7 +181,9 @@ def locate(
                     share=float(np.clip(share, 0.0, 1.0)),
                 )
             )
-    return tuple(sorted(regions, key=lambda region: (region.p_value > SURE, -region.share)))
+    return tuple(
+        sorted(regions, key=lambda region: (region.p_value > settings.certain, -region.share))
+    )
 
 
 def profiles(
@@ -232,7 +224,11 @@ def errors(breaths: Breaths, simulated: Floats) -> tuple[Floats, NDArray[np.bool
     return np.where(usable, difference, 0.0), usable
 
 
-def statistic(values: Floats, weight: Floats | None = None) -> Floats:
+def statistic(
+    values: Floats,
+    weight: Floats | None = None,
+    min_breaths: int = DEFAULT.residuals.min_breaths,
+) -> Floats:
     """Sum over breaths divided by the root of the sum of squares: t without its heavy tails.
 
     It rises with Student's t, ``t = z sqrt((n - 1) / (n - z^2))``, but never exceeds ``sqrt(n)``:
@@ -241,15 +237,23 @@ def statistic(values: Floats, weight: Floats | None = None) -> Floats:
     Args:
         values: of each breath and range, NaN where there is none, ``(n, k)``.
         weight: factor on each range's statistic, ``(k,)``.
+        min_breaths: fewest breaths that a range must have.
 
     Returns:
-        Shape ``(k,)``; zero for ranges with fewer than :data:`FEWEST` breaths.
+        Shape ``(k,)``; zero for ranges with fewer breaths.
     """
-    filled, scale = _scaled(values, weight)
+    filled, scale = _scaled(values, weight, min_breaths)
     return filled.sum(axis=0) * scale
 
 
-def p_values(values: Floats, *, two_sided: bool, seed: int, weight: Floats | None = None) -> Floats:
+def p_values(
+    values: Floats,
+    *,
+    two_sided: bool,
+    seed: int,
+    weight: Floats | None = None,
+    settings: ResidualSettings = DEFAULT.residuals,
+) -> Floats:
     """Probability that chance alone gives any range as large a statistic, ``(k,)``.
 
     Args:
@@ -257,22 +261,24 @@ def p_values(values: Floats, *, two_sided: bool, seed: int, weight: Floats | Non
         two_sided: whether large negative statistics count too.
         seed: of the sign flips.
         weight: factor on each range's observed statistic, ``(k,)``; not applied to the flips.
+        settings: number of flips, and fewest breaths of a range.
     """
-    filled, scale = _scaled(values, None)
-    signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=(FLIPS, len(values)))
-    flipped, observed = (signs @ filled) * scale, statistic(values, weight)
+    flips, min_breaths = settings.flips, settings.min_breaths
+    filled, scale = _scaled(values, None, min_breaths)
+    signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=(flips, len(values)))
+    flipped, observed = (signs @ filled) * scale, statistic(values, weight, min_breaths)
     if two_sided:
         flipped, observed = np.abs(flipped), np.abs(observed)
     largest = np.sort(flipped.max(axis=1, initial=0.0))
-    above = FLIPS - np.searchsorted(largest, observed * (1.0 - 1e-12), side="left")
-    return np.where(scale > 0, (1.0 + above) / (1.0 + FLIPS), 1.0)
+    above = flips - np.searchsorted(largest, observed * (1.0 - 1e-12), side="left")
+    return np.where(scale > 0, (1.0 + above) / (1.0 + flips), 1.0)
 
 
-def _scaled(values: Floats, weight: Floats | None) -> tuple[Floats, Floats]:
+def _scaled(values: Floats, weight: Floats | None, min_breaths: int) -> tuple[Floats, Floats]:
     there = np.isfinite(values)
     filled = np.where(there, values, 0.0)
     norm = np.sqrt(np.sum(filled**2, axis=0))
-    enough = (there.sum(axis=0) >= FEWEST) & (norm > 0)
+    enough = (there.sum(axis=0) >= min_breaths) & (norm > 0)
     scale = np.divide(1.0, norm, out=np.zeros_like(norm), where=enough)
     return filled, scale if weight is None else scale * weight
 

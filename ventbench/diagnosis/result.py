@@ -51,6 +51,7 @@ class Diagnosis(Findings):
             "sentences": report_text.sentences(self),
             "notes": list(self.notes),
             "seconds": self.seconds,
+            "settings": self.settings.as_dict(),
             "format": FORMAT,
             "ventbench": ventbench.__version__,
         }

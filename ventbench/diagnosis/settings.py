@@ -339,8 +339,6 @@ class ExperimentSettings:
         slow_inspiration: length of slow inflations, s.
         hold: length of a hold with both valves shut, s.
         shutter: length of the interruptions of an expiration, s.
-        reweightings: refits with the weights of robust noise.
-        ridge: share of the diagonal that keeps a Hessian invertible where data say nothing.
     """
 
     breaths: int = 5
@@ -355,8 +353,6 @@ class ExperimentSettings:
     slow_inspiration: float = 1.5
     hold: float = 2.0
     shutter: float = 0.16
-    reweightings: int = 4
-    ridge: float = 1e-9
 
 
 @dataclass(frozen=True)

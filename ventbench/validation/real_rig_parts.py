@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench import files, precision
-from ventbench.diagnosis.simulators import Given
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter
 from ventbench.physics.model import Physics
+from ventbench.plants.catalog import Given
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.plant_files import load_plants
 from ventbench.plants.two_balloon import two_balloon

@@ -16,11 +16,11 @@ import numpy as np
 
 import ventbench
 from ventbench import files, recordings
-from ventbench.diagnosis import simulators
 from ventbench.diagnosis.diagnose import diagnose as diagnose_recording
 from ventbench.diagnosis.residual_analysis import open_loop_error
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.errors import InputError
+from ventbench.plants.catalog import load_simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.validation.real_rig_parts import (
     PARTS,
@@ -166,7 +166,7 @@ def _run(
             progress(part.name, step, share)
 
     # Passive: the ventilator was connected to a test lung.
-    diagnosis = diagnose(setting.breaths, plant=setting.plant, passive=True, progress=tell)
+    diagnosis = diagnose(setting.breaths, simulator=setting.plant, passive=True, progress=tell)
     diagnosis = dataclasses.replace(diagnosis, simulator=setting.plant_name)
     out.mkdir(parents=True, exist_ok=True)
     (out / DONE).unlink(missing_ok=True)
@@ -202,7 +202,7 @@ def _mae_by_names_alone(diagnosis: Diagnosis) -> float | None:
         held_out: Breaths = diagnosis.traces.breaths.select(diagnosis.traces.held_out)
         plants = {lung: by_names_alone(plant) for lung, plant in diagnosis.plants.items()}
         inspiration = held_out.inspiratory & (held_out.time > 0)
-        simulated = simulators.answers(plants, held_out)
+        simulated = load_simulators(plants).pressures(held_out)
         error = open_loop_error(held_out.pressure, simulated, inspiration).mae
     return float(error) if np.isfinite(error) else None
 

@@ -144,7 +144,7 @@ def _ventbench_diagnosis(breaths: Breaths, lung: str) -> Answer:
     from ventbench.diagnosis.diagnose import diagnose
 
     compilation.keep()
-    return diagnose(breaths, plant="physics", lung=lung)
+    return diagnose(breaths, simulator="physics", lung=lung)
 
 
 def _peak_memory() -> float:

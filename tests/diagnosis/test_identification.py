@@ -9,10 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ventbench.diagnosis.split import EVERY, FEWEST, held_out, usable
+from ventbench.diagnosis.identification import held_out, usable
+from ventbench.diagnosis.settings import DEFAULT
 from ventbench.errors import InputError
 
 from . import made
+
+EVERY, FEWEST = DEFAULT.data.held_out_every, DEFAULT.data.min_breaths
 
 
 @given(st.lists(st.sampled_from([5.0, 20.0, 50.0]), min_size=1, max_size=40))

@@ -1,0 +1,295 @@
+"""A simulator compared with a recording: which mechanisms are missing in it.
+
+The same candidate mechanisms are fitted to the recording and to the simulator's response to the
+recorded commands. What only the recording needs is missing in the simulator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ventbench.diagnosis import estimates
+from ventbench.diagnosis.evaluator import Evaluator, groups_by_label
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, varies_by_breath
+from ventbench.diagnosis.identification import IdentifiedModel, identify
+from ventbench.diagnosis.selection import passes_heldout_test
+from ventbench.diagnosis.settings import DEFAULT
+from ventbench.physics.catalogue import mechanism
+from ventbench.system_id import Fit, fit
+from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.noise import Noise
+from ventbench.system_id.unknowns import described, freed
+
+
+def identify_both(
+    data: Data, held: NDArray[np.bool_], response: Floats, recording_only_model: IdentifiedModel,
+    excluded: tuple[str, ...], tell: Callable[[str], None],
+) -> tuple[IdentifiedModel, IdentifiedModel]:  # fmt: skip
+    """Identify the models of a simulator and of its recording.
+
+    What no model can describe may be common to both: valves that differ from breath to breath, or
+    learned shapes. If the simulator errs less with that part than the model of the recording does,
+    the part is subtracted from the recording, and the recording is identified anew: what is then
+    found is what the simulator lacks.
+
+    Args:
+        data: n recorded breaths.
+        held: which of them are held out, ``(n,)``.
+        response: pressures of the simulator for the recorded commands, cmH2O, ``(n, T)``.
+        recording_only_model: identified from the recording alone.
+        excluded: mechanisms that cannot act.
+        tell: receives the current step, in words.
+
+    Returns:
+        The models of the recording and of the simulator.
+    """
+    settings, noise = recording_only_model.evaluator.settings, recording_only_model.conclusion.noise
+    measured = with_sensor_noise(data, response, noise, settings.simulator.noise_seed)
+    simulator_model = identify(
+        measured, held, excluded, lambda what: tell(f"simulator: {what}"), settings
+    )
+    first = response[:, 0]
+    own = simulator_model.pressures(simulator_model.conclusion.full, held, first)
+    unmodelled = np.nan_to_num(response - own)
+    reduced = data.answered(data.seen[:, 0] - unmodelled)
+    refitted = refit_base_parameters(simulator_model, reduced.select(~held))
+    refit = simulator_model.pressures(refitted, held, first) + unmodelled
+    # Predicted as breaths to come: parameters of each breath are not known of them.
+    alone = recording_only_model.pressures(recording_only_model.conclusion.full, held, first)
+    seen = data.select(~held)
+    error = min(_mean_error(seen, response[~held]), _mean_error(seen, refit[~held]))
+    share = settings.simulator.residual_model_share
+    if error >= share * _mean_error(seen, alone[~held]):
+        return recording_only_model, simulator_model
+    recording_model = identify(
+        reduced,
+        held,
+        excluded,
+        lambda what: tell(f"recording less the simulator's part: {what}"),
+        settings,
+    )
+    fit = _noiseless_fit(simulator_model, data.answered(own), held, recording_model)
+    return recording_model, replace(simulator_model, fit=fit)
+
+
+def with_sensor_noise(
+    data: Data, response: Floats, noise: Noise, seed: int = DEFAULT.simulator.noise_seed
+) -> Data:
+    """A simulator's response as the sensor of the recording would have shown it.
+
+    With the noise of the recording, the same mechanisms are detectable in both.
+
+    Args:
+        data: n recorded breaths.
+        response: pressures of the simulator, cmH2O, ``(n, T)``.
+        noise: of the recording.
+        seed: of the noise.
+    """
+    rng = np.random.default_rng(seed)
+    sigma, ar = noise.sigma[0], noise.ar[0]
+    fresh = rng.normal(0.0, sigma * np.sqrt(1.0 - ar**2), response.shape)
+    coloured = np.zeros_like(fresh)
+    coloured[:, 0] = rng.normal(0.0, sigma, len(fresh))
+    for k in range(1, fresh.shape[1]):
+        coloured[:, k] = ar * coloured[:, k - 1] + fresh[:, k]
+    return data.answered(np.nan_to_num(response) + coloured)
+
+
+def refit_base_parameters(
+    simulator_model: IdentifiedModel, data: Data, noise: Noise | None = None
+) -> FittedModel:
+    """Refit R, C, R_ex and PEEP of the simulator's model to other breaths.
+
+    Args:
+        simulator_model: identified from the simulator's response.
+        data: the breaths.
+        noise: of the measurement; that of the model if not given.
+    """
+    own, evaluator = simulator_model.conclusion.full, simulator_model.evaluator
+    noise = noise or simulator_model.conclusion.noise
+    partition = Partition(data, evaluator.training.simulator)
+    return evaluator.fit(own.hypothesis, noise, own, partition=partition)
+
+
+def missing_mechanisms(
+    recording_model: IdentifiedModel, simulator_model: IdentifiedModel | None
+) -> tuple[dict[str, bool], list[str]]:
+    """Compare the mechanisms of a recording with those of a simulator.
+
+    Args:
+        recording_model: identified from the recording.
+        simulator_model: identified from the simulator's response; None for the base model, which
+            has no mechanisms.
+
+    Returns:
+        The missing mechanisms, the most important first, and whether the simulator has each with
+        other parameters; and notes on what the simulator has and the recording does not show.
+    """
+    wanted = recording_model.conclusion
+    order = sorted(wanted.names, key=lambda name: -wanted.held_out_gains.get(name, 0.0))
+    if simulator_model is None:
+        return dict.fromkeys(order, False), []
+    present = simulator_model.conclusion.names
+    missing = {
+        name: name in present
+        for name in order
+        if name not in present or _differs(recording_model, simulator_model, name)
+    }
+    notes = [
+        f"The simulator has {mechanism(name).description.title}, which the recording does not show."
+        for name in present
+        if name not in wanted.names
+    ]
+    return missing, notes
+
+
+def refit_at_simulator_parameters(
+    recording_model: IdentifiedModel, simulator_model: IdentifiedModel, missing: Sequence[str]
+) -> tuple[IdentifiedModel, tuple[str, ...]] | None:
+    """Fit what a simulator lacks with the rest of its physics held at the simulator's own values.
+
+    The base parameters are refitted in every hypothesis so that mechanisms can be trusted, but they
+    need not be wrong in the simulator: from a few breaths each R and C is uncertain, and a
+    correction by them costs accuracy on held-out breaths.
+
+    Args:
+        recording_model: identified from the recording.
+        simulator_model: identified from the simulator's response.
+        missing: mechanisms that the simulator lacks, or has with other parameters.
+
+    Returns:
+        The model of the recording with the simulator's own R, C, R_ex, PEEP and other mechanisms,
+        and the mechanisms that are still missing; None if held-out breaths ask for other values.
+    """
+    full, own = recording_model.conclusion.full, simulator_model.conclusion.full
+    if any(varies_by_breath(name) for name in (*full.names, *own.names)):
+        return None
+    place = recording_model.conclusion.unnamed
+    term = (place.term,) if place is not None and place.term else ()
+    evaluator = _wider(recording_model.evaluator, simulator_model.evaluator)
+    test = evaluator.settings.held_out_test
+
+    def fit_with(names: Sequence[str]) -> tuple[Fit, FittedModel]:
+        asked = (*names, *term)
+        hypothesis = _combined(full.hypothesis, own.hypothesis, asked)
+        result = _fit_beside(evaluator, hypothesis, asked, full, own)
+        likelihood = float(result.problem.log_likelihood(result.minimum.x).sum())
+        return result, FittedModel(hypothesis, result.problem, result.minimum, likelihood)
+
+    score = evaluator.held_out_log_likelihood
+    names, (result, fitted) = tuple(missing), fit_with(missing)
+    refitted = recording_model.evaluator.held_out_log_likelihood(full)
+    if passes_heldout_test(refitted - score(fitted), test):
+        return None
+    nothing = score(fit_with(())[1])
+    while names:
+        # A mechanism that only compensated another R or C is idle beside the simulator's own.
+        fewer = [(name, *fit_with([other for other in names if other != name])) for name in names]
+        lost = [score(fitted) - score(less) for _, _, less in fewer]
+        least = int(np.argmin([nats.sum() for nats in lost]))
+        name, result_without, without = fewer[least]
+        whole = float((score(fitted) - nothing).sum())
+        negligible = is_faint(fitted, own, name, test.negligible_strength)
+        negligible &= bool(lost[least].sum() < test.negligible_share * whole)
+        if passes_heldout_test(lost[least], test) and not negligible:
+            break
+        result, fitted = result_without, without
+        names = tuple(other for other in names if other != name)
+    conclusion = replace(recording_model.conclusion, full=fitted)
+    return IdentifiedModel(evaluator, conclusion, result), names
+
+
+def is_faint(fitted: FittedModel, own: FittedModel, name: str, share: float) -> bool:
+    """Whether a mechanism differs from the simulator's by less than a share of a mild strength."""
+    strength = mechanism(name).description.strength
+    path = f"{name}.{strength.name}"
+    beyond = np.abs(fitted.column(path) - own.column(path)[0])
+    return bool(beyond.max() < share * abs(strength.mild - strength.neutral))
+
+
+def _noiseless_fit(
+    simulator_model: IdentifiedModel, own: Data, held: NDArray[np.bool_],
+    recording_model: IdentifiedModel,
+) -> Fit:  # fmt: skip
+    """Fit of the simulator's model to its own pressures, without noise or unmodelled part.
+
+    The values are those of the model; their intervals are what such breaths tell of them.
+    """
+    fitted, evaluator = simulator_model.conclusion.full, simulator_model.evaluator
+    partition = Partition(own.select(~held), evaluator.training.simulator)
+    problem = replace(fitted.problem, noise=recording_model.conclusion.noise)
+    return estimates.final_fit(replace(fitted, problem=problem), partition, evaluator)
+
+
+def _mean_error(data: Data, pressure: Floats) -> float:
+    """Mean absolute error where pressure was measured, cmH2O."""
+    weight = data.weight[:, 0]
+    return float(np.sum(np.abs(pressure - data.seen[:, 0]) * weight) / np.sum(weight))
+
+
+def _differs(recording_model: IdentifiedModel, simulator_model: IdentifiedModel, name: str) -> bool:
+    """Whether the intervals of a mechanism's strengths lie apart."""
+    strength = mechanism(name).description.strength
+    if strength.scope == "breath":
+        return False
+    values = [
+        estimates.parameter_estimates(model.fit, name)[strength.name]
+        for model in (recording_model, simulator_model)
+    ]
+    gap = abs(values[0].value - values[1].value)
+    half = [0.5 * (value.ci95[1] - value.ci95[0]) for value in values]
+    separation = recording_model.evaluator.settings.simulator.separation
+    return bool(gap > separation * np.hypot(half[0], half[1]))
+
+
+def _combined(full: Hypothesis, own: Hypothesis, asked: tuple[str, ...]) -> Hypothesis:
+    """The mechanisms asked for as the recording has them, all others as the simulator has them."""
+    others = [name for name in full.names if name not in asked]
+    return own.without(*asked).plus(full.without(*others))
+
+
+def _fit_beside(
+    evaluator: Evaluator,
+    hypothesis: Hypothesis,
+    asked: tuple[str, ...],
+    full: FittedModel,
+    own: FittedModel,
+) -> Fit:
+    """Fit the parameters of the mechanisms asked for; all others stay at the simulator's values."""
+    partition = evaluator.training
+    names = partition.simulator.names
+    values = evaluator.transferred_values(own, partition)
+    free = [p for p in (*freed(asked), *hypothesis.free) if p.rpartition(".")[0] in asked]
+    fixed: dict[str, ArrayLike] = {
+        name: values[:, k] for k, name in enumerate(names) if name not in (*free, "position")
+    }
+    given = {p: x for p, x in hypothesis.fixed if p.rpartition(".")[0] in asked}
+    by_breath = ("gain",) if evaluator.gain_sd else ()
+    neutral = float(np.log(described("gain").neutral))
+    return fit(
+        partition.data,
+        hypothesis.names,
+        free=(*free, *by_breath),
+        fixed={p: x for p, x in (fixed | given).items() if p not in by_breath},
+        start={p: float(np.median(full.column(p))) for p in free},
+        groups=groups_by_label(partition.data, tuple(free))
+        | {p: np.arange(len(partition.data)) for p in by_breath},
+        prior={p: (neutral, evaluator.gain_sd) for p in by_breath},
+        noise=full.noise,
+        simulator=partition.simulator,
+    )
+
+
+def _wider(recording: Evaluator, simulator: Evaluator) -> Evaluator:
+    """Evaluator of the recording whose simulator has the parameters of both."""
+    if len(recording.training.simulator.names) >= len(simulator.training.simulator.names):
+        return recording
+    return replace(
+        recording,
+        training=Partition(recording.training.data, simulator.training.simulator),
+        held_out=Partition(recording.held_out.data, simulator.held_out.simulator),
+    )

@@ -5,7 +5,8 @@ from __future__ import annotations
 import gc
 import os
 import sys
-from collections.abc import Iterator
+import textwrap
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,19 @@ from ventbench.recordings.read import VARIABLE, recordings_dir
 
 #: Set by `.ci/run` where the recordings are: then no test may skip for want of them.
 REQUIRED = "VENTBENCH_REQUIRE_RECORDINGS"
+
+#: ``submission.toml`` of the submissions that tests write.
+MANIFEST = """\
+name = "mine"
+authors = ["A. Name"]
+licence = "Apache-2.0"
+api_version = 1
+family = "other"
+tracks = ["robustness", "performance"]
+description = "A test."
+"""
+
+Make = Callable[..., Path]
 
 #: Seconds of compiling from which the result is kept for other workers and later runs.
 KEPT_FROM_S = 0.2
@@ -48,3 +62,32 @@ def public_recordings() -> Path:
             pytest.fail(f"{missing} ({REQUIRED} is set)")
         pytest.skip(missing)
     return folder
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Make:
+    """Write a submission; `act` is the body of a method of a Controller that does nothing else."""
+
+    def write(
+        source: str | None = None,
+        *,
+        act: str = "return 0.0",
+        manifest: str = MANIFEST,
+        name: str = "mine",
+        **files: str,
+    ) -> Path:
+        folder = tmp_path / name
+        folder.mkdir(exist_ok=True)
+        if source is None:
+            body = textwrap.indent(textwrap.dedent(act), " " * 8)
+            source = (
+                "class Controller:\n    def reset(self, task):\n        self.task = task\n"
+                f"    def act(self, observation):\n{body}\n"
+            )
+        (folder / "controller.py").write_text(textwrap.dedent(source))
+        (folder / "submission.toml").write_text(manifest)
+        for stem, text in files.items():
+            (folder / f"{stem}.py").write_text(textwrap.dedent(text))
+        return folder
+
+    return write

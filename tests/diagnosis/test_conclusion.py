@@ -65,7 +65,9 @@ def compared(gains: dict[str, tuple[float, float]]) -> tuple[Any, list[Any]]:
         ({"patient_effort": (2500.0, 500.0), "leak": (101.0, 5.0)}, True),
     ],
 )
-def test_what_explains_much_and_is_not_believed_is_not_nothing(nats, hidden):
+def test_a_candidate_that_explains_much_and_is_rejected_leaves_the_recording_unresolved(
+    nats, hidden
+):
     assert is_unresolved(*compared(nats)) is hidden
 
 
@@ -73,18 +75,18 @@ def test_without_a_comparison_nothing_is_unresolved():
     assert not is_unresolved(compared({})[0], [])
 
 
-def test_a_name_is_enough():
+def test_a_mechanism_is_enough():
     found = concluded(small.made(small.effect("turbulent_resistance", quadratic=10.0)))
     assert found.names == ("turbulent_resistance",)
     assert found.unnamed is None
     assert found.held_out_gains["turbulent_resistance"] > 50.0
     assert set(found.alternatives) == {"turbulent_resistance"}
-    # The noise is what the name leaves, not what the base model does.
+    # The noise is what the mechanism leaves, not what the base model leaves.
     assert found.noise.sigma[0] == pytest.approx(0.2, rel=0.15)
     assert found.base.hypothesis.names == ()
 
 
-def test_resistance_that_follows_volume_has_no_name_but_a_place():
+def test_resistance_that_depends_on_volume_is_an_unnamed_effect():
     found = concluded(small.made(small.effect("volume_resistance", "R(V)", change=0.65)))
     assert found.names == ()
     assert found.unnamed is not None
@@ -120,7 +122,7 @@ def test_a_beating_heart_is_at_the_alveolus():
 
 
 @pytest.mark.slow  # many refits
-def test_a_name_stands_beside_a_place():
+def test_a_mechanism_stands_beside_an_unnamed_effect():
     beats = small.effect("pulsating_supply", "oscillation", amplitude=0.175, frequency=5.0)
     name = small.effect("turbulent_resistance", quadratic=10.0)
     found = concluded(small.made(beats, name, noise=0.1))
@@ -132,7 +134,7 @@ def test_a_name_stands_beside_a_place():
     assert shown.y_unit.startswith("share of the flow")
 
 
-def test_breaths_whose_valves_differ_are_no_physics():
+def test_scatter_of_the_valves_gain_is_no_missing_physics():
     rng = np.random.default_rng(4)
     rows = []
     for i in range(small.BREATHS):
@@ -145,7 +147,7 @@ def test_breaths_whose_valves_differ_are_no_physics():
     assert found.noise.sigma[0] == pytest.approx(0.2, rel=0.2)
 
 
-@pytest.mark.slow  # all slots take minutes to compile
+@pytest.mark.slow  # all terms take minutes to compile
 @pytest.mark.parametrize(
     ("name", "form", "parameters", "place"),
     [
@@ -154,21 +156,21 @@ def test_breaths_whose_valves_differ_are_no_physics():
         ("direction_resistance", "R(direction)", {"ratio": 2.0}, "R(direction)"),
     ],
 )
-def test_places_are_found_among_all(name, form, parameters, place):
+def test_unnamed_effects_are_found_among_all_terms(name, form, parameters, place):
     breaths = small.made(small.effect(name, form, **parameters), samples=60)
-    found = concluded(breaths, small.with_terms())
+    found = concluded(breaths, small.ALL_TERMS)
     assert found.names == ()
     assert found.unnamed is not None
     assert found.unnamed.name == place
 
 
-@pytest.mark.slow  # all slots take minutes to compile
-def test_a_name_or_nothing_is_enough_among_all_places():
+@pytest.mark.slow  # all terms take minutes to compile
+def test_a_mechanism_or_nothing_is_enough_among_all_terms():
     named = concluded(
-        small.made(small.effect("viscoelasticity", ratio=0.7, time=1.0)), small.with_terms()
+        small.made(small.effect("viscoelasticity", ratio=0.7, time=1.0)), small.ALL_TERMS
     )
     assert named.names == ("viscoelasticity",)
     assert named.unnamed is None
-    nothing = concluded(small.made(seed=1), small.with_terms())
+    nothing = concluded(small.made(seed=1), small.ALL_TERMS)
     assert nothing.names == ()
     assert nothing.unnamed is None

@@ -22,7 +22,7 @@ hypotheses = st.builds(
 
 
 @given(hypotheses, hypotheses)
-def test_both_together_keep_the_order_and_name_nothing_twice(one, other):
+def test_a_union_keeps_the_order_and_names_no_term_twice(one, other):
     both = one.plus(other)
     assert both.names[: len(one.names)] == one.names
     assert len(set(both.names)) == len(both.names)
@@ -40,7 +40,7 @@ def test_nothing_added_changes_nothing(one):
 
 
 @given(hypotheses, st.sampled_from(NAMES))
-def test_without_takes_all_that_belongs_to_a_name(one, name):
+def test_without_a_term_all_its_parameters_are_gone(one, name):
     left = one.without(name)
     assert name not in left.names
     owned = (*left.paths, *left.free, *dict(left.fixed))
@@ -52,7 +52,7 @@ def test_without_takes_all_that_belongs_to_a_name(one, name):
 
 
 @given(hypotheses)
-def test_what_is_fixed_is_not_fitted_and_the_base_always_is(one):
+def test_fixed_parameters_are_not_fitted_and_base_parameters_always_are(one):
     assert not set(one.paths) & set(dict(one.fixed))
     assert {*BASE, START} <= set(one.paths)
     assert len(set(one.paths)) == len(one.paths)
@@ -60,7 +60,7 @@ def test_what_is_fixed_is_not_fitted_and_the_base_always_is(one):
         assert path in one.paths or path in dict(one.fixed)
 
 
-def test_shapes_are_fitted_only_if_freed():
+def test_shape_parameters_are_fitted_only_if_freed():
     assert Hypothesis(("leak",)).paths == (*BASE, "leak.conductance", START)
     free = Hypothesis(("leak",), ("leak.exponent",))
     assert free.paths == (*BASE, "leak.conductance", START, "leak.exponent")
@@ -68,5 +68,5 @@ def test_shapes_are_fitted_only_if_freed():
     assert fixed.paths == Hypothesis(("leak",)).paths
 
 
-def test_only_an_effort_is_each_breaths_own():
+def test_only_patient_effort_varies_by_breath():
     assert [name for name in NAMES if varies_by_breath(name)] == ["patient_effort"]

@@ -36,7 +36,7 @@ def clean(plain):
     return partition, values, partition.simulator.predict(values)[:, 0]
 
 
-def test_a_source_at_the_alveolus_does_what_muscles_do(clean):
+def test_an_input_at_the_alveolus_acts_as_muscles_do(clean):
     partition, values, before = clean
     names = partition.simulator.names
     time = np.cumsum(partition.data.dt, axis=1) - partition.data.dt
@@ -48,7 +48,7 @@ def test_a_source_at_the_alveolus_does_what_muscles_do(clean):
     source = -amplitude * np.sin(np.pi * np.clip((time - onset) / duration, 0.0, 1.0))
     answer = input_responses(partition, values, ALVEOLUS)
     drawn = np.einsum("nk,nkt->nt", source, answer)
-    # The flow is the valve's: what is added at the alveolus is seen whole in inspiration.
+    # In inspiration the valve sets the flow, so that the input adds to the pressure as it is.
     np.testing.assert_allclose(drawn[:, :INSPIRED], source[:, :INSPIRED], atol=1e-9)
     np.testing.assert_allclose(seen[:, :INSPIRED], source[:, :INSPIRED], atol=1e-6)
     assert np.abs(seen[:, INSPIRED + 2 :]).max() > 0.02
@@ -56,7 +56,7 @@ def test_a_source_at_the_alveolus_does_what_muscles_do(clean):
 
 
 @pytest.mark.parametrize("sample", [5, 17, 29])
-def test_a_source_at_the_supply_is_more_command(clean, sample):
+def test_an_input_at_the_supply_acts_as_more_command(clean, sample):
     partition, values, before = clean
     u_in = partition.data.u_in.copy()
     u_in[:, sample - 1] *= 1.001
@@ -68,7 +68,7 @@ def test_a_source_at_the_supply_is_more_command(clean, sample):
     np.testing.assert_allclose(found, slope, atol=0.1 * np.abs(slope).max())
 
 
-def test_a_gain_is_all_the_commands(clean):
+def test_gain_scatter_scales_all_commands(clean):
     partition, values, before = clean
     column = partition.simulator.names.index("gain")
     more = values.copy()
@@ -79,30 +79,30 @@ def test_a_gain_is_all_the_commands(clean):
     np.testing.assert_allclose(found[:, 0], slope, atol=1e-3 * np.abs(slope).max())
 
 
-def test_a_source_at_the_sensor_is_seen_as_it_is(clean):
+def test_an_input_at_the_sensor_is_added_to_the_reading(clean):
     partition, values, _ = clean
     found = input_responses(partition, values, MEASUREMENT)
     assert np.array_equal(found, np.broadcast_to(np.eye(small.SAMPLES), found.shape))
 
 
-def heard(*effects, seed=0, **changed):
+def latent_input_recording(*effects, seed=0, **changed):
     evaluator = small.split(small.made(*effects, seed=seed, **changed))
-    null = fit_with_noise(evaluator, Hypothesis())
-    return evaluator, null, log_likelihood_without_input(evaluator, null)
+    base = fit_with_noise(evaluator, Hypothesis())
+    return evaluator, base, log_likelihood_without_input(evaluator, base)
 
 
 @pytest.mark.parametrize("frequency", [1.1, 1.5])
 def test_a_beating_heart_is_found_at_its_rate(frequency):
     effect = small.effect("cardiogenic", "oscillation", amplitude=1.3, frequency=frequency)
-    evaluator, null, (training, judged) = heard(effect, style="pi")
-    found = fit_latent_inputs(evaluator, null)
+    evaluator, base, (training, held_out) = latent_input_recording(effect, style="pi")
+    found = fit_latent_inputs(evaluator, base)
     best = found[ALVEOLUS]
     assert best.periodic
     assert best.scale == pytest.approx(frequency, abs=0.2)
     # A sine of amplitude 1.3.
     assert best.size in (0.8, 1.6)
     assert best.training_log_likelihood > training + 40.0
-    assert np.sum(best.held_out_log_likelihood - judged) > 20.0
+    assert np.sum(best.held_out_log_likelihood - held_out) > 20.0
     # In the physics, not in the sensor: exhalation tells.
     assert best.training_log_likelihood > found[MEASUREMENT].training_log_likelihood
     assert best.course.shape == (8, small.SAMPLES)
@@ -111,9 +111,9 @@ def test_a_beating_heart_is_found_at_its_rate(frequency):
 
 def test_a_pulsating_supply_is_found_at_the_supply():
     effect = small.effect("pulsating_supply", "oscillation", amplitude=0.175, frequency=5.0)
-    evaluator, null, _ = heard(effect)
-    found = fit_latent_inputs(evaluator, null)
-    best = max(found.values(), key=lambda one: one.training_log_likelihood)
+    evaluator, base, _ = latent_input_recording(effect)
+    found = fit_latent_inputs(evaluator, base)
+    best = max(found.values(), key=lambda latent: latent.training_log_likelihood)
     assert best.place == SUPPLY
     assert best.periodic
     assert best.scale == pytest.approx(5.0, abs=0.26)
@@ -121,27 +121,29 @@ def test_a_pulsating_supply_is_found_at_the_supply():
 
 
 @pytest.mark.parametrize("coloured", [0.0, 0.6])
-def test_noise_is_no_source_in_the_physics(coloured):
-    evaluator, null, (_, judged) = heard(coloured=coloured, correlation=0.8, seed=7)
-    found = fit_latent_inputs(evaluator, null)
+def test_noise_is_no_input_in_the_physics(coloured):
+    evaluator, base, (_, held_out) = latent_input_recording(
+        coloured=coloured, correlation=0.8, seed=7
+    )
+    found = fit_latent_inputs(evaluator, base)
     sensor = found.pop(MEASUREMENT)
-    best = max(found.values(), key=lambda one: one.training_log_likelihood)
-    gained = float((best.held_out_log_likelihood - judged).sum())
+    best = max(found.values(), key=lambda latent: latent.training_log_likelihood)
+    gained = float((best.held_out_log_likelihood - held_out).sum())
     ahead = float((best.held_out_log_likelihood - sensor.held_out_log_likelihood).sum())
     assert min(gained, ahead) < 4.6
 
 
-def test_likelihood_without_a_source_is_that_of_the_breaths(plain):
+def test_the_likelihood_without_an_input_is_that_of_the_breaths(plain):
     noise = dataclasses.replace(plain.base.noise, tail=np.inf)
-    null = plain.evaluator.fit(Hypothesis(), noise, plain.base)
-    _, judged = log_likelihood_without_input(plain.evaluator, null)
+    base = plain.evaluator.fit(Hypothesis(), noise, plain.base)
+    _, held_out = log_likelihood_without_input(plain.evaluator, base)
     constant = 0.5 * np.log(2 * np.pi) * small.SAMPLES
     np.testing.assert_allclose(
-        judged - constant, plain.evaluator.held_out_log_likelihood(null), atol=0.2
+        held_out - constant, plain.evaluator.held_out_log_likelihood(base), atol=0.2
     )
 
 
-def test_kernel_of_a_source_is_the_ratio_of_two_gaussians(plain):
+def test_the_gain_of_an_input_is_the_ratio_of_two_gaussians(plain):
     """Against the determinant and the inverse of the whole covariance of a breath."""
     noise = dataclasses.replace(plain.base.noise, ar=(0.4,), tail=np.inf)
     problem, x = plain.evaluator.refit_breath_parameters(plain.base)

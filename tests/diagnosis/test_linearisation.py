@@ -29,12 +29,12 @@ class Linear(NamedTuple):
 
 @pytest.fixture(scope="module")
 def bent() -> Linear:
-    """Fitted without the little turbulence that is there."""
+    """The base model of a recording with weak turbulence."""
     evaluator = small.split(
         small.made(small.effect("turbulent_resistance", quadratic=1.0), noise=0.1)
     )
-    null = evaluator.fit(Hypothesis(), NOISE, tolerance=1e-6, iterations=30)
-    return Linear(evaluator, null, linearise(null.problem, null.minimum.x, SCREENING, clip=np.inf))
+    base = evaluator.fit(Hypothesis(), NOISE, tolerance=1e-6, iterations=30)
+    return Linear(evaluator, base, linearise(base.problem, base.minimum.x, SCREENING, clip=np.inf))
 
 
 def whitened(difference: np.ndarray) -> np.ndarray:
@@ -59,7 +59,7 @@ def changed(found: Linear, path: str, breath: int | None = None) -> np.ndarray:
 
 
 @pytest.mark.parametrize("path", ["R", "C", "R_ex", "PEEP"])
-def test_residual_and_templates_are_orthogonal_to_what_is_refitted(bent, path):
+def test_residual_and_templates_are_orthogonal_to_refitted_parameters(bent, path):
     slope = changed(bent, path)
     scale = np.linalg.norm(slope) * np.linalg.norm(bent.place.residual)
     assert abs(np.sum(slope * bent.place.residual)) < 1e-4 * scale
@@ -87,7 +87,7 @@ def test_bases_are_orthonormal(bent):
     np.testing.assert_allclose(again[:, 0], bent.place.residual, atol=1e-6)
 
 
-def test_gain_is_the_fall_of_the_cost_after_a_refit(bent):
+def test_gain_is_the_decrease_of_the_cost_after_a_refit(bent):
     values = bent.base.values.copy()
     names = bent.base.problem.simulator.names
     values[:, names.index("turbulent_resistance.quadratic")] = 0.2
@@ -116,7 +116,7 @@ def test_gain_of_the_wrong_sign_and_of_nothing(bent):
     assert nats == pytest.approx(0.5 * np.sum(bent.place.residual**2))
 
 
-def test_far_samples_are_cut_off(bent):
+def test_outlying_samples_are_clipped(bent):
     seen = bent.base.problem.data.seen.copy()
     seen[2, 0, 10] += 5.0  # 25 standard deviations
     problem = dataclasses.replace(
@@ -128,7 +128,7 @@ def test_far_samples_are_cut_off(bent):
     assert np.abs(cut).max() < 5.0
 
 
-def test_a_gain_of_each_breath_is_its_own(bent):
+def test_a_valve_gain_of_each_breath_is_absorbed_by_the_breath(bent):
     evaluator = dataclasses.replace(bent.evaluator, gain_sd=0.1)
     fitted = evaluator.fit(Hypothesis(), NOISE, iterations=2)
     place = linearise(fitted.problem, fitted.minimum.x, SCREENING)

@@ -40,7 +40,7 @@ def fitted(active) -> FittedModel:
 
 
 def misplaced(fitted: FittedModel, onset: float) -> np.ndarray:
-    """Its unknowns with all efforts begun elsewhere."""
+    """The unknowns of a model with all efforts at another onset, s."""
     x = fitted.minimum.x.copy()
     x[fitted.problem.unknowns.of(ONSET)] = onset
     return x
@@ -55,7 +55,7 @@ def test_all_efforts_are_found_from_a_poor_start(active, fitted):
 
 
 @pytest.mark.parametrize("refit", [False, True])
-def test_efforts_that_begin_elsewhere_are_moved_back(fitted, refit):
+def test_misplaced_efforts_are_moved_back(fitted, refit):
     problem = fitted.problem
     wrong = misplaced(fitted, 1.7)
     mended = TERM.start(problem, wrong, EFFORT.names if refit else (), refit=refit)
@@ -71,7 +71,7 @@ def test_efforts_that_are_the_likeliest_stay(fitted):
     assert TERM.start(fitted.problem, x, (), refit=False) == pytest.approx(x)
 
 
-def test_evidence_of_a_breath_is_the_integral_over_its_efforts(active, fitted):
+def test_the_gain_of_a_breath_is_the_integral_over_its_efforts(active, fitted):
     """Against a sum over a fine grid of amplitudes and onsets, at the fitted parameters."""
     still, x = active.refit_breath_parameters(fitted)
     still = dataclasses.replace(still, noise=NOISE)
@@ -97,20 +97,20 @@ def test_evidence_of_a_breath_is_the_integral_over_its_efforts(active, fitted):
     assert np.all(found[~clear] < 20.0)
 
 
-def test_what_a_fit_found_is_integrated_alike(active, fitted):
+def test_training_and_held_out_breaths_are_integrated_alike(active, fitted):
     training = dataclasses.replace(active, held_out=active.training)
     held_out = training.held_out_log_likelihood(fitted)
     marginal = TERM.marginal_log_likelihood(fitted, fitted.noise)
     assert marginal == pytest.approx(held_out, abs=4.0)
 
 
-def test_a_patient_who_pulls_is_told_from_noise_that_wanders(active, fitted):
+def test_effort_is_told_from_slow_sensor_noise(active, fitted):
     assert exceeds_sensor_noise(active, fitted)
     wandering = small.split(small.made(noise=0.3, coloured=0.9, correlation=0.9, seed=4))
     assert not exceeds_sensor_noise(wandering, fit_with_noise(wandering, EFFORT))
 
 
-def test_of_breaths_to_come_the_mean_over_efforts_is_expected(active, fitted):
+def test_the_prediction_is_the_mean_over_efforts(active, fitted):
     passive = active.fit(Hypothesis(), fitted.noise, fitted)
     values = active.transferred_values(fitted, active.held_out)
     simulator = active.held_out.simulator

@@ -34,7 +34,9 @@ def named():
 
 
 @pytest.mark.parametrize(("nats", "kept"), [(1.0, NAMES), (1e9, ())])
-def test_a_source_takes_over_only_what_explains_less_than_itself(named, monkeypatch, nats, kept):
+def test_an_input_replaces_only_mechanisms_that_explain_less_than_it_does(
+    named, monkeypatch, nats, kept
+):
     evaluator, fitted = named
 
     def idle(evaluator, current, here, name):
@@ -50,21 +52,20 @@ BOTH = Hypothesis(("leak", "viscoelasticity"))
 
 def left(*effects):
     breaths = small.made(*effects, noise=0.1, seed=2)
-    settings = small.with_terms("leak_shape")
-    evaluator, wide = small.split(breaths, settings), small.split_wide(breaths, settings)
+    evaluator, wide = small.split(breaths), small.split_wide(breaths)
     said: list[str] = []
     named = drop_compensating_terms(evaluator, wide, fit_with_noise(evaluator, BOTH), said.append)
     assert said
     return named
 
 
-def test_a_name_that_bends_anothers_form_is_dropped():
-    """A linear leak is no root, and a viscous lung makes up for that."""
+def test_a_mechanism_that_compensates_for_anothers_form_is_dropped():
+    """A linear leak is no square root, and a viscoelastic lung compensates for that."""
     named = left(small.effect("leak", "linear", conductance=20.0))
     assert named.hypothesis.names == ("leak",)
 
 
-def test_two_that_act_both_stay():
+def test_two_mechanisms_that_act_both_stay():
     named = left(
         small.effect("leak", conductance=20.0),
         small.effect("viscoelasticity", ratio=0.7, time=1.0),
@@ -72,7 +73,7 @@ def test_two_that_act_both_stay():
     assert named.hypothesis.names == BOTH.names
 
 
-def test_a_single_name_trims_nothing(plain):
+def test_a_single_mechanism_compensates_for_nothing(plain):
     one = plain.evaluator.fit(Hypothesis(("leak",)), plain.base.noise, plain.base, iterations=1)
     said: list[str] = []
     assert drop_compensating_terms(plain.evaluator, plain.evaluator, one, said.append) is one
@@ -82,25 +83,26 @@ def test_a_single_name_trims_nothing(plain):
 SUM = Hypothesis(("turbulent_resistance", "viscoelasticity", "leak"))
 
 
-def one_shape(breaths):
-    narrow = small.split(breaths)
-    null = fit_with_noise(narrow, Hypothesis())
+def single_term_alternative(breaths):
+    evaluator = small.split(breaths)
+    base = fit_with_noise(evaluator, Hypothesis())
     return (
-        narrow,
-        null,
-        SingleTermAlternative(narrow, lambda: small.split_wide(breaths), null),
+        evaluator,
+        base,
+        SingleTermAlternative(evaluator, lambda: small.split_wide(breaths), base),
     )
 
 
-def test_names_that_imitate_a_shape_give_way():
+def test_mechanisms_that_imitate_a_nonparametric_term_are_replaced():
     effect = small.effect("volume_resistance", "R(V)", change=0.65)
-    narrow, null, simpler = one_shape(small.made(effect, noise=0.1))
-    assert simpler(fit_with_noise(narrow, Hypothesis(SUM.names[:2]))) is None  # too few to ask
-    assert simpler(fit_with_noise(narrow, SUM)) is null
+    evaluator, base, replacement = single_term_alternative(small.made(effect, noise=0.1))
+    too_few = fit_with_noise(evaluator, Hypothesis(SUM.names[:2]))
+    assert replacement(too_few) is None
+    assert replacement(fit_with_noise(evaluator, SUM)) is base
 
 
-def test_names_that_act_stay():
-    narrow, _, simpler = one_shape(
+def test_mechanisms_that_act_are_not_replaced():
+    evaluator, _, replacement = single_term_alternative(
         small.made(
             small.effect("turbulent_resistance", quadratic=10.0),
             small.effect("leak", conductance=20.0),
@@ -108,7 +110,7 @@ def test_names_that_act_stay():
             noise=0.1,
         )
     )
-    assert simpler(fit_with_noise(narrow, SUM)) is None
+    assert replacement(fit_with_noise(evaluator, SUM)) is None
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +121,7 @@ def alike():
     return evaluator, *forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), print)
 
 
-def test_a_rival_that_is_nearly_as_good_is_listed(alike):
+def test_an_alternative_that_is_nearly_as_good_is_listed(alike):
     evaluator, named, steps = alike
     named, other = find_alternatives(evaluator, named, steps)
     (name,) = named.hypothesis.names
@@ -131,7 +133,7 @@ def test_a_rival_that_is_nearly_as_good_is_listed(alike):
 
 
 @pytest.mark.slow  # many refits
-def test_a_worse_name_is_swapped_for_the_better_one(alike):
+def test_a_worse_mechanism_is_swapped_for_the_better_one(alike):
     evaluator, named, _ = alike
     wrong = evaluator.fit(Hypothesis(("viscoelasticity",)), named.noise)
     swapped, other = find_alternatives(evaluator, wrong, [])
@@ -146,7 +148,7 @@ def test_an_effect_like_no_other_has_no_alternative():
     evaluator = small.split(small.made(small.effect("viscoelasticity", ratio=0.7, time=1.0)))
     named, steps = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), print)
     named, other = find_alternatives(evaluator, named, steps)
-    # But for what pressure alone can never tell from it.
+    # Pressure alone can never tell it from a second compartment.
     assert other["viscoelasticity"].names == ("second_compartment",)
     assert other["viscoelasticity"].confidence > 0.99
     assert other["viscoelasticity"].models == ()

@@ -33,7 +33,7 @@ def test_every_basis_term_belongs_to_a_component():
     assert component_of("sensor_memory") == component_of("drift_shape") == "measurement"
 
 
-def test_all_paths_are_those_of_the_library_and_of_all_slots():
+def test_all_parameter_paths_are_those_of_the_library_and_of_all_terms():
     found = all_parameter_paths(SelectionConfig())
     owners = {path.rpartition(".")[0] for path in found} - {""}
     assert owners == set(library()) | set(basis_terms())
@@ -42,43 +42,46 @@ def test_all_paths_are_those_of_the_library_and_of_all_slots():
 
 def scanned(*effects, seed=0, **changed):
     evaluator = small.split_wide(small.made(*effects, seed=seed, **changed))
-    null = fit_with_noise(evaluator, Hypothesis())
-    return evaluator, null, score_nonparametric_terms(null, small.SETTINGS)
+    base = fit_with_noise(evaluator, Hypothesis())
+    return evaluator, base, score_nonparametric_terms(base, small.SETTINGS)
 
 
 @pytest.mark.parametrize("change", [0.65, -0.65])
-def test_resistance_that_follows_volume_is_found(change):
+def test_resistance_that_depends_on_volume_is_ranked_first(change):
     effect = small.effect("volume_resistance", "R(V)", change=change)
-    _, null, found = scanned(effect)
-    assert {one.name for one in found} == set(small.FEW)
+    _, base, found = scanned(effect)
+    assert {candidate.name for candidate in found} == set(small.FEW)
     assert found[0].name == "volume_resistance"
     assert found[0].promise > 20.0
-    best = [one.promise for one in found]
+    best = [candidate.promise for candidate in found]
     assert best == sorted(best, reverse=True)
-    assert all(one.hypothesis == Hypothesis((one.name,)) for one in found)
-    again = dataclasses.replace(null, hypothesis=Hypothesis((found[0].name,)))
-    assert {one.name for one in score_nonparametric_terms(again, small.SETTINGS)} == set(
-        small.FEW
-    ) - {found[0].name}
+    assert all(candidate.hypothesis == Hypothesis((candidate.name,)) for candidate in found)
+    again = dataclasses.replace(base, hypothesis=Hypothesis((found[0].name,)))
+    assert {
+        candidate.name for candidate in score_nonparametric_terms(again, small.SETTINGS)
+    } == set(small.FEW) - {found[0].name}
 
 
-def test_nothing_is_promised_where_nothing_is():
+def test_no_term_is_promising_where_nothing_is_missing():
     *_, found = scanned(seed=3)
-    # A slot has up to ten coefficients, each worth half a nat by chance.
-    assert max(one.promise for one in found) < 10.0
+    # A term has up to ten coefficients, each worth half a nat by chance.
+    assert max(candidate.promise for candidate in found) < 10.0
 
 
-def test_promised_nats_are_what_a_refit_gains():
+def test_the_expected_gain_is_what_a_refit_gains():
     effect = small.effect("turbulent_resistance", quadratic=1.0)
     evaluator = small.split_wide(small.made(effect))
-    null = evaluator.fit(Hypothesis(), NOISE, tolerance=1e-4, iterations=30)
-    found = {one.name: one.nats for one in score_nonparametric_terms(null, small.SETTINGS)}
+    base = evaluator.fit(Hypothesis(), NOISE, tolerance=1e-4, iterations=30)
+    found = {
+        candidate.name: candidate.nats
+        for candidate in score_nonparametric_terms(base, small.SETTINGS)
+    }
     assert max(found, key=lambda name: found[name]) == "flow_shape"
     refitted = evaluator.fit(
-        Hypothesis(("flow_shape",)), NOISE, null, iterations=30, tolerance=1e-4
+        Hypothesis(("flow_shape",)), NOISE, base, iterations=30, tolerance=1e-4
     )
-    # The cost has the prior of the coefficients in it, as the promise has.
-    fallen = null.minimum.cost - refitted.minimum.cost
+    # The cost contains the prior of the coefficients, as the expected gain does.
+    fallen = base.minimum.cost - refitted.minimum.cost
     assert fallen > 5.0
     assert found["flow_shape"] == pytest.approx(fallen, rel=0.15)
     first = next(path for path in refitted.problem.unknowns.paths if path.startswith("flow_shape"))
@@ -102,24 +105,24 @@ MILD = {
 @pytest.mark.parametrize("name", MILD)
 def test_screening_ranks_a_mild_effect_among_the_first(name):
     evaluator = small.split(small.made(small.effect(name, **MILD[name]), seed=3))
-    null = fit_with_noise(evaluator, Hypothesis())
-    found = screen_mechanisms(null, fit_with_white_noise(evaluator, null), small.SETTINGS)
-    assert {one.name for one in found} == set(library())
-    place = [one.name for one in found].index(name)
-    assert place < 5, [one.name for one in found]
-    one = found[place]
-    assert one.promise > 10.0
-    assert one.hypothesis.names == (name,)
-    for path, value in one.start.items():
+    base = fit_with_noise(evaluator, Hypothesis())
+    found = screen_mechanisms(base, fit_with_white_noise(evaluator, base), small.SETTINGS)
+    assert {candidate.name for candidate in found} == set(library())
+    place = [candidate.name for candidate in found].index(name)
+    assert place < 5, [candidate.name for candidate in found]
+    candidate = found[place]
+    assert candidate.promise > 10.0
+    assert candidate.hypothesis.names == (name,)
+    for path, value in candidate.start.items():
         item = parameter(path)
         assert item.low <= value <= item.high
 
 
-def test_screening_leaves_out_what_is_there_and_looks_only_at_what_it_is_told(plain):
+def test_screening_ranks_only_the_allowed_mechanisms_that_are_missing(plain):
     named = plain.evaluator.fit(Hypothesis(("leak",)), plain.base.noise, plain.base, iterations=1)
     assert "leak" not in {
-        one.name
-        for one in screen_mechanisms(
+        candidate.name
+        for candidate in screen_mechanisms(
             named, fit_with_white_noise(plain.evaluator, named), small.SETTINGS
         )
     }
@@ -129,4 +132,4 @@ def test_screening_leaves_out_what_is_there_and_looks_only_at_what_it_is_told(pl
         small.SETTINGS,
         ("leak", "inertance"),
     )
-    assert {one.name for one in some} == {"leak", "inertance"}
+    assert {candidate.name for candidate in some} == {"leak", "inertance"}

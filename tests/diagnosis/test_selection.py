@@ -26,14 +26,14 @@ from ventbench.system_id import Noise
 from . import small
 
 
-def test_what_acts_is_needed_and_what_does_not_is_not(turbulent, both):
+def test_a_mechanism_is_needed_if_and_only_if_it_acts(turbulent, both):
     named, without = both
     assert selection.is_needed(turbulent, named, without)
     idle = turbulent.fit(Hypothesis(("turbulent_resistance", "leak")), named.noise, named)
     assert not selection.is_needed(turbulent, idle, named)
 
 
-def test_all_breaths_are_asked_only_where_the_training_ones_plainly_are(
+def test_cross_validation_runs_only_where_the_training_breaths_clearly_ask(
     turbulent, both, monkeypatch
 ):
     asked = []
@@ -50,7 +50,7 @@ def test_all_breaths_are_asked_only_where_the_training_ones_plainly_are(
     assert len(asked) == 1
 
 
-def test_a_trace_is_far_weaker_than_mild_and_explains_little(turbulent, both):
+def test_a_negligible_term_is_far_weaker_than_mild_and_explains_little(turbulent, both):
     named, _ = both
     two = turbulent.fit(Hypothesis(("turbulent_resistance", "sensor_drift")), named.noise, named)
     assert abs(two.column("sensor_drift.drift")[0]) < 0.2 * 1.2
@@ -59,7 +59,7 @@ def test_a_trace_is_far_weaker_than_mild_and_explains_little(turbulent, both):
     assert not selection.is_negligible(turbulent, two, without, "turbulent_resistance")
 
 
-def test_a_weak_term_that_explains_nearly_all_is_no_trace():
+def test_a_weak_term_that_explains_nearly_all_is_not_negligible():
     evaluator = small.split(small.made(small.effect("valve_dead_band", width=0.28), noise=0.02))
     weak = fit_with_noise(evaluator, Hypothesis(("valve_dead_band",)))
     assert weak.column("valve_dead_band.width")[0] < 0.2 * 1.5
@@ -82,17 +82,17 @@ def quiet(what: str) -> None:
     pass
 
 
-def test_what_cannot_act_is_not_looked_at():
+def test_excluded_mechanisms_are_not_compared():
     active = small.split(small.made(small.effect("turbulent_resistance", quadratic=10.0)))
     without = dataclasses.replace(active, excluded=("turbulent_resistance", "patient_effort"))
     assert set(active.allowed_mechanisms) - set(without.allowed_mechanisms) == set(without.excluded)
-    null = fit_with_noise(without, Hypothesis())
-    named, steps = forward_selection(without, null, quiet)
+    base = fit_with_noise(without, Hypothesis())
+    named, steps = forward_selection(without, base, quiet)
     assert not set(named.hypothesis.names) & set(without.excluded)
-    assert not {one.name for one in steps[0].ranked} & set(without.excluded)
+    assert not {candidate.name for candidate in steps[0].ranked} & set(without.excluded)
 
 
-def test_gate_needs_much_and_from_more_than_one_breath():
+def test_the_held_out_test_needs_enough_gain_from_more_than_one_breath():
     even = np.full(8, 1.0)
     assert passes_heldout_test(even)
     assert not passes_heldout_test(0.9 * THRESHOLD / 8 * even)
@@ -102,7 +102,7 @@ def test_gate_needs_much_and_from_more_than_one_breath():
     assert not passes_heldout_test(one)
     assert not passes_heldout_test(one + 0.1)
     assert passes_heldout_test(one + 200.0)
-    # Two breaths of another rig do not outvote the others, nor carry them.
+    # Two breaths of another rig do not outvote the others, nor decide for them.
     mixed = np.array([20.0, 25.0, 18.0, -150.0, 30.0, 22.0, 24.0, -60.0, 28.0, 26.0, 33.0, 19.0])
     assert passes_heldout_test(mixed)
     carried = np.tile([0.1, -0.2, 0.1, -0.3, 0.2], 4)
@@ -114,38 +114,38 @@ def test_gate_needs_much_and_from_more_than_one_breath():
     assert not passes_heldout_test(mixed)
 
 
-def test_nothing_is_worth_a_look_if_nothing_is_promising(plain):
+def test_without_a_promising_candidate_there_is_no_comparison(plain):
     found = screen_mechanisms(
         plain.base, fit_with_white_noise(plain.evaluator, plain.base), small.SETTINGS
     )
-    faint = [one for one in found if one.promise <= 3.0]
+    faint = [candidate for candidate in found if candidate.promise <= 3.0]
     assert faint
     assert compare_candidates(plain.evaluator, plain.base, faint) is None
     assert compare_candidates(plain.evaluator, plain.base, []) is None
 
 
-def test_a_step_orders_candidates_at_one_noise():
+def test_a_comparison_ranks_candidates_at_one_noise():
     evaluator = small.split(small.made(small.effect("turbulent_resistance", quadratic=10.0)))
-    null = fit_with_noise(evaluator, Hypothesis())
+    base = fit_with_noise(evaluator, Hypothesis())
     found = compare_candidates(
         evaluator,
-        null,
-        screen_mechanisms(null, fit_with_white_noise(evaluator, null), small.SETTINGS),
+        base,
+        screen_mechanisms(base, fit_with_white_noise(evaluator, base), small.SETTINGS),
     )
     assert found is not None
     assert found.ranked[0].name == "turbulent_resistance"
-    criteria = [one.criterion for one in found.ranked]
+    criteria = [candidate.criterion for candidate in found.ranked]
     assert criteria == sorted(criteria)
-    assert len({one.name for one in found.ranked}) == len(found.ranked)
-    # The noise is the best one's, and no longer what the effect left in the residual.
+    assert len({candidate.name for candidate in found.ranked}) == len(found.ranked)
+    # The noise is the best candidate's, without the effect in the residual.
     best = found.ranked[0].fitted
-    assert best.log_likelihood > best.log_likelihood_at(null.noise) + 20.0
+    assert best.log_likelihood > best.log_likelihood_at(base.noise) + 20.0
     assert found.base.noise == found.ranked[0].fitted.noise
     assert passes_heldout_test(found.held_out_gain)
 
 
 @pytest.mark.parametrize("name", STRONG)
-def test_one_strong_effect_is_named_and_nothing_else(name):
+def test_one_strong_effect_is_selected_and_nothing_else(name):
     evaluator = small.split(small.made(small.effect(name, **STRONG[name]), seed=4))
     named, steps = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
     assert named.hypothesis.names == (name,)
@@ -155,7 +155,7 @@ def test_one_strong_effect_is_named_and_nothing_else(name):
 
 
 @pytest.mark.slow  # every refit has each breath's own effort
-def test_strong_efforts_are_named_and_nothing_else():
+def test_strong_efforts_are_selected_and_nothing_else():
     effect = small.effect("patient_effort", amplitude=5.0, duration=0.8)
     evaluator = small.split(small.made(effect, seed=4))
     named, _ = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
@@ -163,7 +163,7 @@ def test_strong_efforts_are_named_and_nothing_else():
 
 
 @pytest.mark.slow  # many refits
-def test_two_strong_effects_are_both_named():
+def test_two_strong_effects_are_both_selected():
     two = (
         small.effect("turbulent_resistance", quadratic=10.0), small.effect("sensor_lag", tau=0.12)
     )  # fmt: skip
@@ -174,7 +174,7 @@ def test_two_strong_effects_are_both_named():
 
 @pytest.mark.parametrize("coloured", [0.0, 0.6])
 @pytest.mark.parametrize("seed", [10, 11, 12])
-def test_nothing_is_named_in_noise(coloured, seed):
+def test_nothing_is_selected_in_noise(coloured, seed):
     recording = small.made(coloured=coloured, correlation=0.8, seed=seed)
     evaluator = small.split(recording)
     named, _ = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
@@ -187,12 +187,12 @@ def test_a_term_that_another_replaces_is_dropped():
     both = evaluator.fit(Hypothesis(("sensor_drift", "sensor_lag")), noise)
     assert drop_redundant_terms(evaluator, both).hypothesis.names == ("sensor_lag",)
     kept = evaluator.fit(Hypothesis(("sensor_lag", "sensor_drift")), noise)
-    # Only those before the newest are asked.
+    # Only terms before the newest are tested.
     assert drop_redundant_terms(evaluator, kept).hypothesis.names == ("sensor_lag", "sensor_drift")
 
 
 @pytest.mark.parametrize("form", ["linear", "library"])
-def test_a_shape_is_freed_if_the_recording_asks_for_it(form):
+def test_a_shape_parameter_is_freed_if_the_recording_asks_for_it(form):
     effect = small.effect("leak", form, conductance=20.0)
     evaluator = small.split(small.made(effect, noise=0.1, seed=5))
     found = free_shape_parameters(
@@ -217,7 +217,7 @@ def test_a_shape_is_freed_if_the_recording_asks_for_it(form):
         (small.effect("sensor_drift", "warming", drift=3.0), "sensor_drift.warming", 3.0),
     ],
 )
-def test_another_form_is_found_by_the_shape_of_its_name(effect, path, wanted):
+def test_another_form_is_found_by_a_shape_parameter(effect, path, wanted):
     evaluator = small.split(small.made(effect, noise=0.03, seed=5))
     found = free_shape_parameters(evaluator, fit_with_noise(evaluator, Hypothesis((effect.name,))))
     assert found.hypothesis.free == (path,)

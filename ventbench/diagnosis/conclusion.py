@@ -109,7 +109,7 @@ def conclude(evaluator: Evaluator, wider: Callable[[], Evaluator], tell: Progres
     wider = cache(wider)
     single = SingleTermAlternative(evaluator, wider, base)
     selected, comparisons = forward_selection(evaluator, base, tell, single)
-    tell("looking for what has no name")
+    tell("looking for effects that no mechanism explains")
     wide = wider()
     reduced = drop_compensating_terms(evaluator, wide, selected, tell)
     rest = _explain_rest(evaluator, wide, reduced)

@@ -136,7 +136,7 @@ def drop_compensating_terms(
         tell: is told what is being done.
     """
     while len(selected.names) > 1:
-        tell("looking for names that trim others")
+        tell("looking for mechanisms that only compensate for others")
         name = _compensating_term(wide, selected)
         if name is None:
             break

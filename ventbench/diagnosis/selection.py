@@ -90,7 +90,7 @@ def forward_selection(
     for _ in range(settings.forward.max_rounds):
         if len(current.names) == settings.forward.max_terms:
             break
-        tell(f"comparing mechanisms ({len(current.names)} named)")
+        tell(f"comparing mechanisms ({len(current.names)} selected)")
         white = fit_with_white_noise(evaluator, current)
         candidates = screen_mechanisms(current, white, settings, evaluator.allowed_mechanisms)
         comparison = compare_candidates(evaluator, current, candidates, white)

@@ -50,14 +50,13 @@ def _relaxing_volume(time: float, periodic: bool) -> Callable[[Segment], Floats]
         decay = np.exp(-np.diff(t) / time)
         # Exact for a flow that is constant within a step.
         gain = (1.0 - decay) * time / np.diff(t) * np.diff(v)
-        start = 0.0
+        steps = list(zip(decay.tolist(), gain.tolist(), strict=True))
+        relaxed = [0.0]
         for _ in range(2 if periodic else 1):
-            out = np.zeros(len(t))
-            out[0] = start
-            for i in range(len(t) - 1):
-                out[i + 1] = out[i] * decay[i] + gain[i]
-            start = out[-1]
-        return out
+            relaxed = [relaxed[-1]]
+            for kept, added in steps:
+                relaxed.append(relaxed[-1] * kept + added)
+        return np.array(relaxed)
 
     return values
 
@@ -155,14 +154,12 @@ def cross_products(
         full = np.stack([c.values(segment) for c in chosen] + [segment.pressure], axis=1)
         own = np.stack([np.ones(len(segment)), segment.time - segment.time.mean()], axis=1)
         freedom[row] += len(segment) - own.shape[1]
-        for k, rho in enumerate(GRID):
-            white = _whiten(full, rho, segment.begins)
-            nuisance = _whiten(own, rho, segment.begins)
-            basis, upper = np.linalg.qr(nuisance)
-            white = white - basis @ (basis.T @ white)
-            products[row, k] += white.T @ white
-            constant[row, k] += 0.5 * segment.begins.sum() * np.log(1.0 - rho**2)
-            constant[row, k] -= float(np.sum(np.log(np.abs(np.diag(upper)))))
+        white, nuisance = (_whiten(signals, segment.begins) for signals in (full, own))
+        basis, upper = np.linalg.qr(nuisance)
+        white = white - basis @ (basis.mT @ white)
+        products[row] += white.mT @ white
+        constant[row] += 0.5 * segment.begins.sum() * np.log(1.0 - np.square(GRID))
+        constant[row] -= np.log(np.abs(np.diagonal(upper, axis1=1, axis2=2))).sum(axis=1)
     return CrossProducts(products, freedom, constant, np.array(indices, np.int64))
 
 
@@ -176,20 +173,16 @@ def fit(table: CrossProducts, which: NDArray[np.bool_], columns: Sequence[int]) 
     """
     columns = tuple(columns)
     pick = [*columns, -1]
-    total = table.products[which].sum(axis=0)[:, pick][:, :, pick]
+    total = table.products[np.ix_(which, range(len(GRID)), pick, pick)].sum(axis=0)
     freedom = float(table.freedom[which].sum())
     constants = table.constant[which].sum(axis=0)
-    best, highest = None, -np.inf
-    for k in range(len(GRID)):
-        left = _regular(total[k, :-1, :-1])
-        x = np.linalg.solve(left, total[k, :-1, -1])
-        square = max(float(total[k, -1, -1] - x @ total[k, :-1, -1]), 0.0)
-        sigma = max(np.sqrt(square / max(freedom - len(columns), 1.0)), _LEAST_SIGMA)
-        value = constants[k] - freedom * np.log(sigma) - 0.5 * square / sigma**2
-        if value > highest:
-            best, highest = RegressionFit(columns, x, float(sigma), k), value
-    assert best is not None
-    return best
+    right = total[:, :-1, -1]
+    x = np.linalg.solve(_regularised(total[:, :-1, :-1]), right[..., None])[..., 0]
+    square = np.maximum(total[:, -1, -1] - np.vecdot(x, right), 0.0)
+    sigma = np.maximum(np.sqrt(square / max(freedom - len(columns), 1.0)), _LEAST_SIGMA)
+    value = constants - freedom * np.log(sigma) - 0.5 * square / sigma**2
+    best = int(np.argmax(value))
+    return RegressionFit(columns, x[best], float(sigma[best]), best)
 
 
 def log_likelihood(table: CrossProducts, fitted: RegressionFit) -> Floats:
@@ -217,7 +210,7 @@ def covariance(table: CrossProducts, fitted: RegressionFit) -> Floats:
     columns = list(fitted.columns)
     products = table.products[:, fitted.grid]
     curvature = products[:, columns][:, :, columns]
-    bread = np.asarray(np.linalg.inv(_regular(curvature.sum(axis=0))), np.float64)
+    bread = np.asarray(np.linalg.inv(_regularised(curvature.sum(axis=0))), np.float64)
     model = bread * fitted.sigma**2
     count = len(table)
     if count < 3:
@@ -236,17 +229,21 @@ def effect_size(table: CrossProducts, fitted: RegressionFit, column: int) -> flo
     own = total[column, column]
     if others:
         cross = total[others, column]
-        own = own - cross @ np.linalg.solve(_regular(total[np.ix_(others, others)]), cross)
+        own = own - cross @ np.linalg.solve(_regularised(total[np.ix_(others, others)]), cross)
     x = fitted.coefficients[fitted.columns.index(column)]
     return float(abs(x) * np.sqrt(max(own, 0.0) / table.freedom.sum()))
 
 
-def _whiten(values: Floats, rho: float, begins: NDArray[np.bool_]) -> Floats:
-    out = values.copy()
-    out[1:] -= rho * values[:-1]
-    out[begins] = np.sqrt(1.0 - rho**2) * values[begins]
-    return out
+def _whiten(values: Floats, begins: NDArray[np.bool_]) -> Floats:
+    """Whiten signals ``(n, c)`` for each autocorrelation of the grid, ``(g, n, c)``."""
+    rho = np.array(GRID)[:, None, None]
+    white = np.repeat(values[None], len(GRID), axis=0)
+    white[:, 1:] -= rho * values[:-1]
+    white[:, begins] = np.sqrt(1.0 - rho**2) * values[begins]
+    return white
 
 
-def _regular(matrix: Floats) -> Floats:
-    return matrix + np.diag(1e-10 * np.diag(matrix) + 1e-30)
+def _regularised(matrix: Floats) -> Floats:
+    """Matrices ``(..., k, k)`` with slightly larger diagonals, so that they can be inverted."""
+    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+    return matrix + (1e-10 * diagonal + 1e-30)[..., None] * np.eye(matrix.shape[-1])

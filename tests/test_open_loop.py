@@ -14,6 +14,7 @@ from ventbench import open_loop_report
 from ventbench.cli import app
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS, lung
+from ventbench.open_loop_report import Misfit, OpenLoopReport
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import nominal_plants
@@ -28,6 +29,10 @@ single_compartments = partial(nominal_plants, single_compartment)
 FIGURES = ("mae", "median_mae", "ci95", "breaths")
 PREFIXES = ("", "held_out_", "official_held_out_")
 SAMPLES, INSPIRATORY = 40, 30
+
+
+def as_json(*arguments):
+    return open_loop_report.open_loop(*arguments).as_dict()
 
 
 def answered(plants_for, lungs: list[str], seed: int = 0, noise: float = 0.3) -> Breaths:
@@ -61,7 +66,8 @@ def breaths(simulators):
 
 
 def test_the_error_is_the_one_that_was_put_in(breaths):
-    result = open_loop_report.run(breaths)
+    report = open_loop_report.open_loop(breaths)
+    result = report.as_dict()
     assert list(result["lungs"]) == ["R5C20", "R20C50"]
     for one in result["lungs"].values():
         for prefix in PREFIXES:  # new breaths: the official simulators judge them
@@ -73,7 +79,7 @@ def test_the_error_is_the_one_that_was_put_in(breaths):
             assert high >= one[f"{prefix}mae"] - 1e-12
         assert one["fitting_label"] == {k: v for k, v in one.items() if k != "fitting_label"}
     assert result["misfits"] == result["not_judged"] == []
-    assert open_loop_report.misfit_lines(result) == []
+    assert report.misfit_lines() == []
     assert json.loads(json.dumps(result, allow_nan=False)) == result
 
 
@@ -81,7 +87,7 @@ def test_the_error_is_the_one_that_was_put_in(breaths):
 def test_each_kind_is_what_it_says(simulators, breaths, kind):
     kinds = {"physics": single_compartments, "learned": frozen.load_learned().for_breaths}
     error = open_loop_report.errors(kinds.get(kind, simulators.for_breaths), breaths)
-    result = open_loop_report.run(breaths, kind)
+    result = as_json(breaths, kind)
     assert result["plant"] == kind
     assert result["simulators"] == simulators.about()
     for name, index in breaths.by_lung_index.items():
@@ -104,7 +110,8 @@ def test_a_wrong_label_or_valve_is_noticed_and_named(simulators):
         return replace(plants, slopes=plants.slopes * gain)
 
     pressure = answered(stronger, lungs, noise=0.1).pressure
-    result = open_loop_report.run(replace(breaths, C=C, pressure=pressure))
+    report = open_loop_report.open_loop(replace(breaths, C=C, pressure=pressure))
+    result = report.as_dict()
     found = {one["breath_id"]: one["explanation"] for one in result["misfits"]}
     assert found == {1: "lung R5C50", 4: "valve gain x 1.25"}
     mislabelled = result["lungs"]["R5C20"]
@@ -113,7 +120,7 @@ def test_a_wrong_label_or_valve_is_noticed_and_named(simulators):
     assert mislabelled["fitting_label"]["mae"] is None
     stiff = result["lungs"]["R5C10"]
     assert stiff["mae"] > 0.5 > 0.2 > stiff["fitting_label"]["mae"]
-    lines = open_loop_report.misfit_lines(result)
+    lines = report.misfit_lines()
     assert "2 breaths are explained far better" in lines[0]
     assert "breath 1 (R5C20)" in lines[1]
     assert lines[1].endswith("as lung R5C50")
@@ -123,16 +130,17 @@ def test_breaths_without_a_first_pressure_are_not_judged(breaths):
     pressure = breaths.pressure.copy()
     pressure[1, 0] = np.nan
     pressure[5, 1:INSPIRATORY] = np.nan
-    result = open_loop_report.run(replace(breaths, pressure=pressure))
+    report = open_loop_report.open_loop(replace(breaths, pressure=pressure))
+    result = report.as_dict()
     assert result["not_judged"] == [2, 6]
     assert [one["breaths"] for one in result["lungs"].values()] == [2, 2]
-    assert "2 breaths have no first pressure" in open_loop_report.misfit_lines(result)[-1]
+    assert "2 breaths have no first pressure" in report.misfit_lines()[-1]
 
 
 def test_many_misfits_are_told_in_few_lines():
-    one = {"lung": "R5C10", "mae": 3.0, "mae_explained": 0.5, "explanation": "lung R5C20"}
-    misfits = [one | {"breath_id": i} for i in range(25)]
-    lines = open_loop_report.misfit_lines({"misfits": misfits, "not_judged": []})
+    misfits = tuple(Misfit(i, "R5C10", 3.0, "lung R5C20", 0.5) for i in range(25))
+    report = OpenLoopReport("frozen", {}, None, {}, misfits, (), ())
+    lines = report.misfit_lines()
     assert len(lines) == 22
     assert lines[-1].endswith("5 more; --json lists all")
 
@@ -154,7 +162,7 @@ def test_the_command_writes_what_the_function_finds(breaths, tmp_path):
         out = tmp_path / "out.json"
         text = run("open-loop", tmp_path / name, "--json", out)
         result = json.loads(out.read_text())
-        assert result == open_loop_report.run(load(tmp_path / name))
+        assert result == as_json(load(tmp_path / name))
         for lung_id in ("R5C20", "R20C50"):
             assert lung_id in text
             assert set(result["lungs"][lung_id]) == {"fitting_label"} | {

@@ -1,3 +1,127 @@
-"""ventbench: the benchmark for mechanical-ventilator control."""
+"""ventbench: the benchmark for mechanical-ventilator control.
+
+Everything that a notebook needs is an attribute of this package and is imported at first use:
+
+- recordings: ``load_recording``, ``example``, ``Breaths``;
+- simulators: ``load_simulators``, ``simulate``, ``open_loop``, the protocol ``Plant``;
+- controllers: ``score``, ``rollout``, ``tune_pid``, ``train_residual``, ``train_ppo``,
+  ``train_dqn``, the protocol ``Controller``;
+- missing physics: ``diagnose``, ``Diagnosis``;
+- learned simulators: ``train_simulator``; the leaderboard: ``load_board``.
+
+``help(ventbench.score)`` and so on say types, shapes and units and give an example.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ventbench.board.frames import load_board as load_board
+    from ventbench.data_files import example as example
+    from ventbench.diagnosis.diagnose import diagnose as diagnose
+    from ventbench.diagnosis.result import Diagnosis as Diagnosis
+    from ventbench.errors import InputError as InputError
+    from ventbench.interfaces import Controller as Controller
+    from ventbench.interfaces import Observation as Observation
+    from ventbench.interfaces import Plant as Plant
+    from ventbench.interfaces import Task as Task
+    from ventbench.lungs import LUNGS as LUNGS
+    from ventbench.lungs import Lung as Lung
+    from ventbench.open_loop_report import OpenLoopReport as OpenLoopReport
+    from ventbench.open_loop_report import open_loop as open_loop
+    from ventbench.plants.catalog import Simulators as Simulators
+    from ventbench.plants.catalog import load_simulators as load_simulators
+    from ventbench.recordings import Breaths as Breaths
+    from ventbench.recordings import load as load_recording
+    from ventbench.simulation import Simulation as Simulation
+    from ventbench.simulation import simulate as simulate
+    from ventbench.submissions.result import Score as Score
+    from ventbench.submissions.scoring import score as score
+    from ventbench.training.pid_grid import tune_pid as tune_pid
+    from ventbench.training.residual.train import train_residual as train_residual
+    from ventbench.training.rl.train import train_dqn as train_dqn
+    from ventbench.training.rl.train import train_ppo as train_ppo
+    from ventbench.training.simulator import train_simulator as train_simulator
+    from ventbench.trajectories import Trajectories as Trajectories
+    from ventbench.trajectories import rollout as rollout
 
 __version__ = "0.1.0"
+
+#: Module and attribute of each name.
+_SOURCES = {
+    "Breaths": ("recordings", "Breaths"),
+    "Controller": ("interfaces", "Controller"),
+    "Diagnosis": ("diagnosis.result", "Diagnosis"),
+    "InputError": ("errors", "InputError"),
+    "LUNGS": ("lungs", "LUNGS"),
+    "Lung": ("lungs", "Lung"),
+    "Observation": ("interfaces", "Observation"),
+    "OpenLoopReport": ("open_loop_report", "OpenLoopReport"),
+    "Plant": ("interfaces", "Plant"),
+    "Score": ("submissions.result", "Score"),
+    "Simulation": ("simulation", "Simulation"),
+    "Simulators": ("plants.catalog", "Simulators"),
+    "Task": ("interfaces", "Task"),
+    "Trajectories": ("trajectories", "Trajectories"),
+    "diagnose": ("diagnosis.diagnose", "diagnose"),
+    "example": ("data_files", "example"),
+    "load_board": ("board.frames", "load_board"),
+    "load_recording": ("recordings", "load"),
+    "load_simulators": ("plants.catalog", "load_simulators"),
+    "open_loop": ("open_loop_report", "open_loop"),
+    "rollout": ("trajectories", "rollout"),
+    "score": ("submissions.scoring", "score"),
+    "simulate": ("simulation", "simulate"),
+    "train_dqn": ("training.rl.train", "train_dqn"),
+    "train_ppo": ("training.rl.train", "train_ppo"),
+    "train_residual": ("training.residual.train", "train_residual"),
+    "train_simulator": ("training.simulator", "train_simulator"),
+    "tune_pid": ("training.pid_grid", "tune_pid"),
+}
+
+__all__ = [
+    "LUNGS",
+    "Breaths",
+    "Controller",
+    "Diagnosis",
+    "InputError",
+    "Lung",
+    "Observation",
+    "OpenLoopReport",
+    "Plant",
+    "Score",
+    "Simulation",
+    "Simulators",
+    "Task",
+    "Trajectories",
+    "__version__",
+    "diagnose",
+    "example",
+    "load_board",
+    "load_recording",
+    "load_simulators",
+    "open_loop",
+    "rollout",
+    "score",
+    "simulate",
+    "train_dqn",
+    "train_ppo",
+    "train_residual",
+    "train_simulator",
+    "tune_pid",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _SOURCES:
+        raise AttributeError(f"module 'ventbench' has no attribute {name!r}")
+    module, attribute = _SOURCES[name]
+    value = getattr(import_module(f"ventbench.{module}"), attribute)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.interfaces import Plant
 from ventbench.lungs import RECORDED_LUNGS
-from ventbench.metrics import bootstrap, open_loop
+from ventbench.metrics import bootstrap
+from ventbench.metrics.open_loop import mae
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators, names
-from ventbench.recordings import Breaths
+from ventbench.recordings import Breaths, load
 from ventbench.rollouts import PlantsFor, open_loop_breaths
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Floats = NDArray[np.float64]
 
@@ -28,29 +34,146 @@ FAR_BETTER = 0.4
 #: Factors on the flow of the valve that are tried as explanations.
 GAINS = (0.6, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6)
 
+#: Misfits that a printed report names; the JSON has all.
+_MISFITS_SHOWN = 20
 
-def run(breaths: Breaths, plant: Given = "frozen") -> dict[str, Any]:
-    """Test simulators against a recording.
+
+@dataclass(frozen=True)
+class Misfit:
+    """A breath that something else than its label explains far better.
+
+    Attributes:
+        breath_id: of the recording.
+        lung: its label.
+        mae: under its label, cmH2O.
+        explanation: such as ``"lung R20C20"`` or ``"valve gain x 0.8"``.
+        mae_explained: under the explanation, cmH2O.
+    """
+
+    breath_id: int
+    lung: str
+    mae: float
+    explanation: str
+    mae_explained: float
+
+
+@dataclass(frozen=True)
+class OpenLoopReport:
+    """Open-loop errors of simulators on a recording, cmH2O.
+
+    Attributes:
+        plant: name of the simulators.
+        simulators: version and hashes of the official ones, by which misfits are judged.
+        about: what is known of simulators from a file, a function or the caller; else None.
+        lungs: by lung id, the figures of :func:`summary`: without prefix of the simulators that
+            make the scores, over all breaths; ``held_out_...`` of each breath by a member of the
+            ensemble that has not seen it; ``official_held_out_...`` of the simulators that make
+            the scores, on what they have not seen. In ``fitting_label`` the figures without the
+            misfits.
+        misfits: breaths that something else than their label explains far better.
+        not_judged: ids of breaths without a first or another inspiratory pressure.
+        notes: what a reader of the recording should know.
+    """
+
+    plant: str
+    simulators: dict[str, Any]
+    about: dict[str, Any] | None
+    lungs: dict[str, dict[str, Any]]
+    misfits: tuple[Misfit, ...]
+    not_judged: tuple[int, ...]
+    notes: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values of ``ventbench open-loop --json``."""
+        return {
+            "plant": self.plant,
+            "simulators": self.simulators,
+            **({} if self.about is None else {"about": self.about}),
+            "unit": "cmH2O",
+            "lungs": self.lungs,
+            "misfits": [asdict(misfit) for misfit in self.misfits],
+            "not_judged": list(self.not_judged),
+            "notes": list(self.notes),
+        }
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row a lung: the figures of :attr:`lungs`, those without misfits excepted."""
+        import pandas as pd
+
+        rows = {
+            name: {key: value for key, value in figures.items() if key != "fitting_label"}
+            for name, figures in self.lungs.items()
+        }
+        return pd.DataFrame.from_dict(rows, orient="index").rename_axis("lung")
+
+    def misfit_lines(self) -> list[str]:
+        """Sentences about the breaths that do not fit their label or could not be judged."""
+        lines = []
+        if self.misfits:
+            lines.append(
+                f"{len(self.misfits)} breaths are explained far better by something else than "
+                "their label:"
+            )
+            lines += [
+                f"  breath {misfit.breath_id} ({misfit.lung}): {misfit.mae:.2f} cmH2O, "
+                f"{misfit.mae_explained:.2f} as {misfit.explanation}"
+                for misfit in self.misfits[:_MISFITS_SHOWN]
+            ]
+            if len(self.misfits) > _MISFITS_SHOWN:
+                lines.append(
+                    f"  ... and {len(self.misfits) - _MISFITS_SHOWN} more; --json lists all"
+                )
+        if self.not_judged:
+            lines.append(
+                f"{len(self.not_judged)} breaths have no first pressure or no other inspiratory "
+                "one and were not judged."
+            )
+        return lines
+
+    def __str__(self) -> str:
+        """Return mean errors by lung, and the sentences of :meth:`misfit_lines`."""
+        title = f"Open-loop MAE of the {self.plant} simulators, cmH2O"
+        rows = [
+            f"  {name}: {_shown(one['mae'])}, held out {_shown(one['held_out_mae'])} "
+            f"({one['breaths']} breaths)"
+            for name, one in self.lungs.items()
+        ]
+        return "\n".join([title, *rows, *self.misfit_lines()])
+
+    def _repr_html_(self) -> str:
+        frame = self.to_frame()[["breaths", "mae", "median_mae", "held_out_mae"]]
+        title = f"<p>Open-loop MAE of the {html.escape(self.plant)} simulators, cmH2O</p>"
+        below = "".join(f"<p>{html.escape(line)}</p>" for line in self.misfit_lines())
+        return title + frame.to_html(float_format="%.2f") + below
+
+
+def open_loop(breaths: Breaths | Path | str, simulator: Given = "frozen") -> OpenLoopReport:
+    """Measure how far simulators stray from recorded breaths under the recorded commands.
+
+    The error of a breath is the mean |simulated - recorded| pressure over its inspiratory samples,
+    from its first recorded pressure, cmH2O.
 
     Args:
-        breaths: the recording.
-        plant: the simulators; see :func:`ventbench.plants.catalog.load_simulators`.
+        breaths: n recorded breaths, or the path of a recording.
+        simulator: a name, a file, a plant, plants by lung, a function of commands or an array of
+            simulated pressures ``(n, T)``; see :func:`ventbench.load_simulators`.
 
     Returns:
-        JSON values: ``plant``; ``simulators``, the official ones, by which misfits are judged;
-        ``about``, what is known of others if they are from a file, a function or the caller;
-        ``lungs``; ``misfits``; ``not_judged``, the ids of breaths without a first or another
-        inspiratory pressure; ``notes``. For each lung the figures of :func:`summary`, cmH2O:
-        without prefix of the simulators that make the scores, over all breaths; ``held_out_...``
-        of each breath by a member of the ensemble that has not seen it; ``official_held_out_...``
-        of the simulators that make the scores, on what they have not seen. In ``fitting_label``
-        the figures without the misfits.
+        Errors by lung, and the breaths that do not fit their label.
 
     Raises:
         InputError: if there is no simulator for a lung of the recording.
+
+    Example:
+        >>> import ventbench
+        >>> report = ventbench.open_loop(ventbench.example("sound"), "physics")
+        >>> report.to_frame().loc["R5C20", "mae"] < 1.0
+        True
     """
+    if not isinstance(breaths, Breaths):
+        breaths = load(breaths)
     official = frozen.load()
-    tested = load_simulators(plant, breaths=breaths)
+    tested = load_simulators(simulator, breaths=breaths)
     error = mean_errors(tested.pressures(breaths), breaths)
     crossed = mean_errors(tested.pressures(breaths, cross_fitted=True), breaths)
     held_out, unseen = tested.held_out(breaths), tested.unseen(breaths)
@@ -73,39 +196,19 @@ def run(breaths: Breaths, plant: Given = "frozen") -> dict[str, Any]:
     lungs = {}
     for lung, index in breaths.by_lung_index.items():
         lungs[lung] = figures(index) | {"fitting_label": figures(index[~apart[index]])}
-    return {
-        "plant": plant if isinstance(plant, str) and plant in names() else tested.name,
-        "simulators": official.about(),
-        **({} if tested.kind in names() else {"about": dict(tested.about)}),
-        "unit": "cmH2O",
-        "lungs": lungs,
-        "misfits": [asdict(misfit) for misfit in doubtful],
-        "not_judged": breaths.breath_id[np.isnan(error)].tolist(),
-        "notes": list(breaths.notes),
-    }
+    return OpenLoopReport(
+        plant=simulator if isinstance(simulator, str) and simulator in names() else tested.name,
+        simulators=official.about(),
+        about=None if tested.kind in names() else dict(tested.about),
+        lungs=lungs,
+        misfits=tuple(doubtful),
+        not_judged=tuple(breaths.breath_id[np.isnan(error)].tolist()),
+        notes=breaths.notes,
+    )
 
 
-def misfit_lines(result: dict[str, Any]) -> list[str]:
-    """Say in words which breaths do not fit their label."""
-    misfits = result["misfits"]
-    lines = []
-    if misfits:
-        lines.append(
-            f"{len(misfits)} breaths are explained far better by something else than their label:"
-        )
-        lines += [
-            f"  breath {one['breath_id']} ({one['lung']}): {one['mae']:.2f} cmH2O, "
-            f"{one['mae_explained']:.2f} as {one['explanation']}"
-            for one in misfits[:20]
-        ]
-        if len(misfits) > 20:
-            lines.append(f"  ... and {len(misfits) - 20} more; --json lists all")
-    if result["not_judged"]:
-        lines.append(
-            f"{len(result['not_judged'])} breaths have no first pressure or no other inspiratory "
-            "one and were not judged."
-        )
-    return lines
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
 
 
 def errors(plants_for: PlantsFor, breaths: Breaths) -> Floats:
@@ -123,27 +226,8 @@ def mean_errors(simulated: Floats, breaths: Breaths) -> Floats:
         breaths: n recorded breaths.
     """
     blank = np.isnan(breaths.pressure[:, 0])
-    found = open_loop.mae(breaths.pressure, np.nan_to_num(simulated), breaths.inspiratory)
+    found = mae(breaths.pressure, np.nan_to_num(simulated), breaths.inspiratory)
     return np.where(blank, np.nan, found)
-
-
-@dataclass(frozen=True)
-class Misfit:
-    """A breath that something else than its label explains far better.
-
-    Attributes:
-        breath_id: of the recording.
-        lung: its label.
-        mae: under its label, cmH2O.
-        explanation: such as ``"lung R20C20"`` or ``"valve gain x 0.8"``.
-        mae_explained: under the explanation, cmH2O.
-    """
-
-    breath_id: int
-    lung: str
-    mae: float
-    explanation: str
-    mae_explained: float
 
 
 def misfits(

@@ -87,7 +87,7 @@ def simulate(
     controls: Controls | Path | str | ArrayLike,
     *,
     lung: str = "R20C50",
-    plant: Given = "frozen",
+    simulator: Given = "frozen",
     start: float = protocol.PEEP,
 ) -> Simulation:
     """Answer valve commands with pressures.
@@ -96,7 +96,8 @@ def simulate(
         controls: T commands; or a CSV file of them, see :func:`read_controls`; or ``u_in`` alone,
             %, shape ``(T,)``, at steps of 30 ms with the expiratory valve closed.
         lung: id of the lung.
-        plant: simulators; see :func:`ventbench.load_simulators`.
+        simulator: a name, a file, plants by lung or a function of commands; see
+            :func:`ventbench.load_simulators`.
         start: pressure at the first sample, cmH2O; the lung is at rest there.
 
     Returns:
@@ -109,7 +110,7 @@ def simulate(
         >>> import numpy as np
         >>> import ventbench
         >>> u_in = np.full(30, 10.0)  # the inspiratory valve held at 10 % for 0.9 s
-        >>> answer = ventbench.simulate(u_in, lung="R20C50", plant="physics")
+        >>> answer = ventbench.simulate(u_in, lung="R20C50", simulator="physics")
         >>> answer.pressure.shape
         (30,)
         >>> bool(answer.pressure[-1] > answer.pressure[1] > 5.0)
@@ -119,7 +120,7 @@ def simulate(
         controls = read_controls(Path(controls))
     elif not isinstance(controls, Controls):
         controls = _controls(controls)
-    simulators = load_simulators(plant)
+    simulators = load_simulators(simulator)
     commands = (controls.u_in, controls.u_out, controls.dt)
     pressure = simulators.respond(lung, *commands, initial_pressure=start)
     return Simulation(lung, simulators.name, controls.time, controls.u_in, controls.u_out, pressure)

@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
+import html
 import zipfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import files
+from ventbench import files, precision, protocol, rollouts, scenario, waveform
 from ventbench.errors import InputError
+from ventbench.interfaces import Controller, Plant
+from ventbench.metrics.waveform import run_error
+from ventbench.plants.catalog import Given, load_simulators
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Floats = NDArray[np.float64]
+
+_SERIES = ("target", "pressure", "u_in", "u_out")
 
 
 @dataclass(frozen=True)
@@ -42,6 +55,29 @@ class Trajectories:
     u_in: Floats
     u_out: Floats
 
+    def to_frame(self) -> pd.DataFrame:
+        """One row a step: ``lung``, ``pip``, ``time`` (s), and the four series as columns."""
+        import pandas as pd
+
+        index = pd.MultiIndex.from_product(
+            [self.lungs, self.pips, self.time], names=["lung", "pip", "time"]
+        )
+        series = {name: getattr(self, name).ravel() for name in _SERIES}
+        return pd.DataFrame(series, index=index).reset_index()
+
+    def errors(self) -> pd.DataFrame:
+        """Mean |p - target| of the scored inspirations, cmH2O; a row a lung, a column a PIP."""
+        import pandas as pd
+
+        breaths = (*self.pressure.shape[:2], protocol.BREATHS, protocol.BREATH_STEPS)
+        inspired = self.pressure.reshape(breaths)[..., : protocol.INSPIRATION_STEPS]
+        error = run_error(inspired, np.asarray(self.pips)[:, None, None])
+        return pd.DataFrame(error, index=list(self.lungs), columns=list(self.pips))
+
+    def _repr_html_(self) -> str:
+        title = f"<p>{html.escape(self.name)}: mean |pressure - target| by lung and PIP, cmH2O</p>"
+        return title + self.errors().to_html(float_format="%.3f")
+
     def save(self, path: Path) -> None:
         """Write an ``.npz`` file in one step."""
         arrays = {
@@ -56,6 +92,91 @@ class Trajectories:
             "u_out": self.u_out,
         }
         files.write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
+
+
+def end_to_end(
+    name: str,
+    track: str,
+    lungs: tuple[str, ...],
+    pips: tuple[float, ...],
+    pressure: Floats,
+    u_in: Floats,
+) -> Trajectories:
+    """Lay whole breaths end to end.
+
+    Args:
+        name: of the controller.
+        track: of the run.
+        lungs: ids, length L.
+        pips: cmH2O, length P.
+        pressure: true airway pressure, cmH2O, shape ``(L, P, BREATHS, BREATH_STEPS)``.
+        u_in: as applied, %, that shape too.
+    """
+    steps = np.arange(protocol.BREATHS * protocol.BREATH_STEPS)
+    shape = (len(lungs), len(pips), steps.size)
+    u_out = (steps % protocol.BREATH_STEPS >= protocol.INSPIRATION_STEPS).astype(float)
+    return Trajectories(
+        name=name,
+        track=track,
+        lungs=lungs,
+        pips=pips,
+        time=np.asarray(steps * protocol.DT, np.float64),
+        target=np.broadcast_to(waveform.target(steps, np.asarray(pips)[:, None]), shape),
+        pressure=pressure.reshape(shape),
+        u_in=u_in.reshape(shape),
+        u_out=np.broadcast_to(u_out, shape),
+    )
+
+
+def rollout(
+    controller: Controller,
+    *,
+    simulator: Given = "frozen",
+    lungs: Sequence[str] | None = None,
+    pips: Sequence[float] = protocol.PIPS,
+) -> Trajectories:
+    """Run a pure JAX controller through the noise-free protocol: three breaths at each PIP.
+
+    Args:
+        controller: a pytree with ``init`` and ``step``, see :class:`ventbench.Controller`; such as
+            :class:`ventbench.controllers.pid.PID` or what a training returned.
+        simulator: simulators with plants; see :func:`ventbench.load_simulators`.
+        lungs: ids; all that the simulators have if not given.
+        pips: peak inspiratory pressures, cmH2O.
+
+    Returns:
+        Time series of shape ``(L, P, 300)``, float64.
+
+    Raises:
+        InputError: if the simulators have no plants, or none for a lung.
+
+    Example:
+        >>> import ventbench
+        >>> from ventbench.controllers.pid import PID
+        >>> run = ventbench.rollout(PID(1.0, 5.0), simulator="physics", lungs=["R20C50"], pips=[20])
+        >>> run.pressure.shape
+        (1, 1, 300)
+        >>> bool(run.errors().loc["R20C50", 20] < 10.0)
+        True
+    """
+    simulators = load_simulators(simulator)
+    names = [entry.id for entry in simulators.lungs] if lungs is None else list(lungs)
+    cells = tuple(float(pip) for pip in pips)
+    plants = [simulators.plant(name) for name in names]
+    with precision.float64():
+        nominal = scenario.nominal(np.asarray(cells))
+
+        def run(plant: Plant) -> tuple[Floats, Floats]:
+            plant = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), plant)
+            inspired, expired = rollouts.closed_loop(plant, controller, nominal, whole=True)
+            return tuple(  # type: ignore[return-value]
+                np.concatenate([getattr(inspired, field), getattr(expired, field)], axis=-1)
+                for field in ("pressure", "u_in")
+            )
+
+        pressure, u_in = (np.stack(series) for series in zip(*map(run, plants), strict=True))
+    name = type(controller).__name__
+    return end_to_end(name, "performance", tuple(names), cells, pressure, u_in)
 
 
 def load(path: Path) -> Trajectories:

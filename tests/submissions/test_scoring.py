@@ -399,20 +399,20 @@ def twice(observation):
 def test_a_folder_a_name_a_class_and_a_function_are_scored_alike(make, two_lungs):
     act = "return 5.0 + 2.0 * (observation.target - observation.pressure)"
     folder = make(act=act)
-    inside = score(folder, plants=two_lungs, sandbox=False)
-    again = score(str(folder), plants=two_lungs, draws=1, sandbox=False)
-    function = score(twice, plants=two_lungs, draws=1)
+    inside = score(folder, simulator=two_lungs, sandbox=False)
+    again = score(str(folder), simulator=two_lungs, draws=1, sandbox=False)
+    function = score(twice, simulator=two_lungs, draws=1)
     assert (again.track, function.track) == ("robustness", "robustness")
     np.testing.assert_array_equal(again.nominal, inside.nominal)
     np.testing.assert_array_equal(function.nominal, inside.nominal)
     np.testing.assert_array_equal(function.drawn, again.drawn)
-    told = score(Proportional, plants=two_lungs)
+    told = score(Proportional, simulator=two_lungs)
     assert told.track == "performance"
     np.testing.assert_array_equal(told.nominal[1], inside.nominal[1])
     assert not np.array_equal(told.nominal[0], inside.nominal[0])
-    hidden = score(Proportional, plants=two_lungs, track="robustness")
+    hidden = score(Proportional, simulator=two_lungs, track="robustness")
     np.testing.assert_array_equal(hidden.nominal, inside.nominal)
-    named = score("pid_best", plants=two_lungs, sandbox=False)
+    named = score("pid_best", simulator=two_lungs, sandbox=False)
     assert named.submission == open_submission("pid_best")
     for result in (inside, function, told, named):
         assert result.sandbox is None
@@ -422,7 +422,7 @@ def test_a_folder_a_name_a_class_and_a_function_are_scored_alike(make, two_lungs
 
 
 def test_a_folder_runs_in_the_sandbox_unless_told_otherwise(make, two_lungs):
-    result = score(make(act="return 3.0"), plants=two_lungs)
+    result = score(make(act="return 3.0"), simulator=two_lungs)
     assert result.sandbox is not None
     assert not result.failures
     assert not result.official, "not the frozen lungs"
@@ -432,10 +432,10 @@ def test_failures_of_a_function_name_its_file_and_line(two_lungs):
     def divides(observation):
         return 1.0 / 0.0
 
-    result = score(divides, plants=two_lungs)
+    result = score(divides, simulator=two_lungs)
     assert result.failures[0].message.startswith("divides: test_scoring.py line ")
     typed = eval("lambda observation: {}['gain']")
-    result = score(typed, plants=two_lungs)
+    result = score(typed, simulator=two_lungs)
     assert result.failures[0].message.startswith("<lambda>: <lambda> raised KeyError at step 1")
 
 
@@ -450,4 +450,4 @@ def test_failures_of_a_function_name_its_file_and_line(two_lungs):
 )
 def test_what_cannot_be_scored(given, said):
     with pytest.raises(SubmissionError, match=said):
-        score(given, plants="physics")
+        score(given, simulator="physics")

@@ -59,7 +59,7 @@ def simulate(
     from ventbench import files
     from ventbench.simulation import simulate as work
 
-    text = work(controls, lung=lung, plant=plant, start=start).to_csv()
+    text = work(controls, lung=lung, simulator=plant, start=start).to_csv()
     if out is None:
         typer.echo(text, nl=False)
     else:

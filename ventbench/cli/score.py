@@ -77,7 +77,7 @@ def score(
         with progress.status(f"scoring {entry.label}"):
             scores.append(
                 scoring.score(
-                    entry, plants=simulators, track=track, draws=draws, sandbox=not in_process
+                    entry, simulator=simulators, track=track, draws=draws, sandbox=not in_process
                 )
             )
     results = [result.to_json() for result in scores]

@@ -47,11 +47,11 @@ def open_loop(
     for note in breaths.notes:
         progress.print(f"note: {note}", markup=False, highlight=False)
     with progress.status(f"simulating {len(breaths)} breaths"):
-        result = open_loop_report.run(breaths, plant)
-    emit(result, json)
+        result = open_loop_report.open_loop(breaths, plant)
+    emit(result.as_dict(), json)
     console = Console(stderr=str(json) == "-")
-    console.print(_table(result))
-    for line in open_loop_report.misfit_lines(result):
+    console.print(_table(result.as_dict()))
+    for line in result.misfit_lines():
         console.print(line, markup=False, highlight=False)
 
 

@@ -42,6 +42,12 @@ def load(path: FilePath, *, clip: bool = False, pad: bool = False) -> Breaths:
 
     Raises:
         RecordingError: if the file cannot be used; the error carries its problems.
+
+    Example:
+        >>> import ventbench
+        >>> breaths = ventbench.load_recording(ventbench.example("concealed"))
+        >>> breaths.pressure.shape, list(breaths.by_lung_index)
+        ((24, 80), ['R20C50'])
     """
     source = open_source(path)
     log = ProblemLog(source.file)

@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench import draws as published
-from ventbench import precision, protocol, scenario, waveform
+from ventbench import precision, protocol, scenario
 from ventbench.interfaces import Plant, Task
 from ventbench.lungs import LUNGS, Lung
 from ventbench.metrics import safety
 from ventbench.metrics.figures import InspirationSignals, figures
 from ventbench.metrics.waveform import run_error
 from ventbench.plants import frozen
+from ventbench.plants.catalog import Given, load_simulators
 from ventbench.plants.hybrid import Hybrid
 from ventbench.scenario import Scenario
 from ventbench.submissions.errors import SubmissionError
@@ -26,7 +27,7 @@ from ventbench.submissions.folder import Submission, open_submission, submission
 from ventbench.submissions.result import CellFailure, Score
 from ventbench.submissions.runner import InProcessRunner, Runner
 from ventbench.submissions.stepping import ProtocolRun, as_float64, replay, step_through
-from ventbench.trajectories import Trajectories
+from ventbench.trajectories import end_to_end
 
 Floats = NDArray[np.float64]
 
@@ -34,7 +35,7 @@ Floats = NDArray[np.float64]
 def score(
     submission: Any,
     *,
-    plants: Any = "frozen",
+    simulator: Given = "frozen",
     track: str | None = None,
     draws: int = 0,
     sandbox: bool = True,
@@ -47,8 +48,7 @@ def score(
         submission: folder of a submission, the name of a bundled one, a class with ``reset(task)``
             and ``act(observation)``, or a function from an observation to ``u_in``, %. Classes and
             functions run in this process.
-        plants: simulators, as anything that
-            :func:`ventbench.plants.catalog.load_simulators` takes.
+        simulator: simulators with plants; see :func:`ventbench.load_simulators`.
         track: ``"performance"`` (the controller is told the lung) or ``"robustness"``; the first
             that the submission enters if not given.
         draws: how many of the 20 published draws to run besides the nominal cells.
@@ -69,12 +69,10 @@ def score(
         >>> from ventbench import score
         >>> def proportional(observation):
         ...     return 5.0 + 2.0 * (observation.target - observation.pressure)
-        >>> result = score(proportional, plants="physics")
+        >>> result = score(proportional, simulator="physics")
         >>> result.official
         False
     """
-    from ventbench.plants.catalog import load_simulators
-
     runner: Runner = InProcessRunner()
     if isinstance(submission, Submission):
         entry = submission
@@ -82,7 +80,7 @@ def score(
         entry = open_submission(str(submission))
     else:
         entry = submission_of(submission)
-    simulators = load_simulators(plants)
+    simulators = load_simulators(simulator)
     if sandbox and entry.controller is None:
         from ventbench.sandbox.runner import SandboxRunner
 
@@ -157,7 +155,7 @@ def run_protocol(
         np.concatenate([getattr(inspired, name), getattr(expired, name)], axis=-1)
         for name in ("pressure", "u_in")
     ]
-    trajectories = _trajectories(submission.manifest.name, track, names, pips, *joined)
+    trajectories = end_to_end(submission.manifest.name, track, names, pips, *joined)
 
     timing = {
         "seconds": time.perf_counter() - started,
@@ -233,29 +231,4 @@ def _failures(
             lungs[i], pips[p], k or None, failure, failure.message(submission.label, tasks[i].lung)
         )
         for (i, k, p), failure in sorted(run.failures.items())
-    )
-
-
-def _trajectories(
-    name: str,
-    track: str,
-    lungs: tuple[str, ...],
-    pips: tuple[float, ...],
-    pressure: Floats,
-    u_in: Floats,
-) -> Trajectories:
-    """Lay breaths end to end; ``pressure`` and ``u_in`` have shape ``(L, P, BREATHS, steps)``."""
-    steps = np.arange(protocol.BREATHS * protocol.BREATH_STEPS)
-    shape = (len(lungs), len(pips), steps.size)
-    u_out = (steps % protocol.BREATH_STEPS >= protocol.INSPIRATION_STEPS).astype(float)
-    return Trajectories(
-        name=name,
-        track=track,
-        lungs=lungs,
-        pips=pips,
-        time=np.asarray(steps * protocol.DT, np.float64),
-        target=np.broadcast_to(waveform.target(steps, np.asarray(pips)[:, None]), shape),
-        pressure=pressure.reshape(shape),
-        u_in=u_in.reshape(shape),
-        u_out=np.broadcast_to(u_out, shape),
     )

@@ -1,0 +1,5 @@
+"""``python -m ventbench``: the command line."""
+
+from ventbench.cli import main
+
+main()

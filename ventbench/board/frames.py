@@ -59,11 +59,6 @@ def load_board(
     - ``score_R5C10_cmH2O``, ...: mean error over draws and PIPs of each lung, cmH2O, and
       ``nominal_R5C10_cmH2O``, ...: mean nominal error over PIPs of each lung, cmH2O.
 
-    Example::
-
-        board = load_board("leaderboard", track="performance")
-        board[["rank", "name", "score_cmH2O", "score_R5C10_cmH2O"]]
-
     Args:
         folder: of the leaderboard; ``leaderboard`` in the working directory by default.
         track: ``"performance"`` or ``"robustness"``; both by default.
@@ -76,6 +71,12 @@ def load_board(
         InputError: if there is no leaderboard, a record was changed, or the track or version is
             not there.
         OSError: if a file cannot be read.
+
+    Example:
+        >>> import ventbench
+        >>> board = ventbench.load_board("leaderboard", track="performance")
+        >>> board[["rank", "name", "score_cmH2O", "score_R5C10_cmH2O"]].shape[1]
+        4
     """
     import pandas as pd
 

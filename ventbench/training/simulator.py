@@ -105,6 +105,11 @@ def train_simulator(
     On one machine with the same packages the files are the same byte for byte. Finished members are
     kept in ``out/parts`` until all is done, so that an interrupted training goes on.
 
+    Example::
+
+        simulators = ventbench.train_simulator("recordings", "runs/simulators")
+        ventbench.score("pid_best", simulator="runs/simulators")
+
     Args:
         folder: of the public recordings.
         out: where the files are written; those that are there are replaced at the end.

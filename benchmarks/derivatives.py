@@ -23,7 +23,8 @@ from ventbench.physics import library, parameter, paths
 from ventbench.physics.catalogue import basis_terms
 from ventbench.precision import float64
 from ventbench.recordings import Breaths
-from ventbench.system_id import Simulator, derivatives, recorded, settings
+from ventbench.system_id import Predictor, make_data, parameter_values
+from ventbench.system_id import predictor as predictor_module
 
 BREATHS, SAMPLES, DT = 40, 80, 0.03
 
@@ -42,15 +43,15 @@ def breaths() -> Breaths:
     )  # fmt: skip
 
 
-def exact(simulator: Simulator, values: np.ndarray, columns: int) -> Callable[[], object]:
+def exact(predictor: Predictor, values: np.ndarray, columns: int) -> Callable[[], object]:
     """Forward mode along each column of ``values``, compiled."""
-    ((u_in, u_out, dt),) = simulator._commands
+    ((u_in, u_out, dt),) = predictor._commands
     basis = np.eye(values.shape[1])[:columns]
 
     @jax.jit
     def slopes(values: jax.Array, basis: jax.Array) -> jax.Array:
-        static = simulator._static | {"skip_idle": False}
-        run = partial(derivatives._run, commands=(u_in, u_out, dt), **static)
+        static = predictor._static | {"skip_idle": False}
+        run = partial(predictor_module._run, commands=(u_in, u_out, dt), **static)
 
         def along(direction: jax.Array) -> jax.Array:
             return jax.jvp(run, (values,), (jnp.broadcast_to(direction, values.shape),))[1]
@@ -76,7 +77,7 @@ def seconds(call: Callable[[], object], repeats: int) -> tuple[float, float]:
 
 def compare(names: tuple[str, ...], columns: int, repeats: int) -> None:
     """Print times and their ratio for a model with some parameters."""
-    simulator = Simulator(recorded(breaths()), names, sizes=(BREATHS,))
+    predictor = Predictor(make_data(breaths()), names, sizes=(BREATHS,))
     few = {"PEEP": 5.0, "valve_lag.tau": 0.03, "leak.conductance": 5.0}
     mild = {name: parameter(name).mild for name in names if "." in name}
     off = {"command_rounding.amount": 0.0}  # has no slope
@@ -84,11 +85,11 @@ def compare(names: tuple[str, ...], columns: int, repeats: int) -> None:
     print(f"  {'':12}{'pressures':>12}{'differences':>14}{'forward mode':>14}{'ratio':>8}")
     firsts = []
     for label, given in (("none acts", {}), ("two act", few), ("all act", mild | off)):
-        values = settings(recorded(breaths()), names, given)
+        values = parameter_values(make_data(breaths()), names, given)
         ways = (
-            partial(simulator.predict, values),
-            partial(simulator.derivatives, values, tuple(range(columns))),
-            exact(simulator, values, columns),
+            partial(predictor.predict, values),
+            partial(predictor.derivatives, values, tuple(range(columns))),
+            exact(predictor, values, columns),
         )
         found = [seconds(way, repeats) for way in ways]
         alone, differences, forward = (1e3 * least for _, least in found)

@@ -20,7 +20,7 @@ from ventbench.diagnosis.settings import (
 )
 from ventbench.physics import paths
 from ventbench.recordings.breaths import Breaths
-from ventbench.system_id import recorded
+from ventbench.system_id import make_data
 from ventbench.validation.challenge.cases import Base, Case, Effect
 from ventbench.validation.challenge.rig import record
 
@@ -59,13 +59,13 @@ def made(*effects: Effect, seed: int = 0, **changed: Any) -> Breaths:
 
 def split(breaths: Breaths, settings: SelectionConfig = SETTINGS) -> Evaluator:
     """Training and held-out breaths, with the library's parameters."""
-    return make_evaluator(recorded(breaths), HELD[: len(breaths)], paths(), settings=settings)
+    return make_evaluator(make_data(breaths), HELD[: len(breaths)], paths(), settings=settings)
 
 
 def split_wide(breaths: Breaths, settings: SelectionConfig = SETTINGS) -> Evaluator:
     """Training and held-out breaths, with the parameters of the nonparametric terms as well."""
     names = all_parameter_paths(settings)
-    return make_evaluator(recorded(breaths), HELD[: len(breaths)], names, settings=settings)
+    return make_evaluator(make_data(breaths), HELD[: len(breaths)], names, settings=settings)
 
 
 def numbered(breaths: Breaths, first: int) -> Breaths:

@@ -10,8 +10,8 @@ import pytest
 
 from ventbench.diagnosis import estimates
 from ventbench.physics.catalogue import paths
-from ventbench.system_id import recorded, settings
-from ventbench.system_id.derivatives import START, Simulator
+from ventbench.system_id import make_data, parameter_values
+from ventbench.system_id.predictor import START, Predictor
 
 from . import small
 
@@ -29,7 +29,7 @@ def test_the_larger_of_two_lags_comes_first(monkeypatch, found):
         problem=SimpleNamespace(unknowns=unknowns, data=SimpleNamespace(lung=np.zeros(3))),
     )  # fmt: skip
     monkeypatch.setattr(estimates, "fit", lambda *_, start, **__: start)
-    partition: Any = SimpleNamespace(data=None, simulator=None)
+    partition: Any = SimpleNamespace(data=None, predictor=None)
     start: Any = estimates.final_fit(fitted, partition, partition)
     assert start["R"] == 20.0
     assert start[LAGS[0]] == 0.08
@@ -37,11 +37,11 @@ def test_the_larger_of_two_lags_comes_first(monkeypatch, found):
 
 
 def test_two_lags_may_change_places():
-    data = recorded(small.made())
-    simulator = Simulator(data, paths(("valve_lag",)))
-    order = [settings(data, simulator.names, dict(zip(LAGS, pair, strict=True)))
+    data = make_data(small.made())
+    simulator = Predictor(data, paths(("valve_lag",)))
+    order = [parameter_values(data, simulator.names, dict(zip(LAGS, pair, strict=True)))
              for pair in ((0.09, 0.03), (0.03, 0.09))]  # fmt: skip
     one, other = simulator.predict_all(np.stack(order))
     np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)
-    off = simulator.predict(settings(data, simulator.names, {}))
+    off = simulator.predict(parameter_values(data, simulator.names, {}))
     assert np.abs(one - off).max() > 1.0

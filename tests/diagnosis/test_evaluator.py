@@ -18,7 +18,7 @@ from ventbench.diagnosis.hypothesis import Hypothesis, Partition
 from ventbench.diagnosis.selection import estimate_noise, fit_with_noise
 from ventbench.diagnosis.settings import PatientEffortSettings
 from ventbench.physics import paths
-from ventbench.system_id import START, Data, Noise, recorded, settings
+from ventbench.system_id import START, Data, Noise, make_data, parameter_values
 
 from . import small
 
@@ -31,7 +31,7 @@ DELAY, LAG = Hypothesis(("valve_delay",)), Hypothesis(("sensor_lag",))
 def shifted(partition: Partition, by: float) -> Partition:
     """The breaths with higher readings."""
     data = partition.data
-    return Partition(dataclasses.replace(data, seen=data.seen + by), partition.simulator)
+    return Partition(dataclasses.replace(data, measured=data.measured + by), partition.predictor)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_breaths_are_split_and_none_is_lost():
     breaths = small.made()
     made = small.split(breaths)
     assert np.array_equal(made.training.data.u_in, breaths.u_in[~small.HELD])
-    assert np.array_equal(made.held_out.data.seen[:, 0], breaths.pressure[small.HELD])
+    assert np.array_equal(made.held_out.data.measured[:, 0], breaths.pressure[small.HELD])
 
 
 def test_a_fit_recovers_the_parameters(lagging):
@@ -96,14 +96,14 @@ def test_held_out_breaths_do_not_change_a_fit(late):
 def test_shared_parameters_are_transferred_and_breaths_start_at_their_first_reading(late):
     fitted = late.fit(DELAY, GAUSSIAN)
     values = late.transferred_values(fitted, late.held_out)
-    order = (*late.held_out.simulator.names, START)
+    order = (*late.held_out.predictor.names, START)
     for path in ("R", "C", "R_ex", "PEEP", "valve_delay.delay"):
         assert np.all(values[:, order.index(path)] == fitted.column(path)[0])
-    assert np.array_equal(values[:, -1], late.held_out.data.seen[:, 0, 0])
+    assert np.array_equal(values[:, -1], late.held_out.data.measured[:, 0, 0])
     assert np.array_equal(values[:, order.index("position")], late.held_out.data.position)
     seen = late.predict(fitted, late.held_out)
-    assert np.array_equal(seen, late.held_out.simulator.predict(values))
-    error = (seen - late.held_out.data.seen)[:, 0, :30]
+    assert np.array_equal(seen, late.held_out.predictor.predict(values))
+    error = (seen - late.held_out.data.measured)[:, 0, :30]
     assert np.sqrt(np.mean(error**2)) < 0.5
 
 
@@ -111,7 +111,7 @@ def test_each_breaths_own_gain_is_not_transferred(late):
     own = dataclasses.replace(late, gain_sd=0.1)
     fitted = own.fit(DELAY, GAUSSIAN)
     assert len(np.unique(fitted.column("gain"))) == len(own.training.data)
-    order = own.held_out.simulator.names
+    order = own.held_out.predictor.names
     assert np.all(own.transferred_values(fitted, own.held_out)[:, order.index("gain")] == 22.8)
     # Held-out breaths are fitted with a gain each, and can only be likelier.
     assert np.all(
@@ -151,15 +151,15 @@ def brute_force(made: Evaluator, values: np.ndarray, duration: float, which: int
     A start is fitted to each effort, by a derivative that is a difference.
     """
     partition = made.held_out
-    order = (*partition.simulator.names, START)
+    order = (*partition.predictor.names, START)
     columns = [order.index(f"patient_effort.{p}") for p in ("amplitude", "onset", "duration")]
-    measured = partition.data.seen[which, 0]
+    measured = partition.data.measured[which, 0]
 
     def seen(amplitude: float, onset: float, start: float) -> np.ndarray:
         trial = values.copy()
         trial[:, columns] = amplitude, onset, duration
         trial[:, -1] = start
-        return partition.simulator.predict(trial)[which, 0]
+        return partition.predictor.predict(trial)[which, 0]
 
     def likelihood(amplitude: float, onset: float) -> float:
         first = values[which, -1]
@@ -198,7 +198,7 @@ def test_efforts_are_integrated_out(which):
 def two_lungs() -> Data:
     one = small.made(seed=1)
     R = np.where(np.arange(16) < 8, 20.0, 5.0)
-    return recorded(dataclasses.replace(one, R=R))
+    return make_data(dataclasses.replace(one, R=R))
 
 
 def test_what_belongs_to_R_is_one_for_each_label():
@@ -224,7 +224,7 @@ def test_what_belongs_to_R_is_one_for_each_label():
 def test_a_lung_without_training_breaths_takes_the_first_ones(late):
     fitted = late.fit(DELAY, GAUSSIAN)
     other = dataclasses.replace(late.held_out.data, R=np.full(8, 5.0))
-    carried = late.transferred_values(fitted, Partition(other, late.held_out.simulator))
+    carried = late.transferred_values(fitted, Partition(other, late.held_out.predictor))
     assert np.all(carried[:, paths().index("R")] == fitted.column("R")[0])
 
 
@@ -233,7 +233,7 @@ def test_fit_with_noise_recovers_the_noise():
     fitted = fit_with_noise(loud, Hypothesis())
     assert fitted.noise.sigma[0] == pytest.approx(0.4, rel=0.2)
     assert fitted.noise.ar[0] == pytest.approx(0.7, abs=0.12)
-    neutral = settings(loud.training.data, paths(), {})
+    neutral = parameter_values(loud.training.data, paths(), {})
     assert np.array_equal(
         fitted.values[:, paths().index("gain")], neutral[:, paths().index("gain")]
     )
@@ -275,7 +275,7 @@ def test_without_dead_times_nothing_is_moved(exhaling_late):
 def test_every_breath_is_held_out_once(turbulent, both):
     assert len(turbulent.folds) == 2
     seen = [turbulent.held_out, *(held_out for _, held_out in turbulent.folds)]
-    pressures = np.concatenate([partition.data.seen[:, 0] for partition in seen])
+    pressures = np.concatenate([partition.data.measured[:, 0] for partition in seen])
     assert len(np.unique(pressures, axis=0)) == small.BREATHS
     for training, held_out in turbulent.folds:
         assert len(training.data) + len(held_out.data) == small.BREATHS

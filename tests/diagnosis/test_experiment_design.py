@@ -10,7 +10,7 @@ import pytest
 from ventbench.diagnosis.candidate_breaths import Rig, families
 from ventbench.diagnosis.experiment_design import contrast, forecast, request_breaths
 from ventbench.physics import paths
-from ventbench.system_id import Data, Noise, Simulator, fit, settings
+from ventbench.system_id import Data, Noise, Predictor, fit, parameter_values
 
 NOISE = Noise((0.2,), (0.0,))
 #: With what is asked for, 40 breaths: sizes repeat, and nothing is compiled twice.
@@ -42,9 +42,9 @@ def simulated(u, out, truth, *, R=20.0, C=20.0, seed=0):
     )  # fmt: skip
     rng = np.random.default_rng(seed + 100)
     start = 5.0 + rng.normal(0, 0.3, n)
-    values = settings(empty, paths(), {"PEEP": 5.0, "start": start, **truth})
-    clean = Simulator(empty, paths()).predict(values)[:, 0]
-    return empty.answered(clean + rng.normal(0, 0.2, clean.shape))
+    values = parameter_values(empty, paths(), {"PEEP": 5.0, "start": start, **truth})
+    clean = Predictor(empty, paths()).predict(values)[:, 0]
+    return empty.with_pressure(clean + rng.normal(0, 0.2, clean.shape))
 
 
 def recorded(truth, *, seed=0):
@@ -66,7 +66,7 @@ def expected(truth, other, u_in, u_out):
         np.full(n, data.C[0]), np.ones(n),
     )  # fmt: skip
     here = np.arange(len(data))
-    simulator = Simulator(new, paths())
+    simulator = Predictor(new, paths())
     one, two = (forecast(x, new, simulator, here, 5.0, NOISE) for x in (truth, other))
     return contrast(one, two, NOISE).nats(np.arange(n))
 
@@ -105,7 +105,7 @@ def test_what_is_asked_for_is_safe_also_with_another_lung():
     found = request_breaths(one, [two])
     assert found is not None
     assert found.why == ("valve_delay", "valve_lag")
-    seen = simulated(found.u_in, found.u_out, stiff).seen
+    seen = simulated(found.u_in, found.u_out, stiff).measured
     assert seen.min() > -1.0
     assert 10.0 < seen.max() < 51.0
 

@@ -21,7 +21,7 @@ from ventbench.diagnosis.latent_inputs import (
 )
 from ventbench.diagnosis.linearisation import linearise
 from ventbench.diagnosis.selection import fit_with_noise
-from ventbench.system_id import Simulator
+from ventbench.system_id import Predictor
 
 from . import small
 
@@ -33,18 +33,18 @@ def clean(plain):
     """The training breaths, the values of a fit to them, and its prediction, ``(n, T)``."""
     partition = plain.evaluator.training
     values = plain.evaluator.transferred_values(plain.base, partition)
-    return partition, values, partition.simulator.predict(values)[:, 0]
+    return partition, values, partition.predictor.predict(values)[:, 0]
 
 
 def test_an_input_at_the_alveolus_acts_as_muscles_do(clean):
     partition, values, before = clean
-    names = partition.simulator.names
+    names = partition.predictor.names
     time = np.cumsum(partition.data.dt, axis=1) - partition.data.dt
     onset, duration, amplitude = 0.5, 0.7, -0.5
     pulling = values.copy()
     for name, value in (("amplitude", amplitude), ("onset", onset), ("duration", duration)):
         pulling[:, names.index(f"patient_effort.{name}")] = value
-    seen = partition.simulator.predict(pulling)[:, 0] - before
+    seen = partition.predictor.predict(pulling)[:, 0] - before
     source = -amplitude * np.sin(np.pi * np.clip((time - onset) / duration, 0.0, 1.0))
     answer = input_responses(partition, values, ALVEOLUS)
     drawn = np.einsum("nk,nkt->nt", source, answer)
@@ -60,7 +60,7 @@ def test_an_input_at_the_supply_acts_as_more_command(clean, sample):
     partition, values, before = clean
     u_in = partition.data.u_in.copy()
     u_in[:, sample - 1] *= 1.001
-    other = Simulator(dataclasses.replace(partition.data, u_in=u_in), partition.simulator.names)
+    other = Predictor(dataclasses.replace(partition.data, u_in=u_in), partition.predictor.names)
     slope = (other.predict(values)[:, 0] - before) / 0.001
     found = input_responses(partition, values, SUPPLY)[:, sample]
     np.testing.assert_allclose(found[:, :INSPIRED], slope[:, :INSPIRED], atol=1e-3)
@@ -70,10 +70,10 @@ def test_an_input_at_the_supply_acts_as_more_command(clean, sample):
 
 def test_gain_scatter_scales_all_commands(clean):
     partition, values, before = clean
-    column = partition.simulator.names.index("gain")
+    column = partition.predictor.names.index("gain")
     more = values.copy()
     more[:, column] *= 1.0001
-    slope = (partition.simulator.predict(more)[:, 0] - before) / 0.0001
+    slope = (partition.predictor.predict(more)[:, 0] - before) / 0.0001
     found = input_responses(partition, values, GAIN_SCATTER)
     assert found.shape == (8, 1, small.SAMPLES)
     np.testing.assert_allclose(found[:, 0], slope, atol=1e-3 * np.abs(slope).max())

@@ -48,13 +48,13 @@ def whitened(difference: np.ndarray) -> np.ndarray:
 def changed(found: Linear, path: str, breath: int | None = None) -> np.ndarray:
     """Whitened change of the prediction by a small change of a parameter, by a difference."""
     problem = found.base.problem
-    column = (*problem.simulator.names, START).index(path)
+    column = (*problem.predictor.names, START).index(path)
     rows = slice(None) if breath is None else slice(breath, breath + 1)
     ends = []
     for sign in (1.0, -1.0):
         values = found.base.values.copy()
         values[rows, column] *= 1.0 + 1e-5 * sign
-        ends.append(problem.simulator.predict(values)[:, 0])
+        ends.append(problem.predictor.predict(values)[:, 0])
     return whitened((ends[0] - ends[1]) * 1e4)
 
 
@@ -65,8 +65,8 @@ def test_residual_and_templates_are_orthogonal_to_refitted_parameters(bent, path
     assert abs(np.sum(slope * bent.place.residual)) < 1e-4 * scale
     # A template of the same change is absorbed nearly whole.
     values = bent.base.values.copy()
-    values[:, bent.base.problem.simulator.names.index(path)] *= 1.001
-    seen = bent.base.problem.simulator.predict(values)
+    values[:, bent.base.problem.predictor.names.index(path)] *= 1.001
+    seen = bent.base.problem.predictor.predict(values)
     raw = bent.place.whiten(seen - bent.place.prediction)
     assert np.linalg.norm(bent.place.template(seen)) < 0.01 * np.linalg.norm(raw)
 
@@ -89,9 +89,9 @@ def test_bases_are_orthonormal(bent):
 
 def test_gain_is_the_decrease_of_the_cost_after_a_refit(bent):
     values = bent.base.values.copy()
-    names = bent.base.problem.simulator.names
+    names = bent.base.problem.predictor.names
     values[:, names.index("turbulent_resistance.quadratic")] = 0.2
-    seen = bent.base.problem.simulator.predict(values)
+    seen = bent.base.problem.predictor.predict(values)
     nats, share = bent.place.gain(bent.place.template(seen))
     refitted = bent.evaluator.fit(
         Hypothesis(("turbulent_resistance",)), NOISE, bent.base, tolerance=1e-6, iterations=30
@@ -117,10 +117,10 @@ def test_gain_of_the_wrong_sign_and_of_nothing(bent):
 
 
 def test_outlying_samples_are_clipped(bent):
-    seen = bent.base.problem.data.seen.copy()
+    seen = bent.base.problem.data.measured.copy()
     seen[2, 0, 10] += 5.0  # 25 standard deviations
     problem = dataclasses.replace(
-        bent.base.problem, data=dataclasses.replace(bent.base.problem.data, seen=seen)
+        bent.base.problem, data=dataclasses.replace(bent.base.problem.data, measured=seen)
     )
     at = bent.base.minimum.x
     free, cut = (linearise(problem, at, SCREENING, clip=clip).residual for clip in (np.inf, 4.0))

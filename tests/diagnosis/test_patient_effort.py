@@ -76,7 +76,7 @@ def test_the_gain_of_a_breath_is_the_integral_over_its_efforts(active, fitted):
     still, x = active.refit_breath_parameters(fitted)
     still = dataclasses.replace(still, noise=NOISE)
     found = TERM.log_likelihood_gain(still, x, fitted)
-    names = still.simulator.names
+    names = still.predictor.names
     columns = [names.index(path) for path in (AMPLITUDE, ONSET)]
     amplitudes, onsets = np.arange(-8.0, 8.01, 0.25), np.arange(0.0, 1.7, 0.04)
     total = np.full(len(found), -np.inf)
@@ -113,7 +113,7 @@ def test_effort_is_told_from_slow_sensor_noise(active, fitted):
 def test_the_prediction_is_the_mean_over_efforts(active, fitted):
     passive = active.fit(Hypothesis(), fitted.noise, fitted)
     values = active.transferred_values(fitted, active.held_out)
-    simulator = active.held_out.simulator
+    simulator = active.held_out.predictor
     columns = [simulator.names.index(path) for path in (AMPLITUDE, ONSET)]
     answers = []
     for effort in zip(fitted.column(AMPLITUDE), fitted.column(ONSET), strict=True):

@@ -25,7 +25,7 @@ from ventbench.mechanics.lung_match import Estimate
 from ventbench.physics import mechanism, physics
 from ventbench.plants.catalog import load_simulators
 from ventbench.recordings.breaths import Breaths
-from ventbench.system_id import Noise, recorded
+from ventbench.system_id import Noise, make_data
 
 from . import made, small
 
@@ -97,10 +97,10 @@ def test_the_sensors_noise_is_the_recordings():
     breaths = made.breaths(n=60, samples=60)
     pressure = breaths.pressure.copy()
     pressure[:, 20] = np.nan
-    data = recorded(dataclasses.replace(breaths, pressure=pressure))
+    data = make_data(dataclasses.replace(breaths, pressure=pressure))
     answer = np.full(pressure.shape, 7.0)
     found = with_sensor_noise(data, answer, Noise((0.3, 20.0), (0.6, 0.0)))
-    error = found.seen[:, 0] - 7.0
+    error = found.measured[:, 0] - 7.0
     seen = found.weight[:, 0] > 0
     assert np.array_equal(seen, np.isfinite(pressure))
     for part in (error[:, :1], error[seen]):
@@ -110,11 +110,11 @@ def test_the_sensors_noise_is_the_recordings():
     # The same commands, and the same noise each time.
     assert found.u_in is data.u_in
     again = with_sensor_noise(data, answer, Noise((0.3, 20.0), (0.6, 0.0)))
-    assert np.array_equal(again.seen, found.seen)
+    assert np.array_equal(again.measured, found.measured)
     still = with_sensor_noise(
         data, np.where(np.isnan(pressure), np.nan, 7.0), Noise((1e-9,), (0.0,))
     )
-    np.testing.assert_allclose(still.seen[:, 0][seen], 7.0, atol=1e-6)
+    np.testing.assert_allclose(still.measured[:, 0][seen], 7.0, atol=1e-6)
 
 
 def strange(breaths: Breaths) -> np.ndarray:
@@ -132,7 +132,7 @@ def test_what_recording_and_simulator_share_is_no_mismatch():
         )
     before = load_simulators({small.LABEL: plant}).pressures(effect) + strange(effect)
     breaths = dataclasses.replace(effect, pressure=effect.pressure + strange(effect))
-    data, held = recorded(breaths), held_out(breaths)
+    data, held = make_data(breaths), held_out(breaths)
     alone = identify(data, held, PASSIVE, lambda what: None, small.SETTINGS)
     told: list[str] = []
     recording_model, simulator_model = identify_both(

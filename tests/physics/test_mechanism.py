@@ -11,7 +11,7 @@ from ventbench.physics import library, mechanism, parameter, paths
 from ventbench.physics.catalogue import basis_terms
 from ventbench.physics.mechanism import apply_if_active, is_active
 from ventbench.physics.model import Physics
-from ventbench.system_id import START, Simulator, recorded, settings
+from ventbench.system_id import START, Predictor, make_data, parameter_values
 
 from . import cases
 
@@ -20,24 +20,24 @@ NAMES = paths((*library(), *basis_terms()))
 
 @pytest.fixture(scope="module")
 def data():
-    return recorded(cases.recording(6, {}))
+    return make_data(cases.recording(6, {}))
 
 
 @pytest.fixture(scope="module")
 def skipping(data):
-    return Simulator(data, NAMES)
+    return Predictor(data, NAMES)
 
 
 @pytest.fixture(scope="module")
 def whole(data):
-    simulator = Simulator(data, NAMES)
-    simulator._static["skip_idle"] = False
-    return simulator
+    predictor = Predictor(data, NAMES)
+    predictor._static["skip_idle"] = False
+    return predictor
 
 
 @pytest.fixture(scope="module")
 def off(data):
-    return settings(data, NAMES, {"PEEP": 5.0})
+    return parameter_values(data, NAMES, {"PEEP": 5.0})
 
 
 def of_strength(name):

@@ -10,13 +10,14 @@ from ventbench.diagnosis.evaluator import make_evaluator
 from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.screening import screen_mechanisms
 from ventbench.diagnosis.selection import fit_with_noise, fit_with_white_noise
+from ventbench.diagnosis.settings import DEFAULT
 from ventbench.errors import InputError
 from ventbench.lungs import Lung
 from ventbench.physics import Description, Mechanism, Parameter, library, paths, physics
 from ventbench.physics.catalogue import extended
 from ventbench.precision import float64
 from ventbench.rollouts import open_loop
-from ventbench.system_id import Simulator, fit, interval, recorded
+from ventbench.system_id import Predictor, fit, interval, make_data
 
 from . import cases
 
@@ -61,7 +62,7 @@ def relieved():
         commands = (breaths.pressure[:, 0], breaths.u_in, breaths.u_out * 1.0, breaths.dt)
         pressure = np.array(open_loop(plant, *(jnp.asarray(x) for x in commands)))
     noise = np.random.default_rng(0).normal(0, 0.05, pressure.shape)
-    return breaths, recorded(breaths).answered(pressure + noise)
+    return breaths, make_data(breaths).with_pressure(pressure + noise)
 
 
 def test_it_is_known_by_name_within_the_block_only():
@@ -81,13 +82,13 @@ def test_it_is_known_by_name_within_the_block_only():
 def test_a_model_has_its_effect(relieved):
     breaths, data = relieved
     assert breaths.pressure.max() > OPENS + 3.0
-    assert data.seen.max() < breaths.pressure.max() - 1.0
+    assert data.measured.max() < breaths.pressure.max() - 1.0
 
 
 def test_a_fit_estimates_its_strength(relieved):
     with extended(RELIEF_VALVE):
-        simulator = Simulator(relieved[1], paths(NAMES))
-        fitted = fit(relieved[1], ["relief_valve"], simulator=simulator)
+        predictor = Predictor(relieved[1], paths(NAMES))
+        fitted = fit(relieved[1], ["relief_valve"], predictor=predictor)
         conductance = interval(fitted, "relief_valve.conductance")
     assert conductance.low < 20.0 < conductance.high
     assert conductance.value == pytest.approx(20.0, rel=0.1)
@@ -97,6 +98,6 @@ def test_screening_puts_it_first(relieved):
     with extended(RELIEF_VALVE):
         evaluator = make_evaluator(relieved[1], np.arange(12) % 2 == 1, paths(NAMES))
         null = fit_with_noise(evaluator, Hypothesis())
-        candidates = screen_mechanisms(null, fit_with_white_noise(evaluator, null), NAMES)
+        candidates = screen_mechanisms(null, fit_with_white_noise(evaluator, null), DEFAULT, NAMES)
     assert candidates[0].name == "relief_valve"
     assert candidates[0].nats > 50.0

@@ -14,9 +14,9 @@ from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.plants.plant_files import load_plant, save_plant
 from ventbench.precision import float64
 from ventbench.rollouts import open_loop
-from ventbench.system_id import Simulator, fit, recorded, settings
+from ventbench.system_id import Predictor, fit, make_data, parameter_values
 from ventbench.system_id.noise import Noise
-from ventbench.system_id.unknowns import freed, unknowns
+from ventbench.system_id.problem import free_paths, make_unknowns
 
 from . import cases
 
@@ -44,19 +44,19 @@ class Bench:
     """Twelve breaths, and what the model says of them with anything in it."""
 
     def __init__(self):
-        self.data = recorded(cases.recording(12, {}))
-        self.simulator = Simulator(self.data, ALL)
+        self.data = make_data(cases.recording(12, {}))
+        self.predictor = Predictor(self.data, ALL)
         self.error = np.random.default_rng(0).normal(0.0, 0.1, self.data.u_in.shape)
 
     def values(self, given, names=ALL):
-        return settings(self.data, names, {"PEEP": 5.0, "R": 11.0, "C": 23.0} | given)
+        return parameter_values(self.data, names, {"PEEP": 5.0, "R": 11.0, "C": 23.0} | given)
 
     def predict(self, given):
-        return self.simulator.predict(self.values(given))[:, 0]
+        return self.predictor.predict(self.values(given))[:, 0]
 
     def fit(self, pressure, names, **options):
-        noisy = self.data.answered(pressure + self.error)
-        return fit(noisy, names, noise=NOISE, simulator=self.simulator, **options)
+        noisy = self.data.with_pressure(pressure + self.error)
+        return fit(noisy, names, noise=NOISE, predictor=self.predictor, **options)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_slots_are_complete_and_outside_the_library():
 
 
 def test_coefficients_tend_to_zero_and_strengths_of_the_library_do_not(bench):
-    layout = unknowns(bench.data, freed(("leak", "recoil_shape")))
+    layout = make_unknowns(bench.data, free_paths(("leak", "recoil_shape")))
     _, precision = layout.prior({})
     assert np.all(precision[layout.of("leak.conductance")] == 0.0)
     for k in range(1, 6):
@@ -119,7 +119,7 @@ def test_all_at_zero_are_off(bench):
         "circuit_compliance.compliance": 1.0, "exhalation_valve_delay.opening": 0.05,
         "valve_hysteresis.width": 3.0, "sensor_drift.drift": 2.0, "leak.conductance": 5.0,
     }  # fmt: skip
-    without = Simulator(bench.data, paths()).predict(bench.values(given, paths()))[:, 0]
+    without = Predictor(bench.data, paths()).predict(bench.values(given, paths()))[:, 0]
     np.testing.assert_allclose(bench.predict(given), without, atol=1e-12, rtol=0)
 
 
@@ -131,14 +131,14 @@ def test_derivatives(bench, name):
     filled = columns + tuple(range(9 - len(columns)))  # a size that is compiled already
     for share in (0.0, 0.3):
         values = bench.values(drawn_coefficients([name], 3, share))
-        _, slopes = bench.simulator.derivatives(values, filled)
+        _, slopes = bench.predictor.derivatives(values, filled)
         for k, (column, item) in enumerate(zip(columns, items, strict=True)):
             step = 1e-6 * item.prior()[1]
             ends = []
             for sign in (1.0, -1.0):
                 moved = values.copy()
                 moved[:, column] += sign * step
-                ends.append(bench.simulator.predict(moved))
+                ends.append(bench.predictor.predict(moved))
             moved = (ends[0] - ends[1]) / (2.0 * step)
             np.testing.assert_allclose(slopes[:, k], moved, atol=1e-4 * (1 + np.abs(moved).max()))
         assert np.abs(slopes[:, : len(columns)]).max() * items[0].prior()[1] > 0.3
@@ -153,7 +153,7 @@ def test_shapes_are_recovered(bench, names):
     assert base.log_likelihood.sum() < found.log_likelihood.sum() - 15.0
     assert rms(found.residual) < 0.105
     # The noise is averaged out: the answer is nearer to the truth than any sample.
-    assert rms(bench.simulator.predict(found.values)[:, 0] - truth) < 0.025
+    assert rms(bench.predictor.predict(found.values)[:, 0] - truth) < 0.025
 
 
 SEEN = {
@@ -201,7 +201,7 @@ def test_slots_hold_what_they_are_said_to_hold(bench, slot, name, level, most):
     elements = ("drift_shape",) if slot == "measurement" else NONPARAMETRIC_COMPONENTS[slot].terms
     found = bench.fit(truth, elements)
     assert rms(bench.fit(truth, ()).residual) > 0.11
-    assert rms(bench.simulator.predict(found.values)[:, 0] - truth) < most
+    assert rms(bench.predictor.predict(found.values)[:, 0] - truth) < most
 
 
 def test_knots_without_data_stay_at_zero(bench):
@@ -261,7 +261,7 @@ def test_plants_with_slots_are_kept_in_files(bench, tmp_path):
         data = bench.data
         start = jnp.asarray(found.column("start"))
         seen = open_loop(loaded, start, *(jnp.asarray(x) for x in (data.u_in, data.u_out, data.dt)))
-        expected = bench.simulator.predict(found.values)[:, 0]
+        expected = bench.predictor.predict(found.values)[:, 0]
         np.testing.assert_allclose(seen, expected, atol=1e-9)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ventbench.physics import paths
-from ventbench.system_id import Simulator, fit, recorded
+from ventbench.system_id import Predictor, fit, make_data
 
 from . import cases
 
@@ -20,14 +20,14 @@ FIVE = ("valve_lag", "turbulent_resistance", "leak", "circuit_compliance", "sens
 def test_sixty_breaths_and_nine_parameters():
     """3 s on one core; twice that is allowed here, as other tests share the machine."""
     m = {"valve_lag": {"tau": 0.05}, "turbulent_resistance": {"quadratic": 8.0}}
-    few = recorded(cases.recording(12, m))
+    few = make_data(cases.recording(12, m))
     data = few.select(np.arange(60) % 12)
-    seen = data.seen + np.random.default_rng(0).normal(0, 0.2, data.seen.shape)
-    data = replace(data, seen=seen)
-    simulator = Simulator(data, paths())
-    fit(data, FIVE, simulator=simulator, iterations=2)  # compiles
+    seen = data.measured + np.random.default_rng(0).normal(0, 0.2, data.measured.shape)
+    data = replace(data, measured=seen)
+    predictor = Predictor(data, paths())
+    fit(data, FIVE, predictor=predictor, iterations=2)  # compiles
     begun = time.process_time()
-    found = fit(data, FIVE, simulator=simulator)
+    found = fit(data, FIVE, predictor=predictor)
     assert found.minimum.converged
     assert time.process_time() - begun < 6.0
     assert found.value("valve_lag.tau")[0] == pytest.approx(0.05, rel=0.2)

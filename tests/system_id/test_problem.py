@@ -11,16 +11,16 @@ from scipy import optimize, stats
 
 from tests.physics import cases
 from ventbench.errors import InputError
-from ventbench.system_id import Noise, Unknowns, estimate, fit, recorded, unknowns
-from ventbench.system_id.intervals import quantile
-from ventbench.system_id.least_squares import minimise
+from ventbench.system_id import Noise, Unknowns, fit, make_data, make_unknowns, robust_noise
+from ventbench.system_id.fit import t_quantile
+from ventbench.system_id.levenberg_marquardt import minimise
 
 M = {"valve_lag": {"tau": 0.05}, "viscoelasticity": {"ratio": 0.4, "time": 0.8}}
 
 
 @pytest.fixture(scope="module")
 def found():
-    return fit(recorded(cases.recording(8, M, noise=0.2, seed=4)), M)
+    return fit(make_data(cases.recording(8, M, noise=0.2, seed=4)), M)
 
 
 def test_gradient_and_jacobian(found):
@@ -103,17 +103,17 @@ def test_noise_is_estimated_in_spite_of_misfits():
     for t in range(1, 80):
         residual[..., t] = 0.5 * residual[..., t - 1] + fresh[..., t]
     residual[:3] += 4.0
-    noise = estimate(residual, np.ones_like(residual))
+    noise = robust_noise(residual, np.ones_like(residual))
     assert noise.sigma[0] == pytest.approx(0.2, rel=0.15)
     assert 0.4 < noise.ar[0] < 0.85
 
 
 def test_outlying_breaths_do_not_move_a_robust_fit(found):
     data = found.problem.data
-    seen = data.seen.copy()
+    seen = data.measured.copy()
     seen[3, :, 5:30] += 6.0
-    spoilt = fit(replace(data, seen=seen), M, noise=found.problem.noise)
-    plain = fit(replace(data, seen=seen), M, noise=replace(found.problem.noise, tail=np.inf))
+    spoilt = fit(replace(data, measured=seen), M, noise=found.problem.noise)
+    plain = fit(replace(data, measured=seen), M, noise=replace(found.problem.noise, tail=np.inf))
     truth = found.value("C")[0]
     assert abs(spoilt.value("C")[0] - truth) < 0.5 * abs(plain.value("C")[0] - truth)
 
@@ -144,12 +144,12 @@ def test_minimise_stops_at_bounds():
 
 @pytest.mark.parametrize("freedom", [5, 10, 40])
 def test_quantile(freedom):
-    assert quantile(freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=0.01)
+    assert t_quantile(freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=0.01)
 
 
 def test_layout_and_its_errors(found):
     data = found.problem.data
-    layout = unknowns(data, ("R", "gain", "start"), {"gain": np.arange(8) // 4})
+    layout = make_unknowns(data, ("R", "gain", "start"), {"gain": np.arange(8) // 4})
     assert isinstance(layout, Unknowns)
     assert len(layout.of("R")) == 1
     assert len(layout.of("gain")) == 2
@@ -160,16 +160,16 @@ def test_layout_and_its_errors(found):
     np.testing.assert_allclose(back[:, 1], np.repeat([20.0, 25.0], 4))
     np.testing.assert_allclose(back[:, 2], np.arange(8.0))
     with pytest.raises(InputError, match="freed twice"):
-        unknowns(data, ("R", "R"))
+        make_unknowns(data, ("R", "R"))
     with pytest.raises(InputError, match="groups of R"):
-        unknowns(data, ("R",), {"R": [0, 1]})
+        make_unknowns(data, ("R",), {"R": [0, 1]})
 
 
 def test_recordings_that_cannot_be_fitted():
     breaths = cases.recording(2, {})
     with pytest.raises(InputError, match="no breaths"):
-        recorded(breaths.select([]))
+        make_data(breaths.select([]))
     with pytest.raises(InputError, match="no flow"):
-        recorded(replace(breaths, flow=None), flow=True)
+        make_data(replace(breaths, flow=None), flow=True)
     with pytest.raises(InputError, match="no pressure"):
-        recorded(replace(breaths, pressure=np.full_like(breaths.pressure, np.nan)))
+        make_data(replace(breaths, pressure=np.full_like(breaths.pressure, np.nan)))

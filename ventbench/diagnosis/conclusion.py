@@ -44,7 +44,7 @@ from ventbench.diagnosis.selection import (
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import Noise
-from ventbench.system_id.together import each
+from ventbench.system_id.parallel import parallel_map
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,4 +272,4 @@ def _held_out_gains(evaluator: Evaluator, selected: FittedModel) -> dict[str, fl
         left = evaluator.fit(selected.hypothesis.without(name), selected.noise, selected)
         return float((here - evaluator.held_out_log_likelihood(left)).sum())
 
-    return dict(zip(selected.names, each(lost, selected.names), strict=True))
+    return dict(zip(selected.names, parallel_map(lost, selected.names), strict=True))

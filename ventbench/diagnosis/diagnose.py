@@ -28,7 +28,7 @@ from ventbench.errors import InputError
 from ventbench.mechanics.lung_match import LungMatch
 from ventbench.plants.catalog import Given, Simulators, load_simulators
 from ventbench.recordings.breaths import Breaths
-from ventbench.system_id import Fit, Noise, recorded
+from ventbench.system_id import Fit, Noise, make_data
 
 #: Receives the current step in words, and the share of the whole that is done.
 Progress: TypeAlias = Callable[[str, float], None]
@@ -87,7 +87,7 @@ def diagnose(
     held = held_out(breaths, settings.data)
     tell("simulating", 0.02)
     before = simulators.pressures(breaths)
-    data = recorded(breaths)
+    data = make_data(breaths)
     excluded = ("patient_effort",) if passive else ()
     recording_only_model = identify(data, held, excluded, lambda what: tell(what, 0.3), settings)
     recording_model, simulator_model = recording_only_model, None

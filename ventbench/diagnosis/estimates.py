@@ -25,7 +25,7 @@ from ventbench.precision import float64
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit, fit, interval
 from ventbench.system_id.data import Data, Floats
-from ventbench.system_id.derivatives import START, Simulator
+from ventbench.system_id.predictor import START, Predictor
 
 #: What a latent input is, by the place where it enters.
 _LATENT_INPUTS = {
@@ -71,7 +71,7 @@ def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
         fixed=dict(hypothesis.fixed),
         start=start,
         noise=fitted.noise,
-        simulator=partition.simulator,
+        predictor=partition.predictor,
     )
 
 
@@ -135,7 +135,7 @@ def lung_matches_by_flow(breaths: Breaths) -> tuple[tuple[LungMatch, ...], tuple
 def plants(fitted: Fit) -> dict[str, Plant]:
     """The fitted plant of each lung, by label, without parameters that differ between breaths."""
     problem = fitted.problem
-    return _by_label(problem.data, problem.simulator, fitted.mechanisms, fitted.values)
+    return _by_label(problem.data, problem.predictor, fitted.mechanisms, fitted.values)
 
 
 def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
@@ -143,25 +143,25 @@ def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
     partition = evaluator.training
     return _by_label(
         partition.data,
-        partition.simulator,
+        partition.predictor,
         fitted.names,
         evaluator.transferred_values(fitted, partition),
     )
 
 
 def _by_label(
-    data: Data, simulator: Simulator, mechanisms: tuple[str, ...], values: Floats
+    data: Data, predictor: Predictor, mechanisms: tuple[str, ...], values: Floats
 ) -> dict[str, Plant]:
     own = [name for name in library() if varies_by_breath(name)]
     names = [path for path in paths(mechanisms) if path.rpartition(".")[0] not in own]
     names.remove("position")
-    columns = [simulator.names.index(name) for name in names]
+    columns = [predictor.names.index(name) for name in names]
     result: dict[str, Plant] = {}
     for R, C in np.unique(np.stack([data.R, data.C], axis=1), axis=0):
         breath = int(np.flatnonzero((data.R == R) & (data.C == C))[0])
         with float64():
             given = dict(zip(names, values[breath, columns], strict=True))
-            plant = Physics((), (), simulator.substeps, simulator.memory).having(**given)
+            plant = Physics((), (), predictor.substeps, predictor.memory).having(**given)
         result[f"R{R:g}C{C:g}"] = plant
     return result
 

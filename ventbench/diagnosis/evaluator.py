@@ -23,12 +23,11 @@ from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.physics.catalogue import library
 from ventbench.system_id import problem as problems
 from ventbench.system_id.data import Data, Floats
-from ventbench.system_id.derivatives import START
-from ventbench.system_id.least_squares import minimise
+from ventbench.system_id.levenberg_marquardt import minimise
 from ventbench.system_id.noise import Noise
-from ventbench.system_id.problem import Problem
-from ventbench.system_id.together import each
-from ventbench.system_id.unknowns import described, unknowns
+from ventbench.system_id.parallel import parallel_map
+from ventbench.system_id.predictor import START
+from ventbench.system_id.problem import Problem, make_unknowns, parameter_of
 
 
 def fit(
@@ -64,9 +63,9 @@ def fit(
     paths = tuple(dict.fromkeys((*hypothesis.paths, *extra)))
     problem = make_problem(partition, paths, noise, dict(hypothesis.fixed), gain_sd)
     layout = problem.unknowns
-    columns = (*partition.simulator.names, START)
+    columns = (*partition.predictor.names, START)
     first = {p: problem.fixed[:, columns.index(p)] for p in layout.paths if "." not in p}
-    first |= {p: described(p).mild for p in layout.paths if "." in p}
+    first |= {p: parameter_of(p).mild for p in layout.paths if "." in p}
     before: tuple[str, ...] = ()
     if warm_start is not None:
         before = warm_start.names
@@ -105,11 +104,11 @@ def make_problem(
     data = partition.data
     groups = {"gain": np.arange(len(data))} if gain_sd else {}
     groups |= groups_by_label(data, paths)
-    layout = unknowns(data, paths, groups)
-    base = problems.settings(data, partition.simulator.names, fixed)
-    neutral = float(np.log(described("gain").neutral))
+    layout = make_unknowns(data, paths, groups)
+    base = problems.parameter_values(data, partition.predictor.names, fixed)
+    neutral = float(np.log(parameter_of("gain").neutral))
     mean, precision = layout.prior({"gain": (neutral, gain_sd)} if gain_sd else {})
-    return Problem(data, partition.simulator, layout, base, noise, mean, precision)
+    return Problem(data, partition.predictor, layout, base, noise, mean, precision)
 
 
 def groups_by_label(data: Data, paths: tuple[str, ...]) -> dict[str, NDArray[np.int64]]:
@@ -120,7 +119,7 @@ def groups_by_label(data: Data, paths: tuple[str, ...]) -> dict[str, NDArray[np.
     """
     groups = {}
     for path in paths:
-        follows = described(path).follows if "." in path else None
+        follows = parameter_of(path).follows if "." in path else None
         if follows:
             label = data.R if follows == "R" else data.C
             groups[path] = np.unique(label, return_inverse=True)[1].reshape(-1)
@@ -140,7 +139,7 @@ def delay_restarts(problem: Problem, x: Floats, settings: SelectionConfig = DEFA
         settings: every threshold.
     """
     for path in problem.unknowns.paths:
-        parameter = described(path)
+        parameter = parameter_of(path)
         if parameter.kinked and parameter.scan:
             x = _best_delay(problem, x, path, settings)
     return x
@@ -148,17 +147,17 @@ def delay_restarts(problem: Problem, x: Floats, settings: SelectionConfig = DEFA
 
 def _best_delay(problem: Problem, x: Floats, path: str, settings: SelectionConfig) -> Floats:
     linear = linearise(problem, x, settings.screening, clip=np.inf)
-    column = problem.simulator.names.index(path)
+    column = problem.predictor.names.index(path)
     loss = float(np.sum(problem.noise.loss(linear.residual)))
     best, least = x, loss - settings.fit.delay_gain
-    for value in described(path).scan:
+    for value in parameter_of(path).scan:
         trial = linear.values.copy()
         trial[:, column] = value
-        left = linear.residual + linear.template(problem.simulator.predict(trial))
+        left = linear.residual + linear.template(problem.predictor.predict(trial))
         loss = float(np.sum(problem.noise.loss(left)))
         if loss < least:
             best, least = x.copy(), loss
-            best[problem.unknowns.of(path)] = described(path).coordinate(value)
+            best[problem.unknowns.of(path)] = parameter_of(path).coordinate(value)
     return best
 
 
@@ -261,7 +260,7 @@ class Evaluator:
         values = self.transferred_values(fitted, partition)
         if first is not None:
             values[:, -1] = first
-        return self.breath_term(fitted).predict(fitted, partition.simulator, values)
+        return self.breath_term(fitted).predict(fitted, partition.predictor, values)
 
     def refit_breath_parameters(
         self, fitted: FittedModel, partition: Partition | None = None
@@ -277,7 +276,7 @@ class Evaluator:
         """
         partition, settings = partition or self.held_out, self.settings.fit
         own = (START, "gain") if self.gain_sd else (START,)
-        values, names = self.transferred_values(fitted, partition), partition.simulator.names
+        values, names = self.transferred_values(fitted, partition), partition.predictor.names
         fixed = {name: values[:, k] for k, name in enumerate(names) if name != "position"}
         problem = make_problem(partition, own, fitted.noise, fixed, self.gain_sd)
         columns, layout = (*names, START), problem.unknowns
@@ -301,14 +300,14 @@ class Evaluator:
                 values of its first breath.
         """
         data, known = partition.data, fitted.problem.data
-        names = fitted.problem.simulator.names
-        values = problems.settings(data, partition.simulator.names, {})
+        names = fitted.problem.predictor.names
+        values = problems.parameter_values(data, partition.predictor.names, {})
         same = (data.R[:, None] == known.R) & (data.C[:, None] == known.C)
         same |= ~same.any(axis=1, keepdims=True)
         first = np.argmax(same, axis=1)
-        for column, name in enumerate(partition.simulator.names):
+        for column, name in enumerate(partition.predictor.names):
             if name != "position" and name in names and not self._differs_by_breath(name):
-                parameter = described(name)  # rounding must not carry a value beyond its bound
+                parameter = parameter_of(name)  # rounding must not carry a value beyond its bound
                 found = fitted.values[first, names.index(name)]
                 values[:, column] = np.clip(found, parameter.low, parameter.high)
         return values
@@ -320,7 +319,7 @@ class Evaluator:
     def _differs_by_breath(self, path: str) -> bool:
         if path == "gain":
             return self.gain_sd > 0
-        return path == START or ("." in path and described(path).scope == "breath")
+        return path == START or ("." in path and parameter_of(path).scope == "breath")
 
 
 def make_evaluator(
@@ -364,11 +363,11 @@ def cross_validated_gain(
     def evaluate(work: tuple[tuple[Partition, Partition], FittedModel]) -> Floats:
         (training, held_out), fitted = work
         fold = replace(evaluator, training=training, held_out=held_out, folds=())
-        values, names = fold.transferred_values(fitted, training), training.simulator.names
+        values, names = fold.transferred_values(fitted, training), training.predictor.names
         start = {path: values[:, k] for k, path in enumerate(names) if path != START}
         return fold.held_out_log_likelihood(fold.fit(fitted.hypothesis, fitted.noise, start=start))
 
-    found = each(evaluate, product(evaluator.folds, (with_term, without_term)))
+    found = parallel_map(evaluate, product(evaluator.folds, (with_term, without_term)))
     gains = [new - old for new, old in zip(found[::2], found[1::2], strict=True)]
     first = evaluator.held_out_log_likelihood(with_term)
     return np.concatenate([first - evaluator.held_out_log_likelihood(without_term), *gains])

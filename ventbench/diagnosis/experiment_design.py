@@ -20,11 +20,10 @@ from ventbench.diagnosis.settings import DEFAULT, ExperimentSettings
 from ventbench.lungs import Lung
 from ventbench.physics.catalogue import parameter, strength_path
 from ventbench.system_id.data import Data, Floats
-from ventbench.system_id.derivatives import START, Simulator
-from ventbench.system_id.least_squares import Minimum
+from ventbench.system_id.levenberg_marquardt import Minimum
 from ventbench.system_id.noise import Noise
-from ventbench.system_id.problem import Problem
-from ventbench.system_id.unknowns import described
+from ventbench.system_id.predictor import START, Predictor
+from ventbench.system_id.problem import Problem, parameter_of
 
 #: Share of the diagonal that keeps a Hessian invertible where data say nothing.
 _RIDGE = 1e-9
@@ -89,11 +88,11 @@ def acting(fitted: FittedHypothesis) -> tuple[str, ...]:
     """Mechanisms of a hypothesis: free ones, and fixed ones that are not neutral."""
     problem = fitted.problem
     free = {path.rpartition(".")[0] for path in problem.unknowns.paths}
-    owners = dict.fromkeys(path.rpartition(".")[0] for path in problem.simulator.names)
+    owners = dict.fromkeys(path.rpartition(".")[0] for path in problem.predictor.names)
     names = []
     for name in filter(None, owners):
         path = strength_path(name)
-        column = problem.fixed[:, problem.simulator.names.index(path)]
+        column = problem.fixed[:, problem.predictor.names.index(path)]
         if name in free or np.any(column != parameter(path).neutral):
             names.append(name)
     return tuple(names)
@@ -130,7 +129,7 @@ def values_of(fitted: FittedHypothesis, data: Data, lung: NDArray[np.intp], star
     problem = fitted.problem
     rows = np.resize(lung, len(data))
     values = problem.values(fitted.minimum.x)[rows]
-    columns = (*problem.simulator.names, START)
+    columns = (*problem.predictor.names, START)
     if "position" in columns:
         values[:, columns.index("position")] = data.position
     values[:, -1] = start
@@ -138,14 +137,14 @@ def values_of(fitted: FittedHypothesis, data: Data, lung: NDArray[np.intp], star
 
 
 def forecast(
-    fitted: FittedHypothesis, data: Data, simulator: Simulator, lung: NDArray[np.intp],
+    fitted: FittedHypothesis, data: Data, predictor: Predictor, lung: NDArray[np.intp],
     start: float, noise: Noise,
 ) -> Forecast:  # fmt: skip
     """Predict new breaths with derivatives; for the arguments see :func:`values_of`."""
     problem = fitted.problem
     layout = problem.unknowns
     values = values_of(fitted, data, lung, start)
-    seen, slopes = simulator.derivatives(values, problem.columns)
+    seen, slopes = predictor.derivatives(values, problem.columns)
     slopes = slopes * layout.slopes(values[:, list(problem.columns)])[:, :, None, None]
     rows = noise.whiten(slopes, data.weight).reshape(len(data), len(layout.paths), -1)
     white = noise.whiten(seen, data.weight).reshape(len(data), -1)
@@ -210,7 +209,7 @@ def _is_own(problem: Problem, column: int) -> bool:
     if path in ("R", "C"):
         return False
     alone = len(np.unique(problem.unknowns.index[:, column])) == len(problem.data) > 1
-    return alone or path == START or described(path).scope == "breath"
+    return alone or path == START or parameter_of(path).scope == "breath"
 
 
 def _information(hessian: Floats, which: NDArray[np.int64]) -> Floats:
@@ -244,7 +243,7 @@ def _best_on_lung(
     """The best design on the lung of the recorded breaths ``here``."""
     problem = chosen.problem
     values = problem.values(chosen.minimum.x)[here]
-    columns = (*problem.simulator.names, START)
+    columns = (*problem.predictor.names, START)
     rig = Rig(*(float(np.median(values[:, columns.index(n)])) for n in ("R", "C", "gain", "PEEP")))
     start = float(np.median(values[:, -1]))
     samples, dt = problem.data.u_in.shape[1], float(np.median(problem.data.dt))
@@ -253,8 +252,8 @@ def _best_on_lung(
     if not kinds:
         return None
     data = _data(kinds, problem.data, here)
-    simulator = Simulator(data, problem.simulator.names, problem.simulator.substeps)
-    expected = [forecast(hypothesis, data, simulator, here, start, noise) for hypothesis in every]
+    predictor = Predictor(data, problem.predictor.names, problem.predictor.substeps)
+    expected = [forecast(hypothesis, data, predictor, here, start, noise) for hypothesis in every]
     pairs = [
         pair
         for other in expected[1:]
@@ -298,9 +297,9 @@ def _safe(
         data = _data(kinds, recorded, here)
         safe = np.ones(len(data), bool)
         for hypothesis in hypotheses:
-            known = hypothesis.problem.simulator
-            simulator = Simulator(data, known.names, known.substeps)
-            pressure = simulator.predict(values_of(hypothesis, data, here, start))[:, 0]
+            known = hypothesis.problem.predictor
+            predictor = Predictor(data, known.names, known.substeps)
+            pressure = predictor.predict(values_of(hypothesis, data, here, start))[:, 0]
             inside = (pressure >= low) & (pressure <= high)  # False where it is not finite
             safe &= inside.all(axis=1)
         parts = np.split(safe, np.cumsum([len(kind.u_in) for kind in kinds])[:-1])
@@ -318,7 +317,7 @@ def _data(kinds: Sequence[Family], recorded: Data, here: NDArray[np.intp]) -> Da
     """Breaths of all families as data without readings, on the lung of recorded breaths."""
     u_in = np.concatenate([kind.u_in for kind in kinds])
     u_out = np.concatenate([kind.u_out for kind in kinds])
-    count, channels = len(u_in), recorded.seen.shape[1]
+    count, channels = len(u_in), recorded.measured.shape[1]
     shape = (count, channels, u_in.shape[1])
     weight = np.ones(shape)
     weight[:, 1:, 0] = 0.0

@@ -8,11 +8,10 @@ from functools import cached_property
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.physics.catalogue import mechanism, strength_path
 from ventbench.system_id.data import Data, Floats
-from ventbench.system_id.derivatives import START, Simulator
-from ventbench.system_id.least_squares import Minimum
+from ventbench.system_id.levenberg_marquardt import Minimum
 from ventbench.system_id.noise import Noise
-from ventbench.system_id.problem import Problem
-from ventbench.system_id.unknowns import freed
+from ventbench.system_id.predictor import START, Predictor
+from ventbench.system_id.problem import Problem, free_paths
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,8 @@ class Hypothesis:
     def paths(self) -> tuple[str, ...]:
         """Paths of all parameters that are fitted."""
         fixed = dict(self.fixed)
-        return tuple(p for p in dict.fromkeys((*freed(self.names), *self.free)) if p not in fixed)
+        paths = dict.fromkeys((*free_paths(self.names), *self.free))
+        return tuple(path for path in paths if path not in fixed)
 
 
 def varies_by_breath(name: str) -> bool:
@@ -71,20 +71,20 @@ class Partition:
     """Breaths, such as the training breaths, with the simulator that predicts them."""
 
     data: Data
-    simulator: Simulator
+    predictor: Predictor
 
 
 def make_partition(
     data: Data, names: tuple[str, ...], settings: SelectionConfig = DEFAULT
 ) -> Partition:
-    """Combine breaths with a simulator of their commands.
+    """Combine breaths with a predictor of their measurements.
 
     Args:
         data: the breaths.
         names: paths of the simulator's parameters.
         settings: give the number of breaths that are simulated at once.
     """
-    return Partition(data, Simulator(data, names, sizes=(settings.data.batch_size,)))
+    return Partition(data, Predictor(data, names, sizes=(settings.data.batch_size,)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ class FittedModel:
         """Residual with the strength of one mechanism set to zero, ``(n, c, T)``."""
         if name not in self._residual_without:
             values = self.values.copy()
-            values[:, self.problem.simulator.names.index(strength_path(name))] = 0.0
+            values[:, self.problem.predictor.names.index(strength_path(name))] = 0.0
             self._residual_without[name] = self.problem.residual_of(values)
         return self._residual_without[name]
 
@@ -144,7 +144,7 @@ class FittedModel:
 
     def column(self, path: str) -> Floats:
         """Physical value of one parameter in each breath, ``(n,)``."""
-        return self.values[:, (*self.problem.simulator.names, START).index(path)]
+        return self.values[:, (*self.problem.predictor.names, START).index(path)]
 
     def log_likelihood_at(self, noise: Noise) -> float:
         """Log-likelihood of the residuals under another noise, nats."""

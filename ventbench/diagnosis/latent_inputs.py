@@ -20,9 +20,9 @@ from ventbench.diagnosis.hypothesis import FittedModel, Partition
 from ventbench.diagnosis.linearisation import Linearisation, linearise
 from ventbench.diagnosis.settings import LatentInputSettings
 from ventbench.system_id.data import Floats
-from ventbench.system_id.noise import Noise, estimate
+from ventbench.system_id.noise import Noise, robust_noise
+from ventbench.system_id.parallel import parallel_map
 from ventbench.system_id.problem import Problem
-from ventbench.system_id.together import each
 
 #: Public names of the places where an input may act.
 ALVEOLUS, SUPPLY, MEASUREMENT = "f(t) at the alveolus", "f(t) at the supply", "measurement"
@@ -82,7 +82,7 @@ def fit_latent_inputs(
         responses = input_responses(evaluator.training, values, place)
         return _fit_input(evaluator, fitted, problem, x, place, responses)
 
-    return dict(zip(places, each(best, places), strict=True))
+    return dict(zip(places, parallel_map(best, places), strict=True))
 
 
 def log_likelihood_without_input(evaluator: Evaluator, fitted: FittedModel) -> tuple[float, Floats]:
@@ -137,11 +137,11 @@ def input_responses(partition: Partition, values: Floats, place: str) -> Floats:
     Returns:
         ``(n, T, T)``, input first; for the gain ``(n, 1, T)``.
     """
-    data, names = partition.data, partition.simulator.names
+    data, names = partition.data, partition.predictor.names
     n, samples = data.u_in.shape
     if place == GAIN_SCATTER:
         column = (names.index("gain"),)
-        slopes = partition.simulator.derivatives(values, column)[1][:, :, 0]
+        slopes = partition.predictor.derivatives(values, column)[1][:, :, 0]
         return slopes * values[:, column[0], None, None]
     if place == MEASUREMENT:
         return np.broadcast_to(np.eye(samples), (n, samples, samples)).copy()
@@ -286,9 +286,9 @@ def _noise_beside(
     """Noise that is left once the expected input is taken out."""
     course, freedom = process.expected()
     data = linear.problem.data
-    residual = (linear.prediction - data.seen) * data.weight
+    residual = (linear.prediction - data.measured) * data.weight
     residual[:, 0] -= np.einsum("nk,nkt->nt", course, responses) * data.weight[:, 0]
-    noise = estimate(residual, data.weight)
+    noise = robust_noise(residual, data.weight)
     share = 1.0 - float(freedom.sum()) / float(data.weight[:, 0].sum())
     sigma = noise.sigma[0] / np.sqrt(max(share, settings.min_noise_share))
     return replace(noise, sigma=(sigma, *noise.sigma[1:]))

@@ -24,11 +24,10 @@ from ventbench.diagnosis.hypothesis import FittedModel
 from ventbench.diagnosis.linearisation import Linearisation, linearise
 from ventbench.diagnosis.settings import PatientEffortSettings, SelectionConfig
 from ventbench.system_id.data import Floats
-from ventbench.system_id.derivatives import START, Simulator
-from ventbench.system_id.least_squares import Minimum, minimise
+from ventbench.system_id.levenberg_marquardt import Minimum, minimise
 from ventbench.system_id.noise import Noise
-from ventbench.system_id.problem import Problem
-from ventbench.system_id.unknowns import unknowns
+from ventbench.system_id.predictor import START, Predictor
+from ventbench.system_id.problem import Problem, make_unknowns
 
 EFFORT = "patient_effort"
 AMPLITUDE, ONSET, DURATION = (f"{EFFORT}.{p}" for p in ("amplitude", "onset", "duration"))
@@ -84,7 +83,7 @@ class BreathTerm(Protocol):
         """Log-likelihood that the term gains to first order, ``(n,)``."""
         ...
 
-    def predict(self, fitted: FittedModel, simulator: Simulator, values: Floats) -> Floats:
+    def predict(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
         """Expected readings of breaths to come, ``(n, c, T)``, at values ``(n, P + 1)``."""
         ...
 
@@ -119,9 +118,9 @@ class NoBreathTerm:
         """Zero."""
         return np.zeros(len(linearisation.values))
 
-    def predict(self, fitted: FittedModel, simulator: Simulator, values: Floats) -> Floats:
+    def predict(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
         """Simulate the values as they are."""
-        return simulator.predict(values)
+        return predictor.predict(values)
 
 
 class Evidence(NamedTuple):
@@ -163,12 +162,12 @@ class PatientEffort:
         """Move each breath's effort to where the breath is clearly likelier."""
         if EFFORT in fitted_names and not refit:
             return x
-        layout, names = problem.unknowns, problem.simulator.names
+        layout, names = problem.unknowns, problem.predictor.names
         values = problem.values(x)
         duration = float(values[0, names.index(DURATION)])
         passive = values.copy()
         passive[:, names.index(AMPLITUDE)] = 0.0
-        own, none = unknowns(problem.data, (START,)), np.zeros(len(values))
+        own, none = make_unknowns(problem.data, (START,)), np.zeros(len(values))
         still = replace(problem, unknowns=own, fixed=passive, mean=none, precision=none)
         at = own.pack({START: values[:, -1]})
         evidence = self.evidence([self._linearise(still, at, np.inf)], duration)[0]
@@ -231,13 +230,13 @@ class PatientEffort:
         """Sums over the grid of onsets at the fitted duration, ``(n,)``."""
         return self.evidence([linearisation], float(fitted.column(DURATION)[0]))[0].nats
 
-    def predict(self, fitted: FittedModel, simulator: Simulator, values: Floats) -> Floats:
+    def predict(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
         """Mean over the efforts of the fitted breaths: nobody knows the effort of a new breath."""
-        columns = [simulator.names.index(path) for path in (AMPLITUDE, ONSET)]
+        columns = [predictor.names.index(path) for path in (AMPLITUDE, ONSET)]
         total, efforts = 0.0, zip(fitted.column(AMPLITUDE), fitted.column(ONSET), strict=True)
         for effort in efforts:
             values[:, columns] = effort
-            total = total + simulator.predict(values)
+            total = total + predictor.predict(values)
         return np.asarray(total) / len(fitted.column(AMPLITUDE))
 
     def evidence(
@@ -262,12 +261,12 @@ class PatientEffort:
 
     def _effects(self, linearisation: Linearisation, duration: float) -> list[Floats]:
         """Change of the prediction by an effort at each onset of the grid, ``(n, c, T)`` each."""
-        simulator = linearisation.problem.simulator
-        columns = [simulator.names.index(path) for path in (AMPLITUDE, ONSET, DURATION)]
+        predictor = linearisation.problem.predictor
+        columns = [predictor.names.index(path) for path in (AMPLITUDE, ONSET, DURATION)]
         points = np.repeat(linearisation.values[None], len(self.prior.onsets), axis=0)
         for point, onset in zip(points, self.prior.onsets, strict=True):
             point[:, columns] = (self.prior.template, onset, duration)
-        return list(simulator.predict_all(points) - linearisation.prediction)
+        return list(predictor.predict_all(points) - linearisation.prediction)
 
     def _grid_evidence(
         self, linearisation: Linearisation, duration: float, effects: list[Floats]
@@ -295,7 +294,7 @@ class PatientEffort:
         """Fit an effort to each breath, together with the breath's other own parameters."""
         paths, none = still.unknowns.paths, np.zeros(len(still.data))
         every = np.arange(len(none))
-        layout = unknowns(still.data, (*paths, AMPLITUDE, ONSET), dict.fromkeys(paths, every))
+        layout = make_unknowns(still.data, (*paths, AMPLITUDE, ONSET), dict.fromkeys(paths, every))
         precision = self._precision
         problem = replace(
             still,

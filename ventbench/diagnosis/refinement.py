@@ -44,7 +44,7 @@ from ventbench.diagnosis.selection import (
 )
 from ventbench.physics.catalogue import mechanism, special_cases
 from ventbench.system_id.data import Floats
-from ventbench.system_id.together import each
+from ventbench.system_id.parallel import parallel_map
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +150,7 @@ def _compensating_term(wide: Evaluator, selected: FittedModel) -> str | None:
     here = wide.training_log_likelihood(selected)
     whole = max(here - base.log_likelihood, 1e-9)
     most = wide.settings.refinement.max_compensating_share * whole
-    reduced = each(
+    reduced = parallel_map(
         lambda name: wide.fit(selected.hypothesis.without(name), selected.noise, selected),
         selected.names,
     )
@@ -263,7 +263,7 @@ def eliminate_beside_input(
         nats: held-out log-likelihood that the input gains.
     """
     current = without_breath_terms(evaluator, selected)
-    gains = each(partial(_held_out_gain, evaluator, current), current.names)
+    gains = parallel_map(partial(_held_out_gain, evaluator, current), current.names)
     strong = {name for name, gain in zip(current.names, gains, strict=True) if gain > nats}
     if _is_effort(evaluator, selected, current, latent):
         current = selected
@@ -273,7 +273,7 @@ def eliminate_beside_input(
         ]
         idle = [
             removal
-            for removal in each(partial(_without_idle, evaluator, current, latent), asked)
+            for removal in parallel_map(partial(_without_idle, evaluator, current, latent), asked)
             if removal is not None
         ]
         if not idle:
@@ -356,7 +356,7 @@ def find_alternatives(
     """
     for last in (False, False, True):
         criterion, names = evaluator.criterion(selected), selected.names
-        ranked = each(partial(_ranked_instead, evaluator, selected, comparisons), names)
+        ranked = parallel_map(partial(_ranked_instead, evaluator, selected, comparisons), names)
         better = [
             models[0].fitted for models in ranked if models and models[0].criterion < criterion
         ]

@@ -19,8 +19,8 @@ from ventbench.diagnosis.settings import ScreeningSettings, SelectionConfig
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter, paths
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.system_id.data import Floats
-from ventbench.system_id.derivatives import Simulator
-from ventbench.system_id.together import each
+from ventbench.system_id.parallel import parallel_map
+from ventbench.system_id.predictor import Predictor
 
 
 @dataclass(frozen=True)
@@ -69,16 +69,16 @@ def screen_mechanisms(
         linearise(model.problem, model.minimum.x, settings.screening)
         for model in (fitted, whitened)
     ]
-    simulator = fitted.problem.simulator
+    predictor = fitted.problem.predictor
     missing = [name for name in names or library() if name not in fitted.names]
 
     def candidate(name: str) -> Candidate:
         screened = breath_term((name,), settings).screen(linear)
         if screened is None:
-            return _screen(simulator, linear, name, settings.screening)
+            return _screen(predictor, linear, name, settings.screening)
         return Candidate(name, Hypothesis((name,)), screened.start, *screened.nats)
 
-    candidates = each(candidate, missing)
+    candidates = parallel_map(candidate, missing)
     by_nats = sorted(candidates, key=lambda candidate: -candidate.nats)
     by_white = sorted(candidates, key=lambda candidate: -candidate.white_nats)
     mixed = [candidate for pair in zip(by_nats, by_white, strict=True) for candidate in pair]
@@ -86,10 +86,10 @@ def screen_mechanisms(
 
 
 def _screen(
-    simulator: Simulator, linear: list[Linearisation], name: str, settings: ScreeningSettings
+    predictor: Predictor, linear: list[Linearisation], name: str, settings: ScreeningSettings
 ) -> Candidate:
     """Simulate a mechanism at all points of its grid, and keep the best."""
-    order = simulator.names
+    order = predictor.names
     first, *others = library()[name].description.parameters
     best, start = np.zeros(len(linear)), {}
     own = [f"{name}.{first.name}", *(f"{name}.{p.name}" for p in others)]
@@ -102,7 +102,7 @@ def _screen(
             trial[:, order.index(path)] = value
         work.append((k, linearisation, given))
         points.append(trial)
-    predictions = simulator.predict_all(np.stack(points))
+    predictions = predictor.predict_all(np.stack(points))
     for (k, linearisation, given), prediction in zip(work, predictions, strict=True):
         if not np.all(np.isfinite(prediction)):
             continue
@@ -167,14 +167,14 @@ def score_nonparametric_terms(fitted: FittedModel, settings: SelectionConfig) ->
 
 def _slopes(fitted: FittedModel, columns: list[str], together: int) -> Floats:
     """Derivatives of the prediction by coefficients, ``(n, q, c, T)``."""
-    simulator = fitted.problem.simulator
-    index = [simulator.names.index(path) for path in columns]
+    predictor = fitted.problem.predictor
+    index = [predictor.names.index(path) for path in columns]
     parts = []
     for first in range(0, len(index), together):
         some = index[first : first + together]
         # Filled up to one size, so that one compiled function serves.
         filled = tuple(some + some[:1] * (together - len(some)))
-        parts.append(simulator.derivatives(fitted.values, filled)[1][:, : len(some)])
+        parts.append(predictor.derivatives(fitted.values, filled)[1][:, : len(some)])
     return np.concatenate(parts, axis=1)
 
 

@@ -28,8 +28,8 @@ from ventbench.diagnosis.screening import Candidate, screen_mechanisms
 from ventbench.diagnosis.settings import DEFAULT, HeldOutTestSettings
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id.data import Floats
-from ventbench.system_id.noise import Noise, estimate
-from ventbench.system_id.together import each
+from ventbench.system_id.noise import Noise, robust_noise
+from ventbench.system_id.parallel import parallel_map
 
 #: Is told what is being done.
 Progress = Callable[[str], None]
@@ -112,7 +112,7 @@ def forward_selection(
 
 def estimate_noise(fitted: FittedModel) -> Noise:
     """Noise that a model leaves in the breaths that it was fitted to."""
-    return estimate(fitted.residual, fitted.problem.data.weight)
+    return robust_noise(fitted.residual, fitted.problem.data.weight)
 
 
 def fit_with_noise(
@@ -245,7 +245,7 @@ def compare_candidates(
         chosen = chosen[: settings.fitted_candidates]
     # Noise that was estimated with an effect in the residual would hide the effect from its fit.
     white = replace(current.noise, ar=(0.0, 0.0))
-    models = each(
+    models = parallel_map(
         lambda candidate: evaluator.fit(
             current.hypothesis.plus(candidate.hypothesis),
             white,
@@ -257,7 +257,7 @@ def compare_candidates(
         chosen,
     )
     criteria = _Criteria(evaluator)
-    own = each(lambda model: criteria(model, estimate_noise(model)), models)
+    own = parallel_map(lambda model: criteria(model, estimate_noise(model)), models)
     noise = criteria.better_noise(models[int(np.argmin(own))], current.noise)
     order = criteria.order(models, noise)
     for _ in range(settings.noise_rounds):
@@ -294,7 +294,7 @@ def _fit_contenders(
             return evaluator.fit(model.hypothesis, noise, model)
         return model
 
-    return each(continued, models)
+    return parallel_map(continued, models)
 
 
 class _Criteria:

@@ -22,7 +22,7 @@ from ventbench.physics.catalogue import mechanism
 from ventbench.system_id import Fit, fit
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.noise import Noise
-from ventbench.system_id.unknowns import described, freed
+from ventbench.system_id.problem import free_paths, parameter_of
 
 
 def identify_both(
@@ -55,7 +55,7 @@ def identify_both(
     first = response[:, 0]
     own = simulator_model.pressures(simulator_model.conclusion.full, held, first)
     unmodelled = np.nan_to_num(response - own)
-    reduced = data.answered(data.seen[:, 0] - unmodelled)
+    reduced = data.with_pressure(data.measured[:, 0] - unmodelled)
     refitted = refit_base_parameters(simulator_model, reduced.select(~held))
     refit = simulator_model.pressures(refitted, held, first) + unmodelled
     # Predicted as breaths to come: parameters of each breath are not known of them.
@@ -72,7 +72,7 @@ def identify_both(
         lambda what: tell(f"recording less the simulator's part: {what}"),
         settings,
     )
-    fit = _noiseless_fit(simulator_model, data.answered(own), held, recording_model)
+    fit = _noiseless_fit(simulator_model, data.with_pressure(own), held, recording_model)
     return recording_model, replace(simulator_model, fit=fit)
 
 
@@ -96,7 +96,7 @@ def with_sensor_noise(
     coloured[:, 0] = rng.normal(0.0, sigma, len(fresh))
     for k in range(1, fresh.shape[1]):
         coloured[:, k] = ar * coloured[:, k - 1] + fresh[:, k]
-    return data.answered(np.nan_to_num(response) + coloured)
+    return data.with_pressure(np.nan_to_num(response) + coloured)
 
 
 def refit_base_parameters(
@@ -111,7 +111,7 @@ def refit_base_parameters(
     """
     own, evaluator = simulator_model.conclusion.full, simulator_model.evaluator
     noise = noise or simulator_model.conclusion.noise
-    partition = Partition(data, evaluator.training.simulator)
+    partition = Partition(data, evaluator.training.predictor)
     return evaluator.fit(own.hypothesis, noise, own, partition=partition)
 
 
@@ -220,7 +220,7 @@ def _noiseless_fit(
     The values are those of the model; their intervals are what such breaths tell of them.
     """
     fitted, evaluator = simulator_model.conclusion.full, simulator_model.evaluator
-    partition = Partition(own.select(~held), evaluator.training.simulator)
+    partition = Partition(own.select(~held), evaluator.training.predictor)
     problem = replace(fitted.problem, noise=recording_model.conclusion.noise)
     return estimates.final_fit(replace(fitted, problem=problem), partition, evaluator)
 
@@ -228,7 +228,7 @@ def _noiseless_fit(
 def _mean_error(data: Data, pressure: Floats) -> float:
     """Mean absolute error where pressure was measured, cmH2O."""
     weight = data.weight[:, 0]
-    return float(np.sum(np.abs(pressure - data.seen[:, 0]) * weight) / np.sum(weight))
+    return float(np.sum(np.abs(pressure - data.measured[:, 0]) * weight) / np.sum(weight))
 
 
 def _differs(recording_model: IdentifiedModel, simulator_model: IdentifiedModel, name: str) -> bool:
@@ -261,15 +261,15 @@ def _fit_beside(
 ) -> Fit:
     """Fit the parameters of the mechanisms asked for; all others stay at the simulator's values."""
     partition = evaluator.training
-    names = partition.simulator.names
+    names = partition.predictor.names
     values = evaluator.transferred_values(own, partition)
-    free = [p for p in (*freed(asked), *hypothesis.free) if p.rpartition(".")[0] in asked]
+    free = [p for p in (*free_paths(asked), *hypothesis.free) if p.rpartition(".")[0] in asked]
     fixed: dict[str, ArrayLike] = {
         name: values[:, k] for k, name in enumerate(names) if name not in (*free, "position")
     }
     given = {p: x for p, x in hypothesis.fixed if p.rpartition(".")[0] in asked}
     by_breath = ("gain",) if evaluator.gain_sd else ()
-    neutral = float(np.log(described("gain").neutral))
+    neutral = float(np.log(parameter_of("gain").neutral))
     return fit(
         partition.data,
         hypothesis.names,
@@ -280,16 +280,16 @@ def _fit_beside(
         | {p: np.arange(len(partition.data)) for p in by_breath},
         prior={p: (neutral, evaluator.gain_sd) for p in by_breath},
         noise=full.noise,
-        simulator=partition.simulator,
+        predictor=partition.predictor,
     )
 
 
 def _wider(recording: Evaluator, simulator: Evaluator) -> Evaluator:
     """Evaluator of the recording whose simulator has the parameters of both."""
-    if len(recording.training.simulator.names) >= len(simulator.training.simulator.names):
+    if len(recording.training.predictor.names) >= len(simulator.training.predictor.names):
         return recording
     return replace(
         recording,
-        training=Partition(recording.training.data, simulator.training.simulator),
-        held_out=Partition(recording.held_out.data, simulator.held_out.simulator),
+        training=Partition(recording.training.data, simulator.training.predictor),
+        held_out=Partition(recording.held_out.data, simulator.held_out.predictor),
     )

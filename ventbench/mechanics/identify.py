@@ -35,7 +35,7 @@ from ventbench.mechanics.term_selection import (
     select_terms,
 )
 from ventbench.recordings.breaths import Breaths
-from ventbench.system_id.intervals import quantile
+from ventbench.system_id.fit import t_quantile
 
 Floats = NDArray[np.float64]
 
@@ -269,7 +269,7 @@ class LungFit:
         median, count = float(np.median(values)), len(values)
         # Robust standard error of a median: a breath that was cut off must not count for much.
         spread = 1.25 * 1.4826 * float(np.median(np.abs(np.array(values) - median)))
-        factor = quantile(max(count - 1, _LEAST_FREEDOM))
+        factor = t_quantile(max(count - 1, _LEAST_FREEDOM))
         reach = factor * spread / np.sqrt(count) if count > 1 else np.inf
         return Estimate(median, "cmH2O", (median - reach, median + reach))
 
@@ -325,7 +325,7 @@ class LungFit:
             for h, direction in zip(step, np.eye(len(x)), strict=True)
         ]
         sd = float(np.sqrt(max(np.array(slopes) @ self.covariance @ np.array(slopes), 0.0)))
-        reach, centre = quantile(max(len(self.table) - 1, _LEAST_FREEDOM)) * sd, at(x)
+        reach, centre = t_quantile(max(len(self.table) - 1, _LEAST_FREEDOM)) * sd, at(x)
         return Estimate(centre, unit, (centre - reach, centre + reach))
 
     def _coefficient(self, term: str) -> float:

@@ -24,7 +24,7 @@ from ventbench.mechanics.regression import (
     log_likelihood,
 )
 from ventbench.mechanics.segments import Segment
-from ventbench.system_id.intervals import quantile
+from ventbench.system_id.fit import t_quantile
 
 #: Log-likelihood ratio on held-out breaths that a term needs: one false term in a hundred.
 LEAST_NATS = 4.6
@@ -213,7 +213,7 @@ def circuit_compliance(segments: Sequence[Segment]) -> CircuitCompliance | None:
         return None
     jackknife = [_peak(tables, np.arange(count) != i) for i in range(count)]
     sd = float(np.sqrt((count - 1) * np.var(jackknife)))
-    reach = quantile(max(count - 1, 4)) * max(sd, _LEAST_DEVIATION)
+    reach = t_quantile(max(count - 1, 4)) * max(sd, _LEAST_DEVIATION)
     ends = (max(value - reach, 0.0), value + reach)
     nearest = tables[round(value / (_COMPLIANCES[1] - _COMPLIANCES[0]))]
     variances = [_residual_variance(table, every) for table in (null, nearest)]

@@ -1,12 +1,17 @@
-"""Fits of physics to measurements: data, noise, unknowns, search, intervals."""
+"""System identification: data, noise, predictions, least squares, fits and their intervals."""
 
-from ventbench.system_id.data import Data, recorded
-from ventbench.system_id.derivatives import START, Simulator
-from ventbench.system_id.fit import Fit, fit, held_out
-from ventbench.system_id.noise import Noise, estimate
-from ventbench.system_id.problem import Problem, settings
-from ventbench.system_id.profile import Interval, interval, profile
-from ventbench.system_id.unknowns import Unknowns, freed, unknowns
+from ventbench.system_id.data import Data, make_data
+from ventbench.system_id.fit import Fit, fit, refit_breath_parameters
+from ventbench.system_id.noise import Noise, robust_noise
+from ventbench.system_id.predictor import START, Predictor
+from ventbench.system_id.problem import (
+    Problem,
+    Unknowns,
+    free_paths,
+    make_unknowns,
+    parameter_values,
+)
+from ventbench.system_id.profile_likelihood import Interval, interval, profile_interval
 
 __all__ = [
     "START",
@@ -14,16 +19,16 @@ __all__ = [
     "Fit",
     "Interval",
     "Noise",
+    "Predictor",
     "Problem",
-    "Simulator",
     "Unknowns",
-    "estimate",
     "fit",
-    "freed",
-    "held_out",
+    "free_paths",
     "interval",
-    "profile",
-    "recorded",
-    "settings",
-    "unknowns",
+    "make_data",
+    "make_unknowns",
+    "parameter_values",
+    "profile_interval",
+    "refit_breath_parameters",
+    "robust_noise",
 ]

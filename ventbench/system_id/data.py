@@ -1,4 +1,4 @@
-"""What a fit is made to: commands, times, and what was measured, as plain arrays."""
+"""Data of a fit: commands, sample times and measurements, as plain arrays."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ class Data:
         u_in: inspiratory valve, %, ``(n, T)``.
         u_out: expiratory valve, 0/1, ``(n, T)``.
         dt: time to the next sample, s, ``(n, T)``.
-        seen: pressure, cmH2O, and flow, mL/s, zero where not measured, ``(n, c, T)``.
+        measured: pressure, cmH2O, and flow, mL/s; zero where nothing was measured, ``(n, c, T)``.
         weight: 1 where measured, else 0, ``(n, c, T)``.
-        R: labels, cmH2O s/L, ``(n,)``.
-        C: labels, mL/cmH2O, ``(n,)``.
-        position: of each breath in its recording, 0..1, ``(n,)``.
+        R: label of the lung's resistance, cmH2O s/L, ``(n,)``.
+        C: label of the lung's compliance, mL/cmH2O, ``(n,)``.
+        position: place of each breath in its recording, 0 first, 1 last, ``(n,)``.
     """
 
     u_in: Floats
     u_out: Floats
     dt: Floats
-    seen: Floats
+    measured: Floats
     weight: Floats
     R: Floats
     C: Floats
@@ -48,17 +48,17 @@ class Data:
         return np.unique(pairs, axis=0, return_inverse=True)[1].reshape(-1)
 
     def select(self, which: ArrayLike | slice) -> Data:
-        """Some of the breaths, by mask, index or slice; they keep their positions."""
+        """Select breaths by mask, index or slice; they keep their positions."""
         index = which if isinstance(which, slice) else np.asarray(which)
         return Data(**{name: array[index] for name, array in self._arrays().items()})
 
-    def answered(self, pressure: ArrayLike) -> Data:
-        """The same commands with other pressures, cmH2O, ``(n, T)``: a simulator's answer.
+    def with_pressure(self, pressure: ArrayLike) -> Data:
+        """Replace the pressure, cmH2O, ``(n, T)``, for example by a simulator's response.
 
-        Where the recording has no pressure the answer does not count either.
+        A sample without a measured pressure keeps its weight of zero.
 
         Raises:
-            InputError: if the shape is another, or a pressure that counts is not finite.
+            InputError: if the shape differs, or a pressure with weight is not finite.
         """
         pressure = np.asarray(pressure, float)
         if pressure.shape != self.u_in.shape:
@@ -67,12 +67,12 @@ class Data:
             )
         weight = self.weight[:, :1]
         if not np.all(np.isfinite(pressure[weight[:, 0] > 0])):
-            raise InputError("a pressure of the answer is not finite; use a stable simulator")
-        seen = np.where(weight > 0, pressure[:, None], 0.0)
-        return replace(self, seen=seen, weight=weight)
+            raise InputError("a simulated pressure is not finite; use a stable simulator")
+        measured = np.where(weight > 0, pressure[:, None], 0.0)
+        return replace(self, measured=measured, weight=weight)
 
     def padded(self, count: int) -> Data:
-        """The same with breaths of weight zero behind, so that sizes repeat."""
+        """Append breaths of weight zero up to ``count``, so that compiled sizes recur."""
         index = np.concatenate([np.arange(len(self)), np.zeros(count - len(self), int)])
         longer = self.select(index)
         weight = longer.weight.copy()
@@ -83,13 +83,13 @@ class Data:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 
-def recorded(breaths: Breaths, *, flow: bool = False, position: ArrayLike | None = None) -> Data:
-    """Make the data of a fit out of a recording.
+def make_data(breaths: Breaths, *, flow: bool = False, position: ArrayLike | None = None) -> Data:
+    """Make the data of a fit from a recording.
 
     Args:
         breaths: at least one.
-        flow: use the recorded flow too.
-        position: of each breath in its recording; evenly from 0 to 1 if not given.
+        flow: use the recorded flow as well.
+        position: place of each breath in its recording; evenly from 0 to 1 if not given.
 
     Raises:
         InputError: if there is no breath, no pressure or, when asked for, no flow.
@@ -99,8 +99,8 @@ def recorded(breaths: Breaths, *, flow: bool = False, position: ArrayLike | None
     if flow and breaths.flow is None:
         raise InputError("the recording has no flow; fit its pressure alone")
     channels = [breaths.pressure] + ([breaths.flow] if flow and breaths.flow is not None else [])
-    seen = np.stack(channels, axis=1)
-    weight = (np.isfinite(seen) & breaths.valid[:, None]).astype(float)
+    measured = np.stack(channels, axis=1)
+    weight = (np.isfinite(measured) & breaths.valid[:, None]).astype(float)
     if flow:
         weight[:, 1, 0] = 0.0  # a breath starts at rest
     if not weight[:, 0].any():
@@ -108,7 +108,12 @@ def recorded(breaths: Breaths, *, flow: bool = False, position: ArrayLike | None
     if position is None:
         position = np.linspace(0.0, 1.0, len(breaths)) if len(breaths) > 1 else np.zeros(1)
     return Data(
-        breaths.u_in.astype(float), breaths.u_out.astype(float), breaths.dt.astype(float),
-        np.where(weight > 0, seen, 0.0), weight, breaths.R.astype(float), breaths.C.astype(float),
-        np.asarray(position, float),
-    )  # fmt: skip
+        u_in=breaths.u_in.astype(float),
+        u_out=breaths.u_out.astype(float),
+        dt=breaths.dt.astype(float),
+        measured=np.where(weight > 0, measured, 0.0),
+        weight=weight,
+        R=breaths.R.astype(float),
+        C=breaths.C.astype(float),
+        position=np.asarray(position, float),
+    )

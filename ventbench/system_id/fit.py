@@ -1,9 +1,10 @@
-"""Fits of the base model with any set of mechanisms to recordings or to simulators' answers."""
+"""Fits of the base model with any set of mechanisms, with covariance and intervals."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,28 +12,44 @@ from numpy.typing import ArrayLike
 from ventbench.physics.catalogue import mechanism, paths
 from ventbench.physics.model import Physics
 from ventbench.precision import float64
-from ventbench.system_id import starts
 from ventbench.system_id.data import Data, Floats
-from ventbench.system_id.derivatives import START, Simulator
-from ventbench.system_id.intervals import covariance, quantile
-from ventbench.system_id.least_squares import Minimum
-from ventbench.system_id.noise import Noise, estimate
-from ventbench.system_id.problem import Problem, settings
-from ventbench.system_id.unknowns import described, freed, unknowns
+from ventbench.system_id.levenberg_marquardt import Minimum, minimise
+from ventbench.system_id.noise import Noise, robust_noise
+from ventbench.system_id.predictor import START, Predictor
+from ventbench.system_id.problem import (
+    Problem,
+    free_paths,
+    make_unknowns,
+    parameter_of,
+    parameter_values,
+)
+
+#: Steps of a search before other starts are tried, most rounds of trying, and nats by which another
+#: start must be better.
+_FIRST_STEPS, _ROUNDS, _BETTER = 8, 3, 1.0
+
+#: Breaths in excess of the shared unknowns from which on the sandwich covariance is used.
+_ENOUGH = 10
+
+#: Fewest degrees of freedom of an interval.
+_LEAST_FREEDOM = 4
+
+#: Largest leverage of one breath on an unknown.
+_LEVERAGE = 0.98
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Where a fit ended.
+    """Result of a fit.
 
     Attributes:
-        mechanisms: of the hypothesis.
-        problem: with the noise that was found or given.
-        minimum: of its cost.
-        values: physical values of everything, ``(n, P + 1)``, columns as in the simulator.
-        residual: simulated minus measured, ``(n, c, T)``.
-        log_likelihood: of each breath, ``(n,)``.
-        covariance: of the unknowns in coordinates, ``(U, U)``.
+        mechanisms: names of the hypothesis.
+        problem: the problem with the estimated or given noise.
+        minimum: minimum of its cost.
+        values: physical values of all columns of the predictor, ``(n, P + 1)``.
+        residual: predicted minus measured, ``(n, c, T)``.
+        log_likelihood: log-likelihood of each breath, ``(n,)``.
+        covariance: covariance of the unknowns in coordinates, ``(U, U)``.
     """
 
     mechanisms: tuple[str, ...]
@@ -45,38 +62,43 @@ class Fit:
 
     @property
     def bic(self) -> float:
-        """Bayesian information criterion, by the samples that count; less is better."""
+        """Bayesian information criterion, with the number of measured samples; less is better."""
         count = float(self.problem.data.weight.sum())
         return -2.0 * float(self.log_likelihood.sum()) + len(self.minimum.x) * np.log(count)
 
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom of intervals: breaths in excess of the shared unknowns."""
+        shared = int(self.problem.unknowns.shared.sum())
+        return max(len(self.problem.data) - shared, _LEAST_FREEDOM)
+
     def value(self, path: str) -> Floats:
-        """Physical values of a free parameter, one for each of its groups."""
+        """Physical values of a free parameter, one for each group of breaths."""
         x = self.minimum.x[self.problem.unknowns.of(path)]
-        return described(path).physical(x)
+        return parameter_of(path).physical(x)
 
     def ci95(self, path: str) -> Floats:
-        """Ends of 95 % intervals of a free parameter, ``(groups, 2)``, within its bounds."""
-        layout, item = self.problem.unknowns, described(path)
+        """Ends of the 95 % intervals of a free parameter, within its bounds, ``(groups, 2)``."""
+        layout, item = self.problem.unknowns, parameter_of(path)
         which = layout.of(path)
-        freedom = max(len(self.problem.data) - int(layout.shared.sum()), 4)
-        reach = quantile(freedom) * np.sqrt(np.diag(self.covariance)[which])
+        reach = t_quantile(self.freedom) * np.sqrt(np.diag(self.covariance)[which])
         x = self.minimum.x[which]
-        with np.errstate(over="ignore"):  # of what the data say nothing about
+        with np.errstate(over="ignore"):  # where the data say nothing
             ends = item.physical(np.stack([x - reach, x + reach], axis=1))
         return np.clip(ends, item.low, item.high)
 
     def column(self, path: str) -> Floats:
-        """Physical value of any parameter in each breath, ``(n,)``."""
-        return self.values[:, (*self.problem.simulator.names, START).index(path)]
+        """Physical values of any parameter in each breath, ``(n,)``."""
+        return self.values[:, (*self.problem.predictor.names, START).index(path)]
 
     def plant(self, breath: int | slice = slice(None)) -> Physics:
-        """The fitted plant, in float64: one breath's, or a stack over breaths."""
+        """The fitted model as a plant in float64: of one breath, or stacked over breaths."""
         names = [name for name in paths(self.mechanisms) if name != "position"]
         names += ["position"] if any(mechanism(m).uses_position for m in self.mechanisms) else []
-        simulator = self.problem.simulator
+        predictor = self.problem.predictor
         with float64():
             given = {name: self.column(name)[breath] for name in names}
-            plant = Physics((), (), simulator.substeps, simulator.memory).having(**given)
+            plant = Physics((), (), predictor.substeps, predictor.memory).having(**given)
         return plant
 
 
@@ -90,70 +112,202 @@ def fit(
     groups: Mapping[str, ArrayLike] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
     noise: Noise | None = None,
-    simulator: Simulator | None = None,
+    predictor: Predictor | None = None,
     iterations: int = 40,
 ) -> Fit:
-    """Fit a hypothesis: R, C, R_ex, PEEP, starting pressures and the mechanisms' parameters.
+    """Fit a hypothesis: R, C, R_ex, PEEP, starting pressures and parameters of mechanisms.
 
-    Mechanisms start at their mild strength, as some have little slope at zero, and where several
-    minima are known to be possible from several values; see :mod:`ventbench.system_id.starts`.
+    Mechanisms start at their mild strength, because some have little slope at zero. Parameters with
+    several known minima are searched from several starts.
 
     Args:
-        data: from :func:`~ventbench.system_id.data.recorded`.
-        mechanisms: names.
-        free: further paths, such as ``gain`` or ``leak.exponent``.
-        fixed: physical values of paths that stay, a number or one for each breath.
+        data: from :func:`~ventbench.system_id.data.make_data`.
+        mechanisms: names of the hypothesis.
+        free: further free paths, such as ``gain`` or ``leak.exponent``.
+        fixed: physical values of paths that stay fixed, a number or one for each breath.
         start: physical values to start from.
-        groups: which breaths share a parameter: see :func:`unknowns`.
-        prior: mean and standard deviation in coordinates, by path.
-        noise: of the measurement; found from the residuals if not given.
-        simulator: of the same data with all parameters, to save placing it again.
+        groups: which breaths share a parameter; see
+            :func:`~ventbench.system_id.problem.make_unknowns`.
+        prior: prior mean and standard deviation in coordinates, by path.
+        noise: measurement noise; estimated from the residuals if not given.
+        predictor: of the same data with all parameters, to avoid padding the data again.
         iterations: most steps of each search.
 
     Raises:
         InputError: if a name or a value does not fit.
     """
     mechanisms, fixed, start = tuple(mechanisms), dict(fixed or {}), dict(start or {})
-    simulator = simulator or Simulator(data, paths())
-    layout = unknowns(
-        data, (p for p in dict.fromkeys((*freed(mechanisms), *free)) if p not in fixed), groups
+    predictor = predictor or Predictor(data, paths())
+    layout = make_unknowns(
+        data, (p for p in dict.fromkeys((*free_paths(mechanisms), *free)) if p not in fixed), groups
     )
-    base = settings(data, simulator.names, fixed)
+    base = parameter_values(data, predictor.names, fixed)
     mean, precision = layout.prior(prior or {})
-    problem = Problem(data, simulator, layout, base, noise or Noise(), mean, precision)
-    order = (*simulator.names, START)
+    problem = Problem(data, predictor, layout, base, noise or Noise(), mean, precision)
+    order = (*predictor.names, START)
     first = {p: base[:, order.index(p)] for p in layout.paths if "." not in p}
-    first |= {p: described(p).mild for p in layout.paths if "." in p}
+    first |= {p: parameter_of(p).mild for p in layout.paths if "." in p}
     first |= {p: value for p, value in start.items() if p in layout.paths}
-    found = starts.search(problem, layout.pack(first), set(start), iterations)
+    minimum = _search(problem, layout.pack(first), set(start), iterations)
     for _ in range(2 if noise is None else 0):
-        problem = replace(problem, noise=estimate(problem.residual(found.x), data.weight))
-        found = starts.descend(problem, found.x, iterations)
-    residual = problem.residual(found.x)
+        problem = replace(problem, noise=robust_noise(problem.residual(minimum.x), data.weight))
+        minimum = _descend(problem, minimum.x, iterations)
+    residual = problem.residual(minimum.x)
     return Fit(
-        mechanisms, problem, found, problem.values(found.x), residual,
-        problem.noise.log_likelihood(residual, data.weight), covariance(problem, found),
+        mechanisms, problem, minimum, problem.values(minimum.x), residual,
+        problem.noise.log_likelihood(residual, data.weight), covariance(problem, minimum),
     )  # fmt: skip
 
 
-def held_out(fit_: Fit, data: Data, *, free: Iterable[str] = ()) -> Fit:
-    """Put what a fit has found to other breaths, which refit only what is their own.
+def refit_breath_parameters(fitted: Fit, data: Data, *, free: Iterable[str] = ()) -> Fit:
+    """Evaluate a fit on other breaths; only parameters of scope ``breath`` are fitted to them.
 
     Args:
-        fit_: with shared parameters that are the same for all breaths of ``data``.
-        data: other breaths; those of one lung, if the fit has several.
-        free: paths that may move as well.
+        fitted: a fit; its shared parameters stay, those of the same label where it has several.
+        data: other breaths.
+        free: further paths to fit.
     """
-    layout, names = fit_.problem.unknowns, fit_.problem.simulator.names
-    own = {p for p in layout.paths if described(p).scope == "breath"} | set(free) | {"position"}
-    fixed = {name: _of_labels(fit_, data, name) for name in names if name not in own}
-    return fit(data, fit_.mechanisms, free=free, fixed=fixed, noise=fit_.problem.noise)
+    layout, names = fitted.problem.unknowns, fitted.problem.predictor.names
+    own = {p for p in layout.paths if parameter_of(p).scope == "breath"} | set(free) | {"position"}
+    fixed = {name: _label_mean(fitted, data, name) for name in names if name not in own}
+    return fit(data, fitted.mechanisms, free=free, fixed=fixed, noise=fitted.problem.noise)
 
 
-def _of_labels(fit_: Fit, data: Data, path: str) -> Floats:
-    """Mean of a parameter over the fitted breaths of the same label, or over all if it is new."""
-    known, column = fit_.problem.data, fit_.column(path)
+def _label_mean(fitted: Fit, data: Data, path: str) -> Floats:
+    """Mean of a parameter over fitted breaths with the same label, or over all if it is new."""
+    known, column = fitted.problem.data, fitted.column(path)
     same = (data.R[:, None] == known.R) & (data.C[:, None] == known.C)
     same |= ~same.any(axis=1, keepdims=True)
-    item = described(path)  # rounding must not carry a value at its bound beyond it
+    item = parameter_of(path)  # rounding must not carry a value at its bound beyond it
     return np.clip(same @ column / same.sum(axis=1), item.low, item.high)
+
+
+def _descend(problem: Problem, x: Floats, iterations: int) -> Minimum:
+    """Search from one start."""
+    low, high = problem.unknowns.bounds()
+    return minimise(problem.cost, problem.normal, x, low, high, iterations=iterations)
+
+
+def _search(problem: Problem, x: Floats, given: Set[str], iterations: int) -> Minimum:
+    """Search from ``x``, then try the values of ``Parameter.scan`` with all else as minimum.
+
+    The search continues from a value that is better, for all breaths or, if each breath has its own
+    value, for one breath.
+
+    Args:
+        problem: problem to solve.
+        x: start, ``(U,)``.
+        given: paths whose start the caller chose; they are not scanned.
+        iterations: most steps of each search.
+    """
+    scanned = {p: parameter_of(p) for p in problem.unknowns.paths if parameter_of(p).scan}
+    scanned = {p: item for p, item in scanned.items() if p not in given}
+    shared = [p for p, item in scanned.items() if item.scope == "shared"]
+    own = [p for p, item in scanned.items() if item.scope == "breath"]
+    minimum = _descend(problem, x, _FIRST_STEPS if scanned else iterations)
+    for _ in range(_ROUNDS if scanned else 0):
+        better = _other_values(problem, minimum, shared)
+        better = _other_breaths(problem, minimum.x if better is None else better, own, better)
+        if better is None:
+            break
+        minimum = _descend(problem, better, iterations)
+    return minimum if minimum.converged else _descend(problem, minimum.x, iterations)
+
+
+def _other_values(problem: Problem, minimum: Minimum, paths: Sequence[str]) -> Floats | None:
+    """Return a point with another value of one shared parameter and lower cost, or None."""
+    best, reached = None, minimum.cost - _BETTER
+    for path in paths:
+        for value in parameter_of(path).scan:
+            trial = minimum.x.copy()
+            trial[problem.unknowns.of(path)] = parameter_of(path).coordinate(value)
+            cost = problem.cost(trial)
+            if cost < reached:
+                best, reached = trial, cost
+    return best
+
+
+def _other_breaths(
+    problem: Problem, x: Floats, own: Sequence[str], otherwise: Floats | None
+) -> Floats | None:
+    """Return a point at which some breaths have a higher likelihood, or ``otherwise``."""
+    if not own:
+        return otherwise
+    layout = problem.unknowns
+    columns = [layout.paths.index(path) for path in own]
+    best, reached = x.copy(), problem.log_likelihood(x) + _BETTER
+    known = reached.copy()
+    for values in product(*(parameter_of(path).scan for path in own)):
+        trial = x.copy()
+        for path, value in zip(own, values, strict=True):
+            trial[layout.of(path)] = parameter_of(path).coordinate(value)
+        likelihood = problem.log_likelihood(trial)
+        won = np.flatnonzero(likelihood > reached)
+        reached[won] = likelihood[won]
+        for column in columns:
+            index = layout.index[won, column]
+            best[index] = trial[index]
+    return best if np.any(reached > known) else otherwise
+
+
+def covariance(problem: Problem, minimum: Minimum) -> Floats:
+    """Covariance of the unknowns in coordinates, ``(U, U)``.
+
+    The inverse Hessian is valid if noise and model are right. The sandwich estimate, which uses the
+    spread of the breaths' gradients, is valid if the breaths are independent, whatever happens
+    within them (coloured noise, an effect that the model lacks). Each unknown has the larger of the
+    two variances; the correlations are those of the inverse Hessian.
+    """
+    floor = 1e-9 * np.maximum(np.diag(minimum.hessian), 1e-9)
+    bread = np.asarray(np.linalg.inv(minimum.hessian + np.diag(floor)), np.float64)
+    index = problem.unknowns.index
+    own = np.array([len(np.unique(column)) == len(index) for column in index.T])
+    common = np.unique(index[:, ~own])
+    if len(index) - len(common) < _ENOUGH:
+        return bread
+    sandwich = _sandwich(problem, minimum, own, common, bread[np.ix_(common, common)])
+    grown = np.ones(len(bread))
+    grown[common] = np.sqrt(np.maximum(sandwich / np.diag(bread)[common], 1.0))
+    return np.asarray(bread * np.outer(grown, grown), np.float64)
+
+
+def _sandwich(
+    problem: Problem, minimum: Minimum, own: np.ndarray, common: np.ndarray, bread: Floats
+) -> Floats:
+    """Sandwich variances of the shared unknowns, from the spread between breaths, ``(s,)``.
+
+    A breath with high leverage hides its own deviation. Each gradient is therefore scaled by the
+    breath's leverage, as leaving the breath out would (cluster jackknife, CR3).
+    """
+    _, gradients, curvatures = problem.scores(minimum.x)
+    layout = problem.unknowns
+    if own.any():  # eliminate the unknowns of single breaths (Schur complement)
+        known = problem.precision[layout.index[:, own]][:, :, None] * np.eye(int(own.sum()))
+        inner = curvatures[:, own][:, :, own] + known
+        inner = inner + 1e-9 * np.maximum(inner.max(axis=(1, 2), keepdims=True), 1e-9) * np.eye(
+            inner.shape[1]
+        )
+        across = np.linalg.solve(inner, curvatures[:, own][:, :, ~own]).swapaxes(1, 2)
+        gradients, curvatures = (
+            gradients[:, ~own] - np.matmul(across, gradients[:, own, None])[:, :, 0],
+            curvatures[:, ~own][:, :, ~own] - np.matmul(across, curvatures[:, own][:, :, ~own]),
+        )
+    else:
+        gradients, curvatures = gradients[:, ~own], curvatures[:, ~own][:, :, ~own]
+    rows, place = np.arange(len(gradients)), np.searchsorted(common, layout.index[:, ~own])
+    forces = np.zeros((len(rows), len(common)))
+    np.add.at(forces, (rows[:, None], place), gradients)
+    shares = np.zeros((len(rows), len(common), len(common)))
+    np.add.at(shares, (rows[:, None, None], place[:, :, None], place[:, None, :]), curvatures)
+    forces -= forces.mean(axis=0)
+    left = np.eye(len(common)) - _LEVERAGE * np.matmul(shares, bread)
+    spread = np.linalg.solve(left, forces[:, :, None])[:, :, 0] @ bread
+    return np.asarray(np.sum(spread**2, axis=0) * (1.0 - 1.0 / len(rows)), np.float64)
+
+
+def t_quantile(freedom: float) -> float:
+    """The 97.5 % quantile of Student's t with some degrees of freedom, by its expansion."""
+    z = 1.959964
+    first = (z**3 + z) / 4.0
+    second = (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0
+    return z + first / freedom + second / freedom**2

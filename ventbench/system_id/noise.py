@@ -1,4 +1,4 @@
-"""Noise of a measurement: its size, its tails, how long it lasts; and its whitening."""
+"""Measurement noise: size, tails, autocorrelation, and whitening."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from ventbench.system_id.data import Floats
 
-#: Autocorrelation above this is taken for a model that fits badly, not for noise.
-_MOST = 0.95
+#: Highest autocorrelation of noise: above it, the model is taken to fit badly.
+_MOST_AR = 0.95
 
 
 @dataclass(frozen=True)
@@ -18,8 +18,8 @@ class Noise:
     """First-order autoregressive noise of each channel, Gaussian with exponential tails (Huber).
 
     Attributes:
-        sigma: standard deviation of pressure, cmH2O, and of flow, mL/s, a number a channel.
-        ar: correlation from one sample to the next, likewise, within -1..1.
+        sigma: standard deviations of pressure, cmH2O, and of flow, mL/s, one for each channel.
+        ar: correlations of neighbouring samples, one for each channel, within -1..1.
         tail: whitened size from which the tails are exponential; ``inf`` for a Gaussian.
     """
 
@@ -28,7 +28,7 @@ class Noise:
     tail: float = 3.0
 
     def whiten(self, residual: Floats, weight: Floats) -> Floats:
-        """Independent residuals of unit variance, where ``weight`` is 1; else 0.
+        """Transform residuals to independent ones of unit variance; 0 where ``weight`` is 0.
 
         Args:
             residual: ``(n, ..., c, T)``.
@@ -41,13 +41,13 @@ class Noise:
         return weight * (residual - coupled * before) / scale
 
     def loss(self, white: Floats) -> Floats:
-        """Minus the log of the density of whitened residuals, up to :meth:`log_norm`."""
+        """Negative log density of whitened residuals, without :meth:`log_norm`."""
         size = np.abs(white)
         core = np.minimum(size, self.tail)
         return 0.5 * core**2 + (self.tail * (size - core) if math.isfinite(self.tail) else 0.0)
 
     def influence(self, white: Floats) -> Floats:
-        """Weight of each squared residual in the normal equations, 1 in the core."""
+        """Huber weight of each squared residual in the normal equations, 1 in the core."""
         return np.minimum(1.0, self.tail / np.maximum(np.abs(white), 1e-12))
 
     def log_norm(self) -> float:
@@ -57,7 +57,7 @@ class Noise:
         return math.log(math.sqrt(2.0 * math.pi) * math.erf(c / math.sqrt(2.0)) + tails)
 
     def log_likelihood(self, residual: Floats, weight: Floats) -> Floats:
-        """Of the residuals ``(n, c, T)``, natural logarithm, by breath, ``(n,)``."""
+        """Log-likelihood of the residuals ``(n, c, T)`` of each breath, ``(n,)``."""
         white = self.whiten(residual, weight)
         _, scale, _ = self._chain(weight)
         terms = -self.loss(white) - weight * (np.log(scale) + self.log_norm())
@@ -69,7 +69,7 @@ class Noise:
         return np.sum(weight * np.log(scale), axis=(1, 2))
 
     def _chain(self, weight: Floats) -> tuple[Floats, Floats, Floats]:
-        """Coupling to the sample before, what is new in each sample, and the weight."""
+        """Coupling to the sample before, standard deviation of the innovation, and weight."""
         channels = weight.shape[1]
         ar = np.asarray(self.ar[:channels], float)[None, :, None]
         sigma = np.asarray(self.sigma[:channels], float)[None, :, None]
@@ -78,26 +78,26 @@ class Noise:
         return ar * linked, sigma * np.sqrt(1.0 - linked * ar**2), weight
 
 
-def estimate(
+def robust_noise(
     residual: Floats, weight: Floats, *, floor: float = 0.02, tail: float = Noise.tail
 ) -> Noise:
-    """Noise that residuals ``(n, c, T)`` look like, robust against some that are far off.
+    """Estimate the noise from residuals, robust against outliers.
 
     Args:
-        residual: measured minus simulated, or the reverse.
-        weight: 1 where measured.
-        floor: smallest sigma, of pressure in cmH2O; of flow 20 times that, mL/s.
-        tail: of the noise that is returned.
+        residual: measured minus simulated, or the reverse, ``(n, c, T)``.
+        weight: 1 where measured, else 0, ``(n, c, T)``.
+        floor: smallest sigma of pressure, cmH2O; that of flow is 20 times as large, mL/s.
+        tail: tail parameter of the returned noise.
     """
     sigma, ar = [], []
     for channel in range(residual.shape[1]):
         r, w = residual[:, channel], weight[:, channel] > 0
         size = 1.4826 * np.median(np.abs(r[w])) if w.any() else 0.0
-        # Of the products of clipped neighbours: far values do not count for more.
+        # Autocorrelation of clipped residuals, so that outliers have a bounded influence.
         clipped = np.clip(r, -3.0 * size, 3.0 * size)
         both = w[:, 1:] & w[:, :-1]
         power = np.sum(clipped[:, 1:][both] ** 2) + np.sum(clipped[:, :-1][both] ** 2)
         product = np.sum((clipped[:, 1:] * clipped[:, :-1])[both])
         sigma.append(max(float(size), floor * (20.0 if channel else 1.0)))
-        ar.append(float(np.clip(2.0 * product / power, -_MOST, _MOST)) if power > 0 else 0.0)
+        ar.append(float(np.clip(2.0 * product / power, -_MOST_AR, _MOST_AR)) if power > 0 else 0.0)
     return Noise(tuple(sigma), tuple(ar), tail)

@@ -1,39 +1,169 @@
-"""A hypothesis against data: residuals, likelihood and normal equations at any parameters."""
+"""A hypothesis and its data: unknowns, residuals, likelihood and normal equations."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ventbench.errors import InputError
-from ventbench.physics.catalogue import parameter, paths
+from ventbench.physics.catalogue import mechanism, parameter, paths, strength_path
+from ventbench.physics.parameters import REFITTED, Parameter
 from ventbench.system_id.data import Data, Floats
-from ventbench.system_id.derivatives import START, Simulator
 from ventbench.system_id.noise import Noise
-from ventbench.system_id.unknowns import Unknowns
+from ventbench.system_id.predictor import START, Predictor
+
+#: The starting pressure of a breath as a parameter.
+_START = Parameter(
+    START, "cmH2O", "reading at the first sample", -50.0, 150.0, 5.0, 5.0, 5.0, scope="breath"
+)
+
+#: Starting pressure of a breath whose first pressure is not measured, cmH2O.
+_DEFAULT_START = 5.0
+
+
+def parameter_of(path: str) -> Parameter:
+    """Parameter of a path; the path may be the start of a breath."""
+    return _START if path == START else parameter(path)
+
+
+def free_paths(mechanisms: Iterable[str]) -> tuple[str, ...]:
+    """Paths that a hypothesis frees: R, C, R_ex, PEEP, parameters of its mechanisms, the starts."""
+    own = [
+        f"{name}.{item.name}"
+        for name in dict.fromkeys(mechanisms)
+        for item in mechanism(name).description.parameters
+        if not item.shape
+    ]
+    return (*REFITTED, *own, START)
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """Layout of the vector of a fit: U numbers in the coordinates of their parameters.
+
+    Attributes:
+        paths: paths of the k free parameters.
+        index: unknown that each breath uses for each free parameter, ``(n, k)``.
+        path_of: free parameter of each unknown, as an index into ``paths``, ``(U,)``.
+    """
+
+    paths: tuple[str, ...]
+    index: NDArray[np.int64]
+    path_of: NDArray[np.int64]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Parameters of the free paths."""
+        return tuple(parameter_of(path) for path in self.paths)
+
+    @property
+    def shared(self) -> NDArray[np.bool_]:
+        """Whether each unknown is shared by breaths, ``(U,)``."""
+        own = np.array([item.scope == "breath" for item in self.parameters])
+        return ~own[self.path_of]
+
+    def of(self, path: str) -> NDArray[np.int64]:
+        """Unknowns of a parameter, in the order of their groups."""
+        return np.flatnonzero(self.path_of == self.paths.index(path))
+
+    def bounds(self) -> tuple[Floats, Floats]:
+        """Lowest and highest coordinates, ``(U,)``."""
+        pairs = [(p.coordinate(p.low), p.coordinate(p.high)) for p in self.parameters]
+        low, high = np.array(pairs, float).reshape(-1, 2)[self.path_of].T.copy()
+        return low, high
+
+    def prior(self, given: Mapping[str, tuple[float, float]]) -> tuple[Floats, Floats]:
+        """Prior means and precisions (1 / variance) in coordinates, ``(U,)``; precision 0 if none.
+
+        A parameter other than the strength has its own prior, because no data bear on it while the
+        effect is off. So does a strength with a ``spread``.
+        """
+        mean, precision = np.zeros(len(self.path_of)), np.zeros(len(self.path_of))
+        for path in self.paths:
+            owner = path.rpartition(".")[0]
+            if path in given:
+                centre, width = given[path]
+            elif owner and (path != strength_path(owner) or parameter(path).spread is not None):
+                centre, width = parameter(path).prior()
+            else:
+                continue
+            mean[self.of(path)], precision[self.of(path)] = centre, width**-2.0
+        return mean, precision
+
+    def pack(self, values: Mapping[str, ArrayLike]) -> Floats:
+        """Coordinates of physical values, a number or one for each breath by path."""
+        x = np.zeros(len(self.path_of))
+        for column, (path, item) in enumerate(zip(self.paths, self.parameters, strict=True)):
+            value = np.broadcast_to(np.asarray(values[path], float), self.index.shape[:1])
+            x[self.index[:, column]] = item.coordinate(np.clip(value, item.low, item.high))
+        return x
+
+    def unpack(self, x: Floats) -> Floats:
+        """Physical values of each breath, ``(n, k)``."""
+        columns = x[self.index].T
+        pairs = zip(self.parameters, columns, strict=True)
+        return np.stack([item.physical(column) for item, column in pairs], axis=1)
+
+    def slopes(self, physical: Floats) -> Floats:
+        """Derivatives of physical values with respect to coordinates, ``(n, k)``."""
+        pairs = zip(self.parameters, physical.T, strict=True)
+        return np.stack([item.slope(column) for item, column in pairs], axis=1)
+
+
+def make_unknowns(
+    data: Data, paths: Iterable[str], groups: Mapping[str, ArrayLike] | None = None
+) -> Unknowns:
+    """Lay out the unknowns of a fit.
+
+    Args:
+        data: the breaths.
+        paths: free parameters.
+        groups: by path, breaths that share the parameter, as whole numbers ``(n,)``. By default, R
+            and C belong to the lung, a parameter of scope ``breath`` to the breath, and all others
+            are shared by all breaths.
+
+    Raises:
+        InputError: if a group does not fit the data, or a parameter appears twice.
+    """
+    paths, groups = tuple(paths), dict(groups or {})
+    if len(set(paths)) < len(paths):
+        raise InputError(f"a parameter is freed twice among {', '.join(paths)}")
+    index, path_of = [], []
+    for column, path in enumerate(paths):
+        item = parameter_of(path)
+        default = np.arange(len(data)) if item.scope == "breath" else np.zeros(len(data), int)
+        if path in ("R", "C"):
+            default = data.lung
+        group = np.asarray(groups.get(path, default))
+        if group.shape != (len(data),):
+            raise InputError(f"groups of {path}: {group.shape} for {len(data)} breaths")
+        kinds, place = np.unique(group, return_inverse=True)
+        index.append(len(path_of) + place.reshape(-1))
+        path_of += [column] * len(kinds)
+    return Unknowns(paths, np.stack(index, axis=1), np.asarray(path_of))
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What a fit minimises; every method takes the unknowns ``x`` in coordinates, ``(U,)``.
+    """The cost that a fit minimises. Methods take the unknowns ``x`` in coordinates, ``(U,)``.
 
     Attributes:
-        data: measured.
-        simulator: of the same breaths.
-        unknowns: what may move.
-        fixed: physical values of all columns of the simulator, ``(n, P + 1)``; those of free
-            parameters are replaced.
-        noise: of the measurement.
-        mean: of the prior, in coordinates, ``(U,)``.
-        precision: of the prior, 1 / variance, ``(U,)``.
+        data: measurements.
+        predictor: predicts the same breaths.
+        unknowns: layout of ``x``.
+        fixed: physical values of all columns of the predictor, ``(n, P + 1)``; the unknowns
+            replace those of free parameters.
+        noise: measurement noise.
+        mean: prior mean in coordinates, ``(U,)``.
+        precision: prior precision, 1 / variance, ``(U,)``.
     """
 
     data: Data
-    simulator: Simulator
+    predictor: Predictor
     unknowns: Unknowns
     fixed: Floats
     noise: Noise
@@ -42,50 +172,50 @@ class Problem:
 
     @cached_property
     def columns(self) -> tuple[int, ...]:
-        """Where the free parameters stand among the simulator's."""
-        order = (*self.simulator.names, START)
+        """Columns of the free parameters in the predictor's values."""
+        order = (*self.predictor.names, START)
         return tuple(order.index(path) for path in self.unknowns.paths)
 
     def values(self, x: Floats) -> Floats:
-        """Physical values of everything, ``(n, P + 1)``."""
+        """Physical values of all columns, ``(n, P + 1)``."""
         values = self.fixed.copy()
         values[:, list(self.columns)] = self.unknowns.unpack(x)
         return values
 
     def predict(self, x: Floats) -> Floats:
-        """What would be measured, ``(n, c, T)``."""
-        return self.simulator.predict(self.values(x))
+        """Predicted measurements, ``(n, c, T)``."""
+        return self.predictor.predict(self.values(x))
 
     def residual(self, x: Floats) -> Floats:
-        """Simulated minus measured, 0 where not measured, ``(n, c, T)``."""
+        """Predicted minus measured, 0 where nothing was measured, ``(n, c, T)``."""
         return self.residual_of(self.values(x))
 
     def residual_of(self, values: Floats) -> Floats:
-        """The same at physical values of everything, ``(n, P + 1)``."""
-        return self._residual(self.simulator.predict(values))
+        """Residual at physical values of all columns, ``(n, P + 1)``."""
+        return self._residual(self.predictor.predict(values))
 
     def jacobian(self, x: Floats) -> tuple[Floats, Floats]:
-        """Residual, and its derivative by the coordinates of each free path, ``(n, k, c, T)``.
+        """Residual, and its derivative with respect to each free coordinate, ``(n, k, c, T)``.
 
         Column ``j`` of breath ``i`` belongs to the unknown ``unknowns.index[i, j]``.
         """
         values = self.values(x)
-        seen, slopes = self.simulator.derivatives(values, self.columns)
+        seen, slopes = self.predictor.derivatives(values, self.columns)
         chain = self.unknowns.slopes(values[:, list(self.columns)])
         return self._residual(seen), slopes * (chain[:, :, None, None] * self.data.weight[:, None])
 
     def log_likelihood(self, x: Floats) -> Floats:
-        """Of each breath, natural logarithm, ``(n,)``; without the prior."""
+        """Log-likelihood of each breath, without the prior, ``(n,)``."""
         return self.noise.log_likelihood(self.residual(x), self.data.weight)
 
     def cost(self, x: Floats) -> float:
-        """Minus the logarithm of likelihood and prior, up to a constant; infinite if unstable."""
+        """Negative log posterior, up to a constant; infinite if the model is unstable."""
         return self._cost(self._white(self.residual(x)), x)
 
     def scores(self, x: Floats) -> tuple[float, Floats, Floats]:
-        """Cost; its gradient by breath, ``(n, k)``; its Gauss-Newton Hessian, ``(n, k, k)``.
+        """Cost with the prior; gradient and Gauss-Newton Hessian of the likelihood by breath.
 
-        Of the likelihood alone; the cost has the prior in it.
+        Shapes ``()``, ``(n, k)`` and ``(n, k, k)``.
         """
         residual, slopes = self.jacobian(x)
         white = self._white(residual)
@@ -98,7 +228,7 @@ class Problem:
         return self._cost(white, x), gradient, np.matmul(weighted, rows.swapaxes(1, 2))
 
     def normal(self, x: Floats) -> tuple[float, Floats, Floats]:
-        """Cost, gradient ``(U,)`` and Gauss-Newton Hessian ``(U, U)``."""
+        """Cost, its gradient ``(U,)`` and its Gauss-Newton Hessian ``(U, U)``."""
         cost, by_breath, curvature = self.scores(x)
         index = self.unknowns.index
         gradient = self.precision * (x - self.mean)
@@ -108,7 +238,7 @@ class Problem:
         return cost, gradient, hessian
 
     def _residual(self, seen: Floats) -> Floats:
-        return np.where(self.data.weight > 0, seen - self.data.seen, 0.0)
+        return np.where(self.data.weight > 0, seen - self.data.measured, 0.0)
 
     def _white(self, residual: Floats) -> Floats:
         return self.noise.whiten(residual, self.data.weight)
@@ -119,18 +249,18 @@ class Problem:
         return cost if np.isfinite(cost) else np.inf
 
 
-def settings(data: Data, names: tuple[str, ...], given: Mapping[str, ArrayLike]) -> Floats:
-    """Physical values of all parameters of a simulator and of the start, ``(n, P + 1)``.
+def parameter_values(data: Data, names: tuple[str, ...], given: Mapping[str, ArrayLike]) -> Floats:
+    """Physical values of all columns of a predictor, ``(n, P + 1)``.
 
     Args:
-        data: gives R, C, positions and starting pressures.
-        names: of the simulator.
-        given: other values, a number or one for each breath; the rest is neutral.
+        data: R, C, positions and starting pressures come from here.
+        names: paths of the predictor.
+        given: other values by path, a number or one for each breath; the rest is neutral.
 
     Raises:
         InputError: if a name is unknown or a value outside its bounds.
     """
-    first = np.where(data.weight[:, 0, 0] > 0, data.seen[:, 0, 0], 5.0)
+    first = np.where(data.weight[:, 0, 0] > 0, data.measured[:, 0, 0], _DEFAULT_START)
     known = {"R": data.R, "C": data.C, "position": data.position, START: first} | dict(given)
     columns = []
     for name in (*names, START):

@@ -172,16 +172,16 @@ def oracle_rmse(breaths: Breaths, held_out: list[int], names: frozenset[str]) ->
         InputError: if no breath or every breath is held out.
     """
     from ventbench.physics.catalogue import parameter
-    from ventbench.system_id import START, Simulator, fit, recorded, settings
+    from ventbench.system_id import START, Predictor, fit, make_data, parameter_values
 
     apart = np.isin(breaths.breath_id, held_out)
     if not apart.any() or apart.all():
         raise InputError(f"{apart.sum()} of {len(apart)} breaths are held out; both are needed")
-    data = recorded(breaths)
+    data = make_data(breaths)
     fitted = fit(data.select(~apart), sorted(names))
     test = data.select(apart)
-    simulator = Simulator(test, fitted.problem.simulator.names)
-    values = settings(test, simulator.names, {})
+    simulator = Predictor(test, fitted.problem.predictor.names)
+    values = parameter_values(test, simulator.names, {})
     for column, name in enumerate(simulator.names):
         per_breath = "." in name and parameter(name).scope == "breath"
         if name != "position" and name != START and not per_breath:
@@ -192,7 +192,7 @@ def oracle_rmse(breaths: Breaths, held_out: list[int], names: frozenset[str]) ->
         for effort in zip(*(fitted.column(path) for path in _EFFORT), strict=True):
             values[:, columns] = effort
             predicted.append(simulator.predict(values))
-    error = np.mean(predicted, axis=0)[:, 0] - test.seen[:, 0]
+    error = np.mean(predicted, axis=0)[:, 0] - test.measured[:, 0]
     counted = (test.u_out < 0.5) & (test.weight[:, 0] > 0)
     counted[:, 0] = False  # every simulation starts there, and no answer is scored there either
     return float(np.sqrt(np.mean(error[counted] ** 2)))

@@ -10,7 +10,8 @@ import pytest
 from tests.physics import cases
 from ventbench.physics import parameter, paths
 from ventbench.precision import float64
-from ventbench.system_id import START, Simulator, derivatives, recorded, settings
+from ventbench.system_id import START, Predictor, make_data, parameter_values
+from ventbench.system_id import predictor as predictor_module
 
 ORDER = (*paths(), START)
 
@@ -31,17 +32,17 @@ AT = [(path, first) for path in LATE for first in (0.0, 0.041) if (path, first) 
 
 @pytest.fixture(scope="module")
 def data():
-    return recorded(cases.recording(6, {}))
+    return make_data(cases.recording(6, {}))
 
 
 @pytest.fixture(scope="module")
-def simulator(data):
-    return Simulator(data, paths())
+def predictor(data):
+    return Predictor(data, paths())
 
 
 @pytest.fixture(scope="module")
 def values(data):
-    return settings(data, paths(), ACTING)
+    return parameter_values(data, paths(), ACTING)
 
 
 def columns(names):
@@ -49,32 +50,32 @@ def columns(names):
 
 
 @pytest.fixture(scope="module")
-def exact(simulator):
+def exact(predictor):
     """Slopes along a direction, by automatic differentiation of the same model."""
-    (commands,) = simulator._commands
+    (commands,) = predictor._commands
 
     @jax.jit
     def slope(values, direction):
         def run(values):
-            static = simulator._static | {"skip_idle": False}
-            return derivatives._run(values, commands, **static)
+            static = predictor._static | {"skip_idle": False}
+            return predictor_module._run(values, commands, **static)
 
         return jax.jvp(run, (values,), (jnp.broadcast_to(direction, values.shape),))[1]
 
     def found(values, column):
         direction = np.zeros(len(ORDER))
         direction[column] = 1.0
-        padded = np.resize(values, (simulator._part, len(ORDER)))
+        padded = np.resize(values, (predictor._part, len(ORDER)))
         with float64():
             return np.asarray(slope(jnp.asarray(padded), jnp.asarray(direction)))[: len(values)]
 
     return found
 
 
-def test_are_those_of_automatic_differentiation(simulator, values, exact):
+def test_are_those_of_automatic_differentiation(predictor, values, exact):
     names = (*ACTING, START)
-    seen, slopes = simulator.derivatives(values, columns(names))
-    np.testing.assert_allclose(seen, simulator.predict(values), rtol=0, atol=1e-10)
+    seen, slopes = predictor.derivatives(values, columns(names))
+    np.testing.assert_allclose(seen, predictor.predict(values), rtol=0, atol=1e-10)
     for k, name in enumerate(names):
         other = exact(values, ORDER.index(name))
         assert np.abs(other).max() > 0.01, name
@@ -83,31 +84,31 @@ def test_are_those_of_automatic_differentiation(simulator, values, exact):
 
 
 @pytest.mark.parametrize(("path", "first"), AT)
-def test_of_dead_times_are_those_of_milliseconds(simulator, values, path, first):
+def test_of_dead_times_are_those_of_milliseconds(predictor, values, path, first):
     """At zero too, where the smallest one moves the integrator's cuts."""
     (column,) = columns([path])
     ends = np.stack([values, values])
     ends[0, :, column], ends[1, :, column] = first, first + 2e-3
-    there, beyond = simulator.predict_all(ends)
+    there, beyond = predictor.predict_all(ends)
     moved = (beyond - there) / 2e-3
-    slope = simulator.derivatives(ends[0], (column,))[1][:, 0]
+    slope = predictor.derivatives(ends[0], (column,))[1][:, 0]
     assert np.sqrt(np.mean(moved**2)) > 1.0
     assert np.sqrt(np.mean((slope - moved) ** 2)) < 0.2 * np.sqrt(np.mean(moved**2))
 
 
-def test_look_within_the_bounds_alone(simulator, data, monkeypatch):
+def test_look_within_the_bounds_alone(predictor, data, monkeypatch):
     asked = []
 
     def predict_all(points):
         asked.append(points)
-        return np.zeros((len(points), *data.seen.shape))
+        return np.zeros((len(points), *data.measured.shape))
 
-    monkeypatch.setattr(simulator, "predict_all", predict_all)
+    monkeypatch.setattr(predictor, "predict_all", predict_all)
     low = np.array([parameter(name).low for name in paths()])
     high = np.array([parameter(name).high for name in paths()])
     for bound in (low, high):
         values = np.tile(np.append(bound, 5.0), (len(data), 1))
-        simulator.derivatives(values, tuple(range(len(ORDER))))
+        predictor.derivatives(values, tuple(range(len(ORDER))))
         points = asked.pop()
         assert np.all((points[:, :, :-1] >= low) & (points[:, :, :-1] <= high))
         moved = points[1:] != points[:1]
@@ -116,9 +117,9 @@ def test_look_within_the_bounds_alone(simulator, data, monkeypatch):
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 6, 13])
-def test_several_points_are_each_by_itself(simulator, values, count):
+def test_several_points_are_each_by_itself(predictor, values, count):
     points = np.repeat(values[None], count, axis=0)
     points[:, :, ORDER.index("leak.conductance")] += np.arange(count)[:, None]
-    alone = np.stack([simulator.predict(point) for point in points])
-    np.testing.assert_allclose(simulator.predict_all(points), alone, rtol=0, atol=1e-10)
+    alone = np.stack([predictor.predict(point) for point in points])
+    np.testing.assert_allclose(predictor.predict_all(points), alone, rtol=0, atol=1e-10)
     assert count == 1 or np.abs(np.diff(alone, axis=0)).max() > 0.01

@@ -11,7 +11,15 @@ from ventbench.errors import InputError
 from ventbench.physics import library, parameter, paths, strength_path
 from ventbench.precision import float64
 from ventbench.rollouts import open_loop
-from ventbench.system_id import START, Noise, Simulator, fit, held_out, interval, recorded
+from ventbench.system_id import (
+    START,
+    Noise,
+    Predictor,
+    fit,
+    interval,
+    make_data,
+    refit_breath_parameters,
+)
 
 BREATHS, NOISE = 8, 0.2
 #: Efforts in some of the breaths: amplitude, cmH2O, and onset, s.
@@ -29,7 +37,7 @@ def within(fitted, path, truth, slack=1.0):
 @pytest.mark.parametrize("name", sorted(set(library()) - APART))
 def test_recovers_its_parameters(name):
     m = cases.strengths(name)
-    data = recorded(cases.recording(BREATHS, m, noise=NOISE, seed=7))
+    data = make_data(cases.recording(BREATHS, m, noise=NOISE, seed=7))
     found = fit(data, m)
     assert found.minimum.converged
     assert found.problem.noise.sigma[0] == pytest.approx(NOISE, abs=0.03)
@@ -48,7 +56,7 @@ def test_recovers_its_parameters(name):
 def test_dead_time_has_a_profile():
     """Two and a half samples: flat between walls, where the curvature would promise too much."""
     m = cases.strengths("valve_delay")
-    found = fit(recorded(cases.recording(BREATHS, m, noise=NOISE, seed=7)), m)
+    found = fit(make_data(cases.recording(BREATHS, m, noise=NOISE, seed=7)), m)
     value, low, high = interval(found, "valve_delay.delay")
     assert low < 0.08 < high
     assert value == pytest.approx(0.08, abs=0.01)
@@ -64,7 +72,7 @@ def test_efforts_are_found_breath_by_breath():
         return {"patient_effort": {"amplitude": amplitude, "onset": onset, "duration": 0.9}}
 
     breaths = cases.recording(BREATHS, {}, noise=NOISE, seed=3, each=each)
-    found = fit(recorded(breaths), ["patient_effort"])
+    found = fit(make_data(breaths), ["patient_effort"])
     truth = np.array([EFFORTS.get(i, (0.0, 0.0))[0] for i in range(BREATHS)])
     amplitude = found.value("patient_effort.amplitude")
     np.testing.assert_allclose(amplitude, truth, atol=0.6)
@@ -78,7 +86,7 @@ def test_efforts_are_found_breath_by_breath():
     "name", ["valve_lag", "leak", "circuit_compliance", "turbulent_resistance"]
 )
 def test_finds_nothing_in_nothing(name):
-    data = recorded(cases.recording(BREATHS, {}, noise=NOISE, seed=11))
+    data = make_data(cases.recording(BREATHS, {}, noise=NOISE, seed=11))
     without, found = fit(data), fit(data, [name])
     assert found.bic > without.bic
     low, _ = found.ci95(strength_path(name))[0]
@@ -93,38 +101,38 @@ def test_several_at_once_and_held_out():
         "viscoelasticity": {"ratio": 0.4, "time": 0.8},
         "exhalation_valve_delay": {"opening": 0.05},
     }
-    data = recorded(cases.recording(24, m, noise=NOISE, seed=5))
+    data = make_data(cases.recording(24, m, noise=NOISE, seed=5))
     train, test = data.select(slice(0, 16)), data.select(slice(16, 24))
     found, base = fit(train, m), fit(train)
     for owner, own in m.items():
         for name, value in own.items():
             assert within(found, f"{owner}.{name}", value, 2.0), (owner, name)
-    unseen = held_out(found, test)
+    unseen = refit_breath_parameters(found, test)
     assert unseen.problem.unknowns.paths == (START,)
     np.testing.assert_allclose(unseen.column("R"), found.value("R")[0])
     assert np.sqrt(np.mean(unseen.residual**2)) < 1.1 * NOISE
-    gain = unseen.log_likelihood.sum() - held_out(base, test).log_likelihood.sum()
+    gain = unseen.log_likelihood.sum() - refit_breath_parameters(base, test).log_likelihood.sum()
     assert gain > 100.0
 
 
 def test_answers_of_a_simulator_and_the_fitted_plant():
-    """The fitted plant, run as any simulator, answers as the fit says."""
+    """The fitted plant, run as any predictor, answers as the fit says."""
     m = cases.strengths("valve_lag") | cases.strengths("sensor_drift")
-    data = recorded(cases.recording(BREATHS, m, noise=NOISE, seed=2))
+    data = make_data(cases.recording(BREATHS, m, noise=NOISE, seed=2))
     found = fit(data, m)
     with float64():
         start = jnp.asarray(found.column(START))
         arrays = (jnp.asarray(x) for x in (data.u_in, data.u_out, data.dt))
         answer = np.asarray(open_loop(found.plant(), start, *arrays))
-    np.testing.assert_allclose(answer, data.seen[:, 0] + found.residual[:, 0], atol=1e-9)
-    again = fit(data.answered(answer), m, noise=Noise((0.05,), (0.0,)))
+    np.testing.assert_allclose(answer, data.measured[:, 0] + found.residual[:, 0], atol=1e-9)
+    again = fit(data.with_pressure(answer), m, noise=Noise((0.05,), (0.0,)))
     assert again.value("valve_lag.tau")[0] == pytest.approx(found.value("valve_lag.tau")[0], 1e-3)
     assert again.minimum.cost < 1e-3
     assert set(found.plant(0).names) < set(paths())
     with pytest.raises(InputError, match="shape"):
-        data.answered(answer[:, 1:])
+        data.with_pressure(answer[:, 1:])
     with pytest.raises(InputError, match="not finite"):
-        data.answered(np.full_like(answer, np.nan))
+        data.with_pressure(np.full_like(answer, np.nan))
 
 
 def test_flow_and_groups_and_priors():
@@ -137,7 +145,7 @@ def test_flow_and_groups_and_priors():
         a, b = getattr(one, key), getattr(two, key)
         both[key] = np.concatenate([a, b]) if isinstance(a, np.ndarray) else a
     both["flow"] = both["flow"] + rng.normal(0, 20.0, both["flow"].shape)
-    data = recorded(type(one)(**both), flow=True)
+    data = make_data(type(one)(**both), flow=True)
     found = fit(data, free=["gain"])
     np.testing.assert_allclose(found.value("R"), [10.0, 30.0], rtol=0.05)
     np.testing.assert_allclose(found.value("C"), [25.0, 15.0], rtol=0.05)
@@ -150,12 +158,12 @@ def test_flow_and_groups_and_priors():
 
 
 def test_shared_simulator_and_fixed_values():
-    data = recorded(cases.recording(BREATHS, cases.strengths("leak"), noise=NOISE))
-    simulator = Simulator(data, paths())
-    held = fit(data, ["leak"], fixed={"leak.conductance": 20.0}, simulator=simulator)
+    data = make_data(cases.recording(BREATHS, cases.strengths("leak"), noise=NOISE))
+    predictor = Predictor(data, paths())
+    held = fit(data, ["leak"], fixed={"leak.conductance": 20.0}, predictor=predictor)
     assert "leak.conductance" not in held.problem.unknowns.paths
     np.testing.assert_array_equal(held.column("leak.conductance"), 20.0)
-    free = fit(data, ["leak"], free=["leak.exponent"], simulator=simulator)
+    free = fit(data, ["leak"], free=["leak.exponent"], predictor=predictor)
     low, high = free.ci95("leak.exponent")[0]
     assert low <= 0.5 <= high
     with pytest.raises(InputError, match=r"outside 0\.0\.\.50\.0 mL/s"):

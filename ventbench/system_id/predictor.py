@@ -1,7 +1,7 @@
-"""The one compiled function of all fits: pressures, and their derivatives by differences.
+"""Predicted measurements at any parameters, and their derivatives by finite differences.
 
-Every parameter of every mechanism is an input, at its neutral value where a hypothesis leaves it
-out, and a hypothesis only chooses directions: one compilation for all of them.
+One compiled function serves all hypotheses: every parameter of every mechanism is an input, which
+has its neutral value where a hypothesis leaves it out.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from ventbench.physics.dead_time import resolution
 from ventbench.physics.model import Physics
 from ventbench.precision import float64
 from ventbench.system_id.data import Data, Floats
-from ventbench.system_id.together import each
+from ventbench.system_id.parallel import parallel_map
 
-#: Name of what is not a parameter of a plant: the reading that a breath starts from, cmH2O.
+#: Path of the reading that a breath starts from, cmH2O; it is no parameter of the model.
 START = "start"
 
-#: Numbers of breaths that are compiled for, unless told otherwise; more are done in parts.
+#: Numbers of breaths to compile for, unless told otherwise; larger data are divided.
 SIZES = (4, 8, 16, 32, 64)
 
-#: Numbers of points that are compiled for, at once for all breaths; more are done in parts.
+#: Numbers of points to compile for, each for all breaths; a larger number is divided.
 _WIDTHS = (1, 4, 8)
 
-#: Distance of two points, as a share of a parameter's range or, on a log scale, of its value: what
-#: rounding and the slope's change add to a slope are about equal there.
-_APART, _APART_LOG = 2e-8, 5e-8
+#: Step of a difference quotient, as a share of a parameter's range or, on a log scale, of its
+#: value: rounding and truncation errors are about equal there.
+_STEP, _STEP_LOG = 2e-8, 5e-8
 
-#: Distance of two starts, cmH2O.
-_APART_START = 1e-6
+#: Step of the starting pressure, cmH2O.
+_STEP_START = 1e-6
 
-#: Distance of a dead time from none, s. The first tiny one moves one of the integrator's cuts to
-#: its edge: what is left of that error, up to 0.03 cmH2O, must not make a slope.
-_APART_LATE = 1e-3
+#: Step of a dead time from zero, s. Any positive dead time moves a cut of the integrator to its
+#: edge. That changes the integration error by up to 0.03 cmH2O, which must not make a slope.
+_STEP_DEAD_TIME = 1e-3
 
 _STATIC = ("names", "substeps", "memory", "flow", "skip_idle")
 
@@ -70,15 +70,16 @@ def _predict(points: Array, commands: Commands, **static: object) -> Array:
     return _run(points, commands, **static)  # type: ignore[arg-type]
 
 
-class Simulator:
-    """All breaths of some data, at any parameters; compiled once for each size.
+class Predictor:
+    """Predictions for all breaths of some data, at any parameters; compiled once for each size.
 
-    Parts of equally many breaths, and points, run side by side; see :func:`~.together.each`.
+    Blocks of breaths and points are computed in parallel; see :func:`~.parallel.parallel_map`.
 
     Attributes:
-        names: paths of the parameters, the columns of ``values``; the last column is the start.
-        substeps: of a sample.
-        memory: samples that dead times can reach back over.
+        names: paths of the parameters in the order of the columns of ``values``, whose last column
+            is the start.
+        substeps: number of substeps in a sample.
+        memory: number of past samples that a dead time can reach back over.
     """
 
     def __init__(
@@ -88,15 +89,16 @@ class Simulator:
         substeps: int | None = None,
         sizes: tuple[int, ...] = SIZES,
     ) -> None:
-        """Pad and place the data.
+        """Pad the data to a compiled size.
 
         Args:
-            data: to simulate.
+            data: breaths to predict.
             names: paths of the parameters in the order of the columns.
-            substeps: of a sample; enough for most purposes if not given. An edge that a dead time
-                shifts is smoothed over one substep, and the dead time is uncertain by part of it.
-            sizes: to which the number of breaths is padded, each compiled once; more than the last
-                are done in parts of it.
+            substeps: number of substeps in a sample; enough for most purposes if not given. An edge
+                that a dead time shifts is smoothed over one substep, and the dead time is uncertain
+                by part of it.
+            sizes: numbers of breaths to pad to, each compiled once; data with more breaths than the
+                last are divided into blocks of that size.
         """
         self.names = names
         self._count = len(data)
@@ -105,7 +107,7 @@ class Simulator:
         padded = data.padded(parts * self._part)
         enough, memory = resolution(float(np.median(data.dt)))
         self.substeps, self.memory = substeps or enough, memory
-        flow = data.seen.shape[1] > 1
+        flow = data.measured.shape[1] > 1
         self._static = {
             "names": names, "substeps": self.substeps, "memory": memory, "flow": flow,
             "skip_idle": True,
@@ -118,13 +120,13 @@ class Simulator:
         self._commands: list[Commands] = list(zip(u_in, u_out, dt, strict=True))
 
     def predict(self, values: Floats) -> Floats:
-        """What would be measured, ``(n, c, T)``, at physical values ``(n, P + 1)``."""
+        """Predicted measurements, ``(n, c, T)``, at physical values ``(n, P + 1)``."""
         return self.predict_all(values[None])[0]
 
     def predict_all(self, points: Floats) -> Floats:
-        """The same at several points, ``(m, n, P + 1)``, faster than one by one."""
+        """Predicted measurements, ``(m, n, c, T)``, at several points ``(m, n, P + 1)``."""
         parts = len(self._commands)
-        extra = parts * self._part - self._count  # breaths that are made up
+        extra = parts * self._part - self._count  # padding breaths
         points = np.concatenate([points, np.repeat(points[:, :1], extra, axis=1)], axis=1)
         groups = _groups(len(points))
         work = [
@@ -139,19 +141,19 @@ class Simulator:
             with float64():
                 return np.asarray(_predict(jnp.asarray(place[0]), place[1], **self._static))
 
-        seen = each(predicted, work)
+        seen = parallel_map(predicted, work)
         rows = [np.concatenate(seen[k : k + parts], axis=1) for k in range(0, len(seen), parts)]
         kept = [row[: last - first] for row, (first, last, _) in zip(rows, groups, strict=True)]
         return np.concatenate(kept)[:, : self._count]
 
     def derivatives(self, values: Floats, columns: tuple[int, ...]) -> tuple[Floats, Floats]:
-        """Also its derivatives with respect to k columns of ``values``, ``(n, k, c, T)``.
+        """Predictions, and their derivatives with respect to k columns, ``(n, k, c, T)``.
 
-        By differences, since a point takes two thirds of the time of an exact derivative in one
-        direction, and half to compile (``benchmarks/derivatives.py``). Pressures are continuous in
-        all that is fitted; what they are not, such as the bias of a rounding, is tried value by
-        value. Where an effect of either sign is off there may be a kink: it is the mean of both
-        sides' slopes.
+        The derivatives are finite differences: a point takes two thirds of the time of an exact
+        directional derivative, and half the time to compile (``benchmarks/derivatives.py``).
+        Pressures are continuous in all free parameters; a parameter in which they are not, such as
+        the bias of a rounding, is tried value by value. An effect that may have either sign can
+        have a kink where it is off: there, the derivative is the mean of both one-sided slopes.
         """
         moves = np.stack([self._move(values[:, column], column) for column in columns])
         off = [k for k, column in enumerate(columns) if self._is_off(values[:, column], column)]
@@ -167,28 +169,28 @@ class Simulator:
         return seen[0], np.moveaxis(changes / moves[:, :, None, None], 0, 1)
 
     def _is_off(self, values: Floats, column: int) -> bool:
-        """Whether a mechanism's parameter that may have either sign is where its effect is off."""
+        """Whether a parameter of a mechanism that may have either sign is at its neutral value."""
         if column == len(self.names) or "." not in self.names[column]:
             return False
         item = parameter(self.names[column])
         return item.low < item.neutral < item.high and bool(np.all(values == item.neutral))
 
     def _move(self, values: Floats, column: int) -> Floats:
-        """To another point within the bounds, upwards if that may be, ``(n,)``."""
+        """Step to another point within the bounds, upwards if possible, ``(n,)``."""
         if column == len(self.names):
-            return np.full(len(values), _APART_START)
+            return np.full(len(values), _STEP_START)
         item = parameter(self.names[column])
         if item.scale == "log":
-            move = _APART_LOG * values
+            move = _STEP_LOG * values
         else:
-            move = np.full(len(values), _APART * (item.high - item.low))
+            move = np.full(len(values), _STEP * (item.high - item.low))
         if item.kinked:
-            move = np.where(values == item.neutral, _APART_LATE, move)
+            move = np.where(values == item.neutral, _STEP_DEAD_TIME, move)
         return np.where(values + move > item.high, -move, move)
 
 
 def _groups(count: int) -> list[tuple[int, int, int]]:
-    """First and last of the points that are computed at once, and the number compiled for.
+    """First and last of the points that are computed at once, and the compiled number of points.
 
     A group may lack up to a quarter of that number.
     """

@@ -1,4 +1,4 @@
-"""Intervals by profile likelihood: for what the sum of squares is no parabola in."""
+"""Intervals by profile likelihood, for parameters in which the cost is no parabola."""
 
 from __future__ import annotations
 
@@ -7,39 +7,39 @@ from typing import NamedTuple
 import numpy as np
 
 from ventbench.system_id.data import Floats
-from ventbench.system_id.fit import Fit
-from ventbench.system_id.intervals import quantile
-from ventbench.system_id.least_squares import minimise
-from ventbench.system_id.unknowns import described
+from ventbench.system_id.fit import Fit, t_quantile
+from ventbench.system_id.levenberg_marquardt import minimise
+from ventbench.system_id.problem import parameter_of
 
-#: Refits towards either end, first to pass it and then to halve the distance.
-_OUT, _IN = 14, 8
+#: Most refits towards an end of an interval: to bracket it, and then to bisect.
+_BRACKETING, _BISECTIONS = 14, 8
 
-#: First stride of a kinked parameter, as a share of its range: at a wall the curvature is no guide.
+#: First stride for a kinked parameter, as a share of its range: at a steep wall of the likelihood
+#: the curvature says nothing.
 _STRIDE = 0.01
 
-#: Points of a plateau's grid; nats beyond which it ends, and of a dip that may be a sample's noise.
+#: Points of the grid over a plateau, nats below which the plateau ends, and depth of a dip, in
+#: nats, that the noise of a single sample may cause.
 _GRID, _FAR, _DIP = 101, 6.0, 8.0
 
 
-def profile(fit: Fit, path: str, group: int = 0) -> tuple[float, float]:
-    """Ends of the 95 % interval of a free parameter, physical, within its bounds.
+def profile_interval(fit: Fit, path: str, group: int = 0) -> tuple[float, float]:
+    """Ends of the 95 % profile-likelihood interval of a free parameter, within its bounds.
 
-    All else is refitted at each value that is tried. The interval holds the values at which the
-    cost is less than that of a normal distribution at its 95 % quantile, times what the spread
-    between breaths adds to the variance.
+    All other unknowns are refitted at each trial value. The interval contains the values whose cost
+    exceeds the minimum by less than half the squared 97.5 % quantile of Student's t, times the
+    factor by which the sandwich covariance exceeds the inverse Hessian.
 
     Args:
-        fit: where the search ended.
+        fit: a fit.
         path: a free parameter.
-        group: which of its groups.
+        group: index of the group of breaths.
     """
     layout = fit.problem.unknowns
-    unknown, item = int(layout.of(path)[group]), described(path)
+    unknown, item = int(layout.of(path)[group]), parameter_of(path)
     local = np.linalg.pinv(fit.minimum.hessian)[unknown, unknown]
     grown = max(float(fit.covariance[unknown, unknown] / max(local, 1e-30)), 1.0)
-    freedom = max(len(fit.problem.data) - int(layout.shared.sum()), 4)
-    allowed = fit.minimum.cost + 0.5 * quantile(freedom) ** 2 * grown
+    allowed = fit.minimum.cost + 0.5 * t_quantile(fit.freedom) ** 2 * grown
     sd = float(np.sqrt(fit.covariance[unknown, unknown]))
     if item.kinked:
         sd = max(sd, _STRIDE * (item.high - item.low))
@@ -49,7 +49,7 @@ def profile(fit: Fit, path: str, group: int = 0) -> tuple[float, float]:
 
 
 class Interval(NamedTuple):
-    """A value and the ends of its 95 % interval, physical."""
+    """An estimate and the ends of its 95 % interval, in physical units."""
 
     value: float
     low: float
@@ -57,19 +57,19 @@ class Interval(NamedTuple):
 
 
 def interval(fit: Fit, path: str, group: int = 0) -> Interval:
-    """Value and 95 % interval of a free parameter.
+    """Estimate and 95 % interval of a free parameter.
 
-    Usually where the search ended and what its curvature says. Of a dead time it is mean and
-    central 95 % of the profile likelihood over the whole plateau: in the narrow wall where an edge
-    passes a sample a model fits that one sample's noise, a dip of some nats that means nothing. Its
-    interval is wider by half a substep at either end.
+    In general, these are the minimum and the interval of the covariance. For a dead time, they are
+    the mean and the central 95 % of the profile likelihood over its whole plateau: in the narrow
+    wall where an edge passes a sample, the model can fit the noise of that one sample, a dip of
+    some nats without meaning. The interval of a dead time is wider by half a substep at either end.
     """
-    item = described(path)
+    item = parameter_of(path)
     if item.kinked:
         value = float(fit.value(path)[group])
-        found = _plateau(fit, path, group) or Interval(value, *profile(fit, path, group))
-        # The simulator smooths an edge over a substep, and knows its time to half of it.
-        reach = 0.5 * float(np.median(fit.problem.data.dt)) / fit.problem.simulator.substeps
+        found = _plateau(fit, path, group) or Interval(value, *profile_interval(fit, path, group))
+        # The predictor smooths an edge over a substep, and resolves its time to half of it.
+        reach = 0.5 * float(np.median(fit.problem.data.dt)) / fit.problem.predictor.substeps
         ends = np.clip([found.low - reach, found.high + reach], item.low, item.high)
         return Interval(found.value, float(ends[0]), float(ends[1]))
     low, high = fit.ci95(path)[group]
@@ -77,8 +77,8 @@ def interval(fit: Fit, path: str, group: int = 0) -> Interval:
 
 
 def _plateau(fit: Fit, path: str, group: int) -> Interval | None:
-    """Moments of the profile likelihood on a grid, or None if it is narrower than the grid."""
-    unknown, item = int(fit.problem.unknowns.of(path)[group]), described(path)
+    """Mean and quantiles of the profile likelihood on a grid; None if it is narrower than that."""
+    unknown, item = int(fit.problem.unknowns.of(path)[group]), parameter_of(path)
     grid = np.linspace(item.low, item.high, _GRID)
     nearest = int(np.argmin(np.abs(grid - fit.value(path)[group])))
     costs = np.full(_GRID, np.inf)
@@ -105,12 +105,12 @@ def _plateau(fit: Fit, path: str, group: int) -> Interval | None:
 
 
 def _end(fit: Fit, unknown: int, stride: float, allowed: float) -> float:
-    """Coordinate beyond which the refitted cost exceeds what is allowed, or the bound."""
+    """Coordinate beyond which the profile cost exceeds ``allowed``, or the bound."""
     low, high = fit.problem.unknowns.bounds()
     bound = low[unknown] if stride < 0 else high[unknown]
     inside, point = fit.minimum.x[unknown], fit.minimum.x
     outside = None
-    for _ in range(_OUT):
+    for _ in range(_BRACKETING):
         trial = float(np.clip(inside + stride, low[unknown], high[unknown]))
         cost, end = _pinned(fit, point, unknown, trial)
         if cost > allowed:
@@ -121,7 +121,7 @@ def _end(fit: Fit, unknown: int, stride: float, allowed: float) -> float:
             return float(bound)
     if outside is None:
         return float(inside)
-    for _ in range(_IN):
+    for _ in range(_BISECTIONS):
         middle = 0.5 * (inside + outside)
         cost, end = _pinned(fit, point, unknown, middle)
         if cost > allowed:
@@ -132,7 +132,7 @@ def _end(fit: Fit, unknown: int, stride: float, allowed: float) -> float:
 
 
 def _pinned(fit: Fit, x: Floats, unknown: int, value: float) -> tuple[float, Floats]:
-    """Lowest cost with one unknown held, searched from ``x``, and where it is."""
+    """Lowest cost with one unknown held, and its point, searched from ``x``."""
     low, high = fit.problem.unknowns.bounds()
     low[unknown] = high[unknown] = value
     end = minimise(fit.problem.cost, fit.problem.normal, x, low, high, tolerance=0.02, iterations=8)

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt within bounds, for sums whose normal equations are at hand."""
+"""Levenberg-Marquardt method with bounds, for costs with normal equations."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 
 from ventbench.system_id.data import Floats
 
-#: Cost and, on demand, gradient and approximate Hessian at a point.
+#: Cost at a point; cost, gradient and Gauss-Newton Hessian at a point.
 Cost = Callable[[Floats], float]
 Normal = Callable[[Floats], tuple[float, Floats, Floats]]
 
-#: Times that a step is found anew since unknowns would leave their bounds.
+#: Most solutions of one step: each pins the unknowns that would leave their bounds.
 _PASSES = 4
 
-#: Steps in a row that hardly lower the cost after which a valley is called flat.
+#: Successive steps with little gain after which the search ends: the valley is flat.
 _SLOW = 4
 
 
@@ -26,11 +26,11 @@ class Minimum:
 
     Attributes:
         x: the point, ``(U,)``.
-        cost: there.
-        gradient: there, ``(U,)``.
-        hessian: its Gauss-Newton approximation there, ``(U, U)``.
-        iterations: derivatives that were computed.
-        converged: False if it ran out of iterations.
+        cost: cost at the point.
+        gradient: gradient at the point, ``(U,)``.
+        hessian: Gauss-Newton Hessian at the point, ``(U, U)``.
+        iterations: number of evaluations of the normal equations.
+        converged: False if the search ran out of iterations.
     """
 
     x: Floats
@@ -45,20 +45,21 @@ def minimise(
     cost: Cost, normal: Normal, x: Floats, low: Floats, high: Floats, *, tolerance: float = 1e-3,
     iterations: int = 40,
 ) -> Minimum:  # fmt: skip
-    """Search for a minimum from ``x``.
+    """Search for a local minimum within bounds, starting from ``x``.
 
-    Unknowns at a bound that the gradient pushes against stay there for the step; others that would
-    pass theirs end there, and the rest of the step is found anew. Damping is by
-    Marquardt's diagonal, so that scales do not matter.
+    An unknown at a bound that the gradient pushes it against stays there for the step. An unknown
+    that would cross its bound ends at the bound, and the rest of the step is solved for again.
+    Damping multiplies the diagonal of the Hessian (Marquardt), so that scales do not matter.
 
     Args:
-        cost: value at a point; infinite or nan is a step too far.
-        normal: also gradient and Gauss-Newton Hessian.
-        x: start, moved into the bounds, ``(U,)``.
-        low: bounds, ``(U,)``.
-        high: bounds.
-        tolerance: the expected fall of the cost (in nats, if it is minus a log-likelihood) at
-            which the search ends; or after four steps that each gain less than ten times that.
+        cost: cost at a point; infinity or nan rejects the step.
+        normal: cost, gradient and Gauss-Newton Hessian at a point.
+        x: start, ``(U,)``; it is moved into the bounds.
+        low: lower bounds, ``(U,)``.
+        high: upper bounds, ``(U,)``.
+        tolerance: the search ends when the expected decrease of the cost is below it (in nats, if
+            the cost is a negative log-likelihood), or after four steps that each gain less than ten
+            times the tolerance.
         iterations: most evaluations of ``normal``.
     """
     x = np.clip(x, low, high)
@@ -80,7 +81,7 @@ def minimise(
                 moved = True
                 break
             damping *= 8.0
-        if not moved:  # no smaller value to be found, to rounding
+        if not moved:  # no smaller value within rounding errors
             return Minimum(x, value, gradient, hessian, iteration, True)
         slow = slow + 1 if value - reached < 10.0 * tolerance else 0
         x = trial
@@ -93,7 +94,7 @@ def minimise(
 def _step(
     gradient: Floats, hessian: Floats, damping: float, pinned: np.ndarray, low: Floats, high: Floats
 ) -> Floats:
-    """Damped Newton step; ``low`` and ``high`` are how far each unknown may go."""
+    """Damped Gauss-Newton step; ``low`` and ``high`` bound the step of each unknown."""
     step, free = np.zeros_like(gradient), ~pinned
     floor = 1e-12 * max(float(np.diag(hessian).max(initial=0.0)), 1e-300)
     damped = hessian + np.diag(damping * np.maximum(np.diag(hessian), floor) + floor)

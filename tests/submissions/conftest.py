@@ -8,6 +8,7 @@ from ventbench import precision
 from ventbench.lungs import LUNGS
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
 from ventbench.plants.stacking import stack
+from ventbench.submissions.scaffold import create
 
 from ..conftest import MANIFEST as MANIFEST
 
@@ -17,3 +18,8 @@ def plants() -> SingleCompartment:
     """The six lungs, float64, stacked."""
     with precision.float64():
         return stack([single_compartment(lung) for lung in LUNGS])
+
+
+@pytest.fixture
+def demo(tmp_path):
+    return create("demo", "ppo", tmp_path)

@@ -3,7 +3,7 @@ import re
 import pytest
 
 from ventbench.submissions.errors import SubmissionError
-from ventbench.submissions.manifest import Training, read_manifest
+from ventbench.submissions.manifest import Training, check_manifest, read_manifest
 
 from .conftest import MANIFEST
 
@@ -113,3 +113,42 @@ def test_hostile_text(problems):
 def test_missing_file(tmp_path):
     with pytest.raises(SubmissionError, match="cannot be read: No such file"):
         read_manifest(tmp_path / "submission.toml")
+
+
+def manifest_of(demo, text):
+    (demo / "submission.toml").write_text(text)
+    findings, read = check_manifest(demo)
+    return findings, read
+
+
+def test_manifest_problems_have_lines(demo):
+    text = MANIFEST.replace('"other"', '"pdi"').replace("licence", "license")
+    findings, read = manifest_of(demo, f'{text}\n[training]\ndata = "x"\nseeds = 3\n"se\'ed" = 1\n')
+    assert read is None
+    assert [(f.line, f.what) for f in findings] == [
+        (3, "key license is not known; did you mean licence?"),
+        (5, "key family 'pdi' is not one of pid, residual, ppo, dqn, other; did you mean pid?"),
+        (None, "key licence is missing"),
+        (11, "key training.seeds must be a list"),
+        (12, "key training.se'ed is not known; did you mean seeds?"),
+    ]
+    assert findings[2].advice == 'write licence = "Apache-2.0"'
+
+
+def test_broken_toml_has_line_and_column(demo):
+    (finding,), _ = manifest_of(demo, MANIFEST + "training = = 1\n")
+    assert (finding.line, finding.column) == (8, 12)
+    assert finding.what == "not TOML: Invalid value"
+
+
+def test_what_a_manifest_says_is_looked_at(demo):
+    text = MANIFEST.replace('"Apache-2.0"', '"Apache 2"') + "[training]\nper_lung = true\n"
+    findings, read = manifest_of(demo, text.replace('"other"', '"ppo"'))
+    assert read is not None
+    assert [(f.problem, f.line, f.what.split(" ")[1]) for f in findings] == [
+        (True, 3, "licence"),
+        (False, 1, "name"),
+        (False, 9, "training.per_lung"),
+        (False, None, "training.data"),
+    ]
+    assert "did you mean Apache-2.0?" in findings[0].what

@@ -41,13 +41,22 @@ def scored(plants, **options):
 
 
 @pytest.fixture(scope="module")
-def official():
-    return scored(frozen.load().plants)
+def textbook(plants):
+    return scored(plants, draws=2)
 
 
 @pytest.fixture(scope="module")
-def textbook(plants):
-    return scored(plants, draws=2)
+def official(textbook):
+    """The nominal part, as if it had been run on the frozen simulators."""
+    frozen_ones = {"frozen_sha256": frozen.MANIFEST_SHA256}
+    return dataclasses.replace(textbook, drawn=textbook.drawn[:0], draws_sha256=None, **frozen_ones)
+
+
+@pytest.mark.slow
+def test_a_score_on_the_frozen_simulators_is_official():
+    result = scored(frozen.load().plants)
+    assert result.official
+    assert not dataclasses.replace(result, sandbox=None).official
 
 
 def test_the_frozen_simulators_are_those_of_the_published_hash():
@@ -146,7 +155,7 @@ def test_it_shows_itself(textbook, official):
     assert "pid_robust" in page
 
 
-def test_failures_are_shown_and_escaped(textbook):
+def test_failures_are_shown_and_escaped(plants):
     class Fails(Pretender):
         def start(self, submission, tasks):
             from ventbench.submissions.errors import Failure
@@ -154,21 +163,12 @@ def test_failures_are_shown_and_escaped(textbook):
             self.failures = {k: Failure("act", "<b>raised</b>") for k in range(6)}
             return self
 
-    plants = textbook_lung()
-    result = scored(plants, runner=Fails(), lungs=LUNGS[:1])
+    result = scored(plants, runner=Fails(), draws=2)
     assert "failed" in repr(result)
     assert str(result).count("<b>raised</b>") == 3
     assert "... 3 more" in str(result)
     assert "<b>raised" not in result._repr_html_()
     assert "failed" in result._repr_html_()
-
-
-def textbook_lung():
-    from ventbench.plants.single_compartment import single_compartment
-    from ventbench.plants.stacking import stack
-
-    with precision.float64():
-        return stack([single_compartment(LUNGS[0])])
 
 
 def test_save(textbook, tmp_path):

@@ -11,7 +11,8 @@ In a test of your own::
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +67,9 @@ _OTHER_ADVICE = "see the limits of the sandbox in docs/submitting.md"
 _TO_RUN: tuple[Group, ...] = ("run", "repeat", "time")
 
 
-def check(name: str, runner: Runner | None = None) -> CheckReport:
+def check(
+    name: str, runner: Runner | None = None, clock: Callable[[], float] = time.perf_counter
+) -> CheckReport:
     """Find everything that is wrong with a submission.
 
     Files, manifest and sources are read; then the controller runs for a few breaths, unless what
@@ -75,6 +78,7 @@ def check(name: str, runner: Runner | None = None) -> CheckReport:
     Args:
         name: path of a folder, or the name of a bundled submission.
         runner: of the controller; the sandbox if not given.
+        clock: by which calls of ``act`` are timed, s.
 
     Raises:
         SubmissionError: if there is no such folder.
@@ -92,7 +96,7 @@ def check(name: str, runner: Runner | None = None) -> CheckReport:
         from ventbench.sandbox.runner import SandboxRunner
 
         runner = SandboxRunner(allowance=Allowance(total_s=120.0))
-    return _ran(opened, runner, [*findings, *sources])
+    return _ran(opened, runner, [*findings, *sources], clock)
 
 
 def assert_ready(name: str, runner: Runner | None = None) -> None:
@@ -117,7 +121,9 @@ def _opened(name: str) -> Submission | None:
         return None  # the checks have said why
 
 
-def _ran(submission: Submission, runner: Runner, findings: list[Finding]) -> CheckReport:
+def _ran(
+    submission: Submission, runner: Runner, findings: list[Finding], clock: Callable[[], float]
+) -> CheckReport:
     name, tracks = submission.label, submission.manifest.tracks
     plain_runs = plain(tracks)
     repetitions = repeated(plain_runs[0].task)
@@ -125,10 +131,10 @@ def _ran(submission: Submission, runner: Runner, findings: list[Finding]) -> Che
     sandbox = None if runner.sandbox is None else dict(runner.sandbox)
     try:
         with driven(submission) as driver:
-            answers = run_all(driver, runs, runner)
+            answers = run_all(driver, runs, runner, clock)
             # By itself, so that the time does not depend on how many run beside it.
             timed_run = plain_runs[0]._replace(script=breaths())
-            timed_answers = run_all(driver, [timed_run], runner)
+            timed_answers = run_all(driver, [timed_run], runner, clock)
     except SubmissionError as error:
         problems = [_import_finding(problem, name) for problem in error.problems]
         return _report(name, [*findings, *problems], left_out=_TO_RUN[1:], sandbox=sandbox)

@@ -73,3 +73,43 @@ def test_what_is_not_finite_becomes_null_and_numpy_numbers_are_numbers():
     assert plain["open_loop"]["noise_floor"] is None
     assert plain["open_loop"]["before"] == {"mae": None, "rmse": 1.0}
     assert plain["lung"] is None
+
+
+def test_a_row_for_each_parameter():
+    found = made.diagnosis(12)
+    (row,) = found.to_frame().to_dict("records")
+    assert (row["mechanism"], row["parameter"], row["unit"]) == ("valve_delay", "delay", "s")
+    assert (row["value"], row["ci95_low"], row["ci95_high"]) == (0.041, 0.038, 0.044)
+    assert (row["confidence"], row["nats"], row["alternatives"]) == (0.97, 212.0, "valve_lag")
+    assert np.isnan(row["simulator_value"])
+    changed = dataclasses.replace(
+        found.mechanisms[0], changed=True, simulator_values={"delay": 0.012}
+    )
+    frame = dataclasses.replace(found, mechanisms=(changed,)).to_frame()
+    assert frame["simulator_value"].tolist() == [0.012]
+    assert list(made.nothing(12).to_frame().columns) == list(frame.columns)
+
+
+def test_text_and_notebook():
+    found = made.diagnosis(12)
+    assert str(found).splitlines() == found.as_dict()["sentences"]
+    named = dataclasses.replace(found, simulator="<b>mine</b>")
+    page = named._repr_html_()
+    assert "<table" in page
+    assert "valve_delay" in page
+    assert "&lt;b&gt;mine&lt;/b&gt;" in page
+    assert "<table" not in made.nothing(12)._repr_html_()
+
+
+def test_files(tmp_path):
+    for extra in ("jinja2", "rerun"):
+        pytest.importorskip(extra, reason="needs the extra ventbench[view]")
+    found = made.diagnosis(12)
+    written = found.save(tmp_path / "deep" / "out")
+    names = ["diagnosis.json", "report.html", "diagnosis.rrd", "corrected.json"]
+    assert [path.name for path in written] == names
+    assert json.loads(written[0].read_text()) == found.as_dict()
+    # A simulator without plants leaves no corrected plants behind, not even older ones.
+    written = dataclasses.replace(found, plants={}).save(tmp_path / "deep" / "out")
+    assert [path.name for path in written] == names[:3]
+    assert sorted(path.name for path in written[0].parent.iterdir()) == sorted(names[:3])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,7 +22,11 @@ def diagnose(
         str | None, typer.Option(metavar="R20C50", help="Only the breaths of this lung.")
     ] = None,
     passive: Annotated[
-        bool, typer.Option("--passive", help="A test lung: nobody breathes, no efforts are named.")
+        bool,
+        typer.Option(
+            "--passive",
+            help="A test lung: nobody breathes, so that no patient effort is considered.",
+        ),
     ] = False,
     clip: Clip = False,
     pad: Pad = False,
@@ -30,11 +34,11 @@ def diagnose(
 ) -> None:
     """Find what physics a simulator lacks when it differs from a recording.
 
-    Says where they differ, names the missing mechanisms with their parameters (or where in the
-    physics something without a name sits), and how much nearer the corrected simulator is on
-    breaths that no fit has seen. R, C, expiratory resistance and PEEP are always refitted. Writes
-    diagnosis.json, report.html, diagnosis.rrd and corrected.json, which `ventbench score --plant`
-    takes.
+    Reports where they differ, which mechanisms are missing with their parameters (or where in the
+    model an effect acts that is not in the library), and how much closer the corrected simulator is
+    on held-out breaths. R, C, expiratory resistance and PEEP are always refitted. Writes
+    diagnosis.json, report.html, diagnosis.rrd and, if the simulator has plants, corrected.json,
+    which every `--plant` takes.
 
     Example: `ventbench diagnose recording.csv --lung R20C50 --out runs/diagnosis`
     """
@@ -49,64 +53,20 @@ def diagnose(
         breaths = files.load(recordings, clip=clip, pad=pad)
     for note in breaths.notes:
         progress.print(f"note: {note}", markup=False, highlight=False)
-    if lung is not None:
-        lung, breaths = _only(recordings, breaths, lung)
-    found = _diagnose(breaths, plant, lung, passive)
-    out.mkdir(parents=True, exist_ok=True)
-    written = keep(out, found)
-    emit(found.as_dict(), json)
+    diagnosis = _diagnose(breaths, plant, lung, passive)
+    written = diagnosis.save(out)
+    emit(diagnosis.as_dict(), json)
     console = Console(stderr=str(json) == "-")
-    _say(console, found)
+    verdict, *others = str(diagnosis).splitlines()
+    console.print(verdict, style="bold", markup=False, highlight=False)
+    for text in others:
+        console.print(text, markup=False, highlight=False)
     for path in written:
         console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
 
 
-def keep(out: Path, found: Diagnosis) -> list[Path]:
-    """Write the four files of a diagnosis, each in one step.
-
-    Args:
-        out: folder.
-        found: what to write.
-
-    Returns:
-        Their paths.
-    """
-    import ventbench
-    from ventbench import files
-    from ventbench.plants.plant_files import save_plants
-    from ventbench.views.diagnosis import write_report, write_rerun
-
-    recorded = found.traces.breaths
-    about = {
-        "corrected": found.simulator,
-        "mechanisms": [item.name for item in found.mechanisms],
-        "recording": recorded.source,
-        "recording_sha256": recorded.sha256,
-        "ventbench": ventbench.__version__,
-    }
-    diagnosis, corrected = out / "diagnosis.json", out / "corrected.json"
-    files.write_json(diagnosis, found.as_dict())
-    save_plants(corrected, found.plants, about)
-    report = write_report(out / "report.html", found)
-    return [diagnosis, report, write_rerun(out / "diagnosis.rrd", found), corrected]
-
-
-def _only(recordings: Path, breaths: Breaths, name: str) -> tuple[str, Breaths]:
-    """Breaths of one lung, and its id as it is written everywhere."""
-    from ventbench.errors import InputError
-    from ventbench.lungs import lung
-
-    name = lung(name).id
-    there = breaths.by_lung_index
-    if name not in there:
-        raise InputError(
-            f"{recordings} has no breath of lung {name}; choose one of {', '.join(there)}"
-        )
-    return name, breaths.select(there[name])
-
-
 def _diagnose(breaths: Breaths, plant: str, lung: str | None, passive: bool) -> Diagnosis:
-    """Run it under a bar of progress."""
+    """Diagnose with a progress bar."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -124,19 +84,6 @@ def _diagnose(breaths: Breaths, plant: str, lung: str | None, passive: bool) -> 
             bars.update(task, description=what, completed=share)
 
         return find(breaths, simulator=simulators, lung=lung, passive=passive, progress=progress)
-
-
-def _say(console: Any, found: Diagnosis) -> None:
-    from ventbench.diagnosis import report_text
-
-    verdict, *others = report_text.sentences(found)
-    console.print(verdict, style="bold", markup=False, highlight=False)
-    for text in others:
-        console.print(text, markup=False, highlight=False)
-    for place in found.location[:3]:
-        console.print(
-            f"  {report_text.error_region(place, found.noise[0])}", markup=False, highlight=False
-        )
 
 
 def register(app: typer.Typer) -> None:

@@ -48,7 +48,6 @@ def proof(
     from rich.console import Console
 
     from ventbench import compilation, extras
-    from ventbench.cli.diagnose import keep
     from ventbench.cli.study import bars
     from ventbench.validation.real_rig_proof import prove
 
@@ -63,7 +62,7 @@ def proof(
                 tasks[part] = shown.add_task(part, total=1.0)
             shown.update(tasks[part], completed=share, description=f"{part}: {what}")
 
-        found = prove(folder, out, keep, only or (), progress)
+        found = prove(folder, out, lambda to, found: found.save(to), only or (), progress)
     emit(found.as_dict(), json)
     _show(Console(stderr=str(json) == "-"), found)
     if not found.met:

@@ -25,6 +25,7 @@ from ventbench.diagnosis.simulator_comparison import (
     refit_at_simulator_parameters,
 )
 from ventbench.errors import InputError
+from ventbench.lungs import lung as parse_lung
 from ventbench.mechanics.lung_match import LungMatch
 from ventbench.plants.catalog import Given, Simulators, load_simulators
 from ventbench.recordings.breaths import Breaths
@@ -82,7 +83,7 @@ def diagnose(
     tell = progress or (lambda what, share: None)
     simulators = load_simulators(simulator, breaths=breaths)
     if lung is not None:
-        breaths = breaths.select(np.flatnonzero(breaths.lung_ids == lung))
+        breaths = _of_lung(breaths, parse_lung(lung).id)
     breaths, notes = usable(breaths, settings.data)
     held = held_out(breaths, settings.data)
     tell("simulating", 0.02)
@@ -144,6 +145,15 @@ def diagnose(
         settings=settings,
         seconds=time.perf_counter() - began,
     )  # fmt: skip
+
+
+def _of_lung(breaths: Breaths, lung: str) -> Breaths:
+    by_lung = breaths.by_lung_index
+    if lung not in by_lung:
+        raise InputError(
+            f"the recording has no breath of lung {lung}; choose one of {', '.join(by_lung)}"
+        )
+    return breaths.select(by_lung[lung])
 
 
 def _name(given: Given, simulators: Simulators) -> str:

@@ -1,12 +1,15 @@
-"""A diagnosis with its ways out: ``diagnosis.json`` and text."""
+"""A diagnosis and what can be made of it: text, JSON, a table, a figure, files."""
 
 from __future__ import annotations
 
+import html
 from dataclasses import dataclass
-from typing import Any
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import ventbench
-from ventbench import files
+from ventbench import extras, files
 from ventbench.diagnosis import report_text
 from ventbench.diagnosis.findings import (
     BreathRequest,
@@ -18,18 +21,138 @@ from ventbench.diagnosis.findings import (
     OpenLoopError,
 )
 from ventbench.mechanics.lung_match import Estimate, LungMatch
+from ventbench.plants.plant_files import save_plants
+from ventbench.system_id.data import Floats
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
 
 #: Version of the layout of ``diagnosis.json``; keys are only ever added.
 FORMAT = "ventbench-diagnosis-1"
 
 
+#: Pictures lie above the diagnosis; they are imported only when they are asked for.
+_VIEWS = "ventbench.views.diagnosis"
+
+#: Columns of :meth:`Diagnosis.to_frame`.
+_COLUMNS = (
+    "mechanism",
+    "parameter",
+    "value",
+    "unit",
+    "ci95_low",
+    "ci95_high",
+    "simulator_value",
+    "confidence",
+    "nats",
+    "alternatives",
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Diagnosis(Findings):
-    """What a simulator lacks, by a recording; see :class:`~.findings.Findings` for the fields."""
+    """What a simulator lacks, by a recording; see :class:`~.findings.Findings` for the fields.
+
+    ``print`` shows it in sentences, a notebook as sentences and a table.
+    """
+
+    @property
+    def corrected_pressures(self) -> Floats:
+        """Pressures of the corrected simulator for the recorded commands, cmH2O, ``(n, T)``.
+
+        Rows are the breaths of ``traces.breaths``: those of the recording that could be used.
+        """
+        return self.traces.after
+
+    def to_frame(self) -> pd.DataFrame:
+        """The missing mechanisms as a table, one row a parameter.
+
+        Columns: mechanism, parameter, value, unit, ci95_low, ci95_high, simulator_value (NaN unless
+        the simulator has the mechanism too), confidence (0..1), nats (held-out log-likelihood that
+        is lost without the mechanism) and alternatives (names separated by commas).
+        """
+        import pandas as pd
+
+        rows = [
+            (
+                missing.name,
+                name,
+                estimate.value,
+                estimate.unit,
+                *estimate.ci95,
+                missing.simulator_values.get(name, float("nan")),
+                missing.confidence,
+                missing.nats,
+                ", ".join(missing.alternatives),
+            )
+            for missing in self.mechanisms
+            for name, estimate in missing.parameters.items()
+        ]
+        return pd.DataFrame(rows, columns=list(_COLUMNS))
+
+    def plot(self) -> Figure:
+        """Draw held-out breaths, and errors before and after the correction.
+
+        Returns:
+            A matplotlib figure, which a notebook shows and ``savefig`` writes.
+
+        Raises:
+            InputError: if the extra ``ventbench[view]`` is missing.
+        """
+        extras.require("matplotlib")
+        return import_module(f"{_VIEWS}.plot").figure(self)
+
+    def save(self, folder: Path | str) -> list[Path]:
+        """Write ``diagnosis.json``, ``report.html``, ``diagnosis.rrd`` and ``corrected.json``.
+
+        Each file is written in one step. ``corrected.json`` holds the corrected plants, which every
+        ``--plant`` takes; it is left out if the simulator has no plants.
+
+        Args:
+            folder: where to write; created if missing.
+
+        Returns:
+            The paths of the files.
+
+        Raises:
+            InputError: if the extra ``ventbench[view]`` is missing.
+            OSError: if a file cannot be written.
+        """
+        extras.require("jinja2", "rerun")
+        views, folder = import_module(_VIEWS), Path(folder)
+        plain, corrected = folder / "diagnosis.json", folder / "corrected.json"
+        files.write_json(plain, self.as_dict())
+        written = [
+            plain,
+            views.write_report(folder / "report.html", self),
+            views.write_rerun(folder / "diagnosis.rrd", self),
+        ]
+        if not self.plants:
+            corrected.unlink(missing_ok=True)  # that of an earlier diagnosis
+            return written
+        breaths = self.traces.breaths
+        about = {
+            "corrected": self.simulator,
+            "mechanisms": [missing.name for missing in self.mechanisms],
+            "recording": breaths.source,
+            "recording_sha256": breaths.sha256,
+            "ventbench": ventbench.__version__,
+        }
+        save_plants(corrected, self.plants, about)
+        return [*written, corrected]
 
     def __str__(self) -> str:
         """The diagnosis in sentences, the most important first."""
         return "\n".join(report_text.sentences(self))
+
+    def _repr_html_(self) -> str:
+        """Sentences and table for a notebook."""
+        first, *others = (html.escape(text) for text in report_text.sentences(self))
+        table = ""
+        if self.mechanisms:
+            table = self.to_frame().to_html(index=False, float_format="%.4g", na_rep="")
+        return f"<p><b>{first}</b></p>{table}" + "".join(f"<p>{text}</p>" for text in others)
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values of ``diagnosis.json``; numbers that are not finite become None.

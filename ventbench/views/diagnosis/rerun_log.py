@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
 from ventbench.diagnosis import report_text
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.errors import InputError
 from ventbench.text import escape_markdown
 from ventbench.views import style
-from ventbench.views.diagnosis.breaths import STAGES, rmse
-from ventbench.views.diagnosis.layout import ABOUT, TIMELINE, blueprint, span
+from ventbench.views.diagnosis.charts import STAGES, rmse
 from ventbench.views.runs import Floats
 
 APPLICATION = "ventbench"
@@ -31,8 +31,14 @@ COLORS = {
 #: Pixels of a map for each sample and breath.
 _ZOOM = 6
 
+#: Name of the timeline; its values are seconds with a lung's breaths end to end.
+TIMELINE = "recording_time"
 
-def recording(found: Diagnosis) -> bytes:
+#: Entity of the text panel.
+ABOUT = "/about"
+
+
+def recording(diagnosis: Diagnosis) -> bytes:
     """Return a whole ``.rrd`` file.
 
     Entities, for each lung: ``/<lung>/pressure/{recorded,before,refit,after}``,
@@ -48,14 +54,14 @@ def recording(found: Diagnosis) -> bytes:
         raise InputError("rerun is switched off by the environment variable RERUN; unset it")
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "diagnosis.rrd")
-        stream.save(file, default_blueprint=blueprint(found))
-        stream.send_recording_name(f"diagnosis of {plain(found.simulator)}")
-        text = rr.TextDocument(markdown(found), media_type=rr.MediaType.MARKDOWN)
+        stream.save(file, default_blueprint=blueprint(diagnosis))
+        stream.send_recording_name(f"diagnosis of {plain(diagnosis.simulator)}")
+        text = rr.TextDocument(markdown(diagnosis), media_type=rr.MediaType.MARKDOWN)
         stream.log(ABOUT, text, static=True)
-        for lung, index in found.traces.breaths.by_lung_index.items():
-            log_lung(stream, found, lung, index)
-        log_by_breath(stream, found)
-        log_maps(stream, found)
+        for lung, index in diagnosis.traces.breaths.by_lung_index.items():
+            log_lung(stream, diagnosis, lung, index)
+        log_by_breath(stream, diagnosis)
+        log_maps(stream, diagnosis)
         stream.disconnect()  # writes the rest and the footer
         return file.read_bytes()
 
@@ -65,12 +71,12 @@ def plain(text: str) -> str:
     return "".join(c if " " <= c <= "~" or "\xa1" <= c <= "\u017e" else "?" for c in text)
 
 
-def markdown(found: Diagnosis) -> str:
+def markdown(diagnosis: Diagnosis) -> str:
     """The text panel: the diagnosis in words, and what is seen."""
-    verdict, *others = (escape_markdown(plain(text)) for text in report_text.sentences(found))
+    verdict, *others = (escape_markdown(plain(text)) for text in report_text.sentences(diagnosis))
     places = [
-        escape_markdown(report_text.error_region(place, found.noise[0]))
-        for place in found.location[:5]
+        escape_markdown(report_text.error_region(place, diagnosis.noise[0]))
+        for place in diagnosis.location[:5]
     ]
     lines = [f"## {verdict}", "", *(f"{text}\n" for text in others)]
     if places:
@@ -90,11 +96,13 @@ def markdown(found: Diagnosis) -> str:
     return "\n".join(lines) + "\n"
 
 
-def log_lung(stream: rr.RecordingStream, found: Diagnosis, lung: str, index: np.ndarray) -> None:
+def log_lung(
+    stream: rr.RecordingStream, diagnosis: Diagnosis, lung: str, index: np.ndarray
+) -> None:
     """Traces of one lung's breaths, laid end to end."""
-    traces = found.traces
+    traces = diagnosis.traces
     breaths = traces.breaths.select(index)
-    start = np.arange(len(index))[:, None] * span(found)
+    start = np.arange(len(index))[:, None] * span(diagnosis)
     time = (start + breaths.time).ravel()
     order = breaths.valid.ravel()
 
@@ -113,7 +121,7 @@ def log_lung(stream: rr.RecordingStream, found: Diagnosis, lung: str, index: np.
         )
 
     send("pressure/recorded", breaths.pressure, "recorded", COLORS["recorded"], 3.0)
-    for key, text, _ in _stages(found):
+    for key, text, _ in _stages(diagnosis):
         simulated = getattr(traces, key)[index]
         send(f"pressure/{key}", simulated, text, COLORS[key], 1.5)
         send(f"error/{key}", breaths.pressure - simulated, text, COLORS[key], 1.5)
@@ -123,22 +131,24 @@ def log_lung(stream: rr.RecordingStream, found: Diagnosis, lung: str, index: np.
     send("held_out", held, "held out of every fit", style.REFERENCE_COLORS[0], 6.0)
 
 
-def log_by_breath(stream: rr.RecordingStream, found: Diagnosis) -> None:
+def log_by_breath(stream: rr.RecordingStream, diagnosis: Diagnosis) -> None:
     """Root mean square errors of every breath, in the order of the recording."""
-    number = np.arange(1, len(found.traces.breaths) + 1)
-    for key, _, _ in _stages(found):
-        values = np.nan_to_num(rmse(found.traces, getattr(found.traces, key)))
+    number = np.arange(1, len(diagnosis.traces.breaths) + 1)
+    for key, _, _ in _stages(diagnosis):
+        values = np.nan_to_num(rmse(diagnosis.traces, getattr(diagnosis.traces, key)))
         bars = rr.BarChart(values, color=style.rgb(COLORS[key]), abscissa=number)
         stream.log(f"/by_breath/{key}", bars, static=True)
 
 
-def log_maps(stream: rr.RecordingStream, found: Diagnosis) -> None:
+def log_maps(stream: rr.RecordingStream, diagnosis: Diagnosis) -> None:
     """Errors of all breaths as pictures on one scale of colours, the first breath on top."""
-    traces = found.traces
-    errors = {key: traces.breaths.pressure - getattr(traces, key) for key, _, _ in _stages(found)}
+    traces = diagnosis.traces
+    errors = {
+        key: traces.breaths.pressure - getattr(traces, key) for key, _, _ in _stages(diagnosis)
+    }
     errors.pop("before")
     refit = np.abs(errors["refit"][np.isfinite(errors["refit"])])
-    top = max(3.0 * found.noise[0], float(np.quantile(refit, 0.98)) if refit.size else 0.0, 0.1)
+    top = max(3.0 * diagnosis.noise[0], float(np.quantile(refit, 0.98)) if refit.size else 0.0, 0.1)
     for key, error in errors.items():
         picture = np.repeat(np.repeat(diverging(error / top), _ZOOM, axis=0), _ZOOM, axis=1)
         stream.log(f"/map/{key}", rr.Image(picture), static=True)
@@ -153,5 +163,83 @@ def diverging(share: Floats) -> np.ndarray:
     return np.where(np.isfinite(share)[..., None], color, 128.0).round().astype(np.uint8)
 
 
-def _stages(found: Diagnosis) -> list[tuple[str, str, str]]:
-    return [x for x in STAGES if x[0] != "after" or found.verdict != "nothing_missing"]
+def _stages(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    return [x for x in STAGES if x[0] != "after" or diagnosis.verdict != "nothing_missing"]
+
+
+def blueprint(diagnosis: Diagnosis) -> rrb.Blueprint:
+    """Return the one blueprint."""
+    lungs = diagnosis.traces.breaths.by_lung_index
+    keys = ["before", "refit", "after"][: 2 if diagnosis.verdict == "nothing_missing" else 3]
+    names = {"before": "as given", "refit": "R and C refitted", "after": "corrected"}
+    bars = [
+        rrb.BarChartView(origin=f"/by_breath/{key}", name=f"RMSE by breath, {names[key]}, cmH2O")
+        for key in keys
+    ]
+    maps = [
+        rrb.Spatial2DView(origin=f"/map/{key}", name=f"Error over time and breath, {names[key]}")
+        for key in keys[1:]
+    ]
+    linked = rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Tabs(
+                _lung(*_worst(diagnosis), "Worst held-out breath"),
+                *(_lung(lung, linked, lung) for lung in lungs),
+                rrb.Vertical(*bars, name="Errors by breath"),
+                rrb.Horizontal(*maps, name="Maps of the error"),
+                active_tab=0,
+                name="Diagnosis",
+            ),
+            rrb.TextDocumentView(origin=ABOUT, name="In words"),
+            column_shares=[2.6, 1],
+        ),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def span(diagnosis: Diagnosis) -> float:
+    """Time from one breath's start to the next one's, s: the longest breath and a gap."""
+    breaths = diagnosis.traces.breaths
+    return float(np.max(breaths.time, initial=0.0, where=breaths.valid)) + 0.1
+
+
+def _lung(lung: str, time: rrb.TimeAxis, name: str) -> rrb.Vertical:
+    """Traces of one lung on one time axis."""
+    rows = (
+        ("pressure", f"{lung}: airway pressure, cmH2O", 4.0),
+        ("error", f"{lung}: error = recorded - simulated, cmH2O", 3.0),
+        ("u_in", f"{lung}: inspiratory valve u_in, %", 2.0),
+        ("u_out", f"{lung}: expiratory valve u_out, 1 open", 1.2),
+    )
+    views = []
+    for part, title, _ in rows:
+        contents = [f"/{lung}/{part}/**" if part in ("pressure", "error") else f"/{lung}/{part}"]
+        if part == "pressure":
+            contents.append(f"/{lung}/held_out")
+        views.append(
+            rrb.TimeSeriesView(
+                origin=f"/{lung}",
+                contents=contents,
+                name=title,
+                axis_x=time,
+                plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=part == "pressure"),
+            )
+        )
+    return rrb.Vertical(*views, row_shares=[share for *_, share in rows], name=name)
+
+
+def _worst(diagnosis: Diagnosis) -> tuple[str, rrb.TimeAxis]:
+    """Lung and times of the held-out breath on which the refitted simulator errs most."""
+    traces = diagnosis.traces
+    error = np.nan_to_num(rmse(traces, traces.refit), nan=-1.0)
+    breath = int(np.argmax(np.where(traces.held_out, error, -1.0)))
+    lung = str(traces.breaths.lung_ids[breath])
+    start = span(diagnosis) * int(np.flatnonzero(traces.breaths.by_lung_index[lung] == breath)[0])
+    end, edge = start + span(diagnosis), rr.TimeRangeBoundary.absolute
+    shown = rr.TimeRange(start=edge(seconds=start - 0.1), end=edge(seconds=end))
+    return lung, rrb.TimeAxis(view_range=shown)

@@ -1,0 +1,340 @@
+"""Charts of a diagnosis as numbers for the template: lines, bands and ticks in picture units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ventbench.diagnosis.findings import BreathRequest, NonparametricTerm, Traces
+from ventbench.diagnosis.residual_analysis import Profile, profiles
+from ventbench.diagnosis.result import Diagnosis
+from ventbench.views import svg
+from ventbench.views.runs import Floats
+
+#: Room for the labels: left, right, top, bottom, picture units.
+LEFT, RIGHT, TOP, BOTTOM = 34.0, 8.0, 16.0, 30.0
+
+#: The three simulators in the order of the legend: key, text, class of the line.
+STAGES = (
+    ("before", "simulator as given", "before"),
+    ("refit", "R and C refitted", "refit"),
+    ("after", "corrected", "after"),
+)
+
+#: Breaths that are shown of either kind.
+WORST = 3
+
+#: Breaths of a request that are drawn.
+REQUESTED = 4
+
+
+@dataclass
+class Chart:
+    """Axes with linear scales; y of the picture runs downwards.
+
+    Attributes:
+        x: ends of the horizontal axis.
+        y: ends of the vertical axis.
+        x_label: under it, with the unit.
+        y_label: above the frame, with the unit.
+        alt: what is seen, in words.
+        width: of the picture.
+        height: likewise.
+        paths: class and path data of lines, the lowest first.
+        areas: likewise of filled areas, below the lines.
+        bands: left end and width of shaded ranges.
+    """
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    x_label: str
+    y_label: str
+    alt: str
+    width: float = 300.0
+    height: float = 170.0
+    paths: list[tuple[str, str]] = field(default_factory=list)
+    areas: list[tuple[str, str]] = field(default_factory=list)
+    bands: list[tuple[float, float]] = field(default_factory=list)
+
+    @property
+    def frame(self) -> tuple[float, float, float, float]:
+        """Left, top, right, bottom."""
+        return LEFT, TOP, self.width - RIGHT, self.height - BOTTOM
+
+    @property
+    def x_ticks(self) -> list[tuple[str, float]]:
+        """Texts and places."""
+        values, texts = ticks(*self.x, 6)
+        return [(t, round(float(self.at_x(v)), 1)) for t, v in zip(texts, values, strict=True)]
+
+    @property
+    def y_ticks(self) -> list[tuple[str, float]]:
+        """Texts and places."""
+        values, texts = ticks(*self.y, 4)
+        return [(t, round(float(self.at_y(v)), 1)) for t, v in zip(texts, values, strict=True)]
+
+    @property
+    def zero(self) -> float | None:
+        """Where y is zero, if that is inside."""
+        return round(float(self.at_y(0.0)), 1) if self.y[0] < 0 < self.y[1] else None
+
+    def at_x(self, value: ArrayLike) -> Floats:
+        """Place on the horizontal axis."""
+        left, _, right, _ = self.frame
+        share = (np.asarray(value, float) - self.x[0]) / (self.x[1] - self.x[0])
+        return left + share * (right - left)
+
+    def at_y(self, value: ArrayLike) -> Floats:
+        """Place on the vertical axis; what is far outside stays near the frame."""
+        _, top, _, bottom = self.frame
+        share = (np.asarray(value, float) - self.y[0]) / (self.y[1] - self.y[0])
+        return bottom - np.clip(share, -0.5, 1.5) * (bottom - top)
+
+    def line(self, look: str, x: ArrayLike, y: ArrayLike) -> None:
+        """Add a line, which breaks where a point is NaN."""
+        self.paths.append((look, svg.path(self._points(x, y))))
+
+    def stairs(self, look: str, edges: ArrayLike, y: ArrayLike) -> None:
+        """Add one level for each of k ranges with ``k + 1`` edges."""
+        edges = np.asarray(edges, float)
+        self.line(look, np.repeat(edges, 2)[1:-1], np.repeat(np.asarray(y, float), 2))
+
+    def boxes(self, look: str, edges: ArrayLike, low: ArrayLike, high: ArrayLike) -> None:
+        """Add an area from low to high in each of k ranges."""
+        edges, parts = np.asarray(edges, float), []
+        bounds = zip(np.asarray(low, float), np.asarray(high, float), strict=True)
+        for k, (bottom, top) in enumerate(bounds):
+            if np.isfinite(bottom) and np.isfinite(top):
+                ends = edges[[k, k + 1]]
+                upper, lower = self._points(ends, [top, top]), self._points(ends, [bottom, bottom])
+                parts.append(svg.area(upper, lower))
+        if parts:
+            self.areas.append((look, "".join(parts)))
+
+    def band(self, low: float, high: float) -> None:
+        """Shade a range."""
+        ends = self.at_x(np.clip([low, high], *self.x))
+        left, right = float(ends[0]), float(ends[1])
+        self.bands.append((round(left, 1), round(max(right - left, 1.0), 1)))
+
+    def _points(self, x: ArrayLike, y: ArrayLike) -> Floats:
+        return np.stack([self.at_x(x), self.at_y(y)], axis=-1)
+
+
+def ticks(low: float, high: float, count: int) -> tuple[list[float], list[str]]:
+    """At most about ``count`` round numbers from ``low`` to ``high``, and their texts."""
+    wanted = max(high - low, 1e-9) / count
+    scale = 10.0 ** np.floor(np.log10(wanted))
+    step = float(scale * next(x for x in (1, 2, 5, 10) if x * scale >= 0.999 * wanted))
+    first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
+    values = [step * k for k in range(first, last + 1)]
+    places = max(0, -int(np.floor(np.log10(step) + 1e-9)))
+    return values, [f"{v + 0.0:.{places}f}" for v in values]
+
+
+def limits(*arrays: ArrayLike, around: float = 0.06, least: float = 0.0) -> tuple[float, float]:
+    """Ends of an axis that holds all finite values with some air.
+
+    Args:
+        arrays: of any shape.
+        around: air at either end, as a share of the height.
+        least: height at least.
+    """
+    flat = np.concatenate([np.ravel(np.asarray(array, float)) for array in arrays])
+    flat = flat[np.isfinite(flat)]
+    if flat.size == 0:
+        return 0.0, max(least, 1.0)
+    low, high = float(flat.min()), float(flat.max())
+    missing = max(least - (high - low), 0.0) or (1.0 if high == low else 0.0)
+    low, high = low - 0.5 * missing, high + 0.5 * missing
+    return low - around * (high - low), high + around * (high - low)
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One breath.
+
+    Attributes:
+        title: such as ``breath 17``.
+        why: it is shown.
+        errors: root mean square over the inspiration by stage, cmH2O.
+        pressure: its chart.
+        valve: chart of the command.
+    """
+
+    title: str
+    why: str
+    errors: dict[str, float]
+    pressure: Chart
+    valve: Chart
+
+
+def rmse(traces: Traces, simulated: Floats) -> Floats:
+    """Root mean square error of each breath's inspiration, cmH2O, ``(n,)``; NaN without any."""
+    error = traces.breaths.pressure - simulated
+    use = traces.breaths.inspiratory & np.isfinite(error)
+    total = np.where(use, error**2, 0.0).sum(axis=1)
+    count = use.sum(axis=1)
+    return np.sqrt(np.divide(total, count, out=np.full(len(total), np.nan), where=count > 0))
+
+
+def worst(diagnosis: Diagnosis) -> list[tuple[int, str]]:
+    """Held-out breaths to look at: where the refit errs most, and where the correction does."""
+    traces = diagnosis.traces
+    held = traces.held_out if traces.held_out.any() else np.ones(len(traces.held_out), bool)
+    corrected = diagnosis.verdict != "nothing_missing"
+    kinds = [(traces.refit, "worst before the correction" if corrected else "worst")]
+    if corrected:
+        kinds.append((traces.after, "worst after the correction"))
+    chosen: dict[int, str] = {}
+    for simulated, why in kinds:
+        error = np.where(held, rmse(traces, simulated), -np.inf)
+        order = np.argsort(-np.nan_to_num(error, nan=-np.inf), kind="stable")
+        fresh = [i for i in order.tolist() if np.isfinite(error[i]) and i not in chosen]
+        chosen |= dict.fromkeys(fresh[:WORST], why)
+    return list(chosen.items())
+
+
+def panels(diagnosis: Diagnosis) -> list[Panel]:
+    """Pictures of :func:`worst`."""
+    traces = diagnosis.traces
+    by_stage = {key: rmse(traces, getattr(traces, key)) for key, _, _ in STAGES}
+    several = len(traces.breaths.by_lung_index) > 1
+    shown = []
+    for i, why in worst(diagnosis):
+        name = f"breath {traces.breaths.breath_id[i]}"
+        if several:
+            name += f", {traces.breaths.lung_ids[i]}"
+        errors = {key: float(values[i]) for key, values in by_stage.items()}
+        pressure = _pressure(traces, i, name, diagnosis.verdict != "nothing_missing")
+        shown.append(Panel(name, why, errors, pressure, _valve(traces, i, name)))
+    return shown
+
+
+def _end(traces: Traces, i: int) -> float:
+    """Until a little after the inspiration, s; the rest is much the same."""
+    breath = traces.breaths
+    last = np.max(breath.time[i], initial=0.0, where=breath.valid[i])
+    inspired = np.max(breath.time[i], initial=0.0, where=breath.inspiratory[i])
+    return float(max(min(last, inspired + 0.6), 0.1))
+
+
+def _pressure(traces: Traces, i: int, name: str, corrected: bool) -> Chart:
+    breath = traces.breaths
+    use = breath.valid[i] & (breath.time[i] <= _end(traces, i))
+    time, recorded = breath.time[i][use], breath.pressure[i][use]
+    near = limits(recorded, traces.refit[i][use], traces.after[i][use])
+    chart = Chart(
+        (0.0, _end(traces, i)),
+        near,
+        "",
+        "cmH2O",
+        f"Pressure of {name}: recorded, and simulated before, after refit and corrected.",
+        height=140.0,
+    )
+    chart.line("seen", time, recorded)
+    for key, _, look in STAGES:
+        if look != "after" or corrected:
+            chart.line(look, time, getattr(traces, key)[i][use])
+    return chart
+
+
+def _valve(traces: Traces, i: int, name: str) -> Chart:
+    breath = traces.breaths
+    use = breath.valid[i] & (breath.time[i] <= _end(traces, i))
+    return command(
+        breath.time[i][use], breath.u_in[i][use], _end(traces, i), f"Commands of {name}.", 84.0
+    )
+
+
+def command(time: Floats, u_in: Floats, end: float, alt: str, height: float) -> Chart:
+    """The inspiratory valve over time; a command holds until the next sample."""
+    top = max(10.0, float(np.max(u_in, initial=0.0)))
+    chart = Chart((0.0, end), (-0.04 * top, 1.08 * top), "s", "u_in, %", alt, height=height)
+    chart.line("u", np.repeat(time, 2)[1:], np.repeat(u_in, 2)[:-1])
+    return chart
+
+
+def by_axis(diagnosis: Diagnosis) -> list[Chart]:
+    """Mean errors of the refitted and of the corrected simulator along each axis."""
+    traces = diagnosis.traces
+    inputs = (traces.breaths, traces.refit, traces.flow, traces.volume)
+    refitted = profiles(*inputs)
+    # Sorted by what the refitted one did, so that both are over the same samples.
+    corrected = profiles(*inputs, simulated=traces.after)
+    return [_axis(diagnosis, a, b) for a, b in zip(refitted, corrected, strict=True)]
+
+
+def _axis(diagnosis: Diagnosis, refit: Profile, after: Profile) -> Chart:
+    axis = refit.axis
+    used = np.flatnonzero(refit.breaths > 0)
+    edges = axis.edges[used[0] : used[-1] + 2] if used.size else axis.edges
+    inside = slice(used[0], used[-1] + 1) if used.size else slice(None)
+    mean, half, corrected = refit.mean[inside], refit.half[inside], after.mean[inside]
+    half = np.where(np.isfinite(half), half, 0.0)
+    y = limits(mean, corrected, [0.0], _near(mean - half, mean), _near(mean + half, mean))
+    places = [place for place in diagnosis.location if place.axis == axis.name]
+    unit = "" if axis.unit == "1" else f", {axis.unit}"
+    where = "; ".join(f"{p.low:.6g} to {p.high:.6g}" for p in places) or "none"
+    chart = Chart(
+        (float(edges[0]), float(edges[-1])),
+        y if y[1] - y[0] > 0.2 else limits(y, least=0.2, around=0.0),
+        f"{axis.name}{unit}",
+        "recorded - simulated, cmH2O",
+        f"Mean error along {axis.name}{unit}; significant ranges: {where}.",
+        width=330.0,
+        height=190.0,
+    )
+    for place in places:
+        # The first breath's number is 1, the axis begins at 0.
+        chart.band(place.low - (axis.name == "breath number"), place.high)
+    chart.boxes("refit", edges, mean - half, mean + half)
+    chart.stairs("refit", edges, mean)
+    if diagnosis.verdict != "nothing_missing":
+        chart.stairs("after", edges, corrected)
+    return chart
+
+
+def _near(end: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Ends of intervals, without those so wide that they would hide all else."""
+    reach = 2.0 * np.nanmax(np.abs(mean), initial=0.1)
+    return np.clip(end, -reach, reach)
+
+
+def nonparametric_term(shape: NonparametricTerm) -> Chart:
+    """The curve of a nonparametric term."""
+    chart = Chart(
+        (float(shape.x.min()), float(shape.x.max())),
+        limits(shape.y, [0.0]),
+        shape.x_unit,
+        shape.y_unit,
+        f"Shape of {shape.name}: {shape.y_unit} over {shape.x_unit}.",
+        width=420.0,
+        height=220.0,
+    )
+    chart.line("after", shape.x, shape.y)
+    return chart
+
+
+def request(wanted: BreathRequest) -> list[Chart]:
+    """The first breaths to record next."""
+    charts = []
+    for k in range(min(len(wanted.u_in), REQUESTED)):
+        time = np.concatenate([[0.0], np.cumsum(wanted.dt[k][:-1])])
+        chart = command(
+            time, wanted.u_in[k], float(time[-1]), f"Commands of breath {k + 1} to record.", 130.0
+        )
+        for start, end in _open(time, wanted.u_out[k]):
+            chart.band(start, end)
+        charts.append(chart)
+    return charts
+
+
+def _open(time: np.ndarray, u_out: np.ndarray) -> list[tuple[float, float]]:
+    """Times during which the expiratory valve is open."""
+    is_open = np.concatenate([[False], u_out > 0.5, [False]])
+    changes = np.flatnonzero(np.diff(is_open.astype(int)))
+    ends = np.append(time, time[-1])
+    return [(float(ends[a]), float(ends[b])) for a, b in changes.reshape(-1, 2)]

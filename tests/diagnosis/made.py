@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 
 import numpy as np
 
@@ -47,17 +48,15 @@ def answer(
     h = dt[:, :, None] / FINE * np.ones(FINE)
     at = (np.cumsum(h.reshape(n, -1), axis=1) - 0.5 * h.reshape(n, -1)).reshape(h.shape)
     edges = np.concatenate([np.zeros((n, 1)), np.cumsum(dt, axis=1)], axis=1)
+    which = np.array([np.searchsorted(edges[b], at[b] - delay, side="right") - 1 for b in range(n)])
+    delayed = u_in[np.arange(n)[:, None, None], np.maximum(which, 0)]
+    inflows = GAIN * np.where(which < 0, 0.0, delayed) / 1000.0  # L/s
     pressure, flow = np.full((n, samples), PEEP), np.zeros((n, samples))
     volume, now = np.zeros((n, samples)), np.zeros(n)
     for i in range(samples - 1):
         p, q = pressure[:, i], flow[:, i]
         for k in range(FINE):
-            late = at[:, i, k] - delay
-            which = np.array(
-                [np.searchsorted(edges[b], late[b], side="right") - 1 for b in range(n)]
-            )
-            command = np.where(which < 0, 0.0, u_in[np.arange(n), np.maximum(which, 0)])
-            inflow = GAIN * command / 1000.0  # L/s
+            inflow = inflows[:, i, k]
             recoil = PEEP + now / C
             shut = u_out[:, i] == 0
             # The expiratory valve lies between the airway and PEEP.
@@ -69,6 +68,7 @@ def answer(
     return pressure, flow, volume
 
 
+@cache
 def breaths(
     label: str = "R20C50", n: int = 40, delay: float = 0.04, seed: int = 0, samples: int = 70
 ) -> Breaths:
@@ -84,6 +84,7 @@ def breaths(
     )
 
 
+@cache
 def diagnosis(n: int = 40) -> Diagnosis:
     """What a diagnosis of :func:`breaths` could be."""
     recorded = breaths(n=n)

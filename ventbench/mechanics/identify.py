@@ -340,7 +340,7 @@ class LungFit:
 def _leak_factor(x: Callable[[str], float]) -> float:
     """Factor by which R and 1/C are larger if part of the measured flow leaks before the lung.
 
-    With a leak g, p = R (Q - g p) + ...: the regression finds R / (1 + R g), and 1/C likewise.
+    With a leak g, p = R (Q - g p) + ...: the regression finds R / (1 + R g) and (1/C) / (1 + R g).
     """
     lost = x("resistance") * x("leak") / x("elastance")
     return 1.0 / (1.0 - min(lost, _MOST_LEAK))

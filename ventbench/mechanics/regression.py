@@ -152,9 +152,9 @@ def cross_products(
     for segment in segments:
         row = indices.index(segment.breath)
         full = np.stack([c.values(segment) for c in chosen] + [segment.pressure], axis=1)
-        own = np.stack([np.ones(len(segment)), segment.time - segment.time.mean()], axis=1)
-        freedom[row] += len(segment) - own.shape[1]
-        white, nuisance = (_whiten(signals, segment.begins) for signals in (full, own))
+        drift = np.stack([np.ones(len(segment)), segment.time - segment.time.mean()], axis=1)
+        freedom[row] += len(segment) - drift.shape[1]
+        white, nuisance = (_whiten(signals, segment.begins) for signals in (full, drift))
         basis, upper = np.linalg.qr(nuisance)
         white = white - basis @ (basis.mT @ white)
         products[row] += white.mT @ white
@@ -226,12 +226,14 @@ def effect_size(table: CrossProducts, fitted: RegressionFit, column: int) -> flo
     """Root mean square of what a column explains beyond the others, cmH2O."""
     others = [c for c in fitted.columns if c != column]
     total = table.products[:, 0].sum(axis=0)
-    own = total[column, column]
+    square = total[column, column]
     if others:
         cross = total[others, column]
-        own = own - cross @ np.linalg.solve(_regularised(total[np.ix_(others, others)]), cross)
+        square = square - cross @ np.linalg.solve(
+            _regularised(total[np.ix_(others, others)]), cross
+        )
     x = fitted.coefficients[fitted.columns.index(column)]
-    return float(abs(x) * np.sqrt(max(own, 0.0) / table.freedom.sum()))
+    return float(abs(x) * np.sqrt(max(square, 0.0) / table.freedom.sum()))
 
 
 def _whiten(values: Floats, begins: NDArray[np.bool_]) -> Floats:

@@ -113,8 +113,8 @@ def _trial(table: CrossProducts, columns: tuple[int, ...], name: str) -> _Trial:
     whole = fit(table, every, (*columns, column))
     ratios, gains = [], []
     for train in splits(len(table)):
-        own = _best_column(table, train, columns, name)
-        richer = fit(table, train, (*columns, own))
+        trained = _best_column(table, train, columns, name)
+        richer = fit(table, train, (*columns, trained))
         # Split likelihood ratio: since the null hypothesis is fitted to the held-out breaths
         # themselves, a ratio above 1 / alpha has a probability below alpha, whatever the model.
         null = fit(table, ~train, columns)

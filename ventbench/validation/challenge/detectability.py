@@ -71,24 +71,26 @@ def _refitted(
 
     error = run(base, start)
     for _ in range(_ITERATIONS):
-        moved = [run(_changed(base, key, _STEP), start) for key in _REFITTED]
-        slopes = np.stack([(error - m) / _STEP for m in moved])
-        own = (error - run(base, start + _STEP)) / _STEP
-        size = np.sum(own**2, axis=1)
-        along = np.einsum("knt,nt->kn", slopes, own) / size
-        apart = slopes - along[:, :, None] * own
-        left = error - (np.sum(error * own, axis=1) / size)[:, None] * own
-        step = np.linalg.lstsq(apart.reshape(len(_REFITTED), -1).T, left.ravel(), rcond=None)[0]
-        shift = np.sum((error - np.tensordot(step, slopes, 1)) * own, axis=1) / size
+        stepped = [run(_changed(base, key, _STEP), start) for key in _REFITTED]
+        slopes = np.stack([(error - other) / _STEP for other in stepped])
+        # Initial pressures are projected out, breath by breath; their steps follow afterwards.
+        by_start = (error - run(base, start + _STEP)) / _STEP
+        square = np.sum(by_start**2, axis=1)
+        along = np.einsum("knt,nt->kn", slopes, by_start) / square
+        projected = slopes - along[:, :, None] * by_start
+        remaining = error - (np.sum(error * by_start, axis=1) / square)[:, None] * by_start
+        jacobian = projected.reshape(len(_REFITTED), -1).T
+        step = np.linalg.lstsq(jacobian, remaining.ravel(), rcond=None)[0]
+        shift = np.sum((error - np.tensordot(step, slopes, 1)) * by_start, axis=1) / square
         limited = np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
         better = None
         for share in _STEP_SHARES:
             tried, first = base, start + share * shift
             for key, value in zip(_REFITTED, limited, strict=True):
                 tried = _changed(tried, key, share * float(value))
-            left = run(tried, first)
-            if np.sum(left**2) < np.sum(error**2):
-                better = tried, first, left
+            tried_error = run(tried, first)
+            if np.sum(tried_error**2) < np.sum(error**2):
+                better = tried, first, tried_error
                 break
         if better is None:
             break

@@ -12,12 +12,14 @@ from ventbench.interfaces import Task
 from ventbench.sandbox.child import libc
 from ventbench.sandbox.runner import SandboxRunner
 
+from .conftest import PATIENT
+
 pytestmark = pytest.mark.skipif(not libc.LINUX, reason="looks into /proc")
 
 
 def started(submission, lungs=(None,), **options):
     tasks = [Task("robustness", lung, protocol.DT, protocol.INSPIRATION_STEPS) for lung in lungs]
-    return SandboxRunner(**options).start(submission, tasks)
+    return SandboxRunner(allowance=PATIENT, **options).start(submission, tasks)
 
 
 def _descriptors():

@@ -24,6 +24,8 @@ from ventbench.submissions.folder import open_submission
 from ventbench.submissions.runner import InProcessRunner
 from ventbench.submissions.scoring import run_protocol
 
+from .conftest import PATIENT
+
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no processes to fork here")
 
 ROOT = Path(runner_module.__file__).parents[2]
@@ -31,7 +33,7 @@ ROOT = Path(runner_module.__file__).parents[2]
 
 def started(submission, lungs=(None,), **options):
     tasks = [Task("robustness", lung, protocol.DT, protocol.INSPIRATION_STEPS) for lung in lungs]
-    return SandboxRunner(**options).start(submission, tasks)
+    return SandboxRunner(allowance=PATIENT, **options).start(submission, tasks)
 
 
 def test_scores_are_those_of_the_plain_process():
@@ -39,7 +41,8 @@ def test_scores_are_those_of_the_plain_process():
         plants = stack([single_compartment(lung) for lung in LUNGS])
     for name in ("pid_best", "pid_robust"):
         submission = open_submission(name)
-        apart = run_protocol(submission, plants, draws=1, pips=(20.0,), runner=SandboxRunner())
+        runner = SandboxRunner(allowance=PATIENT)
+        apart = run_protocol(submission, plants, draws=1, pips=(20.0,), runner=runner)
         plain = run_protocol(submission, plants, draws=1, pips=(20.0,))
         assert not apart.failures
         np.testing.assert_array_equal(apart.nominal, plain.nominal)
@@ -62,7 +65,7 @@ def test_failures_are_those_of_the_plain_process(written, source, kind):
     submission = written(source)
     task = Task("robustness", None, protocol.DT, protocol.INSPIRATION_STEPS)
     found = []
-    for runner in (InProcessRunner(), SandboxRunner()):
+    for runner in (InProcessRunner(), SandboxRunner(allowance=PATIENT)):
         try:
             session = runner.start(submission, [task])
         except SubmissionError as error:

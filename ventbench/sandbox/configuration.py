@@ -28,8 +28,8 @@ class Allowance:
         cpu_s: seconds of processor time of one cell: import, reset and three breaths.
         start_patience_s: while controllers are imported and reset, cells time out when none of
             them has answered for this long.
-        patience_s: in one step, cells time out when none of them has answered for this long.
-        total_s: of a session; then all cells time out.
+        patience_s: cells time out in a step when none of them has answered for this long.
+        total_s: all cells time out when a session has taken this long.
     """
 
     memory: int = 512 * MIB
@@ -61,7 +61,7 @@ def modules_needed(folder: Path) -> tuple[tuple[str, ...], bool]:
     """Modules to load before cells start, so that they share them.
 
     Args:
-        folder: of the submission.
+        folder: the submission's folder.
 
     Returns:
         The modules, and whether they need threads.
@@ -83,9 +83,9 @@ def configuration(
     """What a zygote is told.
 
     Args:
-        folder: of the submission, absolute.
+        folder: the submission's, absolute.
         label: how messages name it.
-        tasks: that its cells may have.
+        tasks: those that its cells may have.
         allowance: what they may use.
     """
     modules, threads = modules_needed(Path(folder))

@@ -35,10 +35,10 @@ class Clock:
         """Wait until a pipe can be read, or the time is over.
 
         Args:
-            selector: of the pipes.
-            timeout_s: at most this long.
+            selector: watches the pipes.
+            timeout_s: how long to wait at most, s.
             due: cells whose reply is waited for.
-            kind: of that reply.
+            kind: what kind of reply that is.
 
         Returns:
             As of ``selector.select``; empty if the time is over.
@@ -50,7 +50,7 @@ class Pipes:
     """Two pipes for each cell.
 
     Args:
-        clock: by which it waits.
+        clock: waits for replies.
     """
 
     def __init__(self, clock: Clock | None = None) -> None:
@@ -103,11 +103,11 @@ class Pipes:
 
     def early(self) -> dict[int, Outcome]:
         """Cells that have written although nothing was due, or have ended."""
-        found: dict[int, Outcome] = {}
+        outcomes: dict[int, Outcome] = {}
         for key, _ in self._selector.select(0):
             data = self._read(key.fd)
-            found[key.data] = WireError(_UNASKED) if data else None
-        return found
+            outcomes[key.data] = WireError(_UNASKED) if data else None
+        return outcomes
 
     def send(self, frames: Mapping[int, bytes]) -> None:
         """Send each cell its frame, in random order; one that has ended is found by reading."""
@@ -123,14 +123,14 @@ class Pipes:
         Args:
             due: the cells; those that have not answered in time are left in it.
             sequence: number of the observation that they answer.
-            kind: of reply that is due, besides a failure.
+            kind: what kind of reply is due, besides a failure.
             patience_s: how long to wait for the next cell to answer.
             deadline: when to stop waiting altogether, by the clock, s.
 
         Returns:
             By cell, what came.
         """
-        found: dict[int, Outcome] = {}
+        outcomes: dict[int, Outcome] = {}
         partial: dict[int, bytes] = {}
         progress = self._clock.now()
         while due:
@@ -151,12 +151,12 @@ class Pipes:
                     partial[cell] = data
                     continue
                 # A cell that has answered and then ends, or writes more, is found here too.
-                found[cell] = outcome
+                outcomes[cell] = outcome
                 due.discard(cell)
                 progress = self._clock.now()
                 if not isinstance(outcome, Reply) or outcome.kind == wire.FAILED:
                     self._selector.unregister(key.fd)  # nothing that follows counts
-        return found
+        return outcomes
 
     def _read(self, descriptor: int) -> bytes:
         # One byte more than fits: an endless stream is told from the longest reply.

@@ -33,11 +33,11 @@ def layers() -> tuple[str, ...]:
         zygote = ZygoteClient(configuration(os.path.realpath(folder), "probe", [], Allowance()))
         try:
             pipes.open(0, lambda far: zygote.start(0, None, far))
-            found = pipes.collect({0}, 0, wire.LOCKED, _PROBE_S, float("inf"))
+            outcomes = pipes.collect({0}, 0, wire.LOCKED, _PROBE_S, float("inf"))
         finally:
             pipes.close_all()
             zygote.close()
-    reply = found.get(0)
+    reply = outcomes.get(0)
     if not isinstance(reply, Reply) or reply.kind != wire.LOCKED:
         raise SandboxError(f"a submission cannot be locked down here: {said(reply)}")
     return lockdown.names(reply.value)
@@ -49,7 +49,7 @@ class SandboxRunner:
     Args:
         require_official: refuse to run where a layer is missing that official results need.
         allowance: what a submission may use.
-        clock: by which its cells time out; the system's if not given.
+        clock: times the cells out; the system's if not given.
 
     Raises:
         SandboxError: if a cell cannot be locked down, or not far enough.

@@ -57,7 +57,7 @@ class SandboxSession:
         tasks: one for each cell.
         layers: what every cell must show to be in force.
         allowance: what they may use.
-        clock: by which they time out.
+        clock: times the cells out.
 
     Raises:
         SandboxError: if a cell does not lock itself down.

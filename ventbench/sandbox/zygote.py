@@ -65,7 +65,7 @@ class ZygoteClient:
     """A running zygote.
 
     Args:
-        config: for :func:`ventbench.sandbox.child.zygote.main`, less ``site`` and ``bubblewrap``.
+        config: what the zygote is told, but for ``site`` and ``bubblewrap``.
 
     Raises:
         SandboxError: if it does not start.
@@ -186,7 +186,7 @@ def bubblewrap_prefix(folders: Sequence[str]) -> list[str]:
     """Words to put before the zygote's command; none where bubblewrap is missing or may not run.
 
     Args:
-        folders: that the zygote and its cells read, besides the interpreter.
+        folders: what the zygote and its cells read, besides the interpreter.
     """
     program = shutil.which("bwrap")
     if program is None or sys.platform != "linux":

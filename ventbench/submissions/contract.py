@@ -1,4 +1,4 @@
-"""The contract of a submission: ``ventbench check``, and the same for an author's own tests.
+"""The contract of a submission, for ``ventbench check`` and for an author's own tests.
 
 In a test of your own::
 
@@ -77,8 +77,8 @@ def check(
 
     Args:
         name: path of a folder, or the name of a bundled submission.
-        runner: of the controller; the sandbox if not given.
-        clock: by which calls of ``act`` are timed, s.
+        runner: runs the controller; the sandbox if not given.
+        clock: times the calls of ``act``, s.
 
     Raises:
         SubmissionError: if there is no such folder.
@@ -104,7 +104,7 @@ def assert_ready(name: str, runner: Runner | None = None) -> None:
 
     Args:
         name: path of its folder.
-        runner: of the controller; the sandbox if not given.
+        runner: runs the controller; the sandbox if not given.
 
     Raises:
         AssertionError: if it has a problem.
@@ -162,7 +162,7 @@ def _import_finding(problem: str, label: str) -> Finding:
 
     Args:
         problem: as ``cell.controller_class`` words it.
-        label: of the submission, at its beginning.
+        label: the submission, with which the problem begins.
     """
     advice = "it must be possible to import it with what the sandbox has"
     return _placed("run", problem.removeprefix(f"{label}: "), advice)
@@ -205,7 +205,7 @@ def _clipping_notes(commands: Sequence[Floats]) -> Iterator[Finding]:
     """A note on commands beyond the valve.
 
     Args:
-        commands: of plain runs, %.
+        commands: answers of the plain runs, %.
     """
     values = np.concatenate(commands)
     outside = np.sum((values < 0.0) | (values > protocol.U_MAX))
@@ -223,8 +223,8 @@ def repetition_findings(first: Floats, again: Floats, thrice: Floats) -> Iterato
 
     Args:
         first: commands of a run, %.
-        again: of the same run in another process.
-        thrice: of the same run three times in one process: fresh, reset, made anew; with one
+        again: commands of the same run in another process, %.
+        thrice: commands of the run three times in one process: fresh, reset, made anew; with one
             command between each, which does not count.
     """
     fresh, reset, renewed = (thrice[k * (STEPS + 1) :][:STEPS] for k in range(3))
@@ -261,7 +261,7 @@ def time_findings(act_seconds: Floats) -> Iterator[Finding]:
     """Findings on how long ``act`` takes.
 
     Args:
-        act_seconds: of each call.
+        act_seconds: duration of each call, s.
     """
     mean = float(act_seconds.mean())
     total = mean * ACTS / CORES

@@ -56,7 +56,7 @@ def plain(tracks: Sequence[str]) -> list[ContractRun]:
     """A run for each lung on the performance track, and for the unnamed one on the other.
 
     Args:
-        tracks: that the submission enters.
+        tracks: those that the submission enters.
     """
     runs = []
     for track in tracks:
@@ -207,9 +207,9 @@ class Answers:
     """What came of the runs.
 
     Attributes:
-        commands: of each run, %, up to its end or failure.
-        failures: by number of the run.
-        act_seconds: of one ``act`` in each round of all runs, without the first ones.
+        commands: answers of each run, %, up to its end or failure.
+        failures: what failed, by number of the run.
+        act_seconds: duration of one ``act`` in each round of all runs, s, without the first ones.
     """
 
     commands: tuple[Floats, ...]
@@ -228,8 +228,8 @@ def run_all(
     Args:
         submission: whose controller is asked.
         runs: fresh ones.
-        runner: of the controllers.
-        clock: by which calls of ``act`` are timed, s.
+        runner: runs the controllers.
+        clock: times the calls of ``act``, s.
 
     Raises:
         SubmissionError: if the code cannot be imported.

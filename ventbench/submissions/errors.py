@@ -17,15 +17,15 @@ GROUPS: tuple[Group, ...] = ("files", "manifest", "source", "run", "repeat", "ti
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found.
+    """One problem or note.
 
     Attributes:
-        group: of checks, see :data:`GROUPS`.
+        group: what was looked at, one of :data:`GROUPS`.
         file: path below the folder, or words such as ``"the folder"``; printable.
         what: is wrong with it; printable.
         advice: what to do; printable.
         line: counted from 1; None where there is none.
-        column: counted from 1; likewise.
+        column: counted from 1; None where there is none.
         problem: whether it stops the submission.
     """
 
@@ -65,7 +65,7 @@ class CheckReport:
 
     Attributes:
         label: the submission, as the person named it.
-        findings: in the order of :data:`GROUPS`.
+        findings: all of them, in the order of :data:`GROUPS`.
         left_out: groups that could not be looked at because of the problems.
         sandbox: layers that the dry run had; None if it ran in this process, or did not run.
         act_us: mean and largest time of an ``act``, microseconds; None if it did not run.

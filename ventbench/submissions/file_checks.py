@@ -33,7 +33,7 @@ def check_files(folder: Path) -> list[Finding]:
     """Look at every file of a submission.
 
     Args:
-        folder: of the submission.
+        folder: the submission's folder.
     """
     findings: list[Finding] = []
     sizes: dict[str, int] = {}
@@ -183,7 +183,7 @@ def path_problem(path: str) -> str | None:
     """Say what is wrong with a file's path.
 
     Args:
-        path: below the submission's folder, with ``/`` between names.
+        path: relative to the submission's folder, with ``/`` between names.
 
     Returns:
         What is wrong, for a sentence that starts with the path; None if nothing is.
@@ -226,7 +226,7 @@ def collisions(paths: Iterable[str]) -> list[tuple[str, str]]:
     """Pairs of files or folders that are one on systems that ignore case.
 
     Args:
-        paths: of all files.
+        paths: those of all files.
     """
     seen: dict[str, str] = {}
     pairs = []
@@ -256,7 +256,7 @@ def weights_problems(path: Path) -> list[str]:
     """Say what is wrong with a file of arrays, each for a sentence that starts with its name.
 
     Args:
-        path: of a ``.npz``, ``.npy`` or ``.safetensors`` file.
+        path: a ``.npz``, ``.npy`` or ``.safetensors`` file.
     """
     try:
         if path.suffix.lower() == ".safetensors":
@@ -287,13 +287,13 @@ def _npz(path: Path) -> list[str]:
 
 
 def _numbers(arrays: Mapping[str, Any]) -> list[str]:
-    found = []
+    problems = []
     for name, values in arrays.items():
         if not isinstance(values, np.ndarray) or values.dtype.kind not in "biuf":
-            found.append(f"{name} does not hold numbers")
+            problems.append(f"{name} does not hold numbers")
         elif not np.isfinite(values).all():
-            found.append(f"{name} holds NaN or infinity")
-    return found
+            problems.append(f"{name} holds NaN or infinity")
+    return problems
 
 
 def _safetensors(path: Path) -> list[str]:
@@ -302,21 +302,21 @@ def _safetensors(path: Path) -> list[str]:
     if len(content) < 8 or size > len(content) - 8:
         return ["is not a safetensors file"]
     header = json.loads(content[8 : 8 + size])
-    data, found = content[8 + size :], []
+    data, problems = content[8 + size :], []
     for name, about in header.items():
         if name == "__metadata__":
             continue
         begin, end = about["data_offsets"]
         kind, count = about["dtype"], math.prod(about["shape"])
         if not 0 <= begin <= end <= len(data):
-            found.append(f"array {name!r} lies outside of the file")
+            problems.append(f"array {name!r} lies outside of the file")
         elif kind in _FLOATS:
             values = np.frombuffer(data[begin:end], _FLOATS[kind])
             if len(values) != count:
-                found.append(f"array {name!r} does not have the size of its shape")
+                problems.append(f"array {name!r} does not have the size of its shape")
             elif not np.isfinite(values).all():
-                found.append(f"array {name!r} holds NaN or infinity")
-    return found
+                problems.append(f"array {name!r} holds NaN or infinity")
+    return problems
 
 
 _FLOATS = {"F16": "<f2", "F32": "<f4", "F64": "<f8"}

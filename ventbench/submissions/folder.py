@@ -39,8 +39,8 @@ class Submission:
     Attributes:
         label: how the person named it; starts every message.
         folder: absolute path.
-        manifest: of ``submission.toml``.
-        sha256: of the folder, see :func:`content_hash`; None for a class or function.
+        manifest: what ``submission.toml`` says.
+        sha256: hash of the folder, see :func:`content_hash`; None for a class or function.
         controller: makes a controller, for a class or function in place of a folder; it can only
             run in this process.
     """
@@ -164,12 +164,12 @@ class _Stateless:
 
 
 def _walk(folder: Path) -> list[Path]:
-    found = []
+    paths = []
     for parent, folders, names in os.walk(folder):
         links = [name for name in folders if (Path(parent) / name).is_symlink()]
         folders[:] = sorted(set(folders) - _IGNORED_FOLDERS - set(links))
-        found += [Path(parent) / name for name in (*links, *names) if name not in _IGNORED_FILES]
-    return sorted(found)
+        paths += [Path(parent) / name for name in (*links, *names) if name not in _IGNORED_FILES]
+    return sorted(paths)
 
 
 def content_hash(folder: Path, paths: list[Path]) -> str:
@@ -179,7 +179,7 @@ def content_hash(folder: Path, paths: list[Path]) -> str:
     ``HASH  PATH`` a line.
 
     Args:
-        folder: of the submission.
+        folder: the submission's folder.
         paths: its files.
     """
     return combined_hash({p.relative_to(folder).as_posix(): files.sha256(p) for p in paths})

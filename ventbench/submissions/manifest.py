@@ -28,7 +28,7 @@ TRACKS = ("performance", "robustness")
 _MAX_BYTES = 64_000
 _MAX_TEXT = 2000
 
-#: What an entry may be called, and the same in words.
+#: Names that an entry may have, and the rule in words.
 NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 NAME_RULE = (
     "must be lower-case letters, digits and underscores, "
@@ -43,7 +43,7 @@ class Training:
     Attributes:
         data: what they were learned or tuned on.
         simulators: version of the frozen simulators used; empty if none.
-        seeds: of all runs.
+        seeds: those of all runs.
         compute: such as ``"20 min on 2 CPU cores"``.
         per_lung: whether there is one set of parameters for each lung.
     """
@@ -60,10 +60,10 @@ class Manifest:
     """The content of ``submission.toml``.
 
     Attributes:
-        name: of the entry: lower-case letters, digits and underscores, at most 40.
+        name: lower-case letters, digits and underscores, at most 40.
         authors: at least one.
         licence: SPDX identifier, such as ``"Apache-2.0"``.
-        api_version: of the submission interface, now 1.
+        api_version: version of the submission interface, now 1.
         family: one of :data:`FAMILIES`.
         tracks: one or both of :data:`TRACKS`; the first is scored if none is asked for.
         description: a sentence or two.
@@ -119,10 +119,10 @@ def _many(check: ValueCheck, *, least: int) -> ValueCheck:
     def checked(value: Any) -> tuple[Any, ...]:
         if not isinstance(value, list) or len(value) < least:
             raise ValueError("must be a list" + (" that is not empty" if least else ""))
-        items = tuple(check(item) for item in value)
-        if len(set(items)) < len(items):
+        entries = tuple(check(entry) for entry in value)
+        if len(set(entries)) < len(entries):
             raise ValueError("contains something twice")
-        return items
+        return entries
 
     return checked
 
@@ -178,7 +178,7 @@ def read_manifest(path: Path, label: str | None = None) -> Manifest:
     """Read and check a manifest.
 
     Args:
-        path: of ``submission.toml``.
+        path: the ``submission.toml``.
         label: how messages name it; the path if not given.
 
     Raises:
@@ -248,7 +248,7 @@ def check_manifest(folder: Path) -> tuple[list[Finding], Manifest | None]:
     """Read the manifest and look at what it says.
 
     Args:
-        folder: of the submission.
+        folder: the submission's folder.
 
     Returns:
         The findings, and the manifest unless it cannot be read.

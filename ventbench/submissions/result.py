@@ -43,7 +43,7 @@ class CellFailure:
         pip: nominal PIP, cmH2O.
         draw: counted from 1; None for the nominal cell.
         failure: what went wrong.
-        message: the same for a person.
+        message: the failure in one sentence for a person.
     """
 
     lung: str
@@ -61,7 +61,7 @@ class Score:
     is what a record is replayed from, and ``trajectories``.
 
     Attributes:
-        submission: that was scored.
+        submission: what was scored.
         track: ``"performance"`` or ``"robustness"``.
         lungs: ids, length L.
         pips: nominal PIPs, cmH2O, length P.
@@ -74,14 +74,14 @@ class Score:
         below: nominal commands below 0 %, shape ``(L,)``.
         above: nominal commands above 100 %, shape ``(L,)``.
         commands: nominal commands on each lung.
-        failures: of all cells.
+        failures: what failed, in all cells.
         requested: all commands, nominal cells first, %, shape
             ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``; 0 once a cell has failed.
         sandbox: the runner's layers; None in this process.
         simulators: what the caller says about the plants (version, hashes); goes into the JSON.
-        frozen_sha256: of the frozen simulators' manifest if the plants that were run are exactly
+        frozen_sha256: hash of the frozen simulators' manifest if the plants that ran are exactly
             those, to the bit; else None, whatever the caller says about them.
-        draws_sha256: of the file of the draws; None without draws.
+        draws_sha256: hash of the file of the draws; None without draws.
         trajectories: nominal runs with their expirations.
         timing: seconds, by name; the only numbers that differ from run to run.
     """

@@ -26,7 +26,7 @@ class ControllerSession(Protocol):
 
     @property
     def failures(self) -> Mapping[int, Failure]:
-        """By index of the cell, what went wrong up to now; a failed cell stays failed."""
+        """What went wrong up to now, by index of the cell; a failed cell stays failed."""
         ...
 
     def act(self, observations: Floats) -> Floats:
@@ -57,7 +57,7 @@ class Runner(Protocol):
 
     @property
     def sandbox(self) -> Mapping[str, Any] | None:
-        """See the class."""
+        """Layers for the record, or None."""
         ...
 
     def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
@@ -96,7 +96,7 @@ def pack(observation: Observation) -> Floats:
 
 
 class InProcessSession:
-    """See :class:`InProcessRunner`."""
+    """Controllers of all cells in this process; :class:`InProcessRunner` starts them."""
 
     def __init__(self, submission: Submission, tasks: Sequence[Task]):
         controller = submission.controller
@@ -113,7 +113,7 @@ class InProcessSession:
                 self.failures[index] = failed.failure
 
     def act(self, observations: Floats) -> Floats:
-        """See :class:`ControllerSession`."""
+        """Ask every controller for its next command; see :class:`ControllerSession`."""
         commands = np.zeros(self._count)
         rows = observations.tolist()
         for index, cell in list(self._cells.items()):
@@ -140,5 +140,5 @@ class InProcessRunner:
     sandbox: Mapping[str, Any] | None = None
 
     def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
-        """See :class:`Runner`."""
+        """Make and reset one fresh controller for each cell; see :class:`Runner`."""
         return InProcessSession(submission, tasks)

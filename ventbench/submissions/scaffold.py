@@ -62,7 +62,7 @@ def create(name: str, family: str = "pid", out: Path | str = ".") -> Path:
     """Write a new submission.
 
     Args:
-        name: of the entry and of its folder.
+        name: what the entry and its folder are called.
         family: one of :data:`~ventbench.submissions.manifest.FAMILIES`.
         out: folder to write it into; created if missing.
 
@@ -98,8 +98,8 @@ def contents(name: str, family: str) -> dict[str, bytes]:
     """Files of a new submission, by name.
 
     Args:
-        name: of the entry, allowed.
-        family: of the entry, known.
+        name: what the entry is called; allowed.
+        family: the entry's family; known.
     """
     network = family in ("residual", "ppo", "dqn")
     files = {CONTROLLER: _template(f"{family if network else 'pid'}.py").encode()}

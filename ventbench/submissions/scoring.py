@@ -114,9 +114,9 @@ def run_protocol(
         plants: one plant, stacked over the lungs on the leading axis of every leaf.
         track: ``"performance"`` or ``"robustness"``; the manifest's first if not given.
         draws: how many of the published draws to run besides the nominal cells, 0..20.
-        lungs: of ``plants``, in their order.
+        lungs: those of ``plants``, in their order.
         pips: cmH2O.
-        runner: of the controllers; in this process if not given.
+        runner: runs the controllers; in this process if not given.
         simulators: what is known of the plants (version, hashes), to be written into the result.
 
     Raises:

@@ -26,7 +26,7 @@ def check_sources(folder: Path) -> list[Finding]:
     Other sources, such as the training's, need only be Python.
 
     Args:
-        folder: of the submission.
+        folder: the submission's folder.
     """
     findings, trees = [], {}
     for path in sorted(folder.rglob("*.py")):
@@ -71,7 +71,7 @@ def _check_class(tree: ast.Module) -> list[Finding]:
     """Look for the class and its methods.
 
     Args:
-        tree: of ``controller.py``.
+        tree: the parsed ``controller.py``.
     """
     classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
     if CLASS in classes:
@@ -102,7 +102,7 @@ def _problem(what: str, advice: str, line: int | None, column: int | None = None
 
 
 def _class(node: ast.ClassDef) -> Iterator[Finding]:
-    methods = {item.name: item for item in node.body if isinstance(item, Function)}
+    methods = {part.name: part for part in node.body if isinstance(part, Function)}
     given = {name.id for name in ast.walk(node) if isinstance(name, ast.Name)}
     inherits = bool(node.bases or node.keywords or node.decorator_list)
     for name, argument in _METHODS.items():
@@ -130,7 +130,7 @@ def _method(node: Function, argument: str) -> Iterator[Finding]:
         what = f"{node.name} cannot be called as {node.name}({argument})"
         yield _problem(what, f"write {signature}", *place)
     inside = list(_inside(node))
-    if any(isinstance(item, ast.Yield | ast.YieldFrom) for item in inside):
+    if any(isinstance(part, ast.Yield | ast.YieldFrom) for part in inside):
         yield _problem(f"{node.name} is a generator", "return a value, do not yield it", *place)
     elif node.name == "act" and not any(map(_ends, inside)):
         yield _problem("act returns nothing", "return u_in, a number in %", *place)
@@ -195,7 +195,7 @@ def _check_imports(trees: Mapping[str, ast.Module]) -> list[Finding]:
     """Follow the imports from ``controller.py`` on.
 
     Args:
-        trees: of all sources, by path below the folder; the controller's among them.
+        trees: all parsed sources, by path below the folder; the controller's among them.
     """
     own = {name.partition("/")[0].removesuffix(".py") for name in trees}
     waiting, seen, findings = [CONTROLLER], set(), []
@@ -204,11 +204,11 @@ def _check_imports(trees: Mapping[str, ast.Module]) -> list[Finding]:
         if name in seen or name not in trees:
             continue
         seen.add(name)
-        for item in _imports(trees[name].body):
-            finding = _import_finding(item, name, own)
+        for imported in _imports(trees[name].body):
+            finding = _import_finding(imported, name, own)
             if finding is not None:
                 findings.append(finding)
-            waiting += _files(item, name)
+            waiting += _files(imported, name)
     return list(dict.fromkeys(findings))  # `from a import b` may be two modules
 
 
@@ -242,14 +242,14 @@ def _catches(handler: ast.ExceptHandler) -> bool:
     return any(isinstance(node, ast.Name) and node.id in kinds for node in ast.walk(handler.type))
 
 
-def _import_finding(item: _Import, name: str, own: set[str]) -> Finding | None:
-    top, what = item.module.partition(".")[0], ""
-    if item.level:
+def _import_finding(imported: _Import, name: str, own: set[str]) -> Finding | None:
+    top, what = imported.module.partition(".")[0], ""
+    if imported.level:
         if "/" in name:
             return None
         what, advice = "uses a relative import, and is not in a package", "leave out the dot"
     elif top in own:
-        if not item.late or item.optional:
+        if not imported.late or imported.optional:
             return None
         what, advice = f"imports {top} inside a function", _LATE
     elif top in _USELESS:
@@ -262,14 +262,14 @@ def _import_finding(item: _Import, name: str, own: set[str]) -> Finding | None:
     else:
         what = f"imports {top}, which is neither in the folder nor among the packages it may use"
         advice = f"use {', '.join(ALLOWED)} and the standard library"
-    place = item.node.lineno, item.node.col_offset + 1
-    return Finding("source", name, what, advice, *place, problem=not item.optional)
+    place = imported.node.lineno, imported.node.col_offset + 1
+    return Finding("source", name, what, advice, *place, problem=not imported.optional)
 
 
-def _files(item: _Import, name: str) -> Iterator[str]:
+def _files(imported: _Import, name: str) -> Iterator[str]:
     """Paths that a module of the folder may have, on the way to it and itself."""
-    parent = name.split("/")[: -item.level] if item.level else []
-    parts = [*parent, *item.module.split(".")]
+    parent = name.split("/")[: -imported.level] if imported.level else []
+    parts = [*parent, *imported.module.split(".")]
     for depth in range(len(parent) + 1, len(parts) + 1):
         path = "/".join(parts[:depth])
         yield from (f"{path}.py", f"{path}/__init__.py")

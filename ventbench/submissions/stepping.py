@@ -35,7 +35,7 @@ class ProtocolRun:
         pressure: true airway pressure at each step, cmH2O.
         requested: what the controllers asked for, %; 0 once a cell has failed.
         u_in: what was applied, %.
-        failures: by cell, index ``(lung, ...)``.
+        failures: what failed, by cell, index ``(lung, ...)``.
         act_seconds: time that one ``act`` took on average, s, for each round of all cells, shape
             ``(BREATHS * INSPIRATION_STEPS,)``.
     """
@@ -110,7 +110,7 @@ def step_through(
     Args:
         plants: from :func:`as_float64`, L lungs.
         scenario: cells of each lung, batch shape ``(...)``.
-        runner: of the controllers.
+        runner: runs the controllers.
         submission: whose they are.
         tasks: what is told of each lung, length L.
 

@@ -42,7 +42,7 @@ class Cell:
     Args:
         controller: the submission's class.
         task: what it is told.
-        folder: of the submission, to name files and lines in it.
+        folder: the submission's, to name files and lines in it.
         source: what messages name where no line of the folder is to blame.
 
     Raises:
@@ -115,8 +115,8 @@ def _plain(value: Any) -> float | int | None:
     if package in ("numpy", "jax", "jaxlib") and package in sys.modules:
         if getattr(value, "shape", None) != ():
             return None
-        item = value.item()
-        return item if type(item) in (int, float) else None
+        number = value.item()
+        return number if type(number) in (int, float) else None
     return None
 
 
@@ -147,7 +147,7 @@ def controller_class(folder: Path, label: str | None = None) -> Callable[[], Any
     sandbox.
 
     Args:
-        folder: of the submission.
+        folder: the submission's folder.
         label: how messages name it; the folder if not given.
 
     Raises:
@@ -175,25 +175,27 @@ def controller_class(folder: Path, label: str | None = None) -> Callable[[], Any
         except (Exception, SystemExit) as error:
             what, detail = describe(error, folder)
             raise SubmissionError(f"{label}: {what} while it was imported: {detail}") from error
-        found = _checked(getattr(module, CLASS, None), label)
+        controller = _checked(getattr(module, CLASS, None), label)
         undo.pop_all()
-    return found
+    return controller
 
 
-def _checked(found: Any, label: str) -> Callable[[], Any]:
-    if found is None:
+def _checked(controller: Any, label: str) -> Callable[[], Any]:
+    if controller is None:
         raise SubmissionError(f"{label}: {FILE} defines no class {CLASS}")
-    if not callable(found):
-        raise SubmissionError(f"{label}: {CLASS} in {FILE} is a {type(found).__name__}, no class")
-    missing = [m for m in ("reset(task)", "act(observation)") if not _has(found, m)]
+    if not callable(controller):
+        raise SubmissionError(
+            f"{label}: {CLASS} in {FILE} is a {type(controller).__name__}, no class"
+        )
+    missing = [m for m in ("reset(task)", "act(observation)") if not _has(controller, m)]
     if missing:
         problems = (f"{label}: class {CLASS} in {FILE} has no method {m}" for m in missing)
         raise SubmissionError(*problems)
-    return found
+    return controller
 
 
-def _has(found: Any, method: str) -> bool:
-    return callable(getattr(found, method.partition("(")[0], None))
+def _has(controller: Any, method: str) -> bool:
+    return callable(getattr(controller, method.partition("(")[0], None))
 
 
 @contextlib.contextmanager
@@ -228,7 +230,7 @@ def describe(error: BaseException, folder: Path, source: str | None = None) -> t
 
     Args:
         error: the exception.
-        folder: of the submission.
+        folder: the submission's folder.
         source: its name where no line of the folder raised it; ``controller.py`` if not given.
 
     Returns:

@@ -37,7 +37,7 @@ class Failure:
         what: what happened, such as ``"controller.py line 7 raised ValueError"``.
         detail: the exception's text, or empty.
         breath: counted from 1; None before the first step.
-        step: of the breath, counted from 1; likewise.
+        step: of the breath, counted from 1; None before the first step.
     """
 
     kind: str

@@ -1,4 +1,4 @@
-"""What every cell finds imported, and the folders that it may read for more of the same."""
+"""What every cell finds imported, and the folders from which it may import more."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def load(packages: Iterable[str], site: Iterable[str]) -> tuple[list[str], list[
 
 def _imported(site: str) -> list[str]:
     """Files and folders of what has been imported from there, with shared libraries beside it."""
-    found = set()
+    imported = set()
     for module in list(sys.modules.values()):
         file = getattr(module, "__file__", None)
         if file and file.startswith(site + os.sep):
             top = file[len(site) + 1 :].split(os.sep)[0]
-            found |= {top, f"{top}.libs"}
-    return sorted(os.path.join(site, name) for name in found - {"ventbench", "ventbench.libs"})
+            imported |= {top, f"{top}.libs"}
+    return sorted(os.path.join(site, name) for name in imported - {"ventbench", "ventbench.libs"})
 
 
 def _entries(folder: str) -> list[str]:

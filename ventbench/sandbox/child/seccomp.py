@@ -153,7 +153,7 @@ class Condition(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """For one call: the action if all conditions hold; else later rules are tried."""
+    """The action for one call if all conditions hold; else later rules are tried."""
 
     number: int
     action: int
@@ -267,7 +267,7 @@ def cell_filter(machine: str, pid: int, threads: bool) -> bytes:
 
     Args:
         machine: ``"x86_64"`` or ``"aarch64"``.
-        pid: of the cell, which may signal itself alone.
+        pid: the cell's process, which may signal itself alone.
         threads: whether threads may be started (JAX needs them); processes never.
     """
     rules: _Rules = []

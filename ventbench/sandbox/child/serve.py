@@ -25,12 +25,12 @@ OBSERVATIONS, REPLIES, END = 3, 4, 5
 
 @dataclass(frozen=True)
 class Setup:
-    """What is the same for all cells of a session.
+    """What all cells of a session share.
 
     Attributes:
-        folder: of the submission.
+        folder: the submission's folder.
         label: how messages name it.
-        limits: of each cell.
+        limits: what each cell may use.
     """
 
     folder: Path
@@ -71,7 +71,7 @@ def run(setup: Setup, prepared: Lockdown, task: Task | None) -> NoReturn:
 
     Args:
         setup: what all cells share.
-        prepared: by the zygote.
+        prepared: what the zygote has prepared.
         task: what the controller is told; None to lock down, say so and end.
     """
     replies = _Replies(setup)

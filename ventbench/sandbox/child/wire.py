@@ -41,7 +41,7 @@ class Reply(NamedTuple):
     Attributes:
         kind: ``LOCKED``, ``READY``, ``COMMAND`` or ``FAILED``.
         value: ``u_in``, %, of a command; the layers' bits of ``LOCKED``.
-        text: of a failure.
+        text: what a failure says.
     """
 
     kind: int

@@ -151,7 +151,7 @@ def main(descriptor: int) -> None:
     """Prepare, say so, serve.
 
     Args:
-        descriptor: of the socket to the scorer.
+        descriptor: the socket to the scorer.
     """
     control = socket.socket(fileno=descriptor)
     config = _receive(control)

@@ -19,7 +19,7 @@ from ventbench.diagnosis.findings import (
 from ventbench.diagnosis.residual_analysis import locate
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.lungs import lung
-from ventbench.mechanics.lung_match import Estimate, LungMatch
+from ventbench.mechanics.labels import Estimate, LungMatch
 from ventbench.physics import physics
 from ventbench.recordings.breaths import Breaths
 

@@ -9,7 +9,7 @@ import pytest
 from ventbench.diagnosis import report_text
 from ventbench.diagnosis.findings import ErrorRegion, MissingMechanism, OpenLoopError
 from ventbench.diagnosis.report_text import probability, quantity
-from ventbench.mechanics.lung_match import Estimate
+from ventbench.mechanics.labels import Estimate
 from ventbench.physics import library, parameter
 
 from . import made

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ventbench.diagnosis.findings import OpenLoopError
-from ventbench.mechanics.lung_match import Estimate
+from ventbench.mechanics.labels import Estimate
 
 from . import made
 

@@ -21,7 +21,7 @@ from ventbench.diagnosis.simulator_comparison import (
     with_sensor_noise,
 )
 from ventbench.lungs import lung
-from ventbench.mechanics.lung_match import Estimate
+from ventbench.mechanics.labels import Estimate
 from ventbench.physics import mechanism, physics
 from ventbench.plants.catalog import load_simulators
 from ventbench.recordings.breaths import Breaths

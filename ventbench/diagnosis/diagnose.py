@@ -26,7 +26,7 @@ from ventbench.diagnosis.simulator_comparison import (
 )
 from ventbench.errors import InputError
 from ventbench.lungs import lung as parse_lung
-from ventbench.mechanics.lung_match import LungMatch
+from ventbench.mechanics.labels import LungMatch
 from ventbench.plants.catalog import Given, Simulators, load_simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit, Noise, make_data

@@ -16,7 +16,7 @@ from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY, Lat
 from ventbench.diagnosis.patient_effort import EFFORT
 from ventbench.diagnosis.screening import component_of
 from ventbench.interfaces import Plant
-from ventbench.mechanics.lung_match import Estimate, LungMatch
+from ventbench.mechanics.labels import Estimate, LungMatch
 from ventbench.physics.catalogue import library, mechanism, parameter, paths
 from ventbench.physics.component_curves import component_curves, without_absorbed
 from ventbench.physics.model import Physics

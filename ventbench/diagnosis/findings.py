@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.interfaces import Plant
-from ventbench.mechanics.lung_match import Estimate, LungMatch
+from ventbench.mechanics.labels import Estimate, LungMatch
 from ventbench.recordings.breaths import Breaths
 
 Floats = NDArray[np.float64]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from ventbench.diagnosis.findings import ErrorRegion, Findings, MissingMechanism, NonparametricTerm
-from ventbench.mechanics.lung_match import Estimate, LungMatch
+from ventbench.mechanics.labels import Estimate, LungMatch
 from ventbench.physics import mechanism, parameter
 
 #: Axes whose ranges are parts of a breath: an effect is described best by these.

@@ -20,7 +20,7 @@ from ventbench.diagnosis.findings import (
     OpenLoopComparison,
     OpenLoopError,
 )
-from ventbench.mechanics.lung_match import Estimate, LungMatch
+from ventbench.mechanics.labels import Estimate, LungMatch
 from ventbench.plants.plant_files import save_plants
 from ventbench.system_id.data import Floats
 

@@ -10,8 +10,13 @@ from numpy.typing import NDArray
 
 from ventbench.errors import InputError
 from ventbench.lungs import Lung
-from ventbench.mechanics.labels import fits, match_label, matching_settings
-from ventbench.mechanics.lung_match import Estimate, LungMatch
+from ventbench.mechanics.labels import (
+    Estimate,
+    LungMatch,
+    fits,
+    match_label,
+    matching_settings,
+)
 from ventbench.mechanics.regression import (
     BASE,
     COLUMNS,

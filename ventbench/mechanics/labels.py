@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from ventbench.lungs import RECORDED_LUNGS, Lung
-from ventbench.mechanics.lung_match import Estimate, LungMatch
-from ventbench.system_id import Fit
+
+if TYPE_CHECKING:
+    from ventbench.system_id import Fit
 
 #: Factors by which R and C may differ from the label beyond their intervals: calibration errors of
 #: lung and sensors.
@@ -26,6 +29,41 @@ REFERENCE_FLOW = 1.0
 
 #: Factor by which the gain of the valve may be wrong where flow is not measured.
 GAIN = 1.2
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Value of a parameter with the ends of its 95 % interval, all in ``unit``."""
+
+    value: float
+    unit: str
+    ci95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class LungMatch:
+    """The lung that was recorded, compared with its label; R in cmH2O s/L, C in mL/cmH2O.
+
+    Attributes:
+        label: id of the lung in the recording, such as ``R20C50``.
+        fitted_R: resistance.
+        fitted_C: compliance.
+        ci95_R: ends of the 95 % interval of R.
+        ci95_C: ends of the 95 % interval of C.
+        label_matches: whether R and C are within tolerance of the label.
+        source: ``pressure`` (given the valve's gain) or ``pressure and flow``.
+        settings: ids of known settings that the lung may be, the nearest first.
+    """
+
+    label: str
+    fitted_R: float
+    fitted_C: float
+    ci95_R: tuple[float, float]
+    ci95_C: tuple[float, float]
+    label_matches: bool
+    source: str
+    settings: tuple[str, ...] = ()
+
 
 #: Resistance, cmH2O s/L, at a flow, L/s.
 Resistance = Callable[[float], Estimate]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.mechanics.lung_match import Estimate
+from ventbench.mechanics.labels import Estimate
 from ventbench.mechanics.regression import (
     BASE,
     GRID,

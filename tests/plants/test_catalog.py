@@ -97,6 +97,8 @@ def test_plants_by_lung_from_a_mapping_and_a_file(breaths, tmp_path):
     with precision.float64():
         plants = {name: single_compartment(lung(name)) for name in ("R20C50", "R5C10")}
     given = load_simulators(plants)
+    assert given.sha256 == load_simulators(dict(plants)).sha256
+    assert given.sha256 != load_simulators({"R20C50": plants["R20C50"]}).sha256
     np.testing.assert_allclose(
         given.pressures(breaths), load_simulators("physics").pressures(breaths), atol=1e-9
     )

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ventbench.cli.options import JsonFile, emit
+from ventbench.cli.options import JsonFile, PlantName, emit
 
 app = typer.Typer(name="tune", help="Search for gains.", no_args_is_help=True)
 
@@ -38,9 +38,10 @@ def pid(
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler, such as tcp://host:8786.")
     ] = None,
+    plant: PlantName = "frozen",
     json: JsonFile = None,
 ) -> None:
-    """Run the paper's 8,000 PIDs at six PIPs on the frozen simulators, all of them.
+    """Run the paper's 8,000 PIDs at six PIPs on the frozen simulators or others.
 
     P, I and D each 0, 0.1, ..., 0.9, 1, 2, ..., 10 %/cmH2O, without noise. Ctrl-C keeps what is
     finished; the same command goes on from there.
@@ -56,7 +57,7 @@ def pid(
     if (lung is not None) + every + robust != 1:
         raise InputError("say for which lungs: --lung LUNG, --all or --robust, one of them")
     names = (scored_lung(lung).id,) if lung is not None else LUNG_IDS
-    grid, result = _search(names, out, workers, scheduler, not robust)
+    grid, result = _search(names, plant, out, workers, scheduler, not robust)
     written = [TABLE, RESULT, *_plot(out / PLOT, grid, not robust, lung is None)]
     emit(result, json)
     console = Console(stderr=str(json) == "-")
@@ -66,7 +67,12 @@ def pid(
 
 
 def _search(
-    names: tuple[str, ...], out: Path, workers: int, scheduler: str | None, each: bool
+    names: tuple[str, ...],
+    plant: str,
+    out: Path,
+    workers: int,
+    scheduler: str | None,
+    each: bool,
 ) -> tuple[Any, dict[str, Any]]:
     from rich.progress import (
         BarColumn,
@@ -88,7 +94,13 @@ def _search(
             bars.update(task, completed=done, total=total)
 
         return tune_pid(
-            names, out, workers=workers, scheduler=scheduler, each=each, progress=progress
+            names,
+            out,
+            workers=workers,
+            scheduler=scheduler,
+            each=each,
+            simulator=plant,
+            progress=progress,
         )
 
 

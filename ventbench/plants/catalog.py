@@ -20,6 +20,7 @@ an array                              simulated pressures of given breaths
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import inspect
 import sys
@@ -338,13 +339,23 @@ def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) 
     if isinstance(given, str | Path):
         return _by_text(str(given))
     if isinstance(given, Mapping):
-        return _plants(dict(given), "the given plants", {"kind": "plants"})
+        digest = _leaves_sha256(given)
+        about = {"kind": "plants", "sha256": digest}
+        return _plants(dict(given), "the given plants", about, digest)
     if isinstance(given, Plant) and not isinstance(given, type):
-        return _single(given, type(given).__name__)
+        return _single(given, type(given).__name__, _leaves_sha256(given))
     if callable(given):
         name = getattr(given, "__qualname__", type(given).__name__)
         return _of_function(given, name)
     return _of_array(given, breaths)
+
+
+def _leaves_sha256(plants: Any) -> str:
+    """Hash of all parameters, by which results and interrupted work tell plants apart."""
+    digest = hashlib.sha256(str(jax.tree.structure(plants)).encode())
+    for leaf in jax.tree.leaves(plants):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()
 
 
 def _by_text(text: str) -> Simulators:

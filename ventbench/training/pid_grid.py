@@ -28,8 +28,7 @@ from ventbench.controllers.pid import PID
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNG_IDS, scored_lung
-from ventbench.plants import frozen
-from ventbench.plants.stacking import take
+from ventbench.plants.catalog import Given, load_simulators
 from ventbench.resume import ARRAY, WorkFolder, fingerprint
 from ventbench.scenario import Scenario, nominal
 from ventbench.training.executor import InProcess, executor, results
@@ -205,7 +204,7 @@ def tune_pid(
     scheduler: str | None = None,
     each: bool = True,
     single: bool | None = None,
-    simulators: frozen.Frozen | None = None,
+    simulator: Given = "frozen",
     progress: Progress | None = None,
 ) -> tuple[PIDGrid, dict[str, Any]]:
     """Run every PID of a grid on simulators without noise, and name the best gains.
@@ -226,7 +225,7 @@ def tune_pid(
         each: put the best gains of each lung into the result.
         single: put the best gains for all lungs together into the result; if not given, where there
             are several lungs.
-        simulators: what is ventilated; the frozen simulators if not given.
+        simulator: simulators with plants of these lungs; see :func:`ventbench.load_simulators`.
         progress: see :data:`Progress`.
 
     Returns:
@@ -237,20 +236,20 @@ def tune_pid(
             a worker died.
     """
     names = tuple(scored_lung(name).id for name in lungs)
-    simulators = simulators or frozen.load()
-    plants = {name: take(simulators.plants, LUNG_IDS.index(name)) for name in names}
+    simulators = load_simulators(simulator)
+    plants = {name: simulators.plant(name) for name in names}
     parts = None if out is None else Path(out) / PARTS
     with executor(workers, scheduler) as pool:
         grid = search(
             plants,
-            settings=simulators.about(),
+            settings=dict(simulators.about),
             folder=parts,
             gains=gains,
             pool=pool,
             progress=progress,
         )
     result = grid.summary(each=each, single=len(names) > 1 if single is None else single)
-    result["simulators"] = simulators.about()
+    result["simulators"] = dict(simulators.about)
     if out is not None:
         grid.save(Path(out) / TABLE)
         files.write_json(Path(out) / RESULT, result)

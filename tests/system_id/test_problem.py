@@ -142,9 +142,9 @@ def test_minimise_stops_at_bounds():
     np.testing.assert_allclose(run([0.5, 3.0]).x, [0.5, 0.25], atol=1e-4)
 
 
-@pytest.mark.parametrize("freedom", [5, 10, 40])
+@pytest.mark.parametrize("freedom", [1, 2, 4, 5, 10, 40, 1000])
 def test_quantile(freedom):
-    assert t_quantile(freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=0.01)
+    assert t_quantile(freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=1e-12)
 
 
 def test_layout_and_its_errors(found):

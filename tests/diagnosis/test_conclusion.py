@@ -121,7 +121,6 @@ def test_a_beating_heart_is_at_the_alveolus():
     assert np.ptp(shown.y) == pytest.approx(2.6, rel=0.4)
 
 
-@pytest.mark.slow  # many refits
 def test_a_mechanism_stands_beside_an_unnamed_effect():
     beats = small.effect("pulsating_supply", "oscillation", amplitude=0.175, frequency=5.0)
     name = small.effect("turbulent_resistance", quadratic=10.0)

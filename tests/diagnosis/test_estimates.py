@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ventbench.diagnosis import estimates
+from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.physics.catalogue import paths
 from ventbench.system_id import make_data, parameter_values
 from ventbench.system_id.predictor import START, Predictor
@@ -22,7 +23,7 @@ LAGS = ("valve_lag.tau", "valve_lag.second")
 def test_the_larger_of_two_lags_comes_first(monkeypatch, found):
     """A search may end in either order: they are the same simulator."""
     values = {path: value for path, value in zip(LAGS, found, strict=True) if value is not None}
-    hypothesis = SimpleNamespace(names=("valve_lag",), free=LAGS[1:], fixed=())
+    hypothesis = Hypothesis(("valve_lag",), LAGS[1:])
     unknowns = SimpleNamespace(paths=("R", *values, START))
     fitted: Any = SimpleNamespace(
         hypothesis=hypothesis, noise=None, column=lambda path: np.full(3, values.get(path, 20.0)),

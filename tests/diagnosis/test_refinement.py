@@ -132,7 +132,6 @@ def test_an_alternative_that_is_nearly_as_good_is_listed(alike):
     assert other[name].confidence == pytest.approx(1.0 / (1.0 + np.exp(-0.5 * gap)))
 
 
-@pytest.mark.slow  # many refits
 def test_a_worse_mechanism_is_swapped_for_the_better_one(alike):
     evaluator, named, _ = alike
     wrong = evaluator.fit(Hypothesis(("viscoelasticity",)), named.noise)

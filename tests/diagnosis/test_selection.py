@@ -162,7 +162,6 @@ def test_strong_efforts_are_selected_and_nothing_else():
     assert named.hypothesis.names == ("patient_effort",)
 
 
-@pytest.mark.slow  # many refits
 def test_two_strong_effects_are_both_selected():
     two = (
         small.effect("turbulent_resistance", quadratic=10.0), small.effect("sensor_lag", tau=0.12)

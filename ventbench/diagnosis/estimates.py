@@ -13,7 +13,6 @@ from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.findings import NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
 from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY, LatentInput
-from ventbench.diagnosis.patient_effort import EFFORT
 from ventbench.diagnosis.screening import component_of
 from ventbench.interfaces import Plant
 from ventbench.mechanics.labels import Estimate, LungMatch
@@ -59,7 +58,7 @@ def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
     if len(np.unique(known.lung)) > 1:
         same = (partition.data.R[:, None] == known.R) & (partition.data.C[:, None] == known.C)
         start |= {path: fitted.column(path)[np.argmax(same, axis=1)] for path in ("R", "C")}
-    if EFFORT in hypothesis.names:  # the efforts of each breath start where they are likeliest
+    if hypothesis.breath_terms:  # the efforts of each breath start where they are likeliest
         near = evaluator.fit(
             hypothesis, fitted.noise, start=start, partition=partition, restart=True
         )

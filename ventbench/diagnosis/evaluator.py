@@ -2,8 +2,8 @@
 
 :func:`fit` finds the maximum-likelihood parameters of a hypothesis on some breaths. An
 :class:`Evaluator` holds a recording that is split into training and held-out breaths; it fits
-hypotheses to the former and gives their information criterion there, and their log-likelihood on
-the latter.
+hypotheses to the training breaths, computes their information criterion there, and evaluates them
+by the log-likelihood of the held-out breaths.
 """
 
 from __future__ import annotations
@@ -218,9 +218,9 @@ class Evaluator:
         """
         if fitted not in self._held_out:
             problem, x = self.refit_breath_parameters(fitted)
-            found = problem.log_likelihood(x)
+            plain = problem.log_likelihood(x)
             term = self.breath_term(fitted)
-            self._held_out[fitted] = found + term.log_likelihood_gain(problem, x, fitted)
+            self._held_out[fitted] = plain + term.log_likelihood_gain(problem, x, fitted)
         return self._held_out[fitted]
 
     def training_log_likelihood(self, fitted: FittedModel, noise: Noise | None = None) -> float:
@@ -308,8 +308,8 @@ class Evaluator:
         for column, name in enumerate(partition.predictor.names):
             if name != "position" and name in names and not self._differs_by_breath(name):
                 parameter = parameter_of(name)  # rounding must not carry a value beyond its bound
-                found = fitted.values[first, names.index(name)]
-                values[:, column] = np.clip(found, parameter.low, parameter.high)
+                value = fitted.values[first, names.index(name)]
+                values[:, column] = np.clip(value, parameter.low, parameter.high)
         return values
 
     def breath_term(self, fitted: FittedModel) -> BreathTerm:
@@ -367,7 +367,8 @@ def cross_validated_gain(
         start = {path: values[:, k] for k, path in enumerate(names) if path != START}
         return fold.held_out_log_likelihood(fold.fit(fitted.hypothesis, fitted.noise, start=start))
 
-    found = parallel_map(evaluate, product(evaluator.folds, (with_term, without_term)))
-    gains = [new - old for new, old in zip(found[::2], found[1::2], strict=True)]
+    likelihoods = parallel_map(evaluate, product(evaluator.folds, (with_term, without_term)))
+    pairs = zip(likelihoods[::2], likelihoods[1::2], strict=True)
     first = evaluator.held_out_log_likelihood(with_term)
-    return np.concatenate([first - evaluator.held_out_log_likelihood(without_term), *gains])
+    first = first - evaluator.held_out_log_likelihood(without_term)
+    return np.concatenate([first, *(with_it - without for with_it, without in pairs)])

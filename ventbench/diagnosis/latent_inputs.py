@@ -5,7 +5,7 @@ It acts on the pressure at the alveolus, on the flow of the supply, or on the re
 Its course is integrated out; only its size and its scale are fitted. Its response is linearised, so
 that the marginal likelihood is that of a Gaussian. Coloured noise is such an input at the sensor,
 and an input that acts in the physics has to explain more than that. Scatter of the valve's gain
-between breaths is treated alike, with one number for each breath.
+between breaths is treated as an input that is one number for each breath.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ventbench.system_id.problem import Problem
 ALVEOLUS, SUPPLY, MEASUREMENT = "f(t) at the alveolus", "f(t) at the supply", "measurement"
 PLACES = (ALVEOLUS, SUPPLY, MEASUREMENT)
 
-#: Scatter of the valve's gain between breaths, which is no place but is fitted alike.
+#: Scatter of the valve's gain between breaths, which is fitted as if it were an input.
 GAIN_SCATTER = "gain of each breath"
 
 
@@ -93,13 +93,13 @@ def log_likelihood_without_input(evaluator: Evaluator, fitted: FittedModel) -> t
     Returns:
         Of all training breaths, and of each held-out breath, ``(n,)``.
     """
-    found = []
+    likelihoods = []
     for partition in (evaluator.training, evaluator.held_out):
         problem, x = evaluator.refit_breath_parameters(fitted, partition)
         linear = _linearise(evaluator, problem, x)
         gain = evaluator.breath_term(fitted).linear_gain(linear, fitted)
-        found.append(_gaussian_log_likelihood(linear, fitted.noise) + gain)
-    return float(found[0].sum()), found[1]
+        likelihoods.append(_gaussian_log_likelihood(linear, fitted.noise) + gain)
+    return float(likelihoods[0].sum()), likelihoods[1]
 
 
 def exceeds_sensor_noise(evaluator: Evaluator, with_effort: FittedModel) -> bool:
@@ -125,8 +125,8 @@ def exceeds_sensor_noise(evaluator: Evaluator, with_effort: FittedModel) -> bool
 def input_responses(partition: Partition, values: Floats, place: str) -> Floats:
     """Change of the pressure by a unit input at one sample, cmH2O.
 
-    Only resistance, compliance and the expiratory valve count; other mechanisms are left out, which
-    draws an input to about 10 %.
+    Only resistance, compliance and the expiratory valve are modelled. Other mechanisms are left
+    out, so that an input's course is right to about 10 %.
 
     Args:
         partition: n breaths of T samples.

@@ -8,8 +8,8 @@ a second is off by more than the noise, and no small step of a fit mends an effo
 there is none: each breath's effort is then started where the breath is likeliest, fitted, and
 integrated out around the fit (Laplace's method).
 
-The rest of the diagnosis treats a hypothesis with efforts and one without alike, through
-:class:`BreathTerm`.
+The rest of the diagnosis does not know about efforts: it treats hypotheses with and without them
+alike, through :class:`BreathTerm`.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class BreathTerm(Protocol):
     def start(
         self, problem: Problem, x: Floats, fitted_names: Iterable[str], *, refit: bool
     ) -> Floats:
-        """Unknowns ``(U,)`` with each breath's own parameters where the breath is likelier.
+        """Move each breath's own parameters to where the breath is likelier, ``(U,)``.
 
         Args:
             problem: of the hypothesis.
@@ -97,7 +97,7 @@ class NoBreathTerm:
     """All terms have the same parameters in all breaths."""
 
     def screen(self, linearisations: list[Linearisation]) -> ScreenedTerm | None:
-        """Nothing is integrated out."""
+        """Return None: nothing is integrated out."""
         return None
 
     def start(
@@ -111,11 +111,11 @@ class NoBreathTerm:
         return noise.log_likelihood(fitted.residual, fitted.problem.data.weight)
 
     def log_likelihood_gain(self, problem: Problem, x: Floats, fitted: FittedModel) -> Floats:
-        """Zero."""
+        """Return zeros, ``(n,)``."""
         return np.zeros(len(problem.data))
 
     def linear_gain(self, linearisation: Linearisation, fitted: FittedModel) -> Floats:
-        """Zero."""
+        """Return zeros, ``(n,)``."""
         return np.zeros(len(linearisation.values))
 
     def predict(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:

@@ -1,8 +1,8 @@
 """Every threshold of the diagnosis, in one versioned object.
 
 ``nats`` are differences of log-likelihood (natural logarithm). ``criterion`` is the Bayesian
-information criterion, ``-2 log L + k log n``, so that 2 of it correspond to one nat. The values
-were tuned on concealed challenges whose seeds are not among those that the documentation reports.
+information criterion, ``-2 log L + k log n``, so that 2 of it correspond to one nat. How they act
+together is told in ``docs/missing_physics_method.md``.
 """
 
 from __future__ import annotations
@@ -224,13 +224,14 @@ class PatientEffortSettings:
 
 @dataclass(frozen=True)
 class LatentInputSettings:
-    """Gaussian processes that act on the rig or on the sensor.
+    """Inputs that vary in time and that no command explains: Gaussian processes.
 
     Attributes:
         frequencies: of periodic inputs, Hz: heart beats to the pulsation of a supply.
         correlation_times: of smooth inputs, s.
         sizes: standard deviations, cmH2O.
-        relative_size: sizes of a flow, and of the valve's gain, by those: a share for each cmH2O.
+        relative_size: factor from ``sizes`` to those of a flow or of the valve's gain, which are
+            shares, 1/cmH2O.
         clip: whitened residuals are cut off here, in standard deviations; wider than in screening,
             since an input may be large in a few breaths.
         noise_rounds: most times that the input and the noise beside it are estimated in turn.

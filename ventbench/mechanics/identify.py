@@ -33,7 +33,7 @@ from ventbench.mechanics.regression import (
 from ventbench.mechanics.segments import Segment, clipped_share, segments
 from ventbench.mechanics.term_selection import (
     FEWEST_BREATHS,
-    CircuitCompliance,
+    CircuitEstimate,
     SelectedTerm,
     behind_circuit,
     circuit_compliance,
@@ -183,7 +183,7 @@ def _best_for_label(full: LungFit, plain: LungFit, label: Lung) -> LungFit:
     return plain
 
 
-def _circuit_term(circuit: CircuitCompliance | None) -> tuple[Term, ...]:
+def _circuit_term(circuit: CircuitEstimate | None) -> tuple[Term, ...]:
     if circuit is None:
         return ()
     parameters = {"compliance": circuit.compliance}

@@ -171,7 +171,7 @@ def splits(count: int) -> list[NDArray[np.bool_]]:
 
 
 @dataclass(frozen=True)
-class CircuitCompliance:
+class CircuitEstimate:
     """Compliance of the circuit between flow sensor and lung.
 
     Attributes:
@@ -185,7 +185,7 @@ class CircuitCompliance:
     effect: float
 
 
-def circuit_compliance(segments: Sequence[Segment]) -> CircuitCompliance | None:
+def circuit_compliance(segments: Sequence[Segment]) -> CircuitEstimate | None:
     """Estimate the compliance of the circuit; None if the breaths do not need it.
 
     The lung's flow is that of the sensor less the circuit's compliance times the rise of the
@@ -218,7 +218,7 @@ def circuit_compliance(segments: Sequence[Segment]) -> CircuitCompliance | None:
     nearest = tables[round(value / (_COMPLIANCES[1] - _COMPLIANCES[0]))]
     variances = [_residual_variance(table, every) for table in (null, nearest)]
     effect = float(np.sqrt(max(variances[0] - variances[1], 0.0)))
-    return CircuitCompliance(Estimate(value, "mL/cmH2O", ends), nats, effect)
+    return CircuitEstimate(Estimate(value, "mL/cmH2O", ends), nats, effect)
 
 
 def behind_circuit(segment: Segment, compliance: float) -> Segment:

@@ -3,13 +3,13 @@
 from ventbench.recordings.breaths import Breaths as Breaths
 from ventbench.recordings.breaths import join as join
 from ventbench.recordings.breaths import make_breaths as make_breaths
-from ventbench.recordings.problems import Problem as Problem
 from ventbench.recordings.problems import RecordingError as RecordingError
+from ventbench.recordings.problems import RecordingProblem as RecordingProblem
 from ventbench.recordings.read import check as check
 from ventbench.recordings.read import iter_breaths as iter_breaths
 from ventbench.recordings.read import load as load
 from ventbench.recordings.read import recordings_dir as recordings_dir
-from ventbench.recordings.report import CheckReport as CheckReport
+from ventbench.recordings.report import RecordingReport as RecordingReport
 from ventbench.recordings.respiraworks import RespiraWorksRun as RespiraWorksRun
 from ventbench.recordings.respiraworks import load_respiraworks as load_respiraworks
 from ventbench.recordings.schema import COLUMNS as COLUMNS

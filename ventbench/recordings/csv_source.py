@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import IO
 
-from ventbench.recordings.problems import SHOWN, Place, Problem, RecordingError, fail
+from ventbench.recordings.problems import SHOWN, Place, RecordingError, RecordingProblem, fail
 from ventbench.recordings.rows import Chunk, chunk_of_batch
 from ventbench.recordings.schema import COLUMNS, Kind, check_header
 
@@ -37,7 +37,7 @@ class CsvSource:
     file: str
     kind: Kind
     names: tuple[str, ...] = ()
-    warnings: tuple[Problem, ...] = ()
+    warnings: tuple[RecordingProblem, ...] = ()
     sha256: str | None = None
     place: str = field(default="line", init=False)
     block: int = BLOCK
@@ -166,7 +166,9 @@ def locate_rows(
     return places
 
 
-def text_problems(file: str, kind: Kind, names: Sequence[str]) -> tuple[list[Problem], int]:
+def text_problems(
+    file: str, kind: Kind, names: Sequence[str]
+) -> tuple[list[RecordingProblem], int]:
     """List the cells that are not numbers and the rows that have too few or too many cells.
 
     Args:
@@ -180,7 +182,7 @@ def text_problems(file: str, kind: Kind, names: Sequence[str]) -> tuple[list[Pro
     patterns = [_pattern(name) for name in names]
     sound = re.compile(",".join(patterns).encode())
     cell_patterns = {name: re.compile(_pattern(name)) for name in names if name in COLUMNS}
-    problems: list[Problem] = []
+    problems: list[RecordingProblem] = []
     total = 0
     for number, text in data_lines(file, kind):
         if sound.fullmatch(text):
@@ -203,13 +205,13 @@ def _in_line(
     text: bytes,
     names: Sequence[str],
     patterns: dict[str, re.Pattern[str]],
-) -> list[Problem]:
+) -> list[RecordingProblem]:
     cells = _cells(text)
     if cells is None:
-        return [Problem(file, "the line is not CSV", "Fix the row.", number)]
+        return [RecordingProblem(file, "the line is not CSV", "Fix the row.", number)]
     if len(cells) != len(names):
         what = f"the row has {len(cells)} cells, but the header has {len(names)} columns"
-        return [Problem(file, what, "Fix the row.", number)]
+        return [RecordingProblem(file, what, "Fix the row.", number)]
     problems = []
     for name, cell in zip(names, cells, strict=True):
         if name in patterns and not (patterns[name].fullmatch(cell) or _fits(cell, name)):
@@ -221,7 +223,7 @@ def _in_line(
             except UnicodeDecodeError as error:
                 what += f" (byte 0x{text[error.start]:02x} is not UTF-8)"
                 advice = "Save the file as UTF-8 text."
-            problems.append(Problem(file, what, advice, number, name, value))
+            problems.append(RecordingProblem(file, what, advice, number, name, value))
     return problems
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ventbench.files import sha256
-from ventbench.recordings.problems import Problem, RecordingError, fail
+from ventbench.recordings.problems import RecordingError, RecordingProblem, fail
 from ventbench.recordings.rows import Chunk, chunk_of_batch
 from ventbench.recordings.schema import COLUMNS, Kind, check_header
 
@@ -35,7 +35,7 @@ class ParquetSource:
     file: str
     kind: Kind = "parquet"
     names: tuple[str, ...] = ()
-    warnings: tuple[Problem, ...] = ()
+    warnings: tuple[RecordingProblem, ...] = ()
     sha256: str | None = None
     place: str = field(default="row", init=False)
     batch: int = BATCH
@@ -88,7 +88,7 @@ class ParquetSource:
             raise _damaged(self.file, error) from None
 
 
-def _check_type(file: str, name: str, kind: pa.DataType) -> Iterator[Problem]:
+def _check_type(file: str, name: str, kind: pa.DataType) -> Iterator[RecordingProblem]:
     from pyarrow import types
 
     if COLUMNS[name].whole:
@@ -98,7 +98,7 @@ def _check_type(file: str, name: str, kind: pa.DataType) -> Iterator[Problem]:
         good = good or (name == "u_out" and types.is_boolean(kind))
     if not good:
         what = f"the column has type {kind}, but numbers are needed"
-        yield Problem(file, what, f"Write it as {needed}.", None, name, str(kind), "row")
+        yield RecordingProblem(file, what, f"Write it as {needed}.", None, name, str(kind), "row")
 
 
 def _damaged(file: str, error: Exception) -> RecordingError:

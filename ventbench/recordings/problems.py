@@ -19,7 +19,7 @@ SHOWN = 20
 
 
 @dataclass(frozen=True)
-class Problem:
+class RecordingProblem:
     """An error in a recording, or something that its user should know.
 
     Attributes:
@@ -63,15 +63,17 @@ class RecordingError(InputError):
         total: number of all problems, at least `len(problems)`.
     """
 
-    def __init__(self, problems: Problem | Sequence[Problem], total: int | None = None) -> None:
+    def __init__(
+        self, problems: RecordingProblem | Sequence[RecordingProblem], total: int | None = None
+    ) -> None:
         """Keep the problems.
 
         Args:
             problems: one problem or several, in file order; at least one.
             total: number of all problems, if there are more than are given.
         """
-        listed = (problems,) if isinstance(problems, Problem) else tuple(problems)
-        self.problems: tuple[Problem, ...] = listed
+        listed = (problems,) if isinstance(problems, RecordingProblem) else tuple(problems)
+        self.problems: tuple[RecordingProblem, ...] = listed
         self.total: int = max(len(listed), total or 0)
         super().__init__(listed, self.total)
 
@@ -110,7 +112,7 @@ class RecordingError(InputError):
 
 def fail(file: str, what: str, advice: str, line: int | None = None) -> RecordingError:
     """Make a RecordingError about a whole file or a line."""
-    return RecordingError(Problem(file, what, advice, line))
+    return RecordingError(RecordingProblem(file, what, advice, line))
 
 
 Level = Literal["problem", "warning"]
@@ -175,7 +177,7 @@ class ProblemLog:
         kept.sort(key=lambda entry: entry.row)
         del kept[SHOWN:]
 
-    def listed(self, level: Level, locate: Locate, place: str) -> tuple[Problem, ...]:
+    def listed(self, level: Level, locate: Locate, place: str) -> tuple[RecordingProblem, ...]:
         """Return the kept problems of a level with their lines.
 
         Args:
@@ -201,14 +203,14 @@ class ProblemLog:
         if self.counts["problem"]:
             raise RecordingError(self.listed("problem", locate, place), self.counts["problem"])
 
-    def _problem(self, entry: _Entry, places: Mapping[int, Place], place: str) -> Problem:
+    def _problem(self, entry: _Entry, places: Mapping[int, Place], place: str) -> RecordingProblem:
         line, cells = places.get(entry.row, (None, {}))
         value = cells.get(entry.column or "", entry.value)
         what = entry.what.replace("{value}", value or "blank")
         if entry.other is not None:
             other = places.get(entry.other, (None, {}))[0]
             what = what.replace("{other}", f"{place} {other}")
-        return Problem(self.file, what, entry.advice, line, entry.column, value, place)
+        return RecordingProblem(self.file, what, entry.advice, line, entry.column, value, place)
 
 
 def _text(value: np.generic) -> str:

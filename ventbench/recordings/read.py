@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
-from ventbench.recordings.problems import Problem, ProblemLog, RecordingError, fail
+from ventbench.recordings.problems import ProblemLog, RecordingError, RecordingProblem, fail
 from ventbench.recordings.report import (
-    CheckReport,
+    RecordingReport,
     Tally,
     check_inferable,
     check_lengths,
@@ -68,7 +68,7 @@ def load(path: FilePath, *, clip: bool = False, pad: bool = False) -> Breaths:
     return replace(breaths, sha256=source.sha256, notes=notes)
 
 
-def check(path: FilePath, *, clip: bool = False, pad: bool = False) -> CheckReport:
+def check(path: FilePath, *, clip: bool = False, pad: bool = False) -> RecordingReport:
     """Check a recording; needs about 80 bytes of memory a breath.
 
     Args:
@@ -90,7 +90,7 @@ def check(path: FilePath, *, clip: bool = False, pad: bool = False) -> CheckRepo
     except RecordingError as error:
         kind = source.kind if source else None
         warnings = source.warnings if source else ()
-        return CheckReport(
+        return RecordingReport(
             str(path),
             kind,
             problems=error.problems,
@@ -161,11 +161,11 @@ def _no_rows(source: Source) -> RecordingError:
     return fail(source.file, "the file has a header but no rows", "Write at least one breath.")
 
 
-def _report(source: Source, log: ProblemLog, tally: Tally) -> CheckReport:
+def _report(source: Source, log: ProblemLog, tally: Tally) -> RecordingReport:
     find = partial(locate, source)
-    whole: tuple[Problem, ...] = source.warnings + unit_warning(source.file, tally)
+    whole: tuple[RecordingProblem, ...] = source.warnings + unit_warning(source.file, tally)
     warnings = whole + log.listed("warning", find, source.place)
-    return CheckReport(
+    return RecordingReport(
         source.file,
         source.kind,
         source.sha256,

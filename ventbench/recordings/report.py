@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ventbench.lungs import Lung
-from ventbench.recordings.problems import Problem, ProblemLog
+from ventbench.recordings.problems import ProblemLog, RecordingProblem
 from ventbench.recordings.scan import Block
 from ventbench.recordings.times import IntervalTable, interval_table
 
@@ -20,7 +20,7 @@ PAD_LIMIT = 10
 
 
 @dataclass(frozen=True)
-class CheckReport:
+class RecordingReport:
     """The result of `check`.
 
     Attributes:
@@ -47,9 +47,9 @@ class CheckReport:
     file: str
     kind: str | None = None
     sha256: str | None = None
-    problems: tuple[Problem, ...] = ()
+    problems: tuple[RecordingProblem, ...] = ()
     problem_count: int = 0
-    warnings: tuple[Problem, ...] = ()
+    warnings: tuple[RecordingProblem, ...] = ()
     warning_count: int = 0
     rows: int = 0
     breaths: int = 0
@@ -131,7 +131,7 @@ def describe(tally: Tally) -> dict[str, Any]:
         tally: all breaths.
 
     Returns:
-        Keyword arguments for `CheckReport`.
+        Keyword arguments for `RecordingReport`.
     """
     lengths = tally.column("lengths")
     pairs, counts = np.unique(
@@ -153,14 +153,14 @@ def describe(tally: Tally) -> dict[str, Any]:
     }
 
 
-def unit_warning(file: str, tally: Tally) -> tuple[Problem, ...]:
+def unit_warning(file: str, tally: Tally) -> tuple[RecordingProblem, ...]:
     """Return a warning if times look like milliseconds."""
     median = tally.table().overall
     if median is None or median <= SLOW:
         return ()
     what = f"the median sampling interval is {median:g} s"
     advice = "time_step is in seconds; divide by 1000 if the file has milliseconds."
-    return (Problem(file, what, advice, column="time_step", value=f"{median:g}"),)
+    return (RecordingProblem(file, what, advice, column="time_step", value=f"{median:g}"),)
 
 
 def _intervals(tally: Tally) -> dict[str, float]:

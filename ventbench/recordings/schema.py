@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Literal
 
-from ventbench.recordings.problems import Problem, RecordingError
+from ventbench.recordings.problems import RecordingError, RecordingProblem
 
 #: Formats of files.
 Kind = Literal["csv", "csv.gz", "parquet"]
@@ -109,7 +109,7 @@ HEADER: str = ",".join(REQUIRED) + "[,flow][,volume]"
 _RESPIRAWORKS = {"run", "test", "breath", "cmd_inh_valve", "cmd_exh_valve"}
 
 
-def check_header(file: str, names: Sequence[str], line: int | None) -> tuple[Problem, ...]:
+def check_header(file: str, names: Sequence[str], line: int | None) -> tuple[RecordingProblem, ...]:
     """Check the names of the columns.
 
     Args:
@@ -127,17 +127,17 @@ def check_header(file: str, names: Sequence[str], line: int | None) -> tuple[Pro
     for name in dict.fromkeys(names):
         if name in COLUMNS and names.count(name) > 1:
             what = f"the header names {name} {names.count(name)} times"
-            problems.append(Problem(file, what, "Keep one of them.", line, name, name))
+            problems.append(RecordingProblem(file, what, "Keep one of them.", line, name, name))
     missing = [name for name in REQUIRED if name not in names]
     if missing:
         column = missing[0] if len(missing) == 1 else None
         what = f"missing column{'s' if len(missing) > 1 else ''} {', '.join(missing)}"
-        problems.append(Problem(file, what, _advice(names, missing), line, column))
+        problems.append(RecordingProblem(file, what, _advice(names, missing), line, column))
     if problems:
         raise RecordingError(problems)
     advice = f"Rename it if it is one of {HEADER}."
     return tuple(
-        Problem(file, f"column {name!r} is not known and is ignored", advice, line, name)
+        RecordingProblem(file, f"column {name!r} is not known and is ignored", advice, line, name)
         for name in dict.fromkeys(names)
         if name not in COLUMNS
     )

@@ -27,7 +27,7 @@ _INTEGRAL_SHARE = 0.06
 INSPIRATION = 1.0
 
 
-class Controller:
+class RecordingController:
     """PI control to a target; some breaths add a disturbance, others follow a programme.
 
     Args:

@@ -11,7 +11,7 @@ from ventbench.errors import InputError
 from ventbench.recordings.breaths import Breaths
 from ventbench.validation.challenge.cases import Base, Case, draw_base
 from ventbench.validation.challenge.circuit import READING, Circuit, Disturbances
-from ventbench.validation.challenge.controller import Controller, expiratory
+from ventbench.validation.challenge.controller import RecordingController, expiratory
 from ventbench.validation.challenge.instruments import Floats, Sensor, Valve
 
 #: Means of the sampling interval that a breath may have, s.
@@ -114,7 +114,7 @@ def record(
     """
     base = case.base or draw_base(case.lung_R, case.lung_C, rng)
     time = sampling_times(case.breaths, case.samples, case.jitter, rng)
-    controller = Controller(case, time, rng, share)
+    controller = RecordingController(case, time, rng, share)
     return _run(case, base, time, expiratory(time), controller, np.arange(len(time)), rng, steps)
 
 
@@ -174,8 +174,8 @@ def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 
 
 def _run(
     case: Case, base: Base, time: Floats, u_out: NDArray[np.int8],
-    controller: Controller | _GivenCommands, number: NDArray[np.int64], rng: np.random.Generator,
-    steps: int | None = None, start: Floats | None = None,
+    controller: RecordingController | _GivenCommands, number: NDArray[np.int64],
+    rng: np.random.Generator, steps: int | None = None, start: Floats | None = None,
 ) -> Breaths:  # fmt: skip
     """Simulate breaths side by side; ``number``: place of each in the recording, from 0."""
     n, samples = time.shape

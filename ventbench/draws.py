@@ -1,8 +1,8 @@
-"""The published paired draws: how the bench deviates from nominal, the same for every entry.
+"""Deviations of the ventilator from nominal: the published paired draws, and new random ones.
 
-One draw is one deviation for each PIP, common to all lungs and entries: sensor noise and converter,
-pressure at the start of the inspiration, R, C, dead time, control step, PIP and PEEP. They are
-frozen in ``data/draws-v1.npz``; ``python -m ventbench.draws FILE`` makes that file again.
+One published draw is one deviation for each PIP, common to all lungs and entries: sensor noise and
+converter, pressure at the start of the inspiration, R, C, dead time, control step, PIP and PEEP.
+They are frozen in ``data/draws-v1.npz``; ``python -m ventbench.draws FILE`` makes that file again.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def write(path: Path) -> str:
 
 
 def about() -> dict[str, Any]:
-    """What a record says about all of the draws."""
+    """Version, hash and number of the draws, for records."""
     return {"version": VERSION, "sha256": SHA256, "count": COUNT}
 
 
@@ -104,10 +104,10 @@ def about() -> dict[str, Any]:
 def _frozen() -> dict[str, Floats]:
     path = data_files.data_path(FILE)
     content = path.read_bytes()
-    found = hashlib.sha256(content).hexdigest()
-    if found != SHA256:
+    sha256 = hashlib.sha256(content).hexdigest()
+    if sha256 != SHA256:
         raise InputError(
-            f"{path} is not the published draws version {VERSION}: its SHA-256 is {found}, "
+            f"{path} is not the published draws version {VERSION}: its SHA-256 is {sha256}, "
             f"expected {SHA256}; restore the file"
         )
     with np.load(io.BytesIO(content), allow_pickle=False) as npz:
@@ -139,8 +139,8 @@ def scenarios(pips: Sequence[float] = protocol.PIPS, n: int = COUNT) -> Scenario
     drawn = {name: values[:n, columns] for name, values in _frozen().items()}
     pip = np.asarray(pips, float)
     noise = drawn.pop("noise")
-    found = _deviate(pip, drawn, np.full((n, len(pips)), QUANTUM), noise)
-    return jax.tree.map(jnp.asarray, found)
+    cells = _deviate(pip, drawn, np.full((n, len(pips)), QUANTUM), noise)
+    return jax.tree.map(jnp.asarray, cells)
 
 
 def random_scenarios(

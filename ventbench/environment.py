@@ -1,7 +1,7 @@
-"""The loop around a plant, one control step at a time: the only place where it is written.
+"""One control step of the loop around a plant: observation, inspiratory and expiratory command.
 
 The scan of :mod:`ventbench.rollouts` and the stepwise scorer of :mod:`ventbench.submissions` both
-call these functions, so that a controller scores the same either way.
+call these functions, so that a controller scores the same in both.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ def _table(values: NDArray[np.float64], scenario: Scenario) -> Array:
 
 @flax.struct.dataclass
 class LoopState:
-    """A batch of plants in mid-breath.
+    """State of the loop: a batch of plants in mid-breath.
 
     Attributes:
-        plant: state of the plants.
+        plant: states of the plants.
         pressure: true airway pressure, cmH2O, shape ``(...)``.
-        previous: command of the step before as applied, %, shape ``(...)``.
+        previous: command of the previous step as applied, %, shape ``(...)``.
     """
 
     plant: Any
@@ -46,7 +46,7 @@ class LoopState:
 
 
 def vary(plant: Plant, scenario: Scenario) -> Plant:
-    """Return the plants of the scenario's cells: R and C off their nominal values.
+    """Return plants with the resistance and compliance of each cell of a scenario.
 
     Raises:
         TypeError: if the plant cannot be varied.
@@ -78,7 +78,7 @@ def observe(
 
     Args:
         scenario: the cells.
-        loop: their plants now.
+        loop: state of the loop.
         breath: index of the breath.
         step: index of the step in the breath, below ``INSPIRATION_STEPS``.
     """
@@ -98,13 +98,13 @@ def inspire(
     """Apply one inspiratory command, clipped to the valve's range.
 
     Args:
-        plant: the varied plants.
+        plant: plants of the cells, from :func:`vary`.
         scenario: the cells.
-        loop: their plants now.
+        loop: state of the loop.
         u_in: what the controller asked for, %, shape ``(...)``.
 
     Returns:
-        The plants one step later and the command as applied, %.
+        The state one step later, and the command as applied, %, shape ``(...)``.
     """
     applied = jnp.clip(u_in, 0.0, protocol.U_MAX)
     # The held command reaches the valve `delay` of a step late: over this step it averages to
@@ -116,7 +116,7 @@ def inspire(
 def expire(
     plant: Plant, scenario: Scenario, loop: LoopState, step: Array | int
 ) -> tuple[LoopState, Array]:
-    """Apply the hard-coded expiratory command of a step; likewise."""
+    """Apply the fixed expiratory command of a step; arguments and results as of :func:`inspire`."""
     u_in = jnp.broadcast_to(_table(_EXPIRATORY, scenario)[step], loop.pressure.shape)
     state, pressure = plant.step(loop.plant, u_in, jnp.ones_like(u_in), scenario.dt)
     return LoopState(state, pressure, u_in), u_in

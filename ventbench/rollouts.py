@@ -94,7 +94,14 @@ class Inspirations:
 
 @flax.struct.dataclass
 class Expirations:
-    """The expirations that follow, likewise shaped; the expiratory valve is open throughout."""
+    """Expirations of a closed-loop run; every array has shape ``(..., BREATHS, steps)``.
+
+    The expiratory valve is open throughout.
+
+    Attributes:
+        pressure: true airway pressure at each step, cmH2O.
+        u_in: inspiratory valve as applied, %.
+    """
 
     pressure: Array
     u_in: Array

@@ -1,4 +1,4 @@
-"""One cell of a score: what is asked of the controller and how the bench deviates from nominal."""
+"""Cells of a score: the pressures asked for, and the deviations of the ventilator from nominal."""
 
 from __future__ import annotations
 

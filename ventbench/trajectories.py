@@ -1,4 +1,4 @@
-"""What happened in a scored run: arrays over lungs, PIPs and time, and their file."""
+"""Trajectories of a scored run: arrays over lungs, PIPs and time, and their file."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ class Trajectories:
         pips: cmH2O, length P.
         time: since the start of the run, s, shape ``(T,)``.
         target: target pressure, cmH2O, shape ``(L, P, T)``.
-        pressure: true airway pressure, cmH2O, likewise.
-        u_in: inspiratory valve as applied, %, likewise.
-        u_out: expiratory valve, 0/1, likewise.
+        pressure: true airway pressure, cmH2O, shape ``(L, P, T)``.
+        u_in: inspiratory valve as applied, %, shape ``(L, P, T)``.
+        u_out: expiratory valve, 0/1, shape ``(L, P, T)``.
     """
 
     name: str
@@ -192,8 +192,8 @@ def load(path: Path) -> Trajectories:
             return Trajectories(
                 name=str(npz["name"]),
                 track=str(npz["track"]),
-                lungs=tuple(str(x) for x in npz["lungs"]),
-                pips=tuple(float(x) for x in npz["pips"]),
+                lungs=tuple(str(lung) for lung in npz["lungs"]),
+                pips=tuple(float(pip) for pip in npz["pips"]),
                 **{k: npz[k] for k in ("time", "target", "pressure", "u_in", "u_out")},
             )
     # What np.load raises for a text, an empty or cut-off file, and for a plain array (TypeError).

@@ -1,1 +1,1 @@
-"""Controllers: what they are, the PID, the hard-coded expiration."""
+"""Pure controllers, a family a file, and the fixed commands of the expiration."""

@@ -1,4 +1,4 @@
-"""The hard-coded controller of the expiratory phase (paper, section 4.3; authors' code)."""
+"""The fixed commands of the expiratory phase (paper, section 4.3; authors' code)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The PID that all of the field compares with."""
+"""The PID, the baseline of the field."""
 
 from __future__ import annotations
 
@@ -14,7 +14,13 @@ TIME_CONSTANT = 0.5
 
 @flax.struct.dataclass
 class PIDState:
-    """Averages of a PID: proportional error of the step before, I and D term, cmH2O, ``(...)``."""
+    """Averages of a PID.
+
+    Attributes:
+        error: of the previous step, cmH2O, shape ``(...)``.
+        integral: leaky integral of the error, cmH2O, shape ``(...)``.
+        derivative: smoothed difference of the error, cmH2O, shape ``(...)``.
+    """
 
     error: Array
     integral: Array
@@ -30,7 +36,9 @@ class PID:
     from zero at every breath.
 
     Attributes:
-        P: proportional gain, %/cmH2O, shape ``(...)``; so ``I`` and ``D``.
+        P: proportional gain, %/cmH2O, shape ``(...)``.
+        I: integral gain, %/cmH2O, shape ``(...)``.
+        D: derivative gain, %/cmH2O, shape ``(...)``.
     """
 
     P: Array | float
@@ -43,7 +51,7 @@ class PID:
         return PIDState(zero, zero, zero)
 
     def step(self, state: PIDState, observation: Observation) -> tuple[PIDState, Array]:
-        """One control step; see the class."""
+        """Return the next state and ``u_in``, %, shape ``(...)``."""
         restart = observation.time == 0
         before, integral, derivative = (
             jnp.where(restart, 0.0, leaf)

@@ -1,4 +1,4 @@
-"""A PID and a network that corrects it, which looks back at this breath and at the one before.
+"""A PID with a correction by a network that sees this breath and the previous one.
 
 Its weights file is an ``.npz`` of plain arrays, as the submissions read it. For each network, by
 the id of its lung or ``all``: ``ID.gains`` (P, I, D), ``ID.limit``, ``ID.windows`` (pressures,
@@ -36,19 +36,22 @@ _STEPS = protocol.INSPIRATION_STEPS
 
 @flax.struct.dataclass
 class ResidualState:
-    """What the controller remembers; every array has shape ``(...)`` unless it says otherwise.
+    """Memory of the controller.
 
     Attributes:
-        pid: of the PID.
-        begun: 0 before the first breath, then 1.
-        known: whether there was a breath before this one, 0/1.
-        errors: of the last steps of this breath, the latest first, cmH2O, ``(..., pressures)``.
-        commands: likewise as applied, %, ``(..., commands)``.
+        pid: state of the PID.
+        begun: 0 before the first breath, then 1, shape ``(...)``.
+        known: whether there was a previous breath, 0/1, shape ``(...)``.
+        errors: in the last steps of this breath, the latest first, cmH2O, ``(..., pressures)``.
+        commands: as applied in the last steps, the latest first, %, ``(..., commands)``.
         error_trace: errors of the last 34 steps, the latest last, cmH2O, ``(..., 34)``.
-        command_trace: likewise, %; the command of a step is known one step later, so that the
-            first entry is the bias flow before the breath.
-        error_before: errors of the breath before from this step on, ``(..., 34 + ahead)``.
-        command_before: likewise.
+        command_trace: commands of the last 34 steps, the latest last, %, ``(..., 34)``. The command
+            of a step is known one step later, so that the first entry is the bias flow before the
+            breath.
+        error_before: errors of the previous breath from this step on, cmH2O,
+            ``(..., 34 + ahead)``.
+        command_before: commands of the previous breath from this step on, %,
+            ``(..., 34 + ahead)``.
     """
 
     pid: PIDState
@@ -66,17 +69,17 @@ class ResidualState:
 class Residual:
     """``u_in = PID + limit tanh(network(features))``, %.
 
-    Features: the PID's error, integral and derivative; the target; time in breath and control step;
-    errors and applied commands of the last steps; errors and commands of the breath before at this
-    step and at the next ones, zero in the first breath.
+    The features are the PID's error, integral and derivative; the target; time in breath and
+    control step; errors and applied commands of the last steps; and errors and commands of the
+    previous breath at this step and at the next ones, which are zero in the first breath.
 
     Attributes:
         pid: gains of shape ``()``.
-        layers: of the network, tanh between them; the last has one output.
-        pressures: how many errors before the present one it sees.
-        commands: how many commands.
-        ahead: how many steps of the breath before; 0 for a network without that memory.
-        limit: the largest correction, %.
+        layers: dense layers of the network, tanh between them; the last has one output.
+        pressures: number of earlier errors that the network sees.
+        commands: number of earlier commands that it sees.
+        ahead: number of steps of the previous breath that it sees; 0 for none.
+        limit: largest correction, %.
     """
 
     pid: PID
@@ -103,14 +106,14 @@ class Residual:
         )
 
     def step(self, state: ResidualState, observation: Observation) -> tuple[ResidualState, Array]:
-        """One control step."""
+        """Return the next state and ``u_in``, %, shape ``(...)``."""
         state, base, correction = self.parts(state, observation)
         return state, base + correction
 
     def parts(
         self, state: ResidualState, observation: Observation
     ) -> tuple[ResidualState, Array, Array]:
-        """Like :meth:`step`, with the PID's command and its correction, %, apart."""
+        """Return the next state, the PID's command and the correction of it, %, shape ``(...)``."""
         error = observation.target - observation.pressure
         state = self._begin(state, observation, error)
         pid, base = self.pid.step(state.pid, observation)
@@ -150,7 +153,7 @@ class Residual:
         return state, base, correction
 
     def _begin(self, state: ResidualState, seen: Observation, error: Array) -> ResidualState:
-        """Where a breath begins, the trace of the last one becomes what is known of it."""
+        """Where a breath begins, turn the traces of the previous breath into its memory."""
         restart = seen.time + jnp.zeros_like(error) == 0
         wide = restart[..., None]
         room = jnp.zeros((*error.shape, self.ahead), error.dtype)
@@ -169,7 +172,7 @@ class Residual:
 
 
 def inputs(controller: Residual) -> int:
-    """How many features the network has."""
+    """Number of features that the network of a controller sees."""
     return 7 + controller.pressures + controller.commands + 2 * controller.ahead
 
 
@@ -182,12 +185,12 @@ def apply(layers: tuple[Layer, ...], x: Array) -> Array:
 
 
 def untrained(key: Array, like: Residual, widths: tuple[int, ...]) -> Residual:
-    """The controller with a new network that corrects nothing yet: its last layer is zero.
+    """Return a controller with a new network that corrects nothing yet: its last layer is zero.
 
     Args:
-        key: of the hidden layers' weights.
-        like: whose PID, windows and limit it has.
-        widths: of the hidden layers.
+        key: of the random weights of the hidden layers.
+        like: controller that gives PID, windows and limit.
+        widths: units of each hidden layer.
     """
     sizes = [inputs(like), *widths]
     layers = []
@@ -199,12 +202,12 @@ def untrained(key: Array, like: Residual, widths: tuple[int, ...]) -> Residual:
 
 
 def _push(value: Array, before: Array) -> Array:
-    """Latest first."""
+    """Put a value first and drop the last one."""
     return jnp.concatenate([value[..., None], before], axis=-1)[..., : before.shape[-1]]
 
 
 def _append(trace: Array, value: Array) -> Array:
-    """Latest last."""
+    """Put a value last and drop the first one."""
     return jnp.concatenate([trace, value[..., None]], axis=-1)[..., 1:]
 
 
@@ -245,7 +248,7 @@ def _read_network(arrays: Any, name: str) -> Residual:
         for k in range(count)
     )
     P, I, D = arrays[f"{name}.gains"]  # noqa: E741
-    pressures, commands, ahead = (int(x) for x in arrays[f"{name}.windows"])
+    pressures, commands, ahead = (int(size) for size in arrays[f"{name}.windows"])
     return Residual(
         PID(P, I, D),
         layers,

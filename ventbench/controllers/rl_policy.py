@@ -25,13 +25,13 @@ from ventbench.interfaces import Observation
 #: The PID that is corrected: the best single one of the grid for all six lungs, (P, I, D).
 GAINS = (6.0, 6.0, 0.3)
 
-#: Errors and commands before this step that are shown.
+#: Number of earlier errors, and of earlier commands, among the features.
 PAST = 4
 
 #: Number of features.
 FEATURES = 2 * PAST + 7
 
-#: What makes the features of the order of 1: cmH2O and %.
+#: Scales that bring the features to the order of 1: cmH2O, cmH2O and %.
 ERROR_SCALE, TARGET_SCALE, COMMAND_SCALE = 10.0, 40.0, 50.0
 
 
@@ -57,7 +57,7 @@ def init_features(shape: tuple[int, ...]) -> FeatureState:
 
 
 def features(state: FeatureState, observation: Observation) -> tuple[FeatureState, Array, Array]:
-    """Take in one observation.
+    """Features of an observation.
 
     Returns:
         The next state, the features, shape ``(..., FEATURES)``, and the command of the PID, clipped
@@ -96,7 +96,7 @@ class TanhNetwork(nn.Module):
 
     Attributes:
         widths: units of each hidden layer.
-        outputs: of the last layer.
+        outputs: units of the last layer.
         first: scale of the last layer's weights at the start; 0 for none.
     """
 
@@ -136,11 +136,11 @@ CHOICES = (
 
 @flax.struct.dataclass
 class GaussianPolicy:
-    """The PID plus the network's output, times :data:`SCALE`: the mean of a Gaussian policy.
+    """The PID plus :data:`SCALE` times the network's output, the mean of a Gaussian policy.
 
     Attributes:
-        parameters: of the network.
-        network: one output.
+        parameters: weights and biases of the network.
+        network: a network with one output.
     """
 
     parameters: Parameters
@@ -159,11 +159,11 @@ class GaussianPolicy:
 
 @flax.struct.dataclass
 class GreedyPolicy:
-    """The PID plus the choice of the highest value.
+    """The PID plus the correction to which the network gives the highest value.
 
     Attributes:
-        parameters: of the network.
-        network: one output for each of :data:`CHOICES`.
+        parameters: weights and biases of the network.
+        network: a network with one output for each of :data:`CHOICES`.
     """
 
     parameters: Parameters
@@ -186,7 +186,7 @@ def arrays(policies: Mapping[str, Any]) -> dict[str, np.ndarray]:
     Layer k does ``x @ wk + bk``, with tanh between the layers.
 
     Args:
-        policies: by the lung that they are for, ``all`` for one that does not know it.
+        policies: by lung id, or ``all`` for the policy that is not told the lung.
     """
     named = {}
     for name, policy in policies.items():

@@ -1,4 +1,4 @@
-"""What is computed from pressures and commands: numpy, float64, vectorised, one idea a file.
+"""Metrics of pressures and commands in numpy: float64, vectorised over any batch shape.
 
 - :mod:`~ventbench.metrics.open_loop`: distance of a simulator to recordings;
 - :mod:`~ventbench.metrics.waveform`: the score;

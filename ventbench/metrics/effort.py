@@ -1,4 +1,4 @@
-"""What a controller asks of the inspiratory valve."""
+"""Effort: the commands that a controller gives to the inspiratory valve."""
 
 from __future__ import annotations
 

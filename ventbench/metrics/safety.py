@@ -1,4 +1,4 @@
-"""Pressures that a patient must not see."""
+"""Safety: time above the alarm limit, and the safety gate of the protocol."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def time_above_alarm(pressure: ArrayLike, pip: ArrayLike, dt: ArrayLike) -> NDAr
     Args:
         pressure: true airway pressure, cmH2O, shape ``(..., T)``.
         pip: cmH2O, shape ``(...)`` or broadcast against it.
-        dt: time between samples, s, likewise.
+        dt: time between samples, s, shape ``(...)`` or broadcast against it.
 
     Returns:
         Shape ``(...)``; NaN if a pressure is.
@@ -57,7 +57,7 @@ def safe(pressure: ArrayLike, pip: ArrayLike, dt: ArrayLike) -> NDArray[np.bool_
     Args:
         pressure: true airway pressure, cmH2O, shape ``(..., T)``.
         pip: cmH2O, shape ``(...)`` or broadcast against it.
-        dt: time between samples, s, likewise.
+        dt: time between samples, s, shape ``(...)`` or broadcast against it.
 
     Returns:
         Shape ``(...)``; false if a pressure is NaN.

@@ -1,4 +1,4 @@
-"""Secondary figures of one inspiration as the answer to a step from PEEP to PIP.
+"""Figures of an inspiration as the response to a step from PEEP to PIP.
 
 Everywhere ``pressure`` (cmH2O) has shape ``(..., T)``: one sample at each step of an inspiration,
 the first at its start, ``dt`` s apart. ``peep``, ``pip`` (cmH2O) and ``dt`` (s) have the shape

@@ -37,6 +37,6 @@ def lung_score(errors: ArrayLike) -> NDArray[np.float64]:
         errors: cmH2O, shape ``(..., P)``.
 
     Returns:
-        cmH2O, shape ``(...)``; NaN if one of them is.
+        cmH2O, shape ``(...)``; NaN if one of the errors is.
     """
     return np.mean(np.asarray(errors, float), axis=-1)

@@ -1,7 +1,7 @@
-"""Where jobs run: in this process, in processes beside it, or on a Dask cluster.
+"""Executors: this process, processes beside it, or a Dask cluster.
 
-All three are a :class:`concurrent.futures.Executor`. What is run must be a function of a module,
-its arguments small and made of numpy arrays.
+All three are a :class:`concurrent.futures.Executor`. A job must be a function of a module with
+small arguments made of numpy arrays.
 """
 
 from __future__ import annotations
@@ -93,12 +93,12 @@ def results(
     function: Callable[..., ResultT],
     jobs: Mapping[str, tuple[Any, ...]],
 ) -> Iterator[tuple[str, ResultT]]:
-    """Run jobs and tell each one's result once, as they end.
+    """Run jobs and yield the name and the result of each as it ends.
 
     Args:
-        pool: where.
-        function: what.
-        jobs: arguments of each, by name.
+        pool: executor.
+        function: what every job runs.
+        jobs: arguments of each job, by name.
 
     Raises:
         InputError: if a worker process has died.

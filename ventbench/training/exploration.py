@@ -30,7 +30,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class ExplorationRanges:
-    """How one lung is explored.
+    """Exploration of one lung.
 
     Attributes:
         gains: P, I, D of the PID, %/cmH2O.
@@ -49,7 +49,7 @@ class ExplorationRanges:
     boundary_share: float = 0.25
 
 
-#: The paper's table.
+#: The paper's table, by lung id.
 RANGES = {
     "R5C10": ExplorationRanges((1.0, 0.5, 0.0), (50.0, 100.0), (0.3, 0.6), (-20.0, 40.0)),
     "R5C20": ExplorationRanges((1.0, 3.0, 0.0), (50.0, 100.0), (0.4, 0.8), (-20.0, 60.0)),
@@ -62,10 +62,10 @@ RANGES = {
 
 @dataclass(frozen=True, eq=False)
 class Disturbance:
-    """One a breath; every array has shape ``(n,)``.
+    """Disturbances of n breaths; every array has shape ``(n,)``.
 
     Attributes:
-        boundary: of which kind.
+        boundary: whether it is a boundary disturbance; else a triangular one.
         u: the largest of what is added, %.
         begin: where it begins, s; 0 for a boundary.
         end: where it ends, s.
@@ -77,7 +77,7 @@ class Disturbance:
     end: Floats
 
     def at(self, time: float) -> Floats:
-        """What is added to the PID's command, %, ``(n,)``."""
+        """Disturbance at a time of the breath, s, added to the PID's command, %, ``(n,)``."""
         width = self.end - self.begin
         falling = (self.end - time) / width
         rising = (time - self.begin) / width
@@ -88,7 +88,7 @@ class Disturbance:
 def draw_disturbances(
     random: np.random.Generator, ranges: ExplorationRanges, n: int
 ) -> Disturbance:
-    """Draw disturbances; the ends of a triangular one are two times drawn from its range."""
+    """Draw n disturbances; a triangular one lies between two times drawn from its range."""
     boundary = random.random(n) < ranges.boundary_share
     u = np.where(
         boundary, random.uniform(*ranges.boundary_u, n), random.uniform(*ranges.triangular_u, n)
@@ -106,7 +106,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Limits:
-    """When exploring gives way.
+    """Pressures at which exploring is interrupted.
 
     Attributes:
         ease: the valve closes while the measured pressure is above ``min(60, PIP + 15)`` cmH2O or
@@ -122,10 +122,10 @@ class Limits:
 
 
 class Ventilator(Protocol):
-    """What can be explored, ``width`` lungs side by side; a ventilator has one.
+    """A ventilator, real or simulated, or several side by side.
 
     Attributes:
-        width: how many.
+        width: number of lungs side by side; 1 for a real ventilator.
         dt: control step, s.
     """
 
@@ -145,10 +145,10 @@ class SimulatedVentilator:
     """A plant as a ventilator.
 
     Args:
-        plant: one lung.
+        plant: plant of one lung.
         width: breaths side by side.
         noise: standard deviation of the sensor's noise, cmH2O.
-        seed: of the noise.
+        seed: seed of the noise.
     """
 
     def __init__(self, plant: Plant, width: int, *, noise: float = 0.0, seed: int = 0) -> None:
@@ -192,7 +192,7 @@ def explore(
         ventilator: see :class:`Ventilator`.
         lung_id: the setting of its lung, written with the breaths.
         breaths: how many.
-        seed: of all disturbances; the same ones for the same seed and width.
+        seed: seed of all disturbances, which are the same for the same seed and width.
         ranges: the paper's for that lung if not given.
         limits: see :class:`Limits`.
         pips: cmH2O.
@@ -215,10 +215,10 @@ def explore(
     while done < breaths and vented < limits.vented:
         pip = np.array([pips[(done + k) % len(pips)] for k in range(ventilator.width)])
         added = draw_disturbances(random, ranges, ventilator.width)
-        found = _breaths(ventilator, pip, peep, ranges, limits, added)
-        columns.append(found)
+        made = _breaths(ventilator, pip, peep, ranges, limits, added)
+        columns.append(made)
         done += ventilator.width
-        vented += int(np.sum(found[1][:, : protocol.INSPIRATION_STEPS].any(axis=1)))
+        vented += int(np.sum(made[1][:, : protocol.INSPIRATION_STEPS].any(axis=1)))
     together = zip(*columns, strict=True)
     u_in, u_out, pressure = (np.concatenate(column)[:breaths] for column in together)
     n = len(u_in)

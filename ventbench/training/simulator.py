@@ -67,8 +67,8 @@ class TrainingRecordings:
     Attributes:
         measured: m breaths.
         reconstructed: breaths whose pressures were computed from the commands.
-        fold: of each measured breath, ``(m,)``.
-        seed: of the folds.
+        fold: fold of each measured breath, ``(m,)``.
+        seed: seed of the folds.
     """
 
     measured: Breaths
@@ -111,12 +111,12 @@ def train_simulator(
         ventbench.score("pid_best", simulator="runs/simulators")
 
     Args:
-        folder: of the public recordings.
+        folder: folder of the public recordings.
         out: where the files are written; those that are there are replaced at the end.
         config: settings of the hybrid's fit.
         network_config: settings of the networks' training.
-        architecture: of the networks.
-        members: of the ensemble, each without one fold of the measured breaths.
+        architecture: sizes of the networks.
+        members: members of the ensemble, each without one fold of the measured breaths.
         progress: see :data:`Progress`.
 
     Returns:
@@ -227,7 +227,7 @@ def train_network(
         setting: one of the recorded lung settings.
         number: of the network: that of the setting among all, plus their count times the member;
             also the seed. A member does not see the measured breaths of the fold of its number.
-        architecture: of the network.
+        architecture: sizes of the network.
         config: settings of the training.
         checkpoint: see :func:`~ventbench.training.learned.fit`.
     """
@@ -283,7 +283,7 @@ def provenance(
 def evaluate_simulators(
     simulators: frozen.Frozen, learned: frozen.FrozenLearned, data: TrainingRecordings
 ) -> dict[str, Any]:
-    """Test simulators on the measured breaths.
+    """Errors of simulators on the measured breaths.
 
     Returns:
         ``lungs``: for each of the six, its R, C, reference session, and the open-loop errors, see
@@ -300,7 +300,7 @@ def evaluate_simulators(
         "single_compartment": partial(nominal_plants, single_compartment),
         "two_balloon": partial(nominal_plants, two_balloon),
     }
-    found = {
+    errors = {
         kind: open_loop_report.errors(plants_for, measured) for kind, plants_for in kinds.items()
     }
     lungs = {}
@@ -312,19 +312,19 @@ def evaluate_simulators(
             "R": setting.R,
             "C": setting.C,
             "session": reference_session(simulators.sessions, name),
-            **_figures("held_out_", found["hybrid"][index]),
+            **_figures("held_out_", errors["hybrid"][index]),
             **_figures("official_", official[index][new]),
             **_figures("training_", official[index][~new]),
         }
     comparison = {
         kind: {name: _figures("", error[index]) for name, index in measured.by_lung_index.items()}
-        for kind, error in found.items()
+        for kind, error in errors.items()
     }
     return {"lungs": lungs, "comparison": comparison}
 
 
 def reference_session(table: Sessions, lung_id: str) -> int:
-    """The session that stands for a lung: the one with the most breaths, the first of equals."""
+    """Index of the session that stands for a lung: the first with the most breaths."""
     counts = [session.breaths if session.lung == lung_id else -1 for session in table.table]
     return int(np.argmax(counts))
 

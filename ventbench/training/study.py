@@ -64,7 +64,7 @@ class LearningCurve:
 
     Attributes:
         method: name.
-        episodes: breaths seen by one training, ``(points,)``.
+        episodes: breaths that one training has seen, ``(points,)``.
         seconds: for all seeds together, without compiling, ``(points,)``.
         compile_seconds: before that.
         scores: nominal, cmH2O, ``(seeds, points)``.
@@ -83,19 +83,19 @@ class LearningCurve:
 
     def first_below(self, score: float) -> int | None:
         """Index of the first point whose interquartile mean is at or below a score."""
-        found = np.flatnonzero(self.middle <= score)
-        return int(found[0]) if found.size else None
+        points = np.flatnonzero(self.middle <= score)
+        return int(points[0]) if points.size else None
 
 
 @dataclass(frozen=True)
 class SampleStudy:
-    """All methods on one lung, and what PID does there.
+    """Learning curves of all methods on one lung, and the scores of PIDs there.
 
     Attributes:
         lung: its id.
-        curves: of the methods.
+        curves: learning curves of the methods.
         start: nominal score of the PID that is corrected, cmH2O.
-        best_pid: of the best PID of the paper's grid on this lung, cmH2O.
+        best_pid: nominal score of the best PID of the paper's grid on this lung, cmH2O.
     """
 
     lung: str
@@ -187,10 +187,10 @@ def sample_efficiency(
     distributions and are judged by the score without noise.
 
     Args:
-        lung: one of the six.
-        seeds: of the trainings.
+        lung: one of the six scored lungs.
+        seeds: one for each training of a method.
         out: folder of the checkpoints, ``samples.csv`` and ``summary.csv``.
-        share: of the full length of each training.
+        share: share of the full length of each training.
         simulators: what is ventilated; the frozen simulators if not given.
         progress: see :data:`Progress`.
 
@@ -199,8 +199,8 @@ def sample_efficiency(
     """
     simulators = simulators or frozen.load()
     at = LUNG_IDS.index(lung.id)
-    one = jax.tree.map(lambda leaf: leaf[at : at + 1], simulators.plants)
-    plants = jax.tree.map(lambda leaf: np.repeat(leaf[None], len(seeds), axis=0), one)
+    single = jax.tree.map(lambda leaf: leaf[at : at + 1], simulators.plants)
+    plants = jax.tree.map(lambda leaf: np.repeat(leaf[None], len(seeds), axis=0), single)
     curves = []
     for name, recipe in study_methods(share).items():
         trained = train(
@@ -213,7 +213,7 @@ def sample_efficiency(
             progress=lambda done, error, name=name: progress(name, done, float(error.mean())),
         )
         curves.append(_curve(name, trained))
-    grid = pid_grid.errors(one, pid_grid.paper_gains())[0].mean(axis=-1)
+    grid = pid_grid.errors(single, pid_grid.paper_gains())[0].mean(axis=-1)
     study = SampleStudy(lung.id, tuple(curves), float(curves[0].scores[0, 0]), float(grid.min()))
     files.write_text(out / "samples.csv", study.points().to_csv(index=False))
     files.write_text(out / "summary.csv", study.summary().to_csv(index=False))

@@ -87,6 +87,8 @@ def test_controllers_are_compared(tmp_path):
     assert np.all(np.isfinite(runs[list(controllers.FIGURES)]))
     assert [share for _, share in told] == sorted(share for _, share in told)
     assert not list(tmp_path.glob("rows/*.npz"))
+    header = "variant,seed,nominal,draws,exploitation\n"
+    assert (tmp_path / "runs.csv").read_text().startswith(header)
     before = (tmp_path / "summary.csv").read_bytes()
     told.clear()
     pd.testing.assert_frame_equal(compare(), runs)
@@ -161,13 +163,22 @@ def test_networks_need_recordings(tmp_path):
 
 
 def test_controllers_by_the_command(tmp_path, monkeypatch):
+    asked = {}
+
+    def compare(simulators, out, seeds, **options):
+        asked.update(options, seeds=list(seeds))
+        names = ("base", "no agreement")
+        figures = dict.fromkeys(controllers.FIGURES, 2.0)
+        return pd.DataFrame([{"variant": name, "seed": 0} | figures for name in names])
+
     monkeypatch.setattr("ventbench.plants.frozen.load", Textbook)
-    monkeypatch.setattr(controllers, "best_single", lambda simulators: GAINS)
-    out = tmp_path / "out"
-    asked = ["study", "controllers", "--seeds", "1", "--updates", "1", "--only", "no agreement"]
-    result = CliRunner().invoke(app, [*asked, "--out", str(out), "--json", str(tmp_path / "x")])
+    monkeypatch.setattr(controllers, "compare", compare)
+    given = ["study", "controllers", "--seeds", "1", "--updates", "7", "--only", "no agreement"]
+    paths = ["--out", str(tmp_path / "out"), "--json", str(tmp_path / "x")]
+    result = CliRunner().invoke(app, [*given, *paths])
     assert result.exit_code == 0, result.output
     assert "no agreement" in result.output
+    assert (asked["seeds"], asked["only"]) == ([0], ["no agreement"])
+    assert asked["config"].updates == 7
     found = json.loads((tmp_path / "x").read_text())
     assert [row["variant"] for row in found["variants"]] == ["base", "no agreement"]
-    assert (out / "runs.csv").read_text().startswith("variant,seed,nominal,draws,exploitation\n")

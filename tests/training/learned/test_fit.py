@@ -15,6 +15,8 @@ from ventbench.training.learned.data import expiratory_time_constant, inspiratio
 from ventbench.training.learned.fit import CHUNK, LearnedConfig, fit, horizon
 
 SHAPE = Architecture(pressures=3, controls=4, width=24, depth=3, boundary_width=8)
+#: Shared, so that it is compiled once.
+LONG = LearnedConfig(steps=600)
 SHORT = LearnedConfig(steps=2 * CHUNK + 20, batch=8)
 T = 31
 OFF = (jnp.asarray(1.05), jnp.asarray(0.95))
@@ -43,7 +45,7 @@ def equal(a, b) -> bool:
 
 @pytest.fixture(scope="module")
 def trained():
-    return fit(*recordings(60), architecture=SHAPE, config=LearnedConfig(steps=600), tau=0.2)
+    return fit(*recordings(60), architecture=SHAPE, config=LONG, tau=0.2)
 
 
 @pytest.mark.parametrize("interval", [0.0319, 0.034, 0.030])
@@ -103,9 +105,7 @@ def test_missing_pressures_are_masked():
     u_in, u_out, dt, pressure = recordings(60)
     holes = pressure.copy()
     holes[np.random.default_rng(5).uniform(size=pressure.shape) < 0.3] = np.nan
-    plant = fit(
-        u_in, u_out, dt, holes, architecture=SHAPE, config=LearnedConfig(steps=300), tau=0.2
-    )
+    plant = fit(u_in, u_out, dt, holes, architecture=SHAPE, config=LONG, tau=0.2)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(plant))
     assert error(plant, recordings(30, seed=1)) < 0.7
 

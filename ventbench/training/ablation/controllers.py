@@ -32,7 +32,7 @@ DRAWS = 20
 #: Name of the variant that all others are compared with.
 BASE = "base"
 
-#: Figures of one training.
+#: Figures by which trainings are compared.
 FIGURES = ("nominal", "draws", "exploitation")
 
 #: Called with what is trained and the share of all that is done.
@@ -46,7 +46,7 @@ class Variant:
     """One way to train.
 
     Attributes:
-        meaning: in words.
+        meaning: the variant in words.
         config: settings of the training.
         direct: whether the network commands alone, without a PID to correct.
     """
@@ -101,7 +101,7 @@ def compare(
     Args:
         simulators: to train through and to score on.
         out: folder.
-        seeds: of the trainings.
+        seeds: one for each training of a variant.
         config: settings of the base.
         only: names of variants; all if not given. The base is always included.
         draws: published draws to score on.
@@ -150,7 +150,7 @@ def best_single(simulators: frozen.Frozen) -> Gains:
     """P, I, D of the paper's grid with the lowest mean error over the six lungs."""
     grid = pid_grid.paper_gains()
     error = pid_grid.errors(simulators.plants, grid).mean(axis=(0, 2))
-    P, I, D = (float(x) for x in grid[int(np.argmin(error))])  # noqa: E741
+    P, I, D = (float(gain) for gain in grid[int(np.argmin(error))])  # noqa: E741
     return P, I, D
 
 
@@ -201,7 +201,7 @@ def score_controllers(
 
     Args:
         simulators: six lungs.
-        controllers: one a lung.
+        controllers: one for each lung.
         pips: cmH2O, length P.
         draws: published draws to score on as well.
 

@@ -30,7 +30,7 @@ Progress = Callable[[str, float], None]
 
 
 def variants(base: Architecture) -> dict[str, Architecture]:
-    """Architectures by name, each other in one thing than the base."""
+    """Architectures by name; each differs from the base in one thing."""
     changes: list[tuple[str, dict[str, int]]] = [
         *((f"H_p {n}", {"pressures": n}) for n in (1, 2, 10)),
         *((f"H_c {n}", {"controls": n}) for n in (1, 3, 20)),
@@ -57,9 +57,9 @@ def compare(
     ``out``, where ``breaths.csv`` and ``summary.csv`` are written.
 
     Args:
-        folder: of the public recordings.
+        folder: folder of the public recordings.
         out: folder.
-        base: architecture that the others differ from in one thing.
+        base: architecture from which all others differ in one thing.
         config: settings of all trainings.
         members: folds of the measured breaths, and networks of each lung.
         only: names of variants; all if not given. The base is always included.

@@ -20,16 +20,17 @@ SAMPLES = 33
 
 @flax.struct.dataclass
 class InspirationData:
-    """n inspirations, float64; what comes after the inspiration is not counted.
+    """n inspirations, float64; samples after the inspiration do not count.
 
     Attributes:
         groups: setting, kind of rig and session.
         start: first pressure, cmH2O, ``(n,)``; 0 where unknown.
         start_known: whether it was measured, ``(n,)``.
         u_in: commands, %, ``(n, SAMPLES - 1)``.
-        dt: time for which each is held, s, likewise.
-        pressure: at the end of each, cmH2O, likewise; 0 where it does not count.
-        share: weight of each in its breath's mean, adding up to one, likewise.
+        dt: time for which each command is held, s, ``(n, SAMPLES - 1)``.
+        pressure: at the end of each command, cmH2O, ``(n, SAMPLES - 1)``; 0 where it has no weight.
+        share: weight of each pressure in the mean of its breath, ``(n, SAMPLES - 1)``; the weights
+            of a breath add up to one.
     """
 
     groups: Groups
@@ -42,7 +43,7 @@ class InspirationData:
 
 
 def groups_of(breaths: Breaths, sessions: Sessions) -> Groups:
-    """To which setting, kind of rig and session each breath belongs.
+    """Setting, kind of rig and session of each breath.
 
     Raises:
         InputError: a lung was never recorded, or there are too many sessions.
@@ -102,11 +103,11 @@ class WholeBreaths:
     Attributes:
         groups: setting, kind of rig and session.
         pressure: cmH2O, shape ``(n, T)``.
-        u_in: %, likewise.
-        u_out: 0/1, likewise.
-        dt: s, likewise.
-        share: weight of each sample in its breath's error, likewise: the inspiration adds up to
-            one, and so does the expiration; all 0 for a breath that cannot be used.
+        u_in: inspiratory valve, %, shape ``(n, T)``.
+        u_out: expiratory valve, 0/1, shape ``(n, T)``.
+        dt: time for which each command is held, s, shape ``(n, T)``.
+        share: weight of each sample in the error of its breath, shape ``(n, T)``: the inspiration
+            adds up to one, and so does the expiration; all 0 for a breath that cannot be used.
     """
 
     groups: Groups
@@ -118,7 +119,7 @@ class WholeBreaths:
 
 
 def whole_breaths(breaths: Breaths, sessions: Sessions) -> WholeBreaths:
-    """Arrange whole breaths; one without a first pressure or an expiration counts for nothing."""
+    """Arrange whole breaths; a breath without a first pressure or an expiration has no weight."""
     known = breaths.valid & np.isfinite(breaths.pressure)
     opened = known & (breaths.u_out == 1)
     usable = known[:, :1] & opened.any(axis=1, keepdims=True)
@@ -126,7 +127,9 @@ def whole_breaths(breaths: Breaths, sessions: Sessions) -> WholeBreaths:
     for part in (opened, known & (breaths.u_out == 0)):
         share += usable * part / np.maximum(part.sum(axis=1, keepdims=True), 1)
     arrays = (np.nan_to_num(breaths.pressure), breaths.u_in, breaths.u_out, breaths.dt, share)
-    return WholeBreaths(groups_of(breaths, sessions), *(jnp.asarray(x, float) for x in arrays))
+    return WholeBreaths(
+        groups_of(breaths, sessions), *(jnp.asarray(array, float) for array in arrays)
+    )
 
 
 def _first(values: NDArray, fill: float) -> NDArray:

@@ -39,7 +39,7 @@ CHUNK = 20
 
 @dataclass(frozen=True)
 class HybridConfig:
-    """How a member is fitted; hashable, as it is part of what is compiled.
+    """Settings of the fit of a member; hashable, since they are static in compiled functions.
 
     Attributes:
         iterations: of Adam, a multiple of ``CHUNK``.
@@ -68,7 +68,7 @@ class HybridConfig:
 
 @flax.struct.dataclass
 class Unknowns:
-    """All that is fitted: the pooled parameters and first pressures (``(n,)``, cmH2O)."""
+    """Everything that is fitted: the pooled parameters and the first pressures, cmH2O, ``(n,)``."""
 
     pooled: Pooled
     start: Array
@@ -138,8 +138,8 @@ def fit(
 
     Args:
         data: from :func:`~ventbench.training.hybrid.data.inspirations`.
-        weight: of each breath, shape ``(n,)``; 0 leaves it out.
-        config: how.
+        weight: weight of each breath, shape ``(n,)``; 0 leaves it out.
+        config: settings of the fit.
         progress: called with iterations done and the loss, cmH2O.
 
     Returns:
@@ -163,7 +163,7 @@ def mean_absolute_errors(pooled: Pooled, data: InspirationData, config: HybridCo
     return jnp.sum(data.share * jnp.abs(errors(unknowns, data, config)), axis=1)
 
 
-#: What this stage changes, and how far each is believed to move, the deviation of its logarithm.
+#: Parameters that the second stage fits, and the prior standard deviation of their logarithms.
 EXPIRATORY_WIDTHS = {"conductance": 1.0, "session_conductance": 0.3, "opening_delay": 0.7}
 
 EXPIRATORY_ITERATIONS, EXPIRATORY_LEARNING_RATE = 80, 0.05
@@ -178,8 +178,8 @@ def fit_expiration(
     Args:
         pooled: from :func:`fit`.
         data: from :func:`whole_breaths`.
-        weight: of each breath, shape ``(n,)``; 0 leaves it out.
-        config: as of the first stage.
+        weight: weight of each breath, shape ``(n,)``; 0 leaves it out.
+        config: settings of the first stage.
 
     Returns:
         The parameters with those of :data:`EXPIRATORY_WIDTHS` moved.
@@ -192,8 +192,8 @@ def fit_expiration(
 
     def loss(moved: dict[str, Array]) -> Array:
         plant = plants(replace(pooled, **moved), data.groups, directed=config.directed)
-        found = open_loop(plant, data.pressure[:, 0], data.u_in, data.u_out, data.dt)
-        error = jnp.where(data.share > 0, found - data.pressure, 0.0)
+        simulated = open_loop(plant, data.pressure[:, 0], data.u_in, data.u_out, data.dt)
+        error = jnp.where(data.share > 0, simulated - data.pressure, 0.0)
         breath = jnp.sum(data.share * (jnp.sqrt(error**2 + soft**2) - soft), axis=1)
         breath = saturation * jnp.log1p(breath / saturation)
         moves = [
@@ -221,8 +221,8 @@ class TrainingSet:
     Attributes:
         inspirations: of the measured, then of the reconstructed breaths.
         whole: the measured breaths.
-        weight: of each inspiration, ``(n,)``.
-        fold: of each inspiration, -1 for a reconstructed one, ``(n,)``.
+        weight: weight of each inspiration, ``(n,)``.
+        fold: fold of each inspiration, -1 for a reconstructed breath, ``(n,)``.
     """
 
     inspirations: InspirationData

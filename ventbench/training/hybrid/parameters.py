@@ -27,7 +27,7 @@ DIRECTION_SUM = 0.98
 
 @flax.struct.dataclass
 class Groups:
-    """To which setting, kind of rig and session each breath belongs, ints, shape ``(n,)``."""
+    """Setting, kind of rig and session of each breath, as indices, shape ``(n,)``."""
 
     lung: Array
     rig: Array
@@ -39,8 +39,8 @@ class Pooled:
     """Unconstrained parameters; L settings, G kinds of rig, J sessions. Logarithms unless said.
 
     Attributes:
-        slopes: of the valve's curve, L/s per %, shape ``(13,)``.
-        slopes_rig: added for a kind of rig, ``(G, 13)``.
+        slopes: slopes of the valve's curve, L/s per %, shape ``(13,)``.
+        slopes_rig: added to the slopes for a kind of rig, ``(G, 13)``.
         R: laminar resistance, cmH2O s/L, ``(L,)``.
         K2: quadratic resistance, cmH2O s2/L2, ``(L,)``.
         E: elastance, cmH2O/L, ``(L,)``.
@@ -49,22 +49,22 @@ class Pooled:
         direction: odds of the plays' weights, ``(G, 3)``.
         rising: cmH2O, ``(G,)``.
         falling: cmH2O, ``(G,)``.
-        valve_delay: s, ``(G,)``; so are the five that follow.
-        valve_lag: s.
-        sensor_lag: s.
-        closing_delay: s.
-        opening_delay: s.
+        valve_delay: s, ``(G,)``.
+        valve_lag: s, ``(G,)``.
+        sensor_lag: s, ``(G,)``.
+        closing_delay: s, ``(G,)``.
+        opening_delay: s, ``(G,)``.
         circuit_compliance: L/cmH2O, ``(G,)``.
-        conductance: L/s per cmH2O, ``(G,)``.
-        closing_conductance: likewise.
+        conductance: of the open expiratory valve, L/s per cmH2O, ``(G,)``.
+        closing_conductance: while it closes, L/s per cmH2O, ``(G,)``.
         rest: %, ``()``.
         session_gain: added to all slopes, ``(J,)``.
         session_R: added to both resistances, ``(J,)``.
-        session_K2: added to the quadratic one, ``(J,)``.
+        session_K2: added to the quadratic resistance, ``(J,)``.
         session_E: added to the elastance, ``(J,)``.
         session_offset: added to the offset, cmH2O, no logarithm, ``(J,)``.
         session_conductance: added to the conductance, ``(J,)``.
-        session_closing_conductance: added to the closing one, ``(J,)``.
+        session_closing_conductance: added to the closing conductance, ``(J,)``.
     """
 
     slopes: Array
@@ -96,7 +96,7 @@ class Pooled:
 
 
 def initial() -> Pooled:
-    """Where every fit starts: the labels, and the data sheet's orders of magnitude."""
+    """Parameters at the start of every fit: labels, and the data sheet's orders of magnitude."""
     knots = len(VALVE_KNOTS)
     resistance = np.array([lung.R for lung in RECORDED_LUNGS])
     elastance = np.array([1000.0 / lung.C for lung in RECORDED_LUNGS])
@@ -214,15 +214,16 @@ PRIOR_WIDTHS = {
     "session_closing_conductance": 0.3,
 }
 
-#: Likewise between neighbouring slopes of the valve's curve, and of what a rig adds to them.
+#: Standard deviations of the difference between neighbouring slopes of the valve's curve, and
+#: between neighbouring additions of a rig to them.
 SMOOTHNESS, SMOOTHNESS_RIG = 0.5, 0.15
 
-#: Likewise of the plays' weights, and of the effects on the reading, cmH2O, around zero.
+#: Standard deviations around zero of the plays' weights, and of the effects on the reading, cmH2O.
 DIRECTION, READING = 0.2, 0.5
 
 
 def penalty(pooled: Pooled) -> Array:
-    """Negative logarithm of the prior, up to a constant."""
+    """Negative logarithm of the prior probability, up to a constant."""
     start = initial()
     squares = [
         jnp.sum(((getattr(pooled, name) - getattr(start, name)) / width) ** 2)

@@ -60,7 +60,7 @@ def inspirations(
         pressure: cmH2O, shape ``(n, T)``, NaN where blank. A blank first pressure takes the next
             one known, for the start alone.
         window: length of the pressure window.
-        weight: of each breath in the loss, shape ``(n,)``; one if not given.
+        weight: weight of each breath in the loss, shape ``(n,)``; 1 if not given.
 
     Raises:
         ValueError: if shapes differ, there is no breath, a breath has no inspiration or no pressure
@@ -98,9 +98,9 @@ def inspirations(
     steps = -(-steps // _PAD_STEPS) * _PAD_STEPS
     rows = -(-n // _PAD_BREATHS) * _PAD_BREATHS
 
-    def pad(x: NDArray[Any]) -> NDArray[Any]:
-        x = x[:, :steps]
-        return np.pad(x, ((0, rows - n), (0, steps - x.shape[1])))
+    def pad(values: NDArray[Any]) -> NDArray[Any]:
+        values = values[:, :steps]
+        return np.pad(values, ((0, rows - n), (0, steps - values.shape[1])))
 
     # Before the first sample the windows hold the start, as a lung at rest does.
     past = np.concatenate([np.repeat(start[:, None], window, axis=1), pressure[:, 1:-1]], axis=1)

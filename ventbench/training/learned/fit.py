@@ -27,7 +27,7 @@ from ventbench.training.learned.data import (
 
 @dataclasses.dataclass(frozen=True)
 class LearnedConfig:
-    """How a learned plant is trained.
+    """Settings of the training of a learned plant.
 
     Attributes:
         steps: updates; the schedules stretch over them.
@@ -197,17 +197,17 @@ def fit(
 
     Bit-reproducible on one machine: every random number comes from ``seed`` and the number of
     the update, so that an interrupted training continues as if it had not been. Mind the leak
-    told in :class:`~ventbench.plants.learned.Learned`.
+    described in :class:`~ventbench.plants.learned.Learned`.
 
     Args:
         u_in: inspiratory valve, %, shape ``(n, T)``.
         u_out: expiratory valve, 0/1, shape ``(n, T)``.
         dt: time from each sample to the next, s, shape ``(n, T)``.
         pressure: cmH2O, shape ``(n, T)``, NaN where blank.
-        architecture: of the network.
+        architecture: sizes of the network.
         config: settings of the training.
-        seed: of the weights, the batches and the noise; one a member of an ensemble.
-        weight: of each breath, shape ``(n,)``.
+        seed: seed of weights, batches and noise; each member of an ensemble has its own.
+        weight: weight of each breath, shape ``(n,)``.
         tau: time constant of expiration, s; fitted to the expirations if not given.
         checkpoint: file that the training is saved to every ``CHUNK`` updates and resumed from;
             deleted at the end.

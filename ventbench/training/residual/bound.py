@@ -1,4 +1,4 @@
-"""How low an error can be at all: commands found for each cell alone, with the lung known."""
+"""Lower bounds of the error: commands optimised for each cell alone, with the lung known."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ _STEPS = protocol.INSPIRATION_STEPS
 
 
 def rise(plants: Plant, pips: tuple[float, ...] = protocol.PIPS) -> NDArray[np.float64]:
-    """What the rise alone costs: the valve is fully open from the first step on.
+    """Error that the rise of the pressure costs: the valve is fully open from the first step on.
 
-    No command brings more flow, so that no controller has a smaller error, if a higher command
-    never means a lower pressure.
+    No command brings more flow. If a higher command never means a lower pressure, no controller has
+    a smaller error.
 
     Args:
         plants: leaves ``(L, ...)``.
         pips: cmH2O, P of them.
 
     Returns:
-        Mean of what is missing to PIP, cmH2O, shape ``(L, P)``.
+        Mean of the pressure that is missing to PIP, cmH2O, shape ``(L, P)``.
     """
     with precision.float64():
         cells = nominal(np.asarray(pips))
         lungs = jax.tree.leaves(plants)[0].shape[0]
         full = jnp.full((lungs, len(pips), _STEPS), protocol.U_MAX)
-        found = _all_pressures(jax.tree.map(jnp.asarray, plants), cells, full)
-        missing = np.maximum(np.asarray(pips)[:, None] - np.asarray(found), 0.0)
+        pressures = _all_pressures(jax.tree.map(jnp.asarray, plants), cells, full)
+        missing = np.maximum(np.asarray(pips)[:, None] - np.asarray(pressures), 0.0)
     return missing.mean(axis=-1)
 
 
@@ -50,7 +50,7 @@ def reached(
 ) -> NDArray[np.float64]:
     """Least error that a gradient search finds for the commands of each cell, open loop.
 
-    The simulator and everything that it will do are known to it, which no controller can say.
+    The search knows the simulator and its future, which no controller does.
 
     Args:
         plants: leaves ``(L, ...)``.
@@ -60,19 +60,19 @@ def reached(
     Returns:
         cmH2O, shape ``(L, P)``.
     """
-    found = []
+    errors = []
     with precision.float64():
         plants = jax.tree.map(jnp.asarray, plants)
         cells = nominal(np.asarray(pips))
         shape = (jax.tree.leaves(plants)[0].shape[0], len(pips), _STEPS)
         for opened in STARTS:
             start = jnp.broadcast_to(jnp.where(jnp.arange(_STEPS) < opened, 2.0, -2.5), shape)
-            found.append(np.asarray(_search(plants, cells, start, iterations)))
-    return np.min(found, axis=0)
+            errors.append(np.asarray(_search(plants, cells, start, iterations)))
+    return np.min(errors, axis=0)
 
 
 def _pressures(plant: Plant, cells: Scenario, u_in: Array) -> Array:
-    """Of one inspiration, cmH2O, ``(P, steps)``, from commands likewise."""
+    """Pressures of one inspiration, cmH2O, from commands, %; both ``(P, steps)``."""
     varied = env.vary(plant, cells)
 
     def step(loop: env.LoopState, u_in: Array) -> tuple[env.LoopState, Array]:

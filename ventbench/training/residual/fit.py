@@ -34,24 +34,24 @@ from ventbench.scenario import Scenario
 
 @dataclass(frozen=True)
 class ResidualConfig:
-    """How a residual controller is trained; hashable, as it is part of what is compiled.
+    """Settings of the training of residual controllers; hashable, since they are static in ``jit``.
 
     Attributes:
-        updates: of the network; the schedule stretches over them.
+        updates: number of updates of the network; the schedule stretches over them.
         copies: runs of each lung at each PIP in an update: the first on the official simulator
-            without noise, the others on deviating benches.
+            without noise, the others with random deviations.
         learning_rate: peak of the cosine schedule of Adam.
-        weight_decay: of its weights.
+        weight_decay: decay of the network's weights.
         lam: weight of the mean absolute correction, cmH2O for each %; the paper's lambda.
         agreement: weight of the disagreement of the ensemble along the controller's own commands;
-            0 to let it live on what one simulator alone says.
-        first_breath: weight of the breath that is not scored; each scored one has 1.
-        widths: of the network's hidden layers.
-        pressures: errors of earlier steps that it sees.
-        commands: earlier commands that it sees.
-        ahead: steps of the breath before that it sees; 0 for none.
+            0 to train on the official simulator's response alone.
+        first_breath: weight of the breath that is not scored; each scored breath has 1.
+        widths: units of the network's hidden layers.
+        pressures: number of earlier errors that it sees.
+        commands: number of earlier commands that it sees.
+        ahead: number of steps of the previous breath that it sees; 0 for none.
         limit: largest correction, %.
-        members: of the ensemble of simulators, 1 (the official ones) to 5.
+        members: members of the simulators' ensemble, 1 (the official ones) to 5.
         spread: how far deviations reach, as a multiple of the draws' ranges; 0 for none.
         round_robin: whether each update takes one lung at one PIP, in turn, as in the paper,
             instead of all of them.
@@ -108,7 +108,7 @@ def _valve_forward(u_in: Array) -> tuple[Array, Array]:
 
 
 def _valve_backward(u_in: Array, gradient: Array) -> tuple[Array]:
-    # Beyond an end only what a step down the gradient can mend is told.
+    # Beyond an end of the range only a gradient that leads back into it passes.
     stuck = ((u_in > protocol.U_MAX) & (gradient < 0)) | ((u_in < 0) & (gradient > 0))
     return (jnp.where(stuck, 0.0, gradient),)
 
@@ -122,7 +122,7 @@ class DifferentiableRun:
 
     Attributes:
         pressure: true, cmH2O.
-        correction: of the PID's command, %.
+        correction: correction of the PID's command, %.
         u_in: command as applied, %.
     """
 
@@ -132,11 +132,11 @@ class DifferentiableRun:
 
 
 def run(controller: Residual, plant: Plant, cell: Scenario) -> DifferentiableRun:
-    """Run a controller.
+    """Run a controller through three inspirations.
 
     Args:
-        controller: which.
-        plant: one lung.
+        controller: the controller.
+        plant: plant of one lung.
         cell: one cell, batch shape ``()``.
     """
     varied = env.vary(plant, cell)
@@ -156,9 +156,9 @@ def run(controller: Residual, plant: Plant, cell: Scenario) -> DifferentiableRun
 
     count = jnp.arange(protocol.BREATHS * protocol.INSPIRATION_STEPS)
     at = (count // protocol.INSPIRATION_STEPS, count % protocol.INSPIRATION_STEPS)
-    _, found = jax.lax.scan(step, (controller.init(()), start), at)
+    _, steps = jax.lax.scan(step, (controller.init(()), start), at)
     shape = (protocol.BREATHS, protocol.INSPIRATION_STEPS)
-    return jax.tree.map(lambda x: x.reshape(shape), found)
+    return jax.tree.map(lambda leaf: leaf.reshape(shape), steps)
 
 
 def objective(
@@ -167,7 +167,7 @@ def objective(
     """Mean of ``|pressure - PIP| + lam |correction|`` over inspirations and runs.
 
     Args:
-        controller: which.
+        controller: the controller.
         plants: leaves ``(n, ...)``.
         cells: batch shape ``(n,)``.
         first_breath: weight of the first breath; the others have 1.
@@ -176,24 +176,24 @@ def objective(
     Returns:
         The loss, cmH2O, and the applied commands, %, ``(n, BREATHS, INSPIRATION_STEPS)``.
     """
-    found = jax.vmap(run, (None, 0, 0))(controller, plants, cells)
+    runs = jax.vmap(run, (None, 0, 0))(controller, plants, cells)
     scored = jnp.isin(jnp.arange(protocol.BREATHS), jnp.array(protocol.SCORED_BREATHS))
     weight = jnp.where(scored, 1.0, first_breath)[:, None]
-    each = jnp.abs(found.pressure - cells.pip[:, None, None]) + lam * jnp.abs(found.correction)
-    return jnp.mean(each * weight) / jnp.mean(weight), found.u_in
+    each = jnp.abs(runs.pressure - cells.pip[:, None, None]) + lam * jnp.abs(runs.correction)
+    return jnp.mean(each * weight) / jnp.mean(weight), runs.u_in
 
 
 def disagreement(ensemble: Plant, cells: Scenario, u_in: Array) -> Array:
-    """How far the members of an ensemble answer differently to the same commands.
+    """Disagreement of the members of an ensemble about the response to the same commands.
 
     Args:
         ensemble: leaves ``(members, n, ...)``, two members at least.
         cells: batch shape ``(n,)``.
-        u_in: of one inspiration, %, shape ``(n, INSPIRATION_STEPS)``.
+        u_in: commands of one inspiration, %, shape ``(n, INSPIRATION_STEPS)``.
 
     Returns:
         Sample standard deviation over members of the pressure, mean over steps and cells, cmH2O:
-        the exploitation index, but for one breath.
+        the exploitation index of one breath.
     """
 
     def pressures(plant: Plant, cell: Scenario, u_in: Array) -> Array:
@@ -305,7 +305,7 @@ def fit(
             out.
         gains: P, I, D of the PID, %/cmH2O; they stay.
         config: settings of the training.
-        seed: of the weights and the benches.
+        seed: seed of the weights and the random deviations.
         checkpoint: file that the training is saved to every ``CHUNK`` updates and resumed from;
             deleted at the end.
         progress: called after every ``CHUNK`` updates.

@@ -56,22 +56,22 @@ class DQNState:
 
 @dataclass(frozen=True)
 class DQN:
-    """Recipe; one iteration is some breaths into the replay, then some updates.
+    """Settings; one iteration is some breaths into the replay, then some updates.
 
     Attributes:
-        breaths: in an iteration.
-        iterations: of the whole training; the learning rate falls to zero over them.
-        learning_rate: of Adam, at the start.
+        breaths: breaths of an iteration.
+        iterations: iterations of a training, over which the learning rate falls to zero.
+        learning_rate: initial learning rate of Adam.
         vary: draw cells with noise and deviations; false for nominal ones.
         widths: hidden layers of the network.
-        updates: in an iteration.
-        batch: steps in an update.
+        updates: updates of an iteration.
+        batch: steps of an update.
         memory: breaths that the replay holds.
-        discount: of a reward one step later.
-        steps: rewards that are summed before the network is asked.
-        follow: share by which the target network follows at each update.
-        explore: share of random choices: at first, at the end.
-        explored: share of the training after which exploration has come to its end.
+        discount: factor of a reward one step later.
+        steps: rewards that are summed before the value of the next state is added.
+        follow: share by which the target network moves to the online network at each update.
+        explore: share of random choices, at the start and at the end.
+        explored: share of the training after which exploration has reached its end.
     """
 
     breaths: int = 24
@@ -99,7 +99,7 @@ class DQN:
         return optax.chain(optax.clip_by_global_norm(10.0), optax.adam(schedule))
 
     def init(self, key: Array) -> DQNState:
-        """Start one training."""
+        """Return the state at the start of a training."""
         network_key, key = jax.random.split(key)
         parameters = rl_policy.init_parameters(self.network, network_key)
         size = self.memory * episodes.STEPS
@@ -132,7 +132,7 @@ class DQN:
         return DQNState(online, target, optimiser, replay, key, state.iteration + 1)
 
     def policy(self, state: DQNState) -> GreedyPolicy:
-        """What has been learned: the choices of the target network, which is the smoother one."""
+        """Policy so far: the choices of the target network, the smoother of the two."""
         return GreedyPolicy(state.target, self.network)
 
     def _values(self, parameters: Any, x: Array) -> Array:

@@ -20,7 +20,7 @@ from ventbench.draws import random_scenarios
 from ventbench.interfaces import Plant
 from ventbench.scenario import Scenario
 
-#: Commands of a breath that matter: the last one moves no pressure that is scored.
+#: Commands of an episode; the last command of a breath moves no pressure that is scored.
 STEPS = protocol.INSPIRATION_STEPS - 1
 
 #: Error that costs a reward of 1, cmH2O.
@@ -37,7 +37,7 @@ def sample(
     """Draw cells of one breath each, with the deviations of the published draws.
 
     Args:
-        key: of the random numbers.
+        key: key of the random numbers.
         count: number of cells E.
         lungs: cells of that many lungs in turn get the same nominal PIP.
         first: which of the six PIPs comes first.
@@ -88,7 +88,7 @@ def errors(plants: Plant, controller: Any, cells: Scenario, count: int) -> Array
 
     Args:
         plants: leaves ``(L, ...)``, the lungs of the cells in turn.
-        controller: a pure one that starts anew at each breath.
+        controller: pure controller that starts anew at each breath.
         cells: ``count`` of them.
         count: number of cells.
     """
@@ -121,8 +121,8 @@ def advantages(rewards: Array, values: Array, discount: float, trace: float) -> 
 
     Args:
         rewards: after each command, shape ``(T, ...)``.
-        values: estimated before each command, likewise.
-        discount: of a reward one step later.
+        values: estimated before each command, shape ``(T, ...)``.
+        discount: factor of a reward one step later.
         trace: lambda, 0 for one-step differences, 1 for returns minus values.
 
     Returns:
@@ -141,13 +141,13 @@ def n_step(rewards: Array, discount: float, n: int) -> Array:
 
 
 def double_q_target(reward: Array, discount: Array, online: Array, target: Array) -> Array:
-    """What the value of a choice should be: the online network chooses, the target one judges.
+    """Target of the value of a choice: the online network chooses, the target network evaluates.
 
     Args:
         reward: shape ``(...)``.
-        discount: of what follows, 0 at the end of an episode, likewise.
+        discount: factor of what follows, 0 at the end of an episode, shape ``(...)``.
         online: values of the following choices, shape ``(..., choices)``.
-        target: likewise.
+        target: values by the target network, shape ``(..., choices)``.
     """
     choice = jnp.argmax(online, axis=-1, keepdims=True)
     return reward + discount * jnp.take_along_axis(target, choice, axis=-1)[..., 0]

@@ -24,7 +24,7 @@ from ventbench.training.rl import episodes
 
 
 class Method(Protocol):
-    """A recipe: hashable, so that it can be a static argument of ``jit``; its methods are pure."""
+    """Settings of a way of learning: hashable, static in ``jit``; its methods are pure."""
 
     @property
     def breaths(self) -> int:
@@ -33,7 +33,7 @@ class Method(Protocol):
 
     @property
     def iterations(self) -> int:
-        """Of the whole training."""
+        """Iterations of a training."""
         ...
 
     def init(self, key: Array) -> Any:
@@ -77,7 +77,7 @@ class TrainedPolicies:
         validation: their errors on fresh cells with noise, cmH2O, ``(R,)``.
         episodes: breaths that a run had seen at each point of its curve, ``(points,)``.
         curves: nominal error of the policy then, cmH2O, ``(R, points)``.
-        validation_curves: likewise on the fresh cells.
+        validation_curves: error of the policy on the fresh cells, cmH2O, ``(R, points)``.
         seconds: for all runs together until each point, without compiling, ``(points,)``.
         compile_seconds: for compiling, before that, with the chunk that is run to that end.
     """
@@ -113,7 +113,7 @@ def _fresh_error(plants: Plant, policy: Any) -> Array:
 def _advance(method: Method, runs: _Run, plants: Plant, count: int) -> tuple[_Run, Array]:
     """``count`` iterations of each run, then both errors, shape ``(R, 2)``."""
 
-    def one(run: _Run, plant: Plant) -> tuple[_Run, Array]:
+    def advance(run: _Run, plant: Plant) -> tuple[_Run, Array]:
         def iterate(state: Any, _: None) -> tuple[Any, None]:
             return method.iterate(state, plant), None
 
@@ -125,7 +125,7 @@ def _advance(method: Method, runs: _Run, plants: Plant, count: int) -> tuple[_Ru
         errors = jnp.stack([nominal_error(plant, policy), fresh])
         return _Run(state, best, jnp.where(better, fresh, run.error)), errors
 
-    return jax.vmap(one)(runs, plants)
+    return jax.vmap(advance)(runs, plants)
 
 
 def _start(method: Method, seeds: Sequence[int], plants: Plant) -> tuple[_Run, NDArray[np.float32]]:
@@ -156,7 +156,7 @@ def train(
     Args:
         method: the recipe, common to all.
         plants: lungs of each run, leaves ``(R, L, ...)``; taken in float32.
-        seeds: one a run.
+        seeds: one for each run.
         chunk: iterations between two points of the curves.
         about: text that tells one training from another, such as the simulators' hash.
         file: checkpoint that is resumed from and written to; kept at the end.

@@ -34,12 +34,12 @@ class PolicyGradientState:
 
 @dataclass(frozen=True)
 class PolicyGradient:
-    """Recipe; one iteration is one update.
+    """Settings; one iteration is one update.
 
     Attributes:
-        breaths: in an update, PIPs in turn.
-        iterations: of the whole training; the learning rate falls to zero over them.
-        learning_rate: of Adam, at the start.
+        breaths: breaths of an update, PIPs in turn.
+        iterations: iterations of a training, over which the learning rate falls to zero.
+        learning_rate: initial learning rate of Adam.
         vary: draw cells with noise and deviations; false for nominal ones.
         widths: hidden layers of the network.
     """
@@ -61,7 +61,7 @@ class PolicyGradient:
         return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
 
     def init(self, key: Array) -> PolicyGradientState:
-        """Start one training."""
+        """Return the state at the start of a training."""
         network_key, key = jax.random.split(key)
         parameters = rl_policy.init_parameters(self.network, network_key)
         return PolicyGradientState(

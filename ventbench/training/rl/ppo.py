@@ -43,7 +43,7 @@ class PPOBatch:
 
 
 def log_probability(action: Array, mean: Array, log_spread: Array) -> Array:
-    """Of a Gaussian, up to a constant."""
+    """Logarithm of a Gaussian density, up to a constant."""
     return -0.5 * ((action - mean) / jnp.exp(log_spread)) ** 2 - log_spread
 
 
@@ -55,20 +55,20 @@ def clipped_loss(ratio: Array, advantage: Array, clip: float) -> Array:
 
 @dataclass(frozen=True)
 class PPO:
-    """Recipe; one iteration is one batch of breaths, used ``epochs`` times.
+    """Settings; one iteration is one batch of breaths, used ``epochs`` times.
 
     Attributes:
-        breaths: in an iteration.
-        iterations: of the whole training; the learning rate falls to zero over them.
-        learning_rate: of Adam, at the start.
+        breaths: breaths of an iteration.
+        iterations: iterations of a training, over which the learning rate falls to zero.
+        learning_rate: initial learning rate of Adam.
         vary: draw cells with noise and deviations; false for nominal ones.
         widths: hidden layers of both networks.
         epochs: passes over a batch.
-        minibatches: of a pass.
-        discount: of a reward one step later.
-        trace: lambda of the advantages.
-        clip: of the ratio of probabilities.
-        spread: standard deviation at the start, in units of ``SCALE``.
+        minibatches: minibatches of a pass.
+        discount: factor of a reward one step later.
+        trace: lambda of the generalised advantage estimates.
+        clip: limit of the change of the ratio of probabilities.
+        spread: initial standard deviation of the policy, in units of ``SCALE``.
         entropy: weight of the entropy in the loss.
     """
 
@@ -87,7 +87,7 @@ class PPO:
 
     @property
     def network(self) -> TanhNetwork:
-        """Of the policy: the mean."""
+        """Network of the policy's mean."""
         return TanhNetwork(self.widths, 1)
 
     @property
@@ -101,7 +101,7 @@ class PPO:
         return optax.chain(optax.clip_by_global_norm(0.5), optax.adam(schedule, eps=1e-5))
 
     def init(self, key: Array) -> PPOState:
-        """Start one training."""
+        """Return the state at the start of a training."""
         actor_key, critic_key, key = jax.random.split(key, 3)
         parameters = {
             "actor": rl_policy.init_parameters(self.network, actor_key),

@@ -141,6 +141,17 @@ class Simulators:
             raise InputError(f"{self._without_plants} It cannot run in a closed loop.")
         return self._stack()
 
+    @property
+    def ensemble(self) -> Plant:
+        """Plants of all members, leaves ``(members, L, ...)``; one member if there is no ensemble.
+
+        Raises:
+            InputError: as :attr:`stacked`.
+        """
+        if self.kind == "frozen" and self._training is not None:
+            return self._training.ensemble
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], self.stacked)
+
     def plant(self, lung_id: str) -> Plant:
         """Return the plant of one lung.
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jax import Array
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ventbench import environment as env
 from ventbench import files, protocol
@@ -199,7 +199,7 @@ def tune_pid(
     lungs: Sequence[str] = LUNG_IDS,
     out: Path | str | None = None,
     *,
-    gains: NDArray[np.float64] | None = None,
+    gains: ArrayLike | None = None,
     workers: int = 0,
     scheduler: str | None = None,
     each: bool = True,
@@ -208,11 +208,6 @@ def tune_pid(
     progress: Progress | None = None,
 ) -> tuple[PIDGrid, dict[str, Any]]:
     """Run every PID of a grid on simulators without noise, and name the best gains.
-
-    Example::
-
-        grid, result = ventbench.tune_pid(["R20C50"])
-        grid.best("R20C50")  # (P, I, D) in %/cmH2O, error in cmH2O
 
     Args:
         lungs: ids.
@@ -232,8 +227,15 @@ def tune_pid(
         The grid, and the content of ``best.json``: see :meth:`PIDGrid.summary`.
 
     Raises:
-        InputError: if a lung is unknown, ``out`` holds an unfinished search with other settings, or
-            a worker died.
+        InputError: if a lung or a simulator is unknown, ``out`` holds an unfinished search with
+            other settings, or a worker died.
+
+    Example:
+        >>> from ventbench import tune_pid
+        >>> gains = [(2.0, 4.0, 0.0), (5.0, 5.0, 0.0)]  # %/cmH2O
+        >>> grid, result = tune_pid(["R20C50"], simulator="physics", gains=gains)
+        >>> grid.best("R20C50")[0]
+        (2.0, 4.0, 0.0)
     """
     names = tuple(scored_lung(name).id for name in lungs)
     simulators = load_simulators(simulator)
@@ -244,7 +246,7 @@ def tune_pid(
             plants,
             settings=dict(simulators.about),
             folder=parts,
-            gains=gains,
+            gains=None if gains is None else np.asarray(gains, float),
             pool=pool,
             progress=progress,
         )

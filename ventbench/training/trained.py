@@ -9,8 +9,10 @@ from typing import Any
 
 import pandas as pd
 
+from ventbench.errors import InputError
 from ventbench.interfaces import Controller
 from ventbench.lungs import LUNG_IDS, scored_lung
+from ventbench.plants.catalog import Given, Simulators, load_simulators
 
 #: Name of the network that serves all six lungs and is not told which one it ventilates.
 ALL = "all"
@@ -49,3 +51,19 @@ def check_names(names: Sequence[str]) -> tuple[str, ...]:
         InputError: if a name is neither.
     """
     return tuple(name if name == ALL else scored_lung(name).id for name in names)
+
+
+def simulators_to_train_on(simulator: Given) -> Simulators:
+    """Return simulators of the six scored lungs.
+
+    Raises:
+        InputError: if there are no such simulators, or none of one of the six lungs.
+    """
+    simulators = load_simulators(simulator)
+    names = tuple(lung.id for lung in simulators.lungs)
+    if names != LUNG_IDS:
+        raise InputError(
+            f"training needs plants of {', '.join(LUNG_IDS)} in this order; the simulators "
+            f"{simulators.name} have {', '.join(names) or 'none'}"
+        )
+    return simulators

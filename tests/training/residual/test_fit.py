@@ -57,15 +57,6 @@ def lungs(count: int, scale: float = 1.0):
     return made.vary(jnp.full(count, scale), jnp.ones(count))
 
 
-class Textbook:
-    """R-C lungs in place of the frozen simulators."""
-
-    ensemble = stack([lungs(6), lungs(6, 1.2)])
-
-    def about(self) -> dict[str, Any]:
-        return {"version": "textbook"}
-
-
 @pytest.fixture(scope="module")
 def ensemble():
     """Two members of two lungs."""
@@ -328,13 +319,17 @@ def test_the_command_takes_one_lung_or_all():
 
 @pytest.mark.slow
 def test_an_interrupted_training_continues_to_the_same_bytes(tmp_path):
-    simulators: Any = Textbook()
     config = replace(SMALL, updates=2 * CHUNK)
     names = ("R5C10", ALL)
 
     def go(folder, report=None):
         return train_residual(
-            names, folder, config=config, gains=PIDS, simulators=simulators, progress=report
+            names,
+            folder,
+            config=config,
+            gains=PIDS,
+            simulator="single_compartment",
+            progress=report,
         )
 
     whole = go(tmp_path / "whole")

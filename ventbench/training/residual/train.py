@@ -18,12 +18,12 @@ from ventbench.controllers.residual import save_weights
 from ventbench.interfaces import Controller, Plant
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics.waveform import run_error
-from ventbench.plants import frozen
+from ventbench.plants.catalog import Given
 from ventbench.plants.stacking import take
 from ventbench.scenario import nominal
 from ventbench.training.pid_grid import search
 from ventbench.training.residual.fit import ResidualConfig, fit
-from ventbench.training.trained import ALL, TrainedControllers, check_names
+from ventbench.training.trained import ALL, TrainedControllers, check_names, simulators_to_train_on
 
 #: Files that are written.
 WEIGHTS, RESULT, PARTS = "weights.npz", "training.json", "parts"
@@ -39,7 +39,7 @@ def train_residual(
     config: ResidualConfig | None = None,
     seed: int = 0,
     gains: NDArray[np.float64] | None = None,
-    simulators: frozen.Frozen | None = None,
+    simulator: Given = "frozen",
     progress: Progress | None = None,
 ) -> TrainedControllers:
     """Train corrections of the best PIDs by differentiating through simulators.
@@ -59,26 +59,27 @@ def train_residual(
         seed: of the weights and the random deviations, common to all networks.
         gains: grid of P, I, D, %/cmH2O, shape ``(G, 3)``, of which each network corrects the best
             PID; the paper's grid if not given.
-        simulators: ensemble to train through; the frozen simulators if not given.
+        simulator: simulators with plants of the six lungs to train through, see
+            :func:`ventbench.load_simulators`; all members of the ensemble if there is one.
         progress: see :data:`Progress`.
 
     Returns:
         The controllers, float32, and the report.
 
     Raises:
-        InputError: if a network's name is unknown, or ``out`` holds an unfinished training with
-            other settings.
+        InputError: if a network's name or a simulator is unknown, or ``out`` holds an unfinished
+            training with other settings.
         FloatingPointError: if a training diverges.
     """
     names, out = check_names(networks), Path(out)
-    simulators = simulators or frozen.load()
+    simulators = simulators_to_train_on(simulator)
     config, progress = config or ResidualConfig(), progress or (lambda what, how_far: None)
     progress("PID grid", None)
     ensemble = simulators.ensemble
     official = jax.tree.map(lambda leaf: np.asarray(leaf)[0], ensemble)
     lungs = {name: take(official, index) for index, name in enumerate(LUNG_IDS)}
     wanted = lungs if ALL in names else {name: lungs[name] for name in names}
-    grid = search(wanted, settings=simulators.about(), gains=gains)
+    grid = search(wanted, settings=simulators.about, gains=gains)
     controllers, about = {}, {}
     for name in names:
         best, _ = grid.best(None if name == ALL else name)
@@ -106,7 +107,7 @@ def train_residual(
         "networks": about,
         "recipe": dataclasses.asdict(config),
         "seed": seed,
-        "simulators": dict(simulators.about()),
+        "simulators": dict(simulators.about),
         "weights_sha256": files.sha256(out / WEIGHTS),
     }
     files.write_json(out / RESULT, report)

@@ -17,13 +17,20 @@ from ventbench.controllers import rl_policy
 from ventbench.controllers.pid import PID
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS
-from ventbench.plants import frozen
+from ventbench.plants.catalog import Given
+from ventbench.resume import fingerprint
 from ventbench.training.rl import episodes
 from ventbench.training.rl.dqn import DQN
 from ventbench.training.rl.parallel import TrainedPolicies, nominal_error, train
 from ventbench.training.rl.policy_gradient import PolicyGradient
 from ventbench.training.rl.ppo import PPO
-from ventbench.training.trained import ALL, NETWORKS, TrainedControllers, check_names
+from ventbench.training.trained import (
+    ALL,
+    NETWORKS,
+    TrainedControllers,
+    check_names,
+    simulators_to_train_on,
+)
 
 #: Names of the methods, as commands and tables have them.
 METHODS = ("policy-gradient", "ppo", "dqn")
@@ -51,7 +58,7 @@ def train_ppo(
     seeds: Sequence[int] = (0, 1),
     steps: int | None = None,
     method: PPO | None = None,
-    simulators: frozen.Frozen | None = None,
+    simulator: Given = "frozen",
     progress: Progress | None = None,
 ) -> TrainedControllers:
     """Train corrections of a PID by proximal policy optimisation.
@@ -72,7 +79,7 @@ def train_ppo(
         steps: control steps of experience of each training; those of the method if not given.
         method: settings of every training; the published ones, which differ for one lung and for
             all six, if not given.
-        simulators: what is ventilated; the frozen simulators if not given.
+        simulator: simulators with plants of the six lungs, see :func:`ventbench.load_simulators`.
         progress: see :data:`Progress`.
 
     Returns:
@@ -83,7 +90,7 @@ def train_ppo(
             holds an unfinished training with other settings.
         FloatingPointError: if a training diverges.
     """
-    return _train("ppo", networks, out, seeds, steps, method, simulators, progress)
+    return _train("ppo", networks, out, seeds, steps, method, simulator, progress)
 
 
 def train_dqn(
@@ -93,7 +100,7 @@ def train_dqn(
     seeds: Sequence[int] = (0, 1),
     steps: int | None = None,
     method: DQN | None = None,
-    simulators: frozen.Frozen | None = None,
+    simulator: Given = "frozen",
     progress: Progress | None = None,
 ) -> TrainedControllers:
     """Train a choice among 19 corrections of a PID by deep Q-learning.
@@ -106,7 +113,7 @@ def train_dqn(
         trained = ventbench.train_dqn(["R20C50"], "runs/mine", steps=60_000)
         trained.report["networks"]["R20C50"]["error_fresh"]  # cmH2O, by seed
     """
-    return _train("dqn", networks, out, seeds, steps, method, simulators, progress)
+    return _train("dqn", networks, out, seeds, steps, method, simulator, progress)
 
 
 def method_for(name: str, lungs: int, steps: int | None = None) -> Method:
@@ -152,7 +159,7 @@ def _groups(names: Sequence[str]) -> list[_Group]:
 
 def _train(
     name: str, networks: Sequence[str], out: Path | str, seeds: Sequence[int], steps: int | None,
-    method: Method | None, simulators: frozen.Frozen | None, progress: Progress | None,
+    method: Method | None, simulator: Given, progress: Progress | None,
 ) -> TrainedControllers:  # fmt: skip
     began = time.perf_counter()
     groups, out = _groups(check_names(networks)), Path(out)
@@ -160,19 +167,19 @@ def _train(
         method_for(name, group.lungs, steps) if method is None else _shortened(method, name, steps)
         for group in groups
     ]
-    simulators, report = simulators or frozen.load(), progress or (lambda *_: None)
+    simulators, report = simulators_to_train_on(simulator), progress or (lambda *_: None)
     policies, about, checkpoints, used = {}, {}, [], {}
     for group, settings in zip(groups, methods, strict=True):
         label = ALL if group.lungs > 1 else ", ".join(group.names)
         kind = "all" if group.lungs > 1 else "one"
         checkpoints.append(out / f".{name}-{kind}.npz")
-        plants = _plants(simulators.plants, group, len(seeds))
+        plants = _plants(simulators.stacked, group, len(seeds))
         trained = train(
             settings,
             plants,
             [seed for _ in group.names for seed in seeds],
             chunk=CHUNKS[name],
-            about=f"{group.names} {simulators.manifest_sha256}",
+            about=f"{group.names} {fingerprint(plants)}",
             file=checkpoints[-1],
             progress=lambda share, best, label=label: report(label, share, float(best.mean())),
         )
@@ -186,7 +193,7 @@ def _train(
         "method": name,
         "recipes": used,
         "networks": about,
-        "simulators": simulators.about(),
+        "simulators": dict(simulators.about),
         "jax": jax.__version__,
         "seconds": round(time.perf_counter() - began, 1),
     }

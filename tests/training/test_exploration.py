@@ -191,7 +191,7 @@ def test_the_command_line_explores_a_simulator(tmp_path, plant):
 def test_the_command_line_says_what_cannot_be_explored(tmp_path):
     none = CliRunner().invoke(app, ["data", "explore", str(tmp_path / "x.csv"), "--lung", "R9C9"])
     assert isinstance(none.exception, InputError)
-    assert "--lung R9C9: frozen has R5C10" in str(none.exception)
+    assert "--lung R9C9: the simulators frozen have R5C10" in str(none.exception)
     other = CliRunner().invoke(app, ["data", "explore", str(tmp_path / "x.txt")])
     assert isinstance(other.exception, InputError)
     assert not list(tmp_path.iterdir())

@@ -19,7 +19,7 @@ from ventbench.validation.challenge.make import make
 from ventbench.validation.challenge.reveal import reveal
 from ventbench.validation.challenge.rig import record
 
-from .truths import Found, mechanism, request, sees_nothing
+from .truths import GivenDiagnosis, mechanism, request, sees_nothing
 from .truths import answer as made_up
 
 SECRET = "for the test"
@@ -47,7 +47,7 @@ def answered(made):
     def knows(breaths, lung):
         assert set(breaths.lung_ids) == {lung}
         named = [mechanism(name, "inertance") for name in names[breaths.sha256]]
-        return Found(made_up("named", *named)["diagnosis"], request())
+        return GivenDiagnosis(made_up("named", *named)["diagnosis"], request())
 
     assert answer(folder, jobs=0, diagnose=knows) == {}
     return folder
@@ -114,7 +114,7 @@ def test_a_recording_that_cannot_be_read_does_not_stop_the_others(tmp_path):
     text = folder.recording("case_0001").read_text().splitlines()
     text[5] = text[5].rpartition(",")[0] + ",259.2"
     folder.recording("case_0001").write_text("\n".join(text) + "\n")
-    problems = answer(folder, jobs=0, diagnose=lambda breaths, lung: Found({"ok": True}))
+    problems = answer(folder, jobs=0, diagnose=lambda breaths, lung: GivenDiagnosis({"ok": True}))
     assert list(problems) == ["case_0001"]
     assert "column pressure: 259.2 is outside -20..120 cmH2O" in problems["case_0001"]
     assert list(folder.answers()) == ["case_0002"]
@@ -125,7 +125,7 @@ def test_the_one_who_knows_is_right(answered):
 
     def unneeded(breaths, lung):
         done.append(lung)
-        return Found({})
+        return GivenDiagnosis({})
 
     assert answer(answered, jobs=0, diagnose=unneeded) == {}
     assert not done  # nothing was left
@@ -152,7 +152,7 @@ def test_more_breaths_resolve(answered):
 
     def knows(breaths, lung):
         named = [mechanism(e.name) for e in truths[next(calls)].effects]
-        return Found(made_up("named", *named)["diagnosis"])
+        return GivenDiagnosis(made_up("named", *named)["diagnosis"])
 
     assert answer(second, jobs=0, diagnose=knows) == {}
     found = reveal(second, SECRET)

@@ -60,7 +60,7 @@ class Commands:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class GivenDiagnosis:
     """A diagnosis."""
 
     value: Any
@@ -78,6 +78,6 @@ def request(samples: int = 80) -> Commands:
     return Commands(u_in, u_out, np.full((2, samples), 0.033))
 
 
-def sees_nothing(breaths: Any, lung: str) -> Found:
+def sees_nothing(breaths: Any, lung: str) -> GivenDiagnosis:
     """A diagnosis that another process can be asked for."""
-    return Found(answer("nothing_missing")["diagnosis"])
+    return GivenDiagnosis(answer("nothing_missing")["diagnosis"])

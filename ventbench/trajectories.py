@@ -10,19 +10,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import files, precision, protocol, rollouts, scenario, waveform
+from ventbench import files, protocol, waveform
 from ventbench.errors import InputError
-from ventbench.interfaces import Controller, Plant
 from ventbench.metrics.waveform import run_error
-from ventbench.plants.catalog import Given, load_simulators
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from ventbench.interfaces import Controller, Plant
+    from ventbench.plants.catalog import Given
 
 Floats = NDArray[np.float64]
 
@@ -159,6 +158,13 @@ def rollout(
         >>> bool(run.errors().loc["R20C50", 20] < 10.0)
         True
     """
+    # Here, not above: who only reads and shows runs needs neither JAX nor a plant.
+    import jax
+    import jax.numpy as jnp
+
+    from ventbench import precision, rollouts, scenario
+    from ventbench.plants.catalog import load_simulators
+
     simulators = load_simulators(simulator)
     names = [entry.id for entry in simulators.lungs] if lungs is None else list(lungs)
     cells = tuple(float(pip) for pip in pips)

@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 
-import ventbench
 from ventbench.sandbox.child.zygote import (
     ENDED,
     INTERRUPT,
@@ -37,7 +36,7 @@ from ventbench.sandbox.child.zygote import (
 )
 from ventbench.sandbox.configuration import SandboxError
 
-_ROOT = str(Path(ventbench.__file__).resolve().parents[1])
+_ROOT = str(Path(__file__).resolve().parents[2])
 _SITE = str(Path(np.__file__).resolve().parents[1])
 
 #: Not -I, which would make it ignore the fixed hash seed: the environment holds nothing but this.

@@ -291,7 +291,7 @@ class Evaluator:
     def transferred_values(self, fitted: FittedModel, partition: Partition) -> Floats:
         """Values of shared parameters for other breaths of the same lungs, ``(n, P + 1)``.
 
-        Parameters that differ from breath to breath, or that the model's simulator does not have,
+        Parameters that differ from breath to breath, or that the model's predictor does not have,
         are neutral. Breaths start at their first reading.
 
         Args:

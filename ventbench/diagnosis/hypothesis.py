@@ -68,7 +68,7 @@ def varies_by_breath(name: str) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Partition:
-    """Breaths, such as the training breaths, with the simulator that predicts them."""
+    """Breaths, such as the training breaths, with the predictor of their readings."""
 
     data: Data
     predictor: Predictor
@@ -81,7 +81,7 @@ def make_partition(
 
     Args:
         data: the breaths.
-        names: paths of the simulator's parameters.
+        names: paths of the predictor's parameters.
         settings: give the number of breaths that are simulated at once.
     """
     return Partition(data, Predictor(data, names, sizes=(settings.data.batch_size,)))

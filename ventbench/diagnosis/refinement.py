@@ -10,7 +10,7 @@ else, a sum of mechanisms may imitate it. Four questions separate the two:
   input that explains what is left?
 - :func:`find_alternatives`: which other mechanism could take the place of a selected one?
 
-The ``evaluator`` has simulators with the library's parameters; ``wide`` is the same recording with
+The ``evaluator`` has predictors with the library's parameters; ``wide`` is the same recording with
 the parameters of the nonparametric terms as well, which take longer to compile.
 """
 

@@ -140,7 +140,7 @@ def score_nonparametric_terms(fitted: FittedModel, settings: SelectionConfig) ->
     """Rank the basis terms that a hypothesis does not have, the most promising first.
 
     Args:
-        fitted: the hypothesis, with a simulator that has the parameters of all candidates.
+        fitted: the hypothesis, with a predictor that has the parameters of all candidates.
         settings: every threshold.
     """
     missing = [name for name in nonparametric_terms(settings) if name not in fitted.names]

@@ -48,7 +48,7 @@ def controllers(
         )  # fmt: skip
     table = work.summary(runs)
     emit({"updates": updates, "variants": table.to_dict("records")}, json)
-    meanings = {name: one.meaning for name, one in known.items()}
+    meanings = {name: variant.meaning for name, variant in known.items()}
     rows = [
         (
             str(row["variant"]), meanings[str(row["variant"])],

@@ -108,10 +108,10 @@ def _trained(about: dict[str, Any]) -> Any:
     table = Table(title=title, caption="Fresh cells: with noise, drawn as the published ones are.")
     for name in ("network", "breaths", "the PID", "at the end", "fresh cells", "best seed"):
         table.add_column(name, justify="left" if name == "network" else "right")
-    for name, one in about["networks"].items():
-        ends, fresh = (_values(one[key]) for key in ("error_nominal_at_end", "error_fresh"))
-        row = (name, str(one["breaths"]), f"{one['error_pid']:.3f}", ends, fresh, str(one["seed"]))
-        table.add_row(*row)
+    for name, network in about["networks"].items():
+        ends, fresh = (_values(network[key]) for key in ("error_nominal_at_end", "error_fresh"))
+        breaths, pid = str(network["breaths"]), f"{network['error_pid']:.3f}"
+        table.add_row(name, breaths, pid, ends, fresh, str(network["seed"]))
     return table
 
 

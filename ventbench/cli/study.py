@@ -59,17 +59,17 @@ def samples(
             said = f"{method}: {best:.3f} cmH2O"
             shown.update(tasks[method], completed=done, description=said)
 
-        found = work.sample_efficiency(
+        result = work.sample_efficiency(
             scored_lung(lung), range(seeds), out, share=share, progress=progress
         )
     from ventbench.views import learning_curves
 
-    picture = learning_curves.png(found)
+    picture = learning_curves.png(result)
     files.write_atomically(out / "study-samples.png", lambda file: file.write(picture))
-    table = found.summary()
-    emit({"lung": found.lung, "methods": _plain(table)}, json)
+    table = result.summary()
+    emit({"lung": result.lung, "methods": _plain(table)}, json)
     console = Console(stderr=str(json) == "-")
-    console.print(_summary(found, table))
+    console.print(_summary(result, table))
     console.print(f"wrote {out}", markup=False, highlight=False)
 
 
@@ -79,13 +79,13 @@ def _plain(table: Any) -> list[dict[str, Any]]:
     return [{k: None if v != v else v for k, v in row.items()} for row in rows]
 
 
-def _summary(found: Any, frame: Any) -> Any:
+def _summary(result: Any, frame: Any) -> Any:
     from rich.table import Table
 
     caption = (
-        f"The PID that is corrected: {found.start:.3f}; best of the grid: {found.best_pid:.3f}."
+        f"The PID that is corrected: {result.start:.3f}; best of the grid: {result.best_pid:.3f}."
     )
-    table = Table(title=f"{found.lung}: nominal score, cmH2O, and experience", caption=caption)
+    table = Table(title=f"{result.lung}: nominal score, cmH2O, and experience", caption=caption)
     # The file has more columns, and longer names for them.
     heads = {
         "method": "method",

@@ -102,9 +102,9 @@ def _table(result: dict[str, Any]) -> Any:
     table = Table(title="Nominal mean |pressure - target|, cmH2O")
     for name in ("network", "lung", "PID", "corrected", "change"):
         table.add_column(name, justify="left" if name in ("network", "lung") else "right")
-    for network, one in result["networks"].items():
-        for lung, error in one["error"].items():
-            before = one["error_pid"][lung]
+    for network, figures in result["networks"].items():
+        for lung, error in figures["error"].items():
+            before = figures["error_pid"][lung]
             change = f"{100 * (error / before - 1):+.1f} %"
             table.add_row(network, lung, f"{before:.3f}", f"{error:.3f}", change)
     return table

@@ -137,3 +137,18 @@ def test_held_out_breaths_do_not_decide(breaths, monkeypatch):
     )
     assert not one.unchanged
     assert one.training_errors[1] == pytest.approx(0.5 * one.training_errors[0])
+
+
+def test_a_function_has_corrected_pressures_but_no_plants(breaths, monkeypatch):
+    def still(u_in, u_out, dt, *, R, C, initial_pressure):
+        return np.full(len(u_in), initial_pressure)
+
+    simulators = load_simulators(still)
+    before = simulators.pressures(breaths)
+    after = before + 0.9 * (breaths.pressure - before)
+    monkeypatch.setattr(module, "refit_base_parameters", lambda *_: None)
+    found, had = something(after, plants()), something(before, plants())
+    correction = correct(breaths, held_out(breaths), before, found, had, simulators)
+    assert correction.plants == {}
+    np.testing.assert_allclose(correction.pressures["after"], after)
+    assert "has no plant that could be corrected" in correction.notes[0]

@@ -240,3 +240,15 @@ def test_what_cannot_be_diagnosed_is_refused(breaths):
     other = {"R5C10": turbulent(1.0)[small.LABEL]}
     with pytest.raises(InputError, match=r"no lung R20C20 of the recording .*; it has R5C10"):
         diagnose(breaths, simulator=other, settings=small.SETTINGS)
+
+
+def test_simulated_pressures_are_diagnosed_as_their_simulator_is(own, breaths):
+    """Only a plant cannot be made of them."""
+    found = diagnose(breaths, simulator=own.traces.before, settings=small.SETTINGS)
+    assert found.simulator == "given"
+    assert found.plants == {}
+    assert any("no corrected.json" in note for note in found.notes)
+    assert (found.verdict, found.mechanisms) == (own.verdict, own.mechanisms)
+    np.testing.assert_allclose(found.corrected_pressures, own.traces.after, rtol=0, atol=1e-9)
+    with pytest.raises(InputError, match=r"array of simulated pressures, shape \(1, 40\)"):
+        diagnose(breaths, simulator=own.traces.before[:1], settings=small.SETTINGS)

@@ -141,7 +141,8 @@ def test_other_verdicts():
         "; an effect that is not in the library is missing too."
     )
     assert report_text.nonparametric_term(both).startswith(
-        "Beside these mechanisms, a free function at R(V) (resistance of the airway) explains 83 %"
+        "In addition to these mechanisms, a nonparametric term for R(V) (resistance of the airway) "
+        "explains 83 %"
     )
     term = made.unnamed(12).nonparametric
     assert term is not None

@@ -155,10 +155,10 @@ def nonparametric_term(findings: Findings) -> str:
     term = findings.nonparametric
     if term is None:
         return ""
-    beside = "Beside these mechanisms, a" if findings.verdict == "named" else "A"
+    start = "In addition to these mechanisms, a" if findings.verdict == "named" else "A"
     return (
-        f"{beside} free function at {place(term)} explains {100 * term.explains:.0f} % of the "
-        "squared error above the noise."
+        f"{start} nonparametric term for {place(term)} explains {100 * term.explains:.0f} % of "
+        "the squared error above the noise."
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,10 +13,13 @@ from ventbench.errors import InputError
 from ventbench.lungs import Lung
 from ventbench.physics import library, mechanism, parameter, paths, physics, strength_path
 from ventbench.physics.catalogue import basis_terms, special_cases
+from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.precision import float64
 from ventbench.rollouts import open_loop
 
 from . import cases
+
+DOCS = Path(__file__).parents[2] / "docs/physics.md"
 
 NAMES = """
 valve_delay valve_lag valve_dead_band valve_curve valve_hysteresis command_rounding supply_droop
@@ -51,6 +55,16 @@ def test_description_is_complete(name):
         assert item.unit
         assert item.meaning
     assert described.strength.mild != described.strength.neutral
+
+
+@pytest.mark.parametrize("name", [*library(), *basis_terms(), *NONPARAMETRIC_COMPONENTS])
+def test_the_docs_have_a_row(name):
+    """The row of a mechanism gives its parameters too."""
+    rows = [row for row in DOCS.read_text("utf-8").splitlines() if row.startswith("| ")]
+    (row, *_) = [row for row in rows if f"`{name}`" in row]
+    if name in library():
+        assert row.startswith(f"| `{name}` |")
+        assert all(f"`{item.name}`" in row for item in mechanism(name).description.parameters)
 
 
 @pytest.mark.parametrize("name", library())

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ventbench.physics.catalogue import mechanism, paths
+from ventbench.physics.catalogue import library, mechanism, paths
 from ventbench.physics.model import Physics
 from ventbench.precision import float64
 from ventbench.system_id.data import Data, Floats
@@ -137,7 +137,9 @@ def fit(
         InputError: if a name or a value does not fit.
     """
     mechanisms, fixed, start = tuple(mechanisms), dict(fixed or {}), dict(start or {})
-    predictor = predictor or Predictor(data, paths())
+    if predictor is None:
+        terms = [name for name in mechanisms if name not in library()]
+        predictor = Predictor(data, paths((*library(), *terms)))
     layout = make_unknowns(
         data, (p for p in dict.fromkeys((*free_paths(mechanisms), *free)) if p not in fixed), groups
     )

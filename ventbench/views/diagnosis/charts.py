@@ -41,9 +41,9 @@ class Chart:
         y_label: above the frame, with the unit.
         alt: what is seen, in words.
         width: of the picture.
-        height: likewise.
+        height: of the picture.
         paths: class and path data of lines, the lowest first.
-        areas: likewise of filled areas, below the lines.
+        areas: class and path data of filled areas, below the lines.
         bands: left end and width of shaded ranges.
     """
 
@@ -60,24 +60,24 @@ class Chart:
 
     @property
     def frame(self) -> tuple[float, float, float, float]:
-        """Left, top, right, bottom."""
+        """Left, top, right and bottom of the frame, picture units."""
         return LEFT, TOP, self.width - RIGHT, self.height - BOTTOM
 
     @property
     def x_ticks(self) -> list[tuple[str, float]]:
-        """Texts and places."""
+        """Texts and places of the ticks, picture units."""
         values, texts = ticks(*self.x, 6)
         return [(t, round(float(self.at_x(v)), 1)) for t, v in zip(texts, values, strict=True)]
 
     @property
     def y_ticks(self) -> list[tuple[str, float]]:
-        """Texts and places."""
+        """Texts and places of the ticks, picture units."""
         values, texts = ticks(*self.y, 4)
         return [(t, round(float(self.at_y(v)), 1)) for t, v in zip(texts, values, strict=True)]
 
     @property
     def zero(self) -> float | None:
-        """Where y is zero, if that is inside."""
+        """Place of y = 0, or None if it is outside."""
         return round(float(self.at_y(0.0)), 1) if self.y[0] < 0 < self.y[1] else None
 
     def at_x(self, value: ArrayLike) -> Floats:
@@ -87,7 +87,7 @@ class Chart:
         return left + share * (right - left)
 
     def at_y(self, value: ArrayLike) -> Floats:
-        """Place on the vertical axis; what is far outside stays near the frame."""
+        """Place on the vertical axis; values far outside stay near the frame."""
         _, top, _, bottom = self.frame
         share = (np.asarray(value, float) - self.y[0]) / (self.y[1] - self.y[0])
         return bottom - np.clip(share, -0.5, 1.5) * (bottom - top)
@@ -181,7 +181,7 @@ def rmse(traces: Traces, simulated: Floats) -> Floats:
 
 
 def worst(diagnosis: Diagnosis) -> list[tuple[int, str]]:
-    """Held-out breaths to look at: where the refit errs most, and where the correction does."""
+    """Held-out breaths with the largest errors of the refit, and of the correction."""
     traces = diagnosis.traces
     held = traces.held_out if traces.held_out.any() else np.ones(len(traces.held_out), bool)
     corrected = diagnosis.verdict != "nothing_missing"
@@ -198,7 +198,7 @@ def worst(diagnosis: Diagnosis) -> list[tuple[int, str]]:
 
 
 def panels(diagnosis: Diagnosis) -> list[Panel]:
-    """Pictures of :func:`worst`."""
+    """Charts of the breaths of :func:`worst`."""
     traces = diagnosis.traces
     by_stage = {key: rmse(traces, getattr(traces, key)) for key, _, _ in STAGES}
     several = len(traces.breaths.by_lung_index) > 1
@@ -214,7 +214,7 @@ def panels(diagnosis: Diagnosis) -> list[Panel]:
 
 
 def _end(traces: Traces, i: int) -> float:
-    """Until a little after the inspiration, s; the rest is much the same."""
+    """End of the drawn part, s: a little after the inspiration."""
     breath = traces.breaths
     last = np.max(breath.time[i], initial=0.0, where=breath.valid[i])
     inspired = np.max(breath.time[i], initial=0.0, where=breath.inspiratory[i])
@@ -298,7 +298,7 @@ def _axis(diagnosis: Diagnosis, refit: Profile, after: Profile) -> Chart:
 
 
 def _near(end: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """Ends of intervals, without those so wide that they would hide all else."""
+    """Ends of intervals, cut where they are so wide that they would hide everything else."""
     reach = 2.0 * np.nanmax(np.abs(mean), initial=0.1)
     return np.clip(end, -reach, reach)
 

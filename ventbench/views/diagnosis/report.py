@@ -66,7 +66,7 @@ def html(diagnosis: Diagnosis) -> str:
 
 
 def bars(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Root mean square errors as bars: text, class, value and width in %."""
+    """Root-mean-square errors as bars: text, class, value and width in %."""
     one = diagnosis.open_loop
     rows = [("as given", "before", one.before.rmse), ("R and C refitted", "refit", one.refit.rmse)]
     if diagnosis.verdict != "nothing_missing":
@@ -85,7 +85,7 @@ def bars(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def groups(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Rows of the table of distances: all breaths first, then each part."""
+    """Rows of the table of open-loop errors: all breaths first, then each part."""
     one = diagnosis.open_loop
     everything = {"before": one.before, "refit": one.refit, "after": one.after}
     rows = [("all", everything), *one.groups.items()]

@@ -67,12 +67,12 @@ def recording(diagnosis: Diagnosis) -> bytes:
 
 
 def plain(text: str) -> str:
-    """Text that the viewer's font can show: it ends itself over a character it lacks."""
+    """Text with characters of the viewer's font only: the viewer crashes on any other."""
     return "".join(c if " " <= c <= "~" or "\xa1" <= c <= "\u017e" else "?" for c in text)
 
 
 def markdown(diagnosis: Diagnosis) -> str:
-    """The text panel: the diagnosis in words, and what is seen."""
+    """The text panel: the diagnosis in words, and a guide to the views."""
     verdict, *others = (escape_markdown(plain(text)) for text in report_text.sentences(diagnosis))
     places = [
         escape_markdown(report_text.error_region(place, diagnosis.noise[0]))
@@ -168,7 +168,7 @@ def _stages(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
 
 
 def blueprint(diagnosis: Diagnosis) -> rrb.Blueprint:
-    """Return the one blueprint."""
+    """Layout of the views."""
     lungs = diagnosis.traces.breaths.by_lung_index
     keys = ["before", "refit", "after"][: 2 if diagnosis.verdict == "nothing_missing" else 3]
     names = {"before": "as given", "refit": "R and C refitted", "after": "corrected"}

@@ -14,13 +14,13 @@ from ventbench import precision, protocol, rollouts
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
 from ventbench.errors import InputError
+from ventbench.executor import executor
 from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.metrics.waveform import run_error
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, take
 from ventbench.scenario import nominal
 from ventbench.training import pid_grid
-from ventbench.training.executor import executor
 from ventbench.training.pid_grid import PIDGrid
 
 GAINS = np.array([(p, i, d) for p in (0.0, 2.0, 5.0) for i in (0.0, 4.0) for d in (0.0, 1.0)])

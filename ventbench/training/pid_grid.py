@@ -26,12 +26,12 @@ from ventbench import environment as env
 from ventbench import files, protocol
 from ventbench.controllers.pid import PID
 from ventbench.errors import InputError
+from ventbench.executor import InProcess, executor, results
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNG_IDS, scored_lung
 from ventbench.plants.catalog import Given, load_simulators
 from ventbench.resume import ARRAY, WorkFolder, fingerprint
 from ventbench.scenario import Scenario, nominal
-from ventbench.training.executor import InProcess, executor, results
 
 #: The paper's twenty values of P, I and D, %/cmH2O.
 VALUES = (*(round(0.1 * i, 1) for i in range(10)), *(float(i) for i in range(1, 11)))

@@ -13,9 +13,9 @@ from typing import Any, Protocol
 
 from ventbench import compilation, files
 from ventbench.errors import InputError
+from ventbench.executor import executor, results
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import load
-from ventbench.training.executor import executor, results
 from ventbench.validation.challenge import requests
 from ventbench.validation.challenge.folder import ChallengeFolder
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from ventbench import files
 from ventbench.errors import InputError
+from ventbench.executor import executor, results
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.schema import COLUMNS
 from ventbench.recordings.write import write
-from ventbench.training.executor import executor, results
 from ventbench.validation.challenge.cases import DrawnCase, Kind
 from ventbench.validation.challenge.detectability import log_likelihood_loss
 from ventbench.validation.challenge.folder import (

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from ventbench.errors import InputError
+from ventbench.executor import executor, results
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import load
-from ventbench.training.executor import executor, results
 from ventbench.validation.challenge.figures import (
     Figure,
     by_parameter,

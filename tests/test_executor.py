@@ -10,7 +10,7 @@ import pytest
 
 from ventbench import protocol
 from ventbench.errors import InputError
-from ventbench.training.executor import InProcess, executor, results
+from ventbench.executor import InProcess, executor, results
 
 
 def test_an_error_of_a_job_is_that_of_the_search():

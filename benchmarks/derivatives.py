@@ -1,6 +1,6 @@
 """Derivatives of a fit: by differences, as they are computed, and by forward-mode differentiation.
 
-Both of the same model with all mechanisms, and with all slots too, on one core: 40 made-up breaths
+Both of the same model with all mechanisms, and with all basis terms too, on one core: 40 breaths
 of 80 samples, by the first parameters of the model. Differences skip mechanisms that are off;
 forward mode cannot, since they have slopes. Usage:
 
@@ -100,7 +100,7 @@ def compare(names: tuple[str, ...], columns: int, repeats: int) -> None:
 
 
 def main() -> None:
-    """Compare for the library, and for the library and all slots."""
+    """Compare for the library, and for the library and all basis terms."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--columns", type=int, default=8)
     parser.add_argument("--repeats", type=int, default=5)

@@ -47,7 +47,7 @@ def of_strength(name):
 
 @pytest.mark.parametrize("name", [*library(), *basis_terms()])
 def test_one_that_acts_alone_acts_as_among_all(skipping, whole, off, name):
-    """Through any of its coefficients: the first is not the whole strength of a slot."""
+    """Through any of its coefficients: the first is not the whole strength of a basis term."""
     item = mechanism(name)
     moved = item.description.parameters[: 1 if name in library() else None]
     changes = []  # a knot of a curve may lie beyond these data

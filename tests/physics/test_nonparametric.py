@@ -65,7 +65,7 @@ def bench():
 
 
 def drawn_coefficients(names, seed, share=0.3):
-    """Random coefficients of some elements, in shares of what is plausible."""
+    """Random coefficients of some terms, in shares of what is plausible."""
     rng, given = np.random.default_rng(seed), {}
     for name in names:
         for item in mechanism(name).description.parameters:
@@ -79,21 +79,21 @@ def rms(x):
 
 
 def mean_values(found):
-    """Of the base and of the elements, as :func:`component_curves` takes them."""
+    """Of the base and of the terms, as :func:`component_curves` takes them."""
     return {path: float(found.column(path).mean()) for path in paths(found.mechanisms)}
 
 
-def test_slots_are_complete_and_outside_the_library():
+def test_components_are_complete_and_outside_the_library():
     assert set(NONPARAMETRIC_COMPONENTS) == NAMES
-    elements = [name for slot in NONPARAMETRIC_COMPONENTS.values() for name in slot.terms]
-    assert sorted(elements) == list(basis_terms())
+    terms = [name for component in NONPARAMETRIC_COMPONENTS.values() for name in component.terms]
+    assert sorted(terms) == list(basis_terms())
     assert not set(basis_terms()) & set(library())
     assert paths() == paths(tuple(library()))
-    for name, slot in NONPARAMETRIC_COMPONENTS.items():
-        assert slot.name == name
-        assert len(slot.meaning) > 20
-        for element in slot.terms:
-            described = mechanism(element).description
+    for name, component in NONPARAMETRIC_COMPONENTS.items():
+        assert component.name == name
+        assert len(component.meaning) > 20
+        for term in component.terms:
+            described = mechanism(term).description
             assert described.title.startswith(f"{name}: ")
             assert len(described.equation) > 8
             assert len(described.source) > 8
@@ -162,14 +162,14 @@ SEEN = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("slot", SEEN)
-def test_drawn_shapes_are_those_that_were_put_in(bench, slot):
-    first = NONPARAMETRIC_COMPONENTS[slot].terms[0]
+@pytest.mark.parametrize("component", SEEN)
+def test_drawn_shapes_are_those_that_were_put_in(bench, component):
+    first = NONPARAMETRIC_COMPONENTS[component].terms[0]
     given = drawn_coefficients([first], 7, 0.5)
     values = mean_values(bench.fit(bench.predict(given), [first]))
-    truth = component_curves(slot, {"R": 11.0, "C": 23.0} | given, SEEN[slot])[0]
-    found = component_curves(slot, values, SEEN[slot])[0]
-    assert found.x_unit == NONPARAMETRIC_COMPONENTS[slot].axis
+    truth = component_curves(component, {"R": 11.0, "C": 23.0} | given, SEEN[component])[0]
+    found = component_curves(component, values, SEEN[component])[0]
+    assert found.x_unit == NONPARAMETRIC_COMPONENTS[component].axis
     size = np.abs(truth.y).max()
     assert size > 0
     there = np.interp(truth.x, found.x, found.y)
@@ -177,7 +177,7 @@ def test_drawn_shapes_are_those_that_were_put_in(bench, slot):
 
 
 @pytest.mark.parametrize(
-    ("slot", "name", "level", "most"),
+    ("component", "name", "level", "most"),
     [
         ("f(V)", "nonlinear_compliance", "strong", 0.03),
         ("f(V)", "nonlinear_compliance", "mild", 0.03),
@@ -193,13 +193,17 @@ def test_drawn_shapes_are_those_that_were_put_in(bench, slot):
         ("measurement", "sensor_drift", "strong", 0.04),
     ],
 )
-def test_slots_hold_what_they_are_said_to_hold(bench, slot, name, level, most):
+def test_components_hold_what_they_are_said_to_hold(bench, component, name, level, most):
     """Near the noise of 0.1, where the base model is not."""
-    assert any(name in special_cases(term) for term in NONPARAMETRIC_COMPONENTS[slot].terms)
+    assert any(name in special_cases(term) for term in NONPARAMETRIC_COMPONENTS[component].terms)
     items = mechanism(name).description.parameters
     truth = bench.predict({f"{name}.{p.name}": getattr(p, level) for p in items})
-    elements = ("drift_shape",) if slot == "measurement" else NONPARAMETRIC_COMPONENTS[slot].terms
-    found = bench.fit(truth, elements)
+    terms = (
+        ("drift_shape",)
+        if component == "measurement"
+        else NONPARAMETRIC_COMPONENTS[component].terms
+    )
+    found = bench.fit(truth, terms)
     assert rms(bench.fit(truth, ()).residual) > 0.11
     assert rms(bench.predictor.predict(found.values)[:, 0] - truth) < most
 
@@ -246,7 +250,7 @@ def test_readings_are_understood(bench):
             assert np.abs(meant - shown).max() > 0.1
 
 
-def test_plants_with_slots_are_kept_in_files(bench, tmp_path):
+def test_plants_with_components_are_kept_in_files(bench, tmp_path):
     names = ["recoil_shape", "command_memory", "command_plays", "drift_shape"]
     given = drawn_coefficients(names, 4)
     truth = bench.predict(given)
@@ -292,8 +296,8 @@ def test_the_strongest_element_is_drawn_first():
     assert len(shapes) == 3
     late = component_curves("exhalation path", {"outlet_memory.c2": 1.0, "outlet_shape.c1": 0.1})
     assert late[0].y[0] == pytest.approx(1.0)
-    for slot in NONPARAMETRIC_COMPONENTS:
-        for shape in component_curves(slot, {}):
+    for component in NONPARAMETRIC_COMPONENTS:
+        for shape in component_curves(component, {}):
             np.testing.assert_array_equal(shape.y, 0.0)
             assert shape.x.shape == shape.y.shape
 

@@ -98,8 +98,9 @@ def window_weights(start: Array, length: Array, past: Array) -> Array:
     """How much of a window falls into this sample, each of P samples before, and all earlier ones.
 
     Args:
-        start: of the window, s after the start of this sample; negative reaches back; ``(...)``.
-        length: of the window, s, positive, likewise.
+        start: start of the window, s after the start of this sample; negative reaches back;
+            ``(...)``.
+        length: length of the window, s, positive, ``(...)``.
         past: durations of the P samples before, the latest first, s, ``(..., P)``.
 
     Returns:

@@ -12,17 +12,17 @@ class View:
     """What a mechanism may look at while it changes the network; every array ``(...)``.
 
     Attributes:
-        time: since the start of the breath, s.
-        volume: of the lung before the step, L; ``volume / C`` is its recoil if it is linear.
-        pressure: at the airway, the last one known, cmH2O.
-        flow: into the lung, likewise, L/s.
-        state: what the mechanism itself keeps, before the step (0 if it keeps nothing); one that
-            keeps several has them along a first axis, ``(K, ...)``.
-        length: of the implicit step, s.
-        elastance: 1/C of the lung, cmH2O/L.
+        time: time since the start of the breath, s.
+        volume: volume of the lung before the step, L; a linear lung has the recoil ``volume / C``.
+        pressure: last known pressure at the airway, cmH2O.
+        flow: last known flow into the lung, L/s.
+        state: own state of the mechanism before the step (0 if it has none), ``(K, ...)`` for one
+            with several states.
+        length: length of the implicit step, s.
+        elastance: elastance 1/C of the lung, cmH2O/L.
         peep: pressure behind the expiratory valve, cmH2O.
-        position: of the breath in the recording, 0..1.
-        resistance: R of the airway, cmH2O s/L.
+        position: position of the breath in the recording, 0..1.
+        resistance: resistance R of the airway, cmH2O s/L.
         outlet: conductance of the open expiratory valve, 1 / R_ex, L/s per cmH2O.
         opened: expiratory valve, 0 closed, 1 open.
     """
@@ -56,17 +56,17 @@ class Network:
     Any of ``circuit``, ``inertance``, ``quadratic``, ``leak`` and ``outlet`` may be zero.
 
     Attributes:
-        inflow: out of the inspiratory valve, L/s.
+        inflow: flow out of the inspiratory valve, L/s.
         circuit: compliance of tubing and connectors, L/cmH2O.
         leak: slope of the leak, L/s per cmH2O.
         leak_flow: leak at zero pressure on that slope, L/s.
         outlet: conductance of the expiratory valve, L/s per cmH2O.
-        behind: pressure behind it, cmH2O.
-        resistance: of the airway, cmH2O s/L.
-        quadratic: likewise, cmH2O s2/L2.
-        inertance: of the gas, cmH2O s2/L.
-        recoil: of the lung if no gas flowed, less the muscles' pressure, cmH2O.
-        elastance: its slope, cmH2O/L.
+        behind: pressure behind the expiratory valve, cmH2O.
+        resistance: resistance of the airway, cmH2O s/L.
+        quadratic: quadratic resistance of the airway, cmH2O s2/L2.
+        inertance: inertance of the gas, cmH2O s2/L.
+        recoil: recoil of the lung without flow, less the pressure of the muscles, cmH2O.
+        elastance: slope of the recoil, cmH2O/L.
     """
 
     inflow: Array

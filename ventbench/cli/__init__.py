@@ -18,10 +18,9 @@ from ventbench.cli import (
     diagnose,
     mechanics,
     proof,
-    rl,
-    run,
     score,
     simulators,
+    study,
     submit,
     train,
     tune,
@@ -56,11 +55,10 @@ def _root(
 
 score.register(app)
 submit.register(app)
-run.register(app)
 simulators.register(app)
 tune.register(app)
-train.register(simulators.train)
-rl.register(app, simulators.train)
+train.register(app)
+study.register(app)
 view.register(app)
 board.register(app)
 diagnose.register(app)

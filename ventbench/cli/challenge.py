@@ -44,7 +44,7 @@ def make(
 
     Example: `ventbench challenge make --seed "$SECRET" --out runs/challenge --cases 200`
     """
-    from ventbench.cli.study import bars
+    from ventbench.cli.options import bars
     from ventbench.validation.challenge.make import make as work
 
     with bars() as shown:
@@ -68,7 +68,7 @@ def answer(
 
     Example: `ventbench challenge answer runs/challenge --jobs 2`
     """
-    from ventbench.cli.study import bars
+    from ventbench.cli.options import bars
     from ventbench.validation.challenge.answer import answer as work
     from ventbench.validation.challenge.folder import ChallengeFolder
 
@@ -122,7 +122,7 @@ def reveal(
     """
     from rich.console import Console
 
-    from ventbench.cli.study import bars
+    from ventbench.cli.options import bars
     from ventbench.validation.challenge.folder import ChallengeFolder
     from ventbench.validation.challenge.reveal import reveal as work
 

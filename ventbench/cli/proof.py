@@ -48,7 +48,7 @@ def proof(
     from rich.console import Console
 
     from ventbench import compilation, extras
-    from ventbench.cli.study import bars
+    from ventbench.cli.options import bars
     from ventbench.validation.real_rig_proof import prove
 
     extras.require("jinja2", "rerun")

@@ -1,4 +1,4 @@
-"""``ventbench open-loop`` and ``ventbench train simulator``: simulators against recordings."""
+"""``ventbench lungs``, ``simulate`` and ``open-loop``: the simulators by themselves."""
 
 from __future__ import annotations
 
@@ -7,17 +7,63 @@ from typing import Annotated, Any
 
 import typer
 
-from ventbench.cli.options import (
-    Clip,
-    JsonFile,
-    Pad,
-    PlantName,
-    RecordingsDir,
-    emit,
-    recordings_folder,
-)
+from ventbench import protocol
+from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, emit
 
-train = typer.Typer(name="train", help="Learn simulators and controllers.", no_args_is_help=True)
+
+def lungs(json: JsonFile = None) -> None:
+    """List the six lungs, and how well their simulators meet held-out recordings.
+
+    Example: `ventbench lungs`
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from ventbench.plants import frozen
+
+    table = Table(title="The six lungs of protocol version 1, simulators version 1")
+    for name in ("lung", "R cmH2O/(L/s)", "C mL/cmH2O", "held-out MAE cmH2O", "median", "breaths"):
+        table.add_column(name, justify="left" if name == "lung" else "right")
+    known = frozen.load().lungs()
+    emit(known, json)
+    for lung_id, about in known.items():
+        figures = (about["held_out_mae"], about["held_out_median_mae"])
+        table.add_row(
+            lung_id,
+            f"{about['R']:g}",
+            f"{about['C']:g}",
+            *(f"{figure:.2f}" for figure in figures),
+            str(about["held_out_breaths"]),
+        )
+    Console(stderr=str(json) == "-").print(table)
+
+
+def simulate(
+    lung: Annotated[str, typer.Option(help="Lung, such as R20C50.")],
+    controls: Annotated[
+        Path,
+        typer.Option(metavar="FILE", help="CSV: u_in in %; optionally u_out and time_step in s."),
+    ],
+    start: Annotated[
+        float, typer.Option(min=0.0, max=60.0, help="Pressure at the first sample, cmH2O.")
+    ] = protocol.PEEP,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the CSV here instead of stdout.")
+    ] = None,
+    plant: PlantName = "frozen",
+) -> None:
+    """Answer a file of valve commands with pressures, as CSV.
+
+    Example: `ventbench simulate --lung R20C50 --controls commands.csv`
+    """
+    from ventbench import files
+    from ventbench.simulation import simulate as work
+
+    text = work(controls, lung=lung, simulator=plant, start=start).to_csv()
+    if out is None:
+        typer.echo(text, nl=False)
+    else:
+        files.write_text(out, text)
 
 
 def open_loop(
@@ -50,12 +96,12 @@ def open_loop(
         result = open_loop_report.open_loop(breaths, plant)
     emit(result.as_dict(), json)
     console = Console(stderr=str(json) == "-")
-    console.print(_table(result.as_dict()))
+    console.print(_open_loop_table(result.as_dict()))
     for line in result.misfit_lines():
         console.print(line, markup=False, highlight=False)
 
 
-def _table(result: dict[str, Any]) -> Any:
+def _open_loop_table(result: dict[str, Any]) -> Any:
     from rich.table import Table
 
     table = Table(title=f"Open-loop MAE of the {result['plant']} simulators, cmH2O")
@@ -82,44 +128,8 @@ def _table(result: dict[str, Any]) -> Any:
     return table
 
 
-@train.callback()
-def _group() -> None:
-    pass
-
-
-@train.command()
-def simulator(
-    recordings: RecordingsDir = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write them.")] = Path(
-        "runs/simulators"
-    ),
-) -> None:
-    """Learn the six simulators from the public recordings, as the frozen ones were.
-
-    Ctrl-C keeps what is finished; the same command goes on from there.
-
-    Example: `ventbench train simulator --recordings ../shared/recordings --out runs/simulators`
-    """
-    from ventbench.training.simulator import train_simulator
-
-    _train(train_simulator, recordings_folder(recordings), out)
-
-
-def _train(run: Any, folder: Path, out: Path) -> None:
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, transient=True) as bars:
-        task = bars.add_task("learning", total=1.0)
-
-        def progress(what: str, share: float) -> None:
-            bars.update(task, description=what, completed=share)
-
-        run(folder, out, progress=progress)
-    typer.echo(f"wrote {out}")
-
-
 def register(app: typer.Typer) -> None:
     """Add the commands."""
+    app.command()(lungs)
+    app.command()(simulate)
     app.command("open-loop")(open_loop)
-    app.add_typer(train)

@@ -1,4 +1,4 @@
-"""``ventbench train residual``: a network that corrects a PID."""
+"""``ventbench train``: simulators, and controllers that correct a PID."""
 
 from __future__ import annotations
 
@@ -7,9 +7,61 @@ from typing import Annotated, Any
 
 import typer
 
-from ventbench.cli.options import JsonFile, emit
+from ventbench.cli.options import JsonFile, PlantName, RecordingsDir, bars, emit, recordings_folder
+
+train = typer.Typer(name="train", help="Learn simulators and controllers.", no_args_is_help=True)
+
+Lung = Annotated[
+    str | None, typer.Option(metavar="ID", help="Only a network for this lung, such as R20C50.")
+]
+All = Annotated[bool, typer.Option("--all", help="Only one network for all six, not told which.")]
+Seed = Annotated[int, typer.Option(min=0, help="Of the first training.")]
+Seeds = Annotated[
+    int, typer.Option(min=1, max=32, help="Trainings of each network, of which the best is kept.")
+]
+Steps = Annotated[
+    int | None, typer.Option(min=1, help="Control steps of experience; those of the docs if left.")
+]
 
 
+@train.callback()
+def _group() -> None:
+    pass
+
+
+@train.command()
+def simulator(
+    recordings: RecordingsDir = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write them.")] = Path(
+        "runs/simulators"
+    ),
+) -> None:
+    """Learn the six simulators from the public recordings, as the frozen ones were.
+
+    Ctrl-C keeps what is finished; the same command goes on from there.
+
+    Example: `ventbench train simulator --recordings ../shared/recordings --out runs/simulators`
+    """
+    from ventbench.training.simulator import train_simulator
+
+    _train_simulators(train_simulator, recordings_folder(recordings), out)
+
+
+def _train_simulators(run: Any, folder: Path, out: Path) -> None:
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, transient=True) as bars:
+        task = bars.add_task("learning", total=1.0)
+
+        def progress(what: str, share: float) -> None:
+            bars.update(task, description=what, completed=share)
+
+        run(folder, out, progress=progress)
+    typer.echo(f"wrote {out}")
+
+
+@train.command()
 def residual(
     lung: Annotated[
         str | None, typer.Option(metavar="ID", help="Only a network for this lung, such as R20C50.")
@@ -39,9 +91,10 @@ def residual(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write.")] = Path(
         "runs/residual"
     ),
+    plant: PlantName = "frozen",
     json: JsonFile = None,
 ) -> None:
-    """Learn a correction of the best PID by differentiating through the frozen simulators.
+    """Learn a correction of the best PID by differentiating through the simulators.
 
     Writes weights.npz, as `submissions/residual_mlp` and `submissions/residual_mlp_all` read it,
     and training.json. Six networks, one a lung, if neither `--lung` nor `--all` is given. Ctrl-C
@@ -68,14 +121,16 @@ def residual(
         lam=penalty,
         round_robin=round_robin,
     )
-    result = _train(names, out, config, seed)
+    result = _train_residual(names, out, config, seed, plant)
     emit(result, json)
     console = Console(stderr=str(json) == "-")
-    console.print(_table(result))
+    console.print(_residual_table(result))
     console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)
 
 
-def _train(names: tuple[str, ...], out: Path, config: Any, seed: int) -> dict[str, Any]:
+def _train_residual(
+    names: tuple[str, ...], out: Path, config: Any, seed: int, plant: str
+) -> dict[str, Any]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     from ventbench.training.residual import train_residual
@@ -92,11 +147,13 @@ def _train(names: tuple[str, ...], out: Path, config: Any, seed: int) -> dict[st
                 text = f"{what}: {loss:.3f} cmH2O"
                 bars.update(tasks[what], description=text, completed=done, total=total)
 
-        trained = train_residual(names, out, config=config, seed=seed, progress=report)
+        trained = train_residual(
+            names, out, config=config, seed=seed, simulator=plant, progress=report
+        )
     return trained.report
 
 
-def _table(result: dict[str, Any]) -> Any:
+def _residual_table(result: dict[str, Any]) -> Any:
     from rich.table import Table
 
     table = Table(title="Nominal mean |pressure - target|, cmH2O")
@@ -110,6 +167,111 @@ def _table(result: dict[str, Any]) -> Any:
     return table
 
 
-def register(train: typer.Typer) -> None:
-    """Add the command to the group ``train``."""
-    train.command()(residual)
+@train.command()
+def ppo(
+    lung: Lung = None,
+    all_lungs: All = False,
+    seed: Seed = 0,
+    seeds: Seeds = 2,
+    steps: Steps = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write.")] = Path("runs/ppo"),
+    plant: PlantName = "frozen",
+    json: JsonFile = None,
+) -> None:
+    """Learn a correction of the PID by PPO on the six frozen simulators.
+
+    Writes weights.npz, as `submissions/ppo` reads it, and training.json. Seven networks if neither
+    `--lung` nor `--all` is given: one a lung, and one for all six. Ctrl-C keeps what is done; the
+    same command goes on from there.
+
+    Example: `ventbench train ppo --lung R20C50 --out runs/ppo-R20C50`
+    """
+    _train_policies("ppo", lung, all_lungs, seed, seeds, steps, out, plant, json)
+
+
+@train.command()
+def dqn(
+    lung: Lung = None,
+    all_lungs: All = False,
+    seed: Seed = 0,
+    seeds: Seeds = 2,
+    steps: Steps = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write.")] = Path("runs/dqn"),
+    plant: PlantName = "frozen",
+    json: JsonFile = None,
+) -> None:
+    """Learn which of 19 corrections of the PID is best by DQN on the six frozen simulators.
+
+    Writes weights.npz, as `submissions/dqn` reads it, and training.json. Options as of `train ppo`.
+
+    Example: `ventbench train dqn --lung R20C50 --out runs/dqn-R20C50`
+    """
+    _train_policies("dqn", lung, all_lungs, seed, seeds, steps, out, plant, json)
+
+
+def _train_policies(
+    method: str,
+    lung: str | None,
+    all_lungs: bool,
+    seed: int,
+    seeds: int,
+    steps: int | None,
+    out: Path,
+    plant: str,
+    json: Path | None,
+) -> None:
+    from rich.console import Console
+
+    from ventbench.errors import InputError
+    from ventbench.lungs import scored_lung
+    from ventbench.training.rl.train import train_dqn, train_ppo
+    from ventbench.training.trained import ALL, NETWORKS
+
+    if lung is not None and all_lungs:
+        raise InputError("--lung and --all exclude each other; give one, or none for all seven")
+    networks = (ALL,) if all_lungs else NETWORKS if lung is None else (scored_lung(lung).id,)
+    work = {"ppo": train_ppo, "dqn": train_dqn}[method]
+    with bars() as shown:
+        tasks: dict[str, Any] = {}
+
+        def progress(label: str, share: float, best: float) -> None:
+            if label not in tasks:
+                tasks[label] = shown.add_task(label, total=1.0)
+            said = f"{method}, {label}: {best:.3f} cmH2O"
+            shown.update(tasks[label], completed=share, description=said)
+
+        trained = work(
+            networks,
+            out,
+            seeds=range(seed, seed + seeds),
+            steps=steps,
+            simulator=plant,
+            progress=progress,
+        )
+    emit(trained.report, json)
+    console = Console(stderr=str(json) == "-")
+    console.print(_trained(trained.report))
+    console.print(f"wrote {out}", markup=False, highlight=False)
+
+
+def _trained(about: dict[str, Any]) -> Any:
+    from rich.table import Table
+
+    title = f"{about['method']}: mean |pressure - target|, cmH2O"
+    table = Table(title=title, caption="Fresh cells: with noise, drawn as the published ones are.")
+    for name in ("network", "breaths", "the PID", "at the end", "fresh cells", "best seed"):
+        table.add_column(name, justify="left" if name == "network" else "right")
+    for name, network in about["networks"].items():
+        ends, fresh = (_values(network[key]) for key in ("error_nominal_at_end", "error_fresh"))
+        breaths, pid = str(network["breaths"]), f"{network['error_pid']:.3f}"
+        table.add_row(name, breaths, pid, ends, fresh, str(network["seed"]))
+    return table
+
+
+def _values(values: list[float]) -> str:
+    return " ".join(f"{value:.3f}" for value in values)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the group."""
+    app.add_typer(train)

@@ -13,11 +13,14 @@ from pathlib import Path
 from ci import workflow
 from ci.git import AUTHOR, Git
 from ci.take import submission_name
-from ventbench.board import build, record, store
+from ventbench.board import build, create, record, store
 from ventbench.board.replay import Simulators
 from ventbench.errors import InputError
 
 TITLE = "Record"
+
+#: Why a new record of an entry supersedes the old one, for the page.
+SCORED_AGAIN = "the entry was scored again"
 
 #: Most records of one run: one a track.
 MAX_RECORDS = 2
@@ -46,6 +49,8 @@ def records(folder: Path) -> list[Path]:
 def add(folder: Path, leaderboard: Path, simulators: Simulators) -> list[record.Record]:
     """Add records to a leaderboard, each replayed, and build its pages.
 
+    The record of an entry that has one already names the old one as superseded.
+
     Args:
         folder: of the download.
         leaderboard: to add them to.
@@ -54,7 +59,15 @@ def add(folder: Path, leaderboard: Path, simulators: Simulators) -> list[record.
     Raises:
         InputError: if a record is not what it must be.
     """
-    added = [store.add(leaderboard, path, simulators) for path in records(folder)]
+    added = []
+    for path in records(folder):
+        scored = record.load(path)
+        if not isinstance(scored, record.Record):
+            raise InputError(f"{path} is not the record of a score")
+        older = store.newest_of(store.load(leaderboard), scored)
+        if older is not None and older.sha256 != scored.sha256:
+            path = create.amend(path, supersedes=older.sha256, reason=SCORED_AGAIN)
+        added.append(store.add(leaderboard, path, simulators))
     build.build(leaderboard)
     return added
 

@@ -1,7 +1,11 @@
-"""The leaderboard as a branch of its own: exactly what is committed, as pages."""
+"""The leaderboard as a branch of its own: records, chain and built pages, and no other file.
+
+What was published before stays: a chain that does not begin with the published one is refused.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import re
 import sys
 import tempfile
@@ -9,12 +13,14 @@ from pathlib import Path
 
 from ci import workflow
 from ci.git import AUTHOR, Git, GitError
+from ventbench.board import layout
 from ventbench.errors import InputError
 
 TITLE = "Pages"
 LEADERBOARD = "leaderboard"
 
 _PLAIN = "100644"
+_MAX_CHAIN_BYTES = 100_000_000
 
 
 def pages(git: Git, commit: str, previous: str | None = None) -> str | None:
@@ -29,7 +35,8 @@ def pages(git: Git, commit: str, previous: str | None = None) -> str | None:
         The new commit; None if nothing has changed.
 
     Raises:
-        InputError: if there is no leaderboard, or anything but plain files in it.
+        InputError: if there is no leaderboard, anything but its own plain files in it, or a chain
+            that does not begin with the one published until now.
     """
     tree = f"{commit}:{LEADERBOARD}"
     try:
@@ -40,8 +47,19 @@ def pages(git: Git, commit: str, previous: str | None = None) -> str | None:
     odd = [line.partition("\t")[2] for line in lines if not line.startswith(f"{_PLAIN} blob ")]
     if odd:
         raise InputError(f"{LEADERBOARD}/{odd[0]} is no plain file")
-    if not any(line.endswith("\tindex.html") for line in lines):
-        raise InputError(f"{LEADERBOARD}/index.html is missing; run ventbench board build")
+    names = {line.partition("\t")[2] for line in lines}
+    for required in (layout.INDEX, layout.CHAIN):
+        if required not in names:
+            raise InputError(f"{LEADERBOARD}/{required} is missing; run ventbench board build")
+    chain = chain_of(git, f"{tree}/{layout.CHAIN}")
+    stray = layout.stray(names, chain)
+    if stray:
+        raise InputError(f"{LEADERBOARD}/{stray[0]} is no part of a leaderboard; remove it")
+    if previous and not chain.startswith(published(git, previous)):
+        raise InputError(
+            f"{LEADERBOARD}/{layout.CHAIN} does not begin with the published chain: records were "
+            "dropped, changed or put into another order"
+        )
     with tempfile.TemporaryDirectory() as folder:
         index = {"GIT_INDEX_FILE": str(Path(folder) / "index")}
         git.output("read-tree", tree, more=index)
@@ -56,10 +74,48 @@ def pages(git: Git, commit: str, previous: str | None = None) -> str | None:
     return git.text("commit-tree", root, *parents, "-m", f"Pages of {commit}", more=AUTHOR)
 
 
+def chain_of(git: Git, name: str) -> bytes:
+    """Content of a chain, by git's name of the file.
+
+    Raises:
+        GitError: if there is none.
+    """
+    return git.output("cat-file", "blob", name, limit=_MAX_CHAIN_BYTES)
+
+
+def published(git: Git, previous: str) -> bytes:
+    """The chain among pages; empty where the branch was made before there were records.
+
+    Args:
+        git: repository.
+        previous: commit of the pages.
+    """
+    if not git.output("ls-tree", "-z", previous, "--", layout.CHAIN):
+        return b""
+    return chain_of(git, f"{previous}:{layout.CHAIN}")
+
+
+def head(git: Git, previous: str | None) -> str:
+    """Head of the published chain, for ``ventbench board verify --head``.
+
+    Args:
+        git: repository.
+        previous: commit of the pages; None if there is none.
+
+    Returns:
+        SHA-256 of the last line; zeros, the start of every chain, if nothing is published.
+    """
+    lines = published(git, previous).splitlines(keepends=True) if previous else []
+    return hashlib.sha256(lines[-1]).hexdigest() if lines else "0" * 64
+
+
 def main() -> int:
-    """Make the pages of ``COMMIT`` in this checkout; see ``publish.yml``."""
+    """Make the pages of ``COMMIT`` in this checkout, or say the head; see ``publish.yml``."""
     git = Git(Path.cwd())
     previous = git.text("for-each-ref", "--format=%(objectname)", "refs/remotes/origin/gh-pages")
+    if sys.argv[1:] == ["head"]:
+        workflow.output(head=head(git, previous or None))
+        return 0
     commit = workflow.required("COMMIT")
     if not re.fullmatch(r"[0-9a-f]{40}", commit):
         raise InputError(f"COMMIT is {commit!r}, not the full name of one")

@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from ventbench.board import actions, canonical, create, ranking, store
+from ventbench.board import actions, build, canonical, create, ranking, store
+from ventbench.board.verify import verify
 from ventbench.errors import InputError
 
 from ..textbook import Textbook
@@ -52,25 +53,52 @@ def test_add_refuses_what_does_not_fit(leaderboard: Path, draft, drafts, simulat
     assert len(store.load(leaderboard).records) == 8
 
 
-def test_a_record_that_does_not_replay_is_not_added(leaderboard: Path, drafts, simulators) -> None:
+def test_a_record_that_does_not_replay_is_not_added(tmp_path: Path, drafts, simulators) -> None:
     values = json.loads(drafts["softer"].content)
     values["errors"]["drawn"][0][0][0] -= 1e-6
     forged = create.Draft(canonical.canonical(values), drafts["softer"].commands)
     with pytest.raises(InputError, match=r"does not replay: key errors\.drawn\[0\]\[0\]\[0\] says"):
-        put(leaderboard, forged, simulators)
+        put(tmp_path / "new", forged, simulators)
 
 
 def test_the_newest_official_record_counts(leaderboard: Path, draft, simulators) -> None:
     old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
-    new = put(leaderboard, draft("softer", factor=0.96), simulators)
-    home = put(leaderboard, draft("softer", factor=0.95, sandbox=None), simulators)
+    new = put(leaderboard, draft("softer", factor=0.96, supersedes=old.sha256), simulators)
     track = ranking.standings(store.load(leaderboard).records)[1]["performance"]
     entry = next(x for x in track.ranked if x.record.name == "softer")
     assert entry.record.sha256 == new.sha256
-    assert [event.record.sha256 for event in entry.history] == [
-        home.sha256, new.sha256, old.sha256,
-    ]  # fmt: skip
-    assert home.sha256 in [x.record.sha256 for x in track.unofficial]
+    assert [event.record.sha256 for event in entry.history] == [new.sha256, old.sha256]
+
+
+def test_an_entry_is_replaced_only_by_name_and_by_its_authors(
+    leaderboard: Path, draft, simulators
+) -> None:
+    old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
+    with pytest.raises(InputError, match=f"the entry has record {old.sha256[:12]}"):
+        put(leaderboard, draft("softer", factor=0.96), simulators)
+    thief = draft("softer", factor=0.96, texts="Mallory", supersedes=old.sha256)
+    with pytest.raises(InputError, match="the name belongs to the authors of record"):
+        put(leaderboard, thief, simulators)
+    other_track = draft("softer", "pid_robust", texts="Mallory")
+    with pytest.raises(InputError, match="the name belongs to the authors of record"):
+        put(leaderboard, other_track, simulators)
+    new = put(leaderboard, draft("softer", factor=0.96, supersedes=old.sha256), simulators)
+    with pytest.raises(InputError, match=f"the newest record of softer is {new.sha256[:12]}"):
+        put(leaderboard, draft("softer", factor=0.94, supersedes=old.sha256), simulators)
+
+
+def test_verify_reports_a_replacement_that_add_refuses(
+    leaderboard: Path, draft, simulators, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(store, "conflicts", lambda *_, **__: [])
+        thief = put(leaderboard, draft("softer", factor=0.96, texts="Mallory"), simulators)
+        build.build(leaderboard)
+    problems = verify(leaderboard, lambda version: simulators).problems
+    assert all(thief.sha256 in text for text in problems)
+    assert len(problems) == 2
+    assert "the name belongs to the authors of record" in problems[0]
+    assert "a new one must name it, with --supersedes" in problems[1]
 
 
 def test_a_withdrawn_record_is_listed_with_its_reason(leaderboard: Path) -> None:

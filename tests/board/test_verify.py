@@ -123,6 +123,23 @@ def test_missing_and_strange_files_are_named(leaderboard: Path, check) -> None:
     assert problems.count("\n") == 2
 
 
+STRAY = ["phish.html", "CNAME", "entries/v1/x/a.js", "entries/v1/performance/a.svg", ".nojekyll"]
+
+
+def test_stray_files_and_links_are_refused(leaderboard: Path, check) -> None:
+    for name in STRAY:
+        (leaderboard / name).parent.mkdir(exist_ok=True)
+        (leaderboard / name).write_text("x")
+    (leaderboard / "records/link.json").symlink_to("/etc/passwd")
+    (leaderboard / "entries/v1/linked").symlink_to("/etc")
+    problems = "\n".join(check(leaderboard).problems)
+    for name in STRAY:
+        assert f"{leaderboard / name} is no part of a leaderboard; remove it" in problems
+    for name in ("records/link.json", "entries/v1/linked"):
+        assert f"{leaderboard / name} is neither a plain file nor a folder" in problems
+    assert problems.count("\n") == len(STRAY) + 2 - 1
+
+
 def test_changed_simulators_are_named(leaderboard: Path, simulators: Textbook) -> None:
     def broken(version: int) -> Any:
         raise InputError("data/simulators/v1/hybrid.npz has SHA-256 ...; it is damaged")

@@ -46,8 +46,9 @@ def test_from_a_commit_to_the_pages(repository, simulators, tmp_path, runner):
     added = propose.add(out, leaderboard, simulators)
     assert [record.name for record in store.load(leaderboard).scores] == ["demo"]
     check_branch_and_pages(leaderboard.parent, added)
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match="already"):
         propose.add(out, leaderboard, simulators)  # a second time
+    check_scored_again(path, tmp_path / "again", leaderboard, simulators, added)
 
 
 def check_record(repository, commit, out, lines):
@@ -66,6 +67,19 @@ def check_record(repository, commit, out, lines):
     assert "not on the frozen simulators" in lines[-1]
     assert not any("/tmp" in line for line in lines)
     return path
+
+
+def check_scored_again(path, folder, leaderboard, simulators, added):
+    """A second run of the same commit, an hour later."""
+    values = json.loads(path.read_text()) | {"created": "2030-01-01T00:00:00Z"}
+    content = canonical.canonical(values)
+    folder.mkdir()
+    (folder / f"{canonical.digest(content)}.json").write_bytes(content)
+    for other in set(path.parent.iterdir()) - {path}:
+        (folder / other.name).write_bytes(other.read_bytes())
+    (new,) = propose.add(folder, leaderboard, simulators)
+    assert new.header.supersedes == added[0].sha256
+    assert new.header.reason == propose.SCORED_AGAIN
 
 
 def forged(path, folder):
@@ -161,48 +175,6 @@ def test_main_reads_the_environment(repository, demo, simulators, tmp_path, monk
     assert workflow.run(official.TITLE, official.main) == 2
     assert "| stopped: ventbench is changed as well" in capsys.readouterr().out
     assert not (tmp_path / "out").exists()
-
-
-def test_pages_hold_plain_files_only(repository):
-    git = Git(repository.folder)
-    with pytest.raises(InputError, match="holds no leaderboard/"):
-        publish.pages(git, repository.base)
-    empty = repository.commit({"leaderboard/x.txt": b""}, repository.base)
-    with pytest.raises(InputError, match=r"index\.html is missing"):
-        publish.pages(git, empty)
-    link = "leaderboard/entries"
-    files = {"leaderboard/index.html": b"", link: b"/etc"}
-    linked = repository.commit(files, repository.base, modes={link: "120000"})
-    with pytest.raises(InputError, match="entries is no plain file"):
-        publish.pages(git, linked)
-
-
-def test_pages_grow_upon_those_before(repository):
-    git = Git(repository.folder)
-    one = repository.commit({"leaderboard/index.html": b"1"}, repository.base)
-    first = publish.pages(git, one)
-    two = repository.commit({"leaderboard/index.html": b"2"}, one)
-    second = publish.pages(git, two, first)
-    assert second is not None
-    assert repository.git("rev-parse", f"{second}^") == first
-    assert repository.git("show", f"{second}:index.html") == "2"
-
-
-def test_publish_main(repository, monkeypatch, tmp_path, capsys):
-    commit = repository.commit({"leaderboard/index.html": b"1"}, repository.base)
-    monkeypatch.chdir(repository.folder)
-    monkeypatch.setenv("GITHUB_OUTPUT", str(tmp_path / "output"))
-    monkeypatch.setenv("COMMIT", commit)
-    assert publish.main() == 0
-    made = (tmp_path / "output").read_text().strip().removeprefix("commit=")
-    assert repository.git("cat-file", "-t", made) == "commit"
-    repository.git("update-ref", "refs/remotes/origin/gh-pages", made)
-    assert publish.main() == 0
-    assert (tmp_path / "output").read_text().endswith("commit=\n")
-    monkeypatch.setenv("COMMIT", "HEAD")
-    with pytest.raises(InputError, match="not the full name"):
-        publish.main()
-    assert "up to date" in capsys.readouterr().out
 
 
 def test_a_branch_is_not_overwritten(repository, tmp_path):

@@ -36,6 +36,7 @@ ONLY_ENV = {
     "steps.record.outputs.branch",
     "steps.record.outputs.name",
     "steps.pages.outputs.commit",
+    "steps.published.outputs.head",
 }
 
 

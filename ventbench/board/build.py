@@ -6,11 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ventbench import files
-from ventbench.board import entry_page, frames, index_page, pages, ranking, store
+from ventbench.board import entry_page, frames, index_page, layout, pages, ranking, store
 from ventbench.board.store import Store
-
-#: What a build writes, as patterns within the leaderboard's folder; anything else is left alone.
-BUILT = ("index.html", "leaderboard.csv", "version-*.html", "entries/**/*.html")
 
 
 @dataclass(frozen=True)
@@ -52,6 +49,8 @@ def content(leaderboard: Store) -> dict[str, bytes]:
 def build(folder: Path) -> Built:
     """Bring CSV and pages up to date with the records; only files that differ are written.
 
+    Files that no build writes are left alone.
+
     Args:
         folder: of the leaderboard.
 
@@ -75,5 +74,4 @@ def build(folder: Path) -> Built:
 
 def present(folder: Path) -> set[str]:
     """Relative paths of the built files that are there now."""
-    paths = (path for pattern in BUILT for path in folder.glob(pattern))
-    return {path.relative_to(folder).as_posix() for path in paths}
+    return {name for name in layout.walk(folder)[0] if layout.BUILT.fullmatch(name)}

@@ -11,13 +11,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.board import canonical, schema
+from ventbench.board import canonical, layout, schema
 from ventbench.errors import InputError
 
 Floats = NDArray[np.float64]
 
 #: End of a record's file name, after its SHA-256.
-SUFFIX = ".json"
+SUFFIX = layout.RECORD_SUFFIX
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,11 @@ class Record:
     def version(self) -> int:
         """Version of the protocol, and so of the board."""
         return self.header.protocol
+
+    @property
+    def key(self) -> tuple[int, str, str]:
+        """Version, track and name: what one entry of the board is known by."""
+        return self.version, self.track, self.name
 
     @property
     def lungs(self) -> list[str]:

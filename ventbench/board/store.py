@@ -10,23 +10,18 @@ head can check that it is still there.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ventbench import files, protocol
 from ventbench.board import actions, canonical, record, schema
+from ventbench.board.layout import CHAIN, RECORDS
 from ventbench.board.record import Record, Withdrawal
 from ventbench.errors import InputError
 
 if TYPE_CHECKING:
     from ventbench.board.replay import Simulators
-
-#: Folder of records and commands within the leaderboard's.
-RECORDS = "records"
-
-#: Name of the chain's file.
-CHAIN = "chain.jsonl"
 
 #: Stands for the hash of the line before the first.
 CHAIN_START = "0" * 64
@@ -179,6 +174,12 @@ def _what_changed(content: bytes) -> str:
     return ""
 
 
+def newest_of(store: Store, record: Record) -> Record | None:
+    """The newest record of the same entry, track and version; None if there is none."""
+    of_entry = [entry for entry in store.scores if entry.key == record.key]
+    return of_entry[-1] if of_entry else None
+
+
 def find_record(store: Store, sha256: str) -> Record:
     """Find the record of a score by its hash, or by the unique beginning of one.
 
@@ -277,37 +278,54 @@ def conflicts(records: Sequence[Record | Withdrawal], start: int = 0) -> list[st
         One sentence for each conflict, with the record's hash.
     """
     sentences: list[str] = []
-    first_of_version: dict[int, Record] = {}
-    known: dict[str, Record] = {}
-    withdrawn: set[str] = set()
+    before = _Before()
     for index, entry in enumerate(records):
         if index >= start:
-            sentences += _conflicts(entry, first_of_version, known, withdrawn)
-        if isinstance(entry, Record):
-            first_of_version.setdefault(entry.version, entry)
-            known[entry.sha256] = entry
-        else:
-            withdrawn.add(entry.withdraws)
+            sentences += _conflicts(entry, before)
+        before.append(entry)
     return sentences
 
 
-def _conflicts(
-    entry: Record | Withdrawal,
-    first_of_version: dict[int, Record],
-    known: dict[str, Record],
-    withdrawn: set[str],
-) -> list[str]:
+@dataclass
+class _Before:
+    """What the records before one say.
+
+    Attributes:
+        first_of_version: first record of each protocol version.
+        first_of_name: first record of each entry's name, on any track.
+        newest: of each entry, by version, track and name.
+        known: all scores, by their hash.
+        withdrawn: hashes of those that were taken back.
+    """
+
+    first_of_version: dict[int, Record] = field(default_factory=dict)
+    first_of_name: dict[str, Record] = field(default_factory=dict)
+    newest: dict[tuple[int, str, str], Record] = field(default_factory=dict)
+    known: dict[str, Record] = field(default_factory=dict)
+    withdrawn: set[str] = field(default_factory=set)
+
+    def append(self, entry: Record | Withdrawal) -> None:
+        if isinstance(entry, Withdrawal):
+            self.withdrawn.add(entry.withdraws)
+            return
+        self.first_of_version.setdefault(entry.version, entry)
+        self.first_of_name.setdefault(entry.name, entry)
+        self.newest[entry.key] = entry
+        self.known[entry.sha256] = entry
+
+
+def _conflicts(entry: Record | Withdrawal, before: _Before) -> list[str]:
     name = f"record {entry.sha256}"
     if isinstance(entry, Withdrawal):
-        if entry.withdraws not in known:
+        if entry.withdraws not in before.known:
             return [f"{name} withdraws {entry.withdraws[:12]}, which is not there"]
-        if entry.withdraws in withdrawn:
+        if entry.withdraws in before.withdrawn:
             return [f"{name} withdraws {entry.withdraws[:12]} once more"]
         return []
-    if entry.sha256 in known:
+    if entry.sha256 in before.known:
         return [f"{name} is on the leaderboard already"]
     sentences = []
-    first = first_of_version.get(entry.version)
+    first = before.first_of_version.get(entry.version)
     if first is not None:
         # Records of one version can only be compared over the same simulators and draws.
         pairs = zip(("simulators", "draws"), entry.basis, first.basis, strict=True)
@@ -317,14 +335,29 @@ def _conflicts(
             for key, own, common in pairs
             if own != common
         ]
-    superseded = entry.header.supersedes
+    owner = before.first_of_name.get(entry.name)
+    if owner is not None and set(owner.manifest.authors) != set(entry.manifest.authors):
+        sentences.append(
+            f"{name} ({entry.name}), key submission.manifest.authors: the name belongs to the "
+            f"authors of record {owner.sha256[:12]}; choose another name"
+        )
+    superseded, newest = entry.header.supersedes, before.newest.get(entry.key)
     if superseded is None:
+        if newest is not None:
+            sentences.append(
+                f"{name} ({entry.name}), key supersedes: the entry has record "
+                f"{newest.sha256[:12]}; a new one must name it, with --supersedes and a --reason"
+            )
         return sentences
-    old = known.get(superseded)
+    old = before.known.get(superseded)
     if old is None:
         sentences.append(f"{name}, key supersedes: {superseded[:12]} is not there")
-    elif (old.name, old.track, old.version) != (entry.name, entry.track, entry.version):
+    elif old.key != entry.key:
         sentences.append(f"{name}, key supersedes: is of another entry, track or version")
+    elif newest is not None and old.sha256 != newest.sha256:
+        sentences.append(
+            f"{name}, key supersedes: the newest record of {entry.name} is {newest.sha256[:12]}"
+        )
     elif old.official and not entry.official:
         sentences.append(f"{name} is not official and supersedes an official record")
     return sentences

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from ventbench import draws, protocol
-from ventbench.board import actions, build, canonical, record, store
+from ventbench.board import actions, build, canonical, layout, record, store
 from ventbench.board.record import Record, Withdrawal
 from ventbench.board.replay import BATCH, Simulators, deviation, differences, replay
 from ventbench.errors import InputError
@@ -79,8 +79,7 @@ def verify(
         except (InputError, OSError) as error:
             report.problems.append(str(error))
     report.records = len(entries)
-    if links:
-        report.problems += _unnamed_files(folder, links)
+    report.problems += _strange_files(folder, bool(links))
     report.problems += store.conflicts(entries)
     scores = [entry for entry in entries if isinstance(entry, Record)]
     _check_replay(folder, scores, load, report, progress)
@@ -89,15 +88,21 @@ def verify(
     return report
 
 
-def _unnamed_files(folder: Path, links: Sequence[store.Link]) -> list[str]:
-    """Files among the records that no line names."""
-    named = {f"{link.record}{record.SUFFIX}" for link in links}
-    named |= {f"{link.actions}{actions.SUFFIX}" for link in links}
-    return [
-        f"{folder / store.RECORDS / name} is not named by {store.CHAIN}; add it, or remove it"
-        for name in sorted(path.name for path in (folder / store.RECORDS).iterdir())
-        if name not in named
-    ]
+def _strange_files(folder: Path, readable: bool) -> list[str]:
+    """Files that belong to no leaderboard with this chain: none of them may be published.
+
+    Args:
+        folder: of the leaderboard.
+        readable: whether the chain could be read; else nobody knows which records it names.
+    """
+    plain, odd = layout.walk(folder)
+    problems = [f"{folder / name} is neither a plain file nor a folder; remove it" for name in odd]
+    for name in layout.stray(plain, (folder / store.CHAIN).read_bytes()):
+        if not name.startswith(f"{store.RECORDS}/"):
+            problems.append(f"{folder / name} is no part of a leaderboard; remove it")
+        elif readable:
+            problems.append(f"{folder / name} is not named by {store.CHAIN}; add it, or remove it")
+    return problems
 
 
 def _check_pages(leaderboard: store.Store) -> list[str]:

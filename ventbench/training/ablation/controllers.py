@@ -65,13 +65,13 @@ def variants(config: ResidualConfig) -> dict[str, Variant]:
     wide = max(config.widths)
     return {
         BASE: Variant("as the submission is trained", config),
-        "direct": Variant("no PID: the network commands alone", config, direct=True),
-        "one simulator": changed("the official simulator of each lung alone", members=1),
-        "no deviations": changed("benches without noise, delay or other R and C", spread=0.0),
-        "no agreement": changed("what the simulators disagree about is free", agreement=0.0),
-        "no breath before": changed("it sees nothing of the breath before", ahead=0),
-        "no errors before": changed("it sees no earlier errors of this breath", pressures=0),
-        "no commands before": changed("it sees no earlier commands of this breath", commands=0),
+        "direct": Variant("no PID, the network alone computes the command", config, direct=True),
+        "one simulator": changed("only the official simulator of each lung", members=1),
+        "no deviations": changed("training without noise, delay or other R and C", spread=0.0),
+        "no agreement": changed("no penalty where the simulators disagree", agreement=0.0),
+        "no breath before": changed("no features of the previous breath", ahead=0),
+        "no errors before": changed("no earlier errors of this breath", pressures=0),
+        "no commands before": changed("no earlier commands of this breath", commands=0),
         "twice as far back": changed(
             "twice as many errors and commands",
             pressures=2 * config.pressures, commands=2 * config.commands,

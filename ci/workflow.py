@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from ventbench.errors import InputError
+from ventbench.text import plain
 
 
 def required(name: str) -> str:
@@ -31,7 +32,7 @@ def summary(title: str, lines: Iterable[str]) -> None:
     """
     shown = [line for text in lines for line in text.splitlines() or [""]]
     for line in shown:
-        print(f"| {line}")  # a line that begins with `::` would be a command
+        print(f"| {plain(line)}")  # a line that begins with `::` would be a command
     target = os.environ.get("GITHUB_STEP_SUMMARY")
     if target:
         with open(target, "a", encoding="utf-8") as file:

@@ -69,6 +69,7 @@ def draft(
         texts: str | None = None,
         failed: int = 0,
         wide_open: bool = False,
+        change: Callable[[np.ndarray], None] | None = None,
         **about: Any,
     ) -> create.Draft:
         score = scores[base]
@@ -85,6 +86,8 @@ def draft(
             sha256=create.combined_hash(create.file_hashes(folder)),
         )  # fmt: skip
         requested = np.full_like(score.requested, 100.0) if wide_open else score.requested * factor
+        if change is not None:
+            change(requested)
         cells = [(i, j) for i in range(6) for j in range(6)][:failed]
         for i, j in cells:
             requested[i, 0, j] = 0.0

@@ -44,6 +44,40 @@ WRONG: dict[str, tuple[Any, str]] = {
         "key spread[0][0]: Expected `float | null`, got `str`",
     ),
     "flag as number": (lambda x: {**x, "official": 1}, "key official: Expected `bool`, got `int`"),
+    "protocol 0": (lambda x: {**x, "protocol": 0}, "key protocol: Expected `int` >= 1"),
+    "impossible date": (
+        lambda x: {**x, "created": "0000-99-99T99:99:99Z"},
+        "key created: 0000-99-99T99:99:99Z is no date and time",
+    ),
+    "29 February": (lambda x: {**x, "created": "2026-02-29T00:00:00Z"}, "is no date and time"),
+    "no machine": (lambda x: {**x, "machine": {}}, "key machine.system: is missing or empty"),
+    "blank machine": (
+        lambda x: {**x, "machine": x["machine"] | {"kernel": " "}}, "key machine.kernel",
+    ),
+    "no versions": (lambda x: {**x, "versions": {}}, "key versions.ventbench: is missing"),
+    "no spreads": (
+        lambda x: {**x, "spread": [[None] * 6] * 6},
+        "key spread: R5C10 at PIP 10 has an error without a spread",
+    ),
+    "invented hash of the submission": (
+        lambda x: {**x, "submission": {**x["submission"], "sha256": "a" * 64}},
+        "key submission.sha256: is not that of its files",
+    ),
+    "invented hashes of files": (
+        lambda x: {**x, "submission": {**x["submission"], "files": {"controller.py": "x"}}},
+        "key submission.files: controller.py has no SHA-256",
+    ),
+    "no files": (
+        lambda x: {**x, "submission": {**x["submission"], "files": {}}}, "controller.py is missing",
+    ),
+    "file outside": (
+        lambda x: {**x, "submission": {**x["submission"], "files": {
+            **x["submission"]["files"], "../x": "a" * 64}}},
+        "'../x' is no path within a folder",
+    ),
+    "integer of 400 digits": (
+        lambda x: {**x, "timing": {"act_median_us": 10**400}}, "key timing: holds a whole number",
+    ),
     "deep nesting": (
         lambda x: {**x, "machine": {"a": [[[[[[[[1]]]]]]]]}},
         "key machine: is nested more than 6 deep",
@@ -113,7 +147,7 @@ def test_hostile_values_are_input_errors(drafts, name: str, place: str) -> None:
 @pytest.mark.parametrize("name", HOSTILE)
 def test_hostile_values_within_free_objects(drafts, name: str) -> None:
     values = json.loads(drafts["pid_best"].content)
-    values["machine"] = {"a": "PLACE"}
+    values["machine"] |= {"a": "PLACE"}
     content = canonical.canonical(values).replace(b'"PLACE"', HOSTILE[name])
     if name in ("control characters", "fraction of many digits"):  # a text, a number: both are fine
         assert isinstance(record.from_bytes(content, "it", strict=False), record.Record)

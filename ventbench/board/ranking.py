@@ -246,7 +246,7 @@ def rank(entries: Sequence[Entry], track: str) -> list[Row]:
     ordered = sorted(entries, key=lambda e: (_key(e.record), e.record.name))
     if not ordered:
         return []
-    keys = np.array([_key(entry.record) for entry in ordered])
+    places = ranks([entry.record.by_draw for entry in ordered])
     means = _resampled([entry.record for entry in ordered])
     low, high = _rank_intervals(means)
     base = baseline([entry.record for entry in ordered], track)
@@ -262,7 +262,7 @@ def rank(entries: Sequence[Entry], track: str) -> list[Row]:
         rows.append(
             Row(
                 entry=entry,
-                rank=1 + int(np.sum(keys < keys[i])),
+                rank=places[i],
                 ranks=(int(low[i]), int(high[i])),
                 score=_interval(own, means[i]),
                 to_baseline=to_baseline,
@@ -272,6 +272,12 @@ def rank(entries: Sequence[Entry], track: str) -> list[Row]:
             )
         )
     return rows
+
+
+def ranks(by_draw: Sequence[Floats]) -> list[int]:
+    """Rank scores that are given for each draw, cmH2O; equal ones share a rank."""
+    keys = np.array([_rounded(values) for values in by_draw])
+    return [1 + int(np.sum(keys < key)) for key in keys]
 
 
 def unranked_rows(entries: Sequence[Entry]) -> list[Row]:
@@ -302,7 +308,11 @@ def worst(record: Record) -> tuple[float, str, float]:
 
 
 def _key(record: Record) -> float:
-    return round(float(np.mean(record.by_draw)), DECIMALS)
+    return _rounded(record.by_draw)
+
+
+def _rounded(by_draw: Floats) -> float:
+    return round(float(np.mean(by_draw)), DECIMALS)
 
 
 def _resampled(records: Sequence[Record]) -> Floats:

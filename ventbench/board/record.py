@@ -198,4 +198,4 @@ def withdrawal(withdraws: str, reason: str, now: datetime | None = None) -> byte
 
 def timestamp(now: datetime | None = None) -> str:
     """A time as records write it; the clock's if none is given."""
-    return f"{now or datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"
+    return (now or datetime.now(UTC)).strftime(schema.TIME_FORMAT)

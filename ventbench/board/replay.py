@@ -38,6 +38,10 @@ BATCH = 4
 #: How far a replayed number may be off, cmH2O; matrix products round differently elsewhere.
 TOLERANCE = 1e-9
 
+#: How far the mean over the cells of a draw may be off, cmH2O. Rounding differs from cell to cell
+#: (1e-14 on the machines tried); only a hand that lowers all cells moves their mean.
+MEAN_TOLERANCE = 1e-11
+
 # What is rounded to 0.01 cmH2O or 0.1 %: half of that, and a little for ties.
 _CENTI, _TENTH = 0.005 + 1e-6, 0.05 + 1e-6
 
@@ -81,6 +85,7 @@ class Replayed:
         spread: see :func:`spread`, cmH2O, shape ``(L, P)``.
         pressure: nominal inspiration of :data:`TRACE_BREATH`, cmH2O, shape ``(L, P, S)``.
         u_in: commands of that inspiration as applied, %, shape ``(L, P, S)``.
+        first: first command of each run, %, shape ``(1 + K, L, P)``.
     """
 
     nominal: Floats
@@ -93,6 +98,7 @@ class Replayed:
     spread: Floats
     pressure: Floats
     u_in: Floats
+    first: Floats
 
 
 @jax.jit
@@ -222,6 +228,7 @@ def _measure(cells: Scenario, requested: Floats, pressure: Floats, spread: Float
         spread=spread,
         pressure=pressure[:, 0, :, TRACE_BREATH],
         u_in=np.clip(requested[:, 0, :, TRACE_BREATH], 0.0, protocol.U_MAX),
+        first=np.moveaxis(requested[..., 0, 0], 1, 0),
     )
 
 
@@ -259,7 +266,47 @@ def differences(record: Record, replayed: Replayed) -> list[str]:
         ("trace.pressure_centi_cmH2O", record.pressure, replayed.pressure, _CENTI),
         ("trace.u_in_tenths_percent", record.u_in, replayed.u_in, _TENTH),
     )
-    return [text for check in checks if (text := _difference(*check)) is not None]
+    texts = [text for check in checks if (text := _difference(*check)) is not None]
+    for key in ("nominal", "drawn"):
+        recorded, given = getattr(record, key), getattr(replayed, key)
+        if np.all(_off(recorded, given) <= TOLERANCE):
+            means = _means(recorded, given)
+            text = _difference(f"errors.{key}, mean over cells", *means, MEAN_TOLERANCE)
+            texts += [] if text is None else [text]
+    return texts + lung_leaks(record, replayed)
+
+
+def lung_leaks(record: Record, replayed: Replayed) -> list[str]:
+    """Find first commands of the robustness track that differ from lung to lung.
+
+    The first observation of a run is that of a lung at PEEP: noise, start, target and step are
+    common to all lungs of a draw. A controller that is not told the lung cannot answer
+    differently; one that does has learned it, or nobody has computed its commands from
+    observations. The reverse is no proof of honesty. Failed runs are left out.
+
+    Returns:
+        One sentence for the first draw and PIP that shows it; empty if none does.
+    """
+    if record.track != "robustness":
+        return []
+    failed = np.isnan(np.concatenate([record.nominal[None], record.drawn]))
+    highest = np.max(np.where(failed, -np.inf, replayed.first), axis=1)
+    lowest = np.min(np.where(failed, np.inf, replayed.first), axis=1)
+    apart = np.argwhere(highest > lowest)
+    if not len(apart):
+        return []
+    draw, pip = apart[0]
+    run = f"draw {draw}" if draw else "the nominal run"
+    return [
+        f"key actions: in {run} at PIP {record.pips[pip]:g} the first command is "
+        f"{lowest[draw, pip]:g} % on one lung and {highest[draw, pip]:g} % on another, though the "
+        "first observation is the same: the lung was known"
+    ]
+
+
+def _means(recorded: Floats, replayed: Floats) -> tuple[Floats, Floats]:
+    """Means over lungs and PIPs; NaN where a cell failed."""
+    return recorded.mean(axis=(-2, -1)), replayed.mean(axis=(-2, -1))
 
 
 def _difference(key: str, recorded: ArrayLike, replayed: ArrayLike, tolerance: float) -> str | None:
@@ -272,7 +319,7 @@ def _difference(key: str, recorded: ArrayLike, replayed: ArrayLike, tolerance: f
         return None
     index: Any = np.unravel_index(int(np.argmax(off)), off.shape)
     place = "".join(f"[{i}]" for i in index)
-    return f"key {key}{place} says {recorded[index]:.12g}, its commands give {replayed[index]:.12g}"
+    return f"key {key}{place} says {recorded[index]:.15g}, its commands give {replayed[index]:.15g}"
 
 
 def _off(recorded: ArrayLike, replayed: ArrayLike) -> np.ndarray:

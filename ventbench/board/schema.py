@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from datetime import datetime
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
@@ -17,7 +18,8 @@ from ventbench import protocol
 from ventbench.board import actions
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS
-from ventbench.submissions.manifest import FAMILIES, NAME, TRACKS
+from ventbench.submissions.folder import CONTROLLER, combined_hash
+from ventbench.submissions.manifest import FAMILIES, MANIFEST, NAME, TRACKS
 from ventbench.text import plain
 
 #: Version of the record's form.
@@ -31,6 +33,13 @@ MAX_TEXT = 4000
 
 #: Deepest nesting of what a record says freely about its machine and the like.
 MAX_DEPTH = 6
+
+#: How times are written; always UTC.
+TIME_FORMAT = "%Y-%m-%dT%H:%M:%SZ"
+
+#: What every record says about its scorer and its machine.
+REQUIRED_VERSIONS = ("ventbench", "python", "jax", "jaxlib", "numpy")
+REQUIRED_MACHINE = ("system", "kernel", "architecture")
 
 #: Most characters of a message; a hostile record chose some of them.
 _MAX_MESSAGE = 300
@@ -56,6 +65,7 @@ Track = Annotated[str, _among(TRACKS)]
 
 #: Whole numbers that JavaScript reads as they are, and those that fit into 32 bits.
 Count = Annotated[int, msgspec.Meta(ge=0, lt=2**53)]
+Version = Annotated[int, msgspec.Meta(ge=1, le=10**9)]
 SmallInt = Annotated[int, msgspec.Meta(ge=-(2**31), le=2**31)]
 
 #: Errors are null where a controller failed.
@@ -155,7 +165,7 @@ class ScoreHeader(_Table, frozen=True):
     """A score's record without its large tables; L lungs, P PIPs, K draws."""
 
     format: Literal[1]
-    protocol: Count
+    protocol: Version
     created: Time
     official: bool
     supersedes: Sha256 | None
@@ -226,6 +236,7 @@ def read(content: bytes, label: str) -> ScoreContent | WithdrawalContent:
         InputError: naming the first key that is wrong.
     """
     record = _decoded(_RECORD, content, label)
+    _check_time(record.created, f"{label}, key created")
     if isinstance(record, ScoreContent):
         for key in ("provenance", "simulators", "sandbox", "versions", "machine", "timing"):
             _check_free(getattr(record, key), f"{label}, key {key}")
@@ -233,6 +244,8 @@ def read(content: bytes, label: str) -> ScoreContent | WithdrawalContent:
         _check_free(record.submission.manifest.training, f"{label}, key submission.manifest")
         _check_shapes(record, label)
         _check_consistent(record, label)
+        _check_submission(record.submission, f"{label}, key submission")
+        _check_origin(record, label)
     return record
 
 
@@ -255,7 +268,7 @@ def _decoded(decoder: msgspec.json.Decoder[T], content: bytes, label: str) -> T:
         key = path[:-1].removeprefix(".")
         raise InputError(f"{label}, key {_short(key)}: {_short(message)}") from None
     # Not JSON, not UTF-8, or nested without end.
-    except (msgspec.DecodeError, ValueError, RecursionError) as error:
+    except (msgspec.DecodeError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(f"{label} is not JSON of a record: {_short(str(error))}") from None
 
 
@@ -265,9 +278,11 @@ def _short(message: str) -> str:
 
 
 def _check_free(value: Any, where: str, depth: int = MAX_DEPTH) -> None:
-    """Bound the texts and the nesting of JSON of any form."""
+    """Bound the texts, the whole numbers and the nesting of JSON of any form."""
     if isinstance(value, str) and len(value) > MAX_TEXT:
         raise InputError(f"{where}: holds a text of more than {MAX_TEXT} characters")
+    if isinstance(value, int) and not -(2**53) < value < 2**53:
+        raise InputError(f"{where}: holds a whole number beyond 2^53")
     if not isinstance(value, dict | list):
         return
     if depth == 0:
@@ -333,3 +348,42 @@ def _check_consistent(record: ScoreContent, label: str) -> None:
     named = [(failure.lung, failure.pip, failure.draw) for failure in record.failures]
     if len(named) != len(failed) or set(named) != set(failed):
         raise InputError(f"{label}, key failures: do not fit the errors")
+    for lung, errors, spreads in zip(lungs, record.errors.nominal, record.spread, strict=True):
+        for pip, error, spread in zip(pips, errors, spreads, strict=True):
+            if (error is None) != (spread is None):
+                raise InputError(
+                    f"{label}, key spread: {lung} at PIP {pip:g} has an error without a spread of "
+                    "the ensemble, or the reverse"
+                )
+
+
+def _check_time(created: str, where: str) -> None:
+    """Refuse a time that no calendar has."""
+    try:
+        datetime.strptime(created, TIME_FORMAT)
+    except ValueError:
+        raise InputError(f"{where}: {created} is no date and time") from None
+
+
+def _check_submission(submission: Submission, where: str) -> None:
+    """Check that the hashes of the files have their form and give the hash of the submission."""
+    for name, sha256 in submission.files.items():
+        parts = name.split("/")
+        if not name.isprintable() or {"", ".", ".."} & set(parts):
+            raise InputError(f"{where}.files: {_short(repr(name))} is no path within a folder")
+        if not isinstance(sha256, str) or not re.fullmatch("[0-9a-f]{64}", sha256):
+            raise InputError(f"{where}.files: {_short(name)} has no SHA-256")
+    for name in (CONTROLLER, MANIFEST):
+        if name not in submission.files:
+            raise InputError(f"{where}.files: {name} is missing")
+    if combined_hash(submission.files) != submission.sha256:
+        raise InputError(f"{where}.sha256: is not that of its files")
+
+
+def _check_origin(record: ScoreContent, label: str) -> None:
+    """Refuse a record that does not say by which versions and on what machine it was made."""
+    for table, keys in (("versions", REQUIRED_VERSIONS), ("machine", REQUIRED_MACHINE)):
+        for key in keys:
+            value = getattr(record, table).get(key)
+            if not isinstance(value, str) or not value.strip():
+                raise InputError(f"{label}, key {table}.{key}: is missing or empty")

@@ -11,12 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from ventbench import draws, protocol
-from ventbench.board import actions, build, canonical, layout, record, store
+from ventbench.board import actions, build, canonical, layout, ranking, record, store
 from ventbench.board.record import Record, Withdrawal
 from ventbench.board.replay import BATCH, Simulators, deviation, differences, replay
 from ventbench.errors import InputError
+
+Floats = NDArray[np.float64]
 
 #: Loads the frozen simulators of a version.
 Load = Callable[[int], Simulators]
@@ -82,7 +86,9 @@ def verify(
     report.problems += _strange_files(folder, bool(links))
     report.problems += store.conflicts(entries)
     scores = [entry for entry in entries if isinstance(entry, Record)]
-    _check_replay(folder, scores, load, report, progress)
+    by_draw = _check_replay(folder, scores, load, report, progress)
+    if not report.problems:  # else whatever is wrong has been said, and moves the ranks
+        report.problems += _check_ranks(entries, by_draw)
     if len(entries) == len(links) > 0:
         report.problems += _check_pages(store.Store(folder, tuple(links), tuple(entries)))
     return report
@@ -132,16 +138,46 @@ def _check_replay(
     load: Load,
     report: Report,
     progress: Progress | None,
-) -> None:
-    """Replay records and note in the report what differs."""
+) -> dict[str, Floats]:
+    """Replay records and note in the report what differs.
+
+    Returns:
+        Score of each draw as replayed, cmH2O, shape ``(K,)``, by the record's hash.
+    """
+    by_draw: dict[str, Floats] = {}
     for group in _by_simulators(scores, report):
         simulators = _simulators(group[0].header.simulators, load, report)
         if simulators is None:
             continue
         for first in range(0, len(group), BATCH):
-            _replay_batch(folder, group[first : first + BATCH], simulators, report)
+            by_draw |= _replay_batch(folder, group[first : first + BATCH], simulators, report)
             if progress is not None:
                 progress(min(first + BATCH, len(group)), len(group))
+    return by_draw
+
+
+def _check_ranks(
+    entries: Sequence[Record | Withdrawal], by_draw: Mapping[str, Floats]
+) -> list[str]:
+    """Ranks that recorded errors give and replayed ones do not: nobody gains by a rounding error.
+
+    Args:
+        entries: all that could be read, in the order of the chain.
+        by_draw: replayed scores of each draw; a record without one keeps its own.
+    """
+    problems = []
+    for tracks in ranking.standings(entries).values():
+        for name, standing in tracks.items():
+            records = [entry.record for entry in standing.ranked]
+            recorded = ranking.ranks([score.by_draw for score in records])
+            replayed = ranking.ranks([by_draw.get(x.sha256, x.by_draw) for x in records])
+            problems += [
+                f"record {score.sha256} ({score.name}): ranks {said} on the {name} track by its "
+                f"recorded errors, {given} by those that all commands give"
+                for score, said, given in zip(records, recorded, replayed, strict=True)
+                if said != given
+            ]
+    return problems
 
 
 def _by_simulators(scores: Sequence[Record], report: Report) -> list[list[Record]]:
@@ -193,8 +229,9 @@ def _simulators(recorded: Mapping[str, Any], load: Load, report: Report) -> Simu
 
 def _replay_batch(
     folder: Path, batch: Sequence[Record], simulators: Simulators, report: Report
-) -> None:
+) -> dict[str, Floats]:
     sound, requested = [], []
+    by_draw: dict[str, Floats] = {}
     for score in batch:
         try:
             requested.append(actions.load(score, folder / store.RECORDS))
@@ -202,9 +239,12 @@ def _replay_batch(
         except (InputError, OSError) as error:
             report.problems.append(str(error))
     if not sound:
-        return
+        return by_draw
     for score, replayed in zip(sound, replay(simulators, sound[0].pips, requested), strict=True):
         report.replayed += 1
         report.deviation = max(report.deviation, deviation(score, replayed))
         path = folder / store.RECORDS / f"{score.sha256}{record.SUFFIX}"
         report.problems += [f"{path}, {text}" for text in differences(score, replayed)]
+        failed = np.isnan(score.drawn)
+        by_draw[score.sha256] = np.where(failed, np.nan, replayed.drawn).mean(axis=(1, 2))
+    return by_draw

@@ -27,6 +27,7 @@ from ventbench.cli import (
     view,
 )
 from ventbench.errors import InputError
+from ventbench.text import plain
 
 app = typer.Typer(
     name="ventbench",
@@ -73,5 +74,7 @@ def main() -> None:
     try:
         app()
     except (InputError, OSError) as error:
-        print(f"ventbench: {error}", file=sys.stderr)
+        # Messages quote files and records of others, which may hold commands to the terminal.
+        lines = [plain(line) for line in str(error).split("\n")]
+        print("ventbench:", "\n".join(lines), file=sys.stderr)
         sys.exit(2)

@@ -117,6 +117,7 @@ def verify(
 
     from ventbench.board import verify as verifier
     from ventbench.plants import frozen
+    from ventbench.text import plain
 
     console = Console(stderr=str(json) == "-")
     with Console(stderr=True).status("replaying") as status:
@@ -128,9 +129,9 @@ def verify(
         )
     emit(dataclasses.asdict(report), json)
     for note in report.notes:
-        console.print(f"note: {note}", markup=False, highlight=False)
+        console.print(f"note: {plain(note)}", markup=False, highlight=False)
     for problem in report.problems:
-        console.print(problem, style="red", markup=False, highlight=False, soft_wrap=True)
+        console.print(plain(problem), style="red", markup=False, highlight=False, soft_wrap=True)
     _summary(console, report)
     if report.problems:
         raise typer.Exit(1)
@@ -180,6 +181,8 @@ def _table(track: Track) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
+    from ventbench.text import plain
+
     found = Table(title=f"{track.name}, version {track.version}: score over draws, cmH2O")
     for name in ("rank", "entry", "score", "95 %", "to PID", "nominal", "worst cell", "state"):
         left = name in ("entry", "state")
@@ -194,7 +197,7 @@ def _table(track: Track) -> Table:
             "" if row.to_baseline is None else f"{row.to_baseline.value:+.3f}",
             f"{row.nominal:.3f}" if row.nominal == row.nominal else "failed",
             f"{worst:.3f} {lung} {pip:g}" if lung else "",
-            escape("; ".join((status, *row.entry.reasons))[:120]),
+            escape(plain("; ".join((status, *row.entry.reasons)))[:120]),
         )
     return found
 

@@ -1,0 +1,110 @@
+"""Records that replay and still lie: what `add` and `verify` see of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from ventbench.board import build, canonical, create, ranking, replay, store
+from ventbench.board.verify import verify
+from ventbench.cli import app
+from ventbench.errors import InputError
+
+from .conftest import opened, put
+
+
+def _lowered(made: create.Draft, by: float) -> create.Draft:
+    """The same commands, with all errors a little lower than they give."""
+
+    def lower(table: Any) -> Any:
+        return [lower(x) for x in table] if isinstance(table, list) else table - by
+
+    values = json.loads(made.content)
+    values["errors"] = lower(values["errors"]["nominal"]), lower(values["errors"]["drawn"])
+    values["errors"] = dict(zip(("nominal", "drawn"), values["errors"], strict=True))
+    return create.Draft(canonical.canonical(values), made.commands)
+
+
+def test_errors_lowered_within_tolerance_are_refused(tmp_path: Path, drafts, simulators) -> None:
+    forged = _lowered(drafts["softer"], 9e-10)
+    honest = opened(drafts["softer"])
+    assert np.all(np.abs(opened(forged).drawn - honest.drawn) < replay.TOLERANCE)
+    assert ranking.ranks([opened(forged).by_draw, honest.by_draw]) == [1, 2], "control: it leads"
+    with pytest.raises(InputError, match=r"key errors\.drawn, mean over cells"):
+        put(tmp_path / "board", forged, simulators)
+    put(tmp_path / "board", forged)  # as an owner without scruples does
+    build.build(tmp_path / "board")
+    nominal, drawn = verify(tmp_path / "board", lambda version: simulators).problems
+    assert "key errors.nominal, mean over cells" in nominal
+    assert "key errors.drawn, mean over cells" in drawn
+
+
+def test_replayed_errors_rank(tmp_path: Path, drafts, draft, simulators, monkeypatch) -> None:
+    """Even where rounding to the decimals that decide falls between both."""
+    folder = tmp_path / "board"
+    twin = draft("twin", factor=0.97)  # the same commands as "softer"
+    monkeypatch.setattr(replay, "MEAN_TOLERANCE", 1.0)
+    put(folder, drafts["softer"], simulators)
+    put(folder, _lowered(twin, 9e-10), simulators)
+    build.build(folder)
+    (problem,) = verify(folder, lambda version: simulators).problems
+    assert "(softer): ranks 2 on the performance track by its recorded errors, 1 by" in problem
+
+
+def test_the_lung_is_not_known_before_it_shows(
+    leaderboard: Path, draft, simulators, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Robustness: the first observation of a draw and PIP is the same on all lungs."""
+
+    def by_lung(requested: np.ndarray) -> None:
+        requested[3, 5, 2, 0, 0] += 1e-3
+
+    with monkeypatch.context() as patched:
+        patched.setattr(replay, "lung_leaks", lambda *_: [])
+        leaky = draft("leaky", "pid_robust", change=by_lung)
+        record = put(leaderboard, leaky, simulators)  # control: nothing else sees it
+        build.build(leaderboard)
+        assert verify(leaderboard, lambda version: simulators).problems == []
+    (problem,) = verify(leaderboard, lambda version: simulators).problems
+    assert record.sha256 in problem
+    assert "key actions: in draw 5 at PIP 20 the first command" in problem
+    with pytest.raises(InputError, match="the lung was known"):
+        put(leaderboard.parent / "other", leaky, simulators)
+    with pytest.raises(InputError, match="the lung was known"):
+        draft("leaky", "pid_robust", change=by_lung)
+    draft("told", "pid_best", change=by_lung)  # the performance track is told the lung
+
+
+def test_later_commands_and_failed_runs_may_differ(draft) -> None:
+    def later(requested: np.ndarray) -> None:
+        requested[3, 5, 2, 0, 1] += 1.0
+        requested[3, 5, 2, 1, 0] += 1.0
+
+    draft("later", "pid_robust", change=later)
+    failed = opened(draft("fails", "pid_robust", failed=2))
+    assert failed.header.failed_cells == 2
+    assert failed.track == "robustness"
+
+
+def test_the_terminal_gets_no_commands(leaderboard: Path, drafts, monkeypatch) -> None:
+    item = next(x for x in store.load(leaderboard).scores if x.name == "softer")
+    store.withdraw(leaderboard, item.sha256, "a \x1b]0;owned\x07\x1b[2J\x9b31m\u202e [red]bug")
+    monkeypatch.setenv("COLUMNS", "300")
+    arguments = ["board", "show", "--folder", str(leaderboard)]
+    shown = CliRunner().invoke(app, arguments)
+    assert shown.exit_code == 0
+    assert not {"\x1b", "\x07", "\x9b", "\u202e"} & set(shown.output)
+    assert "[red]bug" in shown.output
+    (leaderboard / "\x1b[2Jx.html").write_text("x")
+    build.build(leaderboard)
+    arguments[1] = "verify"
+    monkeypatch.setattr("ventbench.plants.frozen.load", lambda version=1, path=None: None)
+    checked = CliRunner().invoke(app, arguments)
+    assert checked.exit_code == 1
+    assert "\x1b" not in checked.output
+    assert "x.html is no part of a leaderboard" in checked.output

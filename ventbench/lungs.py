@@ -56,7 +56,7 @@ LUNGS: tuple[Lung, ...] = tuple(Lung(r, c) for r in (5.0, 20.0) for c in (10.0, 
 RECORDED_LUNGS: tuple[Lung, ...] = (*LUNGS, *(Lung(50.0, c) for c in (10.0, 20.0, 50.0)))
 
 #: Ids of :data:`LUNGS`.
-LUNG_IDS: tuple[str, ...] = tuple(item.id for item in LUNGS)
+LUNG_IDS: tuple[str, ...] = tuple(lung.id for lung in LUNGS)
 
 
 def scored_lung(lung_id: str) -> Lung:
@@ -65,7 +65,7 @@ def scored_lung(lung_id: str) -> Lung:
     Raises:
         InputError: if the text is not the id of a scored lung.
     """
-    found = lung(lung_id)
-    if found not in LUNGS:
+    named = lung(lung_id)
+    if named not in LUNGS:
         raise InputError(f"{lung_id} is not a scored lung; choose one of {', '.join(LUNG_IDS)}")
-    return found
+    return named

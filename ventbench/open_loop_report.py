@@ -134,9 +134,9 @@ class OpenLoopReport:
         """Return mean errors by lung, and the sentences of :meth:`misfit_lines`."""
         title = f"Open-loop MAE of the {self.plant} simulators, cmH2O"
         rows = [
-            f"  {name}: {_shown(one['mae'])}, held out {_shown(one['held_out_mae'])} "
-            f"({one['breaths']} breaths)"
-            for name, one in self.lungs.items()
+            f"  {name}: {_shown(figures['mae'])}, held out {_shown(figures['held_out_mae'])} "
+            f"({figures['breaths']} breaths)"
+            for name, figures in self.lungs.items()
         ]
         return "\n".join([title, *rows, *self.misfit_lines()])
 
@@ -226,8 +226,8 @@ def mean_errors(simulated: Floats, breaths: Breaths) -> Floats:
         breaths: n recorded breaths.
     """
     blank = np.isnan(breaths.pressure[:, 0])
-    found = mae(breaths.pressure, np.nan_to_num(simulated), breaths.inspiratory)
-    return np.where(blank, np.nan, found)
+    error = mae(breaths.pressure, np.nan_to_num(simulated), breaths.inspiratory)
+    return np.where(blank, np.nan, error)
 
 
 def misfits(
@@ -253,16 +253,18 @@ def misfits(
     if index.size == 0:
         return []
     suspects = breaths.select(index)
-    names, found = [], []
+    names, explained = [], []
     for r, c in settings:
         other = replace(suspects, R=np.full(index.size, r), C=np.full(index.size, c))
         names.append(f"lung R{r:g}C{c:g}")
-        found.append(errors(plants_for, other))
+        explained.append(errors(plants_for, other))
     for gain in GAINS:
         names.append(f"valve gain x {gain:g}")
-        found.append(errors(lambda part, gain=gain: with_gain(plants_for(part), gain), suspects))
-    best = np.argmin(found, axis=0)
-    least = np.min(found, axis=0)
+        explained.append(
+            errors(lambda part, gain=gain: with_gain(plants_for(part), gain), suspects)
+        )
+    best = np.argmin(explained, axis=0)
+    least = np.min(explained, axis=0)
     return [
         Misfit(
             int(suspects.breath_id[i]),
@@ -286,12 +288,12 @@ def summary(prefix: str, error: Floats) -> dict[str, Any]:
         JSON values: ``mae``, ``median_mae``, ``ci95`` (bootstrap interval of the mean) and
         ``breaths``, with the prefix; null where there is no breath.
     """
-    found = bootstrap.summary(error)
+    estimate = bootstrap.summary(error)
     return {
-        f"{prefix}mae": _number(found.mean),
-        f"{prefix}median_mae": _number(found.median),
-        f"{prefix}ci95": [_number(limit) for limit in found.ci95],
-        f"{prefix}breaths": found.count,
+        f"{prefix}mae": _number(estimate.mean),
+        f"{prefix}median_mae": _number(estimate.median),
+        f"{prefix}ci95": [_number(limit) for limit in estimate.ci95],
+        f"{prefix}breaths": estimate.count,
     }
 
 

@@ -52,7 +52,7 @@ def nominal(pip: ArrayLike, peep: ArrayLike = protocol.PEEP) -> Scenario:
     pip, peep = np.broadcast_arrays(np.asarray(pip, float), np.asarray(peep, float))
     if not np.all(pip > peep):
         raise ValueError(f"PIP {pip} cmH2O must exceed PEEP {peep} cmH2O")
-    one, zero = np.ones(pip.shape), np.zeros(pip.shape)
+    ones, zeros = np.ones(pip.shape), np.zeros(pip.shape)
     noise = np.zeros((*pip.shape, protocol.BREATHS, protocol.INSPIRATION_STEPS))
-    arrays = (pip, peep, peep, protocol.DT * one, one, one, zero, zero, noise)
+    arrays = (pip, peep, peep, protocol.DT * ones, ones, ones, zeros, zeros, noise)
     return Scenario(*(jnp.asarray(array) for array in arrays))

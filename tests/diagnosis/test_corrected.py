@@ -58,8 +58,8 @@ def test_a_simulator_that_would_err_more_is_left_as_it_is(breaths, monkeypatch, 
     assert one.training_errors[1] == pytest.approx((2.0 if worse else 0.1) * one.training_errors[0])
     plant: Any = one.plants[small.LABEL]
     assert float(plant.simulator.get("R")) == 10.0
-    assert float(plant.had.get("R")) == 20.0
-    assert float(plant.wanted.get("R")) == (20.0 if worse else 30.0)
+    assert float(plant.without_mechanisms.get("R")) == 20.0
+    assert float(plant.with_mechanisms.get("R")) == (20.0 if worse else 30.0)
     if worse:  # the plant too
         np.testing.assert_allclose(
             load_simulators(one.plants).pressures(breaths), before, atol=1e-9

@@ -15,7 +15,7 @@ from ventbench.diagnosis.patient_effort import (
     DURATION,
     ONSET,
     NoBreathTerm,
-    PatientEffort,
+    PatientEffortTerm,
     breath_term,
 )
 from ventbench.diagnosis.selection import fit_with_noise
@@ -24,7 +24,7 @@ from ventbench.system_id import Noise
 from . import small
 
 EFFORT = Hypothesis(("patient_effort",))
-TERM = PatientEffort(small.SETTINGS)
+TERM = PatientEffortTerm(small.SETTINGS)
 NOISE = Noise((0.1,), (0.0,), np.inf)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -103,3 +105,25 @@ def test_back_from_json_to_the_bit(base, textbook, tmp_path):
     assert type(found) is Corrected
     assert jax.tree.structure(found) == jax.tree.structure(plant)
     assert np.array_equal(run(found), run(plant))
+
+
+def stored_lung(resistance):
+    fields = {"R": resistance, "C": 20.0, "gain": 20.0, "R_ex": 5.0}
+    return {"type": "SingleCompartment", "fields": {k: {"value": v} for k, v in fields.items()}}
+
+
+def test_files_name_the_two_physics_wanted_and_had(tmp_path):
+    fields = {"simulator": stored_lung(5.0), "wanted": stored_lung(20.0), "had": stored_lung(10.0)}
+    content = {
+        "format": "ventbench-plants-1",
+        "about": {},
+        "lungs": {"R5C20": {"type": "Corrected", "fields": fields}},
+        "arrays": {},
+    }
+    path = tmp_path / "corrected.json"
+    path.write_text(json.dumps(content))
+    plant = load_plants(path)["R5C20"]
+    assert isinstance(plant, Corrected)
+    assert (plant.with_mechanisms.R, plant.without_mechanisms.R) == (20.0, 10.0)
+    save_plants(tmp_path / "again.json", {"R5C20": plant})
+    assert json.loads((tmp_path / "again.json").read_text()) == content

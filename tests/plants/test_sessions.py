@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ventbench.errors import InputError
-from ventbench.plants.sessions import Session, Sessions, clock, find
+from ventbench.plants.sessions import Session, Sessions, find, sample_timing
 
 TABLE = Sessions(
     (
@@ -26,7 +26,7 @@ def assigned(breaths):
 
 
 def test_reads_a_clock(make_recording):
-    seen = clock(
+    seen = sample_timing(
         make_recording(
             ["R5C10"] * 4,
             [31.8, 34.0, 34.0, 33.0],
@@ -47,7 +47,7 @@ def test_padding_is_no_part_of_a_clock(make_recording):
     valid[:, 40:] = False
     dt = breaths.dt.copy()
     dt[:, 39:] = 0.5
-    seen = clock(replace(breaths, valid=valid, dt=dt))
+    seen = sample_timing(replace(breaths, valid=valid, dt=dt))
     assert seen.interval_ms[0] == pytest.approx(31.8)
     assert not seen.spiky[0]
 
@@ -117,7 +117,7 @@ def test_blank_times_do_not_tell_spikes(make_recording):
     """Times that were estimated are even: a breath of a spiky rig must not be held against it."""
     breaths = make_recording(["R5C10"], 34.2, inspiratory=30)
     assert assigned(breaths) == [0]
-    assert not clock(replace(breaths, time_inferred=np.array([True]))).known[0]
+    assert not sample_timing(replace(breaths, time_inferred=np.array([True]))).known[0]
     assert assigned(replace(breaths, time_inferred=np.array([True]))) == [2]
 
 

@@ -154,12 +154,16 @@ def test_by_names_alone_leaves_the_names():
     corrected = Corrected(named, both, own)
     assert has_unnamed(corrected)
     less: Any = by_names_alone(corrected)
-    assert float(less.wanted.get("valve_delay.delay")) == 0.04
+    assert float(less.with_mechanisms.get("valve_delay.delay")) == 0.04
     for path, value in {"valve_shape.c1": 0.2, "supply_memory.c1": 0.3}.items():
-        assert float(less.wanted.get(path)) == pytest.approx(value), "it is the simulator's own"
-        assert less.had.get(path) == less.wanted.get(path), "and makes no difference"
+        assert float(less.with_mechanisms.get(path)) == pytest.approx(value), (
+            "it is the simulator's own"
+        )
+        assert less.without_mechanisms.get(path) == less.with_mechanisms.get(path), (
+            "and makes no difference"
+        )
     none: Any = by_names_alone(Corrected(named, both, named))
-    assert float(none.wanted.get("valve_shape.c1")) == 0.0
+    assert float(none.with_mechanisms.get("valve_shape.c1")) == 0.0
 
 
 def test_all_parts_and_once_only(recordings, tmp_path, diagnoses):

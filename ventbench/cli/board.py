@@ -183,13 +183,13 @@ def _table(track: Track) -> Table:
 
     from ventbench.text import plain
 
-    found = Table(title=f"{track.name}, version {track.version}: score over draws, cmH2O")
+    table = Table(title=f"{track.name}, version {track.version}: score over draws, cmH2O")
     for name in ("rank", "entry", "score", "95 %", "to PID", "nominal", "worst cell", "state"):
         left = name in ("entry", "state")
-        found.add_column(name, justify="left" if left else "right", no_wrap=name == "entry")
+        table.add_column(name, justify="left" if left else "right", no_wrap=name == "entry")
     for status, row in track.rows:
         worst, lung, pip = row.worst
-        found.add_row(
+        table.add_row(
             "" if row.rank is None else str(row.rank),
             row.record.name,
             "failed" if row.score is None else f"{row.score.value:.3f}",
@@ -199,11 +199,11 @@ def _table(track: Track) -> Table:
             f"{worst:.3f} {lung} {pip:g}" if lung else "",
             escape(plain("; ".join((status, *row.entry.reasons)))[:120]),
         )
-    return found
+    return table
 
 
-def _limits(found: Interval | None) -> str:
-    return "" if found is None else f"{found.low:.3f} to {found.high:.3f}"
+def _limits(interval: Interval | None) -> str:
+    return "" if interval is None else f"{interval.low:.3f} to {interval.high:.3f}"
 
 
 def register(parent: typer.Typer) -> None:

@@ -132,38 +132,38 @@ def reveal(
         def progress(done: int, total: int) -> None:
             shown.update(task, completed=done, total=total)
 
-        found = work(
+        result = work(
             ChallengeFolder(folder, round_), seed, with_oracle=oracle, jobs=jobs, progress=progress
         )
-    emit(found.as_dict(), json)
+    emit(result.as_dict(), json)
     console = Console(stderr=str(json) == "-")
-    _show(found, console)
-    if any(item.met is False for item in found.figures):
+    _show(result, console)
+    if any(figure.met is False for figure in result.figures):
         raise typer.Exit(1)
 
 
-def _show(found: Any, console: Any) -> None:
-    console.print(f"commitment {found.commitment}: kept", highlight=False)
-    console.print(_confusion(found))
-    console.print(_figures(found))
-    if found.unanswered:
-        console.print(f"{len(found.unanswered)} cases have no answer and are left out")
+def _show(result: Any, console: Any) -> None:
+    console.print(f"commitment {result.commitment}: kept", highlight=False)
+    console.print(_confusion(result))
+    console.print(_figures(result))
+    if result.unanswered:
+        console.print(f"{len(result.unanswered)} cases have no answer and are left out")
 
 
-def _confusion(found: Any) -> Any:
+def _confusion(result: Any) -> Any:
     from rich.table import Table
 
     table = Table(title="What was answered to what")
     table.add_column("truth", no_wrap=True)
     table.add_column("n", justify="right")
     table.add_column("answers")
-    for truth, counts in found.confusion.items():
+    for truth, counts in result.confusion.items():
         said = ", ".join(f"{answer} {count}" for answer, count in counts.items())
         table.add_row(truth, str(sum(counts.values())), said)
     return table
 
 
-def _figures(found: Any) -> Any:
+def _figures(result: Any) -> Any:
     from rich.table import Table
 
     table = Table(title="Figures to reach")
@@ -171,15 +171,15 @@ def _figures(found: Any) -> Any:
     for name in ("value", "95 %", "goal", "n", ""):
         table.add_column(name, justify="right", no_wrap=True)
     words = {True: "met", False: "missed", None: ""}
-    for item in found.figures:
-        if item.value is None:
+    for figure in result.figures:
+        if figure.value is None:
             value, span = "-", ""
-        elif item.ci95 is None:
-            value, span = f"{item.value:.3g}", ""
+        elif figure.ci95 is None:
+            value, span = f"{figure.value:.3g}", ""
         else:
-            value = f"{item.value:.1%}"
-            span = f"{item.ci95[0]:.1%}..{item.ci95[1]:.1%}"
-        table.add_row(item.what, value, span, item.goal, str(item.count), words[item.met])
+            value = f"{figure.value:.1%}"
+            span = f"{figure.ci95[0]:.1%}..{figure.ci95[1]:.1%}"
+        table.add_row(figure.what, value, span, figure.goal, str(figure.count), words[figure.met])
     return table
 
 

@@ -37,16 +37,16 @@ def mechanics(
     if _is_respiraworks(recordings):
         with progress.status(f"identifying the lungs of {recordings}"):
             runs = _survey(recordings)
-        emit([_run(item) for item in runs], json)
+        emit([_run(run) for run in runs], json)
         _say_runs(console, runs)
         return
     with progress.status(f"identifying the lungs of {recordings}"):
         lungs = _identify(recordings, clip=clip, pad=pad)
-    emit([_lung(one) for one in lungs], json)
+    emit([_lung(lung) for lung in lungs], json)
     console.print(_table(lungs))
-    for one in lungs:
-        for note in one.notes:
-            console.print(f"{one.label}: {note}", markup=False, highlight=False)
+    for lung in lungs:
+        for note in lung.notes:
+            console.print(f"{lung.label}: {note}", markup=False, highlight=False)
 
 
 def _is_respiraworks(path: Path) -> bool:
@@ -68,10 +68,10 @@ def _survey(path: Path) -> tuple[SurveyedRun, ...]:
     from ventbench.errors import InputError
     from ventbench.mechanics import survey
 
-    found = survey(path)
-    if all(item.mechanics is None for item in found):
+    runs = survey(path)
+    if all(run.mechanics is None for run in runs):
         raise InputError(f"{path}: no run has flow or volume; log one of them beside pressure")
-    return found
+    return runs
 
 
 def _identify(path: Path, *, clip: bool, pad: bool) -> tuple[Mechanics, ...]:
@@ -91,20 +91,22 @@ def _identify(path: Path, *, clip: bool, pad: bool) -> tuple[Mechanics, ...]:
         raise InputError(f"{path}: {error}") from error
 
 
-def _lung(one: Mechanics) -> dict[str, Any]:
+def _lung(mechanics: Mechanics) -> dict[str, Any]:
     """JSON values; what is not finite becomes null."""
     import dataclasses
 
     from ventbench import files
 
-    plain = dataclasses.asdict(one) | {"settings": [lung.id for lung in one.settings]}
+    plain = dataclasses.asdict(mechanics) | {
+        "settings": [setting.id for setting in mechanics.settings]
+    }
     return files.json_values(plain)
 
 
-def _run(item: SurveyedRun) -> dict[str, Any]:
-    run, found = item.run, item.mechanics
+def _run(surveyed: SurveyedRun) -> dict[str, Any]:
+    run, mechanics = surveyed.run, surveyed.mechanics
     about = {"run": run.name, "test": run.test, "drive": run.drive, "R": run.R, "C": run.C}
-    return about | {"mechanics": None if found is None else _lung(found)}
+    return about | {"mechanics": None if mechanics is None else _lung(mechanics)}
 
 
 def _say_runs(console: Any, runs: tuple[SurveyedRun, ...]) -> None:
@@ -112,8 +114,8 @@ def _say_runs(console: Any, runs: tuple[SurveyedRun, ...]) -> None:
 
     # Lines of a Markdown table must not be broken.
     console.print(survey_table(runs), markup=False, highlight=False, soft_wrap=True)
-    known = [item.mechanics for item in runs if item.mechanics is not None]
-    holds = sum(one.match.label_matches for one in known)
+    known = [run.mechanics for run in runs if run.mechanics is not None]
+    holds = sum(lung.match.label_matches for lung in known)
     console.print(
         f"\nThe label holds in {holds} of {len(known)} runs; {len(runs) - len(known)} more have "
         "neither flow nor volume.",
@@ -127,15 +129,15 @@ def _table(lungs: tuple[Mechanics, ...]) -> Any:
     table = Table(title="Lungs by pressure and flow: R in cmH2O s/L at 1 L/s, C in mL/cmH2O")
     for name in ("label", "R", "C", "label holds", "may be", "also needs"):
         table.add_column(name)
-    for one in lungs:
-        it = one.match
+    for lung in lungs:
+        match = lung.match
         table.add_row(
-            one.label,
-            f"{it.fitted_R:.1f} [{it.ci95_R[0]:.1f}, {it.ci95_R[1]:.1f}]",
-            f"{it.fitted_C:.1f} [{it.ci95_C[0]:.1f}, {it.ci95_C[1]:.1f}]",
-            "yes" if it.label_matches else "no",
-            ", ".join(lung.id for lung in one.settings[:2]) or "none known",
-            ", ".join(term.name for term in one.terms) or "-",
+            lung.label,
+            f"{match.fitted_R:.1f} [{match.ci95_R[0]:.1f}, {match.ci95_R[1]:.1f}]",
+            f"{match.fitted_C:.1f} [{match.ci95_C[0]:.1f}, {match.ci95_C[1]:.1f}]",
+            "yes" if match.label_matches else "no",
+            ", ".join(setting.id for setting in lung.settings[:2]) or "none known",
+            ", ".join(term.name for term in lung.terms) or "-",
         )
     return table
 

@@ -62,10 +62,10 @@ def proof(
                 tasks[part] = shown.add_task(part, total=1.0)
             shown.update(tasks[part], completed=share, description=f"{part}: {what}")
 
-        found = prove(folder, out, lambda to, found: found.save(to), only or (), progress)
-    emit(found.as_dict(), json)
-    _show(Console(stderr=str(json) == "-"), found)
-    if not found.met:
+        result = prove(folder, out, lambda to, diagnosis: diagnosis.save(to), only or (), progress)
+    emit(result.as_dict(), json)
+    _show(Console(stderr=str(json) == "-"), result)
+    if not result.met:
         raise typer.Exit(1)
 
 
@@ -79,18 +79,18 @@ def _folder(given: Path | None) -> Path:
     return folder
 
 
-def _show(console: Any, found: Proof) -> None:
-    console.print(_table(found))
-    for name, reason in found.impossible.items():
+def _show(console: Any, result: Proof) -> None:
+    console.print(_table(result))
+    for name, reason in result.impossible.items():
         console.print(f"{name}: {reason}", markup=False, highlight=False)
-    for claim in found.claims:
+    for claim in result.claims:
         verdict = "met" if claim.met else "missed"
         console.print(
             f"{claim.part}: {claim.what}: {verdict} ({claim.value})", markup=False, highlight=False
         )
 
 
-def _table(found: Proof) -> Any:
+def _table(result: Proof) -> Any:
     from rich.table import Table
 
     table = Table(title="Open-loop MAE on held-out real breaths, cmH2O")
@@ -99,14 +99,14 @@ def _table(found: Proof) -> Any:
         table.add_column(name, justify="right", no_wrap=True)
     for name in ("named", "without a name", "label misfits"):
         table.add_column(name)
-    for name, part in found.parts.items():
+    for name, part in result.parts.items():
         errors = (f"{part['mae'][k] or float('nan'):.2f}" for k in ("before", "refit", "after"))
         share = part["cut_percent"]
         table.add_row(
             name, str(part["held_out"]), *errors, "-" if share is None else f"{share:.0f} %",
-            ", ".join(item["name"] for item in part["mechanisms"]) or "-",
+            ", ".join(mechanism["name"] for mechanism in part["mechanisms"]) or "-",
             part["slot"]["name"] if part["slot"] else "-",
-            ", ".join(item["label"] for item in part["misfitting_labels"]) or "-",
+            ", ".join(misfit["label"] for misfit in part["misfitting_labels"]) or "-",
         )  # fmt: skip
     return table
 

@@ -112,17 +112,17 @@ def _open_loop_table(result: dict[str, Any]) -> Any:
     def show(value: float | None) -> str:
         return "-" if value is None else f"{value:.2f}"
 
-    for lung, one in result["lungs"].items():
-        low, high = one["held_out_ci95"]
-        apart = one["fitting_label"]
+    for lung, figures in result["lungs"].items():
+        low, high = figures["held_out_ci95"]
+        apart = figures["fitting_label"]
         table.add_row(
             lung,
-            str(one["breaths"]),
-            show(one["mae"]),
-            show(one["median_mae"]),
-            show(one["held_out_mae"]),
+            str(figures["breaths"]),
+            show(figures["mae"]),
+            show(figures["median_mae"]),
+            show(figures["held_out_mae"]),
             f"{show(low)}..{show(high)}",
-            show(one["held_out_median_mae"]),
+            show(figures["held_out_median_mae"]),
             f"{show(apart['held_out_mae'])} ({apart['held_out_breaths']})",
         )
     return table

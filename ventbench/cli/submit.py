@@ -31,7 +31,7 @@ def new(
     from ventbench.submissions import scaffold
 
     path = scaffold.create(name, family, folder)
-    typer.echo(f"wrote {path}: " + ", ".join(sorted(item.name for item in path.iterdir())))
+    typer.echo(f"wrote {path}: " + ", ".join(sorted(entry.name for entry in path.iterdir())))
     typer.echo(f"next: ventbench check {path} && ventbench score {path}")
 
 

@@ -208,8 +208,8 @@ def _is_own(problem: Problem, column: int) -> bool:
     path = problem.unknowns.paths[column]
     if path in ("R", "C"):
         return False
-    alone = len(np.unique(problem.unknowns.index[:, column])) == len(problem.data) > 1
-    return alone or path == START or parameter_of(path).scope == "breath"
+    own = len(np.unique(problem.unknowns.index[:, column])) == len(problem.data) > 1
+    return own or path == START or parameter_of(path).scope == "breath"
 
 
 def _information(hessian: Floats, which: NDArray[np.int64]) -> Floats:

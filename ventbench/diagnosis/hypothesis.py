@@ -63,7 +63,7 @@ class Hypothesis:
 
 def varies_by_breath(name: str) -> bool:
     """Whether a term has parameters that differ from breath to breath."""
-    return any(item.scope == "breath" for item in mechanism(name).description.parameters)
+    return any(parameter.scope == "breath" for parameter in mechanism(name).description.parameters)
 
 
 @dataclass(frozen=True, eq=False)

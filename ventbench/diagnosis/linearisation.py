@@ -93,7 +93,7 @@ def linearise(
     rows = noise.whiten(slopes, weight)
     rows = rows.reshape(*rows.shape[:2], -1)
     layout = problem.unknowns
-    breath = np.array([item.scope == "breath" for item in layout.parameters])
+    breath = np.array([parameter.scope == "breath" for parameter in layout.parameters])
     # Groups may give a shared parameter, such as the valve's gain, one unknown for each breath.
     counts = [len(np.unique(layout.index[:, k])) for k in range(len(layout.paths))]
     breath |= np.array([count == len(white) and count > 1 for count in counts])

@@ -90,7 +90,7 @@ class BreathTerm(Protocol):
 
 def breath_term(names: Iterable[str], settings: SelectionConfig) -> BreathTerm:
     """The breath term of a hypothesis with the terms ``names``."""
-    return PatientEffort(settings) if EFFORT in tuple(names) else NoBreathTerm()
+    return PatientEffortTerm(settings) if EFFORT in tuple(names) else NoBreathTerm()
 
 
 class NoBreathTerm:
@@ -140,7 +140,7 @@ class Evidence(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PatientEffort:
+class PatientEffortTerm:
     """Efforts of a patient, integrated out in each breath."""
 
     settings: SelectionConfig

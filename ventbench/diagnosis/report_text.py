@@ -54,7 +54,9 @@ def verdict(findings: Findings) -> str:
             f"Something is missing in {simulator} that is not in the library of mechanisms; its "
             f"place in the model is {place(term)}."
         )
-    names = _listed([f"{title(item.name)} ({item.name})" for item in findings.mechanisms])
+    names = _listed(
+        [f"{title(mechanism.name)} ({mechanism.name})" for mechanism in findings.mechanisms]
+    )
     rest = "" if term is None else "; an effect that is not in the library is missing too"
     return f"Missing in {simulator}: {names}{rest}."
 
@@ -130,9 +132,9 @@ def where(region: ErrorRegion) -> str:
 def alternatives(findings: Findings) -> list[str]:
     """Mechanisms that the recording cannot distinguish."""
     return [
-        f"This recording cannot tell {item.name} from {_listed(item.alternatives, 'or')}."
-        for item in findings.mechanisms
-        if item.alternatives
+        f"This recording cannot tell {mechanism.name} from {_listed(mechanism.alternatives, 'or')}."
+        for mechanism in findings.mechanisms
+        if mechanism.alternatives
     ]
 
 

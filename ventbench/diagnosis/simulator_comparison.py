@@ -59,11 +59,11 @@ def identify_both(
     refitted = refit_base_parameters(simulator_model, reduced.select(~held))
     refit = simulator_model.pressures(refitted, held, first) + unmodelled
     # Predicted as breaths to come: parameters of each breath are not known of them.
-    alone = recording_only_model.pressures(recording_only_model.conclusion.full, held, first)
+    predicted = recording_only_model.pressures(recording_only_model.conclusion.full, held, first)
     seen = data.select(~held)
     error = min(_mean_error(seen, response[~held]), _mean_error(seen, refit[~held]))
     share = settings.simulator.residual_model_share
-    if error >= share * _mean_error(seen, alone[~held]):
+    if error >= share * _mean_error(seen, predicted[~held]):
         return recording_only_model, simulator_model
     recording_model = identify(
         reduced,

@@ -49,7 +49,7 @@ def extended(*added: Mechanism) -> Iterator[None]:
     """
     global _current
     before = _catalogue()
-    names = [item.description.name for item in added]
+    names = [mechanism.description.name for mechanism in added]
     for name in names:
         if name in before.everything or names.count(name) > 1:
             raise InputError(f"the catalogue already has a mechanism {name!r}; choose another name")
@@ -98,7 +98,7 @@ def mechanism(name: str) -> Mechanism:
 
 def special_cases(term: str) -> tuple[str, ...]:
     """Mechanisms of the library that a basis term contains, exactly or nearly."""
-    described = (item.description for item in library().values())
+    described = (mechanism.description for mechanism in library().values())
     return tuple(about.name for about in described if term in about.special_case_of)
 
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.physics.network import Network, View
+from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import BASE_PARAMETERS, Parameter
 
 #: Values of a mechanism's parameters, by short name.
@@ -118,8 +118,8 @@ class Mechanism:
         """Flow that arrives at the airway, L/s, and the own state after the step."""
         return flow, state
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
-        """Network with its contribution, made by :meth:`Network.plus`."""
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
+        """Network with its contribution, made by :meth:`PneumaticNetwork.plus`."""
         return network
 
     def next_state(self, values: Values, state: Array, flow: Array, view: View) -> Array:
@@ -217,7 +217,9 @@ class Assembly:
 
     def total(self, term: Callable[[Mechanism, Values], Array | float]) -> Array | float:
         """Sum of a term over all mechanisms."""
-        return sum(term(item, self.values[name]) for name, item in self.mechanisms.items())
+        return sum(
+            term(mechanism, self.values[name]) for name, mechanism in self.mechanisms.items()
+        )
 
 
 def assemble(

@@ -85,13 +85,15 @@ class Physics:
         if peep is None:
             peep = assembly.base["PEEP"] if "PEEP" in self.names else shown
         u_in = assembly.base["rest"] + 0.0 * shown
-        memory = {name: u_in for name, item in assembly.mechanisms.items() if item.has_memory}
+        memory = {
+            name: u_in for name, mechanism in assembly.mechanisms.items() if mechanism.has_memory
+        }
         # Inactive mechanisms as well, because the memories get their shapes here.
         flow, memory = solver.commanded(replace(assembly, active={}), u_in, memory)
-        rest, one = solver.at_rest(assembly, shown, flow), jnp.ones_like(flow)
+        rest, ones = solver.at_rest(assembly, shown, flow), jnp.ones_like(flow)
         return PhysicsState(
-            rest, memory, _repeat(flow, self.memory + 1), _repeat(one, self.memory + 1),
-            _repeat(0.03 * one, self.memory), 0.0 * one, rest.volume, peep * one,
+            rest, memory, _repeat(flow, self.memory + 1), _repeat(ones, self.memory + 1),
+            _repeat(0.03 * ones, self.memory), 0.0 * ones, rest.volume, peep * ones,
         )  # fmt: skip
 
     def step(
@@ -121,8 +123,8 @@ class Physics:
         flow, memory = solver.commanded(assembly, u_in + zero, state.memory)
         commanded = _push(flow, state.commanded)
         opened = _push(u_out + zero, state.opened)
-        late = assembly.total(lambda item, own: item.dead_time(own))
-        late_out = assembly.total(lambda item, own: item.outlet_dead_time(own, u_out))
+        late = assembly.total(lambda mechanism, own: mechanism.dead_time(own))
+        late_out = assembly.total(lambda mechanism, own: mechanism.outlet_dead_time(own, u_out))
         lengths, open_for, wanted = dead_time.windows(
             dt, state.past, (late_out, late), (opened, commanded), self.substeps, self.skip_idle
         )

@@ -42,7 +42,7 @@ class View:
 
 
 @flax.struct.dataclass
-class Network:
+class PneumaticNetwork:
     """Coefficients of one step; every array has shape ``(...)``.
 
     Flow balance at the airway, L/s, with ``p`` and ``Q`` after the step and ``p0``, ``Q0`` before::
@@ -81,7 +81,7 @@ class Network:
     recoil: Array
     elastance: Array
 
-    def plus(self, **terms: Array) -> Network:
+    def plus(self, **terms: Array) -> PneumaticNetwork:
         """Add to coefficients, so that the order of mechanisms does not matter."""
         return self.replace(  # type: ignore[attr-defined]
             **{name: getattr(self, name) + term for name, term in terms.items()}

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ventbench.physics.mechanism import Assembly, Mechanism, Values
-from ventbench.physics.network import Network, View
+from ventbench.physics.network import PneumaticNetwork, View
 
 #: Place of the first stage of the SDIRK method, as a share of the substep.
 _GAMMA = 1.0 - 0.5**0.5
@@ -47,9 +47,9 @@ def commanded(
 ) -> tuple[Array, dict[str, Array]]:
     """Steady-state flow of the inspiratory valve at a command, L/s, and the new memory."""
     memory = dict(memory)
-    for name, item in assembly.mechanisms.items():
+    for name, mechanism in assembly.mechanisms.items():
         u_in, kept = assembly.change(name, _command, (u_in, memory.get(name, u_in)))
-        if item.has_memory:
+        if mechanism.has_memory:
             memory[name] = kept
     return assembly.base["gain"] * 1e-3 * u_in, memory
 
@@ -60,13 +60,15 @@ def at_rest(assembly: Assembly, recorded: Array, flow: Array) -> ContinuousState
     Newton's method finds the volume at which the recoil balances the pressure.
     """
     pressure = recorded
-    for name, item in reversed(assembly.mechanisms.items()):
-        pressure = item.sensor_input(assembly.values[name], pressure, assembly.base["position"])
+    for name, mechanism in reversed(assembly.mechanisms.items()):
+        pressure = mechanism.sensor_input(
+            assembly.values[name], pressure, assembly.base["position"]
+        )
     zero = jnp.zeros_like(pressure + flow)
     internal = {
-        name: item.initial_state(assembly.values[name], flow, pressure) + zero
-        for name, item in assembly.mechanisms.items()
-        if item.stateful
+        name: mechanism.initial_state(assembly.values[name], flow, pressure) + zero
+        for name, mechanism in assembly.mechanisms.items()
+        if mechanism.stateful
     }
     now = ContinuousState(zero, zero, pressure + zero, pressure + zero, internal)
     goal = pressure + assembly.base["offset"]
@@ -106,8 +108,8 @@ def substep(
 
 def sensor_output(assembly: Assembly, reading: Array) -> Array:
     """Recorded pressure, cmH2O, given the pressure after the sensor's dynamics."""
-    for name, item in assembly.mechanisms.items():
-        reading = item.sensor_output(assembly.values[name], reading, assembly.base["position"])
+    for name, mechanism in assembly.mechanisms.items():
+        reading = mechanism.sensor_output(assembly.values[name], reading, assembly.base["position"])
     return reading
 
 
@@ -139,21 +141,21 @@ def _implicit(
 
     start = between(now.replace(internal={}), guess.replace(internal={}))  # type: ignore[attr-defined]
     internal, flow = dict(guess.internal), wanted
-    for name, item in assembly.mechanisms.items():
-        if _has(item, "inflow"):
+    for name, mechanism in assembly.mechanisms.items():
+        if _has(mechanism, "inflow"):
             before = (flow, internal.get(name, flow))
             flow, kept = assembly.change(name, _inflow, before, partial(state, name), length)
-            internal |= {name: kept} if item.stateful else {}
+            internal |= {name: kept} if mechanism.stateful else {}
     view = _view(assembly, start, guess, opened, time, length, peep)
     network = _network(assembly, start, flow, view, state)
     pressure, flow = network.solve(start.pressure, start.flow, length)
     reading = pressure
-    for name, item in assembly.mechanisms.items():
-        if _has(item, "reading") or _has(item, "next_state"):
+    for name, mechanism in assembly.mechanisms.items():
+        if _has(mechanism, "reading") or _has(mechanism, "next_state"):
             before = (reading, internal.get(name, reading))
-            first = None if _has(item, "inflow") else partial(state, name)
+            first = None if _has(mechanism, "inflow") else partial(state, name)
             reading, kept = assembly.change(name, _after, before, first, flow, view)
-            internal |= {name: kept} if item.stateful else {}
+            internal |= {name: kept} if mechanism.stateful else {}
     return ContinuousState(start.volume + flow * length, flow, pressure, reading, internal)
 
 
@@ -163,15 +165,15 @@ def _network(
     inflow: Array,
     view: View,
     state: Callable[[str], Array],
-) -> Network:
+) -> PneumaticNetwork:
     zero = jnp.zeros_like(start.volume)
-    network = Network(
+    network = PneumaticNetwork(
         inflow=inflow, circuit=zero, leak=zero, leak_flow=zero, outlet=view.opened * view.outlet,
         behind=view.peep, resistance=view.resistance + zero, quadratic=zero, inertance=zero,
         recoil=view.elastance * start.volume, elastance=view.elastance + zero,
     )  # fmt: skip
-    for name, item in assembly.mechanisms.items():
-        if _has(item, "network"):
+    for name, mechanism in assembly.mechanisms.items():
+        if _has(mechanism, "network"):
             network = assembly.change(name, _joined, network, partial(state, name), view)
     return network
 
@@ -192,33 +194,37 @@ def _view(
     )  # fmt: skip
 
 
-def _command(item: Mechanism, own: Values, before: Pair) -> Pair:
-    return item.command(own, *before)
+def _command(mechanism: Mechanism, own: Values, before: Pair) -> Pair:
+    return mechanism.command(own, *before)
 
 
 def _inflow(
-    item: Mechanism, own: Values, before: Pair, state: Callable[[], Array], length: Array
+    mechanism: Mechanism, own: Values, before: Pair, state: Callable[[], Array], length: Array
 ) -> Pair:
-    return item.inflow(own, before[0], state() if item.stateful else before[1], length)
+    return mechanism.inflow(own, before[0], state() if mechanism.stateful else before[1], length)
 
 
 def _joined(
-    item: Mechanism, own: Values, network: Network, state: Callable[[], Array], view: View
-) -> Network:
-    return item.network(own, network, view.replace(state=state()))  # type: ignore[attr-defined]
+    mechanism: Mechanism,
+    own: Values,
+    network: PneumaticNetwork,
+    state: Callable[[], Array],
+    view: View,
+) -> PneumaticNetwork:
+    return mechanism.network(own, network, view.replace(state=state()))  # type: ignore[attr-defined]
 
 
 def _after(
-    item: Mechanism, own: Values, before: Pair, state: Callable[[], Array] | None, flow: Array,
+    mechanism: Mechanism, own: Values, before: Pair, state: Callable[[], Array] | None, flow: Array,
     view: View,
 ) -> Pair:  # fmt: skip
     reading, kept = before
-    if item.stateful and state is not None:
+    if mechanism.stateful and state is not None:
         kept = state()
-    reading, kept = item.reading(own, reading, kept, view.length)
+    reading, kept = mechanism.reading(own, reading, kept, view.length)
     view = view.replace(state=kept)  # type: ignore[attr-defined]
-    return reading, item.next_state(own, kept, flow, view) if item.stateful else kept
+    return reading, mechanism.next_state(own, kept, flow, view) if mechanism.stateful else kept
 
 
-def _has(item: Mechanism, hook: str) -> bool:
-    return getattr(type(item), hook) is not getattr(Mechanism, hook)
+def _has(mechanism: Mechanism, hook: str) -> bool:
+    return getattr(type(mechanism), hook) is not getattr(Mechanism, hook)

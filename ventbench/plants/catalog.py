@@ -391,30 +391,30 @@ def _by_text(text: str) -> Simulators:
 
 
 def _official(path: Path | None = None) -> Simulators:
-    found = frozen.load(path=path)
+    loaded = frozen.load(path=path)
     return Simulators(
-        "frozen", "frozen", found.about(), LUNGS, found.manifest_sha256, found,
-        lambda: found.plants, found.for_breaths, found.cross_fitted, found,
+        "frozen", "frozen", loaded.about(), LUNGS, loaded.manifest_sha256, loaded,
+        lambda: loaded.plants, loaded.for_breaths, loaded.cross_fitted, loaded,
     )  # fmt: skip
 
 
 def _trained(path: Path) -> Simulators:
     """Simulators of a folder; they are the official ones if its manifest is theirs."""
-    found = frozen.load(path=path)
-    official = found.manifest_sha256 == files.sha256(frozen.folder() / frozen.MANIFEST)
+    loaded = frozen.load(path=path)
+    official = loaded.manifest_sha256 == files.sha256(frozen.folder() / frozen.MANIFEST)
     return Simulators(
-        "frozen", path.name, found.about(), LUNGS, found.manifest_sha256,
-        found if official else None, lambda: found.plants, found.for_breaths, found.cross_fitted,
-        found,
+        "frozen", path.name, loaded.about(), LUNGS, loaded.manifest_sha256,
+        loaded if official else None, lambda: loaded.plants, loaded.for_breaths,
+        loaded.cross_fitted, loaded,
     )  # fmt: skip
 
 
 def _learned() -> Simulators:
-    found, official = frozen.load_learned(), frozen.load()
+    loaded, official = frozen.load_learned(), frozen.load()
     about = {"kind": "learned", **{k: official.about()[k] for k in ("version", "manifest_sha256")}}
     return Simulators(
         "learned", "learned", about, LUNGS, official.manifest_sha256, None,
-        lambda: found.plants, found.for_breaths, found.cross_fitted, official,
+        lambda: loaded.plants, loaded.for_breaths, loaded.cross_fitted, official,
     )  # fmt: skip
 
 
@@ -432,7 +432,7 @@ def _at_label(name: str, make: Callable[[Lung], Plant], for_breaths: PlantsFor) 
 
 def _named() -> dict[str, Callable[[], Simulators]]:
     """By name, the simulators that need no file."""
-    found: dict[str, Callable[[], Simulators]] = {
+    resolvers: dict[str, Callable[[], Simulators]] = {
         "frozen": _official,
         "hybrid": _official,  # the kind of plant that the official ones are
         "learned": _learned,
@@ -444,8 +444,8 @@ def _named() -> dict[str, Callable[[], Simulators]]:
     for name, family in FAMILIES.items():
         if family.for_lung is not None:
             for_breaths = partial(nominal_plants, family.for_lung)
-            found[name] = partial(_at_label, name, family.for_lung, for_breaths)
-    return found
+            resolvers[name] = partial(_at_label, name, family.for_lung, for_breaths)
+    return resolvers
 
 
 def _plants(

@@ -10,36 +10,37 @@ from jax import Array
 
 @flax.struct.dataclass
 class Corrected:
-    """Any plant, corrected by the difference of two physics: ``p = simulator + wanted - had``.
+    """Any plant, corrected by the difference of two physics.
 
-    What the simulator knows beyond physics stays; where both physics agree, it is the simulator.
+    The pressure is ``simulator + with_mechanisms - without_mechanisms``. What the simulator knows
+    beyond the physics stays; where both physics agree, the plant is the simulator. Plant files
+    call the two physics ``wanted`` and ``had``.
 
     Attributes:
-        simulator: what is corrected.
-        wanted: physics of the recordings.
-        had: physics of the simulator itself.
+        simulator: the plant that is corrected.
+        with_mechanisms: physics of the recordings, with the missing mechanisms.
+        without_mechanisms: physics of the simulator itself.
     """
 
     simulator: Any
-    wanted: Any
-    had: Any
+    with_mechanisms: Any
+    without_mechanisms: Any
 
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[Any, Any, Any]:
-        """All three at rest; see :class:`~ventbench.interfaces.Plant`."""
-        return tuple(  # type: ignore[return-value]
-            one.init(pressure, peep) for one in (self.simulator, self.wanted, self.had)
-        )
+        """All three plants at rest; see :class:`~ventbench.interfaces.Plant`."""
+        parts = (self.simulator, self.with_mechanisms, self.without_mechanisms)
+        return tuple(part.init(pressure, peep) for part in parts)  # type: ignore[return-value]
 
     def step(
         self, state: tuple[Any, Any, Any], u_in: Array, u_out: Array, dt: Array
     ) -> tuple[tuple[Any, Any, Any], Array]:
         """Hold one command; see :class:`~ventbench.interfaces.Plant`."""
         simulator, pressure = self.simulator.step(state[0], u_in, u_out, dt)
-        wanted, more = self.wanted.step(state[1], u_in, u_out, dt)
-        had, less = self.had.step(state[2], u_in, u_out, dt)
-        return (simulator, wanted, had), pressure + more - less
+        wanted, more = self.with_mechanisms.step(state[1], u_in, u_out, dt)
+        own, less = self.without_mechanisms.step(state[2], u_in, u_out, dt)
+        return (simulator, wanted, own), pressure + more - less
 
     def vary(self, r_scale: Array, c_scale: Array) -> Corrected:
         """Return the same lung with another resistance and compliance."""
-        parts = (self.simulator, self.wanted, self.had)
-        return Corrected(*(one.vary(r_scale, c_scale) for one in parts))
+        parts = (self.simulator, self.with_mechanisms, self.without_mechanisms)
+        return Corrected(*(part.vary(r_scale, c_scale) for part in parts))

@@ -257,13 +257,13 @@ def _manifest(path: Path) -> dict[str, Any]:
 
 def _checked(path: Path, name: str, manifest: dict[str, Any]) -> Path:
     try:
-        found, wanted = files.sha256(path / name), manifest["files"][name]["sha256"]
+        digest, expected = files.sha256(path / name), manifest["files"][name]["sha256"]
     except (OSError, KeyError) as error:
         raise InputError(f"{path / name} is missing, or the manifest lacks it: {error}") from error
-    if found != wanted:
+    if digest != expected:
         raise InputError(
-            f"{path / name} has SHA-256 {found[:16]}..., the manifest says {wanted[:16]}...; it is "
-            "damaged or changed: restore it, or reinstall ventbench"
+            f"{path / name} has SHA-256 {digest[:16]}..., the manifest says {expected[:16]}...; "
+            "it is damaged or changed: restore it, or reinstall ventbench"
         )
     return path / name
 

@@ -131,11 +131,16 @@ def _write_npz(path: Path, structure: Any, arrays: dict[str, np.ndarray]) -> Non
 
 def _encode(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {
-            field.name: _encode(getattr(value, field.name), f"{path}.{field.name}", arrays)
-            for field in dataclasses.fields(value)
+        kind = type(value).__name__
+        in_file = registry.FIELDS_IN_FILES.get(kind, {})
+        stored = {
+            in_file.get(field.name, field.name): field.name for field in dataclasses.fields(value)
         }
-        return {"type": type(value).__name__, "fields": fields}
+        fields = {
+            name: _encode(getattr(value, attribute), f"{path}.{name}", arrays)
+            for name, attribute in stored.items()
+        }
+        return {"type": kind, "fields": fields}
     if isinstance(value, tuple | list):
         return {"tuple": [_encode(part, f"{path}.{i}", arrays) for i, part in enumerate(value)]}
     if isinstance(value, jax.Array | np.ndarray | np.generic):
@@ -149,8 +154,14 @@ def _encode(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
 
 def _decode(node: dict[str, Any], arrays: Any, as_array: Callable[[Any], Any]) -> Any:
     if "type" in node:
-        fields = {name: _decode(child, arrays, as_array) for name, child in node["fields"].items()}
-        return registry.stored_type(node["type"])(**fields)
+        kind = registry.stored_type(node["type"])
+        in_file = registry.FIELDS_IN_FILES.get(kind.__name__, {})
+        attributes = {name: attribute for attribute, name in in_file.items()}
+        fields: dict[str, Any] = {
+            str(attributes.get(name, name)): _decode(child, arrays, as_array)
+            for name, child in node["fields"].items()
+        }
+        return kind(**fields)
     if "tuple" in node:
         return tuple(_decode(child, arrays, as_array) for child in node["tuple"])
     if "array" in node:

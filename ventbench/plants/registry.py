@@ -47,6 +47,11 @@ FAMILIES: dict[str, PlantFamily] = {
 #: Today's class name by the name that older files have.
 RENAMED: dict[str, str] = {}
 
+#: Names of fields in plant files, by class and field, where they differ from the attribute's.
+FIELDS_IN_FILES: dict[str, dict[str, str]] = {
+    "Corrected": {"with_mechanisms": "wanted", "without_mechanisms": "had"},
+}
+
 
 def stored_type(name: str) -> type:
     """Return the class that a plant file names.

@@ -33,7 +33,7 @@ _UNIT_MS, _SPIKE_UNITS, _FAR_SAMPLES = 0.2, 1.5, 2.0
 
 
 @dataclass(frozen=True)
-class Clock:
+class SampleTiming:
     """What the times of n breaths say; every array has shape ``(n,)``.
 
     Attributes:
@@ -51,14 +51,14 @@ class Clock:
     regular: NDArray[np.bool_]
 
 
-def clock(breaths: Breaths) -> Clock:
+def sample_timing(breaths: Breaths) -> SampleTiming:
     """Read the clocks of breaths."""
     interval = np.where(breaths.valid[:, 1:], breaths.dt[:, :-1] * 1000.0, np.nan)
     median = np.nanmedian(interval, axis=1)
     late = np.nanmean(interval - median[:, None] > _LATE_MS, axis=1)
     regular = np.any([(low <= median) & (median <= high) for low, high in CLUSTERS_MS], axis=0)
     inspiratory = np.count_nonzero(breaths.inspiratory, axis=1)
-    return Clock(median, late > _SPIKY_SHARE, inspiratory, ~breaths.time_inferred, regular)
+    return SampleTiming(median, late > _SPIKY_SHARE, inspiratory, ~breaths.time_inferred, regular)
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Sessions:
         Raises:
             InputError: if no session has a breath's lung.
         """
-        seen = clock(breaths)
+        seen = sample_timing(breaths)
         out = np.empty(len(breaths), np.int64)
         for lung, index in breaths.by_lung_index.items():
             candidates = [i for i, session in enumerate(self.table) if session.lung == lung]
@@ -121,7 +121,7 @@ class Sessions:
         return out
 
     @staticmethod
-    def _distance(seen: Clock, index: NDArray[np.int64], to: Session) -> NDArray[np.float64]:
+    def _distance(seen: SampleTiming, index: NDArray[np.int64], to: Session) -> NDArray[np.float64]:
         samples = np.abs(seen.inspiratory[index] - to.inspiratory)
         spike = (seen.spiky[index] != to.spiky) & seen.known[index]
         return (
@@ -158,7 +158,7 @@ def find(breaths: Breaths) -> Sessions:
     Breaths of one lung belong together if their rigs are of one kind, their intervals leave no gap
     and, on rigs that are not spiky, they have equally many inspiratory samples.
     """
-    seen = clock(breaths)
+    seen = sample_timing(breaths)
     rows: list[Session] = []
     for lung, index in breaths.by_lung_index.items():
         groups = _groups(seen, index)
@@ -171,7 +171,7 @@ def find(breaths: Breaths) -> Sessions:
     return Sessions(tuple(rows))
 
 
-def _groups(seen: Clock, index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def _groups(seen: SampleTiming, index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     groups = []
     for spiky in (False, True):
         some = index[seen.spiky[index] == spiky]

@@ -203,9 +203,9 @@ def _add_repeat(
     )
 
 
-def _same(rows: Rows, one: np.ndarray, other: np.ndarray, names: object) -> np.ndarray:
-    same = np.ones(len(one), dtype=bool)
+def _same(rows: Rows, first: np.ndarray, other: np.ndarray, names: object) -> np.ndarray:
+    same = np.ones(len(first), dtype=bool)
     for name in names:  # type: ignore[attr-defined]
-        a, b = rows.columns[name][one], rows.columns[name][other]
+        a, b = rows.columns[name][first], rows.columns[name][other]
         same &= (a == b) | ((a != a) & (b != b))
     return same

@@ -11,13 +11,13 @@ from ventbench.system_id.problem import (
     make_unknowns,
     parameter_values,
 )
-from ventbench.system_id.profile_likelihood import Interval, interval, profile_interval
+from ventbench.system_id.profile_likelihood import ConfidenceInterval, interval, profile_interval
 
 __all__ = [
     "START",
+    "ConfidenceInterval",
     "Data",
     "Fit",
-    "Interval",
     "Noise",
     "Predictor",
     "Problem",

@@ -79,13 +79,13 @@ class Fit:
 
     def ci95(self, path: str) -> Floats:
         """Ends of the 95 % intervals of a free parameter, within its bounds, ``(groups, 2)``."""
-        layout, item = self.problem.unknowns, parameter_of(path)
+        layout, parameter = self.problem.unknowns, parameter_of(path)
         which = layout.of(path)
         reach = t_quantile(self.freedom) * np.sqrt(np.diag(self.covariance)[which])
         x = self.minimum.x[which]
         with np.errstate(over="ignore"):  # where the data say nothing
-            ends = item.physical(np.stack([x - reach, x + reach], axis=1))
-        return np.clip(ends, item.low, item.high)
+            ends = parameter.physical(np.stack([x - reach, x + reach], axis=1))
+        return np.clip(ends, parameter.low, parameter.high)
 
     def column(self, path: str) -> Floats:
         """Physical values of any parameter in each breath, ``(n,)``."""
@@ -180,8 +180,8 @@ def _label_mean(fitted: Fit, data: Data, path: str) -> Floats:
     known, column = fitted.problem.data, fitted.column(path)
     same = (data.R[:, None] == known.R) & (data.C[:, None] == known.C)
     same |= ~same.any(axis=1, keepdims=True)
-    item = parameter_of(path)  # rounding must not carry a value at its bound beyond it
-    return np.clip(same @ column / same.sum(axis=1), item.low, item.high)
+    parameter = parameter_of(path)  # rounding must not carry a value at its bound beyond it
+    return np.clip(same @ column / same.sum(axis=1), parameter.low, parameter.high)
 
 
 def _descend(problem: Problem, x: Floats, iterations: int) -> Minimum:
@@ -203,9 +203,9 @@ def _search(problem: Problem, x: Floats, given: Set[str], iterations: int) -> Mi
         iterations: most steps of each search.
     """
     scanned = {p: parameter_of(p) for p in problem.unknowns.paths if parameter_of(p).scan}
-    scanned = {p: item for p, item in scanned.items() if p not in given}
-    shared = [p for p, item in scanned.items() if item.scope == "shared"]
-    own = [p for p, item in scanned.items() if item.scope == "breath"]
+    scanned = {p: parameter for p, parameter in scanned.items() if p not in given}
+    shared = [p for p, parameter in scanned.items() if parameter.scope == "shared"]
+    own = [p for p, parameter in scanned.items() if parameter.scope == "breath"]
     minimum = _descend(problem, x, _FIRST_STEPS if scanned else iterations)
     for _ in range(_ROUNDS if scanned else 0):
         better = _other_values(problem, minimum, shared)

@@ -172,21 +172,23 @@ class Predictor:
         """Whether a parameter of a mechanism that may have either sign is at its neutral value."""
         if column == len(self.names) or "." not in self.names[column]:
             return False
-        item = parameter(self.names[column])
-        return item.low < item.neutral < item.high and bool(np.all(values == item.neutral))
+        definition = parameter(self.names[column])
+        return definition.low < definition.neutral < definition.high and bool(
+            np.all(values == definition.neutral)
+        )
 
     def _move(self, values: Floats, column: int) -> Floats:
         """Step to another point within the bounds, upwards if possible, ``(n,)``."""
         if column == len(self.names):
             return np.full(len(values), _STEP_START)
-        item = parameter(self.names[column])
-        if item.scale == "log":
+        definition = parameter(self.names[column])
+        if definition.scale == "log":
             move = _STEP_LOG * values
         else:
-            move = np.full(len(values), _STEP * (item.high - item.low))
-        if item.kinked:
-            move = np.where(values == item.neutral, _STEP_DEAD_TIME, move)
-        return np.where(values + move > item.high, -move, move)
+            move = np.full(len(values), _STEP * (definition.high - definition.low))
+        if definition.kinked:
+            move = np.where(values == definition.neutral, _STEP_DEAD_TIME, move)
+        return np.where(values + move > definition.high, -move, move)
 
 
 def _groups(count: int) -> list[tuple[int, int, int]]:

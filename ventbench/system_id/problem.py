@@ -33,10 +33,10 @@ def parameter_of(path: str) -> Parameter:
 def free_paths(mechanisms: Iterable[str]) -> tuple[str, ...]:
     """Paths that a hypothesis frees: R, C, R_ex, PEEP, parameters of its mechanisms, the starts."""
     own = [
-        f"{name}.{item.name}"
+        f"{name}.{parameter.name}"
         for name in dict.fromkeys(mechanisms)
-        for item in mechanism(name).description.parameters
-        if not item.shape
+        for parameter in mechanism(name).description.parameters
+        if not parameter.shape
     ]
     return (*REFITTED, *own, START)
 
@@ -63,7 +63,7 @@ class Unknowns:
     @property
     def shared(self) -> NDArray[np.bool_]:
         """Whether each unknown is shared by breaths, ``(U,)``."""
-        own = np.array([item.scope == "breath" for item in self.parameters])
+        own = np.array([parameter.scope == "breath" for parameter in self.parameters])
         return ~own[self.path_of]
 
     def of(self, path: str) -> NDArray[np.int64]:
@@ -97,21 +97,21 @@ class Unknowns:
     def pack(self, values: Mapping[str, ArrayLike]) -> Floats:
         """Coordinates of physical values, a number or one for each breath by path."""
         x = np.zeros(len(self.path_of))
-        for column, (path, item) in enumerate(zip(self.paths, self.parameters, strict=True)):
+        for column, (path, bounded) in enumerate(zip(self.paths, self.parameters, strict=True)):
             value = np.broadcast_to(np.asarray(values[path], float), self.index.shape[:1])
-            x[self.index[:, column]] = item.coordinate(np.clip(value, item.low, item.high))
+            x[self.index[:, column]] = bounded.coordinate(np.clip(value, bounded.low, bounded.high))
         return x
 
     def unpack(self, x: Floats) -> Floats:
         """Physical values of each breath, ``(n, k)``."""
         columns = x[self.index].T
         pairs = zip(self.parameters, columns, strict=True)
-        return np.stack([item.physical(column) for item, column in pairs], axis=1)
+        return np.stack([parameter.physical(column) for parameter, column in pairs], axis=1)
 
     def slopes(self, physical: Floats) -> Floats:
         """Derivatives of physical values with respect to coordinates, ``(n, k)``."""
         pairs = zip(self.parameters, physical.T, strict=True)
-        return np.stack([item.slope(column) for item, column in pairs], axis=1)
+        return np.stack([parameter.slope(column) for parameter, column in pairs], axis=1)
 
 
 def make_unknowns(
@@ -134,8 +134,8 @@ def make_unknowns(
         raise InputError(f"a parameter is freed twice among {', '.join(paths)}")
     index, path_of = [], []
     for column, path in enumerate(paths):
-        item = parameter_of(path)
-        default = np.arange(len(data)) if item.scope == "breath" else np.zeros(len(data), int)
+        parameter = parameter_of(path)
+        default = np.arange(len(data)) if parameter.scope == "breath" else np.zeros(len(data), int)
         if path in ("R", "C"):
             default = data.lung
         group = np.asarray(groups.get(path, default))
@@ -266,9 +266,10 @@ def parameter_values(data: Data, names: tuple[str, ...], given: Mapping[str, Arr
     for name in (*names, START):
         value = np.asarray(known.pop(name, None if name == START else parameter(name).neutral))
         if name != START:
-            item = parameter(name)
-            if not np.all((value >= item.low) & (value <= item.high)):
-                raise InputError(f"{name} = {value} is outside {item.low}..{item.high} {item.unit}")
+            definition = parameter(name)
+            if not np.all((value >= definition.low) & (value <= definition.high)):
+                bounds = f"{definition.low}..{definition.high} {definition.unit}"
+                raise InputError(f"{name} = {value} is outside {bounds}")
         columns.append(np.broadcast_to(value, (len(data),)).astype(float))
     if known:
         raise InputError(f"no parameter {sorted(known)} here; choose of {', '.join(paths())}")

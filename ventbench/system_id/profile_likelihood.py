@@ -36,19 +36,19 @@ def profile_interval(fit: Fit, path: str, group: int = 0) -> tuple[float, float]
         group: index of the group of breaths.
     """
     layout = fit.problem.unknowns
-    unknown, item = int(layout.of(path)[group]), parameter_of(path)
+    unknown, parameter = int(layout.of(path)[group]), parameter_of(path)
     local = np.linalg.pinv(fit.minimum.hessian)[unknown, unknown]
     grown = max(float(fit.covariance[unknown, unknown] / max(local, 1e-30)), 1.0)
     allowed = fit.minimum.cost + 0.5 * t_quantile(fit.freedom) ** 2 * grown
     sd = float(np.sqrt(fit.covariance[unknown, unknown]))
-    if item.kinked:
-        sd = max(sd, _STRIDE * (item.high - item.low))
+    if parameter.kinked:
+        sd = max(sd, _STRIDE * (parameter.high - parameter.low))
     ends = [_end(fit, unknown, sd * side, allowed) for side in (-1.0, 1.0)]
-    low, high = (float(np.clip(item.physical(x), item.low, item.high)) for x in ends)
+    low, high = (float(np.clip(parameter.physical(x), parameter.low, parameter.high)) for x in ends)
     return low, high
 
 
-class Interval(NamedTuple):
+class ConfidenceInterval(NamedTuple):
     """An estimate and the ends of its 95 % interval, in physical units."""
 
     value: float
@@ -56,7 +56,7 @@ class Interval(NamedTuple):
     high: float
 
 
-def interval(fit: Fit, path: str, group: int = 0) -> Interval:
+def interval(fit: Fit, path: str, group: int = 0) -> ConfidenceInterval:
     """Estimate and 95 % interval of a free parameter.
 
     In general, these are the minimum and the interval of the covariance. For a dead time, they are
@@ -64,29 +64,31 @@ def interval(fit: Fit, path: str, group: int = 0) -> Interval:
     wall where an edge passes a sample, the model can fit the noise of that one sample, a dip of
     some nats without meaning. The interval of a dead time is wider by half a substep at either end.
     """
-    item = parameter_of(path)
-    if item.kinked:
+    parameter = parameter_of(path)
+    if parameter.kinked:
         value = float(fit.value(path)[group])
-        found = _plateau(fit, path, group) or Interval(value, *profile_interval(fit, path, group))
+        estimate = _plateau(fit, path, group) or ConfidenceInterval(
+            value, *profile_interval(fit, path, group)
+        )
         # The predictor smooths an edge over a substep, and resolves its time to half of it.
         reach = 0.5 * float(np.median(fit.problem.data.dt)) / fit.problem.predictor.substeps
-        ends = np.clip([found.low - reach, found.high + reach], item.low, item.high)
-        return Interval(found.value, float(ends[0]), float(ends[1]))
+        ends = np.clip([estimate.low - reach, estimate.high + reach], parameter.low, parameter.high)
+        return ConfidenceInterval(estimate.value, float(ends[0]), float(ends[1]))
     low, high = fit.ci95(path)[group]
-    return Interval(float(fit.value(path)[group]), float(low), float(high))
+    return ConfidenceInterval(float(fit.value(path)[group]), float(low), float(high))
 
 
-def _plateau(fit: Fit, path: str, group: int) -> Interval | None:
+def _plateau(fit: Fit, path: str, group: int) -> ConfidenceInterval | None:
     """Mean and quantiles of the profile likelihood on a grid; None if it is narrower than that."""
-    unknown, item = int(fit.problem.unknowns.of(path)[group]), parameter_of(path)
-    grid = np.linspace(item.low, item.high, _GRID)
+    unknown, parameter = int(fit.problem.unknowns.of(path)[group]), parameter_of(path)
+    grid = np.linspace(parameter.low, parameter.high, _GRID)
     nearest = int(np.argmin(np.abs(grid - fit.value(path)[group])))
     costs = np.full(_GRID, np.inf)
     for side in (range(nearest, _GRID), range(nearest - 1, -1, -1)):
         point = fit.minimum.x
         beyond = 0
         for k in side:
-            costs[k], point = _pinned(fit, point, unknown, float(item.coordinate(grid[k])))
+            costs[k], point = _pinned(fit, point, unknown, float(parameter.coordinate(grid[k])))
             beyond = (
                 beyond + 1 if costs[k] > min(costs.min(), fit.minimum.cost + _DIP) + _FAR else 0
             )
@@ -99,9 +101,9 @@ def _plateau(fit: Fit, path: str, group: int) -> Interval | None:
         return None
     share = np.concatenate([[0.0], np.cumsum(weight)]) / weight.sum()
     half = 0.5 * (grid[1] - grid[0])
-    edges = np.clip(np.concatenate([grid - half, [grid[-1] + half]]), item.low, item.high)
+    edges = np.clip(np.concatenate([grid - half, [grid[-1] + half]]), parameter.low, parameter.high)
     low, high = np.interp([0.025, 0.975], share, edges)
-    return Interval(float(weight @ grid / weight.sum()), float(low), float(high))
+    return ConfidenceInterval(float(weight @ grid / weight.sum()), float(low), float(high))
 
 
 def _end(fit: Fit, unknown: int, stride: float, allowed: float) -> float:

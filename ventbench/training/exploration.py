@@ -121,7 +121,7 @@ class Limits:
     vented: int = 3
 
 
-class Ventilator(Protocol):
+class VentilatorInterface(Protocol):
     """A ventilator, real or simulated, or several side by side.
 
     Attributes:
@@ -176,7 +176,7 @@ class SimulatedVentilator:
 
 
 def explore(
-    ventilator: Ventilator,
+    ventilator: VentilatorInterface,
     lung_id: str,
     breaths: int,
     *,
@@ -189,7 +189,7 @@ def explore(
     """Explore a ventilator; the PIPs take turns.
 
     Args:
-        ventilator: see :class:`Ventilator`.
+        ventilator: see :class:`VentilatorInterface`.
         lung_id: the setting of its lung, written with the breaths.
         breaths: how many.
         seed: seed of all disturbances, which are the same for the same seed and width.
@@ -233,7 +233,7 @@ def explore(
 
 
 def _breaths(
-    ventilator: Ventilator,
+    ventilator: VentilatorInterface,
     pip: Floats,
     peep: float,
     ranges: ExplorationRanges,

@@ -194,16 +194,16 @@ def by_names_alone(plant: Plant) -> Plant:
     """
     if not isinstance(plant, Corrected):
         return without(plant, basis_terms()) if isinstance(plant, Physics) else plant
-    had, wanted = plant.had, plant.wanted
-    coefficients = [path for path in (*wanted.names, *had.names) if _owner(path) in basis_terms()]
+    wanted, own = plant.with_mechanisms, plant.without_mechanisms
+    coefficients = [path for path in (*wanted.names, *own.names) if _owner(path) in basis_terms()]
     with precision.float64():
-        same = wanted.having(**{path: had.get(path) for path in coefficients})
-    return dataclasses.replace(plant, wanted=same)
+        named_only = wanted.having(**{path: own.get(path) for path in coefficients})
+    return dataclasses.replace(plant, with_mechanisms=named_only)
 
 
 def has_unnamed(plant: Plant) -> bool:
     """Whether a corrected plant has nonparametric components."""
-    physics = plant.wanted if isinstance(plant, Corrected) else plant
+    physics = plant.with_mechanisms if isinstance(plant, Corrected) else plant
     return isinstance(physics, Physics) and any(
         _owner(path) in basis_terms() for path in physics.names
     )

@@ -104,7 +104,7 @@ def _row_head(draw: Drawing, lung: str, names: Sequence[str], errors: Floats, to
 
 
 def _panel(
-    draw: Drawing, panel: panels.Panel, errors: Floats, origin: tuple[float, float], first: bool
+    draw: Drawing, panel: panels.RunPanel, errors: Floats, origin: tuple[float, float], first: bool
 ) -> None:
     at = np.array(origin)
     left, right = panels.LEFT, panels.LEFT + panels.PLOT_WIDTH

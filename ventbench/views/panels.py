@@ -32,7 +32,7 @@ BREATH = max(protocol.SCORED_BREATHS)
 
 
 @dataclass(frozen=True)
-class Panel:
+class RunPanel:
     """One lung and PIP, in panel units (y downwards).
 
     Attributes:
@@ -57,7 +57,7 @@ class Panel:
     above: float | None
 
 
-def panels(runs: Sequence[Trajectories]) -> list[list[Panel]]:
+def panels(runs: Sequence[Trajectories]) -> list[list[RunPanel]]:
     """All panels, a row a lung; axes are the same down a column (one PIP)."""
     columns = [_column(runs, j) for j in range(len(runs[0].pips))]
     return [list(row) for row in zip(*columns, strict=True)]
@@ -78,7 +78,7 @@ def _window() -> slice:
     return slice(start, start + SHOWN + 1)
 
 
-def _column(runs: Sequence[Trajectories], j: int) -> list[Panel]:
+def _column(runs: Sequence[Trajectories], j: int) -> list[RunPanel]:
     pip, window, top = runs[0].pips[j], _window(), _valve_limit(runs, j)
     x = time_x(np.arange(SHOWN + 1, dtype=np.float64) * protocol.DT)
     low, high = _limits([run.pressure[:, j, window] for run in runs], runs[0].target[:, j, window])
@@ -98,7 +98,7 @@ def _column(runs: Sequence[Trajectories], j: int) -> list[Panel]:
         target = runs[0].target[i, j, window]
         marks = (float(target.min()), pip)
         column.append(
-            Panel(
+            RunPanel(
                 lung=lung,
                 pip=pip,
                 ticks=tuple((value, float(y(value))) for value in marks),

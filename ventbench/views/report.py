@@ -100,7 +100,7 @@ def frame() -> dict[str, Any]:
     }
 
 
-def _panel(panel: panels.Panel, names: Sequence[str], errors: Floats) -> dict[str, Any]:
+def _panel(panel: panels.RunPanel, names: Sequence[str], errors: Floats) -> dict[str, Any]:
     errors_text = "; ".join(
         f"{name} {number(e)}{' cmH2O' if np.isfinite(e) else ''}"
         for name, e in zip(names, errors, strict=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.network import Network, View
+from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import Parameter
 
 
@@ -38,7 +38,7 @@ class CircuitCompliance(Mechanism):
         detectable=0.4,
     )
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Add it beside the lung."""
         return network.plus(circuit=1e-3 * values["compliance"])
 

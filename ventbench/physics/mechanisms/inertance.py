@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.network import Network, View
+from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import Parameter
 
 
@@ -32,7 +32,7 @@ class Inertance(Mechanism):
         detectable=0.16,
     )
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Add it in series with the airway."""
         return network.plus(inertance=values["inertance"])
 

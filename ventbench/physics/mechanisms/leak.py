@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.network import Network, View
+from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import Parameter
 
 #: The root is rounded off below this pressure, cmH2O, where its slope would be infinite.
@@ -46,7 +46,7 @@ class Leak(Mechanism):
         special_case_of=("leak_shape",),
     )
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Tangent of the leak at the last pressure."""
         power = 0.5 * (values["exponent"] - 1.0)
         square = view.pressure**2 + _ROUND**2

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.network import Network, View
+from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import Parameter
 
 #: Share of the capacity up to which the curve is followed.
@@ -47,7 +47,7 @@ class NonlinearCompliance(Mechanism):
         special_case_of=("recoil_shape",),
     )
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Tangent of the curve at the last volume, less the linear lung's."""
         k = values["stiffening"]
         linear = view.elastance * view.volume  # cmH2O

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.network import Network, View
+from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import Parameter
 
 
@@ -56,7 +56,7 @@ class PatientEffort(Mechanism):
         detectable=0.3,
     )
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Muscles pull at the alveolus."""
         phase = (view.time - values["onset"]) / values["duration"]
         pull = values["amplitude"] * jnp.sin(jnp.pi * jnp.clip(phase, 0.0, 1.0))

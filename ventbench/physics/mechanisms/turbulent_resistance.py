@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.network import Network, View
+from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import Parameter
 
 #: The slope of the power by flow is rounded off below this flow, L/s.
@@ -59,7 +59,7 @@ class TurbulentResistance(Mechanism):
         special_case_of=("flow_shape",),
     )
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Add it to the airway; what differs from a square, at the last flow."""
         milder = jnp.log(view.flow**2 + _ROUND**2) * (0.5 * values["exponent"] - 1.0)
         return network.plus(quadratic=values["quadratic"] * jnp.exp(milder))

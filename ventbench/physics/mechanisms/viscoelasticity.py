@@ -5,7 +5,7 @@ from __future__ import annotations
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.network import Network, View
+from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import Parameter
 
 
@@ -58,7 +58,7 @@ class Viscoelasticity(Mechanism):
 
     stateful = True
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Stress after the step: what is left of it, and what the flow adds."""
         left = 1.0 / (1.0 + view.length / values["time"])
         elastance = values["ratio"] * view.elastance * left

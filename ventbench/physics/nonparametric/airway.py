@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Values
-from ventbench.physics.network import Network, View
+from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.nonparametric.basis import (
     BasisTerm,
     Curve,
@@ -47,7 +47,7 @@ class LeakShape(BasisTerm):
         confusable=("leak", "viscoelasticity"),
     )
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Tangent of the curve at the last pressure."""
         flow, slope = PiecewiseQuadratic(_LEAK_KNOTS)(view.pressure, self.coefficients(values))
         return network.plus(leak=1e-3 * slope, leak_flow=1e-3 * (flow - slope * view.pressure))
@@ -88,7 +88,7 @@ class FlowShape(BasisTerm):
         confusable=("turbulent_resistance", "valve_curve"),
     )
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Tangent of the curve at the last flow."""
         drop, slope = self._drop(values, view.flow)
         return network.plus(resistance=slope, recoil=drop - slope * view.flow)
@@ -133,7 +133,7 @@ class VolumeResistance(BasisTerm):
         confusable=("turbulent_resistance", "nonlinear_compliance"),
     )
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Resistance at the volume that the last flow leads to."""
         filled = view.elastance * (view.volume + view.length * view.flow)
         return network.plus(resistance=view.resistance * self._excess(values, filled))
@@ -169,7 +169,7 @@ class DirectionResistance(BasisTerm):
         confusable=("exhalation_valve_delay", "turbulent_resistance"),
     )
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Resistance in the direction of the last flow."""
         outwards = jnp.where(view.flow < 0.0, values["c1"], 0.0)
         return network.plus(resistance=view.resistance * outwards)

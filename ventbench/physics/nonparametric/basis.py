@@ -105,7 +105,7 @@ class BasisTerm(Mechanism):
 
     def coefficients(self, values: Values) -> list[Array]:
         """Values of all coefficients, in order."""
-        return [values[item.name] for item in self.description.parameters]
+        return [values[parameter.name] for parameter in self.description.parameters]
 
     def stacked(self, values: Values, state: Array) -> Array:
         """Coefficients in the shape of several states, ``(K, ...)``."""
@@ -149,7 +149,7 @@ def coefficients(
     def repeated(value: float | Iterable[float]) -> list[float]:
         if isinstance(value, int | float):
             return [float(value)] * len(at)
-        return [float(one) for one in value]
+        return [float(number) for number in value]
 
     rows = zip(at, repeated(low), repeated(high), repeated(spread), strict=True)
     return tuple(

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Values
-from ventbench.physics.network import Network, View
+from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.nonparametric.basis import (
     BasisTerm,
     Curve,
@@ -56,7 +56,7 @@ class RecoilShape(BasisTerm):
         confusable=("nonlinear_compliance",),
     )
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Tangent of the curve at the last volume."""
         extra, slope = PiecewiseQuadratic(_RECOIL_KNOTS)(
             view.elastance * view.volume, self._slopes(values)
@@ -113,7 +113,7 @@ class RecoilMemory(BasisTerm):
         """No stress, cmH2O."""
         return jnp.stack([0.0 * (flow + pressure)] * len(_MEMORY_TAUS))
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Stresses after the step: what is left of them, and what the flow adds."""
         left = 1.0 / (1.0 + view.length / per_state(_MEMORY_TAUS, view.state))
         added = jnp.sum(self.stacked(values, view.state) * left, axis=0)

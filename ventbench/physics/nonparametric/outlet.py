@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Values
-from ventbench.physics.network import Network, View
+from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.nonparametric.basis import (
     BasisTerm,
     Curve,
@@ -52,7 +52,7 @@ class OutletShape(BasisTerm):
     )
     rank = 1  # a factor of how far the valve is open, however late that is
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Conductance at the last pressure."""
         excess = self._excess(values, view.pressure - view.peep)
         return network.plus(outlet=network.outlet * excess)
@@ -107,7 +107,7 @@ class OutletMemory(BasisTerm):
         """Open."""
         return jnp.stack([1.0 + 0.0 * (flow + pressure)] * len(_MEMORY_TAUS))
 
-    def network(self, values: Values, network: Network, view: View) -> Network:
+    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Opening at the end of the step."""
         states = self.next_state(values, view.state, view.flow, view)
         late = jnp.sum(self.stacked(values, states) * (states - view.opened), axis=0)

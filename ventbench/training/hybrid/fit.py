@@ -67,7 +67,7 @@ class HybridConfig:
 
 
 @flax.struct.dataclass
-class Unknowns:
+class HybridParameters:
     """Everything that is fitted: the pooled parameters and the first pressures, cmH2O, ``(n,)``."""
 
     pooled: Pooled
@@ -85,21 +85,23 @@ def simulate(plant: Hybrid, start: Array, data: InspirationData) -> Array:
     return pressure.T
 
 
-def errors(unknowns: Unknowns, data: InspirationData, config: HybridConfig) -> Array:
+def errors(parameters: HybridParameters, data: InspirationData, config: HybridConfig) -> Array:
     """Simulated minus recorded pressure, cmH2O, 0 where none counts, ``(n, SAMPLES - 1)``."""
-    plant = plants(unknowns.pooled, data.groups, directed=config.directed)
-    start = jnp.where(data.start_known > 0, data.start, unknowns.start)
+    plant = plants(parameters.pooled, data.groups, directed=config.directed)
+    start = jnp.where(data.start_known > 0, data.start, parameters.start)
     return jnp.where(data.share > 0, simulate(plant, start, data) - data.pressure, 0.0)
 
 
-def loss(unknowns: Unknowns, data: InspirationData, weight: Array, config: HybridConfig) -> Array:
+def loss(
+    parameters: HybridParameters, data: InspirationData, weight: Array, config: HybridConfig
+) -> Array:
     """Robust mean error and prior; ``weight`` has shape ``(n,)``."""
     soft, saturation = config.softness, config.saturation
-    error = errors(unknowns, data, config)
+    error = errors(parameters, data, config)
     breath = jnp.sum(data.share * (jnp.sqrt(error**2 + soft**2) - soft), axis=1)
     breath = saturation * jnp.log1p(breath / saturation)
-    starts = jnp.sum((unknowns.start - config.start_mean) ** 2) / config.start_width**2
-    prior = penalty(unknowns.pooled) + 0.5 * starts
+    starts = jnp.sum((parameters.start - config.start_mean) ** 2) / config.start_width**2
+    prior = penalty(parameters.pooled) + 0.5 * starts
     return (jnp.sum(weight * breath) + config.prior * prior) / jnp.sum(weight)
 
 
@@ -114,16 +116,18 @@ def _optimiser(config: HybridConfig) -> optax.GradientTransformation:
 
 @partial(jax.jit, static_argnames="config")
 def _advance(
-    carry: tuple[Unknowns, Any], data: InspirationData, weight: Array, config: HybridConfig
-) -> tuple[tuple[Unknowns, Any], Array]:
+    carry: tuple[HybridParameters, Any], data: InspirationData, weight: Array, config: HybridConfig
+) -> tuple[tuple[HybridParameters, Any], Array]:
     optimiser = _optimiser(config)
 
-    def iterate(carry: tuple[Unknowns, Any], _: None) -> tuple[tuple[Unknowns, Any], Array]:
-        unknowns, state = carry
-        value, gradient = jax.value_and_grad(loss)(unknowns, data, weight, config)
+    def iterate(
+        carry: tuple[HybridParameters, Any], _: None
+    ) -> tuple[tuple[HybridParameters, Any], Array]:
+        parameters, state = carry
+        value, gradient = jax.value_and_grad(loss)(parameters, data, weight, config)
         updates, state = optimiser.update(gradient, state)
-        unknowns = jax.tree.map(jnp.add, unknowns, updates)
-        return (unknowns, state), value
+        parameters = jax.tree.map(jnp.add, parameters, updates)
+        return (parameters, state), value
 
     return jax.lax.scan(iterate, carry, None, length=CHUNK)
 
@@ -145,8 +149,8 @@ def fit(
     Returns:
         The parameters and the loss.
     """
-    unknowns = Unknowns(initial(), jnp.full_like(data.start, config.start_mean))
-    carry = (unknowns, _optimiser(config).init(unknowns))  # pyright: ignore[reportArgumentType]
+    parameters = HybridParameters(initial(), jnp.full_like(data.start, config.start_mean))
+    carry = (parameters, _optimiser(config).init(parameters))  # pyright: ignore[reportArgumentType]
     value = jnp.inf
     for done in range(0, config.iterations, CHUNK):
         carry, values = _advance(carry, data, weight, config)
@@ -159,8 +163,8 @@ def fit(
 @partial(jax.jit, static_argnames="config")
 def mean_absolute_errors(pooled: Pooled, data: InspirationData, config: HybridConfig) -> Array:
     """Open-loop error of each breath whose first pressure is known, cmH2O, ``(n,)``."""
-    unknowns = Unknowns(pooled, jnp.full_like(data.start, config.start_mean))
-    return jnp.sum(data.share * jnp.abs(errors(unknowns, data, config)), axis=1)
+    parameters = HybridParameters(pooled, jnp.full_like(data.start, config.start_mean))
+    return jnp.sum(data.share * jnp.abs(errors(parameters, data, config)), axis=1)
 
 
 #: Parameters that the second stage fits, and the prior standard deviation of their logarithms.

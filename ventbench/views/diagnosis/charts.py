@@ -153,7 +153,7 @@ def limits(*arrays: ArrayLike, around: float = 0.06, least: float = 0.0) -> tupl
 
 
 @dataclass(frozen=True, eq=False)
-class Panel:
+class BreathPanel:
     """One breath.
 
     Attributes:
@@ -197,7 +197,7 @@ def worst(diagnosis: Diagnosis) -> list[tuple[int, str]]:
     return list(chosen.items())
 
 
-def panels(diagnosis: Diagnosis) -> list[Panel]:
+def panels(diagnosis: Diagnosis) -> list[BreathPanel]:
     """Charts of the breaths of :func:`worst`."""
     traces = diagnosis.traces
     by_stage = {key: rmse(traces, getattr(traces, key)) for key, _, _ in STAGES}
@@ -209,7 +209,7 @@ def panels(diagnosis: Diagnosis) -> list[Panel]:
             name += f", {traces.breaths.lung_ids[i]}"
         errors = {key: float(values[i]) for key, values in by_stage.items()}
         pressure = _pressure(traces, i, name, diagnosis.verdict != "nothing_missing")
-        shown.append(Panel(name, why, errors, pressure, _valve(traces, i, name)))
+        shown.append(BreathPanel(name, why, errors, pressure, _valve(traces, i, name)))
     return shown
 
 

@@ -39,7 +39,7 @@ def html(diagnosis: Diagnosis) -> str:
         plant=diagnosis.simulator,
         light=style.RUN_COLORS,
         dark=style.RUN_COLORS_DARK,
-        mechanisms=[_named(item) for item in diagnosis.mechanisms],
+        mechanisms=[_named(mechanism) for mechanism in diagnosis.mechanisms],
         alternatives=report_text.alternatives(diagnosis),
         bars=bars(diagnosis),
         groups=groups(diagnosis),
@@ -67,11 +67,14 @@ def html(diagnosis: Diagnosis) -> str:
 
 def bars(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Root-mean-square errors as bars: text, class, value and width in %."""
-    one = diagnosis.open_loop
-    rows = [("as given", "before", one.before.rmse), ("R and C refitted", "refit", one.refit.rmse)]
+    distance = diagnosis.open_loop
+    rows = [
+        ("as given", "before", distance.before.rmse),
+        ("R and C refitted", "refit", distance.refit.rmse),
+    ]
     if diagnosis.verdict != "nothing_missing":
-        rows.append(("corrected", "after", one.after.rmse))
-    rows.append(("noise of the measurement", "noise", one.noise_floor))
+        rows.append(("corrected", "after", distance.after.rmse))
+    rows.append(("noise of the measurement", "noise", distance.noise_floor))
     top = max((value for *_, value in rows if np.isfinite(value)), default=1.0) or 1.0
     return [
         {
@@ -86,9 +89,9 @@ def bars(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 def groups(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Rows of the table of open-loop errors: all breaths first, then each part."""
-    one = diagnosis.open_loop
-    everything = {"before": one.before, "refit": one.refit, "after": one.after}
-    rows = [("all", everything), *one.groups.items()]
+    distance = diagnosis.open_loop
+    everything = {"before": distance.before, "refit": distance.refit, "after": distance.after}
+    rows = [("all", everything), *distance.groups.items()]
     keys = [key for key, _, _ in _stages(diagnosis)]
     return [
         {"name": name, "cells": [_cell(values.get(key)) for key in keys]} for name, values in rows
@@ -105,21 +108,21 @@ def _cell(distance: OpenLoopError | None) -> dict[str, str]:
     return {"rmse": _number(distance.rmse), "mae": _number(distance.mae)}
 
 
-def _named(item: MissingMechanism) -> dict[str, Any]:
-    """A mechanism for the table."""
-    about = mechanism(item.name).description
+def _named(missing: MissingMechanism) -> dict[str, Any]:
+    """A missing for the table."""
+    about = mechanism(missing.name).description
     meanings = {parameter.name: parameter.meaning for parameter in about.parameters}
     return {
-        "name": item.name,
+        "name": missing.name,
         "title": about.title,
         "equation": about.equation,
         "signature": about.signature,
-        "changed": item.changed,
-        "confidence": f"{100 * item.confidence:.0f} %",
-        "alternatives": item.alternatives,
+        "changed": missing.changed,
+        "confidence": f"{100 * missing.confidence:.0f} %",
+        "alternatives": missing.alternatives,
         "parameters": [
-            (meanings.get(key, key), report_text.quantity(value, f"{item.name}.{key}"))
-            for key, value in item.parameters.items()
+            (meanings.get(key, key), report_text.quantity(value, f"{missing.name}.{key}"))
+            for key, value in missing.parameters.items()
         ],
     }
 

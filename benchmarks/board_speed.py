@@ -1,9 +1,9 @@
-"""How long a leaderboard of many records takes to build and to verify.
+"""Time to build and to verify a leaderboard of many records.
 
-python benchmarks/board_speed.py [--records 1000] [--verified 100]
+The entries are synthetic: the commands of ``pid_best`` times a few factors, replayed, under new
+names. Verification runs on a part of the records; its time is scaled to all of them. Usage:
 
-Synthetic entries from a few real ones: their commands times a factor, replayed, under new names.
-Verification is measured on a part of them and its time a record multiplied.
+    python benchmarks/board_speed.py [--records 1000] [--verified 100]
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ventbench.plants import frozen
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.scoring import run_protocol
 
-#: What must not be exceeded with 1,000 records, s.
+#: Largest times for 1,000 records, s.
 BUILD_LIMIT_S, VERIFY_LIMIT_S = 10.0, 300.0
 
 SANDBOX = {"layers": ["landlock", "seccomp"], "official": True}
@@ -32,7 +32,7 @@ FACTORS = (1.0, 0.99, 0.98, 0.97, 0.96, 0.95, 0.94, 0.93)
 
 
 def drafts(plants: Simulators) -> list[create.Draft]:
-    """Real records: commands of the PID times a factor."""
+    """Return real records whose commands are those of the PID times a factor."""
     result = run_protocol(open_submission("pid_best"), plants.plants, draws=draws.COUNT)
     made = []
     for factor in FACTORS:
@@ -52,7 +52,7 @@ def drafts(plants: Simulators) -> list[create.Draft]:
 
 
 def fill(folder: Path, made: list[create.Draft], count: int) -> None:
-    """Write a leaderboard of that many entries; the first keeps its name, as the PID."""
+    """Write a leaderboard of ``count`` entries; the first keeps the name of the PID."""
     lines, head = b"", store.CHAIN_START
     for draft in made:
         draft.save(folder / store.RECORDS).unlink()
@@ -82,16 +82,16 @@ def main() -> None:
     share = arguments.records / 1000
     print(f"{arguments.records} records on {os.cpu_count()} cores")
     sizes = [len(x.content) + len(x.commands) for x in made]
-    print(f"a record with its commands: {max(sizes) / 1e3:.0f} kB at most")
+    print(f"largest record with its commands: {max(sizes) / 1e3:.0f} kB")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "large"
         fill(folder, made, arguments.records)
         begun = time.perf_counter()
         done = build.build(folder)
-        report("build, first", time.perf_counter() - begun, BUILD_LIMIT_S * share)
+        report("first build", time.perf_counter() - begun, BUILD_LIMIT_S * share)
         begun = time.perf_counter()
         again = build.build(folder)
-        report("build, again", time.perf_counter() - begun, BUILD_LIMIT_S * share)
+        report("second build", time.perf_counter() - begun, BUILD_LIMIT_S * share)
         if again.changed or len(done.changed) != done.pages:
             raise SystemExit("the second build changed something")
         part = Path(temporary) / "part"

@@ -1,8 +1,9 @@
-"""Derivatives of a fit: by differences, as they are computed, and by forward-mode differentiation.
+"""Time of the derivatives of a fit, by finite differences and by forward-mode differentiation.
 
-Both of the same model with all mechanisms, and with all basis terms too, on one core: 40 breaths
-of 80 samples, by the first parameters of the model. Differences skip mechanisms that are off;
-forward mode cannot, since they have slopes. Usage:
+Fits use finite differences. The benchmark differentiates 40 breaths of 80 samples by the first
+parameters of the model, on one core: with all mechanisms, and with all mechanisms and basis terms.
+Differences skip mechanisms that are off; forward mode cannot, because their slopes are not zero.
+Usage:
 
     python benchmarks/derivatives.py [--columns 8] [--repeats 5]
 """
@@ -30,7 +31,7 @@ BREATHS, SAMPLES, DT = 40, 80, 0.03
 
 
 def breaths() -> Breaths:
-    """Commands that step every 120 ms, then an open expiratory valve; pressures do not matter."""
+    """Return breaths with random steps of u_in every 120 ms; their pressures are not used."""
     shape = (BREATHS, SAMPLES)
     steps = np.random.default_rng(0).uniform(0.0, 60.0, (BREATHS, SAMPLES // 4))
     inspired = np.arange(SAMPLES) < SAMPLES // 2
@@ -44,7 +45,7 @@ def breaths() -> Breaths:
 
 
 def exact(predictor: Predictor, values: np.ndarray, columns: int) -> Callable[[], object]:
-    """Forward mode along each column of ``values``, compiled."""
+    """Return a call that differentiates along columns of ``values`` in forward mode."""
     ((u_in, u_out, dt),) = predictor._commands
     basis = np.eye(values.shape[1])[:columns]
 
@@ -66,7 +67,7 @@ def exact(predictor: Predictor, values: np.ndarray, columns: int) -> Callable[[]
 
 
 def seconds(call: Callable[[], object], repeats: int) -> tuple[float, float]:
-    """Of the first call, which compiles, and the least of the others."""
+    """Return the seconds of the first call, which compiles, and of the fastest other call."""
     times = []
     for _ in range(1 + repeats):
         begun = time.perf_counter()
@@ -76,7 +77,7 @@ def seconds(call: Callable[[], object], repeats: int) -> tuple[float, float]:
 
 
 def compare(names: tuple[str, ...], columns: int, repeats: int) -> None:
-    """Print times and their ratio for a model with some parameters."""
+    """Print the times of both methods and their ratio for a model with the named parameters."""
     predictor = Predictor(make_data(breaths()), names, sizes=(BREATHS,))
     few = {"PEEP": 5.0, "valve_lag.tau": 0.03, "leak.conductance": 5.0}
     mild = {name: parameter(name).mild for name in names if "." in name}
@@ -100,7 +101,7 @@ def compare(names: tuple[str, ...], columns: int, repeats: int) -> None:
 
 
 def main() -> None:
-    """Compare for the library, and for the library and all basis terms."""
+    """Compare for all mechanisms, and for all mechanisms and basis terms."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--columns", type=int, default=8)
     parser.add_argument("--repeats", type=int, default=5)

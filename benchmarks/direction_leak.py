@@ -1,11 +1,12 @@
 """Is the effect of the command's direction physics, or pressure read from the commands?
 
-In the public recordings a PI controller made the commands from the measured pressure, so a model
-could learn to read the pressure back from them, which would make its open-loop error better than
-its physics. This fits the hybrid with and without the effect of the command's direction, held out
-by breath, twice: to the real recordings, and to breaths simulated *without* such an effect under
-the same kind of PI controller, with the sensor's noise and valves that differ from breath to
-breath. If the effect were a leak, the fit would find it in the simulated breaths too. Usage:
+In the public recordings a PI controller computed the commands from the measured pressure. A model
+could reconstruct the pressure from the commands; its open-loop error would then be better than its
+physics. The benchmark fits the hybrid with and without the effect of the command's direction,
+evaluates it on held-out breaths, and does so twice: for the real recordings, and for breaths
+simulated *without* the effect under the same kind of PI controller, with sensor noise and valve
+gains that differ from breath to breath. If the effect only reconstructed the pressure, the fit
+would also find it in the simulated breaths. Usage:
 
     python benchmarks/direction_leak.py [--recordings DIR] [--folds 5] [--json FILE]
 """
@@ -32,13 +33,13 @@ from ventbench.training.hybrid.fit import HybridConfig, fit, mean_absolute_error
 from ventbench.training.hybrid.parameters import direction
 from ventbench.training.simulator import TrainingRecordings, load_recordings
 
-#: Of the simulated breaths: sensor noise, cmH2O; spread of the valves' gain; the PI's constants.
+#: Simulated breaths: sensor noise, cmH2O; relative spread of the valve gain; constants of the PI.
 NOISE, SPREAD = 0.22, 0.1
 KP, KI, TARGETS, TIME_CONSTANT = (0.5, 10.0), (0.5, 20.0), (10.0, 35.0), 0.5
 
 
 def simulated(breaths: Breaths, simulators: frozen.Frozen, seed: int) -> Breaths:
-    """Breaths with the same clocks, from plants without effects of direction, under a PI."""
+    """Return breaths with the same clocks, from plants without effects of direction, under a PI."""
     rng = np.random.default_rng(seed)
     n, samples = breaths.u_in.shape
     plants = simulators.for_breaths(breaths)
@@ -77,7 +78,7 @@ def simulated(breaths: Breaths, simulators: frozen.Frozen, seed: int) -> Breaths
 
 
 def held_out(data: TrainingRecordings, table: Sessions, directed: bool, folds: int) -> Any:
-    """Held-out errors of the measured breaths, cmH2O, and the mean sum of the plays' weights."""
+    """Return held-out errors of the measured breaths, cmH2O, and the mean sum of play weights."""
     config = HybridConfig(directed=directed)
     arranged = training_set(data.measured, data.reconstructed, data.fold, table, config)
     measured = inspirations(data.measured, table)

@@ -1,7 +1,7 @@
-"""How long a file as large as the public one takes to load, and how much memory.
+"""Time and memory to load a file as large as the public recordings.
 
-Writes 75,450 synthetic breaths of 80 rows to a temporary folder, loads them in a process of its own
-and compares with a plain `pyarrow.csv.read_csv` of the same file in another.
+Writes 75,450 synthetic breaths of 80 rows to a temporary folder, loads them in a separate process
+and compares with a plain ``pyarrow.csv.read_csv`` of the same file in another process. Usage:
 
     python benchmarks/load_recordings.py [--breaths 75450] [--folder DIR]
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 SECONDS, GIB = 15.0, 3.0
-"""What a load may take."""
+"""Largest time and memory of a load."""
 
 LOAD = """
 from ventbench.recordings import load
@@ -71,7 +71,7 @@ def write_synthetic(path: Path, breaths: int) -> None:
 
 
 def measure(body: str, path: Path) -> tuple[int, float, float]:
-    """Rows, seconds and peak GiB of a fresh process, with its imports."""
+    """Return rows, seconds and peak GiB of a fresh process, imports included."""
     command = [sys.executable, "-c", FRAME.format(body=body), str(path)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     rows, seconds, peak = json.loads(done.stdout)
@@ -81,7 +81,7 @@ def measure(body: str, path: Path) -> tuple[int, float, float]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--breaths", type=int, default=75_450)
-    parser.add_argument("--folder", default=None, help="where the temporary file goes")
+    parser.add_argument("--folder", default=None, help="folder of the temporary file")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         path = Path(folder) / "synthetic.csv"

@@ -1,8 +1,9 @@
-"""The paper's whole PID grid on the six frozen simulators: best gains, and how fast.
+"""The paper's PID grid on the six frozen simulators: best gains and speed.
 
-8,000 gains x six PIPs on each lung, 288,000 trajectories. Prints the best gains of each lung beside
-those that the paper found on the physical lung, the best single set (`submissions/pid_robust`), and
-steps/s against the textbook lung, the cheapest plant there is, in the same run. Usage:
+Simulates 8,000 sets of gains at six PIPs on each lung, 288,000 trajectories. Prints the best gains
+of each lung and those that the paper found on the physical lung, the best single set
+(``submissions/pid_robust``), and the steps/s relative to the R-C lung, the cheapest plant, in the
+same run. Usage:
 
     python benchmarks/pid_grid.py [--json FILE]
 """
@@ -25,7 +26,7 @@ from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.training import pid_grid
 
-#: On the physical lung, paper appendix: P, I; D is 0.
+#: Best gains P, I on the physical lung (paper, appendix); D is 0.
 PAPER = {
     "R5C10": (10.0, 0.2),
     "R5C20": (10.0, 10.0),
@@ -37,7 +38,7 @@ PAPER = {
 
 
 def timed(plants: Any, gains: np.ndarray) -> tuple[np.ndarray, float]:
-    """Errors and steps/s, without compilation."""
+    """Return errors, cmH2O, and steps/s without compilation."""
     pid_grid.errors(jax.tree.map(lambda x: x[:1], plants), gains[: pid_grid.BATCH])
     started = time.perf_counter()
     error = pid_grid.errors(plants, gains)
@@ -73,7 +74,7 @@ def main() -> None:
     shown = ", ".join(f"{gain:g}" for gain in gains[one])
     print(f"{'all six':8} {shown:>20} {error[:, one].mean():7.3f}")
     print(f"\n{error.size} trajectories, {rate:.3g} steps/s")
-    print(f"textbook lungs {textbook:.3g} steps/s, ratio {rate / textbook:.3f}")
+    print(f"R-C lungs {textbook:.3g} steps/s, ratio {rate / textbook:.3f}")
     result |= {"robust": gains[one].tolist(), "robust_error": float(error[:, one].mean())}
     result |= {"steps_per_s": rate, "textbook_steps_per_s": textbook}
     if options.json:

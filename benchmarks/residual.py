@@ -1,9 +1,11 @@
-"""The residual submissions against the best PIDs of the whole grid, and against what can be had.
+"""The residual submissions compared with the best PIDs of the grid and with lower bounds.
 
-On the six frozen simulators, float64. *rise*: the valve fully open until PIP is reached, a bound as
-far as more command means more pressure. *reached*: commands found for each cell by gradient, with
-everything known. Then differences of the error, paired over the six PIPs (nominal) and over the 20
-published draws, with 95 % bootstrap intervals: below zero the residual is better. Usage:
+On the six frozen simulators, in float64. Prints two bounds of the error: *rise*, with the valve
+fully open until PIP is reached (a lower bound if a higher command never lowers the pressure), and
+*reached*, the lowest error that a gradient search finds for the commands of each cell with the
+simulator known. Then prints differences of the error, paired over the six PIPs (nominal) and over
+the 20 published draws, with 95 % bootstrap intervals; below zero the residual network is better.
+Usage:
 
     python benchmarks/residual.py [--json FILE]
 """
@@ -31,7 +33,7 @@ from ventbench.training.trained import ALL
 
 
 def row(name: str, one: np.ndarray, other: np.ndarray) -> dict[str, Any]:
-    """Print and return paired differences; errors of shape ``(1 + draws, P)``."""
+    """Print and return paired differences of errors of shape ``(1 + draws, P)``."""
     nominal = bootstrap.summary(one[0] - other[0])
     drawn = bootstrap.summary((one[1:] - other[1:]).mean(axis=1))
     print(f"{name:8} {one[0].mean():7.3f} {other[0].mean():7.3f}", end="")
@@ -75,7 +77,7 @@ def main() -> None:
         (one, index, safe), (other, pid_index, _) = (
             score_controllers(simulators, controllers) for controllers in (residuals, pids)
         )
-        print(f"\n{title}: nominal, PID's, differences on PIPs and on draws")
+        print(f"\n{title}: nominal error, PID's, differences over PIPs and over draws")
         rows = {name: row(name, one[k], other[k]) for k, name in enumerate(LUNG_IDS)}
         rows["mean"] = row("mean", one.mean(axis=0), other.mean(axis=0))
         less = [1.0 - one[:, part].mean() / other[:, part].mean() for part in (0, slice(1, None))]

@@ -1,16 +1,16 @@
-"""Closed-loop rollout speed against the machine's own matrix products, measured in one run.
+"""Speed of closed-loop rollouts relative to matrix products on the same machine.
 
-Prints, for float32 batched PID rollouts on a learned plant of the paper's size (9 x 150):
-environment steps/s, GFLOP/s (multiply and add of every executed layer, boundary network included)
-and their ratio to plain matrix products of the same layer shapes; the latency of one run of 300
-steps; steps/s of the other plants. Nothing is asserted on time. Usage:
+For batched PID rollouts in float32 on a learned plant of the paper's size (9 x 150), prints the
+environment steps/s, the GFLOP/s (multiplications and additions of every executed layer, boundary
+network included) and the ratio to plain matrix products of the same layer shapes. Also prints the
+latency of one run of 300 steps and the steps/s of the other plants. Usage:
 
     python benchmarks/rollout_speed.py [--batch 512 1024 2048] [--rounds 5] [--cpu-time]
         [--json FILE]
 
-Rounds alternate rollouts and products, and the best of each is compared, since a machine shared
-with others slows both. With ``--cpu-time`` the clock counts this process's own processor seconds
-over all threads, so that the ratio holds on a busy machine too; rates are then those of one core.
+Rounds alternate rollouts and products, and the best of each is compared, because other work on the
+machine slows both. With ``--cpu-time`` the clock counts the processor seconds of this process over
+all threads, so the ratio also holds on a busy machine; the rates are then those of one core.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _CLOCK = [time.perf_counter]
 
 
 def layers(plant: Learned) -> list[tuple[int, int]]:
-    """Shapes of the matrices that one step multiplies with."""
+    """Return the shapes of the matrices that one step multiplies with."""
     shapes = [w.shape for w in plant.general.weights]
     if plant.boundary is not None:
         shapes += [plant.boundary.hidden.shape, plant.boundary.output.shape]
@@ -64,21 +64,21 @@ def layers(plant: Learned) -> list[tuple[int, int]]:
 
 
 def seconds(run: Callable[[], Any]) -> float:
-    """Time of one call by :data:`_CLOCK`, results waited for."""
+    """Return the time of one call by :data:`_CLOCK`, s, including its asynchronous work."""
     started = _CLOCK[0]()
     jax.block_until_ready(run())
     return _CLOCK[0]() - started
 
 
 def cells(batch: int) -> tuple[PID, Scenario]:
-    """A grid's worth of PIDs and their nominal cells, shape ``(batch,)``."""
+    """Return random PIDs and their nominal cells, shape ``(batch,)``."""
     rng = np.random.default_rng(0)
     pid = PID(*(jnp.asarray(rng.uniform(0, 5, batch), jnp.float32) for _ in range(2)))
     return pid, nominal(np.resize(protocol.PIPS, batch))
 
 
 def xla_products(plant: Learned, batch: int) -> Callable[[], Any]:
-    """The general network's matrices alone, chained, as often as a run steps."""
+    """Return a call that multiplies the matrices of the general network, once for each step."""
     weights = plant.general.weights
 
     @jax.jit
@@ -97,7 +97,7 @@ def xla_products(plant: Learned, batch: int) -> Callable[[], Any]:
 
 
 def blas_products(plant: Learned, batch: int) -> Callable[[], Any]:
-    """Likewise with NumPy's BLAS, in place and without Python between but the loop."""
+    """Return the same products by NumPy's BLAS, in place."""
     weights = [np.asarray(w) for w in plant.general.weights]
     rng = np.random.default_rng(0)
     inputs = rng.standard_normal((batch, weights[0].shape[0]), np.float32)
@@ -114,7 +114,7 @@ def blas_products(plant: Learned, batch: int) -> Callable[[], Any]:
 
 
 def throughput(plant: Learned, batches: list[int], rounds: int) -> list[dict[str, float]]:
-    """Best rates a batch size; GFLOP/s and steps/s."""
+    """Return the best rates for each batch size, in GFLOP/s and steps/s."""
     step_flop = 2.0 * sum(a * b for a, b in layers(plant))
     product_flop = 2.0 * sum(w.shape[0] * w.shape[1] for w in plant.general.weights)
     rows = []
@@ -148,7 +148,7 @@ def throughput(plant: Learned, batches: list[int], rounds: int) -> list[dict[str
 
 
 def latency(plant: Plant, repeats: int = 50) -> dict[str, float]:
-    """Best and median milliseconds of one compiled run of one cell."""
+    """Return best and median milliseconds of one compiled run of one cell."""
     pid, scenario = PID(1.0, 3.0), nominal(20.0)
     found = {}
     for whole in (False, True):

@@ -1,6 +1,8 @@
-"""What the sandbox costs: starting cells, one step, ending; beside the same in this process.
+"""Cost of the sandbox: start of cells, one step and end, compared with the same process.
 
-python benchmarks/sandbox_cost.py [--cells 756] [--entry pid_best]
+Usage:
+
+    python benchmarks/sandbox_cost.py [--cells 756] [--entry pid_best]
 """
 
 from __future__ import annotations

@@ -115,9 +115,9 @@ def test_simulate_refuses_bad_input(commands, tmp_path):
 
 def test_train_needs_recordings(tmp_path, monkeypatch):
     message = run("train", "simulator", "--recordings", tmp_path / "nowhere", code=2)
-    assert "nowhere holds no recordings; give --recordings DIR" in message
+    assert "nowhere contains no recordings; give --recordings DIR" in message
     monkeypatch.setenv("VENTBENCH_RECORDINGS", str(tmp_path / "gone"))
-    assert "no folder holds no recordings" in run("train", "simulator", code=2)
+    assert "no folder contains no recordings" in run("train", "simulator", code=2)
     message = run("train", "simulator", "--recordings", tmp_path, "--out", tmp_path / "x", code=2)
     assert f"{simulator.MEASURED}: there is no such file" in message
     assert not (tmp_path / "x").exists()
@@ -140,7 +140,7 @@ def test_train_hands_over_folder_target_and_progress(tmp_path, monkeypatch):
 def test_the_program_ends_with_2_and_one_line(tmp_path):
     for arguments, message in (
         (("open-loop", tmp_path / "none.csv"), "no such file"),
-        (("train", "simulator", "--recordings", tmp_path / "nowhere"), "holds no recordings"),
+        (("train", "simulator", "--recordings", tmp_path / "nowhere"), "contains no recordings"),
     ):
         found = program(*arguments)
         assert found.returncode == 2

@@ -1,8 +1,9 @@
-"""Make the example recordings and their manifest; the same code gives the same bytes.
+"""Write the example recordings and their manifest; the same code gives the same bytes.
 
 Usage: ``python data/examples/make.py [DIR]``
 
-All breaths are simulated; none is from a real rig. The rigs share no code with the diagnosis.
+All breaths are simulated; none is from a real rig. The simulated rigs share no code with the
+diagnosis.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from ventbench.recordings import Breaths, make_breaths, write
 from ventbench.validation.challenge.cases import Base, Case, Effect
 from ventbench.validation.challenge.rig import record
 
-#: Version of the examples: another one when a byte of a recording changes.
+#: Version of the examples; it changes with any byte of a recording.
 VERSION = 1
 
 #: Seeds of times, commands and noise.
 SEEDS = {"concealed": 101, "sound": 102, "flow": 103}
 
-#: The rig of the first two: a valve that gives 4 % less than nominal, a PEEP of 5.2 cmH2O.
+#: Rig of the first two recordings: a valve that gives 4 % less than nominal, PEEP 5.2 cmH2O.
 CONCEALED = Case(
     "concealed", 20.0, 50.0,
     (Effect("turbulent_resistance", "strong", "library", {"quadratic": 10.0}),),
@@ -37,7 +38,7 @@ SOUND = Case(
     samples=80,
 )  # fmt: skip
 
-#: The lung of the recording with flow: labelled R20C20, but a leaflet is stuck and C is higher.
+#: Lung of the recording with flow: its label is R20C20, but C is higher.
 FLOW_R, FLOW_C, FLOW_PEEP = 20.0, 27.0, 5.0
 
 #: Noise of the pressure and of the flow sensor, cmH2O and mL/s.
@@ -45,12 +46,12 @@ PRESSURE_NOISE, FLOW_NOISE = 0.1, 3.0
 
 
 def with_flow(seed: int, breaths: int = 12, samples: int = 100) -> Breaths:
-    """Simulate an R-C lung exactly: constant flow in, then out through 6 cmH2O s/L.
+    """Simulate an R-C lung exactly: constant inflow, then outflow through 6 cmH2O/(L/s).
 
     Args:
-        seed: of flows and noise.
-        breaths: how many.
-        samples: of each, at 30 ms.
+        seed: seed of flows and noise.
+        breaths: number of breaths.
+        samples: samples of each breath, 30 ms apart.
     """
     rng = np.random.default_rng(seed)
     dt, inspiratory = 0.03, samples // 3
@@ -90,10 +91,10 @@ def make(folder: Path) -> list[Path]:
     """Write the recordings and ``manifest.toml``.
 
     Args:
-        folder: target.
+        folder: target folder.
 
     Returns:
-        The files.
+        Paths of the files written.
     """
     concealed, about_concealed = _case(CONCEALED)
     sound, about_sound = _case(SOUND)

@@ -42,7 +42,7 @@ def test_from_records_to_a_verified_board(drafts, tmp_path: Path) -> None:
     assert "3 records, 5 files, 5 changed" in run("build", "--folder", folder)
     assert "3 records, 5 files, 0 changed" in run("build", "--folder", folder)
     output = run("verify", "--folder", folder)
-    assert "all is well: 3 records, 3 replayed" in output
+    assert "no problems: 3 records, 3 replayed" in output
     report = tmp_path / "show.json"
     text = run("show", "--folder", folder, "--json", report)
     rows = json.loads(report.read_text())["rows"]
@@ -71,7 +71,7 @@ def test_withdraw(leaderboard: Path) -> None:
     assert item.sha256 in output
     run("build", "--folder", leaderboard)
     assert "withdrawn: a bug" in (leaderboard / "index.html").read_text()
-    assert "all is well" in run("verify", "--folder", leaderboard)
+    assert "no problems" in run("verify", "--folder", leaderboard)
 
 
 def test_a_correction_says_why_and_whence(leaderboard: Path, draft) -> None:
@@ -80,7 +80,7 @@ def test_a_correction_says_why_and_whence(leaderboard: Path, draft) -> None:
     options = ("--supersedes", old.sha256[:8], "--reason", "a bug", "--source", "commit=9c1e5d0")
     run("add", path, *options, "--folder", leaderboard)
     run("build", "--folder", leaderboard)
-    assert "all is well: 9 records" in run("verify", "--folder", leaderboard)
+    assert "no problems: 9 records" in run("verify", "--folder", leaderboard)
     new = store.load(leaderboard).scores[-1]
     assert new.header.supersedes == old.sha256
     assert new.header.provenance == {"commit": "9c1e5d0"}

@@ -1,7 +1,7 @@
-"""The command line ``ventbench``: parses, calls, prints. One module a group of commands.
+"""The command line ``ventbench``: parses, calls, prints. One module per group of commands.
 
-Exit codes: 0 done; 1 it ran and the answer is no; 2 bad input. Heavy packages are imported inside
-the commands, so that ``ventbench --help`` answers at once.
+Exit codes: 0 done; 1 the command ran and the answer is no; 2 bad input. Heavy packages are
+imported inside the commands, so that ``ventbench --help`` answers at once.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from ventbench.text import plain
 
 app = typer.Typer(
     name="ventbench",
-    help="The benchmark for mechanical-ventilator control.",
+    help="A benchmark for the control of mechanical ventilators.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

@@ -1,4 +1,4 @@
-"""``ventbench board``: add records, build the pages, verify everything, look at it."""
+"""``ventbench board``: add records, build, verify and show the leaderboard."""
 
 from __future__ import annotations
 
@@ -16,11 +16,14 @@ if TYPE_CHECKING:
     from ventbench.board.ranking import Interval, Track
 
 app = typer.Typer(
-    name="board", help="The leaderboard: records in, pages out.", no_args_is_help=True
+    name="board", help="The leaderboard: add records, build and verify pages.", no_args_is_help=True
 )
 
 Folder = Annotated[
-    Path, typer.Option("--folder", metavar="DIR", help="The leaderboard; leaderboard by default.")
+    Path,
+    typer.Option(
+        "--folder", metavar="DIR", help="Folder of the leaderboard; default: leaderboard."
+    ),
 ]
 FOLDER = Path("leaderboard")
 
@@ -30,21 +33,23 @@ def add(
     record: Annotated[
         Path,
         typer.Argument(
-            help="The JSON that `ventbench score --record DIR` wrote; its commands lie beside it."
+            help="JSON file of `ventbench score --record DIR`, with its commands next to it."
         ),
     ],
     supersedes: Annotated[
         str | None,
-        typer.Option(metavar="HASH", help="Record that this one corrects, or the beginning of it."),
+        typer.Option(
+            metavar="HASH", help="SHA-256 (or its beginning) of the record that this one corrects."
+        ),
     ] = None,
-    reason: Annotated[str, typer.Option(help="Why, for the page.")] = "",
+    reason: Annotated[str, typer.Option(help="Reason of the correction, shown on the page.")] = "",
     source: Annotated[
         list[str] | None,
-        typer.Option(metavar="KEY=TEXT", help="Where the submission came from; may be repeated."),
+        typer.Option(metavar="KEY=TEXT", help="Origin of the submission; may be repeated."),
     ] = None,
     folder: Folder = FOLDER,
 ) -> None:
-    """Add a record, if it replays to the same numbers.
+    """Add a record if its replay gives the recorded numbers.
 
     Example: `ventbench board add runs/record/3f2a....json --source commit=9c1e5d0`
     """
@@ -66,11 +71,11 @@ def add(
 
 @app.command()
 def withdraw(
-    record: Annotated[str, typer.Argument(help="SHA-256 of the record, or the beginning of it.")],
-    reason: Annotated[str, typer.Option(help="Shown on the page.")],
+    record: Annotated[str, typer.Argument(help="SHA-256 of the record, or its beginning.")],
+    reason: Annotated[str, typer.Option(help="Reason, shown on the page.")],
     folder: Folder = FOLDER,
 ) -> None:
-    """Take a record back; it stays in the history and its entry is no longer ranked.
+    """Withdraw a record: it stays in the history, but its entry is no longer ranked.
 
     Example: `ventbench board withdraw 3f2a91 --reason "the authors found a bug"`
     """
@@ -101,13 +106,13 @@ def build(folder: Folder = FOLDER, json: JsonFile = None) -> None:
 def verify(
     folder: Folder = FOLDER,
     head: Annotated[
-        str | None, typer.Option(help="Head of the chain as noted before; it must still be there.")
+        str | None, typer.Option(help="Earlier head of the chain, which must still be part of it.")
     ] = None,
     json: JsonFile = None,
 ) -> None:
-    """Check every hash, replay every record's commands and build every page again.
+    """Check every hash, replay the commands of every record and rebuild every page.
 
-    Exit code 1 if anything is not as it must be; every problem names its file.
+    The exit code is 1 if there is any problem. Each problem names its file.
 
     Example: `ventbench board verify`
     """
@@ -139,7 +144,7 @@ def verify(
 
 def _summary(console: Console, report: Any) -> None:
     count = len(report.problems)
-    state = f"{count} problem{'s' if count > 1 else ''}" if count else "all is well"
+    state = f"{count} problem{'s' if count > 1 else ''}" if count else "no problems"
     console.print(
         f"{state}: {report.records} records, {report.replayed} replayed "
         f"(largest difference {report.deviation:.1e} cmH2O)\nhead {report.head}",
@@ -153,11 +158,11 @@ def _summary(console: Console, report: Any) -> None:
 def show(
     folder: Folder = FOLDER,
     version: Annotated[
-        int | None, typer.Option(help="Of the protocol; the newest by default.")
+        int | None, typer.Option(help="Version of the protocol; default: the newest.")
     ] = None,
     json: JsonFile = None,
 ) -> None:
-    """Show both tracks in the terminal.
+    """Show the ranking of both tracks.
 
     Example: `ventbench board show`
     """
@@ -207,5 +212,5 @@ def _limits(interval: Interval | None) -> str:
 
 
 def register(parent: typer.Typer) -> None:
-    """Add the group."""
+    """Add the group of commands."""
     parent.add_typer(app)

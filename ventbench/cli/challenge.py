@@ -11,14 +11,20 @@ from ventbench.cli.options import JsonFile, emit
 
 challenge = typer.Typer(
     name="challenge",
-    help="Prove the diagnosis on recordings whose effects are concealed.",
+    help="Test the diagnosis on recordings with concealed effects.",
     no_args_is_help=True,
 )
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the challenge.")]
-Seed = Annotated[str, typer.Option(help="The secret that the challenge is drawn from; any text.")]
+Seed = Annotated[str, typer.Option(help="Secret seed of the challenge; any text.")]
 Round = Annotated[
-    int, typer.Option("--round", min=1, max=2, help="2: with the breaths that were asked for.")
+    int,
+    typer.Option(
+        "--round",
+        min=1,
+        max=2,
+        help="1: the recordings as made; 2: also the breaths that the answers asked for.",
+    ),
 ]
 Kind = Literal["single", "null", "pair", "four", "outside", "form", "masked", "all"]
 
@@ -26,21 +32,23 @@ Kind = Literal["single", "null", "pair", "four", "outside", "form", "masked", "a
 @challenge.command()
 def make(
     seed: Seed,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write.")],
-    cases: Annotated[int, typer.Option(min=1, help="How many recordings.")] = 200,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the challenge.")],
+    cases: Annotated[int, typer.Option(min=1, help="Number of recordings.")] = 200,
     kind: Annotated[
         Kind,
         typer.Option(
-            help="one effect, none, two, four, one outside the library, one in another form, "
-            "one in few closed-loop breaths; or some of each."
+            help="Effects of each recording: one (single), none (null), two (pair), four, one "
+            "outside the library, one in another form, one in few closed-loop breaths (masked); or "
+            "all of these kinds."
         ),
     ] = "all",
-    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
 ) -> None:
-    """Write recordings with concealed effects, and the answers under seal.
+    """Write recordings with concealed effects, and the sealed answers.
 
-    DIR/recordings and DIR/cases.json are for everyone; commitment.txt is the SHA-256 of the
-    answers: publish it before anyone looks. The same seed, kind and number give the same files.
+    Anyone may read DIR/recordings and DIR/cases.json. commitment.txt holds the SHA-256 of the
+    answers: publish it before the first diagnosis. The same seed, kind and number of recordings
+    give the same files.
 
     Example: `ventbench challenge make --seed "$SECRET" --out runs/challenge --cases 200`
     """
@@ -59,12 +67,14 @@ def make(
 @challenge.command()
 def answer(
     folder: Folder,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes, of one thread each.")] = 2,
+    jobs: Annotated[
+        int, typer.Option(min=1, help="Number of processes, each with one thread.")
+    ] = 2,
     round_: Round = 1,
 ) -> None:
-    """Diagnose every recording; the answers under seal are not read.
+    """Diagnose every recording without reading the sealed answers.
 
-    Ctrl-C keeps what is answered; the same command goes on from there.
+    Ctrl-C keeps the finished diagnoses; the same command continues.
 
     Example: `ventbench challenge answer runs/challenge --jobs 2`
     """
@@ -88,9 +98,9 @@ def answer(
 
 @challenge.command()
 def record(folder: Folder, seed: Seed) -> None:
-    """Record the breaths that answers asked for, each on its own concealed rig.
+    """Record the breaths that the answers asked for, each on its own concealed rig.
 
-    Then `answer` and `reveal` with `--round 2` judge all breaths together.
+    Afterwards, `answer` and `reveal` with `--round 2` use all breaths.
 
     Example: `ventbench challenge record runs/challenge --seed "$SECRET"`
     """
@@ -98,7 +108,7 @@ def record(folder: Folder, seed: Seed) -> None:
     from ventbench.validation.challenge.folder import ChallengeFolder
 
     names = requests.record(ChallengeFolder(folder), seed)
-    typer.echo(f"recorded what was asked for in {len(names)} cases")
+    typer.echo(f"recorded the requested breaths of {len(names)} cases")
 
 
 @challenge.command()
@@ -107,16 +117,16 @@ def reveal(
     seed: Seed,
     round_: Round = 1,
     oracle: Annotated[
-        bool, typer.Option("--oracle", help="Compare with fits that know the truth; slow.")
+        bool, typer.Option("--oracle", help="Compare with fits that know the true effects; slow.")
     ] = False,
     jobs: Annotated[
-        int, typer.Option(min=0, help="Processes for that; 0 for none but this one.")
+        int, typer.Option(min=0, help="Processes for --oracle; 0 for this process alone.")
     ] = 0,
     json: JsonFile = None,
 ) -> None:
-    """Open the seal, check all hashes, and score the answers.
+    """Open the sealed answers, check all hashes, and score the diagnoses.
 
-    Exit code 1 if a goal is missed.
+    The exit code is 1 if a goal is missed.
 
     Example: `ventbench challenge reveal runs/challenge --seed "$SECRET" --json scores.json`
     """
@@ -147,13 +157,13 @@ def _show(result: Any, console: Any) -> None:
     console.print(_confusion(result))
     console.print(_figures(result))
     if result.unanswered:
-        console.print(f"{len(result.unanswered)} cases have no answer and are left out")
+        console.print(f"{len(result.unanswered)} cases have no answer and are not counted")
 
 
 def _confusion(result: Any) -> Any:
     from rich.table import Table
 
-    table = Table(title="What was answered to what")
+    table = Table(title="Truth and answers")
     table.add_column("truth", no_wrap=True)
     table.add_column("n", justify="right")
     table.add_column("answers")
@@ -166,7 +176,7 @@ def _confusion(result: Any) -> Any:
 def _figures(result: Any) -> Any:
     from rich.table import Table
 
-    table = Table(title="Figures to reach")
+    table = Table(title="Figures and goals")
     table.add_column("figure")
     for name in ("value", "95 %", "goal", "n", ""):
         table.add_column(name, justify="right", no_wrap=True)

@@ -1,4 +1,4 @@
-"""``ventbench data``: recordings on disk, checked or explored."""
+"""``ventbench data``: check recordings, or make new ones by exploration."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, emit
 _TOGETHER = 60
 
 app = typer.Typer(
-    name="data", help="Check recordings, or explore simulators for new ones.", no_args_is_help=True
+    name="data",
+    help="Check recordings, or make new ones by exploring simulators.",
+    no_args_is_help=True,
 )
 
 
@@ -29,7 +31,7 @@ def check(
     pad: Pad = False,
     json: JsonFile = None,
 ) -> None:
-    """Say everything that is wrong with a recording, with line, column and value.
+    """Report every problem of a recording, with line, column and value.
 
     Example: `ventbench data check lab.csv`
     """
@@ -49,17 +51,21 @@ def check(
 
 @app.command()
 def explore(
-    out: Annotated[Path, typer.Argument(help="CSV, CSV.GZ or Parquet to write.")],
+    out: Annotated[Path, typer.Argument(help="CSV, CSV.GZ or Parquet file to write.")],
     lung: Annotated[str, typer.Option(help="Lung setting, such as R20C50.")] = "R20C50",
     plant: PlantName = "frozen",
-    breaths: Annotated[int, typer.Option(min=1, help="Breaths; the PIPs take turns.")] = 60,
-    noise: Annotated[float, typer.Option(min=0.0, help="Of the sensor, cmH2O.")] = 0.0,
-    seed: Annotated[int, typer.Option(min=0, help="Of disturbances and noise.")] = 0,
+    breaths: Annotated[
+        int, typer.Option(min=1, help="Number of breaths; the PIPs alternate.")
+    ] = 60,
+    noise: Annotated[
+        float, typer.Option(min=0.0, help="Standard deviation of the sensor noise, cmH2O.")
+    ] = 0.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of disturbances and noise.")] = 0,
 ) -> None:
-    """Record breaths to learn from: a safe PID, disturbed as the paper explores.
+    """Record breaths for training: a safe PID with the disturbances of the paper.
 
-    The valve closes above min(60, PIP + 15) cmH2O, the expiratory valve opens above 60, and
-    exploring stops after three breaths that ended so.
+    The inspiratory valve closes above min(60, PIP + 15) cmH2O. Above 60 cmH2O the expiratory valve
+    opens, and the exploration stops after three such breaths.
 
     Example: `ventbench data explore explored.csv --lung R5C20 --breaths 120 --noise 0.2`
     """

@@ -1,4 +1,4 @@
-"""``ventbench diagnose``: what physics a simulator lacks, by a recording."""
+"""``ventbench diagnose``: the physics that a simulator lacks, from a recording."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ if TYPE_CHECKING:
 
 
 def diagnose(
-    recordings: Annotated[Path, typer.Argument(help="CSV, CSV.GZ or Parquet, public schema.")],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write the four files.")],
+    recordings: Annotated[
+        Path, typer.Argument(help="CSV, CSV.GZ or Parquet file in the public schema.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")],
     plant: PlantName = "physics",
     lung: Annotated[
         str | None, typer.Option(metavar="R20C50", help="Only the breaths of this lung.")
@@ -25,20 +27,20 @@ def diagnose(
         bool,
         typer.Option(
             "--passive",
-            help="A test lung: nobody breathes, so that no patient effort is considered.",
+            help="The lung is a test lung: nobody breathes, so patient effort is excluded.",
         ),
     ] = False,
     clip: Clip = False,
     pad: Pad = False,
     json: JsonFile = None,
 ) -> None:
-    """Find what physics a simulator lacks when it differs from a recording.
+    """Find the physics that a simulator lacks when it differs from a recording.
 
-    Reports where they differ, which mechanisms are missing with their parameters (or where in the
-    model an effect acts that is not in the library), and how much closer the corrected simulator is
-    on held-out breaths. R, C, expiratory resistance and PEEP are always refitted. Writes
+    Reports where they differ, which mechanisms are missing and with which parameters (or where in
+    the model an effect outside the library acts), and how much the corrected simulator gains on
+    held-out breaths. R, C, the expiratory resistance and PEEP are always refitted. Writes
     diagnosis.json, report.html, diagnosis.rrd and, if the simulator has plants, corrected.json,
-    which every `--plant` takes.
+    which every `--plant` option accepts.
 
     Example: `ventbench diagnose recording.csv --lung R20C50 --out runs/diagnosis`
     """

@@ -1,4 +1,4 @@
-"""``ventbench mechanics``: the lung by pressure and flow, whatever the ventilator."""
+"""``ventbench mechanics``: lungs from pressure and flow, for any ventilator."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 def mechanics(
     recordings: Annotated[
         Path,
-        typer.Argument(help="Public schema with flow or volume, or a RespiraWorks Parquet file."),
+        typer.Argument(
+            help="File in the public schema with flow or volume, or a RespiraWorks Parquet file."
+        ),
     ],
     clip: Clip = False,
     pad: Pad = False,
@@ -24,9 +26,9 @@ def mechanics(
 ) -> None:
     """Identify lungs from pressure with flow or volume, and check their labels.
 
-    Needs no model of a valve, so that recordings of any ventilator will do: R, C and what else the
-    lung needs, whether its label holds, and which known settings it may be. A RespiraWorks file
-    gives a Markdown table of its runs.
+    Needs no model of a valve and therefore accepts recordings of any ventilator. Reports R, C and
+    further terms of the lung, whether its label holds, and which known settings it may be. For a
+    RespiraWorks file it prints a Markdown table of the runs.
 
     Example: `ventbench mechanics lab.csv`
     """
@@ -50,7 +52,7 @@ def mechanics(
 
 
 def _is_respiraworks(path: Path) -> bool:
-    """Whether it is Parquet with runs and tests; what is wrong with a file, its reader says."""
+    """Whether a file is Parquet with runs and tests; its reader reports what is wrong with it."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -83,7 +85,7 @@ def _identify(path: Path, *, clip: bool, pad: bool) -> tuple[Mechanics, ...]:
     if breaths.flow is None and breaths.volume is None:
         raise InputError(
             f"{path}: there is neither a column flow (mL/s) nor volume (mL); record one of them, "
-            "or ask `ventbench diagnose`, which judges lungs by pressure alone"
+            "or use `ventbench diagnose`, which needs the pressure only"
         )
     try:
         return identify(breaths)
@@ -92,7 +94,7 @@ def _identify(path: Path, *, clip: bool, pad: bool) -> tuple[Mechanics, ...]:
 
 
 def _lung(mechanics: Mechanics) -> dict[str, Any]:
-    """JSON values; what is not finite becomes null."""
+    """Return JSON values; numbers that are not finite become null."""
     import dataclasses
 
     from ventbench import files
@@ -126,7 +128,7 @@ def _say_runs(console: Any, runs: tuple[SurveyedRun, ...]) -> None:
 def _table(lungs: tuple[Mechanics, ...]) -> Any:
     from rich.table import Table
 
-    table = Table(title="Lungs by pressure and flow: R in cmH2O s/L at 1 L/s, C in mL/cmH2O")
+    table = Table(title="Lungs from pressure and flow: R in cmH2O/(L/s) at 1 L/s, C in mL/cmH2O")
     for name in ("label", "R", "C", "label holds", "may be", "also needs"):
         table.add_column(name)
     for lung in lungs:

@@ -11,7 +11,9 @@ JsonFile = Annotated[
     Path | None,
     typer.Option("--json", metavar="FILE", help="Also write the result as JSON; '-' for stdout."),
 ]
-Clip = Annotated[bool, typer.Option("--clip", help="Bring u_in into 0..100 % instead of refusing.")]
+Clip = Annotated[
+    bool, typer.Option("--clip", help="Clip u_in to 0..100 % instead of refusing the file.")
+]
 Pad = Annotated[bool, typer.Option("--pad", help="Accept breaths of unequal length.")]
 PlantName = Annotated[
     str,
@@ -32,7 +34,7 @@ RecordingsDir = Annotated[
 
 
 def recordings_folder(given: Path | None) -> Path:
-    """The folder of the public recordings.
+    """Return the folder of the public recordings.
 
     Raises:
         InputError: if there is none.
@@ -43,14 +45,14 @@ def recordings_folder(given: Path | None) -> Path:
     folder = given or recordings_dir()
     if folder is None or not folder.is_dir():
         raise InputError(
-            f"{folder or 'no folder'} holds no recordings; give --recordings DIR or set "
+            f"{folder or 'no folder'} contains no recordings; give --recordings DIR or set "
             "VENTBENCH_RECORDINGS"
         )
     return folder
 
 
 def emit(value: object, target: Path | None) -> None:
-    """Write a command's result where ``--json`` says, in one step."""
+    """Write the result of a command to the file of ``--json``, atomically."""
     from ventbench import files
 
     if target is None:
@@ -62,7 +64,7 @@ def emit(value: object, target: Path | None) -> None:
 
 
 def bars() -> Any:
-    """Progress bars on stderr: what is done, and the time that is left."""
+    """Return progress bars on stderr that show the finished share and the remaining time."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 

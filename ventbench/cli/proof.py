@@ -1,4 +1,4 @@
-"""``ventbench proof``: the diagnosis proved on real recordings."""
+"""``ventbench proof``: the diagnosis, tested on real recordings."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ if TYPE_CHECKING:
 
 def proof(
     out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Where to write: a folder a part, and proof.json.")
+        Path,
+        typer.Option(
+            metavar="DIR", help="Folder for the results: a folder for each part, and proof.json."
+        ),
     ],
     recordings: Annotated[
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Folder with pvp_quicklung.csv; by default $VENTBENCH_RECORDINGS.",
+            help="Folder with pvp_quicklung.csv; default: VENTBENCH_RECORDINGS.",
         ),
     ] = None,
     only: Annotated[
@@ -33,15 +36,16 @@ def proof(
     ] = None,
     json: JsonFile = None,
 ) -> None:
-    """Find what physics models lack on the real rig, and find again what was taken or put there.
+    """Diagnose models of the real rig, with known effects removed or injected.
 
-    rc and two_balloon: R-C and the paper's two-balloon lungs at their labels, against the six ISO
-    lungs as recorded. removed: the corrected R-C lungs with their most important mechanism taken
-    out again, which must be named. injected: the frozen simulators against recordings that got a
-    sensor lag of 80 ms, which must be named; frozen: the same before. Takes half an hour to an
-    hour of one core. Ctrl-C keeps the parts that are finished; the same command goes on from there.
+    The parts are: rc and two_balloon, R-C lungs and the paper's two-balloon lungs at their labels,
+    against the recordings of the six lungs; removed, the corrected R-C lungs without their most
+    important mechanism, which must be named; frozen, the frozen simulators against the recordings;
+    and injected, the frozen simulators against recordings with an added sensor lag of 80 ms, which
+    must be named. Takes about a quarter of an hour. Ctrl-C keeps the finished parts; the same
+    command continues.
 
-    Exit code 1 if a claim fails.
+    The exit code is 1 if a claim fails.
 
     Example: `ventbench proof --recordings recordings --out runs/proof`
     """

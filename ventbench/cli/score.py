@@ -1,4 +1,4 @@
-"""``ventbench score``: a submission through the protocol."""
+"""``ventbench score``: score submissions by the protocol."""
 
 from __future__ import annotations
 
@@ -20,36 +20,43 @@ Track = Literal["performance", "robustness"]
 def score(
     names: Annotated[
         list[str],
-        typer.Argument(metavar="SUBMISSION...", help="Folders, or names of bundled submissions."),
+        typer.Argument(metavar="SUBMISSION...", help="Folders or names of bundled submissions."),
     ],
     track: Annotated[
-        Track | None, typer.Option(help="Track to score for; the submission's first by default.")
+        Track | None, typer.Option(help="Track to score; default: the first of the submission.")
     ] = None,
     draws: Annotated[
-        int, typer.Option(min=0, max=20, help="How many of the 20 published draws to run as well.")
+        int, typer.Option(min=0, max=20, help="Number of the 20 published draws to run as well.")
     ] = 0,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Keep score.json and trajectories here.")
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Write score.json and trajectories to a folder for each submission here.",
+        ),
     ] = None,
     report: Annotated[
-        bool, typer.Option("--report", help="Also write report.html and scores.rrd to DIR.")
+        bool,
+        typer.Option(
+            "--report", help="Also write report.html and scores.rrd to the folder of --out."
+        ),
     ] = False,
     record: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Keep a record here, for `board add`; needs --draws 20."),
+        typer.Option(metavar="DIR", help="Write a record for `board add` here; needs --draws 20."),
     ] = None,
     plant: PlantName = "frozen",
     in_process: Annotated[
         bool,
-        typer.Option("--in-process", help="Run without the sandbox: only for code that you trust."),
+        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
     ] = False,
     json: JsonFile = None,
 ) -> None:
     """Score controllers on the six frozen lung simulators.
 
-    Lower is better: mean |pressure - target| over the inspirations, cmH2O. Every controller runs in
-    locked-down processes that see nothing of the simulators. With another --plant the lungs are
-    its own, and the score is not official.
+    The score is the mean |pressure - target| over the inspirations, cmH2O; lower is better. Each
+    controller runs in sandboxed processes that have no access to the simulators. With another
+    `--plant` the lungs are those of that plant, and the score is not official.
 
     Example: `ventbench score submissions/pid_best --json score.json`
     """
@@ -70,7 +77,7 @@ def score(
         raise InputError(f"two submissions have the same name: {', '.join(sorted(entries))}")
     simulators = load_simulators(plant)
     if record is not None and simulators.official is None:
-        raise InputError("--record is for the official simulators: leave --plant out")
+        raise InputError("--record needs the official simulators: leave out --plant")
     progress = Console(stderr=True)
     scores = []
     for entry in opened:
@@ -103,7 +110,7 @@ def score(
 
 
 def _table(scores: list[dict[str, Any]]) -> Table:
-    """One row a lung, one column a submission; from their JSON values."""
+    """Return a table with a row for each lung and a column for each submission."""
     from rich.table import Table
 
     def show(value: float | None) -> str:

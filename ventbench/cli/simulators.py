@@ -1,4 +1,4 @@
-"""``ventbench lungs``, ``simulate`` and ``open-loop``: the simulators by themselves."""
+"""``ventbench lungs``, ``simulate`` and ``open-loop``: simulators without a controller."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, emit
 
 
 def lungs(json: JsonFile = None) -> None:
-    """List the six lungs, and how well their simulators meet held-out recordings.
+    """List the six lungs and the errors of their simulators on held-out recordings.
 
     Example: `ventbench lungs`
     """
@@ -42,17 +42,20 @@ def simulate(
     lung: Annotated[str, typer.Option(help="Lung, such as R20C50.")],
     controls: Annotated[
         Path,
-        typer.Option(metavar="FILE", help="CSV: u_in in %; optionally u_out and time_step in s."),
+        typer.Option(
+            metavar="FILE", help="CSV with u_in in %; optionally u_out (0 or 1) and time_step in s."
+        ),
     ],
     start: Annotated[
         float, typer.Option(min=0.0, max=60.0, help="Pressure at the first sample, cmH2O.")
     ] = protocol.PEEP,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the CSV here instead of stdout.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the CSV to this file instead of stdout."),
     ] = None,
     plant: PlantName = "frozen",
 ) -> None:
-    """Answer a file of valve commands with pressures, as CSV.
+    """Simulate the pressures for a file of valve commands, as CSV.
 
     Example: `ventbench simulate --lung R20C50 --controls commands.csv`
     """
@@ -67,18 +70,21 @@ def simulate(
 
 
 def open_loop(
-    recordings: Annotated[Path, typer.Argument(help="CSV, CSV.GZ or Parquet, public schema.")],
+    recordings: Annotated[
+        Path, typer.Argument(help="CSV, CSV.GZ or Parquet file in the public schema.")
+    ],
     plant: PlantName = "frozen",
     clip: Clip = False,
     pad: Pad = False,
     json: JsonFile = None,
 ) -> None:
-    """Measure how far simulators stray from recorded breaths under the same commands.
+    """Measure the error of simulators on recorded breaths under the recorded commands.
 
-    Error of a breath: mean |simulated - recorded| over its inspiratory samples, cmH2O, from the
-    first recorded pressure. Held out: each breath by a member of the ensemble that has not seen it.
-    Breaths that another lung or valve gain explains far better than their label are listed as
-    misfits; they stay in all figures but the last column.
+    The error of a breath is the mean |simulated - recorded| pressure over its inspiratory samples,
+    cmH2O; the simulation starts at the first recorded pressure. For held-out errors, a member of
+    the ensemble that was not trained on a breath simulates it. Breaths that another lung or valve
+    gain explains far better than their label are listed as misfits; only the last column leaves
+    them out.
 
     Example: `ventbench open-loop recording.csv --json errors.json`
     """

@@ -1,4 +1,4 @@
-"""``ventbench study``: ways of learning compared, and what the parts of a design are worth."""
+"""``ventbench study``: compare training methods, and variants of controllers and networks."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ import typer
 
 from ventbench.cli.options import JsonFile, RecordingsDir, bars, emit, recordings_folder
 
-study = typer.Typer(name="study", help="Compare ways of learning.", no_args_is_help=True)
+study = typer.Typer(
+    name="study", help="Compare training methods, and variants of a design.", no_args_is_help=True
+)
 
 
 Only = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME", help="Only this variant, beside the base (may be repeated)."),
+    typer.Option(metavar="NAME", help="Only this variant and the base; may be repeated."),
 ]
 
 
@@ -25,18 +27,23 @@ def _group() -> None:
 
 @study.command()
 def samples(
-    lung: Annotated[str, typer.Option(metavar="ID", help="The lung.")] = "R20C50",
-    seeds: Annotated[int, typer.Option(min=1, max=32, help="Trainings by each method.")] = 5,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write.")] = Path("runs/study"),
+    lung: Annotated[str, typer.Option(metavar="ID", help="Lung, such as R20C50.")] = "R20C50",
+    seeds: Annotated[
+        int, typer.Option(min=1, max=32, help="Number of trainings of each method.")
+    ] = 5,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")] = Path(
+        "runs/study"
+    ),
     share: Annotated[
-        float, typer.Option(min=0.001, max=1.0, help="Of the full length of each training.")
+        float,
+        typer.Option(min=0.001, max=1.0, help="Share of the full length of each training to run."),
     ] = 1.0,
     json: JsonFile = None,
 ) -> None:
-    """Compare how many breaths policy gradient, PPO and DQN need for their scores.
+    """Compare how many breaths policy gradient, PPO and DQN need for a score.
 
-    Writes samples.csv (the curves), summary.csv and study-samples.png. Ctrl-C keeps what is done;
-    the same command goes on from there. Needs the extra `view` for the picture.
+    Writes samples.csv (the curves), summary.csv and study-samples.png. Ctrl-C keeps the finished
+    work; the same command continues. The picture needs the extra `view`.
 
     Example: `ventbench study samples --lung R20C50 --seeds 5`
     """
@@ -79,9 +86,7 @@ def _plain(table: Any) -> list[dict[str, Any]]:
 def _summary(result: Any, frame: Any) -> Any:
     from rich.table import Table
 
-    caption = (
-        f"The PID that is corrected: {result.start:.3f}; best of the grid: {result.best_pid:.3f}."
-    )
+    caption = f"The corrected PID: {result.start:.3f}; best PID of the grid: {result.best_pid:.3f}."
     table = Table(title=f"{result.lung}: nominal score, cmH2O, and experience", caption=caption)
     # The file has more columns, and longer names for them.
     heads = {
@@ -103,19 +108,21 @@ def _summary(result: Any, frame: Any) -> Any:
 
 @study.command()
 def controllers(
-    seeds: Annotated[int, typer.Option(min=1, max=32, help="Trainings of each variant.")] = 3,
-    updates: Annotated[int, typer.Option(min=1, help="Updates of each training.")] = 1000,
+    seeds: Annotated[
+        int, typer.Option(min=1, max=32, help="Number of trainings of each variant.")
+    ] = 3,
+    updates: Annotated[int, typer.Option(min=1, help="Number of updates of each training.")] = 1000,
     only: Only = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write.")] = Path(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")] = Path(
         "runs/controllers"
     ),
     json: JsonFile = None,
 ) -> None:
-    """Take the parts of the residual controller away, one at a time.
+    """Remove or change one part of the residual controller at a time.
 
-    One network for all six lungs by each variant with each seed; nominal score, score on the 20
-    published draws, exploitation index. Writes runs.csv and summary.csv. Ctrl-C keeps what is done;
-    the same command goes on from there.
+    Each variant is trained with each seed as one network for all six lungs. Reports the nominal
+    score, the score on the 20 published draws and the exploitation index. Writes runs.csv and
+    summary.csv. Ctrl-C keeps the finished trainings; the same command continues.
 
     Example: `ventbench study controllers --seeds 3 --updates 1000`
     """
@@ -143,24 +150,24 @@ def controllers(
         )
         for row in table.to_dict("records")
     ]  # fmt: skip
-    heads = ("variant", "what", *work.FIGURES, "nominal - base")
-    _print("Mean |pressure - target|, cmH2O, mean of the seeds", heads, rows, 2, out, json)
+    heads = ("variant", "what", *work.FIGURES, "difference to base")
+    _print("Mean |pressure - target|, cmH2O, averaged over seeds", heads, rows, 2, out, json)
 
 
 @study.command()
 def networks(
     recordings: RecordingsDir = None,
     only: Only = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write.")] = Path(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")] = Path(
         "runs/networks"
     ),
     json: JsonFile = None,
 ) -> None:
     """Change windows, width, depth and boundary networks of the paper's simulators, one at a time.
 
-    Trained on the public recordings, five folds; each breath is judged, open loop, by the network
-    that has not seen it. Writes breaths.csv and summary.csv. Ctrl-C keeps what is done; the same
-    command goes on from there.
+    The networks are trained on the public recordings in five folds. Each breath is simulated, open
+    loop, by the network that was not trained on it. Writes breaths.csv and summary.csv. Ctrl-C
+    keeps the finished trainings; the same command continues.
 
     Example: `ventbench study networks --recordings ../shared/recordings`
     """
@@ -184,7 +191,7 @@ def networks(
         )
         for row in table.to_dict("records")
     ]  # fmt: skip
-    heads = ("variant", "mean", "median", "less base", "95 %, paired by breath")
+    heads = ("variant", "mean", "median", "difference to base", "95 %, paired by breath")
     _print("Held-out open-loop MAE, cmH2O", heads, rows, 1, out, json)
 
 
@@ -193,7 +200,9 @@ def _check(only: list[str] | None, known: dict[str, Any]) -> None:
 
     for name in only or ():
         if name not in known:
-            raise InputError(f"--only {name}: no such variant; choose {', '.join(known)}")
+            raise InputError(
+                f"--only {name}: there is no such variant; choose from {', '.join(known)}"
+            )
 
 
 def _print(

@@ -1,4 +1,4 @@
-"""``ventbench new`` and ``ventbench check``: on the way to a submission."""
+"""``ventbench new`` and ``ventbench check``: write and check submissions."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ def new(
     name: Annotated[
         str,
         typer.Argument(
-            help="Lower-case letters, digits and underscores, a letter first; at most 40."
+            help="At most 40 lower-case letters, digits and underscores, starting with a letter."
         ),
     ],
-    family: Annotated[Family, typer.Option(help="What to start from.")] = "pid",
+    family: Annotated[Family, typer.Option(help="Kind of controller to start from.")] = "pid",
     folder: Annotated[
-        Path, typer.Option("--dir", metavar="DIR", help="Folder to write NAME/ into.")
+        Path, typer.Option("--dir", metavar="DIR", help="Folder in which NAME/ is written.")
     ] = Path("."),
 ) -> None:
-    """Write a submission that scores at once, to be changed into your own.
+    """Write a submission that can be scored at once; change it into your own.
 
     Example: `ventbench new demo && ventbench check demo && ventbench score demo`
     """
@@ -36,19 +36,18 @@ def new(
 
 
 def check(
-    submission: Annotated[str, typer.Argument(help="Folder, or name of a bundled submission.")],
+    submission: Annotated[str, typer.Argument(help="Folder or name of a bundled submission.")],
     in_process: Annotated[
         bool,
-        typer.Option(
-            "--in-process", help="Run it in this process, with all rights: only your own."
-        ),
+        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
     ] = False,
     json: JsonFile = None,
 ) -> None:
-    """Say everything that stands between a submission and the leaderboard.
+    """Report every problem that keeps a submission from the leaderboard.
 
-    Reads its files, manifest and sources, then runs it for a few breaths in the sandbox. Exit code
-    0: ready; 1: it has problems; 2: there is nothing to check, or it cannot be run apart here.
+    Reads its files, manifest and sources, then runs it for a few breaths in the sandbox. The exit
+    code is 0 if it is ready, 1 if it has problems, and 2 if there is nothing to check or no sandbox
+    to run it in.
 
     Example: `ventbench check submissions/mine --json check.json`
     """

@@ -9,18 +9,25 @@ import typer
 
 from ventbench.cli.options import JsonFile, PlantName, RecordingsDir, bars, emit, recordings_folder
 
-train = typer.Typer(name="train", help="Learn simulators and controllers.", no_args_is_help=True)
+train = typer.Typer(name="train", help="Train simulators and controllers.", no_args_is_help=True)
 
 Lung = Annotated[
-    str | None, typer.Option(metavar="ID", help="Only a network for this lung, such as R20C50.")
+    str | None,
+    typer.Option(metavar="ID", help="Train only the network for this lung, such as R20C50."),
 ]
-All = Annotated[bool, typer.Option("--all", help="Only one network for all six, not told which.")]
-Seed = Annotated[int, typer.Option(min=0, help="Of the first training.")]
+All = Annotated[
+    bool,
+    typer.Option(
+        "--all", help="Train only one network for all six lungs, which is not told the lung."
+    ),
+]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the first training.")]
 Seeds = Annotated[
-    int, typer.Option(min=1, max=32, help="Trainings of each network, of which the best is kept.")
+    int, typer.Option(min=1, max=32, help="Number of trainings of each network; the best is kept.")
 ]
 Steps = Annotated[
-    int | None, typer.Option(min=1, help="Control steps of experience; those of the docs if left.")
+    int | None,
+    typer.Option(min=1, help="Control steps of experience; default: as in docs/reinforcement.md."),
 ]
 
 
@@ -32,13 +39,13 @@ def _group() -> None:
 @train.command()
 def simulator(
     recordings: RecordingsDir = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write them.")] = Path(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the simulators.")] = Path(
         "runs/simulators"
     ),
 ) -> None:
-    """Learn the six simulators from the public recordings, as the frozen ones were.
+    """Train the six simulators on the public recordings, as the frozen ones were.
 
-    Ctrl-C keeps what is finished; the same command goes on from there.
+    Ctrl-C keeps the finished work; the same command continues.
 
     Example: `ventbench train simulator --recordings ../shared/recordings --out runs/simulators`
     """
@@ -64,41 +71,59 @@ def _train_simulators(run: Any, folder: Path, out: Path) -> None:
 @train.command()
 def residual(
     lung: Annotated[
-        str | None, typer.Option(metavar="ID", help="Only a network for this lung, such as R20C50.")
+        str | None,
+        typer.Option(metavar="ID", help="Train only the network for this lung, such as R20C50."),
     ] = None,
     every: Annotated[
-        bool, typer.Option("--all", help="Only one network for all six, not told which.")
+        bool,
+        typer.Option(
+            "--all", help="Train only one network for all six lungs, which is not told the lung."
+        ),
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of weights and benches.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of weights and deviations.")] = 0,
     updates: Annotated[
-        int | None, typer.Option(min=1, help="Updates of a network; those of the docs if left.")
+        int | None, typer.Option(min=1, help="Updates of each network; default: 3000.")
     ] = None,
     members: Annotated[
-        int, typer.Option(min=1, max=5, help="Simulators a lung: 1 the official one, 5 all.")
+        int,
+        typer.Option(
+            min=1, max=5, help="Simulators of each lung: 1 the official one, 5 the whole ensemble."
+        ),
     ] = 5,
     randomise: Annotated[
-        float, typer.Option(min=0.0, max=4.0, help="Deviations of the bench; 1: as the draws'.")
+        float,
+        typer.Option(
+            min=0.0,
+            max=4.0,
+            help="Random deviations (noise, R, C, ...), as a multiple of the ranges of the draws.",
+        ),
     ] = 1.0,
     agreement: Annotated[
-        float | None, typer.Option(min=0.0, help="Weight of what the simulators disagree about.")
+        float | None,
+        typer.Option(
+            min=0.0, help="Weight of the disagreement between the simulators; default: 1."
+        ),
     ] = None,
     penalty: Annotated[
-        float, typer.Option("--lambda", min=0.0, help="Weight of the correction, cmH2O for each %.")
+        float,
+        typer.Option(
+            "--lambda", min=0.0, help="Weight of the size of the correction, cmH2O for each %."
+        ),
     ] = 0.0,
     round_robin: Annotated[
-        bool, typer.Option("--round-robin", help="One lung at one PIP an update, in turn.")
+        bool, typer.Option("--round-robin", help="Each update uses one lung at one PIP, in turn.")
     ] = False,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write.")] = Path(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")] = Path(
         "runs/residual"
     ),
     plant: PlantName = "frozen",
     json: JsonFile = None,
 ) -> None:
-    """Learn a correction of the best PID by differentiating through the simulators.
+    """Train networks that correct the best PID, by differentiating through the simulators.
 
-    Writes weights.npz, as `submissions/residual_mlp` and `submissions/residual_mlp_all` read it,
-    and training.json. Six networks, one a lung, if neither `--lung` nor `--all` is given. Ctrl-C
-    keeps what is done; the same command goes on from there.
+    Writes training.json and weights.npz, which `submissions/residual_mlp` and
+    `submissions/residual_mlp_all` can read. Without `--lung` and `--all` it trains six networks,
+    one for each lung. Ctrl-C keeps the finished work; the same command continues.
 
     Example: `ventbench train residual --all --out runs/residual_all`
     """
@@ -174,15 +199,17 @@ def ppo(
     seed: Seed = 0,
     seeds: Seeds = 2,
     steps: Steps = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write.")] = Path("runs/ppo"),
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")] = Path(
+        "runs/ppo"
+    ),
     plant: PlantName = "frozen",
     json: JsonFile = None,
 ) -> None:
-    """Learn a correction of the PID by PPO on the six frozen simulators.
+    """Train networks that correct the PID, by proximal policy optimisation (PPO).
 
-    Writes weights.npz, as `submissions/ppo` reads it, and training.json. Seven networks if neither
-    `--lung` nor `--all` is given: one a lung, and one for all six. Ctrl-C keeps what is done; the
-    same command goes on from there.
+    Writes training.json and weights.npz, which `submissions/ppo` can read. Without `--lung` and
+    `--all` it trains seven networks: one for each lung, and one for all six. Ctrl-C keeps the
+    finished work; the same command continues.
 
     Example: `ventbench train ppo --lung R20C50 --out runs/ppo-R20C50`
     """
@@ -196,13 +223,17 @@ def dqn(
     seed: Seed = 0,
     seeds: Seeds = 2,
     steps: Steps = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write.")] = Path("runs/dqn"),
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")] = Path(
+        "runs/dqn"
+    ),
     plant: PlantName = "frozen",
     json: JsonFile = None,
 ) -> None:
-    """Learn which of 19 corrections of the PID is best by DQN on the six frozen simulators.
+    """Train networks that choose among 19 corrections of the PID, by deep Q-learning (DQN).
 
-    Writes weights.npz, as `submissions/dqn` reads it, and training.json. Options as of `train ppo`.
+    Writes training.json and weights.npz, which `submissions/dqn` can read. Without `--lung` and
+    `--all` it trains seven networks: one for each lung, and one for all six. Ctrl-C keeps the
+    finished work; the same command continues.
 
     Example: `ventbench train dqn --lung R20C50 --out runs/dqn-R20C50`
     """
@@ -228,7 +259,7 @@ def _train_policies(
     from ventbench.training.trained import ALL, NETWORKS
 
     if lung is not None and all_lungs:
-        raise InputError("--lung and --all exclude each other; give one, or none for all seven")
+        raise InputError("give --lung ID or --all, not both; neither trains all seven networks")
     networks = (ALL,) if all_lungs else NETWORKS if lung is None else (scored_lung(lung).id,)
     work = {"ppo": train_ppo, "dqn": train_dqn}[method]
     with bars() as shown:
@@ -258,8 +289,10 @@ def _trained(about: dict[str, Any]) -> Any:
     from rich.table import Table
 
     title = f"{about['method']}: mean |pressure - target|, cmH2O"
-    table = Table(title=title, caption="Fresh cells: with noise, drawn as the published ones are.")
-    for name in ("network", "breaths", "the PID", "at the end", "fresh cells", "best seed"):
+    table = Table(
+        title=title, caption="Fresh cells: new deviations, drawn like the published draws."
+    )
+    for name in ("network", "breaths", "PID", "at the end", "fresh cells", "best seed"):
         table.add_column(name, justify="left" if name == "network" else "right")
     for name, network in about["networks"].items():
         ends, fresh = (_values(network[key]) for key in ("error_nominal_at_end", "error_fresh"))

@@ -9,7 +9,7 @@ import typer
 
 from ventbench.cli.options import JsonFile, PlantName, emit
 
-app = typer.Typer(name="tune", help="Search for gains.", no_args_is_help=True)
+app = typer.Typer(name="tune", help="Search for the gains of a controller.", no_args_is_help=True)
 
 PLOT = "grid.png"
 
@@ -21,19 +21,23 @@ def _group() -> None:
 
 @app.command()
 def pid(
-    lung: Annotated[str | None, typer.Option(metavar="LUNG", help="One lung.")] = None,
+    lung: Annotated[
+        str | None, typer.Option(metavar="LUNG", help="Only this lung, such as R20C50.")
+    ] = None,
     every: Annotated[
         bool,
-        typer.Option("--all", help="All six: the best gains of each, and the best single set."),
+        typer.Option(
+            "--all", help="All six lungs: the best gains of each, and the best single set."
+        ),
     ] = False,
     robust: Annotated[
-        bool, typer.Option("--robust", help="All six: the best single set alone.")
+        bool, typer.Option("--robust", help="All six lungs: only the best single set.")
     ] = False,
     out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Where table, plot and result are written.")
+        Path, typer.Option(metavar="DIR", help="Folder for table, plot and result.")
     ] = Path("runs/pid"),
     workers: Annotated[
-        int, typer.Option(min=0, help="Processes; 0 runs in this one, which all cores serve.")
+        int, typer.Option(min=0, help="Number of processes; 0 uses this one, with all cores.")
     ] = 0,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler, such as tcp://host:8786.")
@@ -41,10 +45,10 @@ def pid(
     plant: PlantName = "frozen",
     json: JsonFile = None,
 ) -> None:
-    """Run the paper's 8,000 PIDs at six PIPs on the frozen simulators or others.
+    """Simulate the paper's 8,000 PIDs at six PIPs on the frozen simulators or others.
 
-    P, I and D each 0, 0.1, ..., 0.9, 1, 2, ..., 10 %/cmH2O, without noise. Ctrl-C keeps what is
-    finished; the same command goes on from there.
+    P, I and D each take the values 0, 0.1, ..., 0.9, 1, 2, ..., 10 %/cmH2O; there is no noise.
+    Ctrl-C keeps the finished parts; the same command continues.
 
     Example: `ventbench tune pid --all --out runs/pid`
     """
@@ -55,7 +59,7 @@ def pid(
     from ventbench.training.pid_grid import RESULT, TABLE
 
     if (lung is not None) + every + robust != 1:
-        raise InputError("say for which lungs: --lung LUNG, --all or --robust, one of them")
+        raise InputError("give exactly one of --lung LUNG, --all and --robust")
     names = (scored_lung(lung).id,) if lung is not None else LUNG_IDS
     grid, result = _search(names, plant, out, workers, scheduler, not robust)
     written = [TABLE, RESULT, *_plot(out / PLOT, grid, not robust, lung is None)]
@@ -105,7 +109,7 @@ def _search(
 
 
 def _plot(path: Path, grid: Any, each: bool, single: bool) -> list[str]:
-    """Draw the picture, where matplotlib is there to draw it."""
+    """Draw the picture if matplotlib is installed."""
     from ventbench import files
     from ventbench.errors import InputError
     from ventbench.views import gain_map

@@ -14,7 +14,7 @@ Runs = Annotated[
     list[Path],
     typer.Argument(
         metavar="RUN...",
-        help="Folders that `ventbench score --out` wrote: the run to look at, then references.",
+        help="Folders that `ventbench score --out` wrote: the run to show, then references.",
     ),
 ]
 
@@ -30,7 +30,7 @@ def _read(folders: list[Path]) -> tuple[list[Trajectories], list[dict[str, Any]]
         kept = folder / "trajectories.npz"
         if not kept.is_file():
             raise InputError(
-                f"{folder} holds no scored run; make one with "
+                f"{folder} contains no scored run; make one with "
                 "`ventbench score SUBMISSION --out DIR` and give DIR/SUBMISSION"
             )
         runs.append(trajectories.load(kept))
@@ -44,7 +44,8 @@ def _read(folders: list[Path]) -> tuple[list[Trajectories], list[dict[str, Any]]
 def view(
     runs: Runs,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Default: scores.rrd in the first RUN.")
+        Path | None,
+        typer.Option(metavar="FILE", help="File to write; default: scores.rrd in the first RUN."),
     ] = None,
     show: Annotated[bool, typer.Option("--open/--no-open", help="Open the viewer.")] = True,
 ) -> None:
@@ -64,7 +65,8 @@ def view(
 def report(
     runs: Runs,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Default: report.html in the first RUN.")
+        Path | None,
+        typer.Option(metavar="FILE", help="File to write; default: report.html in the first RUN."),
     ] = None,
     figure: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Also write the panels as a PNG.")

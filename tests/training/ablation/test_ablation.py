@@ -152,7 +152,7 @@ def test_unknown_variants_are_refused(tmp_path):
         asked = ["study", *command, "--only", "H_p 7", "--out", str(tmp_path / "out")]
         result = CliRunner().invoke(app, asked)
         assert isinstance(result.exception, InputError)
-        assert "--only H_p 7: no such variant; choose base" in str(result.exception)
+        assert "--only H_p 7: there is no such variant; choose from base" in str(result.exception)
 
 
 def test_networks_need_recordings(tmp_path):

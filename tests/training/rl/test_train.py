@@ -24,7 +24,7 @@ def run(*arguments: object):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--lung", "R20C50", "--all"], "exclude each other"),
+        (["--lung", "R20C50", "--all"], "not both"),
         (["--lung", "R20C51"], "not a scored lung"),
         (["--lung", "R20C50", "--steps", "100"], "less than one iteration of ppo, 96 breaths"),
     ],

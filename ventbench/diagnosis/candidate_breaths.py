@@ -18,7 +18,7 @@ class Rig:
     """Rough values of lung and valve; only the size of the commands depends on them.
 
     Attributes:
-        R: resistance, cmH2O s/L.
+        R: resistance, cmH2O/(L/s).
         C: compliance, mL/cmH2O.
         gain: of the inspiratory valve, mL/s per %.
         peep: expiratory pressure, cmH2O.

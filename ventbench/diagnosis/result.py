@@ -157,7 +157,7 @@ class Diagnosis(Findings):
     def as_dict(self) -> dict[str, Any]:
         """JSON values of ``diagnosis.json``; numbers that are not finite become None.
 
-        R is in cmH2O s/L, C in mL/cmH2O, errors in cmH2O. ``lung`` is the first of ``lungs``.
+        R is in cmH2O/(L/s), C in mL/cmH2O, errors in cmH2O. ``lung`` is the first of ``lungs``.
         """
         lungs = [_lung(match) for match in self.lungs]
         plain = {

@@ -86,7 +86,7 @@ class Mechanics:
 
     Attributes:
         label: of the recording.
-        R: inspiratory resistance at small flow, cmH2O s/L.
+        R: inspiratory resistance at small flow, cmH2O/(L/s).
         C: compliance over the tidal volume, mL/cmH2O.
         offset: pressure at the start of a breath without the effect of flow, cmH2O.
         terms: effects beyond R and C, the most important first.
@@ -236,7 +236,7 @@ class LungFit:
     blur: float
 
     def resistance(self, flow: float) -> Estimate:
-        """Inspiratory resistance at a flow, L/s, and at half of the tidal volume, cmH2O s/L."""
+        """Inspiratory resistance at a flow, L/s, and at half of the tidal volume, cmH2O/(L/s)."""
         half = 0.5 * self._tidal_volume()
 
         def value(x: Callable[[str], float]) -> float:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 TOLERANCE_R, TOLERANCE_C = 1.3, 1.2
 
 #: Resistance of tubes and filters between pressure sensor and lung, by which R may be larger,
-#: cmH2O s/L.
+#: cmH2O/(L/s).
 APPARATUS = 2.0
 
 #: Flow at which a parabolic resistor has its nominal resistance, L/s.
@@ -42,7 +42,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class LungMatch:
-    """The lung that was recorded, compared with its label; R in cmH2O s/L, C in mL/cmH2O.
+    """The lung that was recorded, compared with its label; R in cmH2O/(L/s), C in mL/cmH2O.
 
     Attributes:
         label: id of the lung in the recording, such as ``R20C50``.
@@ -65,7 +65,7 @@ class LungMatch:
     settings: tuple[str, ...] = ()
 
 
-#: Resistance, cmH2O s/L, at a flow, L/s.
+#: Resistance, cmH2O/(L/s), at a flow, L/s.
 Resistance = Callable[[float], Estimate]
 
 

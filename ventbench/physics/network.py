@@ -22,7 +22,7 @@ class View:
         elastance: elastance 1/C of the lung, cmH2O/L.
         peep: pressure behind the expiratory valve, cmH2O.
         position: position of the breath in the recording, 0..1.
-        resistance: resistance R of the airway, cmH2O s/L.
+        resistance: resistance R of the airway, cmH2O/(L/s).
         outlet: conductance of the open expiratory valve, 1 / R_ex, L/s per cmH2O.
         opened: expiratory valve, 0 closed, 1 open.
     """
@@ -62,7 +62,7 @@ class PneumaticNetwork:
         leak_flow: leak at zero pressure on that slope, L/s.
         outlet: conductance of the expiratory valve, L/s per cmH2O.
         behind: pressure behind the expiratory valve, cmH2O.
-        resistance: resistance of the airway, cmH2O s/L.
+        resistance: resistance of the airway, cmH2O/(L/s).
         quadratic: quadratic resistance of the airway, cmH2O s2/L2.
         inertance: inertance of the gas, cmH2O s2/L.
         recoil: recoil of the lung without flow, less the pressure of the muscles, cmH2O.

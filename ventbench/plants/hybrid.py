@@ -71,7 +71,7 @@ class Hybrid:
     """One lung on one rig; every array has shape ``()`` or ``(...)`` unless it says otherwise.
 
     Attributes:
-        R: laminar part of the resistance, cmH2O s/L.
+        R: laminar part of the resistance, cmH2O/(L/s).
         K2: quadratic part, cmH2O s2/L2: the drop over the airway is ``R Q + K2 Q |Q|``.
         E: elastance at low volume, cmH2O/L.
         stiffening: change of relative slope of the elastic curve at each knot, ``(..., 5)``.

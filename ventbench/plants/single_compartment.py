@@ -26,7 +26,7 @@ class SingleCompartment:
     Inspiration: ``dP_alv/dt = q / C``, ``p = P_alv + R q`` with the valve's flow
     ``q = gain u_in``. Expiration (valve open): flow leaves through ``R_ex`` in series with ``R``
     towards PEEP, so that ``P_alv`` relaxes to ``peep + R_ex q_in`` with time constant
-    ``(R + R_ex) C``. Everything with R in cmH2O s/L and C in L/cmH2O inside.
+    ``(R + R_ex) C``. Everything with R in cmH2O/(L/s) and C in L/cmH2O inside.
 
     Attributes:
         R: airway resistance, cmH2O/(L/s), shape ``()`` or ``(...)``.

@@ -23,7 +23,7 @@ class Data:
         dt: time to the next sample, s, ``(n, T)``.
         measured: pressure, cmH2O, and flow, mL/s; zero where nothing was measured, ``(n, c, T)``.
         weight: 1 where measured, else 0, ``(n, c, T)``.
-        R: label of the lung's resistance, cmH2O s/L, ``(n,)``.
+        R: label of the lung's resistance, cmH2O/(L/s), ``(n,)``.
         C: label of the lung's compliance, mL/cmH2O, ``(n,)``.
         position: place of each breath in its recording, 0 first, 1 last, ``(n,)``.
     """

@@ -41,7 +41,7 @@ class Pooled:
     Attributes:
         slopes: slopes of the valve's curve, L/s per %, shape ``(13,)``.
         slopes_rig: added to the slopes for a kind of rig, ``(G, 13)``.
-        R: laminar resistance, cmH2O s/L, ``(L,)``.
+        R: laminar resistance, cmH2O/(L/s), ``(L,)``.
         K2: quadratic resistance, cmH2O s2/L2, ``(L,)``.
         E: elastance, cmH2O/L, ``(L,)``.
         stiffening: ratio of the elastic curve's slope to that below each knot, ``(L, 5)``.

@@ -41,9 +41,9 @@ class Base:
     """True values of the rig without any effect.
 
     Attributes:
-        R: airway resistance, cmH2O s/L.
+        R: airway resistance, cmH2O/(L/s).
         C: compliance, mL/cmH2O.
-        R_ex: resistance of the expiratory valve, cmH2O s/L.
+        R_ex: resistance of the expiratory valve, cmH2O/(L/s).
         peep: pressure behind the expiratory valve, cmH2O.
         gain: flow of the inspiratory valve, mL/s per %.
     """
@@ -61,7 +61,7 @@ class Case:
 
     Attributes:
         name: of its file, without suffix.
-        lung_R: label of the lung setting, cmH2O s/L.
+        lung_R: label of the lung setting, cmH2O/(L/s).
         lung_C: label of the lung setting, mL/cmH2O.
         effects: what the recording conceals.
         base: the rig; each recording draws its own if None.

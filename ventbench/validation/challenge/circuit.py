@@ -163,14 +163,14 @@ class Airway:
         self._rest, self._span = 1e-3 * base.C * base.peep, 1e-3 * base.C * 20.0
 
     def resistance(self, volume: Floats) -> Floats | float:
-        """Resistance at a volume, cmH2O s/L."""
+        """Resistance at a volume, cmH2O/(L/s)."""
         if not self._change:
             return self._R
         filled = np.clip((volume - self._rest) / self._span, -0.2, 1.2)
         return self._R * (1.0 + self._change * filled)
 
     def __call__(self, flow: Floats, R: Floats | float) -> tuple[Floats, Floats]:
-        """Pressure drop, cmH2O, and its slope by flow, cmH2O s/L, ``(n,)`` each."""
+        """Pressure drop, cmH2O, and its slope by flow, cmH2O/(L/s), ``(n,)`` each."""
         slope = R * np.where(flow < 0.0, self._out, 1.0) if self._out != 1.0 else R + 0.0 * flow
         drop = slope * flow
         if self._K:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from ventbench.errors import InputError
 from ventbench.interfaces import Task
+from ventbench.sandbox.child.failures import SubmissionError
 from ventbench.sandbox.child.preload import NUMPY
+from ventbench.sandbox.reader import UnreadableError, read_apart
 
 
 class SandboxError(InputError):
@@ -54,21 +55,24 @@ OPTIONAL = {
 #: Those that start threads and reserve much address space.
 _THREADED = ("jax", "flax")
 
-_IMPORT = re.compile(rb"^\s*(?:import|from)\s+([^\s#][^#\n]*)", re.MULTILINE)
-
 
 def modules_needed(folder: Path) -> tuple[tuple[str, ...], bool]:
     """Modules to load before cells start, so that they share them.
 
     Args:
-        folder: the submission's folder.
+        folder: the submission's folder; its sources are read in a limited process.
 
     Returns:
         The modules, and whether they need threads.
+
+    Raises:
+        SubmissionError: if the sources cannot be read within the limits.
     """
-    text = b"\n".join(path.read_bytes() for path in sorted(folder.rglob("*.py")) if path.is_file())
-    words = {word for line in _IMPORT.findall(text) for word in re.findall(rb"\w+", line)}
-    imported = [name for name in OPTIONAL if name.encode() in words]
+    try:
+        packages = read_apart("ventbench.sandbox.child.sources:imported_packages", folder)
+    except UnreadableError as error:
+        raise SubmissionError(f"{folder.name}: a source {error}") from None
+    imported = [name for name in OPTIONAL if name in packages]
     modules = [module for name in imported for module in OPTIONAL[name]]
     return (*NUMPY, *modules), any(name in _THREADED for name in imported)
 

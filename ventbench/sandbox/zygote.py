@@ -18,10 +18,7 @@ import sysconfig
 import tempfile
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from ventbench.sandbox.child.zygote import (
     ENDED,
@@ -35,28 +32,12 @@ from ventbench.sandbox.child.zygote import (
     START,
 )
 from ventbench.sandbox.configuration import SandboxError
+from ventbench.sandbox.interpreter import ENVIRONMENT, OPTIONS, ROOT, SITE
 
-_ROOT = str(Path(__file__).resolve().parents[2])
-_SITE = str(Path(np.__file__).resolve().parents[1])
-
-#: Not -I, which would make it ignore the fixed hash seed: the environment holds nothing but this.
-_OPTIONS = ("-P", "-s", "-S", "-B")
 _BOOT = (
     "import sys; sys.path.insert(0, sys.argv[2]); from ventbench.sandbox.child import zygote; "
     "del sys.path[0]; zygote.main(int(sys.argv[1]))"
 )
-ENVIRONMENT = {
-    "PYTHONHASHSEED": "0",
-    "LC_ALL": "C.UTF-8",
-    "TZ": "UTC",
-    "HOME": "/nonexistent",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "VECLIB_MAXIMUM_THREADS": "1",
-    "JAX_PLATFORMS": "cpu",
-}
-
 _START_S = 60.0
 
 
@@ -71,13 +52,13 @@ class ZygoteClient:
     """
 
     def __init__(self, config: dict[str, Any]):
-        words = bubblewrap_prefix([_SITE, os.path.join(_ROOT, "ventbench"), config["folder"]])
-        config = {**config, "site": [_SITE], "bubblewrap": bool(words)}
+        words = bubblewrap_prefix([SITE, os.path.join(ROOT, "ventbench"), config["folder"]])
+        config = {**config, "site": [SITE], "bubblewrap": bool(words)}
         self._ended: dict[int, int] = {}
         self._data = b""
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed in close()
         self._control, theirs = socket.socketpair()
-        command = [*words, sys.executable, *_OPTIONS, "-c", _BOOT, str(theirs.fileno()), _ROOT]
+        command = [*words, sys.executable, *OPTIONS, "-c", _BOOT, str(theirs.fileno()), ROOT]
         try:
             self._process = subprocess.Popen(
                 command,

@@ -38,11 +38,9 @@ from ventbench.submissions.errors import (
     Group,
     SubmissionError,
 )
-from ventbench.submissions.file_checks import check_files
 from ventbench.submissions.folder import CONTROLLER, Submission, open_submission, resolve
-from ventbench.submissions.manifest import check_manifest
+from ventbench.submissions.inspection import inspect_folder
 from ventbench.submissions.runner import Runner
-from ventbench.submissions.static_checks import check_sources
 
 Floats = NDArray[np.float64]
 
@@ -85,18 +83,16 @@ def check(
         SandboxError: if nothing can be run apart on this machine.
     """
     folder = resolve(name)
-    findings, _ = check_manifest(folder)
-    findings += check_files(folder)
-    sources = check_sources(folder)
+    findings = list(inspect_folder(folder))
     opened = _opened(name)
-    if opened is None or any(finding.problem for finding in sources):
-        return _report(name, [*findings, *sources], left_out=_TO_RUN)
+    if opened is None or any(f.problem for f in findings if f.group == "source"):
+        return _report(name, findings, left_out=_TO_RUN)
     if runner is None:
         from ventbench.sandbox.configuration import Allowance
         from ventbench.sandbox.runner import SandboxRunner
 
         runner = SandboxRunner(allowance=Allowance(total_s=120.0))
-    return _ran(opened, runner, [*findings, *sources], clock)
+    return _ran(opened, runner, findings, clock)
 
 
 def assert_ready(name: str, runner: Runner | None = None) -> None:

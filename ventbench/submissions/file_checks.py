@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from ventbench.sandbox.child.sources import walk
 from ventbench.submissions.errors import Finding
 from ventbench.submissions.folder import CONTROLLER, MAX_BYTES, MAX_FILES
 from ventbench.submissions.manifest import MANIFEST
@@ -66,8 +67,7 @@ def _note(file: str, what: str, advice: str) -> Finding:
 
 def _walk(folder: Path) -> Iterator[Path]:
     """Files, links, and hidden folders as one each; what Python caches is left out."""
-    for parent, folders, names in os.walk(folder):
-        here = Path(parent)
+    for here, folders, names in walk(folder):
         closed = [n for n in folders if (here / n).is_symlink() or n.startswith(".")]
         folders[:] = sorted(set(folders) - {"__pycache__"} - set(closed))
         yield from (here / name for name in sorted((*closed, *names)))

@@ -17,11 +17,11 @@ from typing import Any
 
 from ventbench import data_files, files
 from ventbench.interfaces import API_VERSION, Task
-from ventbench.submissions.errors import SubmissionError
-from ventbench.submissions.manifest import MANIFEST, TRACKS, Manifest, read_manifest
-
-#: File of the controller.
-CONTROLLER = "controller.py"
+from ventbench.sandbox.child.sources import CONTROLLER as CONTROLLER
+from ventbench.sandbox.child.sources import walk
+from ventbench.sandbox.reader import UnreadableError, read_apart
+from ventbench.submissions.errors import SubmissionError, printable
+from ventbench.submissions.manifest import MANIFEST, TRACKS, Manifest, manifest_from_json
 
 #: Largest folder, bytes, and number of files.
 MAX_BYTES = 5_000_000
@@ -92,9 +92,11 @@ def open_submission(name: str) -> Submission:
     problems = []
     paths, size = [], 0
     for path in _walk(folder):
-        relative = path.relative_to(folder).as_posix()
+        relative = printable(path.relative_to(folder).as_posix())
         if path.is_symlink():
             problems.append(f"{name}: {relative} is a symbolic link; put the file itself there")
+        elif path.is_dir():
+            problems.append(f"{name}: {relative} lies in too many folders")
         elif not path.is_file():
             problems.append(f"{name}: {relative} is neither a file nor a folder")
         else:
@@ -110,8 +112,19 @@ def open_submission(name: str) -> Submission:
             problems.append(f"{name}: {required} is missing")
     if problems:
         raise SubmissionError(*problems)
-    manifest = read_manifest(folder / MANIFEST, f"{name}/{MANIFEST}".replace("//", "/"))
+    manifest = _manifest(folder, f"{name}/{MANIFEST}".replace("//", "/"))
     return Submission(name.rstrip("/"), folder, manifest, content_hash(folder, paths))
+
+
+def _manifest(folder: Path, label: str) -> Manifest:
+    """Read a manifest in a limited process."""
+    try:
+        answer = read_apart("ventbench.submissions.manifest:read_as_json", folder, [label])
+    except UnreadableError as error:
+        raise SubmissionError(f"{label}: {error}") from None
+    if answer["problems"]:
+        raise SubmissionError(*answer["problems"])
+    return manifest_from_json(answer["manifest"])
 
 
 def submission_of(controller: Any) -> Submission:
@@ -165,10 +178,10 @@ class _Stateless:
 
 def _walk(folder: Path) -> list[Path]:
     paths = []
-    for parent, folders, names in os.walk(folder):
-        links = [name for name in folders if (Path(parent) / name).is_symlink()]
+    for parent, folders, names in walk(folder):
+        links = [name for name in folders if (parent / name).is_symlink()]
         folders[:] = sorted(set(folders) - _IGNORED_FOLDERS - set(links))
-        paths += [Path(parent) / name for name in (*links, *names) if name not in _IGNORED_FILES]
+        paths += [parent / name for name in (*links, *names) if name not in _IGNORED_FILES]
     return sorted(paths)
 
 

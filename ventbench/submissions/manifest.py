@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import re
 import tomllib
@@ -27,6 +28,8 @@ TRACKS = ("performance", "robustness")
 
 _MAX_BYTES = 64_000
 _MAX_TEXT = 2000
+_MAX_SHOWN = 120
+_MAX_SEED = 1 << 64
 
 #: Names that an entry may have, and the rule in words.
 NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
@@ -96,14 +99,25 @@ def _text(value: Any) -> str:
 
 def _name(value: Any) -> str:
     if not NAME.fullmatch(_text(value)):
-        raise ValueError(f"{value!r} {NAME_RULE}")
+        raise ValueError(f"{_shown(value)} {NAME_RULE}")
     return value
+
+
+def _shown(value: Any) -> str:
+    """Return a value of a hostile file for a message: short, and never an error itself."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer of thousands of digits; a deep list
+        return f"such a {type(value).__name__}"
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
 
 
 def _one_of(choices: tuple[str, ...]) -> ValueCheck:
     def check(value: Any) -> str:
         if value not in choices:
-            raise ValueError(f"{value!r} is not one of {', '.join(choices)}{_hint(value, choices)}")
+            raise ValueError(
+                f"{_shown(value)} is not one of {', '.join(choices)}{_hint(value, choices)}"
+            )
         return value
 
     return check
@@ -111,7 +125,9 @@ def _one_of(choices: tuple[str, ...]) -> ValueCheck:
 
 def _version(value: Any) -> int:
     if type(value) is not int or value != API_VERSION:
-        raise ValueError(f"{value!r} is not supported; this ventbench speaks version {API_VERSION}")
+        raise ValueError(
+            f"{_shown(value)} is not supported; this ventbench speaks version {API_VERSION}"
+        )
     return value
 
 
@@ -130,16 +146,23 @@ def _many(check: ValueCheck, *, least: int) -> ValueCheck:
 def _typed(kind: type, text: str) -> ValueCheck:
     def check(value: Any) -> Any:
         if type(value) is not kind:
-            raise ValueError(f"must be {text}, not {value!r}")
+            raise ValueError(f"must be {text}, not {_shown(value)}")
         return value
 
     return check
 
 
+def _seed(value: Any) -> int:
+    seed = _typed(int, "an integer")(value)
+    if abs(seed) >= _MAX_SEED:
+        raise ValueError("must be an integer of at most 64 bits")
+    return seed
+
+
 _TRAINING: dict[str, ValueCheck] = {
     "data": _text,
     "simulators": _text,
-    "seeds": _many(_typed(int, "an integer"), least=0),
+    "seeds": _many(_seed, least=0),
     "compute": _text,
     "per_lung": _typed(bool, "true or false"),
 }
@@ -155,7 +178,8 @@ _REQUIRED: dict[str, ValueCheck] = {
 
 
 def _hint(value: Any, choices: tuple[str, ...]) -> str:
-    close = difflib.get_close_matches(str(value), choices, n=1)
+    text = value[:_MAX_SHOWN] if isinstance(value, str) else ""
+    close = difflib.get_close_matches(text, choices, n=1)
     return f"; did you mean {close[0]}?" if close else ""
 
 
@@ -165,7 +189,7 @@ def _checked(
     kept = {}
     for key, value in table.items():
         if key not in checks:
-            problems.append(f"{where}{key!r} is not known{_hint(key, tuple(checks))}")
+            problems.append(f"{where}{_shown(key)} is not known{_hint(key, tuple(checks))}")
             continue
         try:
             kept[key] = checks[key](value)
@@ -191,7 +215,7 @@ def read_manifest(path: Path, label: str | None = None) -> Manifest:
         content = tomllib.loads(path.read_bytes().decode())
     except UnicodeDecodeError as error:
         raise SubmissionError(f"{label}: not UTF-8 text (byte {error.start})") from None
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # ValueError: an integer of 5,000 digits too
         raise SubmissionError(f"{label}: not TOML: {error}") from None
     except OSError as error:
         raise SubmissionError(f"{label}: cannot be read: {error.strerror}") from None
@@ -206,6 +230,30 @@ def read_manifest(path: Path, label: str | None = None) -> Manifest:
     if problems:
         raise SubmissionError(*problems)
     return Manifest(**kept, training=Training(**trained))
+
+
+def read_as_json(folder: str, label: str) -> dict[str, Any]:
+    """Read the manifest of a folder, for a process that answers in JSON.
+
+    Args:
+        folder: the submission's.
+        label: how messages name the file.
+
+    Returns:
+        ``manifest``, for :func:`manifest_from_json`, or None; and ``problems``, in words.
+    """
+    try:
+        manifest = read_manifest(Path(folder, MANIFEST), label)
+    except SubmissionError as error:
+        return {"manifest": None, "problems": error.problems}
+    return {"manifest": dataclasses.asdict(manifest), "problems": ()}
+
+
+def manifest_from_json(values: dict[str, Any]) -> Manifest:
+    """Return the manifest of what :func:`read_as_json` answered."""
+    training = {**values["training"], "seeds": tuple(values["training"]["seeds"])}
+    lists = {key: tuple(values[key]) for key in ("authors", "tracks")}
+    return Manifest(**{**values, **lists, "training": Training(**training)})
 
 
 #: SPDX identifiers that most authors use.

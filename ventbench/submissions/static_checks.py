@@ -12,9 +12,9 @@ import sys
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 from ventbench.sandbox.child.cell import CLASS
+from ventbench.sandbox.child.sources import Import, imports, module_files, sources
 from ventbench.sandbox.configuration import OPTIONAL
 from ventbench.submissions.errors import Finding
 from ventbench.submissions.folder import CONTROLLER, MAX_BYTES
@@ -29,9 +29,9 @@ def check_sources(folder: Path) -> list[Finding]:
         folder: the submission's folder.
     """
     findings, trees = [], {}
-    for path in sorted(folder.rglob("*.py")):
+    for path in sources(folder):
         name = path.relative_to(folder).as_posix()
-        if path.is_symlink() or not path.is_file() or path.stat().st_size > MAX_BYTES:
+        if path.stat().st_size > MAX_BYTES:
             continue  # reported by check_files
         tree = _parsed(path, name)
         if isinstance(tree, Finding):
@@ -181,16 +181,6 @@ _SANDBOX = "leave it out: a submission has its folder to read, its observations,
 _LATE = "import it at the top of the file; later the folder is not searched any more"
 
 
-class _Import(NamedTuple):
-    """One imported name."""
-
-    module: str
-    level: int
-    node: ast.stmt
-    optional: bool
-    late: bool
-
-
 def _check_imports(trees: Mapping[str, ast.Module]) -> list[Finding]:
     """Follow the imports from ``controller.py`` on.
 
@@ -204,45 +194,15 @@ def _check_imports(trees: Mapping[str, ast.Module]) -> list[Finding]:
         if name in seen or name not in trees:
             continue
         seen.add(name)
-        for imported in _imports(trees[name].body):
+        for imported in imports(trees[name].body):
             finding = _import_finding(imported, name, own)
             if finding is not None:
                 findings.append(finding)
-            waiting += _files(imported, name)
+            waiting += module_files(imported, name)
     return list(dict.fromkeys(findings))  # `from a import b` may be two modules
 
 
-def _imports(body: list[ast.stmt], optional: bool = False, late: bool = False) -> Iterator[_Import]:
-    for node in body:
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield _Import(alias.name, 0, node, optional, late)
-        elif isinstance(node, ast.ImportFrom):
-            if node.module:
-                yield _Import(node.module, node.level, node, optional, late)
-            for alias in node.names:  # may be modules themselves
-                if node.level or node.module:
-                    module = f"{node.module}.{alias.name}" if node.module else alias.name
-                    yield _Import(module, node.level, node, optional, late)
-        else:
-            deep = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-            caught = isinstance(node, ast.Try) and any(map(_catches, node.handlers))
-            for field in ("body", "orelse", "finalbody"):
-                inner = getattr(node, field, [])
-                guarded = optional or (caught and field == "body")
-                yield from _imports(inner, guarded, late or deep)
-            for part in (*getattr(node, "handlers", ()), *getattr(node, "cases", ())):
-                yield from _imports(part.body, optional, late)
-
-
-def _catches(handler: ast.ExceptHandler) -> bool:
-    kinds = {"ImportError", "ModuleNotFoundError", "Exception", "BaseException"}
-    if handler.type is None:
-        return True
-    return any(isinstance(node, ast.Name) and node.id in kinds for node in ast.walk(handler.type))
-
-
-def _import_finding(imported: _Import, name: str, own: set[str]) -> Finding | None:
+def _import_finding(imported: Import, name: str, own: set[str]) -> Finding | None:
     top, what = imported.module.partition(".")[0], ""
     if imported.level:
         if "/" in name:
@@ -264,12 +224,3 @@ def _import_finding(imported: _Import, name: str, own: set[str]) -> Finding | No
         advice = f"use {', '.join(ALLOWED)} and the standard library"
     place = imported.node.lineno, imported.node.col_offset + 1
     return Finding("source", name, what, advice, *place, problem=not imported.optional)
-
-
-def _files(imported: _Import, name: str) -> Iterator[str]:
-    """Paths that a module of the folder may have, on the way to it and itself."""
-    parent = name.split("/")[: -imported.level] if imported.level else []
-    parts = [*parent, *imported.module.split(".")]
-    for depth in range(len(parent) + 1, len(parts) + 1):
-        path = "/".join(parts[:depth])
-        yield from (f"{path}.py", f"{path}/__init__.py")

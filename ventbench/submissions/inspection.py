@@ -1,0 +1,55 @@
+"""Everything that reading a folder shows, found in a limited process that runs none of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from ventbench.sandbox.reader import UnreadableError, read_apart
+from ventbench.submissions.errors import Finding
+from ventbench.submissions.file_checks import check_files
+from ventbench.submissions.manifest import check_manifest
+from ventbench.submissions.static_checks import check_sources
+
+#: Most findings of one kind that are listed.
+LISTED = 200
+
+_CHECKS = ("manifest", "files", "sources")
+
+
+def findings_as_json(folder: str, check: str) -> list[dict[str, Any]]:
+    """Make one kind of check on a folder, for a process that answers in JSON.
+
+    Args:
+        folder: the submission's.
+        check: ``"manifest"``, ``"files"`` or ``"sources"``.
+    """
+    path = Path(folder)
+    if check == "manifest":
+        findings = check_manifest(path)[0]
+    else:
+        findings = check_files(path) if check == "files" else check_sources(path)
+    # Problems first: what is cut off must not be what stops the submission.
+    kept = sorted(findings, key=lambda finding: not finding.problem)[:LISTED]
+    return [dataclasses.asdict(finding) for finding in findings if finding in kept]
+
+
+def inspect_folder(folder: Path) -> tuple[Finding, ...]:
+    """Return what is wrong with the manifest, the files and the sources of a submission.
+
+    Args:
+        folder: the submission's; nothing in it is run or imported.
+    """
+    findings: list[Finding] = []
+    for check in _CHECKS:
+        try:
+            function = "ventbench.submissions.inspection:findings_as_json"
+            found = read_apart(function, folder, [check])
+        except UnreadableError as error:
+            group = "source" if check == "sources" else check
+            advice = "make its files smaller and plainer"
+            findings.append(Finding(group, "the folder", str(error), advice))  # type: ignore[arg-type]
+            continue
+        findings += [Finding(**finding) for finding in found]
+    return tuple(findings)

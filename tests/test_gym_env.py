@@ -14,7 +14,7 @@ gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
 from ventbench import gym_env, precision, protocol, rollouts, scenario  # noqa: E402
 from ventbench.controllers.script import Script  # noqa: E402
 from ventbench.lungs import LUNG_IDS  # noqa: E402
-from ventbench.metrics.waveform import run_error  # noqa: E402
+from ventbench.metrics.score import run_error  # noqa: E402
 from ventbench.plants import frozen  # noqa: E402
 
 NAME = "ventbench.gym_env:ventbench/Ventilator-v1"

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from ventbench import protocol, waveform
-from ventbench.controllers import expiratory
 
 
 def test_key_points():
@@ -51,6 +50,8 @@ def test_expiratory_controller():
     steps = np.arange(34, 100)
     t = steps * 0.03
     expected = np.where(t < 1.5, 0.0, 5 * (1 - np.exp(5 * (1.5 - t))))
-    np.testing.assert_allclose(expiratory.u_in(steps), expected, atol=1e-12)
-    assert expiratory.u_in(50) == 0.0
-    np.testing.assert_array_equal(expiratory.u_in(steps + 200), expiratory.u_in(steps))
+    np.testing.assert_allclose(waveform.expiratory_command(steps), expected, atol=1e-12)
+    assert waveform.expiratory_command(50) == 0.0
+    np.testing.assert_array_equal(
+        waveform.expiratory_command(steps + 200), waveform.expiratory_command(steps)
+    )

@@ -15,13 +15,12 @@ from jax import Array
 from numpy.typing import NDArray
 
 from ventbench import protocol, waveform
-from ventbench.controllers import expiratory
 from ventbench.interfaces import Observation, Plant
 from ventbench.scenario import Scenario
 
 # Tables over the step of the breath: two breaths of target, so that looking ahead needs no modulo.
 _TARGET = waveform.shape(np.arange(2 * protocol.BREATH_STEPS))
-_EXPIRATORY = expiratory.u_in(np.arange(protocol.BREATH_STEPS))
+_EXPIRATORY = waveform.expiratory_command(np.arange(protocol.BREATH_STEPS))
 
 
 def _table(values: NDArray[np.float64], scenario: Scenario) -> Array:

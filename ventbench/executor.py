@@ -1,20 +1,33 @@
-"""Executors: this process, processes beside it, or a Dask cluster.
+"""Independent computations in parallel: by threads, by processes, or on a Dask cluster.
 
-All three are a :class:`concurrent.futures.Executor`. A job must be a function of a module with
-small arguments made of numpy arrays.
+:func:`parallel_map` uses threads, which suffice for fits: nearly all of their time is spent in
+compiled code, which all threads share. :func:`executor` opens a
+:class:`concurrent.futures.Executor` in this process, in processes beside it or on a cluster; its
+jobs must be functions of a module with small arguments made of numpy arrays.
 """
 
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Iterator, Mapping
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent import futures
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, TypeVar
 
 from ventbench.errors import InputError
 
+ArgumentT = TypeVar("ArgumentT")
 ResultT = TypeVar("ResultT")
+
+#: Environment variable with the most threads.
+THREADS = "VENTBENCH_THREADS"
+
+#: Most threads unless told otherwise: more would wait for each other.
+_MOST = 4
+
+_outermost: ContextVar[bool] = ContextVar("_outermost", default=True)
 
 #: How long a cluster may take to answer, s.
 PATIENCE = "15s"
@@ -121,3 +134,34 @@ def results(
                     "same command again, with fewer --workers"
                 ) from error
             yield running.pop(future), result
+
+
+def parallel_map(
+    work: Callable[[ArgumentT], ResultT], arguments: Iterable[ArgumentT]
+) -> list[ResultT]:
+    """Return ``[work(argument) for argument in arguments]``, computed in parallel.
+
+    Args:
+        work: may run at the same time as itself; a ``parallel_map`` inside it runs serially.
+        arguments: one for each call.
+    """
+    arguments = list(arguments)
+    count = min(thread_count(), len(arguments))
+    if count < 2 or not _outermost.get():
+        return [work(argument) for argument in arguments]
+
+    def nested(argument: ArgumentT) -> ResultT:
+        _outermost.set(False)
+        return work(argument)
+
+    with futures.ThreadPoolExecutor(count) as pool:
+        return list(pool.map(nested, arguments))
+
+
+def thread_count() -> int:
+    """Number of threads that :func:`parallel_map` uses, at least one."""
+    given = os.environ.get(THREADS, "")
+    if given.isdigit() and int(given) > 0:
+        return int(given)
+    can = getattr(os, "sched_getaffinity", None)
+    return min(_MOST, len(can(0)) if can else os.cpu_count() or 1)

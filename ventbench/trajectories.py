@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ventbench import files, protocol, waveform
 from ventbench.errors import InputError
-from ventbench.metrics.waveform import run_error
+from ventbench.metrics.score import run_error
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,4 +1,7 @@
-"""The target waveform, from the integer step of the breath (never from accumulated time)."""
+"""What the protocol fixes for a breath: the target waveform and the commands of the expiration.
+
+Both follow from the integer step of the breath, never from accumulated time.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ventbench import protocol
+
+#: Bias flow that holds PEEP late in expiration, %, and its rate of rise, 1/s (paper, section 4.3;
+#: authors' code).
+EXPIRATORY_BIAS = 5.0
+EXPIRATORY_RATE = 5.0
 
 
 def shape(step: ArrayLike) -> NDArray[np.float64]:
@@ -29,7 +37,7 @@ def target(step: ArrayLike, pip: ArrayLike, peep: ArrayLike = protocol.PEEP) -> 
     Args:
         step: step of the breath, any shape.
         pip: peak inspiratory pressure, cmH2O; broadcast against ``step``.
-        peep: positive end-expiratory pressure, cmH2O; likewise.
+        peep: positive end-expiratory pressure, cmH2O; broadcast against ``step``.
     """
     pip, peep = np.asarray(pip, float), np.asarray(peep, float)
     return peep + (pip - peep) * shape(step)
@@ -45,3 +53,19 @@ def targets_ahead(
     """
     steps = step + 1 + np.arange(protocol.TARGETS_AHEAD)
     return target(steps, np.asarray(pip, float)[..., None], np.asarray(peep, float)[..., None])
+
+
+def expiratory_command(step: ArrayLike) -> NDArray[np.float64]:
+    """Fixed command of the inspiratory valve during expiration, %.
+
+    The expiratory valve is open throughout.
+
+    Args:
+        step: step of the breath, at least :data:`~ventbench.protocol.INSPIRATION_STEPS`; any shape.
+
+    Returns:
+        0 until 1.5 s, then ``5 (1 - exp(5 (1.5 s - t)))``.
+    """
+    t = np.mod(np.asarray(step), protocol.BREATH_STEPS) * protocol.DT
+    late = np.minimum(protocol.FALL_END - t, 0.0)
+    return EXPIRATORY_BIAS * (1.0 - np.exp(EXPIRATORY_RATE * late))

@@ -22,8 +22,7 @@ from hypothesis.extra import numpy as hnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ventbench import protocol
-from ventbench.controllers import expiratory
+from ventbench import protocol, waveform
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNG_IDS, Lung, lung
 from ventbench.physics import physics
@@ -93,7 +92,7 @@ FROZEN = [name for name in PLANTS if name.startswith("hybrid")]
 PHYSICS = TEXTBOOK + FROZEN
 #: Commands that hold PEEP while the expiratory valve is open, %: in the recordings, and so in what
 #: has learned from them, PEEP is held by a resting flow of about 5 %, the protocol's own bias.
-HOLDING = dict.fromkeys(PLANTS, 0.0) | dict.fromkeys(FROZEN, float(expiratory.u_in(99)))
+HOLDING = dict.fromkeys(PLANTS, 0.0) | dict.fromkeys(FROZEN, float(waveform.expiratory_command(99)))
 
 T = 40
 DT = np.full((1, T), protocol.DT)
@@ -118,7 +117,7 @@ def breaths(count: int, u_in: float) -> tuple[np.ndarray, np.ndarray]:
     """Commands of whole breaths."""
     steps = np.arange(protocol.BREATH_STEPS)
     opened = (steps >= protocol.INSPIRATION_STEPS) * 1.0
-    command = np.where(opened > 0, expiratory.u_in(steps), u_in)
+    command = np.where(opened > 0, waveform.expiratory_command(steps), u_in)
     return np.tile(command, count)[None], np.tile(opened, count)[None]
 
 

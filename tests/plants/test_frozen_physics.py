@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import ArrayLike
 
-from ventbench import protocol
-from ventbench.controllers import expiratory
+from ventbench import protocol, waveform
 from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import RELIEF, RELIEF_ROOM, Hybrid
@@ -95,7 +94,7 @@ def breaths_300(six):
     """300 breaths at 8 %, in the order of lung, breath, step."""
     steps = np.arange(protocol.BREATH_STEPS)
     opened = (steps >= protocol.INSPIRATION_STEPS) * 1.0
-    u_in = np.where(opened > 0, expiratory.u_in(steps), 8.0)
+    u_in = np.where(opened > 0, waveform.expiratory_command(steps), 8.0)
     p = answers(six, np.tile(u_in, 300), np.tile(opened, 300))
     return p.reshape(len(LUNG_IDS), 300, protocol.BREATH_STEPS)
 
@@ -113,7 +112,7 @@ def test_every_expiration_returns_to_peep(breaths_300):
 @pytest.mark.parametrize("start", [0.0, 35.0])
 def test_expiration_returns_to_peep_from_anywhere(six, start):
     with float64():
-        opened, held = jnp.asarray(1.0), jnp.asarray(expiratory.u_in(99))
+        opened, held = jnp.asarray(1.0), jnp.asarray(waveform.expiratory_command(99))
 
         def expire(plant):
             state = plant.init(jnp.asarray(start), jnp.asarray(protocol.PEEP))

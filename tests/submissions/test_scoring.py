@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from ventbench import draws, precision, protocol, rollouts, scenario, waveform
-from ventbench.controllers import expiratory
 from ventbench.controllers.pid import PID
 from ventbench.errors import InputError
 from ventbench.interfaces import Task
 from ventbench.lungs import LUNG_IDS, LUNGS, lung
-from ventbench.metrics.waveform import run_error
+from ventbench.metrics.score import run_error
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import take
 from ventbench.submissions import stepping
@@ -201,7 +200,7 @@ def test_what_a_submission_is_told(make, plants, track, known):
                 np.testing.assert_allclose(ahead[step], expected)
         assert len(set(dts)) == 1
         requested = np.clip(2.0 * np.arange(1, 103) - 20.0, 0, 100)
-        bias = expiratory.u_in(protocol.BREATH_STEPS - 1)
+        bias = waveform.expiratory_command(protocol.BREATH_STEPS - 1)
         requested[[33, 67]] = bias  # the step after is the first of a breath
         np.testing.assert_allclose(previous, [bias, *requested[:-1]])
 

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ventbench import precision, protocol
+from ventbench import precision, protocol, waveform
 from ventbench.cli import app
-from ventbench.controllers import expiratory
 from ventbench.controllers.pid import PID
 from ventbench.errors import InputError
 from ventbench.interfaces import Observation
 from ventbench.lungs import LUNG_IDS, lung
-from ventbench.metrics.safety import longest_run
+from ventbench.metrics.score import longest_run
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.recordings import load, write
 from ventbench.training.exploration import (
@@ -90,7 +89,9 @@ def test_without_disturbance_it_is_the_pid():
 def test_expirations_are_the_hard_coded_ones():
     found = explore(ventilator(), "R20C50", 6)
     steps = np.arange(INSPIRATION, protocol.BREATH_STEPS)
-    np.testing.assert_array_equal(found.u_in[:, INSPIRATION:], [expiratory.u_in(steps)] * 6)
+    np.testing.assert_array_equal(
+        found.u_in[:, INSPIRATION:], [waveform.expiratory_command(steps)] * 6
+    )
     np.testing.assert_array_equal(found.u_out[:, INSPIRATION:], 1)
     np.testing.assert_array_equal(found.u_out[:, :INSPIRATION], 0)
 

@@ -16,7 +16,7 @@ from ventbench.controllers.pid import PID
 from ventbench.errors import InputError
 from ventbench.executor import executor
 from ventbench.lungs import LUNG_IDS, LUNGS
-from ventbench.metrics.waveform import run_error
+from ventbench.metrics.score import run_error
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, take
 from ventbench.scenario import nominal

@@ -13,7 +13,7 @@ from ventbench import protocol
 from ventbench.errors import InputError
 from ventbench.text import number
 from ventbench.trajectories import Trajectories
-from ventbench.views import report, scores, svg, write_figure, write_report
+from ventbench.views import graphics, report, scores, write_figure, write_report
 from ventbench.views import runs as shared
 
 pytest.importorskip("jinja2", reason="needs the extra ventbench[view]")
@@ -178,7 +178,7 @@ def test_path_does_not_drift() -> None:
     line = np.cumsum(rng.uniform(0.0, 3.0, (200, 2)), axis=0)
     x = y = 0.0
     points = []
-    for kind, body in re.findall(r"([Mlhv])([^Mlhv]*)", svg.path(line)):
+    for kind, body in re.findall(r"([Mlhv])([^Mlhv]*)", graphics.path(line)):
         numbers = [float(n) for n in re.findall(r"-?\d*\.?\d+", body)]
         if kind == "M":
             x, y = numbers
@@ -191,8 +191,8 @@ def test_path_does_not_drift() -> None:
 
 def test_path_breaks_at_gaps() -> None:
     line = np.array([[0.0, 0.0], [1.0, 1.0], [2.0, np.nan], [3.0, 3.0], [4.0, 2.5]])
-    assert svg.path(line) == "M0 0l1 1M3 3l1-.5"
-    assert svg.area(line, line) == ""
+    assert graphics.path(line) == "M0 0l1 1M3 3l1-.5"
+    assert graphics.area(line, line) == ""
 
 
 def test_figure(

@@ -107,7 +107,7 @@ def test_import_loads_no_extra() -> None:
 def test_open_viewer_without_display(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("ventbench.views.viewer.has_display", lambda: False)
+    monkeypatch.setattr("ventbench.views.write.has_display", lambda: False)
     path = tmp_path / "run.rrd"
     with pytest.raises(FileNotFoundError):
         views.open_viewer(path)
@@ -120,9 +120,9 @@ def test_open_viewer_without_display(
 
 def test_open_viewer_with_display(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[list[str]] = []
-    monkeypatch.setattr("ventbench.views.viewer.has_display", lambda: True)
+    monkeypatch.setattr("ventbench.views.write.has_display", lambda: True)
     monkeypatch.setattr(
-        "ventbench.views.viewer.subprocess.Popen", lambda command, **_: started.append(command)
+        "ventbench.views.write.subprocess.Popen", lambda command, **_: started.append(command)
     )
     path = tmp_path / "run.rrd"
     path.write_bytes(b"RRF2")

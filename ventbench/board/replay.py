@@ -21,8 +21,7 @@ from ventbench import environment as env
 from ventbench import precision, protocol
 from ventbench.board.record import Record
 from ventbench.interfaces import Plant
-from ventbench.metrics import safety
-from ventbench.metrics.waveform import run_error
+from ventbench.metrics.score import longest_run, passes_safety_gate, run_error, safety_limit
 from ventbench.scenario import Scenario
 from ventbench.submissions.scoring import protocol_cells
 from ventbench.submissions.stepping import as_float64
@@ -215,14 +214,14 @@ def replay(
 def _measure(cells: Scenario, requested: Floats, pressure: Floats, spread: Floats) -> Replayed:
     pip, dt = np.asarray(cells.pip), np.asarray(cells.dt)
     errors = run_error(pressure, pip[..., None, None])
-    gate = safety.safe(pressure, pip[..., None], dt[..., None])
-    above = pressure > safety.limit(pip[..., None, None])
+    gate = passes_safety_gate(pressure, pip[..., None], dt[..., None])
+    above = pressure > safety_limit(pip[..., None, None])
     return Replayed(
         nominal=errors[:, 0],
         drawn=np.moveaxis(errors[:, 1:], 1, 0),
         safe=np.all(gate, axis=(1, 2, 3)),
         peak=np.moveaxis(pressure.max(axis=(3, 4)), 1, 0),
-        steps_above=np.moveaxis(safety.longest_run(above).max(axis=-1), 1, 0),
+        steps_above=np.moveaxis(longest_run(above).max(axis=-1), 1, 0),
         below=np.sum(requested < 0.0, axis=(1, 2, 3, 4)),
         above=np.sum(requested > protocol.U_MAX, axis=(1, 2, 3, 4)),
         spread=spread,

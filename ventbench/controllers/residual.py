@@ -18,8 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench import files, protocol
-from ventbench.controllers.expiratory import BIAS
+from ventbench import files, protocol, waveform
 from ventbench.controllers.pid import PID, PIDState
 from ventbench.errors import InputError
 from ventbench.interfaces import Observation
@@ -165,7 +164,7 @@ class Residual:
             begun=jnp.where(restart, 1.0, state.begun),
             known=jnp.where(restart, state.begun, state.known),
             errors=jnp.where(wide, error[..., None], state.errors),
-            commands=jnp.where(wide, BIAS, state.commands),
+            commands=jnp.where(wide, waveform.EXPIRATORY_BIAS, state.commands),
             error_before=turned(state.error_trace, state.error_before),
             command_before=turned(state.command_trace, state.command_before),
         )

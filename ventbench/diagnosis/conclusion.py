@@ -42,9 +42,9 @@ from ventbench.diagnosis.selection import (
     passes_heldout_test,
 )
 from ventbench.diagnosis.settings import SelectionConfig
+from ventbench.executor import parallel_map
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import Noise
-from ventbench.system_id.parallel import parallel_map
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,12 +20,12 @@ from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, m
 from ventbench.diagnosis.linearisation import linearise
 from ventbench.diagnosis.patient_effort import BreathTerm, breath_term
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
+from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import library
 from ventbench.system_id import problem as problems
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.levenberg_marquardt import minimise
 from ventbench.system_id.noise import Noise
-from ventbench.system_id.parallel import parallel_map
 from ventbench.system_id.predictor import START
 from ventbench.system_id.problem import Problem, make_unknowns, parameter_of
 

@@ -19,9 +19,9 @@ from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Partition
 from ventbench.diagnosis.linearisation import Linearisation, linearise
 from ventbench.diagnosis.settings import LatentInputSettings
+from ventbench.executor import parallel_map
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import Noise, robust_noise
-from ventbench.system_id.parallel import parallel_map
 from ventbench.system_id.problem import Problem
 
 #: Public names of the places where an input may act.

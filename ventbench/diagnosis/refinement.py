@@ -42,9 +42,9 @@ from ventbench.diagnosis.selection import (
     is_needed,
     passes_heldout_test,
 )
+from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import mechanism, special_cases
 from ventbench.system_id.data import Floats
-from ventbench.system_id.parallel import parallel_map
 
 
 @dataclass(frozen=True, eq=False)

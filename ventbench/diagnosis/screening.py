@@ -16,10 +16,10 @@ from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
 from ventbench.diagnosis.linearisation import Linearisation, linearise
 from ventbench.diagnosis.patient_effort import breath_term
 from ventbench.diagnosis.settings import ScreeningSettings, SelectionConfig
+from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter, paths
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.system_id.data import Floats
-from ventbench.system_id.parallel import parallel_map
 from ventbench.system_id.predictor import Predictor
 
 

@@ -26,10 +26,10 @@ from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_br
 from ventbench.diagnosis.latent_inputs import exceeds_sensor_noise
 from ventbench.diagnosis.screening import Candidate, screen_mechanisms
 from ventbench.diagnosis.settings import DEFAULT, HeldOutTestSettings
+from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import Noise, robust_noise
-from ventbench.system_id.parallel import parallel_map
 
 #: Is told what is being done.
 Progress = Callable[[str], None]

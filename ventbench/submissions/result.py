@@ -19,7 +19,7 @@ import ventbench
 from ventbench import draws, files, protocol
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics import bootstrap
-from ventbench.metrics.waveform import lung_score
+from ventbench.metrics.score import lung_score
 from ventbench.plants import frozen
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import Submission

@@ -15,9 +15,8 @@ from ventbench import draws as published
 from ventbench import precision, protocol, scenario
 from ventbench.interfaces import Plant, Task
 from ventbench.lungs import LUNGS, Lung
-from ventbench.metrics import safety
 from ventbench.metrics.figures import InspirationSignals, figures
-from ventbench.metrics.waveform import run_error
+from ventbench.metrics.score import passes_safety_gate, run_error
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators
 from ventbench.plants.hybrid import Hybrid
@@ -174,7 +173,7 @@ def run_protocol(
         pips=pips,
         nominal=errors[:, 0],
         drawn=np.moveaxis(errors[:, 1:], 1, 0),
-        safe=np.all(safety.safe(run.pressure, pip, cells.dt[..., None]), axis=(1, 2, 3)),
+        safe=np.all(passes_safety_gate(run.pressure, pip, cells.dt[..., None]), axis=(1, 2, 3)),
         peak=run.pressure.max(axis=(1, 2, 3, 4)),
         figures=_figures(run, cells),
         below=np.sum(requested < 0.0, axis=(1, 2, 3)),

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import parameter
 from ventbench.physics.dead_time import resolution
 from ventbench.physics.model import Physics
 from ventbench.precision import float64
 from ventbench.system_id.data import Data, Floats
-from ventbench.system_id.parallel import parallel_map
 
 #: Path of the reading that a breath starts from, cmH2O; it is no parameter of the model.
 START = "start"

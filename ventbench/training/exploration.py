@@ -15,13 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import protocol
-from ventbench.controllers import expiratory
+from ventbench import protocol, waveform
 from ventbench.controllers.pid import TIME_CONSTANT
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
 from ventbench.lungs import lung as parse_lung
-from ventbench.metrics.safety import limit
+from ventbench.metrics.score import safety_limit
 from ventbench.recordings import Breaths, make_breaths
 
 Floats = NDArray[np.float64]
@@ -241,7 +240,7 @@ def _breaths(
     added: Disturbance,
 ) -> tuple[Floats, Floats, Floats]:
     """One breath on each lung of the ventilator: u_in, u_out and pressure, ``(width, steps)``."""
-    ease = np.minimum(limit(pip), limits.ease)
+    ease = np.minimum(safety_limit(pip), limits.ease)
     vented = np.zeros(ventilator.width, bool)
     before = integral = derivative = np.zeros(ventilator.width)
     a = ventilator.dt / (ventilator.dt + TIME_CONSTANT)
@@ -261,7 +260,7 @@ def _breaths(
             u_in = np.where(closed, 0.0, np.clip(wanted, 0.0, protocol.U_MAX))
             u_out = vented.astype(float)
         else:
-            u_in = np.full(ventilator.width, float(expiratory.u_in(step)))
+            u_in = np.full(ventilator.width, float(waveform.expiratory_command(step)))
             u_out = np.ones(ventilator.width)
         rows.append((u_in, u_out, pressure))
         pressure = ventilator.step(u_in, u_out)

@@ -20,7 +20,7 @@ from ventbench import protocol
 from ventbench.lungs import lung as parse_lung
 from ventbench.text import number
 from ventbench.trajectories import Trajectories
-from ventbench.views import panels, scores, style
+from ventbench.views import graphics, panels, scores
 from ventbench.views.runs import Floats, labels
 
 #: Width, pixels.
@@ -158,7 +158,7 @@ def _inside(line: Floats) -> Floats:
 
 
 def _color(run: int) -> str:
-    return style.RUN_COLORS[style.run_index(run)]
+    return graphics.RUN_COLORS[graphics.run_index(run)]
 
 
 def _width(run: int) -> float:

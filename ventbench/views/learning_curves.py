@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ventbench.training.study import LearningCurve, SampleStudy, band
-from ventbench.views.style import RUN_COLORS
+from ventbench.views.graphics import RUN_COLORS
 
 #: What the curves are called in the picture.
 LABELS = {

@@ -13,7 +13,7 @@ from ventbench import protocol
 from ventbench.lungs import lung as parse_lung
 from ventbench.text import number
 from ventbench.trajectories import Trajectories
-from ventbench.views import panels, scores, style, svg
+from ventbench.views import graphics, panels, scores
 from ventbench.views.runs import Floats, labels
 
 
@@ -39,10 +39,10 @@ def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None
     return environment.get_template("report.html.j2").render(
         title=names[0],
         names=names,
-        classes=[f"r{style.run_index(i)}" for i in range(len(runs))],
-        dashed=[i >= len(style.RUN_COLORS) for i in range(len(runs))],
-        light=style.RUN_COLORS,
-        dark=style.RUN_COLORS_DARK,
+        classes=[f"r{graphics.run_index(i)}" for i in range(len(runs))],
+        dashed=[i >= len(graphics.RUN_COLORS) for i in range(len(runs))],
+        light=graphics.RUN_COLORS,
+        dark=graphics.RUN_COLORS_DARK,
         track=runs[0].track,
         tracks=[run.track for run in runs],
         table=table(runs[0].lungs, numbers),
@@ -112,11 +112,11 @@ def _panel(panel: panels.RunPanel, names: Sequence[str], errors: Floats) -> dict
         f"Mean absolute error: {errors_text}.",
         "errors": [number(error) for error in errors],
         "ticks": [(f"{value:g}", round(y, 1)) for value, y in panel.ticks],
-        "target": svg.path(panel.target),
-        "area": svg.area(first, panels.inspiration(panel.target)),
-        "pressures": [svg.path(line) for line in panel.pressures],
-        "scored": [svg.path(panels.inspiration(line)) for line in panel.pressures],
-        "valves": [svg.path(line) for line in panel.valves],
+        "target": graphics.path(panel.target),
+        "area": graphics.area(first, panels.inspiration(panel.target)),
+        "pressures": [graphics.path(line) for line in panel.pressures],
+        "scored": [graphics.path(panels.inspiration(line)) for line in panel.pressures],
+        "valves": [graphics.path(line) for line in panel.valves],
         "valve_limit": f"{panel.valve_limit:g}",
         "above": None if panel.above is None else f"{panel.above:.0f}",
     }

@@ -23,7 +23,7 @@ from ventbench.errors import InputError
 from ventbench.lungs import lung as parse_lung
 from ventbench.text import escape_markdown, number
 from ventbench.trajectories import Trajectories
-from ventbench.views import style
+from ventbench.views import graphics
 from ventbench.views.runs import Floats, distinct, errors, labels, scored
 
 APPLICATION = "ventbench"
@@ -105,19 +105,21 @@ def log_target(stream: rr.RecordingStream, run: Trajectories) -> None:
     """Target pressure of every lung, one line a PIP."""
     series = ["target, cmH2O"] * len(run.pips)
     for lung, values in zip(run.lungs, run.target, strict=True):
-        _send(stream, f"/{lung}/target", run.time, values, series, [style.TARGET_COLOR], 1.0)
+        _send(stream, f"/{lung}/target", run.time, values, series, [graphics.TARGET_COLOR], 1.0)
 
 
 def log_scored(stream: rr.RecordingStream, run: Trajectories) -> None:
     """A bar along the bottom of every plot where the run is scored."""
     bar = np.where(scored(), 0.0, np.nan)[None]
     for lung in run.lungs:
-        _send(stream, f"/{lung}/scored", run.time, bar, ["scored part"], [style.SCORED_COLOR], 6.0)
+        _send(
+            stream, f"/{lung}/scored", run.time, bar, ["scored part"], [graphics.SCORED_COLOR], 6.0
+        )
 
 
 def log_run(stream: rr.RecordingStream, run: Trajectories) -> None:
     """Pressure, valves and error of every lung, one line a PIP in that PIP's colour."""
-    colors = [style.pip_color(j) for j in range(len(run.pips))]
+    colors = [graphics.pip_color(j) for j in range(len(run.pips))]
     for quantity, unit, array in _quantities(run):
         series = [f"PIP {pip:g}, {unit}" for pip in run.pips]
         for lung, values in zip(run.lungs, array, strict=True):
@@ -126,7 +128,7 @@ def log_run(stream: rr.RecordingStream, run: Trajectories) -> None:
 
 def log_reference(stream: rr.RecordingStream, run: Trajectories, name: str, index: int) -> None:
     """Pressure, valves and error of a run to compare with: thin, one colour, under its name."""
-    colors = [style.REFERENCE_COLORS[index % len(style.REFERENCE_COLORS)]]
+    colors = [graphics.REFERENCE_COLORS[index % len(graphics.REFERENCE_COLORS)]]
     for quantity, unit, array in _quantities(run):
         series = [f"{name}, {unit}"] * len(run.pips)
         for lung, values in zip(run.lungs, array, strict=True):
@@ -155,7 +157,7 @@ def _send(
     """Style once, values in bulk; ``values`` has shape ``(series, T)``."""
     n = len(series)
     look = rr.SeriesLines(
-        colors=[style.rgb(colors[i % len(colors)]) for i in range(n)],
+        colors=[graphics.rgb(colors[i % len(colors)]) for i in range(n)],
         widths=[width] * n,
         names=series,
         # A valve holds its command until the next step.

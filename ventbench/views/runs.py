@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ventbench import protocol
 from ventbench.errors import InputError
-from ventbench.metrics.waveform import run_error
+from ventbench.metrics.score import run_error
 from ventbench.trajectories import Trajectories
 
 Floats = NDArray[np.float64]

@@ -26,7 +26,7 @@ from ventbench.controllers.residual import (
 )
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS, LUNGS
-from ventbench.metrics.waveform import run_error
+from ventbench.metrics.score import run_error
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, take

@@ -13,7 +13,7 @@ from ventbench.controllers.pid import PID
 from ventbench.controllers.rl_policy import GaussianPolicy, TanhNetwork, init_parameters
 from ventbench.interfaces import Observation
 from ventbench.lungs import LUNGS
-from ventbench.metrics.waveform import run_error
+from ventbench.metrics.score import run_error
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.training.rl import episodes

@@ -17,8 +17,7 @@ from ventbench import files, precision, protocol, rollouts
 from ventbench.board.replay import spread
 from ventbench.interfaces import Controller
 from ventbench.lungs import LUNG_IDS
-from ventbench.metrics import safety
-from ventbench.metrics.waveform import run_error
+from ventbench.metrics.score import passes_safety_gate, run_error
 from ventbench.plants import frozen
 from ventbench.plants.stacking import take
 from ventbench.resume import WorkFolder
@@ -219,6 +218,6 @@ def score_controllers(
             run, _ = rollouts.closed_loop(plant, wide, cells)
             errors.append(run_error(run.pressure, pip[..., None]))
             requested.append(np.asarray(run.requested))
-            safe &= bool(np.all(safety.safe(run.pressure, pip, dt)))
+            safe &= bool(np.all(passes_safety_gate(run.pressure, pip, dt)))
     nominal = np.stack(requested)[None][:, :, 0]
     return np.stack(errors), float(spread(simulators, tuple(pips), nominal).mean()), safe

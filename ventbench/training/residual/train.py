@@ -17,7 +17,7 @@ from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import save_weights
 from ventbench.interfaces import Controller, Plant
 from ventbench.lungs import LUNG_IDS
-from ventbench.metrics.waveform import run_error
+from ventbench.metrics.score import run_error
 from ventbench.plants.catalog import Given
 from ventbench.plants.stacking import take
 from ventbench.scenario import nominal

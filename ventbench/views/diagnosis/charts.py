@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from ventbench.diagnosis.findings import BreathRequest, NonparametricTerm, Traces
 from ventbench.diagnosis.residual_analysis import Profile, profiles
 from ventbench.diagnosis.result import Diagnosis
-from ventbench.views import svg
+from ventbench.views import graphics
 from ventbench.views.runs import Floats
 
 #: Room for the labels: left, right, top, bottom, picture units.
@@ -94,7 +94,7 @@ class Chart:
 
     def line(self, look: str, x: ArrayLike, y: ArrayLike) -> None:
         """Add a line, which breaks where a point is NaN."""
-        self.paths.append((look, svg.path(self._points(x, y))))
+        self.paths.append((look, graphics.path(self._points(x, y))))
 
     def stairs(self, look: str, edges: ArrayLike, y: ArrayLike) -> None:
         """Add one level for each of k ranges with ``k + 1`` edges."""
@@ -109,7 +109,7 @@ class Chart:
             if np.isfinite(bottom) and np.isfinite(top):
                 ends = edges[[k, k + 1]]
                 upper, lower = self._points(ends, [top, top]), self._points(ends, [bottom, bottom])
-                parts.append(svg.area(upper, lower))
+                parts.append(graphics.area(upper, lower))
         if parts:
             self.areas.append((look, "".join(parts)))
 

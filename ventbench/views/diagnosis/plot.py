@@ -8,15 +8,15 @@ from matplotlib.figure import Figure
 
 from ventbench.diagnosis import report_text
 from ventbench.diagnosis.result import Diagnosis
-from ventbench.views import style
+from ventbench.views import graphics
 from ventbench.views.diagnosis.charts import STAGES, worst
 
 #: Colours of the recording and of the three simulators, on white.
 _COLORS = {
     "recorded": "#16191d",
-    "before": style.RUN_COLORS[1],
-    "refit": style.RUN_COLORS[2],
-    "after": style.RUN_COLORS[0],
+    "before": graphics.RUN_COLORS[1],
+    "refit": graphics.RUN_COLORS[2],
+    "after": graphics.RUN_COLORS[0],
 }
 
 #: Breaths that are drawn at most.

@@ -12,7 +12,7 @@ from ventbench.diagnosis import report_text
 from ventbench.diagnosis.findings import MissingMechanism, OpenLoopError
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.physics import mechanism
-from ventbench.views import style
+from ventbench.views import graphics
 from ventbench.views.diagnosis import charts
 
 #: Places that are told in words; the charts show all.
@@ -37,8 +37,8 @@ def html(diagnosis: Diagnosis) -> str:
         verdict=report_text.verdict(diagnosis),
         lead=[text for text in lead if text],
         plant=diagnosis.simulator,
-        light=style.RUN_COLORS,
-        dark=style.RUN_COLORS_DARK,
+        light=graphics.RUN_COLORS,
+        dark=graphics.RUN_COLORS_DARK,
         mechanisms=[_named(mechanism) for mechanism in diagnosis.mechanisms],
         alternatives=report_text.alternatives(diagnosis),
         bars=bars(diagnosis),

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ventbench.metrics.waveform import lung_score, run_error
+from ventbench.metrics.score import longest_run, lung_score, passes_safety_gate, run_error
 
 
 def test_first_breath_is_ignored():
@@ -35,3 +35,27 @@ def test_nan_does_not_hide():
 def test_shape():
     with pytest.raises(ValueError, match="do not end in"):
         run_error(np.zeros((3, 33)), 10.0)
+
+
+def test_longest_run_against_loop():
+    flags = np.random.default_rng(0).random((200, 12)) < 0.6
+    for row, found in zip(flags, longest_run(flags), strict=True):
+        text = "".join("x" if flag else " " for flag in row)
+        assert found == max(map(len, text.split()), default=0)
+
+
+@pytest.mark.parametrize(
+    ("pressure", "pip", "dt", "passes"),
+    [
+        ([36.0] * 3 + [20.0] * 31, 20.0, 0.03, True),  # 0.09 s
+        ([36.0] * 4 + [20.0] * 30, 20.0, 0.03, False),  # 0.12 s
+        ([36.0, 36.0, 36.0, 20.0] * 8, 20.0, 0.03, True),  # never 0.1 s in one go
+        ([35.0] * 34, 20.0, 0.03, True),  # the limit itself
+        ([36.0] * 4 + [20.0] * 30, 20.0, 0.025, True),  # 0.1 s exactly
+        ([61.0] * 34, 50.0, 0.03, False),  # 60 cmH2O whatever the PIP
+        ([59.0] * 34, 50.0, 0.03, True),
+        ([20.0] * 33 + [np.nan], 20.0, 0.03, False),
+    ],
+)
+def test_gate(pressure, pip, dt, passes):
+    assert passes_safety_gate(pressure, pip, dt) == passes

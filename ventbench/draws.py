@@ -156,12 +156,12 @@ def random_scenarios(
     The published draws themselves are never among them. Pure, so that it can be compiled.
 
     Args:
-        key: of all random numbers.
+        key: JAX key of all random numbers.
         pip: nominal PIP of each cell, cmH2O, shape ``(n,)``.
-        spread: how far the deviations of each cell reach, as a multiple of the draws' ranges, shape
+        spread: reach of the deviations of each cell, as a multiple of the draws' ranges, shape
             ``(n,)`` or ``()``; 0 for nominal cells. The delay stays below one step. If not given,
             the ranges themselves.
-        breaths: how many breaths have noise.
+        breaths: number of breaths with noise.
         smooth: represent the converter by noise of one step's width, since rounding has no
             derivative; else the cells round.
 

@@ -43,7 +43,7 @@ class Plant(Protocol):
         """Hold one command.
 
         Args:
-            state: from ``init`` or ``step``.
+            state: state from ``init`` or ``step``.
             u_in: inspiratory valve, 0..100 %, shape ``(...)``.
             u_out: expiratory valve, 0 closed, 1 open, shape ``(...)``.
             dt: time for which the command is held, s, shape ``(...)`` or scalar.

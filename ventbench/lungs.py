@@ -36,7 +36,7 @@ def lung(lung_id: str) -> Lung:
     """Parse a lung id.
 
     Args:
-        lung_id: such as ``"R20C50"``.
+        lung_id: id of the lung, such as ``"R20C50"``.
 
     Raises:
         InputError: if the text is not a lung id.

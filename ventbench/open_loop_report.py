@@ -43,11 +43,12 @@ class Misfit:
     """A breath that something else than its label explains far better.
 
     Attributes:
-        breath_id: of the recording.
-        lung: its label.
-        mae: under its label, cmH2O.
-        explanation: such as ``"lung R20C20"`` or ``"valve gain x 0.8"``.
-        mae_explained: under the explanation, cmH2O.
+        breath_id: id of the breath in the recording.
+        lung: label of the lung.
+        mae: error under its label, cmH2O.
+        explanation: what explains the breath better, such as ``"lung R20C20"`` or ``"valve gain x
+            0.8"``.
+        mae_explained: error under the explanation, cmH2O.
     """
 
     breath_id: int
@@ -65,10 +66,10 @@ class OpenLoopReport:
         plant: name of the simulators.
         simulators: version and hashes of the official ones, by which misfits are judged.
         about: what is known of simulators from a file, a function or the caller; else None.
-        lungs: by lung id, the figures of :func:`summary`: without prefix of the simulators that
+        lungs: figures by lung id, those of :func:`summary`: without prefix of the simulators that
             make the scores, over all breaths; ``held_out_...`` of each breath by a member of the
-            ensemble that has not seen it; ``official_held_out_...`` of the simulators that make
-            the scores, on what they have not seen. In ``fitting_label`` the figures without the
+            ensemble that has not seen it; ``official_held_out_...`` of the simulators that make the
+            scores, on what they have not seen. In ``fitting_label`` the figures without the
             misfits.
         misfits: breaths that something else than their label explains far better.
         not_judged: ids of breaths without a first or another inspiratory pressure.
@@ -246,7 +247,7 @@ def misfits(
         plants_for: see :data:`PlantsFor`.
         with_gain: returns plants whose valve gives a multiple of its flow.
         breaths: n breaths.
-        error: of each under its label, cmH2O, shape ``(n,)``.
+        error: error of each breath under its label, cmH2O, shape ``(n,)``.
         settings: the (R, C) that are tried.
     """
     index = np.flatnonzero(error > SUSPECT)
@@ -281,8 +282,8 @@ def summary(prefix: str, error: Floats) -> dict[str, Any]:
     """Figures of some breaths.
 
     Args:
-        prefix: of the keys, such as ``"held_out_"``.
-        error: of each breath, cmH2O, shape ``(n,)``; NaN for one that could not be judged.
+        prefix: prefix of the keys, such as ``"held_out_"``.
+        error: errors of each breath, cmH2O, shape ``(n,)``; NaN for one that could not be judged.
 
     Returns:
         JSON values: ``mae``, ``median_mae``, ``ci95`` (bootstrap interval of the mean) and

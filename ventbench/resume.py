@@ -34,7 +34,7 @@ class Format(NamedTuple):
     """How a result is stored.
 
     Attributes:
-        suffix: of the file name, with the dot.
+        suffix: suffix of the file name, with the dot.
         write: stores a value at a path, in one step.
         read: returns the value stored at a path.
     """

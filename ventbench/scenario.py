@@ -24,8 +24,8 @@ class Scenario:
         c_scale: true over nominal compliance.
         delay: additional dead time of the command, as a share of one step, 0..1.
         quantum: step of the pressure sensor's converter, cmH2O; 0 for none.
-        noise: added to the measured pressure before the converter, cmH2O,
-            shape ``(..., BREATHS, INSPIRATION_STEPS)``.
+        noise: noise that is added to the measured pressure before the converter, cmH2O, shape
+            ``(..., BREATHS, INSPIRATION_STEPS)``.
     """
 
     pip: Array

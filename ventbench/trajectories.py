@@ -33,7 +33,7 @@ class Trajectories:
     """Nominal trajectories of one submission; shapes with L lungs, P PIPs, T = 300 steps.
 
     Attributes:
-        name: of the submission.
+        name: name of the submission.
         track: ``"performance"`` or ``"robustness"``.
         lungs: lung ids, length L.
         pips: cmH2O, length P.
@@ -104,12 +104,12 @@ def end_to_end(
     """Lay whole breaths end to end.
 
     Args:
-        name: of the controller.
-        track: of the run.
+        name: name of the controller.
+        track: track of the run.
         lungs: ids, length L.
         pips: cmH2O, length P.
         pressure: true airway pressure, cmH2O, shape ``(L, P, BREATHS, BREATH_STEPS)``.
-        u_in: as applied, %, that shape too.
+        u_in: commands as applied, %, shape of ``pressure``.
     """
     steps = np.arange(protocol.BREATHS * protocol.BREATH_STEPS)
     shape = (len(lungs), len(pips), steps.size)

@@ -17,7 +17,7 @@ class PIDState:
     """Averages of a PID.
 
     Attributes:
-        error: of the previous step, cmH2O, shape ``(...)``.
+        error: error in the previous step, cmH2O, shape ``(...)``.
         integral: leaky integral of the error, cmH2O, shape ``(...)``.
         derivative: smoothed difference of the error, cmH2O, shape ``(...)``.
     """

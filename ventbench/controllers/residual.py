@@ -41,8 +41,9 @@ class ResidualState:
         pid: state of the PID.
         begun: 0 before the first breath, then 1, shape ``(...)``.
         known: whether there was a previous breath, 0/1, shape ``(...)``.
-        errors: in the last steps of this breath, the latest first, cmH2O, ``(..., pressures)``.
-        commands: as applied in the last steps, the latest first, %, ``(..., commands)``.
+        errors: errors in the last steps of this breath, the latest first, cmH2O, ``(...,
+            pressures)``.
+        commands: commands as applied in the last steps, the latest first, %, ``(..., commands)``.
         error_trace: errors of the last 34 steps, the latest last, cmH2O, ``(..., 34)``.
         command_trace: commands of the last 34 steps, the latest last, %, ``(..., 34)``. The command
             of a step is known one step later, so that the first entry is the bias flow before the
@@ -187,7 +188,7 @@ def untrained(key: Array, like: Residual, widths: tuple[int, ...]) -> Residual:
     """Return a controller with a new network that corrects nothing yet: its last layer is zero.
 
     Args:
-        key: of the random weights of the hidden layers.
+        key: JAX key of the random weights of the hidden layers.
         like: controller that gives PID, windows and limit.
         widths: units of each hidden layer.
     """

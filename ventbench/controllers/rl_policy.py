@@ -41,7 +41,7 @@ class FeatureState:
 
     Attributes:
         pid: state of the PID, ``(...)``.
-        errors: of the last steps, the latest first, cmH2O, ``(..., PAST)``.
+        errors: errors of the last steps, the latest first, cmH2O, ``(..., PAST)``.
         commands: applied in the last steps, the latest first, %, ``(..., PAST)``.
     """
 
@@ -186,7 +186,7 @@ def arrays(policies: Mapping[str, Any]) -> dict[str, np.ndarray]:
     Layer k does ``x @ wk + bk``, with tanh between the layers.
 
     Args:
-        policies: by lung id, or ``all`` for the policy that is not told the lung.
+        policies: policies by lung id, or ``all`` for the policy that is not told the lung.
     """
     named = {}
     for name, policy in policies.items():

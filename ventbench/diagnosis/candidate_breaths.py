@@ -20,7 +20,7 @@ class Rig:
     Attributes:
         R: resistance, cmH2O/(L/s).
         C: compliance, mL/cmH2O.
-        gain: of the inspiratory valve, mL/s per %.
+        gain: gain of the inspiratory valve, mL/s per %.
         peep: expiratory pressure, cmH2O.
     """
 

@@ -73,9 +73,9 @@ class Conclusion:
         named: the selected mechanisms.
         full: the mechanisms and the nonparametric term; ``named`` if there is none.
         unnamed: the unnamed effect, or None.
-        noise: that is left.
+        noise: model of the noise that is left.
         held_out_gains: held-out log-likelihood that each mechanism gains, nats, by name.
-        alternatives: to each mechanism, by name.
+        alternatives: alternatives to each mechanism, by name.
         gain_sd: standard deviation of the logarithm of the breaths' valve gains; 0 if all breaths
             have the same gain.
         unresolved: whether much is missing, and neither mechanism nor unnamed effect is accepted.
@@ -101,9 +101,9 @@ def conclude(evaluator: Evaluator, wider: Callable[[], Evaluator], tell: Progres
     """Find what a recording needs beyond the base model.
 
     Args:
-        evaluator: with the library's parameters.
+        evaluator: evaluator with the library's parameters.
         wider: makes the evaluator with the parameters of the nonparametric terms as well.
-        tell: is told what is being done.
+        tell: called with a description of each step before it runs.
     """
     base = fit_with_noise(evaluator, Hypothesis())
     wider = cache(wider)
@@ -157,8 +157,8 @@ def is_unresolved(evaluator: Evaluator, comparisons: Sequence[Comparison]) -> bo
     explains coloured noise as well.
 
     Args:
-        evaluator: of the recording.
-        comparisons: of the forward selection; the last one counts.
+        evaluator: evaluator of the recording.
+        comparisons: comparisons of the forward selection; the last one counts.
     """
     if not comparisons:
         return False

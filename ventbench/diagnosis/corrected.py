@@ -24,12 +24,13 @@ class Correction:
     """What becomes of a simulator.
 
     Attributes:
-        pressures: of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n, T)`` each.
+        pressures: pressures of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n, T)``
+            each.
         training_errors: mean absolute error of ``before`` and ``after`` on the training breaths,
             inspirations and expirations, cmH2O.
         plants: the corrected simulator of each lung, by label; empty if the simulator has none.
         unchanged: True if the simulator is left as it is, because a correction would be worse.
-        notes: for the reader.
+        notes: notes for the reader.
     """
 
     pressures: dict[str, Floats]

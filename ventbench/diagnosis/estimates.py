@@ -40,7 +40,7 @@ def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
     Args:
         fitted: the concluded model, fitted to some of the breaths.
         partition: breaths to fit.
-        evaluator: with which the model was fitted.
+        evaluator: evaluator with which the model was fitted.
     """
     hypothesis = fitted.hypothesis
     own = [path for path in paths(hypothesis.names) if "." in path]

@@ -48,10 +48,11 @@ def fit(
     Args:
         partition: the breaths.
         hypothesis: the terms.
-        noise: of the measurement.
+        noise: model of the measurement noise.
         warm_start: a model of the same breaths whose parameters the search starts from.
         start: physical values to start from, by path; they precede those of ``warm_start``.
-        restart: also look for dead times and each breath's effort beyond the nearest optimum.
+        restart: True to look also for dead times and each breath's effort beyond the nearest
+            optimum.
         gain_sd: prior standard deviation of the logarithm of each breath's valve gain; 0 if all
             breaths have the same gain.
         tolerance: expected fall of the cost, nats, at which the search ends; as in ``settings`` if
@@ -97,7 +98,7 @@ def make_problem(
     Args:
         partition: the breaths.
         paths: parameters that are fitted.
-        noise: of the measurement.
+        noise: model of the measurement noise.
         fixed: values of others, by path; those that are not given are neutral.
         gain_sd: prior standard deviation of the logarithm of each breath's valve gain, or 0.
     """
@@ -134,8 +135,8 @@ def delay_restarts(problem: Problem, x: Floats, settings: SelectionConfig = DEFA
     compared with all other parameters refitted to first order.
 
     Args:
-        problem: of any hypothesis.
-        x: its unknowns, ``(U,)``.
+        problem: problem of any hypothesis.
+        x: point in the coordinates of its unknowns, ``(U,)``.
         settings: every threshold.
     """
     for path in problem.unknowns.paths:
@@ -355,7 +356,7 @@ def cross_validated_gain(
     """Log-likelihood that a term gains in each breath, by fits to other breaths, ``(n,)``.
 
     Args:
-        evaluator: of the recording; the gains are in the order of its folds.
+        evaluator: evaluator of the recording; the gains are in the order of its folds.
         with_term: fitted to the training breaths.
         without_term: the hypothesis without the term, at the same noise.
     """

@@ -62,7 +62,7 @@ def request_breaths(
     Args:
         chosen: the best hypothesis, on the recorded breaths.
         alternatives: hypotheses to distinguish it from.
-        noise: of the measurement; that of ``chosen`` if not given.
+        noise: model of the measurement noise; that of ``chosen`` if not given.
         settings: number of breaths, limits and thresholds.
 
     Returns:
@@ -164,7 +164,7 @@ class Contrast:
         difference: whitened, ``(m, k)``.
         rows: derivatives by the shared unknowns of the refitted hypothesis, ``(m, s, k)``.
         known: information of the recorded breaths on the shared unknowns, ``(s, s)``.
-        noise: of the measurement.
+        noise: model of the measurement noise.
     """
 
     difference: Floats

@@ -25,7 +25,7 @@ class MissingMechanism:
     """A mechanism that the recording needs and the simulator lacks.
 
     Attributes:
-        name: of the library.
+        name: name in the library.
         parameters: estimates by short name.
         confidence: probability that this mechanism, and none of the alternatives, acts, 0..1.
         alternatives: mechanisms that the recording cannot distinguish from it, the likeliest first.
@@ -48,8 +48,8 @@ class NonparametricTerm:
     """A place in the model where an effect acts that the library does not have.
 
     Attributes:
-        name: of the place, such as ``f(V)``.
-        meaning: in words.
+        name: name of the place, such as ``f(V)``.
+        meaning: what the place means, in words.
         explains: share of the squared error above the noise that the term explains, 0..1.
         nats: held-out log-likelihood that it gains.
         x: what the term depends on, ``(k,)``.
@@ -76,10 +76,10 @@ class ErrorRegion:
         axis: the quantity, such as ``time since inspiration``.
         low: start of the range.
         high: end of the range.
-        unit: of the range.
+        unit: unit of the range.
         mean_error: recorded minus simulated pressure, mean over the range, cmH2O.
         p_value: corrected for all ranges of all axes.
-        share: of the squared error above the noise that lies in the range, 0..1.
+        share: share of the squared error above the noise that lies in the range, 0..1.
     """
 
     axis: str
@@ -104,7 +104,7 @@ class OpenLoopComparison:
     """Open-loop errors over the inspirations of held-out breaths.
 
     Attributes:
-        held_out_breaths: their ids.
+        held_out_breaths: ids of the held-out breaths.
         before: error of the simulator as given.
         refit: error after R, C, R_ex and PEEP are refitted.
         after: error of the corrected simulator.
@@ -131,8 +131,8 @@ class Traces:
         before: pressure of the simulator as given, cmH2O.
         refit: pressure with R, C, R_ex and PEEP refitted, cmH2O.
         after: pressure of the corrected simulator, cmH2O.
-        flow: of the refitted simulator into the lung, mL/s, or None.
-        volume: of the refitted simulator, mL, or None.
+        flow: flow of the refitted simulator into the lung, mL/s, or None.
+        volume: volume of the refitted simulator, mL, or None.
     """
 
     breaths: Breaths

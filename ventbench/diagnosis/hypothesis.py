@@ -94,8 +94,8 @@ class FittedModel:
     Attributes:
         hypothesis: the terms.
         problem: data, noise and unknowns of the fit.
-        minimum: of the problem's cost.
-        log_likelihood: of all its breaths, nats.
+        minimum: minimum of the problem's cost.
+        log_likelihood: log-likelihood of all its breaths, nats.
     """
 
     hypothesis: Hypothesis

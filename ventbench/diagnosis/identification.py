@@ -71,7 +71,7 @@ class IdentifiedModel:
     """What breaths need, with the final fit.
 
     Attributes:
-        evaluator: of the breaths.
+        evaluator: evaluator of the breaths.
         conclusion: base model, mechanisms and nonparametric term that the breaths need.
         fit: final fit of the conclusion, with intervals.
     """

@@ -37,14 +37,14 @@ class LatentInput:
     """The best input at one place.
 
     Attributes:
-        place: where it acts.
+        place: where the input acts.
         periodic: whether it has one frequency; else it is smooth.
         scale: frequency in Hz if periodic, else correlation time in s.
         size: standard deviation, cmH2O, or a share of the flow or of the gain.
-        noise: of the measurement, estimated beside the input.
-        training_log_likelihood: of all training breaths, nats.
-        held_out_log_likelihood: of each held-out breath, nats, ``(n,)``.
-        course: its expected course in each training breath, ``(n, T)``.
+        noise: model of the measurement noise, estimated beside the input.
+        training_log_likelihood: log-likelihood of all training breaths, nats.
+        held_out_log_likelihood: log-likelihood of each held-out breath, nats, ``(n,)``.
+        course: expected course in each training breath, ``(n, T)``.
     """
 
     place: str
@@ -71,9 +71,9 @@ def fit_latent_inputs(
     """Find the best input at each place; the training breaths choose its size and scale.
 
     Args:
-        evaluator: of the recording.
+        evaluator: evaluator of the recording.
         fitted: the model whose residuals inputs may explain, without patient effort.
-        places: to look at.
+        places: places to test.
     """
     problem, x = evaluator.refit_breath_parameters(fitted, evaluator.training)
     values = problem.values(x)
@@ -106,7 +106,7 @@ def exceeds_sensor_noise(evaluator: Evaluator, with_effort: FittedModel) -> bool
     """Whether patient effort explains more of the held-out breaths than slow sensor noise.
 
     Args:
-        evaluator: of the recording.
+        evaluator: evaluator of the recording.
         with_effort: a model with patient effort.
     """
     hypothesis = with_effort.hypothesis

@@ -82,7 +82,7 @@ def linearise(
     Args:
         problem: breaths and noise.
         x: unknowns in coordinates, ``(U,)``.
-        settings: of the projections.
+        settings: settings of the projections.
         clip: whitened residuals are cut off here; as the settings have it if None.
     """
     clip = settings.clip if clip is None else clip

@@ -58,8 +58,8 @@ class BreathTerm(Protocol):
         """Move each breath's own parameters to where the breath is likelier, ``(U,)``.
 
         Args:
-            problem: of the hypothesis.
-            x: its unknowns.
+            problem: problem of the hypothesis.
+            x: point in the coordinates of its unknowns.
             fitted_names: terms of the model that the unknowns come from.
             refit: fit what is tried to each breath before it is compared, as ``x`` is.
         """
@@ -73,8 +73,8 @@ class BreathTerm(Protocol):
         """Log-likelihood that the term gains in breaths that no fit has seen, ``(n,)``.
 
         Args:
-            problem: of these breaths, without the term.
-            x: its unknowns, which differ from breath to breath.
+            problem: problem of these breaths, without the term.
+            x: point in the coordinates of its unknowns, which differ from breath to breath.
             fitted: the model, fitted to other breaths.
         """
         ...
@@ -245,8 +245,8 @@ class PatientEffortTerm:
         """Integrate efforts out of the breaths of one model at several noises.
 
         Args:
-            linearisations: of the model; they share its predictions.
-            duration: of the efforts, s; the best of the grid if not given.
+            linearisations: linearisations of the model; they share its predictions.
+            duration: duration of the efforts, s; the best of the grid if not given.
         """
         best: list[Evidence] = []
         for length in self.prior.durations if duration is None else (duration,):
@@ -314,8 +314,8 @@ class PatientEffortTerm:
         """Logarithm of prior density times posterior volume around the best effort, ``(n,)``.
 
         Args:
-            curvature: by each breath's own unknowns, amplitude and onset last, with the prior's
-                precision, ``(n, k, k)``.
+            curvature: curvature by each breath's own unknowns, amplitude and onset last, with the
+                prior's precision, ``(n, k, k)``.
             amplitude: the best, cmH2O, ``(n,)``.
         """
         across, own = curvature[:, -2:, :-2], curvature[:, :-2, :-2]

@@ -52,7 +52,7 @@ class NonparametricFit:
     """A nonparametric basis term beside mechanisms.
 
     Attributes:
-        term: its name.
+        term: name of the basis term.
         full: the model with the term and the mechanisms.
         nats: held-out log-likelihood that the term gains.
     """
@@ -77,7 +77,7 @@ class SingleTermAlternative:
         """Keep what the term is compared on.
 
         Args:
-            evaluator: with the library's parameters.
+            evaluator: evaluator with the library's parameters.
             wider: gives the evaluator with those of the nonparametric terms as well.
             base: the base model, fitted with its noise.
         """
@@ -130,10 +130,10 @@ def drop_compensating_terms(
     mechanism that acts passes this test: no term related to another one explains it away.
 
     Args:
-        evaluator: with the library's parameters.
-        wide: with those of the nonparametric terms as well.
+        evaluator: evaluator with the library's parameters.
+        wide: evaluator with the parameters of the nonparametric terms as well.
         selected: the selected mechanisms.
-        tell: is told what is being done.
+        tell: called with a description of each step before it runs.
     """
     while len(selected.names) > 1:
         tell("looking for mechanisms that only compensate for others")
@@ -169,10 +169,10 @@ def _is_explained_away(
     """Whether a related nonparametric term makes a mechanism idle.
 
     Args:
-        wide: with the parameters of the nonparametric terms.
-        selected: with the mechanism.
-        reduced: without it.
-        name: of the mechanism.
+        wide: evaluator with the parameters of the nonparametric terms.
+        selected: model with the mechanism.
+        reduced: model without it.
+        name: name of the mechanism.
         nats: training log-likelihood that it gains.
     """
     settings = wide.settings.refinement
@@ -208,8 +208,8 @@ def backward_elimination(
     """Drop the mechanisms that are not needed beside a nonparametric term.
 
     Args:
-        evaluator: with the library's parameters.
-        wide: with those of the nonparametric terms as well.
+        evaluator: evaluator with the library's parameters.
+        wide: evaluator with the parameters of the nonparametric terms as well.
         selected: the selected mechanisms.
         unnamed: the term beside them.
 
@@ -257,7 +257,7 @@ def eliminate_beside_input(
     Mechanisms that explain more than the input are therefore kept in any case.
 
     Args:
-        evaluator: of the recording.
+        evaluator: evaluator of the recording.
         selected: the selected mechanisms.
         latent: the input.
         nats: held-out log-likelihood that the input gains.
@@ -346,9 +346,9 @@ def find_alternatives(
     """Replace each mechanism by every other one.
 
     Args:
-        evaluator: of the recording.
+        evaluator: evaluator of the recording.
         selected: the selected mechanisms.
-        comparisons: of the forward selection, which answer part of the question.
+        comparisons: comparisons of the forward selection, which answer part of the question.
         swap: whether a better mechanism takes the place of a selected one.
 
     Returns:

@@ -105,7 +105,7 @@ def error_region(region: ErrorRegion, noise: float = 0.0) -> str:
     """One error region as a sentence.
 
     Args:
-        region: to describe.
+        region: the range to describe.
         noise: standard deviation of the measurement, cmH2O; far smaller errors have no sign.
     """
     return _capital(f"{_error(region, noise)}.")
@@ -208,8 +208,9 @@ def quantity(estimate: Estimate, path: str = "") -> str:
     """A value with the ends of its interval, such as ``41 ms [38, 44]``.
 
     Args:
-        estimate: to be shown.
-        path: of the parameter, such as ``valve_curve.loss``; tells shares, which are given in %.
+        estimate: the estimate to show.
+        path: path of the parameter, such as ``valve_curve.loss``; tells shares, which are given in
+            %.
     """
     factor, unit = _scale(estimate, path)
     value, low, high = (factor * x for x in (estimate.value, *estimate.ci95))

@@ -27,7 +27,7 @@ class Profile:
     """Errors in the k ranges of one axis; the error is recorded minus simulated, cmH2O.
 
     Attributes:
-        axis: with its ranges.
+        axis: axis with its ranges.
         mean: mean over breaths of each breath's mean error, ``(k,)``; NaN in an empty range.
         half: half of the 95 % interval of the mean, ``(k,)``.
         breaths: number of breaths with samples in the range, ``(k,)``.
@@ -59,7 +59,8 @@ def compare_open_loop(
     Args:
         breaths: n recorded breaths of T samples.
         held_out: breaths that no fit has seen, ``(n,)``.
-        pressures: of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n, T)``.
+        pressures: pressures of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n,
+            T)``.
         noise_floor: standard deviation of the noise, cmH2O.
         settings: length of the beginning of inspiration.
     """
@@ -132,10 +133,10 @@ def locate(
         breaths: n breaths of T samples.
         refit: pressure of the refitted simulator, cmH2O, ``(n, T)``.
         noise_sd: standard deviation of the measurement, cmH2O; NaN to take it from the errors.
-        flow: of the refitted simulator, mL/s, ``(n, T)``, or None.
-        volume: of the refitted simulator, mL, ``(n, T)``, or None.
+        flow: flow of the refitted simulator, mL/s, ``(n, T)``, or None.
+        volume: volume of the refitted simulator, mL, ``(n, T)``, or None.
         settings: ranges and levels.
-        seed: of the random sign flips.
+        seed: seed of the random sign flips.
 
     Returns:
         Regions; first those with a p-value of at most ``settings.certain``, each group by its share
@@ -199,8 +200,8 @@ def profiles(
     Args:
         breaths: n breaths of T samples.
         refit: pressure that assigns samples to ranges, cmH2O, ``(n, T)``.
-        flow: as in :func:`locate`.
-        volume: as in :func:`locate`.
+        flow: see :func:`locate`.
+        volume: see :func:`locate`.
         simulated: pressure whose errors are wanted, cmH2O, ``(n, T)``; ``refit`` if not given.
     """
     error, usable = errors(breaths, refit if simulated is None else simulated)
@@ -235,7 +236,7 @@ def statistic(
     a range that few breaths have cannot outdo all others by chance.
 
     Args:
-        values: of each breath and range, NaN where there is none, ``(n, k)``.
+        values: values of each breath and range, NaN where there is none, ``(n, k)``.
         weight: factor on each range's statistic, ``(k,)``.
         min_breaths: fewest breaths that a range must have.
 
@@ -257,9 +258,9 @@ def p_values(
     """Probability that chance alone gives any range as large a statistic, ``(k,)``.
 
     Args:
-        values: of each breath and range, NaN where there is none, ``(n, k)``.
+        values: values of each breath and range, NaN where there is none, ``(n, k)``.
         two_sided: whether large negative statistics count too.
-        seed: of the sign flips.
+        seed: seed of the sign flips.
         weight: factor on each range's observed statistic, ``(k,)``; not applied to the flips.
         settings: number of flips, and fewest breaths of a range.
     """

@@ -22,8 +22,8 @@ class Axis:
     """k neighbouring ranges of one quantity, and the range in which each sample lies.
 
     Attributes:
-        name: of the quantity, such as ``time since inspiration``.
-        unit: of ``edges``.
+        name: name of the quantity, such as ``time since inspiration``.
+        unit: unit of ``edges``.
         edges: ends of the ranges, ``(k + 1,)``.
         bins: index of the range of each sample, -1 for none, ``(n, T)``.
         merge: whether neighbouring ranges may be merged.

@@ -110,7 +110,7 @@ class Diagnosis(Findings):
         ``--plant`` takes; it is left out if the simulator has no plants.
 
         Args:
-            folder: where to write; created if missing.
+            folder: folder to write to; created if missing.
 
         Returns:
             The paths of the files.

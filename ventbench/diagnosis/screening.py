@@ -28,7 +28,7 @@ class Candidate:
     """A term that may be missing.
 
     Attributes:
-        name: of the term.
+        name: name of the term.
         hypothesis: what it adds.
         start: values to start a fit from, by path.
         nats: log-likelihood that it is expected to gain.

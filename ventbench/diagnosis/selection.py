@@ -43,7 +43,7 @@ class RankedModel:
     """A hypothesis in a comparison, by its last term.
 
     Attributes:
-        name: of the term.
+        name: name of the term.
         fitted: the hypothesis with the term.
         criterion: BIC at the comparison's noise.
     """
@@ -77,10 +77,11 @@ def forward_selection(
     """Add terms while held-out breaths ask for them, and drop terms that become redundant.
 
     Args:
-        evaluator: of the recording.
+        evaluator: evaluator of the recording.
         start: the model that terms are added to.
-        tell: is told what is being done.
-        replacement: is asked for a simpler model once there are several terms, and at the end.
+        tell: called with a description of each step before it runs.
+        replacement: returns, if there is one, a simpler model once there are several terms, and at
+            the end.
 
     Returns:
         The selected model and all comparisons; no comparisons if the model is a replacement.
@@ -156,7 +157,7 @@ def passes_heldout_test(
 
     Args:
         gains: log-likelihood that the term gains in each held-out breath, nats, ``(n,)``.
-        settings: of the test.
+        settings: settings of the test.
         threshold: nats that the sum must exceed; as in ``settings`` if None.
     """
     threshold = settings.threshold if threshold is None else threshold
@@ -176,7 +177,7 @@ def is_needed(evaluator: Evaluator, with_term: FittedModel, without_term: Fitted
     test is repeated by cross-validation.
 
     Args:
-        evaluator: of the recording.
+        evaluator: evaluator of the recording.
         with_term: a hypothesis.
         without_term: the hypothesis without the term, at the same noise.
     """
@@ -204,10 +205,10 @@ def is_negligible(
     four strong effects.
 
     Args:
-        evaluator: of the recording.
+        evaluator: evaluator of the recording.
         with_term: a hypothesis.
         without_term: the hypothesis without the term, at the same noise.
-        name: of the term.
+        name: name of the term.
     """
     settings = evaluator.settings.held_out_test
     about = mechanism(name).description.strength
@@ -229,7 +230,7 @@ def compare_candidates(
     """Fit the candidates and rank them by BIC at one noise; None if none is promising.
 
     Args:
-        evaluator: of the recording.
+        evaluator: evaluator of the recording.
         current: the model that candidates are added to.
         candidates: the most promising first.
         warm_start: the model that fits start from; ``current`` if None.

@@ -227,8 +227,8 @@ class LatentInputSettings:
     """Inputs that vary in time and that no command explains: Gaussian processes.
 
     Attributes:
-        frequencies: of periodic inputs, Hz: heart beats to the pulsation of a supply.
-        correlation_times: of smooth inputs, s.
+        frequencies: frequencies of periodic inputs, Hz: heart beats to the pulsation of a supply.
+        correlation_times: correlation times of smooth inputs, s.
         sizes: standard deviations, cmH2O.
         relative_size: factor from ``sizes`` to those of a flow or of the valve's gain, which are
             shares, 1/cmH2O.
@@ -274,7 +274,7 @@ class SimulatorSettings:
         separation: times the joint half-width of two 95 % intervals by which strengths differ; each
             mechanism of many simulators is compared, and false alarms are to be rare.
         max_error_ratio: times the error of the refitted simulator that the corrected one may err.
-        noise_seed: of the noise that is added to the simulator's response.
+        noise_seed: seed of the noise that is added to the simulator's response.
     """
 
     residual_model_share: float = 0.9
@@ -327,7 +327,7 @@ class ExperimentSettings:
     """Breaths that are proposed to tell alternatives apart.
 
     Attributes:
-        breaths: that are proposed.
+        breaths: number of proposed breaths.
         variants: candidate breaths of each kind.
         pressure_limits: cmH2O, within which every alternative must predict a proposed breath; the
             noise of a starting pressure may go a little below zero.

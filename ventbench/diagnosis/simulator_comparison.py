@@ -86,8 +86,8 @@ def with_sensor_noise(
     Args:
         data: n recorded breaths.
         response: pressures of the simulator, cmH2O, ``(n, T)``.
-        noise: of the recording.
-        seed: of the noise.
+        noise: model of the recording's noise.
+        seed: seed of the noise.
     """
     rng = np.random.default_rng(seed)
     sigma, ar = noise.sigma[0], noise.ar[0]
@@ -107,7 +107,7 @@ def refit_base_parameters(
     Args:
         simulator_model: identified from the simulator's response.
         data: the breaths.
-        noise: of the measurement; that of the model if not given.
+        noise: model of the measurement noise; that of the model if not given.
     """
     own, evaluator = simulator_model.conclusion.full, simulator_model.evaluator
     noise = noise or simulator_model.conclusion.noise

@@ -66,8 +66,8 @@ class Term:
     """An effect that a lung needs beyond R and C.
 
     Attributes:
-        name: of the effect.
-        parameters: by short name.
+        name: name of the effect.
+        parameters: estimated parameters by short name.
         nats: log-likelihood ratio on held-out breaths.
         effect: root mean square of what the term alone explains, cmH2O.
         alternatives: names of effects that would explain nearly as much.
@@ -85,7 +85,7 @@ class Mechanics:
     """Mechanics of a lung.
 
     Attributes:
-        label: of the recording.
+        label: label of the lung in the recording.
         R: inspiratory resistance at small flow, cmH2O/(L/s).
         C: compliance over the tidal volume, mL/cmH2O.
         offset: pressure at the start of a breath without the effect of flow, cmH2O.
@@ -223,9 +223,9 @@ class LungFit:
 
     Attributes:
         fitted: the regression.
-        covariance: of its coefficients, ``(k, k)``.
+        covariance: covariance of its coefficients, ``(k, k)``.
         table: cross products of its breaths.
-        segments: of the breaths.
+        segments: segments of the breaths.
         blur: uncertainty of the time over which the flow is integrated, s.
     """
 

@@ -73,9 +73,9 @@ def fits(resistance: Resistance, compliance: Estimate, setting: Lung, scale: flo
     """Whether a setting is within tolerance of the intervals of R and C.
 
     Args:
-        resistance: of the lung, by flow.
-        compliance: of the lung, mL/cmH2O.
-        setting: to compare with.
+        resistance: resistance of the lung as a function of flow.
+        compliance: compliance of the lung, mL/cmH2O.
+        setting: lung setting to compare with.
         scale: common factor by which R and 1/C may be wrong.
     """
     low, high = resistance(REFERENCE_FLOW).ci95
@@ -108,8 +108,8 @@ def match_label(
 
     Args:
         label: setting that the recording states.
-        resistance: of the lung, by flow.
-        compliance: of the lung, mL/cmH2O.
+        resistance: resistance of the lung as a function of flow.
+        compliance: compliance of the lung, mL/cmH2O.
         source: signals that R and C follow from, in words.
         scale: common factor by which R and 1/C may be wrong.
     """

@@ -33,7 +33,7 @@ class RegressionColumn:
 
     Attributes:
         term: name of the effect.
-        values: of the column in a segment, ``(n,)``.
+        values: values of the column in a segment, ``(n,)``.
         time: relaxation time, s, or None.
     """
 
@@ -123,7 +123,7 @@ class RegressionFit:
     """A fit of k columns.
 
     Attributes:
-        columns: their indices.
+        columns: indices of the columns.
         coefficients: ``(k,)``.
         sigma: standard deviation of the innovations of the noise, cmH2O.
         grid: index of the autocorrelation in :data:`GRID`.
@@ -141,7 +141,7 @@ def cross_products(
     """Compute the cross products of the breaths that have segments.
 
     Args:
-        segments: of the breaths.
+        segments: segments of the breaths.
         columns: indices of the columns; all if None.
     """
     chosen = COLUMNS if columns is None else [COLUMNS[c] for c in columns]
@@ -167,7 +167,7 @@ def fit(table: CrossProducts, which: NDArray[np.bool_], columns: Sequence[int]) 
     """Fit columns to some of the breaths by restricted maximum likelihood.
 
     Args:
-        table: of the breaths.
+        table: table of the breaths.
         which: breaths to fit, bool ``(b,)``.
         columns: indices of the columns.
     """

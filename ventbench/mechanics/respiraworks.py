@@ -23,7 +23,7 @@ class SurveyedRun:
     """A run and the mechanics of its lung.
 
     Attributes:
-        run: as recorded.
+        run: the run as recorded.
         mechanics: None if the run has neither flow nor volume.
     """
 

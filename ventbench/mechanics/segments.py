@@ -35,9 +35,9 @@ class Segment:
         breath: index of the breath.
         first: whether the segment begins where the breath does.
         begins: True at the first sample after a gap, bool ``(n,)``.
-        time: from the start of the breath, s, ``(n,)``.
+        time: time from the start of the breath, s, ``(n,)``.
         pressure: cmH2O, ``(n,)``.
-        volume: from the start of the segment, L, ``(n,)``.
+        volume: volume from the start of the segment, L, ``(n,)``.
         flow: L/s, ``(n,)``.
         slope: derivative of the flow, L/s2, ``(n,)``.
         dose: integral of the pressure from the start of the segment, cmH2O s, ``(n,)``.

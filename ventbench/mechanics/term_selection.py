@@ -56,7 +56,7 @@ class SelectedTerm:
     """A term of the model.
 
     Attributes:
-        name: of the effect.
+        name: name of the effect.
         column: index of its column.
         nats: log-likelihood ratio on held-out breaths.
         alternatives: other terms that would have gained nearly as much.

@@ -20,10 +20,10 @@ class Summary:
     """A sample in four numbers; NaN where they do not exist.
 
     Attributes:
-        mean: of the values; NaN if there are none.
-        median: likewise.
+        mean: mean of the values; NaN if there are none.
+        median: median of the values; NaN if there are none.
         ci95: 95 % interval of the mean; ``(NaN, NaN)`` below two values.
-        count: how many values there were; missing ones (NaN) are not counted.
+        count: number of values; missing ones (NaN) are not counted.
     """
 
     mean: float
@@ -42,9 +42,9 @@ def resampled_means(
 
     Args:
         values: any unit, shape ``(n,)``, n >= 1.
-        resamples: how many.
-        seed: of the bit generator; the raw stream of PCG64 never changes between numpy versions,
-            while the integers that a ``Generator`` makes of it may.
+        resamples: number of resamples.
+        seed: seed of the bit generator; the raw stream of PCG64 never changes between numpy
+            versions, while the integers that a ``Generator`` makes of it may.
 
     Returns:
         Shape ``(resamples,)``.
@@ -74,8 +74,8 @@ def summary(values: ArrayLike, *, resamples: int = RESAMPLES, seed: int = SEED) 
 
     Args:
         values: any unit, any shape; NaN is a missing value, infinity is one like others.
-        resamples: as in :func:`resampled_means`.
-        seed: likewise.
+        resamples: see :func:`resampled_means`.
+        seed: see :func:`resampled_means`.
     """
     values = np.ravel(np.asarray(values, float))
     values = values[~np.isnan(values)]

@@ -41,7 +41,7 @@ def mean_command(u_in: ArrayLike) -> NDArray[np.float64]:
     """Mean of the applied command over an inspiration, %.
 
     Args:
-        u_in: as applied, %, shape ``(..., T)``.
+        u_in: commands as applied, %, shape ``(..., T)``.
 
     Returns:
         Shape ``(...)``; NaN if a command is.
@@ -55,7 +55,7 @@ def mean_change(u_in: ArrayLike) -> NDArray[np.float64]:
     The valve is closed before the first command, so that ``u_(-1) = 0``.
 
     Args:
-        u_in: as applied, %, shape ``(..., T)``.
+        u_in: commands as applied, %, shape ``(..., T)``.
 
     Returns:
         Shape ``(...)``; NaN if a command is.

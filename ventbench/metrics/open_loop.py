@@ -57,9 +57,9 @@ def mae(
     """Mean absolute error per step of each breath: :func:`distance` over the counted steps.
 
     Args:
-        measured: as of :func:`distance`.
-        simulated: as of :func:`distance`.
-        mask: as of :func:`distance`.
+        measured: see :func:`distance`.
+        simulated: see :func:`distance`.
+        mask: see :func:`distance`.
 
     Returns:
         Mean over counted steps, cmH2O, shape ``(...)``; NaN where none counts.
@@ -75,9 +75,9 @@ def by_horizon(
     """Mean absolute error at each step after the start, over breaths (the paper's figure).
 
     Args:
-        measured: as of :func:`distance`, shape ``(n, T + 1)``.
-        simulated: as of :func:`distance`, shape ``(n, T + 1)``.
-        mask: as of :func:`distance`.
+        measured: see :func:`distance`, shape ``(n, T + 1)``.
+        simulated: see :func:`distance`, shape ``(n, T + 1)``.
+        mask: see :func:`distance`.
 
     Returns:
         Mean over the breaths that count a step, cmH2O, shape ``(T,)``; NaN where none does.

@@ -22,7 +22,7 @@ class Catalogue:
 
     Attributes:
         library: mechanisms by name, in alphabetical order.
-        basis_terms: of nonparametric components, by name, in alphabetical order.
+        basis_terms: basis terms of nonparametric components, by name, in alphabetical order.
     """
 
     library: dict[str, Mechanism]

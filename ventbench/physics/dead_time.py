@@ -37,7 +37,7 @@ def windows(
         past: durations of the samples before, the latest first, s, ``(..., P)``.
         late: dead times, s, the most important first; numbers where no mechanism has one.
         held: the command that each of them delays, the latest first, ``(..., P + 1)``.
-        count: of substeps, at least 3.
+        count: number of substeps, at least 3.
         skip_idle: skip the computation of dead times that are zero in all elements.
 
     Returns:
@@ -70,7 +70,7 @@ def substep_lengths(dt: Array, past: Array, late: tuple[Array, ...], count: int)
         dt: length of the sample, s, ``(...)``.
         past: durations of the samples before, the latest first, s, ``(..., P)``.
         late: dead times, s, the most important first.
-        count: of substeps, at least 3.
+        count: number of substeps, at least 3.
 
     Returns:
         Lengths, s, ``(..., count)``.

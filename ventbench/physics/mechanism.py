@@ -36,10 +36,10 @@ class Description:
     Attributes:
         name: public name; the module of a library mechanism has the same name.
         title: the mechanism in a few words.
-        site: where in the physics it acts.
-        equation: its equation in plain text.
-        parameters: in the order of reports; the first one is the strength.
-        source: where the equation and the ranges come from.
+        site: part of the physics in which the mechanism acts.
+        equation: equation of the mechanism in plain text.
+        parameters: parameters in the order of reports; the first one is the strength.
+        source: publications behind the equation and the ranges.
         signature: what it changes in a recording.
         confusable: names of mechanisms, or of other effects, with a similar signature.
         detectable: smallest strength that about 20 breaths of one lung reveal, in the unit of the
@@ -158,7 +158,8 @@ def apply_if_active(
     Only the leaves that the change replaces pass through the branch; XLA would copy the others.
 
     Args:
-        active: from :func:`is_active`; None computes the change unconditionally.
+        active: whether the mechanism is active, from :func:`is_active`; None computes the change
+            unconditionally.
         change: keeps the shapes of the leaves, and returns a leaf that it does not change itself.
         before: any pytree of arrays.
     """

@@ -109,7 +109,7 @@ class Physics:
         """Hold one command, and return flow and volume besides pressure.
 
         Args:
-            state: from ``init``, ``step`` or ``observe``.
+            state: state from ``init``, ``step`` or ``observe``.
             u_in: inspiratory valve, 0..100 %.
             u_out: expiratory valve, 0 closed, 1 open.
             dt: time for which the command is held, s.

@@ -91,9 +91,9 @@ class PneumaticNetwork:
         """Pressure at the airway, cmH2O, and flow into the lung, L/s, after an implicit step.
 
         Args:
-            pressure: before the step, cmH2O.
-            flow: before the step, L/s.
-            length: of the step, s.
+            pressure: pressure before the step, cmH2O.
+            flow: flow before the step, L/s.
+            length: length of the step, s.
         """
         shut = self._balance(pressure, flow, length, jnp.zeros_like(self.outlet))
         vented = self._balance(pressure, flow, length, self.outlet)

@@ -23,13 +23,13 @@ class Parameter:
 
     Attributes:
         name: short, such as ``delay``.
-        unit: of its values, ``1`` if there is none.
+        unit: unit of its values, ``1`` if there is none.
         meaning: what it is, in words.
-        low: plausible and permitted from here,
-        high: to here.
+        low: lowest plausible and permitted value.
+        high: highest plausible and permitted value.
         neutral: value at which its mechanism does nothing; of a shape parameter, the default.
         mild: a small effect that occurs, and where a fit starts.
-        strong: a large one.
+        strong: a large effect that occurs.
         scale: ``"log"`` for what is positive and known to a factor; else ``"linear"``.
         scope: ``"shared"`` by all breaths, or one for each ``"breath"``.
         shape: True for what only shapes the effect (an exponent, a recovery time): it stays at
@@ -40,8 +40,8 @@ class Parameter:
             steeply where an edge passes one, so that its interval is a profile's.
         spread: standard deviation before any data, in coordinates, around ``neutral``; given for
             what must stay there where no data bear on it, be it a strength.
-        grid: of a parameter other than the strength: values at which screening tries the mechanism,
-            as the shape of its effect differs much between them. The neutral value alone if empty.
+        grid: values at which screening tries the mechanism, for a parameter other than the strength
+            that changes the shape of the effect much; only the neutral value if empty.
         discrete: True if the response has no useful derivative with respect to it, such as a choice
             between two rules. A fit holds it at the grid value that screening chose.
         uncertain: True for a shape parameter whose default is a guess. Final estimates free it, so

@@ -28,9 +28,9 @@ class ContinuousState:
     """Continuous states of a model; every array has shape ``(...)``.
 
     Attributes:
-        volume: of the lung, L, zero where a linear lung has no recoil.
+        volume: volume of the lung, L, zero where a linear lung has no recoil.
         flow: into the lung, L/s.
-        pressure: at the airway, cmH2O.
+        pressure: pressure at the airway, cmH2O.
         reading: pressure at the sensor's output, cmH2O.
         internal: states of mechanisms by name; ``(K, ...)`` for one with several states.
     """

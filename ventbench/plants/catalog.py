@@ -76,7 +76,7 @@ class PressureFunction(Protocol):
             dt: time from each sample to the next, s, shape ``(T,)``; the last is not used.
             R: labelled resistance, cmH2O/(L/s).
             C: labelled compliance, mL/cmH2O.
-            initial_pressure: at the first sample, cmH2O.
+            initial_pressure: pressure at the first sample, cmH2O.
 
         Returns:
             Pressure at each sample, cmH2O, shape ``(T,)``.
@@ -100,8 +100,8 @@ class Simulators:
             the caller or of a file, and else it is the name, such as ``"frozen"``.
         name: what messages and reports call them.
         about: JSON values that results keep of them: version, file, hashes.
-        lungs: for which :attr:`stacked` has plants, in its order; empty where there is none.
-        sha256: of the file or manifest they come from; None if there is none.
+        lungs: lungs for which :attr:`stacked` has plants, in its order; empty where there is none.
+        sha256: SHA-256 of the file or manifest that they come from; None if there is none.
         official: the official set if they are it, else None.
     """
 
@@ -213,7 +213,7 @@ class Simulators:
 
         Args:
             breaths: n breaths of T samples.
-            cross_fitted: by the plants of :meth:`cross_fitted`.
+            cross_fitted: True for the answers of the plants of :meth:`cross_fitted`.
 
         Returns:
             cmH2O, shape ``(n, T)``; NaN for a breath whose first pressure is blank.
@@ -234,11 +234,11 @@ class Simulators:
         """Answer to any sequence of commands.
 
         Args:
-            lung_id: such as ``"R20C50"``.
+            lung_id: id of the lung, such as ``"R20C50"``.
             u_in: inspiratory valve, %, shape ``(T,)``.
             u_out: expiratory valve, 0/1, shape ``(T,)``.
             dt: time from each sample to the next, s, shape ``(T,)``.
-            initial_pressure: at the first sample, where the lung is at rest, cmH2O.
+            initial_pressure: pressure at the first sample, where the lung is at rest, cmH2O.
 
         Returns:
             Pressure at each sample, cmH2O, shape ``(T,)``.

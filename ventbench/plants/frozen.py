@@ -63,9 +63,9 @@ class Frozen:
     Plants that it gives have numpy leaves: they take the precision in force where they are used.
 
     Attributes:
-        folder: where they were read.
-        manifest: as in the file: provenance, split, sessions, errors.
-        manifest_sha256: of that file.
+        folder: folder that the files were read from.
+        manifest: content of the manifest: provenance, split, sessions, errors.
+        manifest_sha256: SHA-256 of the manifest.
         sessions: what a breath's clock is compared with.
         members: float64 leaves ``(members, sessions, ...)``.
         seen: the breaths of the training.
@@ -214,7 +214,7 @@ def load(version: int = 1, path: Path | None = None) -> Frozen:
     """Read the official simulators and check every file against the manifest.
 
     Args:
-        version: of the simulators; 1 is the only one so far.
+        version: version of the simulators; 1 is the only one so far.
         path: another folder, such as one that ``ventbench train simulator`` wrote.
 
     Raises:

@@ -47,9 +47,9 @@ class HybridState:
         sensor: pressure that the sensor shows, cmH2O.
         flow: flow out of the inspiratory valve, L/s.
         commanded: flows that the last commands ask for, the latest first, L/s, ``(..., 7)``.
-        opened: expiratory valve during the last samples, likewise, 0/1.
-        past: durations of the last samples, likewise, s, ``(..., 6)``.
-        plays: where each play stands, %, one array a play.
+        opened: expiratory valve during the last samples, the latest first, 0/1, ``(..., 7)``.
+        past: durations of the last samples, the latest first, s, ``(..., 6)``.
+        plays: position of each play, %, one array a play.
         u_in: last command, %.
         peep: end-expiratory pressure, cmH2O.
     """
@@ -76,18 +76,18 @@ class Hybrid:
         E: elastance at low volume, cmH2O/L.
         stiffening: change of relative slope of the elastic curve at each knot, ``(..., 5)``.
         offset: elastic recoil minus airway pressure at rest, cmH2O.
-        slopes: of the valve's curve between knots, L/s per %, ``(..., 13)``.
+        slopes: slopes of the valve's curve between knots, L/s per %, ``(..., 13)``.
         direction: weight of each play in the effective command, ``(..., 3)``.
         valve_delay: dead time of the inspiratory valve, s.
-        valve_lag: its time constant, s.
-        circuit_compliance: of tubing and bellows' dead space, L/cmH2O.
+        valve_lag: time constant of the inspiratory valve, s.
+        circuit_compliance: compliance of tubing and bellows' dead space, L/cmH2O.
         sensor_lag: time constant of the sensor, s.
-        rising: added to the reading while the command rises, cmH2O.
-        falling: subtracted while it falls, cmH2O.
-        conductance: of the open expiratory valve, L/s per cmH2O.
-        closing_conductance: of the valve while it closes, likewise.
-        opening_delay: of the expiratory valve, s.
-        closing_delay: likewise.
+        rising: shift that is added to the reading while the command rises, cmH2O.
+        falling: shift that is subtracted from the reading while the command falls, cmH2O.
+        conductance: conductance of the open expiratory valve, L/s per cmH2O.
+        closing_conductance: conductance of the expiratory valve while it closes, L/s per cmH2O.
+        opening_delay: delay of the expiratory valve when it opens, s.
+        closing_delay: delay of the expiratory valve when it closes, s.
         rest: command that held the flow before the first sample, %.
     """
 

@@ -27,10 +27,10 @@ class Architecture:
     Attributes:
         pressures: length of the pressure window, H_p.
         controls: length of the control window, H_c; the command now is its last entry.
-        width: of each hidden layer.
+        width: number of units of each hidden layer.
         depth: number of matrices, the output's included (the authors' count).
         boundaries: N_B, one-hidden-layer networks for the first steps of an inspiration.
-        boundary_width: their hidden width (authors' code: 100).
+        boundary_width: hidden width of the boundary networks (authors' code: 100).
         activation: ``"tanh"`` or ``"selu"``, of the general network; boundary ones are tanh.
     """
 
@@ -160,15 +160,15 @@ class Learned:
     Attributes:
         general: network after the boundary steps.
         boundary: networks of the first steps; None if there are none.
-        pressure_mean: of the windows' normalisation, cmH2O.
-        pressure_scale: likewise.
-        control_mean: likewise, %.
-        control_scale: likewise, %.
+        pressure_mean: mean by which pressures of the windows are normalised, cmH2O.
+        pressure_scale: scale by which pressures of the windows are normalised, cmH2O.
+        control_mean: mean by which commands of the windows are normalised, %.
+        control_scale: scale by which commands of the windows are normalised, %.
         jump_scale: cmH2O for a unit jump output at a command step of ``control_scale``.
         rate_scale: cmH2O in ``REFERENCE_DT`` for a unit rate output.
         tau: time constant of expiration, s.
-        valve_scale: factor on commands, see :meth:`vary`; shape ``(...)`` or ``()``.
-        time_scale: factor on time constants, see :meth:`vary`; likewise.
+        valve_scale: factor on commands, see :meth:`vary`, shape ``(...)`` or ``()``.
+        time_scale: factor on time constants, see :meth:`vary`, shape ``(...)`` or ``()``.
         windows: ``(H_p, H_c)``.
     """
 
@@ -269,8 +269,8 @@ def learned(
 
     Args:
         key: a JAX key that is used for nothing else.
-        architecture: its shape.
-        normalisation: its constants; the recordings' typical ones if not given.
+        architecture: sizes of the networks.
+        normalisation: constants of the normalisation; the recordings' typical ones if not given.
 
     Returns:
         The plant with float32 leaves.

@@ -47,7 +47,7 @@ def mlp(key: Array, sizes: tuple[int, ...], activation: str, last_scale: float =
 
     Args:
         key: a key that is used for nothing else.
-        sizes: of the input, the hidden layers and the output; at least two numbers.
+        sizes: sizes of the input, the hidden layers and the output; at least two numbers.
         activation: a name in :data:`ACTIVATIONS`.
         last_scale: factor on the weights of the last layer.
 

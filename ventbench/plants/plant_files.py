@@ -35,7 +35,7 @@ def save_plants(
 
     Args:
         path: target, ``.json`` or ``.npz``.
-        plants: by the id of their lung, such as ``R20C50``.
+        plants: plants by the id of their lung, such as ``R20C50``.
         about: JSON values that say where they come from.
 
     Raises:
@@ -59,7 +59,7 @@ def load_plants(path: Path, as_array: Callable[[Any], Any] = np.asarray) -> dict
     """Read what :func:`save_plants` wrote.
 
     Args:
-        path: of the file, ``.json`` or ``.npz``.
+        path: path of the file, ``.json`` or ``.npz``.
         as_array: makes the leaves; those of numpy take the precision in force where they are used.
 
     Returns:
@@ -106,7 +106,7 @@ def load_plant(path: Path, as_array: Callable[[Any], Any] = jnp.asarray) -> Any:
     """Read what :func:`save_plant` wrote.
 
     Args:
-        path: of the file.
+        path: path of the file.
         as_array: makes the leaves; the default gives them the precision that is in force,
             ``numpy.asarray`` that of the file.
 

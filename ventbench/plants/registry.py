@@ -21,8 +21,8 @@ class PlantFamily:
     """One kind of plant.
 
     Attributes:
-        plant: its class; files name it by the class's name, so that a class that is renamed needs
-            a line in :data:`RENAMED`.
+        plant: class of the plants; files name it by the class's name, so that a class that is
+            renamed needs a line in :data:`RENAMED`.
         for_lung: makes the plant of a lung at its label, if labels are all it needs. The family
             then has a name for ``--plant`` and goes through the contract tests of physics plants.
         parts: further classes in its files.

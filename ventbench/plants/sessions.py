@@ -70,7 +70,7 @@ class Session:
         interval_ms: median sampling interval, ms.
         spiky: whether the rig is a spiky one.
         inspiratory: most frequent number of inspiratory samples.
-        breaths: how many breaths defined it.
+        breaths: number of breaths that defined it.
     """
 
     lung: str

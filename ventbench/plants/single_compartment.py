@@ -30,7 +30,7 @@ class SingleCompartment:
 
     Attributes:
         R: airway resistance, cmH2O/(L/s), shape ``()`` or ``(...)``.
-        C: compliance, mL/cmH2O, likewise.
+        C: compliance, mL/cmH2O, shape ``()`` or ``(...)``.
         gain: flow of the inspiratory valve, mL/s per %.
         R_ex: resistance of the expiratory path, cmH2O/(L/s).
     """
@@ -73,7 +73,7 @@ def single_compartment(
     """Build a :class:`SingleCompartment` lung.
 
     Args:
-        lung: its label's R, cmH2O/(L/s), and C, mL/cmH2O.
+        lung: label of the lung: R, cmH2O/(L/s), and C, mL/cmH2O.
         gain: flow of the inspiratory valve, mL/s per %.
         R_ex: resistance of the expiratory path, cmH2O/(L/s).
 

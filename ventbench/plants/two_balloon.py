@@ -51,7 +51,7 @@ class TwoBalloon:
 
     Attributes:
         R: airway resistance, cmH2O/(L/s), shape ``()`` or ``(...)``.
-        C: compliance at rest volume, mL/cmH2O, likewise.
+        C: compliance at rest volume, mL/cmH2O, shape ``()`` or ``(...)``.
         gain: flow of the inspiratory valve at zero pressure, mL/s per %.
         R_ex: resistance of the expiratory path, cmH2O/(L/s).
         K: pressure scale of the balloon, cmH2O.
@@ -124,7 +124,7 @@ def two_balloon(
     """Build a :class:`TwoBalloon` lung.
 
     Args:
-        lung: its label's R, cmH2O/(L/s), and C, mL/cmH2O.
+        lung: label of the lung: R, cmH2O/(L/s), and C, mL/cmH2O.
         gain: flow of the inspiratory valve at zero pressure, mL/s per %.
         R_ex: resistance of the expiratory path, cmH2O/(L/s).
         K: pressure scale of the balloon, cmH2O.

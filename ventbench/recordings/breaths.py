@@ -34,7 +34,7 @@ class Breaths:
         flow: mL/s, NaN where blank, float64, (n, T), or None.
         volume: mL, NaN where blank, float64, (n, T), or None.
         source: path of the file, or None.
-        sha256: of the file, hex, or None if the breaths are not those of a whole file.
+        sha256: SHA-256 of the file, hex, or None if the breaths are not those of a whole file.
         notes: what a reader of the file should know, a sentence each.
     """
 
@@ -247,7 +247,7 @@ def join(parts: Sequence[Breaths]) -> Breaths:
     """Join recordings; flow and volume are left out.
 
     Args:
-        parts: at least one; breaths of equally many samples.
+        parts: one recording or more; breaths of equally many samples.
 
     Returns:
         All breaths, without ``source`` and ``sha256``. Ids may occur twice.

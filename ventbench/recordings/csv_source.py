@@ -30,7 +30,7 @@ class CsvSource:
         kind: `csv` or `csv.gz`.
         names: column names of the header.
         warnings: about columns that are ignored.
-        sha256: of the file on disk; None until all chunks are read.
+        sha256: SHA-256 of the file on disk; None until all chunks are read.
         block: bytes of text that are read at a time.
     """
 

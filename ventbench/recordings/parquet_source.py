@@ -28,7 +28,7 @@ class ParquetSource:
         kind: `parquet`.
         names: column names.
         warnings: about columns that are ignored.
-        sha256: of the file; None until all chunks are read.
+        sha256: SHA-256 of the file; None until all chunks are read.
         batch: rows that are read at a time.
     """
 

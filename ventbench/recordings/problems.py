@@ -26,8 +26,8 @@ class RecordingProblem:
         file: the path as the caller wrote it.
         what: the problem, a phrase without a full stop.
         advice: what to do about it, a sentence.
-        line: in CSV the line, 1 for the header; in Parquet the row, 1 for the first. None for the
-            whole file.
+        line: line of a CSV file, 1 for the header; in Parquet the row, 1 for the first. None for
+            the whole file.
         column: name of the column, or None.
         value: the cell as it is written in the file (CSV) or printed (Parquet), or None.
         place: `line` or `row`, the unit of `line`.

@@ -73,8 +73,8 @@ def check(path: FilePath, *, clip: bool = False, pad: bool = False) -> Recording
 
     Args:
         path: the file.
-        clip: as in `load`.
-        pad: as in `load`.
+        clip: see `load`.
+        pad: see `load`.
 
     Returns:
         What the file holds and what is wrong with it; also for a file that cannot be read.
@@ -112,8 +112,8 @@ def iter_breaths(
     Args:
         path: the file.
         batch: breaths in each result; the last may have fewer.
-        clip: as in `load`.
-        pad: as in `load`, but only up to the longest breath of each batch.
+        clip: see `load`.
+        pad: see `load`, but only up to the longest breath of each batch.
 
     Yields:
         Breaths in file order, without `sha256`.

@@ -41,7 +41,7 @@ class RespiraWorksRun:
         C: compliance that the operators noted, mL/cmH2O.
         breath: number of each sample's breath, int64, (T,).
         time: s, float64, (T,).
-        signals: by the names of `SIGNALS`, float64, NaN where not logged, each (T,).
+        signals: signals by the names of `SIGNALS`, float64, NaN where not logged, each (T,).
     """
 
     name: str

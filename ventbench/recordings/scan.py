@@ -89,7 +89,7 @@ class Block:
         lengths: samples, (k,).
         n_inspiratory: leading samples with u_out = 0, (k,).
         interval: mean sampling interval, s, NaN if times are blank, (k,).
-        times: of the samples, and what was interpolated or shifted.
+        times: times of the samples, and what was interpolated or shifted.
         samples: u_in %, u_out 0/1 (int8), pressure cmH2O, and flow mL/s and volume mL if the file
             has them, each (m,).
     """
@@ -159,7 +159,7 @@ def join_blocks(blocks: Sequence[Block]) -> Block:
     """Join blocks.
 
     Args:
-        blocks: at least one.
+        blocks: one block or more.
 
     Returns:
         One block with all breaths in order.

@@ -27,9 +27,9 @@ class Split:
     Attributes:
         train_ids: breath ids for training, increasing.
         held_out_ids: breath ids held out, increasing; none of them is in `train_ids`.
-        seed: of the split.
+        seed: seed of the split.
         fraction: share that was requested to be held out.
-        sha256: of the file of the breaths, hex, or None.
+        sha256: SHA-256 of the file of the breaths, hex, or None.
     """
 
     train_ids: tuple[int, ...]
@@ -56,7 +56,7 @@ class Split:
         """Split breaths.
 
         Args:
-            breaths: of the file that was split, or a selection of them.
+            breaths: breaths of the file that was split, or a selection of them.
 
         Returns:
             Training and held-out breaths, each in the order of `breaths`.

@@ -108,7 +108,7 @@ def known_times(time: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> Kn
     after the last known one are extrapolated at the breath's mean interval.
 
     Args:
-        time: as in the file, s, NaN where blank, (m,).
+        time: times as in the file, s, NaN where blank, (m,).
         starts: first row of each breath, (k,).
         lengths: rows of each breath, (k,).
 

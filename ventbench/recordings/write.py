@@ -29,7 +29,7 @@ def write(breaths: Breaths, path: str | os.PathLike[str], *, blank_inferred: boo
     The same breaths give the same bytes.
 
     Args:
-        breaths: at least one.
+        breaths: breaths to write; at least one.
         path: ends in .csv, .csv.gz, .parquet or .pq; an existing file is replaced,
             a missing folder is made.
         blank_inferred: write inferred times blank, as they were read, so that nobody takes them for

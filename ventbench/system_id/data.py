@@ -87,7 +87,7 @@ def make_data(breaths: Breaths, *, flow: bool = False, position: ArrayLike | Non
     """Make the data of a fit from a recording.
 
     Args:
-        breaths: at least one.
+        breaths: breaths to convert; at least one.
         flow: use the recorded flow as well.
         position: place of each breath in its recording; evenly from 0 to 1 if not given.
 

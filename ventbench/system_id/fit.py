@@ -121,7 +121,7 @@ def fit(
     several known minima are searched from several starts.
 
     Args:
-        data: from :func:`~ventbench.system_id.data.make_data`.
+        data: data from :func:`~ventbench.system_id.data.make_data`.
         mechanisms: names of the hypothesis.
         free: further free paths, such as ``gain`` or ``leak.exponent``.
         fixed: physical values of paths that stay fixed, a number or one for each breath.
@@ -130,7 +130,7 @@ def fit(
             :func:`~ventbench.system_id.problem.make_unknowns`.
         prior: prior mean and standard deviation in coordinates, by path.
         noise: measurement noise; estimated from the residuals if not given.
-        predictor: of the same data with all parameters, to avoid padding the data again.
+        predictor: predictor of the same data with all parameters, to avoid padding the data again.
         iterations: most steps of each search.
 
     Raises:

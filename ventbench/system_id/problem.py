@@ -122,9 +122,9 @@ def make_unknowns(
     Args:
         data: the breaths.
         paths: free parameters.
-        groups: by path, breaths that share the parameter, as whole numbers ``(n,)``. By default, R
-            and C belong to the lung, a parameter of scope ``breath`` to the breath, and all others
-            are shared by all breaths.
+        groups: breaths that share a parameter, by its path, as whole numbers ``(n,)``. By default,
+            R and C belong to the lung, a parameter of scope ``breath`` to the breath, and all
+            others are shared by all breaths.
 
     Raises:
         InputError: if a group does not fit the data, or a parameter appears twice.

@@ -34,10 +34,10 @@ class ExplorationRanges:
     Attributes:
         gains: P, I, D of the PID, %/cmH2O.
         boundary_u: what is added at the start of a breath, %.
-        boundary_s: how long it takes to fall to zero, s.
+        boundary_s: time in which the boundary disturbance falls to zero, s.
         triangular_u: the largest of what is added, %.
-        triangular_s: where its two ends lie, s.
-        boundary_share: of breaths with the boundary disturbance.
+        triangular_s: start and end of the triangular disturbance, s.
+        boundary_share: share of breaths with the boundary disturbance.
     """
 
     gains: tuple[float, float, float]
@@ -66,8 +66,8 @@ class Disturbance:
     Attributes:
         boundary: whether it is a boundary disturbance; else a triangular one.
         u: the largest of what is added, %.
-        begin: where it begins, s; 0 for a boundary.
-        end: where it ends, s.
+        begin: start of the disturbance, s; 0 for a boundary.
+        end: end of the disturbance, s.
     """
 
     boundary: NDArray[np.bool_]
@@ -110,8 +110,8 @@ class Limits:
     Attributes:
         ease: the valve closes while the measured pressure is above ``min(60, PIP + 15)`` cmH2O or
             this, cmH2O.
-        vent: above this, or where a pressure is not a number, the expiratory valve opens for the
-            rest of the inspiration, cmH2O.
+        vent: pressure above which the expiratory valve opens for the rest of the inspiration, as it
+            does where a pressure is not a number, cmH2O.
         vented: breaths that ended so, after which exploring stops.
     """
 
@@ -190,7 +190,7 @@ def explore(
     Args:
         ventilator: see :class:`VentilatorInterface`.
         lung_id: the setting of its lung, written with the breaths.
-        breaths: how many.
+        breaths: number of breaths.
         seed: seed of all disturbances, which are the same for the same seed and width.
         ranges: the paper's for that lung if not given.
         limits: see :class:`Limits`.

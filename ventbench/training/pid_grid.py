@@ -275,10 +275,10 @@ def search(
     Args:
         plants: one plant a lung, by its id.
         settings: JSON values that identify the plants.
-        folder: where finished parts are kept, so that an interrupted search continues; nowhere if
-            not given.
+        folder: folder in which finished parts are kept, so that an interrupted search continues;
+            nowhere if not given.
         gains: P, I and D, shape ``(G, 3)``; the paper's if not given.
-        pool: where the parts are computed; here if not given.
+        pool: executor that computes the parts; this process if not given.
         part: gains of a part.
         progress: see :data:`Progress`.
         errors_of: computes a part: errors of gains on one plant, shape ``(g, N)``; by

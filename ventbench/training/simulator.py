@@ -112,7 +112,7 @@ def train_simulator(
 
     Args:
         folder: folder of the public recordings.
-        out: where the files are written; those that are there are replaced at the end.
+        out: folder for the files; existing ones are replaced at the end.
         config: settings of the hybrid's fit.
         network_config: settings of the networks' training.
         architecture: sizes of the networks.
@@ -225,8 +225,9 @@ def train_network(
     Args:
         data: all recordings.
         setting: one of the recorded lung settings.
-        number: of the network: that of the setting among all, plus their count times the member;
-            also the seed. A member does not see the measured breaths of the fold of its number.
+        number: number of the network: that of the setting among all, plus their count times the
+            member; also the seed. A member does not see the measured breaths of the fold of its
+            number.
         architecture: sizes of the network.
         config: settings of the training.
         checkpoint: see :func:`~ventbench.training.learned.fit`.

@@ -65,8 +65,8 @@ class LearningCurve:
     Attributes:
         method: name.
         episodes: breaths that one training has seen, ``(points,)``.
-        seconds: for all seeds together, without compiling, ``(points,)``.
-        compile_seconds: before that.
+        seconds: computing time of all seeds together, without compiling, ``(points,)``.
+        compile_seconds: time of compiling, s.
         scores: nominal, cmH2O, ``(seeds, points)``.
     """
 
@@ -92,7 +92,7 @@ class SampleStudy:
     """Learning curves of all methods on one lung, and the scores of PIDs there.
 
     Attributes:
-        lung: its id.
+        lung: id of the lung.
         curves: learning curves of the methods.
         start: nominal score of the PID that is corrected, cmH2O.
         best_pid: nominal score of the best PID of the paper's grid on this lung, cmH2O.

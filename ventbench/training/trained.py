@@ -28,7 +28,7 @@ class TrainedControllers:
     Attributes:
         controllers: pure controllers by lung id, or :data:`ALL`.
         report: content of ``training.json``: settings, errors, provenance of the simulators.
-        folder: where ``weights.npz`` and ``training.json`` were written.
+        folder: folder in which ``weights.npz`` and ``training.json`` were written.
     """
 
     controllers: dict[str, Controller]

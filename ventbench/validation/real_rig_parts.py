@@ -62,9 +62,9 @@ class Part:
     """One diagnosis of the proof.
 
     Attributes:
-        name: of its folder.
-        title: in words.
-        lungs: whose breaths it uses.
+        name: name of its folder.
+        title: title in words.
+        lungs: lungs whose breaths it uses.
         set_up: returns the setting, given the breaths of the lungs and the folder of the proof; or
             the reason why there is none.
         needs: name of a part that must be finished before.
@@ -170,7 +170,7 @@ def most_important(mechanisms: Sequence[Mapping[str, Any]]) -> str | None:
     """Name of the first mechanism that all breaths share; None if there is none.
 
     Args:
-        mechanisms: of a ``diagnosis.json``, the most important first.
+        mechanisms: mechanisms of a ``diagnosis.json``, the most important first.
     """
     for named in mechanisms:
         scopes = [p.scope for p in mechanism(named["name"]).description.parameters]

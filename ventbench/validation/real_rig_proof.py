@@ -56,7 +56,7 @@ class Claim:
     """One claim of the proof.
 
     Attributes:
-        part: whose figures it is about.
+        part: part whose figures the claim is about.
         what: the claim.
         value: the outcome, in words.
         met: whether the claim holds.
@@ -73,7 +73,7 @@ class Proof:
     """The finished parts of the proof.
 
     Attributes:
-        sha256: of the recording.
+        sha256: SHA-256 of the recording.
         parts: figures by name.
         impossible: why a part could not be set up, by name.
         claims: about the finished parts.
@@ -113,8 +113,8 @@ def prove(
     not if the diagnosis has: remove the part's folder then.
 
     Args:
-        folder: of the public recordings.
-        out: where to write, a folder for each part.
+        folder: folder of the public recordings.
+        out: folder to write to, a folder for each part.
         save: see :data:`Save`.
         only: names of parts; all parts if empty.
         progress: see :data:`Progress`.
@@ -211,8 +211,8 @@ def figures(diagnosis: Mapping[str, Any], summary: Mapping[str, Any]) -> dict[st
     """JSON values of a finished part; errors in cmH2O, on breaths that no fit has seen.
 
     Args:
-        diagnosis: its ``diagnosis.json``.
-        summary: its ``part.json``.
+        diagnosis: content of its ``diagnosis.json``.
+        summary: content of its ``part.json``.
     """
     loop = diagnosis["open_loop"]
     stages = {name: loop[name] for name in ("before", "refit", "after")}

@@ -169,8 +169,8 @@ class Drawing:
     """Collects lines and areas by look, so that each look is one collection.
 
     Args:
-        width: of the picture in units; all lengths are in these, y downwards.
-        height: of the picture in units.
+        width: width of the picture in units; all lengths are in these, y downwards.
+        height: height of the picture in units.
         pixels: the width in pixels.
     """
 

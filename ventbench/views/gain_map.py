@@ -24,7 +24,7 @@ def png(grid: PIDGrid, *, each: bool = True, single: bool = True) -> bytes:
     """Return the PNG: one row a lung, and one for the mean of all.
 
     Args:
-        grid: of one lung or more.
+        grid: grid of one lung or more.
         each: show each lung.
         single: show the mean over lungs.
 

@@ -38,7 +38,7 @@ class RunPanel:
     Attributes:
         lung: id.
         pip: cmH2O.
-        ticks: of the pressure axis, value in cmH2O and y.
+        ticks: ticks of the pressure axis, value in cmH2O and y.
         target: polyline, shape ``(SHOWN + 1, 2)``.
         pressures: one polyline a run, shape ``(SHOWN + 1, 2)``; NaN where there is no finite
             pressure.

@@ -44,9 +44,9 @@ class Plot:
 
     Attributes:
         quantity: last part of the entity path.
-        title: with the unit.
-        range: of the axis; None to fit the data.
-        share: of a lung tab's height.
+        title: title with the unit.
+        range: range of the axis; None to fit the data.
+        share: share of a lung tab's height.
     """
 
     quantity: str
@@ -189,7 +189,7 @@ def blueprint(runs: Sequence[Trajectories], names: Sequence[str], tab: int = 0) 
 
     Args:
         runs: matching runs, the one to look at first.
-        names: of the runs.
+        names: names of the runs.
         tab: the one to open at: pressure, u_in, error, then the lungs.
     """
     lungs = runs[0].lungs
@@ -275,7 +275,7 @@ def markdown(runs: Sequence[Trajectories], names: Sequence[str]) -> str:
 
     Args:
         runs: matching runs, the one to look at first.
-        names: their labels; they are strangers' text and are escaped here.
+        names: labels of the runs; foreign text, which is escaped here.
     """
     given, names = names, [escape_markdown(name) for name in names]
     first, last = min(protocol.SCORED_BREATHS) + 1, max(protocol.SCORED_BREATHS) + 1

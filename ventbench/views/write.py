@@ -104,7 +104,7 @@ def open_viewer(path: Path | str) -> bool:
     """Open a rerun file in the viewer, which outlives this process.
 
     Args:
-        path: of the ``.rrd`` file.
+        path: path of the ``.rrd`` file.
 
     Returns:
         Whether a viewer was started; if not, how to open the file was printed.

@@ -136,8 +136,8 @@ def coefficients(
 
     Args:
         at: where each coefficient acts, in words.
-        unit: of all coefficients.
-        meaning: of all coefficients; each is followed by its ``at``.
+        unit: unit of all coefficients.
+        meaning: meaning of all coefficients; each is followed by its ``at``.
         low: lower bounds, one for all coefficients or one for each.
         high: upper bounds, one for all coefficients or one for each.
         spread: prior standard deviations, one for all coefficients or one for each.

@@ -98,7 +98,7 @@ def compare(
     Finished trainings are read from ``out``, where ``runs.csv`` and ``summary.csv`` are written.
 
     Args:
-        simulators: to train through and to score on.
+        simulators: simulators to train through and to score on.
         out: folder.
         seeds: one for each training of a variant.
         config: settings of the base.

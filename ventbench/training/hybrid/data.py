@@ -28,7 +28,8 @@ class InspirationData:
         start_known: whether it was measured, ``(n,)``.
         u_in: commands, %, ``(n, SAMPLES - 1)``.
         dt: time for which each command is held, s, ``(n, SAMPLES - 1)``.
-        pressure: at the end of each command, cmH2O, ``(n, SAMPLES - 1)``; 0 where it has no weight.
+        pressure: pressure at the end of each command, cmH2O, ``(n, SAMPLES - 1)``; 0 where it has
+            no weight.
         share: weight of each pressure in the mean of its breath, ``(n, SAMPLES - 1)``; the weights
             of a breath add up to one.
     """

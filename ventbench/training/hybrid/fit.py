@@ -42,7 +42,7 @@ class HybridConfig:
     """Settings of the fit of a member; hashable, since they are static in compiled functions.
 
     Attributes:
-        iterations: of Adam, a multiple of ``CHUNK``.
+        iterations: number of iterations of Adam, a multiple of ``CHUNK``.
         learning_rate: peak of the cosine schedule.
         softness: error below which the loss turns from absolute to square, cmH2O.
         saturation: breaths with a larger mean error count less and less, cmH2O.
@@ -50,7 +50,7 @@ class HybridConfig:
         reconstructed: weight of a reconstructed breath; a measured one has 1.
         R50: weight of a breath of a setting that is not scored.
         start_mean: belief about a first pressure that is blank, cmH2O.
-        start_width: its standard deviation.
+        start_width: standard deviation of the prior of first pressures.
         directed: whether the direction of the command may have an effect.
     """
 
@@ -141,7 +141,7 @@ def fit(
     """Fit the pooled parameters; call it within :func:`ventbench.precision.float64`.
 
     Args:
-        data: from :func:`~ventbench.training.hybrid.data.inspirations`.
+        data: data from :func:`~ventbench.training.hybrid.data.inspirations`.
         weight: weight of each breath, shape ``(n,)``; 0 leaves it out.
         config: settings of the fit.
         progress: called with iterations done and the loss, cmH2O.
@@ -180,8 +180,8 @@ def fit_expiration(
     """Fit the expiratory valve; call it within :func:`ventbench.precision.float64`.
 
     Args:
-        pooled: from :func:`fit`.
-        data: from :func:`whole_breaths`.
+        pooled: pooled parameters from :func:`fit`.
+        data: data from :func:`whole_breaths`.
         weight: weight of each breath, shape ``(n,)``; 0 leaves it out.
         config: settings of the first stage.
 
@@ -223,7 +223,7 @@ class TrainingSet:
     """Recordings arranged once for all members, so that all share one compilation.
 
     Attributes:
-        inspirations: of the measured, then of the reconstructed breaths.
+        inspirations: inspirations of the measured, then of the reconstructed breaths.
         whole: the measured breaths.
         weight: weight of each inspiration, ``(n,)``.
         fold: fold of each inspiration, -1 for a reconstructed breath, ``(n,)``.
@@ -247,8 +247,8 @@ def training_set(
     Args:
         measured: m breaths.
         reconstructed: breaths that every member may see; their weight is the settings'.
-        fold: of each measured breath, shape ``(m,)``.
-        sessions: by whose clocks breaths belong together.
+        fold: fold of each measured breath, shape ``(m,)``.
+        sessions: sessions by whose sampling times breaths belong together.
         config: gives the weights.
 
     Raises:
@@ -273,9 +273,9 @@ def fit_member(
     """Fit one member; call it within :func:`ventbench.precision.float64`.
 
     Args:
-        data: from :func:`training_set`.
+        data: data from :func:`training_set`.
         held_out: the fold whose breaths count for nothing.
-        config: as of ``data``.
+        config: the settings that ``data`` was made with.
         progress: called with the share that is done, 0..1.
     """
     weight = jnp.where(data.fold == held_out, 0.0, data.weight)

@@ -40,31 +40,32 @@ class Pooled:
 
     Attributes:
         slopes: slopes of the valve's curve, L/s per %, shape ``(13,)``.
-        slopes_rig: added to the slopes for a kind of rig, ``(G, 13)``.
+        slopes_rig: deviation that is added to the slopes for a kind of rig, ``(G, 13)``.
         R: laminar resistance, cmH2O/(L/s), ``(L,)``.
         K2: quadratic resistance, cmH2O s2/L2, ``(L,)``.
         E: elastance, cmH2O/L, ``(L,)``.
         stiffening: ratio of the elastic curve's slope to that below each knot, ``(L, 5)``.
         offset: elastic recoil minus pressure at rest, cmH2O, no logarithm, ``(L,)``.
         direction: odds of the plays' weights, ``(G, 3)``.
-        rising: cmH2O, ``(G,)``.
-        falling: cmH2O, ``(G,)``.
-        valve_delay: s, ``(G,)``.
-        valve_lag: s, ``(G,)``.
-        sensor_lag: s, ``(G,)``.
-        closing_delay: s, ``(G,)``.
-        opening_delay: s, ``(G,)``.
-        circuit_compliance: L/cmH2O, ``(G,)``.
-        conductance: of the open expiratory valve, L/s per cmH2O, ``(G,)``.
-        closing_conductance: while it closes, L/s per cmH2O, ``(G,)``.
-        rest: %, ``()``.
-        session_gain: added to all slopes, ``(J,)``.
-        session_R: added to both resistances, ``(J,)``.
-        session_K2: added to the quadratic resistance, ``(J,)``.
-        session_E: added to the elastance, ``(J,)``.
-        session_offset: added to the offset, cmH2O, no logarithm, ``(J,)``.
-        session_conductance: added to the conductance, ``(J,)``.
-        session_closing_conductance: added to the closing conductance, ``(J,)``.
+        rising: shift of the reading while the command rises, cmH2O, ``(G,)``.
+        falling: shift of the reading while the command falls, cmH2O, ``(G,)``.
+        valve_delay: dead time of the inspiratory valve, s, ``(G,)``.
+        valve_lag: time constant of the inspiratory valve, s, ``(G,)``.
+        sensor_lag: time constant of the sensor, s, ``(G,)``.
+        closing_delay: delay of the expiratory valve when it closes, s, ``(G,)``.
+        opening_delay: delay of the expiratory valve when it opens, s, ``(G,)``.
+        circuit_compliance: compliance of tubing and dead space, L/cmH2O, ``(G,)``.
+        conductance: conductance of the open expiratory valve, L/s per cmH2O, ``(G,)``.
+        closing_conductance: conductance of the expiratory valve while it closes, L/s per cmH2O,
+            ``(G,)``.
+        rest: command that held the flow before the first sample, %, ``()``.
+        session_gain: deviation that is added to all slopes, ``(J,)``.
+        session_R: deviation that is added to both resistances, ``(J,)``.
+        session_K2: deviation that is added to the quadratic resistance, ``(J,)``.
+        session_E: deviation that is added to the elastance, ``(J,)``.
+        session_offset: deviation that is added to the offset, cmH2O, no logarithm, ``(J,)``.
+        session_conductance: deviation that is added to the conductance, ``(J,)``.
+        session_closing_conductance: deviation that is added to the closing conductance, ``(J,)``.
     """
 
     slopes: Array
@@ -157,7 +158,7 @@ def plants(pooled: Pooled, groups: Groups, *, directed: bool = True) -> Hybrid:
 
     Args:
         pooled: the parameters.
-        groups: where each belongs.
+        groups: setting, kind of rig and session of each breath.
         directed: whether the direction of the command has an effect.
 
     Returns:

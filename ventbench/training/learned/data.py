@@ -27,9 +27,9 @@ class WindowedInspirations:
         u_in: command of each step, %, shape ``(n, T)``.
         dt: time for which it was held, s, shape ``(n, T)``.
         after: pressure at its end, cmH2O, 0 where unknown, shape ``(n, T)``.
-        weight: of that pressure in the loss, 0 where unknown, shape ``(n, T)``.
+        weight: weight of the pressure in the loss, 0 where unknown, shape ``(n, T)``.
         window: measured pressures up to each step, the newest last, cmH2O, ``(n, T, H_p)``.
-        known: where they were measured, shape ``(n, T, H_p)``.
+        known: whether each pressure of the window was measured, shape ``(n, T, H_p)``.
         count: breaths before the padding, shape ``()``.
     """
 

@@ -33,7 +33,7 @@ class LearnedConfig:
         steps: updates; the schedules stretch over them.
         batch: breaths an update, drawn with replacement.
         learning_rate: peak of the cosine schedule.
-        weight_decay: of AdamW.
+        weight_decay: weight decay of AdamW.
         one_step: share of the updates with one-step loss.
         whole: share of the updates, at the end, with open-loop runs over the whole inspiration;
             between the two the horizon grows geometrically.
@@ -94,8 +94,8 @@ def open_loop_loss(
         nets: the trained parts, ``(general, boundary)``.
         plant: the rest of the plant.
         batch: breaths.
-        measured: where a run starts anew from the measured window, shape ``(n, T)``.
-        noise: added to measured windows, cmH2O, shape of ``batch.window``.
+        measured: True where a run starts anew from the measured window, shape ``(n, T)``.
+        noise: noise that is added to measured windows, cmH2O, shape of ``batch.window``.
         config: softness and penalty.
     """
     plant = dataclasses.replace(plant, general=nets[0], boundary=nets[1])

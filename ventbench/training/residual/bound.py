@@ -55,7 +55,7 @@ def reached(
     Args:
         plants: leaves ``(L, ...)``.
         pips: cmH2O, P of them.
-        iterations: of Adam, for each of :data:`STARTS`.
+        iterations: number of iterations of Adam, for each of :data:`STARTS`.
 
     Returns:
         cmH2O, shape ``(L, P)``.

@@ -52,7 +52,7 @@ class ResidualConfig:
         ahead: number of steps of the previous breath that it sees; 0 for none.
         limit: largest correction, %.
         members: members of the simulators' ensemble, 1 (the official ones) to 5.
-        spread: how far deviations reach, as a multiple of the draws' ranges; 0 for none.
+        spread: reach of the deviations, as a multiple of the draws' ranges; 0 for none.
         round_robin: whether each update takes one lung at one PIP, in turn, as in the paper,
             instead of all of them.
     """

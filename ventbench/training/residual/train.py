@@ -56,7 +56,7 @@ def train_residual(
         networks: ids of lungs, a network each, or ``"all"`` for one network that serves all six.
         out: folder.
         config: settings of the training.
-        seed: of the weights and the random deviations, common to all networks.
+        seed: seed of the weights and the random deviations, common to all networks.
         gains: grid of P, I, D, %/cmH2O, shape ``(G, 3)``, of which each network corrects the best
             PID; the paper's grid if not given.
         simulator: simulators with plants of the six lungs to train through, see

@@ -28,10 +28,10 @@ class Replay:
     """Steps to learn from, the oldest overwritten first; N of them.
 
     Attributes:
-        features: before the choice, ``(N, FEATURES)``.
+        features: features before the choice, ``(N, FEATURES)``.
         choice: index into the corrections, ``(N,)``.
         reward: discounted sum of the next rewards, ``(N,)``.
-        discount: of what follows them; 0 where the breath ends, ``(N,)``.
+        discount: discount of what follows them; 0 where the breath ends, ``(N,)``.
         following: features then, ``(N, FEATURES)``.
     """
 

@@ -120,7 +120,7 @@ def advantages(rewards: Array, values: Array, discount: float, trace: float) -> 
     """Generalised advantage estimates of an episode that ends after its last reward.
 
     Args:
-        rewards: after each command, shape ``(T, ...)``.
+        rewards: rewards after each command, shape ``(T, ...)``.
         values: estimated before each command, shape ``(T, ...)``.
         discount: factor of a reward one step later.
         trace: lambda, 0 for one-step differences, 1 for returns minus values.

@@ -74,12 +74,13 @@ class TrainedPolicies:
 
     Attributes:
         policies: the best of each, leaves ``(R, ...)``.
-        validation: their errors on fresh cells with noise, cmH2O, ``(R,)``.
+        validation: errors of the policies on fresh cells with noise, cmH2O, ``(R,)``.
         episodes: breaths that a run had seen at each point of its curve, ``(points,)``.
         curves: nominal error of the policy then, cmH2O, ``(R, points)``.
         validation_curves: error of the policy on the fresh cells, cmH2O, ``(R, points)``.
-        seconds: for all runs together until each point, without compiling, ``(points,)``.
-        compile_seconds: for compiling, before that, with the chunk that is run to that end.
+        seconds: computing time of all runs together until each point, without compiling,
+            ``(points,)``.
+        compile_seconds: time of compiling, which comes first, with the chunk that is run for it, s.
     """
 
     policies: Any

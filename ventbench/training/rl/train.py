@@ -75,7 +75,7 @@ def train_ppo(
     Args:
         networks: ids of lungs, a network each, or ``"all"`` for one network that serves all six.
         out: folder; checkpoints lie there until all is done.
-        seeds: of the trainings of each network.
+        seeds: seeds of the trainings of each network.
         steps: control steps of experience of each training; those of the method if not given.
         method: settings of every training; the published ones, which differ for one lung and for
             all six, if not given.

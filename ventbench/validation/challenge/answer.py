@@ -64,7 +64,7 @@ def answer(
     """Answer all cases that have no answer yet; each answer is written as soon as it is there.
 
     Args:
-        folder: of the challenge.
+        folder: folder of the challenge.
         jobs: number of processes of one thread each; 0 to work in this process.
         diagnose: the diagnosis; ventbench's own if None.
         cases_per_process: mean number of cases after which a new process replaces an old one.

@@ -23,11 +23,11 @@ class Effect:
     """A piece of physics that the rig has beyond resistance and compliance.
 
     Attributes:
-        name: of the library's mechanism, or of an effect that the library does not have.
+        name: name of the library's mechanism, or of an effect that the library does not have.
         strength: mild or strong, as :data:`EFFECTS` quantifies them.
-        form: of its equation, one of :attr:`EffectFamily.forms`.
-        parameters: of that form, in the units of :mod:`ventbench.physics`; times in s, lengths of
-            command in %.
+        form: form of its equation, one of :attr:`EffectFamily.forms`.
+        parameters: parameters of that form, in the units of :mod:`ventbench.physics`; times in s,
+            lengths of command in %.
     """
 
     name: str
@@ -60,15 +60,15 @@ class Case:
     """One recording.
 
     Attributes:
-        name: of its file, without suffix.
+        name: name of its file, without suffix.
         lung_R: label of the lung setting, cmH2O/(L/s).
         lung_C: label of the lung setting, mL/cmH2O.
         effects: what the recording conceals.
         base: the rig; each recording draws its own if None.
         noise: standard deviation of the sensor's noise, cmH2O.
         coloured: share of the noise variance that is correlated from sample to sample, 0..1.
-        correlation: of the coloured share, from one sample to the next.
-        step: of the sensor's converter, cmH2O; 0 for none.
+        correlation: correlation of the coloured share, from one sample to the next.
+        step: step of the sensor's converter, cmH2O; 0 for none.
         jitter: standard deviation of the sampling interval, s.
         breaths: number of breaths.
         samples: number of samples in a breath.
@@ -113,9 +113,9 @@ class EffectFamily:
         parameter: the parameter that carries the strength.
         mild: mean of that parameter in a mild effect.
         strong: mean of that parameter in a strong effect.
-        forms: of the equation; the first is the library's if ``inside``.
+        forms: forms of the equation; the first is the library's if ``inside``.
         ranges: further parameters, each with the low and high end of a uniform distribution.
-        signs: that the strength may have.
+        signs: signs of the strength that are drawn.
         inside: whether the library has a mechanism of this name.
     """
 
@@ -202,10 +202,10 @@ def draw_effect(
     """Draw an effect: its strength within 15 % of the mean, its other parameters in their ranges.
 
     Args:
-        name: of the effect.
+        name: name of the effect.
         strength: ``mild`` or ``strong``.
         rng: source of random numbers.
-        form: of its equation; the first of its forms if None, which is the library's if the
+        form: form of its equation; the first of its forms if None, which is the library's if the
             library has the effect.
 
     Raises:

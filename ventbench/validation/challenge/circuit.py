@@ -39,7 +39,7 @@ class Disturbances:
     Each breath has its own effort; the oscillations continue between breaths.
 
     Args:
-        effects: of the rig, by name.
+        effects: effects of the rig, by name.
         began: time of each breath's first sample since the recording began, s, ``(n,)``.
         rng: source of efforts and phases.
     """
@@ -222,7 +222,7 @@ class Circuit:
     """Everything between the flow that the valve is set to and the pressure that the sensor reads.
 
     Args:
-        effects: of the rig, by name.
+        effects: effects of the rig, by name.
         base: values of the rig.
         disturbances: what drives the circuit beside the valve.
     """
@@ -267,7 +267,7 @@ class Circuit:
         """State after a step.
 
         Args:
-            state: before, ``(9, n)``.
+            state: state before the step, ``(9, n)``.
             h: length of the step, s, ``(n,)``.
             asked: flow that the valve is set to during the step, L/s, ``(n,)``.
             opened: 1 if the expiratory valve is open during the step, ``(n,)``.

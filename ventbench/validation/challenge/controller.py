@@ -31,8 +31,8 @@ class RecordingController:
     """PI control to a target; some breaths add a disturbance, others follow a programme.
 
     Args:
-        case: whose breaths are recorded.
-        time: of the samples, s, ``(n, T)``.
+        case: case whose breaths are recorded.
+        time: times of the samples, s, ``(n, T)``.
         rng: source of gains, targets and programmes.
         share: scales pressures above PEEP and commands; 1 for the usual ones.
     """

@@ -46,9 +46,9 @@ def log_likelihood_loss(case: Case, breaths: Breaths, index: int) -> float:
     patient's efforts are not those of the recording.
 
     Args:
-        case: with its base.
-        breaths: its recording.
-        index: of the effect in ``case.effects``.
+        case: case with its base.
+        breaths: recording of the case.
+        index: index of the effect in ``case.effects``.
     """
     assert case.base is not None
     count = min(_BREATHS, len(breaths))

@@ -20,7 +20,7 @@ class Figure:
     Attributes:
         what: the measured quantity, in words.
         value: None if there was nothing to measure.
-        goal: in words, ``""`` if there is none.
+        goal: goal in words, ``""`` if there is none.
         count: number of cases, parameters or breaths behind the value.
         ci95: Wilson's interval of a share, else None.
         met: whether the goal is met; None without a goal or a value.

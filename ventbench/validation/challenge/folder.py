@@ -34,9 +34,9 @@ def encode_answers(secret: str, drawn: list[DrawnCase], nats: list[list[float]])
     """Return the plain text of the answers; a random nonce keeps their hash from being guessed.
 
     Args:
-        secret: of the challenge.
-        drawn: its cases.
-        nats: of each effect of each case, from
+        secret: secret of the challenge.
+        drawn: cases of the challenge.
+        nats: log-likelihood that is lost without each effect of each case, nats, from
             :func:`~ventbench.validation.challenge.detectability.log_likelihood_loss`.
     """
     cases = [
@@ -72,7 +72,7 @@ def encrypt(text: bytes, secret: str, public: bytes) -> bytes:
 
     Args:
         text: answers, plain or encrypted.
-        secret: of the challenge.
+        secret: secret of the challenge.
         public: the public file of the cases, so that no key stream is used twice.
     """
     key = hashlib.sha256(public + b"\n" + secret.encode()).digest()
@@ -101,7 +101,7 @@ class ChallengeFolder:
     """Paths of a challenge's files.
 
     Attributes:
-        path: of the folder.
+        path: path of the folder.
         round: 1, or 2 with the breaths that the first answers requested.
     """
 

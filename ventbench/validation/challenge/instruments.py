@@ -25,7 +25,7 @@ class Valve:
     The valve remembers its position.
 
     Args:
-        effects: of the rig, by name.
+        effects: effects of the rig, by name.
         gain: mL/s per %.
         breaths: number of breaths that run side by side.
     """
@@ -101,9 +101,10 @@ class Sensor:
     """Pressure sensor: bend, drift, noise and converter.
 
     Args:
-        case: with its noise and converter.
-        effects: of the rig, by name.
-        position: of each breath in its recording, 0 for the first, 1 for the last, ``(n,)``.
+        case: case with its noise and converter.
+        effects: effects of the rig, by name.
+        position: position of each breath in its recording, 0 for the first, 1 for the last,
+            ``(n,)``.
         rng: source of the noise.
     """
 

@@ -102,11 +102,11 @@ class EstimateAgainstTruth:
     """An estimated parameter beside its true value.
 
     Attributes:
-        path: of the parameter.
+        path: path of the parameter.
         value: estimate.
         low: lower end of the estimate's 95 % interval.
         high: upper end of the interval.
-        true: as a fit with the nominal valve gain sees it.
+        true: true value, as a fit with the nominal valve gain sees it.
     """
 
     path: str
@@ -131,14 +131,14 @@ class JudgedCase:
     """One case with its answer.
 
     Attributes:
-        name: of the case.
-        kind: of the question.
+        name: name of the case.
+        kind: kind of the question.
         lung: label.
-        strengths: of the effects.
+        strengths: strengths of the effects.
         effects: names of the effects in the rig.
         library: names of the library that are acceptable for these effects.
         seen: effects above the detection limit.
-        verdict: of the answer.
+        verdict: verdict of the answer.
         named: mechanisms that the answer names.
         listed: true mechanisms that are named or among the first two alternatives to a name.
         open: whether the answer lists alternatives.
@@ -215,7 +215,7 @@ def judge(drawn: DrawnCase, nats: list[float], answer: dict[str, Any]) -> Judged
 
     Args:
         drawn: the case.
-        nats: of its effects.
+        nats: log-likelihood that is lost without each of its effects, nats.
         answer: content of the answer's file.
     """
     case, diagnosis = drawn.case, answer["diagnosis"]

@@ -49,7 +49,7 @@ def make(
     Args:
         secret: seed of everything that is drawn.
         out: folder, which must not hold a challenge yet.
-        kind: of the cases.
+        kind: kind of the cases.
         count: number of cases.
         jobs: number of processes.
         record: see :data:`Record`; a function of a module if there are processes.
@@ -110,7 +110,7 @@ def record_within_limits(
     Lungs that stiffen steeply leave the limits under all usual commands.
 
     Args:
-        secret: of the challenge.
+        secret: secret of the challenge.
         drawn: the case.
         usual: number of attempts with commands of the usual size.
         gentle: number of attempts with smaller and smaller ones after these.

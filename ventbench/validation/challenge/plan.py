@@ -50,7 +50,7 @@ def draw(kind: Kind | Literal["all"], count: int, rng: np.random.Generator) -> l
     """Draw cases of one kind or of all kinds, in random order.
 
     Args:
-        kind: of the cases.
+        kind: kind of the cases.
         count: number of cases.
         rng: source of random numbers.
 

@@ -48,7 +48,7 @@ class Request:
     """Requested breaths, as read from a file.
 
     Attributes:
-        time: of the samples from the breath's first, s, ``(k, T)``.
+        time: times of the samples from the breath's first, s, ``(k, T)``.
         u_in: inspiratory valve, %, ``(k, T)``.
         u_out: expiratory valve, 0/1, ``(k, T)``.
     """
@@ -98,7 +98,7 @@ def record(folder: ChallengeFolder, secret: str) -> list[str]:
 
     Args:
         folder: first round of a challenge.
-        secret: of the challenge.
+        secret: secret of the challenge.
 
     Returns:
         Names of the cases with a request.

@@ -70,8 +70,8 @@ def reveal(
     """Check all hashes and score the answers.
 
     Args:
-        folder: of the challenge; for the second round, the first is read too.
-        secret: that the challenge was made with.
+        folder: folder of the challenge; for the second round, the first is read too.
+        secret: secret that the challenge was made with.
         with_oracle: compare with fits that know the true structure, which takes seconds a case.
         jobs: number of processes that fit; 0 to work in this process.
         progress: called with the number of finished fits and the number of all fits.

@@ -60,7 +60,7 @@ def step_grid(
     """Divide the time between samples into steps whose ends include the delayed commands.
 
     Args:
-        time: of the samples, s, ``(n, T)``.
+        time: times of the samples, s, ``(n, T)``.
         u_out: command of the expiratory valve, ``(n, T)``.
         delay: dead time of the inspiratory valve, s.
         opening_delay: dead time of the expiratory valve's opening, s.
@@ -135,12 +135,12 @@ def record_commands(
     """Record given commands on the case's rig, open loop, after the case's own breaths.
 
     Args:
-        case: with its base.
-        time: of the samples, s, ``(k, T)``.
+        case: case with its base.
+        time: times of the samples, s, ``(k, T)``.
         u_in: %, ``(k, T)``.
         u_out: 0/1, ``(k, T)``.
         rng: source of noise and efforts.
-        steps: as in :func:`record`.
+        steps: see :func:`record`.
 
     Raises:
         InputError: if the case has no base: a new one would be another rig.
@@ -156,10 +156,10 @@ def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 
     """Pressures without noise or converter under recorded commands, cmH2O, ``(n, T)``.
 
     Args:
-        case: with its base.
+        case: case with its base.
         breaths: commands and times.
         start: airway pressure at rest, ``(n,)``.
-        seed: of efforts and phases.
+        seed: seed of efforts and phases.
         steps: integration steps between two samples.
     """
     assert case.base is not None

@@ -37,11 +37,11 @@ class Chart:
     Attributes:
         x: ends of the horizontal axis.
         y: ends of the vertical axis.
-        x_label: under it, with the unit.
-        y_label: above the frame, with the unit.
-        alt: what is seen, in words.
-        width: of the picture.
-        height: of the picture.
+        x_label: label under the frame, with the unit.
+        y_label: label above the frame, with the unit.
+        alt: description of the picture for those who cannot see it.
+        width: width of the picture.
+        height: height of the picture.
         paths: class and path data of lines, the lowest first.
         areas: class and path data of filled areas, below the lines.
         bands: left end and width of shaded ranges.
@@ -138,7 +138,7 @@ def limits(*arrays: ArrayLike, around: float = 0.06, least: float = 0.0) -> tupl
     """Ends of an axis that holds all finite values with some air.
 
     Args:
-        arrays: of any shape.
+        arrays: arrays of any shape.
         around: air at either end, as a share of the height.
         least: height at least.
     """
@@ -157,10 +157,10 @@ class BreathPanel:
     """One breath.
 
     Attributes:
-        title: such as ``breath 17``.
-        why: it is shown.
+        title: title, such as ``breath 17``.
+        why: reason why the breath is shown.
         errors: root mean square over the inspiration by stage, cmH2O.
-        pressure: its chart.
+        pressure: chart of the pressure.
         valve: chart of the command.
     """
 

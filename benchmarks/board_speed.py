@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 
 from ventbench import draws
-from ventbench.board import build, canonical, create, record, store
+from ventbench.board import build, canonical, create, layout, record, store
 from ventbench.board.replay import Simulators, replay
 from ventbench.board.verify import verify
 from ventbench.plants import frozen
@@ -53,7 +53,7 @@ def drafts(plants: Simulators) -> list[create.Draft]:
 
 def fill(folder: Path, made: list[create.Draft], count: int) -> None:
     """Write a leaderboard of ``count`` entries; the first keeps the name of the PID."""
-    lines, head = b"", store.CHAIN_START
+    lines, head, accepted = b"", store.CHAIN_START, ""
     for draft in made:
         draft.save(folder / store.RECORDS).unlink()
     for index in range(count):
@@ -65,6 +65,8 @@ def fill(folder: Path, made: list[create.Draft], count: int) -> None:
         (folder / store.RECORDS / f"{added.sha256}{record.SUFFIX}").write_bytes(content)
         line = store.chain_line(index, added, head)
         head, lines = canonical.digest(line), lines + line
+        accepted += f'[[records]]\nrecord = "{added.sha256}"\nreason = "x"\ndate = 2026-01-01\n'
+    (folder / layout.ACCEPTED).write_text(accepted)
     (folder / store.CHAIN).write_bytes(lines)
 
 

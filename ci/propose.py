@@ -6,6 +6,7 @@ record: checked, replayed through the frozen simulators, and escaped on the page
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from pathlib import Path
@@ -13,7 +14,7 @@ from pathlib import Path
 from ci import workflow
 from ci.git import AUTHOR, Git
 from ci.take import submission_name
-from ventbench.board import build, create, record, store
+from ventbench.board import attestation, build, create, record, store
 from ventbench.board.replay import Simulators
 from ventbench.errors import InputError
 
@@ -46,7 +47,9 @@ def records(folder: Path) -> list[Path]:
     return paths
 
 
-def add(folder: Path, leaderboard: Path, simulators: Simulators) -> list[record.Record]:
+def add(
+    folder: Path, leaderboard: Path, simulators: Simulators, secret: str | None = None
+) -> list[record.Record]:
     """Add records to a leaderboard, each replayed, and build its pages.
 
     The record of an entry that has one already names the old one as superseded.
@@ -55,9 +58,10 @@ def add(folder: Path, leaderboard: Path, simulators: Simulators) -> list[record.
         folder: of the download.
         leaderboard: to add them to.
         simulators: the frozen ones.
+        secret: key that signs them; without one they are listed as not official.
 
     Raises:
-        InputError: if a record is not what it must be.
+        InputError: if a record is not what it must be, or the key is not one of the leaderboard's.
     """
     added = []
     for path in records(folder):
@@ -67,7 +71,10 @@ def add(folder: Path, leaderboard: Path, simulators: Simulators) -> list[record.
         older = store.newest_of(store.load(leaderboard), scored)
         if older is not None and older.sha256 != scored.sha256:
             path = create.amend(path, supersedes=older.sha256, reason=SCORED_AGAIN)
-        added.append(store.add(leaderboard, path, simulators))
+        new = store.add(leaderboard, path, simulators)
+        if secret:
+            attestation.sign(leaderboard, new.sha256, secret)
+        added.append(new)
     build.build(leaderboard)
     return added
 
@@ -99,11 +106,18 @@ def main() -> int:
     from ventbench.plants import frozen
 
     checkout = Path.cwd()
-    added = add(Path(workflow.required("RECORDS")), checkout / "leaderboard", frozen.load())
+    # Read here, where no code of a submission runs.
+    secret = os.environ.get(attestation.SECRET) or None
+    downloaded = Path(workflow.required("RECORDS"))
+    added = add(downloaded, checkout / "leaderboard", frozen.load(), secret)
     branch = commit(checkout, added)
     workflow.output(branch=branch, name=added[0].name)
     workflow.summary(
-        TITLE, [f"{score.name} ({score.track}): record {score.sha256}" for score in added]
+        TITLE,
+        [
+            *(f"{score.name} ({score.track}): record {score.sha256}" for score in added),
+            "signed" if secret else f"not signed, so not official: {attestation.SECRET} is not set",
+        ],
     )
     return 0
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ventbench import draws
-from ventbench.board import build, create, record, store
+from ventbench.board import build, create, layout, record, store
 from ventbench.board.record import Record
 from ventbench.board.replay import Simulators, replay
 from ventbench.lungs import LUNG_IDS
@@ -143,8 +143,20 @@ def leaderboard(full: Path, tmp_path: Path) -> Path:
 
 
 def put(folder: Path, made: create.Draft, simulators: Simulators | None = None) -> Record:
-    """Save a draft and add it."""
-    return store.add(folder, made.save(folder.parent / "drafts"), simulators)
+    """Save a draft and add it, accepted as official if it says so."""
+    added = store.add(folder, made.save(folder.parent / "drafts"), simulators)
+    accept(folder)
+    return added
+
+
+def accept(folder: Path) -> None:
+    """Vouch for all records that say that they are official, as their maintainers would."""
+    lines = [
+        f'[[records]]\nrecord = "{score.sha256}"\nreason = "a test"\ndate = 2026-11-23\n'
+        for path in sorted((folder / store.RECORDS).glob("*.json"))
+        if isinstance(score := record.load(path, strict=False), Record) and score.official
+    ]
+    (folder / layout.ACCEPTED).write_text("".join(lines))
 
 
 def opened(made: create.Draft) -> Record:

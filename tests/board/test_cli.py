@@ -16,6 +16,7 @@ from ventbench.errors import InputError
 from ventbench.plants import frozen
 
 from ..textbook import Textbook
+from .conftest import accept
 
 RUN = CliRunner()
 
@@ -39,6 +40,7 @@ def test_from_records_to_a_verified_board(drafts, tmp_path: Path) -> None:
     for name in ("pid_best", "softer", "broken"):
         path = drafts[name].save(tmp_path / "records")
         assert f"added {name} (performance)" in run("add", path, "--folder", folder)
+    accept(folder)
     assert "3 records, 5 files, 5 changed" in run("build", "--folder", folder)
     assert "3 records, 5 files, 0 changed" in run("build", "--folder", folder)
     output = run("verify", "--folder", folder)
@@ -79,6 +81,7 @@ def test_a_correction_says_why_and_whence(leaderboard: Path, draft) -> None:
     path = draft("softer", factor=0.95).save(leaderboard.parent / "new")
     options = ("--supersedes", old.sha256[:8], "--reason", "a bug", "--source", "commit=9c1e5d0")
     run("add", path, *options, "--folder", leaderboard)
+    accept(leaderboard)
     run("build", "--folder", leaderboard)
     assert "no problems: 9 records" in run("verify", "--folder", leaderboard)
     new = store.load(leaderboard).scores[-1]

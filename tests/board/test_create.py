@@ -86,7 +86,7 @@ def test_every_failure_is_there(draft) -> None:
     assert item.header.failed_cells == len(item.header.failures) == 30
     assert np.isnan(item.nominal).sum() == 30
     assert np.isnan(item.exploitation)
-    (first, *_) = ranking.reasons(ranking.Event(item, None))
+    (first, *_) = ranking.reasons(ranking.Event(item, None, True))
     assert first.startswith("30 of 756 cells failed, the first: weak: xxx")
     assert len(first) < 400
 

@@ -31,7 +31,7 @@ def _entry(base: Record, name: str, by_draw: np.ndarray) -> Entry:
     # A fresh object: the cached properties of the old one do not come along.
     fields = {f.name: getattr(base, f.name) for f in dataclasses.fields(base)}
     record = Record(**{**fields, "header": header, "drawn": drawn})
-    return Entry(record, (Event(record, None),), ())
+    return Entry(record, (Event(record, None, True),), ())
 
 
 def test_score_is_the_mean_over_draws_lungs_and_pips(base: Record) -> None:

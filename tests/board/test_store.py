@@ -17,6 +17,11 @@ from ..textbook import Textbook
 from .conftest import put
 
 
+def standings(folder: Path) -> dict[str, ranking.Standing]:
+    board = store.load(folder)
+    return ranking.standings(board.records, board.attested)[1]
+
+
 def test_a_bomb_of_zeros_takes_no_memory() -> None:
     bomb = zlib.compress(bytes(10**8))
     with pytest.raises(InputError, match="does not hold commands of shape"):
@@ -64,7 +69,7 @@ def test_a_record_that_does_not_replay_is_not_added(tmp_path: Path, drafts, simu
 def test_the_newest_official_record_counts(leaderboard: Path, draft, simulators) -> None:
     old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
     new = put(leaderboard, draft("softer", factor=0.96, supersedes=old.sha256), simulators)
-    track = ranking.standings(store.load(leaderboard).records)[1]["performance"]
+    track = standings(leaderboard)["performance"]
     entry = next(x for x in track.ranked if x.record.name == "softer")
     assert entry.record.sha256 == new.sha256
     assert [event.record.sha256 for event in entry.history] == [new.sha256, old.sha256]
@@ -104,7 +109,7 @@ def test_verify_reports_a_replacement_that_add_refuses(
 def test_a_withdrawn_record_is_listed_with_its_reason(leaderboard: Path) -> None:
     old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
     store.withdraw(leaderboard, old.sha256[:10], "its <b>authors</b> found a bug")
-    track = ranking.standings(store.load(leaderboard).records)[1]["performance"]
+    track = standings(leaderboard)["performance"]
     assert "softer" not in [x.record.name for x in track.ranked]
     (entry,) = [x for x in track.unranked if x.record.name == "softer"]
     assert entry.reasons == ("withdrawn: its <b>authors</b> found a bug",)

@@ -16,6 +16,7 @@ from ventbench.board.verify import Report, verify
 from ventbench.errors import InputError
 
 from ..textbook import Textbook
+from .conftest import accept
 
 
 @pytest.fixture
@@ -180,6 +181,7 @@ def _forge(folder: Path, name: str, change: dict[str, Any]) -> Path:
         head = canonical.digest(line)
         lines += line
     (fresh / store.CHAIN).write_bytes(lines)
+    accept(fresh)
     build.build(fresh)
     return fresh
 

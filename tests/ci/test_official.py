@@ -8,7 +8,7 @@ import pytest
 from ci import official, propose, publish, workflow
 from ci.git import Git, GitError, environment
 from ci.take import TakeError, take
-from ventbench.board import canonical, record, store
+from ventbench.board import attestation, canonical, record, store
 from ventbench.errors import InputError
 from ventbench.sandbox.runner import SandboxRunner
 from ventbench.submissions.runner import InProcessRunner
@@ -77,7 +77,14 @@ def check_scored_again(path, folder, leaderboard, simulators, added):
     (folder / f"{canonical.digest(content)}.json").write_bytes(content)
     for other in set(path.parent.iterdir()) - {path}:
         (folder / other.name).write_bytes(other.read_bytes())
-    (new,) = propose.add(folder, leaderboard, simulators)
+    secret = "01" * 32
+    public = attestation._private(secret).public_key().public_bytes_raw()
+    (leaderboard / "keys.toml").write_text(
+        f'[[keys]]\nid = "{attestation.key_id(public)}"\npublic = "{public.hex()}"\n'
+        'added = 2026-11-23\nholder = "a test"\n'
+    )
+    (new,) = propose.add(folder, leaderboard, simulators, secret)
+    assert attestation.attested(leaderboard, [new.sha256, added[0].sha256]) == ({new.sha256}, [])
     assert new.header.supersedes == added[0].sha256
     assert new.header.reason == propose.SCORED_AGAIN
 

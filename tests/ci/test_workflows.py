@@ -30,6 +30,7 @@ TRUSTED = {
 }
 #: Texts of a maintainer, and outputs of our own scripts: as environment variables only.
 ONLY_ENV = {
+    "secrets.VENTBENCH_SIGNING_KEY",
     "inputs.commit",
     "inputs.name",
     "inputs.track",
@@ -74,7 +75,7 @@ class TestEach:
             assert not extra or content[True].keys() <= {"push", "workflow_dispatch"}
 
     def test_no_secret_and_no_foreign_pull_request_with_rights(self, path):
-        text = path.read_text()
+        text = path.read_text().replace("${{ secrets.VENTBENCH_SIGNING_KEY }}", "")
         assert not re.search(r"\bsecrets\b *[.\[]", text.replace("no secrets.", ""))
         assert "pull_request_target" not in text
         assert "workflow_run" not in text
@@ -110,6 +111,21 @@ def test_where_a_submission_runs_nothing_can_be_written():
     assert "GH_TOKEN" not in str(jobs["score"])
     assert "ci.official" not in str(jobs["propose"])
     assert jobs["propose"]["needs"] == "score"
+
+
+def test_the_key_that_signs_is_where_no_submission_runs():
+    """In one step, that of our own script; the environment keeps it from other branches."""
+    with_key = [
+        (path.stem, name, job)
+        for path in FILES
+        for name, job in read(path)["jobs"].items()
+        if "secrets." in str(job)
+    ]
+    ((workflow, name, job),) = with_key
+    assert (workflow, name) == ("score-official", "propose")
+    assert job["environment"] == "records"
+    (step,) = [step for step in job["steps"] if "secrets." in str(step)]
+    assert step["run"] == ".venv/bin/python -m ci.propose"
 
 
 def test_exploits_may_not_be_skipped():

@@ -34,7 +34,9 @@ def content(leaderboard: Store) -> dict[str, bytes]:
     Raises:
         InputError: if jinja2 is not installed.
     """
-    boards = ranking.boards(leaderboard.records) or {pages.CURRENT: ranking.empty(pages.CURRENT)}
+    boards = ranking.boards(leaderboard.records, leaderboard.attested) or {
+        pages.CURRENT: ranking.empty(pages.CURRENT)
+    }
     built = {"leaderboard.csv": frames.csv_text(boards).encode()}
     environment = pages.environment()
     versions = list(boards)

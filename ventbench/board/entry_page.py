@@ -144,7 +144,7 @@ def _history(row: Row) -> list[dict[str, Any]]:
     for event in row.entry.history:
         record = event.record
         state = "counts" if record.sha256 == counts else "superseded"
-        if not record.official and state != "counts":
+        if not event.official and state != "counts":
             state = "not official"
         if event.withdrawn is not None:
             state = "withdrawn"
@@ -152,7 +152,7 @@ def _history(row: Row) -> list[dict[str, Any]]:
             {
                 "sha256": record.sha256,
                 "created": record.header.created,
-                "official": record.official,
+                "official": event.official,
                 "state": state,
                 "reason": event.withdrawn or record.header.reason,
             }

@@ -141,7 +141,8 @@ def load_tracks(
 ) -> list[Track]:
     """Read and rank a leaderboard; arguments and errors as of :func:`load_board`."""
     path = FOLDER if folder is None else Path(folder)
-    boards = ranking.boards(store.load(path).records)
+    leaderboard = store.load(path)
+    boards = ranking.boards(leaderboard.records, leaderboard.attested)
     if not boards:
         raise InputError(f"{path} holds no record; add one with `ventbench board add`")
     chosen = next(iter(boards)) if version is None else version

@@ -92,16 +92,13 @@ def _aside(track: Track, status: str, row: Row) -> dict[str, Any] | None:
     """A line of the list of entries that are not ranked."""
     if status == "ranked":
         return None
-    reasons = list(row.entry.reasons)
-    if status == "not official":
-        reasons.insert(0, "not official: its sandbox lacked a layer, or there was none")
     return {
         "name": row.record.name,
         "track": track.name,
         "path": pages.entry_path(track.version, track.name, row.record.name),
         "official": status != "not official",
         "score": pages.interval(row.score),
-        "reasons": reasons,
+        "reasons": list(row.entry.reasons),
     }
 
 

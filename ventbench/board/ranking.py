@@ -8,7 +8,7 @@ difference is a paired one, and ranks can be counted within each resample.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -37,10 +37,17 @@ class Event:
     Attributes:
         record: the record.
         withdrawn: why it was taken back; None if it was not.
+        attested: whether it is signed or accepted; see :mod:`ventbench.board.attestation`.
     """
 
     record: Record
     withdrawn: str | None
+    attested: bool
+
+    @property
+    def official(self) -> bool:
+        """Whether its sandbox deserves the word, and somebody vouches for that."""
+        return self.record.official and self.attested
 
 
 @dataclass(frozen=True)
@@ -127,7 +134,7 @@ class Track:
         name: ``"performance"`` or ``"robustness"``.
         ranked: best first.
         unranked: official entries that are not ranked, with reasons, by name.
-        unofficial: entries without a sandbox that deserves the word, by name.
+        unofficial: entries that nobody vouches for, or without a full sandbox, by name.
         baseline: record of the track's PID, that the others are compared with; None if there is no
             ranked one.
     """
@@ -147,16 +154,19 @@ class Track:
         return [(kind, row) for kind, rows in zip(kinds, groups, strict=True) for row in rows]
 
 
-def boards(records: Sequence[Record | Withdrawal]) -> dict[int, tuple[Track, ...]]:
+def boards(
+    records: Sequence[Record | Withdrawal], attested: Container[str]
+) -> dict[int, tuple[Track, ...]]:
     """Rank all records.
 
     Args:
         records: in the order of the chain.
+        attested: hashes of the records that are signed or accepted.
 
     Returns:
         Tracks by version, newest version first.
     """
-    by_version = standings(records)
+    by_version = standings(records, attested)
     return {
         version: tuple(_track(version, *track) for track in by_version[version].items())
         for version in sorted(by_version, reverse=True)
@@ -182,11 +192,14 @@ def _track(version: int, name: str, standing: Standing) -> Track:
     )
 
 
-def standings(records: Sequence[Record | Withdrawal]) -> dict[int, dict[str, Standing]]:
+def standings(
+    records: Sequence[Record | Withdrawal], attested: Container[str]
+) -> dict[int, dict[str, Standing]]:
     """Sort records into boards.
 
     Args:
         records: in the order of the chain: later is newer, whatever their clocks said.
+        attested: hashes of the records that are signed or accepted.
 
     Returns:
         By version of the protocol, oldest first, then by track.
@@ -195,7 +208,7 @@ def standings(records: Sequence[Record | Withdrawal]) -> dict[int, dict[str, Sta
     grouped: dict[tuple[int, str, str], list[Event]] = defaultdict(list)
     for record in records:
         if isinstance(record, Record):
-            event = Event(record, withdrawn.get(record.sha256))
+            event = Event(record, withdrawn.get(record.sha256), record.sha256 in attested)
             grouped[record.version, record.track, record.name].insert(0, event)
     boards: dict[int, dict[str, Standing]] = {}
     for (version, track, _), history in sorted(grouped.items(), key=lambda group: group[0]):
@@ -205,14 +218,22 @@ def standings(records: Sequence[Record | Withdrawal]) -> dict[int, dict[str, Sta
 
 
 def _place(standing: Standing, history: tuple[Event, ...]) -> None:
-    counts = next((event for event in history if event.record.official), None)
+    counts = next((event for event in history if event.official), None)
     if counts is not None:
         why = reasons(counts)
         entry = Entry(counts.record, history, why)
         (standing.unranked if why else standing.ranked).append(entry)
     newest = history[0]
-    if not newest.record.official:
-        standing.unofficial.append(Entry(newest.record, history, reasons(newest)))
+    if not newest.official:
+        why = (_not_official(newest), *reasons(newest))
+        standing.unofficial.append(Entry(newest.record, history, why))
+
+
+def _not_official(event: Event) -> str:
+    """Why a record is not official."""
+    if not event.record.official:
+        return "not official: its sandbox lacked a layer, or there was none"
+    return "not official: no key of this leaderboard has signed the record"
 
 
 def reasons(event: Event) -> tuple[str, ...]:

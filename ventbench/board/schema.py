@@ -45,21 +45,22 @@ REQUIRED_MACHINE = ("system", "kernel", "architecture")
 _MAX_MESSAGE = 300
 
 
-def _matching(pattern: str) -> msgspec.Meta:
+def matching(pattern: str) -> msgspec.Meta:
+    """Constraint of a text that matches a pattern as a whole."""
     # msgspec searches; a record's text must match as a whole, and "$" would let a newline pass.
     return msgspec.Meta(pattern=rf"\A(?:{pattern})\Z")
 
 
 def _among(choices: Iterable[str]) -> msgspec.Meta:
-    return _matching("|".join(map(re.escape, choices)))
+    return matching("|".join(map(re.escape, choices)))
 
 
 Text = Annotated[str, msgspec.Meta(max_length=MAX_TEXT)]
-Sha256 = Annotated[str, _matching("[0-9a-f]{64}")]
-Time = Annotated[str, _matching(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z")]
-LungName = Annotated[str, _matching(r"R[0-9]{1,4}(\.[0-9]{1,3})?C[0-9]{1,4}(\.[0-9]{1,3})?")]
+Sha256 = Annotated[str, matching("[0-9a-f]{64}")]
+Time = Annotated[str, matching(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z")]
+LungName = Annotated[str, matching(r"R[0-9]{1,4}(\.[0-9]{1,3})?C[0-9]{1,4}(\.[0-9]{1,3})?")]
 LungId = Annotated[str, _among(LUNG_IDS)]
-EntryName = Annotated[str, _matching(NAME.pattern)]
+EntryName = Annotated[str, matching(NAME.pattern)]
 Family = Annotated[str, _among(FAMILIES)]
 Track = Annotated[str, _among(TRACKS)]
 
@@ -235,7 +236,7 @@ def read(content: bytes, label: str) -> ScoreContent | WithdrawalContent:
     Raises:
         InputError: naming the first key that is wrong.
     """
-    record = _decoded(_RECORD, content, label)
+    record = decoded(_RECORD, content, label)
     _check_time(record.created, f"{label}, key created")
     if isinstance(record, ScoreContent):
         for key in ("provenance", "simulators", "sandbox", "versions", "machine", "timing"):
@@ -255,10 +256,15 @@ def read_line(content: bytes, label: str) -> ChainLine:
     Raises:
         InputError: if it is not one.
     """
-    return _decoded(_LINE, content, label)
+    return decoded(_LINE, content, label)
 
 
-def _decoded(decoder: msgspec.json.Decoder[T], content: bytes, label: str) -> T:
+def decoded(decoder: msgspec.json.Decoder[T], content: bytes, label: str) -> T:
+    """Decode JSON.
+
+    Raises:
+        InputError: naming the first key that is wrong.
+    """
     try:
         return decoder.decode(content)
     except msgspec.ValidationError as error:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ventbench import files, protocol
-from ventbench.board import actions, canonical, record, schema
+from ventbench.board import actions, attestation, canonical, record, schema
 from ventbench.board.layout import CHAIN, RECORDS
 from ventbench.board.record import Record, Withdrawal
 from ventbench.errors import InputError
@@ -54,11 +54,14 @@ class Store:
         folder: of the leaderboard.
         links: lines of the chain.
         records: one for each line.
+        attested: hashes of the records that are signed or accepted; see
+            :mod:`ventbench.board.attestation`.
     """
 
     folder: Path
     links: tuple[Link, ...]
     records: tuple[Record | Withdrawal, ...]
+    attested: frozenset[str]
 
     @property
     def head(self) -> str:
@@ -116,14 +119,18 @@ def parse_chain(content: bytes, label: str = CHAIN) -> list[Link]:
 
 
 def load(folder: Path) -> Store:
-    """Read a leaderboard; every record is checked against its hash.
+    """Read a leaderboard; every record is checked against its hash and its signature.
 
     Raises:
-        InputError: naming the file that is missing or was changed.
+        InputError: naming the file that is missing, was changed, or holds a wrong signature.
         OSError: if one cannot be read.
     """
     links = read_chain(folder)
-    return Store(folder, tuple(links), tuple(read_record(folder, link) for link in links))
+    attested, problems = attestation.attested(folder, [link.record for link in links])
+    if problems:
+        raise InputError(problems[0])
+    records = tuple(read_record(folder, link) for link in links)
+    return Store(folder, tuple(links), records, attested)
 
 
 def read_chain(folder: Path) -> list[Link]:

@@ -5,7 +5,7 @@ Nothing stops at the first problem: each names its file, and the key, line or by
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench import draws, protocol
-from ventbench.board import actions, build, canonical, layout, ranking, record, store
+from ventbench.board import actions, attestation, build, canonical, layout, ranking, record, store
 from ventbench.board.record import Record, Withdrawal
 from ventbench.board.replay import BATCH, Simulators, deviation, differences, replay
 from ventbench.errors import InputError
@@ -85,12 +85,16 @@ def verify(
     report.records = len(entries)
     report.problems += _strange_files(folder, bool(links))
     report.problems += store.conflicts(entries)
+    vouched: frozenset[str] = frozenset()
+    if links:  # else nobody knows which records there are
+        vouched, problems = attestation.attested(folder, [link.record for link in links])
+        report.problems += problems
     scores = [entry for entry in entries if isinstance(entry, Record)]
     by_draw = _check_replay(folder, scores, load, report, progress)
     if not report.problems:  # else whatever is wrong has been said, and moves the ranks
-        report.problems += _check_ranks(entries, by_draw)
+        report.problems += _check_ranks(entries, vouched, by_draw)
     if len(entries) == len(links) > 0:
-        report.problems += _check_pages(store.Store(folder, tuple(links), tuple(entries)))
+        report.problems += _check_pages(store.Store(folder, tuple(links), tuple(entries), vouched))
     return report
 
 
@@ -157,16 +161,19 @@ def _check_replay(
 
 
 def _check_ranks(
-    entries: Sequence[Record | Withdrawal], by_draw: Mapping[str, Floats]
+    entries: Sequence[Record | Withdrawal],
+    attested: Container[str],
+    by_draw: Mapping[str, Floats],
 ) -> list[str]:
     """Ranks that recorded errors give and replayed ones do not: nobody gains by a rounding error.
 
     Args:
         entries: all that could be read, in the order of the chain.
+        attested: hashes of the records that are signed or accepted.
         by_draw: replayed scores of each draw; a record without one keeps its own.
     """
     problems = []
-    for tracks in ranking.standings(entries).values():
+    for tracks in ranking.standings(entries, attested).values():
         for name, standing in tracks.items():
             records = [entry.record for entry in standing.ranked]
             recorded = ranking.ranks([score.by_draw for score in records])

@@ -87,6 +87,43 @@ def withdraw(
 
 
 @app.command()
+def sign(
+    record: Annotated[str, typer.Argument(help="SHA-256 of the record, or the beginning of it.")],
+    folder: Folder = FOLDER,
+) -> None:
+    """Sign a record with the secret key in the environment variable VENTBENCH_SIGNING_KEY.
+
+    Whoever signs says that the record's code gave its commands: run `board verify --rerun` first.
+
+    Example: `ventbench board sign 3f2a91`
+    """
+    import os
+
+    from ventbench.board import attestation, store
+    from ventbench.errors import InputError
+
+    secret = os.environ.get(attestation.SECRET, "")
+    if not secret:
+        raise InputError(f"environment variable {attestation.SECRET} holds no key")
+    sha256 = store.find_record(store.load(folder), record).sha256
+    typer.echo(f"signed {sha256}: {attestation.sign(folder, sha256, secret)}")
+    typer.echo("next: ventbench board build")
+
+
+@app.command(name="new-key")
+def new_key() -> None:
+    """Make a key that signs records: the secret, and the lines for leaderboard/keys.toml.
+
+    Example: `ventbench board new-key`
+    """
+    from ventbench.board import attestation
+
+    secret, lines = attestation.new_key()
+    typer.echo(f"# secret: {attestation.SECRET} of the workflow; keep it nowhere else\n{secret}\n")
+    typer.echo(f"# public: for leaderboard/keys.toml\n{lines}", nl=False)
+
+
+@app.command()
 def build(folder: Folder = FOLDER, json: JsonFile = None) -> None:
     """Build the CSV and all pages from the records; the same records give the same bytes.
 

@@ -1,0 +1,173 @@
+"""Official is what somebody vouches for who may, never what a record says of itself."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from ventbench.board import attestation, build, canonical, frames, layout, store
+from ventbench.board.verify import verify
+from ventbench.errors import InputError
+
+from .conftest import accept, put
+
+pytest.importorskip("cryptography")
+
+SECRET = "01" * 32
+
+
+@pytest.fixture(scope="module")
+def keys() -> str:
+    """Lines of keys.toml for :data:`SECRET`."""
+    return lines_of(SECRET)
+
+
+def lines_of(secret: str) -> str:
+    public = attestation._private(secret).public_key().public_bytes_raw()
+    return (
+        f'[[keys]]\nid = "{attestation.key_id(public)}"\npublic = "{public.hex()}"\n'
+        'added = 2026-11-23\nholder = "a test"\n'
+    )
+
+
+def status(folder: Path) -> dict[str, str]:
+    board = frames.load_board(folder, track="performance")
+    return dict(zip(board["name"], board["status"], strict=True))
+
+
+@pytest.fixture
+def unsigned(leaderboard: Path) -> Path:
+    """A leaderboard whose records say "official", and nobody else does."""
+    (leaderboard / layout.ACCEPTED).unlink()
+    build.build(leaderboard)
+    return leaderboard
+
+
+def sha_of(folder: Path, name: str) -> str:
+    return next(score.sha256 for score in store.load(folder).scores if score.name == name)
+
+
+def test_official_is_not_self_declared(unsigned: Path, simulators) -> None:
+    assert all(score.official for score in store.load(unsigned).scores if score.name != "home")
+    assert set(status(unsigned).values()) == {"not official"}
+    assert verify(unsigned, lambda version: simulators).problems == []
+    page = (unsigned / "index.html").read_text()
+    assert "not official: no key of this leaderboard has signed the record" in page
+    assert "not official: its sandbox lacked a layer" in page
+    accept(unsigned)
+    assert status(unsigned)["softer"] == "ranked", "control"
+
+
+def test_a_signed_record_is_official(unsigned: Path, keys: str, simulators) -> None:
+    (unsigned / layout.KEYS).write_text(keys)
+    for name in ("softer", "home"):
+        attestation.sign(unsigned, sha_of(unsigned, name), SECRET)
+    build.build(unsigned)
+    found = status(unsigned)
+    assert found["softer"] == "ranked"
+    assert found["harder"] == "not official"
+    assert found["home"] == "not official", "a signature gives nobody a sandbox"
+    assert verify(unsigned, lambda version: simulators).problems == []
+
+
+def test_an_unsigned_record_does_not_take_the_place_of_a_signed_one(
+    leaderboard: Path, draft, simulators
+) -> None:
+    accepted = (leaderboard / layout.ACCEPTED).read_text()
+    old = sha_of(leaderboard, "softer")
+    new = put(leaderboard, draft("softer", factor=0.5, supersedes=old), simulators)
+    (leaderboard / layout.ACCEPTED).write_text(accepted)
+    board = frames.load_board(leaderboard, track="performance").query("name == 'softer'")
+    assert dict(zip(board["record"], board["status"], strict=True)) == {
+        old: "ranked",
+        new.sha256: "not official",
+    }
+
+
+def test_wrong_signatures_are_named(unsigned: Path, keys: str, simulators) -> None:
+    (unsigned / layout.KEYS).write_text(keys)
+    softer, harder = (sha_of(unsigned, name) for name in ("softer", "harder"))
+    path = attestation.sign(unsigned, softer, SECRET)
+    good = path.read_bytes()
+    values = json.loads(good)
+
+    def problem() -> str:
+        found = verify(unsigned, lambda version: simulators).problems
+        with pytest.raises(InputError):
+            store.load(unsigned)
+        return "\n".join(x for x in found if path.parent.name in x or "keys.toml" in x)
+
+    wrong = {
+        "signs another record": {"record": harder},
+        "the signature is not by key": {"signature": "0" * 128},
+        "is not in keys.toml": {"key": "0" * 16},
+        "key signature": {"signature": "0"},
+    }
+    for message, change in wrong.items():
+        path.write_bytes(canonical.canonical(values | change))
+        assert message in problem()
+    path.write_bytes(good[:-1])
+    assert "not in canonical form" in problem()
+    path.write_bytes(b"x" * 2000)
+    assert "too large" in problem()
+    path.write_bytes(good)
+    # The signature of one record is none of another.
+    moved = attestation.signature_path(unsigned, harder)
+    moved.write_bytes(canonical.canonical(values | {"record": harder}))
+    assert "the signature is not by key" in problem()
+    moved.unlink()
+    (unsigned / layout.KEYS).write_text(keys.replace(json.loads(good)["key"], "0" * 16))
+    assert "keys.toml" in problem()
+    (unsigned / layout.KEYS).write_text(lines_of("02" * 32))
+    assert "is not in keys.toml" in problem()
+
+
+def test_lists_are_checked(leaderboard: Path, simulators) -> None:
+    path = leaderboard / layout.ACCEPTED
+    good = path.read_text()
+    path.write_text(f'[[records]]\nrecord = "{"a" * 64}"\nreason = "x"\ndate = 2026-11-23\n{good}')
+    (problem,) = verify(leaderboard, lambda version: simulators).problems
+    assert f"record {'a' * 64} is not on the chain" in problem
+    path.write_text(good.replace('reason = "a test"', 'reason = " "'))
+    assert any("accepted.toml: " in x for x in verify(leaderboard, lambda _: simulators).problems)
+    path.unlink()
+    path.symlink_to("/dev/zero")
+    assert any("is a link" in x for x in verify(leaderboard, lambda _: simulators).problems)
+
+
+def test_only_a_listed_key_signs(unsigned: Path, keys: str) -> None:
+    (unsigned / layout.KEYS).write_text(keys)
+    sha256 = sha_of(unsigned, "softer")
+    with pytest.raises(InputError, match="is not in"):
+        attestation.sign(unsigned, sha256, "02" * 32)
+    with pytest.raises(InputError, match="not a key of 64") as refused:
+        attestation.sign(unsigned, sha256, "very secret")
+    assert "very secret" not in str(refused.value)
+
+
+def test_without_the_library_there_is_advice(unsigned: Path, keys: str, monkeypatch) -> None:
+    (unsigned / layout.KEYS).write_text(keys)
+    attestation.sign(unsigned, sha_of(unsigned, "softer"), SECRET)
+    monkeypatch.setitem(sys.modules, "cryptography.exceptions", None)
+    with pytest.raises(InputError, match=r"pip install 'ventbench\[attest\]'"):
+        store.load(unsigned)
+
+
+def test_a_new_key_signs(unsigned: Path, monkeypatch) -> None:
+    from typer.testing import CliRunner
+
+    from ventbench.cli import app
+
+    made = CliRunner().invoke(app, ["board", "new-key"]).output
+    secret = made.splitlines()[1]
+    (unsigned / layout.KEYS).write_text(made[made.index("[[keys]]") :])
+    monkeypatch.setitem(os.environ, attestation.SECRET, secret)
+    name = sha_of(unsigned, "softer")
+    signed = CliRunner().invoke(app, ["board", "sign", name[:12], "--folder", str(unsigned)])
+    assert signed.exit_code == 0
+    assert f"signed {name}" in signed.output
+    assert status(unsigned)["softer"] == "ranked"

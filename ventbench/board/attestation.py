@@ -1,0 +1,259 @@
+"""Who vouches for a record: a signature of the scoring workflow, or the maintainers' list.
+
+Replay proves that a record's errors follow from its commands, and nothing about who computed the
+commands. A record counts as official only if
+
+- ``records/HASH.sig`` holds an Ed25519 signature over its hash by a key of ``keys.toml``, or
+- ``accepted.toml`` names it, with a reason and a date: records from before there were signatures.
+
+Both lists are changed by reviewed commits alone. The signature is made in a job that has run no
+code of a submission; see ``ci/propose.py``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from collections.abc import Collection
+from datetime import date
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+import msgspec
+
+from ventbench import files
+from ventbench.board import canonical, schema
+from ventbench.board.layout import ACCEPTED, KEYS, RECORDS, SIGNATURE_SUFFIX
+from ventbench.errors import InputError
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+#: Environment variable with the secret key: 64 hexadecimal digits.
+SECRET = "VENTBENCH_SIGNING_KEY"
+
+#: Stands before the hash in what is signed, so that no signature of other use fits.
+_PURPOSE = b"ventbench record 1\n"
+
+#: Largest signature file and list, bytes.
+_MAX_SIGNATURE_BYTES, _MAX_LIST_BYTES = 1000, 1_000_000
+
+_Hex32 = Annotated[str, schema.matching("[0-9a-f]{64}")]
+_KeyId = Annotated[str, schema.matching("[0-9a-f]{16}")]
+
+T = TypeVar("T")
+
+
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A table with exactly these keys."""
+
+
+class Key(_Table, frozen=True):
+    """A public key of ``keys.toml``; ``id`` is the beginning of its SHA-256."""
+
+    id: _KeyId
+    public: _Hex32
+    added: date
+    holder: schema.Text
+
+
+class Accepted(_Table, frozen=True):
+    """A record of ``accepted.toml`` that counts without a signature."""
+
+    record: schema.Sha256
+    reason: Annotated[str, msgspec.Meta(max_length=schema.MAX_TEXT, pattern=r"\S")]
+    date: date
+
+
+class _Keys(_Table, frozen=True):
+    keys: list[Key] = []
+
+
+class _AcceptedList(_Table, frozen=True):
+    records: list[Accepted] = []
+
+
+class _Signature(_Table, frozen=True):
+    """Content of ``records/HASH.sig``."""
+
+    key: _KeyId
+    record: schema.Sha256
+    signature: Annotated[str, schema.matching("[0-9a-f]{128}")]
+
+
+def attested(folder: Path, records: Collection[str]) -> tuple[frozenset[str], list[str]]:
+    """Find the records that somebody who may do so vouches for.
+
+    Args:
+        folder: of the leaderboard.
+        records: SHA-256 of all records on its chain.
+
+    Returns:
+        Hashes of the records that are signed or accepted, and a sentence for each signature or
+        line of a list that is wrong.
+
+    Raises:
+        InputError: if there are signatures and no library to check them with.
+        OSError: if a file cannot be read.
+    """
+    vouched: set[str] = set()
+    problems: list[str] = []
+    keys: dict[str, Key] = {}
+    accepted: list[Accepted] = []
+    try:
+        keys = {key.id: key for key in _read_list(folder / KEYS, _Keys).keys}
+        accepted = _read_list(folder / ACCEPTED, _AcceptedList).records
+    except InputError as error:
+        problems.append(str(error))
+    problems += [
+        f"{folder / KEYS}: key {key.id} should have the id {key_id(bytes.fromhex(key.public))}"
+        for key in keys.values()
+        if key.id != key_id(bytes.fromhex(key.public))
+    ]
+    for entry in accepted:
+        if entry.record in records:
+            vouched.add(entry.record)
+        else:
+            problems.append(f"{folder / ACCEPTED}: record {entry.record} is not on the chain")
+    for sha256 in records:
+        path = signature_path(folder, sha256)
+        if not path.is_file() or path.is_symlink():
+            continue
+        try:
+            check(path, sha256, keys)
+            vouched.add(sha256)
+        except InputError as error:
+            problems.append(str(error))
+    return frozenset(vouched), problems
+
+
+def check(path: Path, sha256: str, keys: dict[str, Key]) -> None:
+    """Check the signature of a record.
+
+    Args:
+        path: of the signature.
+        sha256: of the record.
+        keys: that may sign, by id.
+
+    Raises:
+        InputError: if it is not a signature of this record by one of the keys, or there is no
+            library to check it with.
+    """
+    if path.stat().st_size > _MAX_SIGNATURE_BYTES:
+        raise InputError(f"{path} is no signature: it is too large")
+    content = path.read_bytes()
+    canonical.parse(content, str(path))
+    signature = schema.decoded(_SIGNATURE, content, str(path))
+    if signature.record != sha256:
+        raise InputError(f"{path} signs another record, {signature.record[:12]}")
+    key = keys.get(signature.key)
+    if key is None:
+        raise InputError(f"{path}: key {signature.key} is not in {KEYS}")
+    ed25519, invalid = _library()
+    public = ed25519.Ed25519PublicKey.from_public_bytes(bytes.fromhex(key.public))
+    try:
+        public.verify(bytes.fromhex(signature.signature), _message(sha256))
+    except invalid:
+        raise InputError(f"{path}: the signature is not by key {key.id}") from None
+
+
+def sign(folder: Path, sha256: str, secret: str) -> Path:
+    """Sign a record of a leaderboard.
+
+    Args:
+        folder: of the leaderboard.
+        sha256: of the record.
+        secret: key, 64 hexadecimal digits.
+
+    Returns:
+        Path of the signature.
+
+    Raises:
+        InputError: if the secret is not a key, its public key is not in ``keys.toml``, or there
+            is no library to sign with.
+    """
+    private = _private(secret)
+    public = private.public_key().public_bytes_raw()
+    keys = {key.id: key for key in _read_list(folder / KEYS, _Keys).keys}
+    own = keys.get(key_id(public))
+    if own is None or own.public != public.hex():
+        raise InputError(f"the public key of {SECRET}, {key_id(public)}, is not in {folder / KEYS}")
+    content = canonical.canonical(
+        {
+            "key": own.id,
+            "record": sha256,
+            "signature": private.sign(_message(sha256)).hex(),
+        }
+    )
+    path = signature_path(folder, sha256)
+    files.write_atomically(path, lambda file: file.write(content))
+    return path
+
+
+def new_key() -> tuple[str, str]:
+    """Make a key.
+
+    Returns:
+        The secret, 64 hexadecimal digits, and the lines for ``keys.toml``.
+
+    Raises:
+        InputError: if there is no library to make one with.
+    """
+    ed25519, _ = _library()
+    private = ed25519.Ed25519PrivateKey.generate()
+    public = private.public_key().public_bytes_raw()
+    lines = (
+        f'[[keys]]\nid = "{key_id(public)}"\npublic = "{public.hex()}"\n'
+        f'added = {date.today().isoformat()}\nholder = "the workflow score-official"\n'
+    )
+    return private.private_bytes_raw().hex(), lines
+
+
+def key_id(public: bytes) -> str:
+    """Short name of a public key: the beginning of its SHA-256."""
+    return hashlib.sha256(public).hexdigest()[:16]
+
+
+def signature_path(folder: Path, sha256: str) -> Path:
+    """Where the signature of a record lies."""
+    return folder / RECORDS / f"{sha256}{SIGNATURE_SUFFIX}"
+
+
+def _message(sha256: str) -> bytes:
+    return _PURPOSE + sha256.encode("ascii") + b"\n"
+
+
+def _private(secret: str) -> Ed25519PrivateKey:
+    ed25519, _ = _library()
+    try:
+        return ed25519.Ed25519PrivateKey.from_private_bytes(bytes.fromhex(secret.strip()))
+    except ValueError:  # its text is a secret and must not be in the message
+        raise InputError(f"{SECRET} is not a key of 64 hexadecimal digits") from None
+
+
+def _library() -> tuple[Any, type[Exception]]:
+    """The module of Ed25519 and its error of a wrong signature."""
+    try:
+        from cryptography.exceptions import InvalidSignature
+        from cryptography.hazmat.primitives.asymmetric import ed25519
+    except ImportError as error:
+        raise InputError(
+            "signatures of records need cryptography: install ventbench[attest] "
+            f"(pip install 'ventbench[attest]'); import failed with: {error}"
+        ) from error
+    return ed25519, InvalidSignature
+
+
+def _read_list(path: Path, kind: type[T]) -> T:
+    """Read a TOML file; an empty list where there is none."""
+    if not path.exists():
+        return kind()
+    if path.is_symlink() or path.stat().st_size > _MAX_LIST_BYTES:
+        raise InputError(f"{path} is a link, or larger than {_MAX_LIST_BYTES} bytes")
+    try:
+        return msgspec.convert(tomllib.loads(path.read_text("utf-8")), kind)
+    except (ValueError, RecursionError) as error:  # not UTF-8, not TOML, or not of this form
+        raise InputError(f"{path}: {error}") from None
+
+
+_SIGNATURE = msgspec.json.Decoder(_Signature)

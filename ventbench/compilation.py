@@ -17,7 +17,7 @@ _ARENA_MAX = -8
 
 
 def folder() -> Path:
-    """Where they are kept: a folder of the user's cache for each kind of processor.
+    """Folder of kept functions: in the user's cache, one for each kind of processor.
 
     ``VENTBENCH_CACHE`` names another one; empty for none.
     """

@@ -1,4 +1,4 @@
-"""Where the files beside the code are: in the checkout, or inside the installed wheel."""
+"""Paths of the files beside the code: in the checkout, or inside the installed wheel."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def target(scenario: Scenario, step: Array | int) -> Array:
 def observe(
     scenario: Scenario, loop: LoopState, breath: Array | int, step: Array | int
 ) -> Observation:
-    """What the controller sees at a step of an inspiration.
+    """Observation of the controller at a step of an inspiration.
 
     Args:
         scenario: the cells.

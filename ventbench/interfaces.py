@@ -1,4 +1,4 @@
-"""What a plant and a controller are: the two interfaces on which everything else is built.
+"""Plant and controller: the two interfaces on which everything else is built.
 
 Standard library only: processes that run submissions import this module too.
 """
@@ -55,7 +55,7 @@ class Plant(Protocol):
 
 
 class Task(NamedTuple):
-    """What a submission is told before a run.
+    """Information that a submission gets before a run.
 
     Attributes:
         track: ``"performance"`` or ``"robustness"``.
@@ -71,7 +71,7 @@ class Task(NamedTuple):
 
 
 class Observation(NamedTuple):
-    """What a controller at a bench could see, at one step of an inspiration.
+    """Observation that a real ventilator could give a controller, at one step of an inspiration.
 
     In a submission every field is a Python float (``targets_ahead`` a tuple of floats); in pure
     controllers every field is an array with the batch shape ``(...)``.

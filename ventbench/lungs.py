@@ -60,7 +60,7 @@ LUNG_IDS: tuple[str, ...] = tuple(lung.id for lung in LUNGS)
 
 
 def scored_lung(lung_id: str) -> Lung:
-    """Like :func:`lung`, but only the six scored settings are accepted.
+    """Return one of the six scored lung settings by its id.
 
     Raises:
         InputError: if the text is not the id of a scored lung.

@@ -31,7 +31,7 @@ SETTINGS = "settings.json"
 
 
 class Format(NamedTuple):
-    """How a result is stored.
+    """Format in which a result is stored.
 
     Attributes:
         suffix: suffix of the file name, with the dot.
@@ -200,7 +200,7 @@ def _read(path: Path, format: Format) -> Any:
 
 
 def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """What the settings are once written as JSON and read back: tuples become lists."""
+    """Settings as JSON would return them: tuples become lists."""
     return json.loads(json.dumps(dict(settings), sort_keys=True))
 
 

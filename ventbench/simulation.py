@@ -42,7 +42,7 @@ class Controls:
 
 @dataclass(frozen=True)
 class Simulation:
-    """What a simulator answered to one sequence of commands; arrays of shape ``(T,)``.
+    """Response of a simulator to one sequence of commands; arrays of shape ``(T,)``.
 
     Attributes:
         lung: id, such as ``"R20C50"``.

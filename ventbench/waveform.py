@@ -1,4 +1,4 @@
-"""What the protocol fixes for a breath: the target waveform and the commands of the expiration.
+"""Fixed parts of a breath in the protocol: target waveform and commands of the expiration.
 
 Both follow from the integer step of the breath, never from accumulated time.
 """

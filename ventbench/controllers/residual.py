@@ -153,7 +153,7 @@ class Residual:
         return state, base, correction
 
     def _begin(self, state: ResidualState, seen: Observation, error: Array) -> ResidualState:
-        """Where a breath begins, turn the traces of the previous breath into its memory."""
+        """Turn the traces of the previous breath into memory at the first step of a breath."""
         restart = seen.time + jnp.zeros_like(error) == 0
         wide = restart[..., None]
         room = jnp.zeros((*error.shape, self.ahead), error.dtype)

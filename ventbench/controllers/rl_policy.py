@@ -37,7 +37,7 @@ ERROR_SCALE, TARGET_SCALE, COMMAND_SCALE = 10.0, 40.0, 50.0
 
 @flax.struct.dataclass
 class FeatureState:
-    """What the features need of earlier steps.
+    """Traces of earlier steps that the features need.
 
     Attributes:
         pid: state of the PID, ``(...)``.

@@ -1,4 +1,4 @@
-"""What a recording needs: mechanisms of the library, an unnamed effect beside them, or neither.
+"""The model that a recording needs: mechanisms, an unnamed effect beside them, or neither.
 
 :func:`conclude` selects mechanisms (:mod:`ventbench.diagnosis.selection`), looks for what they
 leave unexplained with nonparametric terms and latent inputs, drops the mechanisms that this makes
@@ -66,7 +66,7 @@ class UnnamedEffect:
 
 @dataclass(frozen=True, eq=False)
 class Conclusion:
-    """What a recording needs.
+    """The models that a recording needs.
 
     Attributes:
         base: the base model with its noise.
@@ -112,23 +112,23 @@ def conclude(evaluator: Evaluator, wider: Callable[[], Evaluator], tell: Progres
     tell("looking for effects that no mechanism explains")
     wide = wider()
     reduced = drop_compensating_terms(evaluator, wide, selected, tell)
-    rest = _explain_rest(evaluator, wide, reduced)
-    if reduced is not selected and not rest.prefers_term:
+    remaining = _explain_remaining_error(evaluator, wide, reduced)
+    if reduced is not selected and not remaining.prefers_term:
         # The term that explains the dropped mechanisms away must be there in their place.
-        rest = _explain_rest(evaluator, wide, selected)
+        remaining = _explain_remaining_error(evaluator, wide, selected)
     else:
         selected = reduced
-    if not evaluator.gain_sd and rest.gain_sd:
-        sd = rest.gain_sd
+    if not evaluator.gain_sd and remaining.gain_sd:
+        sd = remaining.gain_sd
         return conclude(replace(evaluator, gain_sd=sd), lambda: replace(wide, gain_sd=sd), tell)
     unnamed, full = None, selected
-    if rest.latent is not None and not rest.prefers_term:
-        unnamed = rest.latent
+    if remaining.latent is not None and not remaining.prefers_term:
+        unnamed = remaining.latent
         assert unnamed.latent_input is not None
         selected = eliminate_beside_input(evaluator, selected, unnamed.latent_input, unnamed.nats)
         full = selected
-    elif rest.term is not None:
-        selected, fit = backward_elimination(evaluator, wide, selected, rest.term)
+    elif remaining.term is not None:
+        selected, fit = backward_elimination(evaluator, wide, selected, remaining.term)
         unnamed, full = UnnamedEffect(component_of(fit.term), fit.term, None, fit.nats), fit.full
     tell("comparing alternatives")
     selected, alternatives = find_alternatives(
@@ -178,8 +178,8 @@ def is_unresolved(evaluator: Evaluator, comparisons: Sequence[Comparison]) -> bo
 
 
 @dataclass(frozen=True, eq=False)
-class _Rest:
-    """What explains the rest that the mechanisms leave.
+class _Unexplained:
+    """Explanation of the error that the mechanisms leave.
 
     Attributes:
         term: best nonparametric term, or None.
@@ -198,7 +198,9 @@ class _Rest:
         return self.term is not None and self.term.nats >= nats
 
 
-def _explain_rest(evaluator: Evaluator, wide: Evaluator, selected: FittedModel) -> _Rest:
+def _explain_remaining_error(
+    evaluator: Evaluator, wide: Evaluator, selected: FittedModel
+) -> _Unexplained:
     term = _best_term(wide, selected)
     passive = without_breath_terms(evaluator, selected)
     inputs = fit_latent_inputs(evaluator, passive, (GAIN_SCATTER, *PLACES))
@@ -206,7 +208,7 @@ def _explain_rest(evaluator: Evaluator, wide: Evaluator, selected: FittedModel) 
     scatter, settings = inputs.pop(GAIN_SCATTER), evaluator.settings
     scattered = _gain_scatters(scatter, inputs, reference, term, settings)
     gain_sd = scatter.size if scattered else 0.0
-    return _Rest(term, _best_input(inputs, reference, settings), gain_sd)
+    return _Unexplained(term, _best_input(inputs, reference, settings), gain_sd)
 
 
 def _best_term(wide: Evaluator, selected: FittedModel) -> NonparametricFit | None:

@@ -21,7 +21,7 @@ from ventbench.system_id.data import Floats
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What becomes of a simulator.
+    """A corrected simulator.
 
     Attributes:
         pressures: pressures of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n, T)``

@@ -157,13 +157,13 @@ def _of_lung(breaths: Breaths, lung: str) -> Breaths:
 
 
 def _name(given: Given, simulators: Simulators) -> str:
-    """What the reports call a simulator."""
+    """Name of a simulator in reports."""
     has_name = isinstance(given, str | Path | Simulators) or simulators.kind == "function"
     return simulators.name if has_name else "given"
 
 
 def _note_on_unchanged(correction: Correction) -> str:
-    """Why a simulator is left as it is."""
+    """Note on why a simulator is left as it is."""
     before, after = correction.training_errors
     return (
         "The identified correction would raise the simulator's mean absolute error on the training "

@@ -1,4 +1,4 @@
-"""What is reported of a conclusion: estimates with intervals, lungs, plants, nonparametric term."""
+"""Reported quantities of a conclusion: estimates, intervals, lungs, plants, unnamed effect."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
             start[path] = float(np.median(fitted.column(path)))
     for name in hypothesis.names:
         for pair in mechanism(name).description.interchangeable:
-            first, second = (f"{name}.{each}" for each in pair)
+            first, second = (f"{name}.{parameter}" for parameter in pair)
             if {first, second} <= set(start) and start[second] > start[first]:
                 start[first], start[second] = start[second], start[first]
     known = fitted.problem.data

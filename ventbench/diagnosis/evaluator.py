@@ -314,7 +314,7 @@ class Evaluator:
         return values
 
     def breath_term(self, fitted: FittedModel) -> BreathTerm:
-        """What differs from breath to breath in a model."""
+        """Term of a model whose parameters differ from breath to breath."""
         return breath_term(fitted.names, self.settings)
 
     def _differs_by_breath(self, path: str) -> bool:

@@ -100,7 +100,7 @@ def acting(fitted: FittedHypothesis) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """What a hypothesis expects of m new breaths.
+    """Prediction of m new breaths by a hypothesis.
 
     Attributes:
         white: predicted readings, whitened, ``(m, c T)``.

@@ -68,7 +68,7 @@ def usable(breaths: Breaths, settings: DataSettings = DEFAULT.data) -> tuple[Bre
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedModel:
-    """What breaths need, with the final fit.
+    """A model identified from breaths, with the final fit.
 
     Attributes:
         evaluator: evaluator of the breaths.

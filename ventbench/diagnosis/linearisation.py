@@ -58,7 +58,7 @@ class Linearisation:
         return flat.reshape(q, n, m).swapaxes(0, 1)
 
     def template(self, prediction: Floats) -> Floats:
-        """What another prediction ``(n, c, T)`` adds that no refit can absorb, ``(n, m)``."""
+        """Part of another prediction ``(n, c, T)`` that no refit can absorb, ``(n, m)``."""
         white = self.without_own(self.whiten(prediction - self.prediction)[:, None])
         return self.without_shared(white)[:, 0]
 

@@ -34,7 +34,7 @@ AMPLITUDE, ONSET, DURATION = (f"{EFFORT}.{p}" for p in ("amplitude", "onset", "d
 
 
 class ScreenedTerm(NamedTuple):
-    """What a term that differs from breath to breath promises.
+    """Expected gain of a term that differs from breath to breath.
 
     Attributes:
         nats: log-likelihood that it is expected to gain, for each linearisation.
@@ -94,7 +94,7 @@ def breath_term(names: Iterable[str], settings: SelectionConfig) -> BreathTerm:
 
 
 class NoBreathTerm:
-    """All terms have the same parameters in all breaths."""
+    """Stands for a hypothesis whose parameters are equal in all breaths."""
 
     def screen(self, linearisations: list[Linearisation]) -> ScreenedTerm | None:
         """Return None: nothing is integrated out."""
@@ -151,9 +151,9 @@ class PatientEffortTerm:
         return self.settings.patient_effort
 
     def screen(self, linearisations: list[Linearisation]) -> ScreenedTerm:
-        """Sums over the grid of onsets, at the best duration of a grid."""
-        evidence = [self.evidence([each])[0] for each in linearisations]
-        nats = [max(float(each.nats.sum()), 0.0) for each in evidence]
+        """Expected gain: sums over the grid of onsets, at the best duration of a grid."""
+        evidence = [self.evidence([linearisation])[0] for linearisation in linearisations]
+        nats = [max(float(terms.nats.sum()), 0.0) for terms in evidence]
         return ScreenedTerm(tuple(nats), {DURATION: evidence[int(np.argmax(nats))].duration})
 
     def start(
@@ -251,7 +251,10 @@ class PatientEffortTerm:
         best: list[Evidence] = []
         for length in self.prior.durations if duration is None else (duration,):
             effects = self._effects(linearisations[0], length)
-            new = [self._grid_evidence(each, length, effects) for each in linearisations]
+            new = [
+                self._grid_evidence(linearisation, length, effects)
+                for linearisation in linearisations
+            ]
             best = best or new
             best = [
                 after if after.nats.sum() > before.nats.sum() else before

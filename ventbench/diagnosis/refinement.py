@@ -1,4 +1,4 @@
-"""What becomes of selected terms beside effects that the library has no mechanism for.
+"""Selected terms beside effects that the library has no mechanism for: keep, drop or replace.
 
 Forward selection can only choose mechanisms of the library. Where the recording contains something
 else, a sum of mechanisms may imitate it. Four questions separate the two:
@@ -84,7 +84,7 @@ class SingleTermAlternative:
         self._evaluator, self._wider, self._base = evaluator, wider, base
 
     def __call__(self, selected: FittedModel) -> FittedModel | None:
-        """What replaces many mechanisms if one nonparametric term alone does better; else None.
+        """Model that replaces many mechanisms if one nonparametric term does better; else None.
 
         The replacement has the mechanisms that are special cases of the term, or none.
         """
@@ -323,7 +323,7 @@ def _is_effort(
 
 @dataclass(frozen=True, eq=False)
 class Alternatives:
-    """What else could explain the effect of a selected mechanism.
+    """Alternative explanations of the effect of a selected mechanism.
 
     Attributes:
         names: other mechanisms, the likeliest first.

@@ -87,7 +87,7 @@ def missing_mechanism(missing: MissingMechanism) -> str:
 
 
 def effect(findings: Findings) -> str:
-    """Where and by how much the simulator errs without the correction."""
+    """Sentence on where and by how much the simulator errs without the correction."""
     if not findings.location:
         return ""
     phases = [region for region in findings.location if region.axis in _PHASES]
@@ -139,7 +139,7 @@ def alternatives(findings: Findings) -> list[str]:
 
 
 def request(findings: Findings) -> str:
-    """What to record next."""
+    """Sentence on what to record next."""
     wanted = findings.request
     if wanted is None:
         return ""
@@ -153,7 +153,7 @@ def request(findings: Findings) -> str:
 
 
 def nonparametric_term(findings: Findings) -> str:
-    """Where an effect acts that is not in the library, and how much it explains."""
+    """Sentence on where an unnamed effect acts, and how much it explains."""
     term = findings.nonparametric
     if term is None:
         return ""
@@ -267,7 +267,7 @@ def _is_unchanged(findings: Findings) -> bool:
 
 
 def _error(region: ErrorRegion, noise: float) -> str:
-    """How the simulator errs in a region; errors are recorded minus simulated."""
+    """Phrase on how the simulator errs in a region; errors are recorded minus simulated."""
     size = abs(region.mean_error)
     if size < max(_NO_SIGN * noise, 0.005):
         return (

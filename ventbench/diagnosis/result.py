@@ -255,7 +255,7 @@ def _lung(match: LungMatch) -> dict[str, Any]:
 
 
 def _request(request: BreathRequest) -> dict[str, Any]:
-    """With the commands, so that a rig can run them."""
+    """JSON values of requested breaths, with the commands for a rig to run."""
     return {
         "title": request.title,
         "why": list(request.why),

@@ -32,7 +32,7 @@ class Candidate:
         hypothesis: what it adds.
         start: values to start a fit from, by path.
         nats: log-likelihood that it is expected to gain.
-        white_nats: the same if the noise were white.
+        white_nats: log-likelihood that it would gain if the noise were white.
     """
 
     name: str

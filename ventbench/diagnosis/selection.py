@@ -55,7 +55,7 @@ class RankedModel:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What could be added to a hypothesis, compared at one noise.
+    """Terms that could be added to a hypothesis, compared at one noise.
 
     Attributes:
         base: the hypothesis without any candidate.

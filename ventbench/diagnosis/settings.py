@@ -18,7 +18,7 @@ VERSION = "selection-1"
 
 @dataclass(frozen=True)
 class DataSettings:
-    """Which breaths are used, and which are held out.
+    """Selection of the breaths that are used, and of those that are held out.
 
     Attributes:
         min_breaths: fewest usable breaths, since each side of the split needs two.
@@ -87,7 +87,7 @@ class ScreeningSettings:
 
 @dataclass(frozen=True)
 class HeldOutTestSettings:
-    """Whether held-out breaths ask for a term.
+    """Test whether held-out breaths ask for a term.
 
     Attributes:
         threshold: log-likelihood ratio on held-out breaths, nats: log(1 / 0.01), so that chance
@@ -125,7 +125,7 @@ class ForwardSelectionSettings:
             and all candidates are fitted.
         fitted_candidates: candidates that are fitted otherwise.
         contender_criterion: criterion within which a candidate may still win and is fitted on.
-        contender_share: share of the best candidate's gain within which the same holds.
+        contender_share: share of the best candidate's gain within which a candidate may still win.
         noise_rounds: most times that the winner and the noise are chosen in turn.
         max_terms: most terms of a hypothesis.
         max_rounds: most comparisons; a term that was dropped may come back, but not for ever.
@@ -165,7 +165,8 @@ class RefinementSettings:
             compensate for another one's form.
         shortfall_share: share of a mechanism's held-out gain by which a nonparametric term may fall
             short and still replace it.
-        shortfall_nats: the same in nats, three times the held-out threshold.
+        shortfall_nats: nats by which a nonparametric term may fall short and still replace a
+            mechanism, three times the held-out threshold.
         remaining_share: share of its held-out gain that a compensating mechanism may still have
             beside the nonparametric term.
         promise_share: share of a mechanism's gain that a nonparametric term must promise to first
@@ -285,7 +286,7 @@ class SimulatorSettings:
 
 @dataclass(frozen=True)
 class ResidualSettings:
-    """Where the simulator errs: ranges of phase, command, pressure and so on.
+    """Test of where the simulator errs: ranges of phase, command, pressure and so on.
 
     Attributes:
         phase_step: width of the ranges of time in a phase, s.

@@ -18,7 +18,7 @@ from ventbench.physics.parameters import BASE_PARAMETERS, Parameter
 
 @dataclass(frozen=True, eq=False)
 class Catalogue:
-    """What a model can be built of.
+    """Mechanisms and basis terms that a model can be built of.
 
     Attributes:
         library: mechanisms by name, in alphabetical order.

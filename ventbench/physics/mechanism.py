@@ -1,4 +1,4 @@
-"""What a mechanism is, where it acts, and how a model applies several."""
+"""The base class of mechanisms, their descriptions, and how a model applies several."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Site = Literal[
 
 @dataclass(frozen=True)
 class Description:
-    """What is known about a mechanism, for people and for programs.
+    """Description of a mechanism, for people and for programs.
 
     All that other packages need to know about a mechanism stands here, so that a new one is a
     single file.

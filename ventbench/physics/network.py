@@ -1,4 +1,4 @@
-"""Where airway, circuit, lung, leak and expiratory valve meet: one implicit step in closed form."""
+"""Airway, circuit, lung, leak and expiratory valve: one implicit step in closed form."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jax import Array
 
 @flax.struct.dataclass
 class View:
-    """What a mechanism may look at while it changes the network; every array ``(...)``.
+    """Quantities that a mechanism may use while it changes the network; every array ``(...)``.
 
     Attributes:
         time: time since the start of the breath, s.

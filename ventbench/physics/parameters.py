@@ -93,7 +93,7 @@ class Parameter:
         return (*positive, *(-value for value in positive if -value >= self.low))
 
     def coordinate(self, value: ArrayLike) -> NDArray[np.float64]:
-        """Where a fit sees a physical value: its logarithm on a log scale, else itself.
+        """Coordinate of a physical value in a fit: its logarithm on a log scale, else the value.
 
         A linear scale lets a fit reach ``neutral`` at a bound, with a derivative that is not zero.
         """

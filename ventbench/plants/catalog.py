@@ -431,7 +431,7 @@ def _at_label(name: str, make: Callable[[Lung], Plant], for_breaths: PlantsFor) 
 
 
 def _named() -> dict[str, Callable[[], Simulators]]:
-    """By name, the simulators that need no file."""
+    """Loaders of the simulators that need no file, by name."""
     resolvers: dict[str, Callable[[], Simulators]] = {
         "frozen": _official,
         "hybrid": _official,  # the kind of plant that the official ones are
@@ -506,7 +506,7 @@ def _of_function(function: Any, name: str, sha256: str | None = None) -> Simulat
 
 
 def _imported(module: str, attribute: str) -> Simulators:
-    """What ``module:attribute`` names; modules of the working folder are found too."""
+    """Simulators that ``module:attribute`` names; modules of the working folder are found too."""
     text = f"{module}:{attribute}"
     sys.path.insert(0, str(Path.cwd()))
     try:

@@ -106,7 +106,7 @@ class Frozen:
         return self._of(breaths, np.zeros(len(breaths), np.int64))
 
     def cross_fitted(self, breaths: Breaths) -> Hybrid:
-        """Like :meth:`for_breaths`, of the member that has not seen the breath; 0 if all have."""
+        """Plants of the member that has not seen each breath; of member 0 if all have seen it."""
         return self._of(breaths, np.maximum(self.seen.folds(breaths), 0))
 
     def held_out(self, breaths: Breaths) -> NDArray[np.bool_]:
@@ -130,7 +130,7 @@ class Frozen:
         return {name: dict(self.manifest["lungs"][name]) for name in LUNG_IDS}
 
     def about(self) -> dict[str, Any]:
-        """What a score must say of the simulators it was made with."""
+        """Version and hashes that a score states of its simulators."""
         hashes = {name: entry["sha256"] for name, entry in self.manifest["files"].items()}
         return {
             "version": self.manifest["version"],
@@ -159,11 +159,11 @@ class FrozenLearned:
         return jax.tree.map(lambda leaf: leaf[0, at], self.members)
 
     def for_breaths(self, breaths: Breaths) -> Plant:
-        """As of :meth:`Frozen.for_breaths`; a network knows the lung, not the rig."""
+        """Networks of the breaths' lungs, leaves ``(n, ...)``; a network knows no rig."""
         return self._of(breaths, np.zeros(len(breaths), np.int64))
 
     def cross_fitted(self, breaths: Breaths) -> Plant:
-        """As of :meth:`Frozen.cross_fitted`."""
+        """Networks of the member that has not seen each breath; of member 0 if all have seen it."""
         return self._of(breaths, np.maximum(self.seen.folds(breaths), 0))
 
     def _of(self, breaths: Breaths, member: NDArray[np.int64]) -> Plant:
@@ -206,7 +206,7 @@ def seen(breaths: Breaths, fold: NDArray[np.int64]) -> Seen:
 
 
 def folder(version: int = 1) -> Path:
-    """Where a version is kept."""
+    """Folder of a version."""
     return data_path(f"simulators/v{version}")
 
 

@@ -1,4 +1,4 @@
-"""Which rig and session a breath of the real ventilators comes from, by its times alone.
+"""Rig and session of a breath of the real ventilators, by its times alone.
 
 The public recordings are from a farm of ventilators that nothing names. Their clocks do: a rig runs
 at about 31.8 ms or about 34.0 ms a sample; on some rigs a share of the samples comes late
@@ -34,7 +34,7 @@ _UNIT_MS, _SPIKE_UNITS, _FAR_SAMPLES = 0.2, 1.5, 2.0
 
 @dataclass(frozen=True)
 class SampleTiming:
-    """What the times of n breaths say; every array has shape ``(n,)``.
+    """Sampling of n breaths, read off their times; every array has shape ``(n,)``.
 
     Attributes:
         interval_ms: median sampling interval, ms.
@@ -52,7 +52,7 @@ class SampleTiming:
 
 
 def sample_timing(breaths: Breaths) -> SampleTiming:
-    """Read the clocks of breaths."""
+    """Read the sampling of breaths off their times."""
     interval = np.where(breaths.valid[:, 1:], breaths.dt[:, :-1] * 1000.0, np.nan)
     median = np.nanmedian(interval, axis=1)
     late = np.nanmean(interval - median[:, None] > _LATE_MS, axis=1)
@@ -92,7 +92,7 @@ class Sessions:
     table: tuple[Session, ...]
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Number of sessions."""
         return len(self.table)
 
     def assign(self, breaths: Breaths) -> NDArray[np.int64]:

@@ -22,7 +22,7 @@ _SLOW = 4
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where a search ended.
+    """Point at which a search ended.
 
     Attributes:
         x: the point, ``(U,)``.

@@ -337,7 +337,7 @@ def _figures(prefix: str, error: NDArray[np.float64]) -> dict[str, Any]:
 
 
 def _rounded(value: Any) -> Any:
-    """To 1e-6 cmH2O, which no machine's arithmetic changes by itself."""
+    """Round to 1e-6 cmH2O, which no machine's arithmetic changes by itself."""
     if isinstance(value, dict):
         return {key: _rounded(part) for key, part in value.items()}
     if isinstance(value, list):

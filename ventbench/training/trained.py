@@ -1,4 +1,4 @@
-"""What a training of controllers returns."""
+"""Result of a training of controllers."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def panels(runs: Sequence[Trajectories]) -> list[list[RunPanel]]:
 
 
 def time_x(seconds: Floats | float) -> Floats:
-    """Where a time since the start of the breath lies, panel units."""
+    """Horizontal position of a time since the start of the breath, panel units."""
     return LEFT + np.asarray(seconds) / (SHOWN * protocol.DT) * PLOT_WIDTH
 
 

@@ -83,7 +83,7 @@ def sections(
 
 
 def frame() -> dict[str, Any]:
-    """What all panels share: sizes, time ticks, the scored part."""
+    """Elements that all panels share: sizes, time ticks, the scored part."""
     end = float(panels.time_x(protocol.INSPIRATION_STEPS * protocol.DT))
     return {
         "width": panels.WIDTH,

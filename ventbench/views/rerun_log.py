@@ -40,7 +40,7 @@ COLUMN = 16
 
 @dataclass(frozen=True)
 class Plot:
-    """How one quantity is shown.
+    """Plot of one quantity.
 
     Attributes:
         quantity: last part of the entity path.

@@ -1,4 +1,4 @@
-"""What all pictures need to know of runs: that they match, their names, how far off they are."""
+"""Runs in pictures: checks that they match, their names and their errors."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def distinct(names: Sequence[str]) -> list[str]:
 
 
 def scored() -> NDArray[np.bool_]:
-    """Which steps of a run are scored: inspirations of the scored breaths, shape ``(T,)``."""
+    """Scored steps of a run: inspirations of the scored breaths, shape ``(T,)``."""
     breath, phase = np.divmod(np.arange(STEPS), protocol.BREATH_STEPS)
     return np.isin(breath, protocol.SCORED_BREATHS) & (phase < protocol.INSPIRATION_STEPS)
 

@@ -74,7 +74,7 @@ def draws(score: Mapping[str, Any]) -> str:
 
 
 def failures(score: Mapping[str, Any]) -> list[str]:
-    """Why a score does not count: safety gate and failed cells, each message once."""
+    """Reasons why a score does not count: safety gate and failed cells, each message once."""
     failed = score.get("failures") or ()
     messages = [str(x.get("message", x)) if isinstance(x, Mapping) else str(x) for x in failed]
     unsafe = ["did not pass the safety gate"] if score.get("safe") is False else []
@@ -82,7 +82,7 @@ def failures(score: Mapping[str, Any]) -> list[str]:
 
 
 def provenance(score: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What a score says about its origin, as flat pairs of text; not escaped."""
+    """Provenance of a score, as flat pairs of text; not escaped."""
     rows: list[tuple[str, str]] = []
     _flatten("", {k: v for k, v in score.items() if k not in NOT_PROVENANCE}, rows)
     return rows[:MAX_ROWS]

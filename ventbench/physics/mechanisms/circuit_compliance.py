@@ -39,7 +39,7 @@ class CircuitCompliance(Mechanism):
     )
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
-        """Add it beside the lung."""
+        """Add the circuit's compliance beside the lung."""
         return network.plus(circuit=1e-3 * values["compliance"])
 
 

@@ -33,7 +33,7 @@ class Inertance(Mechanism):
     )
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
-        """Add it in series with the airway."""
+        """Add the inertance in series with the airway."""
         return network.plus(inertance=values["inertance"])
 
 

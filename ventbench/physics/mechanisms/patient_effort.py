@@ -57,7 +57,7 @@ class PatientEffort(Mechanism):
     )
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
-        """Muscles pull at the alveolus."""
+        """Subtract the pressure of the muscles from the recoil."""
         phase = (view.time - values["onset"]) / values["duration"]
         pull = values["amplitude"] * jnp.sin(jnp.pi * jnp.clip(phase, 0.0, 1.0))
         return network.plus(recoil=-pull)

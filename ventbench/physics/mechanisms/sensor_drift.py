@@ -85,7 +85,7 @@ class SensorDrift(Mechanism):
 
 
 def _grown(values: Values, position: Array) -> Array:
-    """Share of the drift that there is."""
+    """Share of the drift that has set in."""
     fading = values["warming"] + _STEADY
     return jnp.expm1(-fading * position) / jnp.expm1(-fading)
 

@@ -62,7 +62,7 @@ class SupplyDroop(Mechanism):
     def inflow(
         self, values: Values, flow: Array, state: Array, length: Array
     ) -> tuple[Array, Array]:
-        """What the supply can give; recent flow is predicted, then corrected."""
+        """Flow that the supply can give; recent flow is predicted, then corrected."""
         sag = values["drop"] / (1.0 - values["drop"]) / 0.5
         time = values["recovery"]
         ahead = (time * state + length * flow / (1.0 + sag * state)) / (time + length)

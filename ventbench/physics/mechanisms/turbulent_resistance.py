@@ -60,7 +60,7 @@ class TurbulentResistance(Mechanism):
     )
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
-        """Add it to the airway; what differs from a square, at the last flow."""
+        """Add the resistance; the part that differs from a square is taken at the last flow."""
         milder = jnp.log(view.flow**2 + _ROUND**2) * (0.5 * values["exponent"] - 1.0)
         return network.plus(quadratic=values["quadratic"] * jnp.exp(milder))
 

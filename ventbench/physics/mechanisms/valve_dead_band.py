@@ -37,7 +37,7 @@ class ValveDeadBand(Mechanism):
     rank = 2
 
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
-        """What is left of the command; a negative one is not a valve's and passes."""
+        """Remainder of the command; a negative one is not a valve's and passes."""
         return u_in - jnp.minimum(jnp.maximum(u_in, 0.0), values["width"]), memory
 
 

@@ -55,7 +55,7 @@ class ValveHysteresis(Mechanism):
     has_memory = True
 
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
-        """Where the valve stands, %, and that it is remembered."""
+        """Position of the valve, %, which is also its memory."""
         half = 0.5 * values["width"]
         hard = jnp.minimum(jnp.maximum(memory, u_in - half), u_in + half)
         soft = u_in - half * jnp.tanh((u_in - memory) / (half + _THIN))

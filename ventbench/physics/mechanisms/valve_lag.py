@@ -10,7 +10,7 @@ from ventbench.physics.parameters import Parameter
 
 
 class ValveLag(Mechanism):
-    """Flow of the valve follows what is asked for, through one lag or two."""
+    """Flow of the valve follows the commanded flow through one lag or two."""
 
     description = Description(
         name="valve_lag",

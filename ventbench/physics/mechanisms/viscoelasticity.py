@@ -59,7 +59,7 @@ class Viscoelasticity(Mechanism):
     stateful = True
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
-        """Stress after the step: what is left of it, and what the flow adds."""
+        """Stress after the step: the relaxed stress and what the flow adds."""
         left = 1.0 / (1.0 + view.length / values["time"])
         elastance = values["ratio"] * view.elastance * left
         return network.plus(recoil=view.state * left, elastance=elastance)

@@ -1,4 +1,4 @@
-"""What the inspiratory valve makes of the command: a curve, filters and plays."""
+"""Terms of the inspiratory valve's command: a curve, filters and plays."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class ValveShape(BasisTerm):
     rank = 5
 
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
-        """Add the curve."""
+        """Add the curve to the command."""
         return u_in + self._change(values, u_in), memory
 
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
@@ -149,7 +149,7 @@ class CommandPlays(BasisTerm):
     has_memory = True
 
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
-        """Where the plays stand, %, ``(K, ...)``, and what they make of the command."""
+        """Effective command, %, and the positions of the plays, %, ``(K, ...)``."""
         half = 0.5 * per_state(
             _PLAYS_WIDTHS, jnp.broadcast_to(u_in, (len(_PLAYS_WIDTHS), *u_in.shape))
         )

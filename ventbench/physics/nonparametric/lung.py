@@ -72,7 +72,7 @@ class RecoilShape(BasisTerm):
         )
 
     def _slopes(self, values: Values) -> list[Array]:
-        """Those of the recoil less that of a linear lung, at the knots."""
+        """Slopes of the recoil less that of a linear lung, at the knots."""
         free = self.coefficients(values)
         mean = sum((w * c for w, c in zip(_RECOIL_WEIGHTS, free, strict=True)), 0.0 * free[0])
         low, *high = ((c - mean) / (1.0 + mean) for c in free)

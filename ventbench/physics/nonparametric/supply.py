@@ -1,4 +1,4 @@
-"""What the supply makes of the flow that was drawn from it."""
+"""Terms of the gas supply: its answer to the flow that was drawn from it."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ class HybridConfig:
 
 @flax.struct.dataclass
 class HybridParameters:
-    """Everything that is fitted: the pooled parameters and the first pressures, cmH2O, ``(n,)``."""
+    """The fitted quantities: pooled parameters and first pressures, cmH2O, ``(n,)``."""
 
     pooled: Pooled
     start: Array

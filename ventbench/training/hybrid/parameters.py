@@ -1,4 +1,4 @@
-"""What is fitted of the hybrid plant: unconstrained numbers, pooled over lungs, rigs and sessions.
+"""Fitted parameters of the hybrid plant, unconstrained and pooled over lungs, rigs and sessions.
 
 Their prior is Gaussian around the point at which every fit starts.
 """

@@ -45,7 +45,7 @@ class Method(Protocol):
         ...
 
     def policy(self, state: Any) -> Any:
-        """What has been learned so far, as a pure controller."""
+        """The policy learned so far, as a pure controller."""
         ...
 
 

@@ -90,5 +90,5 @@ class PolicyGradient:
         return PolicyGradientState(parameters, optimiser, key, state.iteration + 1)
 
     def policy(self, state: PolicyGradientState) -> GaussianPolicy:
-        """What has been learned."""
+        """The learned policy."""
         return GaussianPolicy(state.parameters, self.network)

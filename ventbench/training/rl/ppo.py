@@ -127,7 +127,7 @@ class PPO:
         return PPOState(parameters, optimiser, key, state.iteration + 1)
 
     def policy(self, state: PPOState) -> GaussianPolicy:
-        """What has been learned: the mean."""
+        """The learned policy: its mean."""
         return GaussianPolicy(state.parameters["actor"], self.network)
 
     def _mean(self, parameters: Any, x: Array) -> Array:

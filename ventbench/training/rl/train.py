@@ -224,7 +224,7 @@ def _pid_errors(plants: Any) -> list[float]:
 def _best_run(
     trained: TrainedPolicies, network: int, seeds: Sequence[int]
 ) -> tuple[dict[str, Any], int]:
-    """What the report says of a network, and the index of its best run."""
+    """Entries of a network in the report, and the index of its best run."""
     first = network * len(seeds)
     rows = slice(first, first + len(seeds))
     best = first + int(np.argmin(trained.validation[rows]))

@@ -37,7 +37,7 @@ _answered = 0
 
 
 class Answer(Protocol):
-    """What a diagnosis must return."""
+    """Interface of a diagnosis result."""
 
     @property
     def request(self) -> Any:

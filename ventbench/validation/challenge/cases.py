@@ -1,4 +1,4 @@
-"""What a concealed recording is made of: effects with their forms and strengths, rig, and case."""
+"""Parts of a concealed recording: effects with their forms and strengths, rig, and case."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How detectable an effect is once R, C, R_ex, PEEP and initial pressures are refitted."""
+"""Detectability of an effect once R, C, R_ex, PEEP and initial pressures are refitted."""
 
 from __future__ import annotations
 

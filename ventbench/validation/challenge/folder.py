@@ -110,7 +110,7 @@ class ChallengeFolder:
 
     @property
     def public(self) -> Path:
-        """What everyone may know: file, lung and hash of each case."""
+        """Public facts: file, lung and hash of each case."""
         return self.path / "cases.json"
 
     @property

@@ -1,4 +1,4 @@
-"""Which cases a challenge draws, for each kind of question."""
+"""Cases that a challenge draws, for each kind of question."""
 
 from __future__ import annotations
 

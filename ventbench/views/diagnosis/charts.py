@@ -124,7 +124,7 @@ class Chart:
 
 
 def ticks(low: float, high: float, count: int) -> tuple[list[float], list[str]]:
-    """At most about ``count`` round numbers from ``low`` to ``high``, and their texts."""
+    """Ticks: about ``count`` round numbers from ``low`` to ``high``, and their texts."""
     wanted = max(high - low, 1e-9) / count
     scale = 10.0 ** np.floor(np.log10(wanted))
     step = float(scale * next(x for x in (1, 2, 5, 10) if x * scale >= 0.999 * wanted))

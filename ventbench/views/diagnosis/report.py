@@ -109,7 +109,7 @@ def _cell(distance: OpenLoopError | None) -> dict[str, str]:
 
 
 def _named(missing: MissingMechanism) -> dict[str, Any]:
-    """A missing for the table."""
+    """A missing mechanism as a row of the table."""
     about = mechanism(missing.name).description
     meanings = {parameter.name: parameter.meaning for parameter in about.parameters}
     return {

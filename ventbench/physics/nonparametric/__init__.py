@@ -42,7 +42,7 @@ NONPARAMETRIC_COMPONENTS = {
         ),
         NonparametricComponent(
             "f(p)", ("leak_shape",),
-            "gas leaves column the lung, by the pressure at the airway", "airway pressure, cmH2O",
+            "gas leaves beside the lung, by the pressure at the airway", "airway pressure, cmH2O",
         ),
         NonparametricComponent(
             "f(Q)", ("flow_shape",),

@@ -28,6 +28,7 @@ import numpy as np
 
 from ventbench import protocol
 from ventbench.controllers.pid import PID
+from ventbench.environment import Scenario, nominal_scenario
 from ventbench.files import write_json
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNGS
@@ -37,7 +38,6 @@ from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import take
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.rollouts import closed_loop
-from ventbench.scenario import Scenario, nominal
 
 #: Environment steps of one run without and with its expirations.
 STEPS = protocol.BREATHS * protocol.INSPIRATION_STEPS
@@ -74,7 +74,7 @@ def cells(batch: int) -> tuple[PID, Scenario]:
     """Return random PIDs and their nominal cells, shape ``(batch,)``."""
     rng = np.random.default_rng(0)
     pid = PID(*(jnp.asarray(rng.uniform(0, 5, batch), jnp.float32) for _ in range(2)))
-    return pid, nominal(np.resize(protocol.PIPS, batch))
+    return pid, nominal_scenario(np.resize(protocol.PIPS, batch))
 
 
 def xla_products(plant: Learned, batch: int) -> Callable[[], Any]:
@@ -149,7 +149,7 @@ def throughput(plant: Learned, batches: list[int], rounds: int) -> list[dict[str
 
 def latency(plant: Plant, repeats: int = 50) -> dict[str, float]:
     """Return best and median milliseconds of one compiled run of one cell."""
-    pid, scenario = PID(1.0, 3.0), nominal(20.0)
+    pid, scenario = PID(1.0, 3.0), nominal_scenario(20.0)
     found = {}
     for whole in (False, True):
         run = lambda whole=whole: closed_loop(plant, pid, scenario, whole=whole)  # noqa: E731

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ventbench import environment as env
-from ventbench import precision, protocol, scenario, waveform
+from ventbench import precision, protocol, waveform
 from ventbench.lungs import Lung
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
 
@@ -23,16 +23,16 @@ def plant():
 
 def cell(**changes):
     arrays = {name: jnp.broadcast_to(jnp.asarray(x), (2,)) for name, x in changes.items()}
-    return replace(scenario.nominal(np.array([10.0, 35.0])), **arrays)
+    return replace(env.nominal_scenario(np.array([10.0, 35.0])), **arrays)
 
 
 def test_nominal_scenario():
-    cells = scenario.nominal(np.array([10.0, 35.0]))
+    cells = env.nominal_scenario(np.array([10.0, 35.0]))
     np.testing.assert_array_equal(cells.start, [5.0, 5.0])
     np.testing.assert_array_equal(cells.dt, [0.03, 0.03])
     assert cells.noise.shape == (2, 3, 34)
     with pytest.raises(ValueError, match="must exceed PEEP"):
-        scenario.nominal([10.0, 5.0])
+        env.nominal_scenario([10.0, 5.0])
 
 
 def test_start_of_a_breath(plant):

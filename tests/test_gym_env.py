@@ -11,7 +11,7 @@ from ventbench.errors import InputError
 
 gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
 
-from ventbench import gym_env, precision, protocol, rollouts, scenario  # noqa: E402
+from ventbench import environment, gym_env, precision, protocol, rollouts  # noqa: E402
 from ventbench.controllers.script import Script  # noqa: E402
 from ventbench.lungs import LUNG_IDS  # noqa: E402
 from ventbench.metrics.score import run_error  # noqa: E402
@@ -56,7 +56,9 @@ def test_a_breath_scores_as_the_benchmark_does():
         import jax.numpy as jnp
 
         plant = jax.tree.map(lambda x: jnp.asarray(x[LUNG_IDS.index("R20C50")]), plants)
-        run, _ = rollouts.closed_loop(plant, Script(jnp.asarray(u_in)), scenario.nominal(25.0))
+        run, _ = rollouts.closed_loop(
+            plant, Script(jnp.asarray(u_in)), environment.nominal_scenario(25.0)
+        )
     wanted = float(run_error(run.pressure, 25.0))
     assert info["error"] == pytest.approx(wanted, rel=1e-4)
     assert (20.0 - 10.0 * sum(rewards)) / 34 == pytest.approx(wanted, rel=1e-4)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import draws, precision, protocol, rollouts, scenario
+from ventbench import draws, precision, protocol, rollouts
 from ventbench import environment as env
 from ventbench.controllers.pid import PID
 from ventbench.controllers.script import Script
@@ -24,7 +24,7 @@ def plants():
 @pytest.fixture
 def nominal():
     with precision.float64():
-        return scenario.nominal(np.array(protocol.PIPS))
+        return env.nominal_scenario(np.array(protocol.PIPS))
 
 
 def looped(plant, controller, cells):

@@ -23,8 +23,8 @@ from jax import Array
 from numpy.typing import NDArray
 
 from ventbench import data_files, files, protocol
+from ventbench.environment import Scenario
 from ventbench.errors import InputError
-from ventbench.scenario import Scenario
 
 #: Version of the draws, how many there are, their file and its SHA-256.
 VERSION = 1

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from ventbench import environment as env
 from ventbench import precision, protocol
+from ventbench.environment import Scenario
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNG_IDS, scored_lung
 from ventbench.plants import frozen
-from ventbench.scenario import Scenario
 from ventbench.training.rl import episodes
 
 #: What an observation holds, in order, each of the order of 1: pressure / 40, target / 40, the

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from ventbench import environment as env
 from ventbench import precision, protocol
+from ventbench.environment import Scenario
 from ventbench.interfaces import Controller, Plant
 from ventbench.recordings.breaths import Breaths
-from ventbench.scenario import Scenario
 
 BREATHS, INSPIRATION = protocol.BREATHS, protocol.INSPIRATION_STEPS
 

@@ -162,7 +162,7 @@ def rollout(
     import jax
     import jax.numpy as jnp
 
-    from ventbench import precision, rollouts, scenario
+    from ventbench import environment, precision, rollouts
     from ventbench.plants.catalog import load_simulators
 
     simulators = load_simulators(simulator)
@@ -170,7 +170,7 @@ def rollout(
     cells = tuple(float(pip) for pip in pips)
     plants = [simulators.plant(name) for name in names]
     with precision.float64():
-        nominal = scenario.nominal(np.asarray(cells))
+        nominal = environment.nominal_scenario(np.asarray(cells))
 
         def run(plant: Plant) -> tuple[Floats, Floats]:
             plant = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), plant)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ventbench import draws, files, precision, protocol, scenario
+from ventbench import draws, environment, files, precision, protocol
 from ventbench.board import actions, create, ranking, record
 from ventbench.board.record import Record
 from ventbench.errors import InputError
@@ -71,7 +71,7 @@ def test_spread_is_the_deviation_of_the_ensemble(drafts, scores, simulators: Tex
     with precision.float64():
         for member in range(3):
             plants = take(simulators.ensemble, member)
-            cells = scenario.nominal(protocol.PIPS)
+            cells = environment.nominal_scenario(protocol.PIPS)
             inspired, _ = replay(plants, cells, scores["pid_best"].requested[:, 0])
             pressures.append(np.asarray(inspired.pressure)[:, :, protocol.SCORED_BREATHS, :])
     expected = np.std(pressures, axis=0, ddof=1).mean(axis=(-2, -1))

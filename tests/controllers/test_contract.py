@@ -16,19 +16,19 @@ from jax import Array
 
 from ventbench import protocol
 from ventbench.controllers.registry import CONTROLLERS
+from ventbench.environment import nominal_scenario
 from ventbench.interfaces import Controller, Observation
 from ventbench.lungs import lung
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.precision import float64
 from ventbench.rollouts import Inspirations, closed_loop
-from ventbench.scenario import nominal
 
 PIPS = np.array([15.0, 20.0, 35.0])
 LUNG = lung("R20C20")
 
 
 def run(controller: Controller, pips: np.ndarray = PIPS) -> Inspirations:
-    inspirations, _ = closed_loop(single_compartment(LUNG), controller, nominal(pips))
+    inspirations, _ = closed_loop(single_compartment(LUNG), controller, nominal_scenario(pips))
     return jax.tree.map(np.asarray, inspirations)
 
 

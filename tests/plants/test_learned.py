@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from ventbench.lungs import lung
-from ventbench.plants.learned import HIGHEST, LOWEST, Architecture, Normalisation, learned
-from ventbench.plants.mlp import mlp
+from ventbench.plants.learned import HIGHEST, LOWEST, Architecture, Normalisation, learned, mlp
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.rollouts import open_loop
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import draws, precision, protocol, rollouts, scenario, waveform
+from ventbench import draws, environment, precision, protocol, rollouts, waveform
 from ventbench.controllers.pid import PID
 from ventbench.errors import InputError
 from ventbench.interfaces import Task
@@ -49,7 +49,7 @@ def best(plants):
 
 def test_nominal_is_that_of_the_pure_pid(plants, best):
     with precision.float64():
-        cells = scenario.nominal(np.array(protocol.PIPS))
+        cells = environment.nominal_scenario(np.array(protocol.PIPS))
     expected = pure_errors(plants, cells, GAINS.values())
     np.testing.assert_allclose(best.nominal, expected, rtol=0, atol=1e-9)
 
@@ -65,7 +65,7 @@ def test_robust_pid(plants):
     for track in ("robustness", "performance"):
         found = run_protocol(open_submission("pid_robust"), plants, track=track)
         with precision.float64():
-            cells = scenario.nominal(np.array(protocol.PIPS))
+            cells = environment.nominal_scenario(np.array(protocol.PIPS))
         expected = pure_errors(plants, cells, [(6.0, 6.0, 0.3)] * 6)
         np.testing.assert_allclose(found.nominal, expected, rtol=0, atol=1e-9)
 
@@ -126,7 +126,7 @@ def test_trajectories(best, plants):
     error = np.abs(found.pressure - found.target)[..., scored].mean(axis=-1)
     np.testing.assert_allclose(error, result.nominal, rtol=0, atol=1e-9)
     with precision.float64():
-        cells = scenario.nominal(np.array(protocol.PIPS))
+        cells = environment.nominal_scenario(np.array(protocol.PIPS))
         inspired, expired = rollouts.closed_loop(take(plants, 4), PID(5.0, 10.0), cells, whole=True)
     for name in ("pressure", "u_in"):
         whole = np.concatenate([getattr(inspired, name), getattr(expired, name)], axis=-1)

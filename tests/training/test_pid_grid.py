@@ -13,13 +13,13 @@ from typer.testing import CliRunner
 from ventbench import precision, protocol, rollouts
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
+from ventbench.environment import nominal_scenario
 from ventbench.errors import InputError
 from ventbench.executor import executor
 from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.metrics.score import run_error
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, take
-from ventbench.scenario import nominal
 from ventbench.training import pid_grid
 from ventbench.training.pid_grid import PIDGrid
 
@@ -150,9 +150,13 @@ def test_the_picture_has_a_row_a_lung_and_one_for_all(whole):
     pytest.importorskip("matplotlib", reason="the extra ventbench[view] is missing")
     from matplotlib.image import imread
 
-    from ventbench.views import gain_map
+    from ventbench.views import training_figures
 
-    pictures = [gain_map.png(whole), gain_map.png(whole), gain_map.png(whole, each=False)]
+    pictures = [
+        training_figures.gain_map_png(whole),
+        training_figures.gain_map_png(whole),
+        training_figures.gain_map_png(whole, each=False),
+    ]
     assert pictures[0] == pictures[1]
     heights = [imread(io.BytesIO(picture)).shape[0] for picture in pictures]
     assert heights[0] > 2 * heights[2]
@@ -189,7 +193,7 @@ def test_the_command_for_one_lung(small, tmp_path):
 def test_the_command_wants_to_know_which_lungs(which):
     run = CliRunner().invoke(app, ["tune", "pid", *which])
     assert isinstance(run.exception, InputError)
-    assert "one of them" in str(run.exception)
+    assert "exactly one of" in str(run.exception)
 
 
 def test_the_papers_values():
@@ -205,7 +209,7 @@ def test_an_error_is_that_of_the_scored_run():
     with precision.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS[:2]])
         gains = np.array([(0.0, 0.0, 0.0), (6.0, 6.0, 0.3), (10.0, 10.0, 10.0)])
-        cells = nominal(np.array(protocol.PIPS))
+        cells = nominal_scenario(np.array(protocol.PIPS))
         expected = [
             [
                 run_error(

@@ -68,12 +68,12 @@ def test_table_has_a_row_for_each_point(made):
 
 def test_picture(made):
     pytest.importorskip("matplotlib", reason="the picture needs the extra view")
-    from ventbench.views import learning_curves
+    from ventbench.views import training_figures
 
-    content = learning_curves.png(made)
+    content = training_figures.learning_curves_png(made)
     assert content.startswith(b"\x89PNG")
     assert len(content) < 300_000
-    assert content == learning_curves.png(made)
+    assert content == training_figures.learning_curves_png(made)
 
 
 def test_the_short_recipe_is_done_after_96_breaths():

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from ventbench import lungs, precision, protocol, rollouts, scenario, waveform
+from ventbench import environment, lungs, precision, protocol, rollouts, waveform
 from ventbench.controllers.pid import PID
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.trajectories import Trajectories
@@ -30,7 +30,7 @@ def simulate(name: str, gains: Mapping[str, tuple[float, float]]) -> Trajectorie
     pressure, u_in = np.empty(SHAPE), np.empty(SHAPE)
     for i, lung in enumerate(lungs.LUNGS):
         with precision.float64():
-            cells = scenario.nominal(protocol.PIPS)
+            cells = environment.nominal_scenario(protocol.PIPS)
             inspired, expired = rollouts.closed_loop(
                 single_compartment(lung), PID(*gains[lung.id]), cells, whole=True
             )

@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from ventbench import environment as env
 from ventbench import precision, protocol
 from ventbench.board.record import Record
+from ventbench.environment import Scenario
 from ventbench.interfaces import Plant
 from ventbench.metrics.score import longest_run, passes_safety_gate, run_error, safety_limit
-from ventbench.scenario import Scenario
 from ventbench.submissions.scoring import protocol_cells
 from ventbench.submissions.stepping import as_float64
 

@@ -66,9 +66,9 @@ def samples(
         result = work.sample_efficiency(
             scored_lung(lung), range(seeds), out, share=share, progress=progress
         )
-    from ventbench.views import learning_curves
+    from ventbench.views import training_figures
 
-    picture = learning_curves.png(result)
+    picture = training_figures.learning_curves_png(result)
     files.write_atomically(out / "study-samples.png", lambda file: file.write(picture))
     table = result.summary()
     emit({"lung": result.lung, "methods": _plain(table)}, json)

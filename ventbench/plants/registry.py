@@ -10,8 +10,7 @@ from ventbench.lungs import Lung
 from ventbench.physics.model import Physics
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.hybrid import Hybrid
-from ventbench.plants.learned import Boundary, Learned
-from ventbench.plants.mlp import MLP
+from ventbench.plants.learned import MLP, Boundary, Learned
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
 from ventbench.plants.two_balloon import TwoBalloon, two_balloon
 

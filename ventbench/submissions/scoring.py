@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench import draws as published
-from ventbench import precision, protocol, scenario
+from ventbench import environment, precision, protocol
+from ventbench.environment import Scenario
 from ventbench.interfaces import Plant, Task
 from ventbench.lungs import LUNGS, Lung
 from ventbench.metrics.figures import InspirationSignals, figures
@@ -20,7 +21,6 @@ from ventbench.metrics.score import passes_safety_gate, run_error
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators
 from ventbench.plants.hybrid import Hybrid
-from ventbench.scenario import Scenario
 from ventbench.submissions.errors import SubmissionError
 from ventbench.submissions.folder import Submission, open_submission, submission_of
 from ventbench.submissions.result import CellFailure, Score
@@ -203,7 +203,9 @@ def _frozen_sha256(plants: Plant) -> str | None:
 def protocol_cells(pips: tuple[float, ...], draws: int) -> Scenario:
     """Nominal cells and draws, batch shape ``(1 + draws, P)``."""
     # In numpy: each eager JAX operation would compile a kernel of its own.
-    cells = jax.tree.map(lambda x: np.asarray(x)[None], scenario.nominal(np.asarray(pips)))
+    cells = jax.tree.map(
+        lambda x: np.asarray(x)[None], environment.nominal_scenario(np.asarray(pips))
+    )
     if draws == 0:
         return cells
     return jax.tree.map(lambda *x: np.concatenate(x), cells, published.scenarios(pips, draws))

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from ventbench import environment as env
 from ventbench import precision, protocol, rollouts
 from ventbench.controllers.script import Script
+from ventbench.environment import Scenario
 from ventbench.interfaces import Observation, Plant, PlantT, Task
-from ventbench.scenario import Scenario
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import Submission
 from ventbench.submissions.runner import Runner, pack

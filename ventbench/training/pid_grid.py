@@ -25,13 +25,13 @@ from numpy.typing import ArrayLike, NDArray
 from ventbench import environment as env
 from ventbench import files, protocol
 from ventbench.controllers.pid import PID
+from ventbench.environment import Scenario, nominal_scenario
 from ventbench.errors import InputError
 from ventbench.executor import InProcess, executor, results
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNG_IDS, scored_lung
 from ventbench.plants.catalog import Given, load_simulators
 from ventbench.resume import ARRAY, WorkFolder, fingerprint
-from ventbench.scenario import Scenario, nominal
 
 #: The paper's twenty values of P, I and D, %/cmH2O.
 VALUES = (*(round(0.1 * i, 1) for i in range(10)), *(float(i) for i in range(1, 11)))
@@ -95,7 +95,7 @@ def errors(
     lungs = jax.tree.leaves(plants)[0].shape[0]
     count = len(gains)
     out = np.empty((lungs, count, len(pips)), np.float32)
-    cells = nominal(np.asarray(pips))
+    cells = nominal_scenario(np.asarray(pips))
     batch = min(batch, count)
     for lung in range(lungs):
         plant = jax.tree.map(lambda x, lung=lung: jnp.asarray(x[lung], jnp.float32), plants)

@@ -24,13 +24,13 @@ from ventbench.controllers.residual import (
     save_weights,
     untrained,
 )
+from ventbench.environment import nominal_scenario
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.metrics.score import run_error
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, take
-from ventbench.scenario import nominal
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.scoring import protocol_cells, run_protocol
 from ventbench.training import pid_grid
@@ -67,7 +67,7 @@ def test_a_new_network_leaves_the_pid_alone():
     like = Residual(PID(*GAINS), ())
     made = untrained(jax.random.key(0), like, (8, 8))
     assert made.layers[0][0].shape == (inputs(like), 8)
-    cells = nominal(np.array(protocol.PIPS))
+    cells = nominal_scenario(np.array(protocol.PIPS))
     found, _ = rollouts.closed_loop(take(lungs(2), 1), made, cells)
     expected, _ = rollouts.closed_loop(take(lungs(2), 1), PID(*GAINS), cells)
     np.testing.assert_allclose(found.u_in, expected.u_in, atol=1e-3)
@@ -75,7 +75,7 @@ def test_a_new_network_leaves_the_pid_alone():
 
 def test_it_remembers_the_breath_before():
     one = controller(3)
-    cells = nominal(np.array([20.0]))
+    cells = nominal_scenario(np.array([20.0]))
     found, _ = rollouts.closed_loop(take(lungs(2), 1), one, cells)
     u_in = np.asarray(found.u_in[0])
     assert np.abs(u_in[0] - u_in[1]).max() > 0.1
@@ -148,7 +148,7 @@ def test_the_gradient_is_that_of_finite_differences():
         one = controller(7, limit=3.0).replace(pid=PID(0.5, 1.0, 0.0))
         one = jax.tree.map(lambda x: jnp.asarray(x, float), one)
         plants = stack([single_compartment(LUNGS[5])])
-        cells = nominal(np.array([20.0]))
+        cells = nominal_scenario(np.array([20.0]))
 
         def value(shift):
             *hidden, (last, bias) = one.layers
@@ -166,7 +166,7 @@ def test_the_gradient_is_that_of_finite_differences():
 
 
 def test_members_that_agree_have_no_disagreement_and_others_their_deviation(ensemble):
-    cells = nominal(np.array([20.0, 30.0]))
+    cells = nominal_scenario(np.array([20.0, 30.0]))
     u_in = jnp.full((2, protocol.INSPIRATION_STEPS), 15.0)
     same = jax.tree.map(lambda leaf: leaf[jnp.array([0, 0])], ensemble)
     assert float(disagreement(same, cells, u_in)) == pytest.approx(1e-3, rel=0.01)
@@ -194,7 +194,7 @@ def test_benches_deviate_as_the_draws_do_but_are_none_of_them():
     normal = jnp.arange(n) % 2 == 0
     found = draws.random_scenarios(jax.random.key(0), pip, spread=1.0 * ~normal, smooth=True)
     calm = jax.tree.map(lambda x: np.asarray(x)[::2], found)
-    expected = jax.tree.map(np.asarray, nominal(np.full(n // 2, 20.0)))
+    expected = jax.tree.map(np.asarray, nominal_scenario(np.full(n // 2, 20.0)))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), calm, expected)
     wild = jax.tree.map(lambda x: np.asarray(x)[1::2], found)
     values = {
@@ -225,7 +225,7 @@ def test_training_lowers_the_error(ensemble, round_robin):
     told = []
     trained = fit(ensemble, GAINS, config=config, progress=lambda done, *_: told.append(done))
     assert told == [CHUNK, PARTIAL.updates]
-    cells = nominal(np.array(protocol.PIPS))
+    cells = nominal_scenario(np.array(protocol.PIPS))
 
     def error(one) -> float:
         pressure = [
@@ -260,7 +260,7 @@ def test_same_seed_same_bits_also_after_ctrl_c(ensemble, tmp_path):
 
 def test_lambda_is_the_weight_of_the_mean_correction(ensemble):
     plants = jax.tree.map(lambda leaf: leaf[0], ensemble)
-    cells = nominal(np.array([20.0, 30.0]))
+    cells = nominal_scenario(np.array([20.0, 30.0]))
     trained = controller(3)
     value = jax.jit(lambda lam: objective(trained, plants, cells, 0.0, lam)[0])
     found = float(value(jnp.asarray(10.0)) - value(jnp.asarray(0.0)))
@@ -353,7 +353,7 @@ def test_no_controller_beats_the_rise_and_the_search_comes_near():
     assert found.shape == least.shape == (3, 2)
     assert np.all(least < found)
     with precision.float64():
-        cells = nominal(np.array([10.0, 30.0]))
+        cells = nominal_scenario(np.array([10.0, 30.0]))
         for k in range(3):
             pressure = rollouts.closed_loop(take(plants, k), PID(10.0, 10.0, 0.0), cells)[
                 0
@@ -402,7 +402,7 @@ def test_a_short_training_on_the_frozen_simulators_beats_their_best_pid():
     index = LUNG_IDS.index("R20C20")
     ensemble = jax.tree.map(lambda leaf: leaf[:, [index]], simulators.ensemble)
     one = fit(ensemble, (5.0, 10.0, 0.0), config=ResidualConfig(updates=200))
-    cells = nominal(np.array(protocol.PIPS))
+    cells = nominal_scenario(np.array(protocol.PIPS))
     plant = jax.tree.map(lambda leaf: jnp.asarray(leaf[index], jnp.float32), simulators.plants)
     pressure = rollouts.closed_loop(plant, one, cells)[0].pressure
     assert run_error(pressure, np.asarray(cells.pip)[:, None, None]).mean() < 2.0  # the PID: 2.095

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import draws, precision, protocol, rollouts, scenario
+from ventbench import draws, environment, precision, protocol, rollouts
 from ventbench.controllers import rl_policy
 from ventbench.controllers.pid import PID
 from ventbench.controllers.rl_policy import GaussianPolicy, TanhNetwork, init_parameters
@@ -59,7 +59,7 @@ def test_the_published_draws_are_not_among_them(cells):
 
 def test_nominal_cells_are_the_protocols():
     found = episodes.sample(jax.random.key(0), 6, vary=False)
-    wanted = scenario.nominal(protocol.PIPS)
+    wanted = environment.nominal_scenario(protocol.PIPS)
     for name in ("pip", "peep", "start", "dt", "r_scale", "c_scale", "delay", "quantum"):
         np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-6)
     assert not np.any(found.noise)
@@ -67,7 +67,7 @@ def test_nominal_cells_are_the_protocols():
 
 def test_the_pid_inside_the_features_is_the_pid(lungs):
     with precision.float64():
-        cells = scenario.nominal(np.asarray(protocol.PIPS))
+        cells = environment.nominal_scenario(np.asarray(protocol.PIPS))
         network = TanhNetwork((4,), 1)
         untrained = GaussianPolicy(init_parameters(network, jax.random.key(0)), network)
         lung = jax.tree.map(lambda x: x[2], lungs)
@@ -108,7 +108,9 @@ def test_rewards_and_errors_are_the_scores(lungs):
     from_rewards = (start - episodes.REWARD_SCALE * rewards.sum(axis=0)) / 34
     errors = episodes.errors(lung, pid, cells, 6)
     run, _ = rollouts.closed_loop(
-        jax.tree.map(lambda x: x[2], lungs), pid, scenario.nominal(np.asarray(protocol.PIPS))
+        jax.tree.map(lambda x: x[2], lungs),
+        pid,
+        environment.nominal_scenario(np.asarray(protocol.PIPS)),
     )
     wanted = run_error(run.pressure, np.asarray(protocol.PIPS)[:, None, None])
     np.testing.assert_allclose(errors, wanted, rtol=1e-4)

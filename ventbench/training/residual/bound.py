@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from ventbench import environment as env
 from ventbench import precision, protocol
+from ventbench.environment import Scenario, nominal_scenario
 from ventbench.interfaces import Plant
-from ventbench.scenario import Scenario, nominal
 
 #: Steps that each start of the search opens the valve fully for, before it nearly closes it.
 STARTS = (1, 2, 3, 5, 8, 14)
@@ -37,7 +37,7 @@ def rise(plants: Plant, pips: tuple[float, ...] = protocol.PIPS) -> NDArray[np.f
         Mean of the pressure that is missing to PIP, cmH2O, shape ``(L, P)``.
     """
     with precision.float64():
-        cells = nominal(np.asarray(pips))
+        cells = nominal_scenario(np.asarray(pips))
         lungs = jax.tree.leaves(plants)[0].shape[0]
         full = jnp.full((lungs, len(pips), _STEPS), protocol.U_MAX)
         pressures = _all_pressures(jax.tree.map(jnp.asarray, plants), cells, full)
@@ -63,7 +63,7 @@ def reached(
     errors = []
     with precision.float64():
         plants = jax.tree.map(jnp.asarray, plants)
-        cells = nominal(np.asarray(pips))
+        cells = nominal_scenario(np.asarray(pips))
         shape = (jax.tree.leaves(plants)[0].shape[0], len(pips), _STEPS)
         for opened in STARTS:
             start = jnp.broadcast_to(jnp.where(jnp.arange(_STEPS) < opened, 2.0, -2.5), shape)

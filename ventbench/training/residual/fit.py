@@ -27,9 +27,9 @@ from ventbench import protocol
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import Residual, untrained
 from ventbench.draws import random_scenarios
+from ventbench.environment import Scenario
 from ventbench.interfaces import Plant
 from ventbench.resume import Checkpoint, fingerprint
-from ventbench.scenario import Scenario
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from ventbench import files, precision, protocol, rollouts
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import save_weights
+from ventbench.environment import nominal_scenario
 from ventbench.interfaces import Controller, Plant
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics.score import run_error
 from ventbench.plants.catalog import Given
 from ventbench.plants.stacking import take
-from ventbench.scenario import nominal
 from ventbench.training.pid_grid import search
 from ventbench.training.residual.fit import ResidualConfig, fit
 from ventbench.training.trained import ALL, TrainedControllers, check_names, simulators_to_train_on
@@ -126,7 +126,7 @@ def _errors(
     """Nominal score on each lung, float64, cmH2O."""
     errors = {}
     with precision.float64():
-        cells = nominal(np.array(protocol.PIPS))
+        cells = nominal_scenario(np.array(protocol.PIPS))
         wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), controller)
         for index in where:
             name = LUNG_IDS[index]

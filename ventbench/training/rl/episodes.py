@@ -17,8 +17,8 @@ from ventbench import environment as env
 from ventbench import protocol
 from ventbench.controllers import rl_policy
 from ventbench.draws import random_scenarios
+from ventbench.environment import Scenario
 from ventbench.interfaces import Plant
-from ventbench.scenario import Scenario
 
 #: Commands of an episode; the last command of a breath moves no pressure that is scored.
 STEPS = protocol.INSPIRATION_STEPS - 1

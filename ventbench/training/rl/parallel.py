@@ -16,10 +16,10 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from ventbench import precision, protocol, scenario
+from ventbench import environment, precision, protocol
+from ventbench.environment import Scenario
 from ventbench.interfaces import Plant
 from ventbench.resume import Checkpoint
-from ventbench.scenario import Scenario
 from ventbench.training.rl import episodes
 
 
@@ -94,7 +94,7 @@ class TrainedPolicies:
 
 def nominal_cells(lungs: int) -> Scenario:
     """The six PIPs without deviation on each lung in turn, ``(6 * lungs,)``."""
-    return scenario.nominal(np.repeat(np.asarray(protocol.PIPS), lungs))
+    return environment.nominal_scenario(np.repeat(np.asarray(protocol.PIPS), lungs))
 
 
 def nominal_error(plants: Plant, policy: Any) -> Array:

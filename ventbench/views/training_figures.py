@@ -1,15 +1,20 @@
-"""The grid of PID gains as a picture: error over P and I, one map a value of D."""
+"""Pictures of trainings: the grid of PID gains, and the learning curves of a study."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.extras import require
+from ventbench.views.graphics import RUN_COLORS
+
 if TYPE_CHECKING:
     from ventbench.training.pid_grid import PIDGrid
+    from ventbench.training.study import LearningCurve, SampleStudy
 
 #: Values of D that are shown beside the best one, %/cmH2O.
 SLICES = (0.0, 0.3, 1.0, 3.0, 10.0)
@@ -17,11 +22,24 @@ SLICES = (0.0, 0.3, 1.0, 3.0, 10.0)
 #: Errors above this multiple of the least one of a row look alike.
 SATURATION = 3.0
 
+#: Dots per inch of the pictures.
 DPI = 110
 
+#: What the curves are called in the picture.
+CURVE_LABELS = {
+    "policy-gradient": "policy gradient through the simulator",
+    "policy-gradient-short": "the same, learning rate for 96 breaths",
+    "ppo": "PPO",
+    "dqn": "DQN",
+}
 
-def png(grid: PIDGrid, *, each: bool = True, single: bool = True) -> bytes:
-    """Return the PNG: one row a lung, and one for the mean of all.
+_CURVE_COLORS = dict(
+    zip(CURVE_LABELS, (RUN_COLORS[0], RUN_COLORS[4], RUN_COLORS[2], RUN_COLORS[3]), strict=True)
+)
+
+
+def gain_map_png(grid: PIDGrid, *, each: bool = True, single: bool = True) -> bytes:
+    """Draw the grid of PID gains: error over P and I, one row a lung, one map a value of D.
 
     Args:
         grid: grid of one lung or more.
@@ -31,8 +49,6 @@ def png(grid: PIDGrid, *, each: bool = True, single: bool = True) -> bytes:
     Raises:
         InputError: if matplotlib is missing.
     """
-    from ventbench.extras import require
-
     require("matplotlib")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -99,3 +115,55 @@ def _map(
         if put is not None:
             put("I", fontsize=8)
     return image
+
+
+def learning_curves_png(study: SampleStudy) -> bytes:
+    """Draw score against breaths of experience and against time.
+
+    Lines are interquartile means; bands are their 95 % intervals.
+
+    Raises:
+        InputError: if matplotlib is missing.
+    """
+    require("matplotlib")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11.0, 4.6), dpi=DPI, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, sharey=True)
+    _curves(left, study, lambda curve: curve.episodes)
+    _curves(right, study, lambda curve: curve.seconds)
+    left.set_xlabel("breaths of experience of one training")
+    right.set_xlabel("seconds, all seeds together, without compiling")
+    left.set_ylabel("score without noise, cmH2O")
+    lines, names = left.get_legend_handles_labels()
+    order = [names.index(name) for name in CURVE_LABELS.values() if name in names]
+    shown = [lines[i] for i in order], [names[i] for i in order]
+    right.legend(*shown, loc="upper right", frameon=False, fontsize=9)
+    seeds = len(study.curves[0].scores)
+    figure.suptitle(f"{study.lung}: interquartile mean and 95 % band of {seeds} seeds", fontsize=11)
+    canvas.draw()
+    output = io.BytesIO()
+    figure.savefig(output, format="png")
+    return output.getvalue()
+
+
+def _curves(axes: Any, study: SampleStudy, across: Callable[[LearningCurve], Any]) -> None:
+    from ventbench.training.study import band
+
+    for curve in study.curves:
+        x, color = across(curve)[1:], _CURVE_COLORS[curve.method]
+        low, high = band(curve.scores[:, 1:])
+        axes.fill_between(x, low, high, color=color, alpha=0.2, linewidth=0)
+        axes.plot(x, curve.middle[1:], color=color, linewidth=1.6, label=CURVE_LABELS[curve.method])
+    axes.axhline(study.start, color="#5b636d", linestyle=":", linewidth=1.2)
+    axes.axhline(study.best_pid, color="#5b636d", linestyle="--", linewidth=1.2)
+    end = axes.get_xlim()[1]
+    axes.annotate("the PID that is corrected", (end, study.start), va="bottom", ha="right", size=8)
+    axes.annotate("best PID for this lung", (end, study.best_pid), va="bottom", ha="right", size=8)
+    axes.set_xscale("log")
+    lowest = min(float(np.min(curve.scores)) for curve in study.curves)
+    axes.set_ylim(0.95 * lowest, 1.25 * study.start)  # room for the legend
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(color="#d9dde2", linewidth=0.6)

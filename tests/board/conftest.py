@@ -19,7 +19,7 @@ from ventbench.board.replay import Simulators, replay
 from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
 from ventbench.submissions.errors import Failure
-from ventbench.submissions.folder import open_submission
+from ventbench.submissions.folder import open_submission, resolve
 from ventbench.submissions.result import CellFailure, Score
 from ventbench.submissions.scoring import run_protocol
 
@@ -73,14 +73,12 @@ def draft(
         **about: Any,
     ) -> create.Draft:
         score = scores[base]
-        folder = tmp_path_factory.mktemp("entries") / name
-        shutil.copytree(score.submission.folder, folder, ignore=lambda *_: ["__pycache__"])
+        folder = entry_folder(tmp_path_factory.mktemp("entries") / name, base, name)
         manifest = dataclasses.replace(score.submission.manifest, name=name)
         if texts is not None:
             manifest = dataclasses.replace(
                 manifest, authors=(texts,), licence=texts, description=texts
             )
-        (folder / "submission.toml").write_text(f"# {name}\n")
         opened = dataclasses.replace(
             score.submission, label=str(folder), folder=folder, manifest=manifest,
             sha256=create.combined_hash(create.file_hashes(folder)),
@@ -107,6 +105,14 @@ def draft(
         return create.create(varied, simulators, now=NOW, **about)
 
     return make
+
+
+def entry_folder(folder: Path, base: str, name: str) -> Path:
+    """Copy a bundled submission under another name; the same files each time."""
+    shutil.copytree(resolve(base), folder, ignore=lambda *_: ["__pycache__"])
+    manifest = folder / "submission.toml"
+    manifest.write_text(manifest.read_text().replace(f'name = "{base}"', f'name = "{name}"'))
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -8,6 +8,7 @@
 - :mod:`~ventbench.board.store`: the folder ``leaderboard/`` and its chain;
 - :mod:`~ventbench.board.layout`: which files it may hold;
 - :mod:`~ventbench.board.attestation`: signatures of records, and who may sign;
+- :mod:`~ventbench.board.rerun`: the code of records once more in the sandbox;
 - :mod:`~ventbench.board.ranking`: which record of an entry counts, ranks, intervals, differences;
 - :mod:`~ventbench.board.frames`: the board as CSV and as pandas frames;
 - :mod:`~ventbench.board.build`: CSV and pages; :mod:`~ventbench.board.verify`: everything again.

@@ -37,6 +37,8 @@ class Report:
         head: SHA-256 that stands for all records and their order.
         records: how many there are.
         replayed: how many were replayed.
+        reproduced: how many were run again and gave the same commands; see
+            :mod:`ventbench.board.rerun`.
         deviation: largest difference between a recorded error and its replay, cmH2O.
         problems: one sentence each; empty if all is well.
         notes: what could not be checked, which is no problem.
@@ -45,6 +47,7 @@ class Report:
     head: str = store.CHAIN_START
     records: int = 0
     replayed: int = 0
+    reproduced: int = 0
     deviation: float = 0.0
     problems: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from ventbench.board.ranking import Interval, Track
+    from ventbench.board.verify import Report
 
 app = typer.Typer(
     name="board", help="The leaderboard: add records, build and verify pages.", no_args_is_help=True
@@ -141,26 +142,56 @@ def build(folder: Folder = FOLDER, json: JsonFile = None) -> None:
 
 @app.command()
 def verify(
+    records: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[HASH]...",
+            help="With --rerun: records to run again, or the beginnings of their hashes; "
+            "default: all.",
+        ),
+    ] = None,
     folder: Folder = FOLDER,
     head: Annotated[
         str | None, typer.Option(help="Earlier head of the chain, which must still be part of it.")
     ] = None,
+    rerun: Annotated[
+        bool,
+        typer.Option("--rerun", help="Also run the code of records again, in the sandbox."),
+    ] = False,
+    source: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="DIR",
+            help="Code for --rerun: a submission or a folder of them; may be repeated. "
+            "submissions/ beside the leaderboard is looked through anyway.",
+        ),
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes of --rerun.")] = 1,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Finished runs of --rerun; it continues from them.")
+    ] = Path("runs/rerun"),
     json: JsonFile = None,
 ) -> None:
-    """Check every hash, replay the commands of every record and rebuild every page.
+    """Check every hash and signature, replay every record and rebuild every page.
+
+    With --rerun, the code that each record names by its hashes runs again, and its commands must
+    be the recorded ones to the bit. Records whose code is not at hand are listed.
 
     The exit code is 1 if there is any problem. Each problem names its file.
 
-    Example: `ventbench board verify`
+    Example: `ventbench board verify --rerun --jobs 2`
     """
     import dataclasses
 
     from rich.console import Console
 
     from ventbench.board import verify as verifier
+    from ventbench.errors import InputError
     from ventbench.plants import frozen
     from ventbench.text import plain
 
+    if records and not rerun:
+        raise InputError("records are chosen for --rerun; without it all are verified")
     console = Console(stderr=str(json) == "-")
     with Console(stderr=True).status("replaying") as status:
         report = verifier.verify(
@@ -169,6 +200,8 @@ def verify(
             head=head,
             progress=lambda done, all_: status.update(f"replayed {done} of {all_} records"),
         )
+    if rerun and not report.problems:  # else the records are not what they were
+        _rerun(report, folder, records or [], source or [], out, jobs)
     emit(dataclasses.asdict(report), json)
     for note in report.notes:
         console.print(f"note: {plain(note)}", markup=False, highlight=False)
@@ -179,12 +212,35 @@ def verify(
         raise typer.Exit(1)
 
 
-def _summary(console: Console, report: Any) -> None:
+def _rerun(
+    report: Report, folder: Path, records: list[str], sources: list[Path], out: Path, jobs: int
+) -> None:
+    """Run code again; note in the report what came of it."""
+    from rich.console import Console
+
+    from ventbench.board import rerun
+
+    with Console(stderr=True).status("running code again") as status:
+
+        def note(outcome: rerun.Outcome) -> None:
+            if outcome.state == rerun.REPRODUCED:
+                report.reproduced += 1
+            status.update(f"{report.reproduced} records reproduced")
+
+        outcomes = rerun.rerun(
+            folder, records=records, sources=sources, work=out, jobs=jobs, progress=note
+        )
+    report.problems += [str(x) for x in outcomes if x.state == rerun.DIFFERENT]
+    report.notes += [str(x) for x in outcomes if x.state == rerun.NOT_RERUN]
+
+
+def _summary(console: Console, report: Report) -> None:
     count = len(report.problems)
     state = f"{count} problem{'s' if count > 1 else ''}" if count else "no problems"
+    reproduced = f", {report.reproduced} reproduced by their code" if report.reproduced else ""
     console.print(
         f"{state}: {report.records} records, {report.replayed} replayed "
-        f"(largest difference {report.deviation:.1e} cmH2O)\nhead {report.head}",
+        f"(largest difference {report.deviation:.1e} cmH2O){reproduced}\nhead {report.head}",
         markup=False,
         highlight=False,
         soft_wrap=True,

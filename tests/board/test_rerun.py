@@ -1,0 +1,147 @@
+"""Who computed the commands: the code that a record names, or somebody else."""
+
+from __future__ import annotations
+
+import functools
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from ventbench.board import build, rerun, store
+from ventbench.board.verify import verify
+from ventbench.cli import app
+from ventbench.errors import InputError
+from ventbench.plants import frozen
+from ventbench.submissions.runner import InProcessRunner
+
+from ..textbook import Textbook
+from .conftest import entry_folder, put
+
+
+def states(outcomes: list[rerun.Outcome]) -> dict[str, str]:
+    return {outcome.name: outcome.state for outcome in outcomes}
+
+
+@pytest.fixture
+def again(simulators: Textbook, tmp_path: Path):
+    """Run records of a leaderboard again, in this process."""
+
+    def run(folder: Path, *sources: Path, **options) -> list[rerun.Outcome]:
+        options = {"work": tmp_path / "work", "runner": InProcessRunner, **options}
+        return rerun.rerun(folder, sources=sources, load=lambda: simulators, **options)
+
+    return run
+
+
+@pytest.fixture
+def board(three: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(three, tmp_path / "leaderboard")
+
+
+@pytest.fixture(scope="module")
+def three(draft, drafts, simulators, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An honest PID, one with commands that its code does not give, one without code."""
+    folder = tmp_path_factory.mktemp("three") / "leaderboard"
+    for made in (draft("honest"), drafts["softer"], draft("absent", "pid_robust")):
+        put(folder, made, simulators)
+    build.build(folder)
+    return folder
+
+
+@pytest.fixture
+def code(tmp_path: Path) -> Path:
+    for name in ("honest", "softer"):
+        entry_folder(tmp_path / "code" / name, "pid_best", name)
+    return tmp_path / "code"
+
+
+def test_commands_of_somebody_else_are_seen(board: Path, code: Path, again, simulators) -> None:
+    """Commands of one's own making under the hashes of decent code: replay cannot see it."""
+    assert verify(board, lambda version: simulators).problems == [], "control"
+    outcomes = again(board, code)
+    assert states(outcomes) == {
+        "honest": rerun.REPRODUCED,
+        "softer": rerun.DIFFERENT,
+        "absent": rerun.NOT_RERUN,
+    }
+    forged, absent = (str(outcome) for outcome in outcomes[1:])
+    assert "commands differ in 756 of 756 cells" in forged
+    assert "first in R5C10, PIP 10, nominal, breath 1, step 1" in forged
+    assert "no folder at hand has the files that it names; give --source DIR" in absent
+
+
+def test_one_bit_is_seen(board: Path, scores) -> None:
+    score = store.load(board).scores[0]
+    recorded = scores["pid_best"].requested
+    changed = recorded.copy()
+    changed[2, 3, 4, 1, 5] = np.nextafter(changed[2, 3, 4, 1, 5], 100.0)
+    assert rerun.difference(score, recorded, recorded.copy()) == ""
+    text = rerun.difference(score, recorded, changed)
+    assert "differ in 1 of 756 cells" in text
+    assert f"first in {score.lungs[2]}, PIP 30, draw 3, breath 2, step 6" in text
+
+
+def test_changed_code_is_not_the_code(board: Path, code: Path, again) -> None:
+    path = code / "honest" / "controller.py"
+    path.write_text(path.read_text() + "\n")
+    assert states(again(board, code))["honest"] == rerun.NOT_RERUN
+    path.write_text(path.read_text()[:-1])
+    (code / "honest" / "more.txt").write_text("x")
+    assert states(again(board, code))["honest"] == rerun.NOT_RERUN
+
+
+def test_what_is_finished_is_kept(board: Path, code: Path, again, tmp_path: Path) -> None:
+    again(board, code)
+
+    def absent():
+        raise AssertionError("run again")
+
+    sha256 = store.load(board).scores[0].sha256
+    (outcome,) = again(board, code, records=[sha256[:8]], runner=absent)
+    assert outcome.state == rerun.REPRODUCED
+    with pytest.raises(AssertionError, match="run again"):
+        again(board, code, runner=absent)  # what differed is tried anew
+    with pytest.raises(InputError, match="no single record"):
+        again(board, code, records=["f" * 64])
+
+
+def test_code_beside_the_leaderboard_and_the_folder_itself(
+    board: Path, code: Path, again, tmp_path: Path
+) -> None:
+    (outcome,) = again(board, code / "honest", records=[store.load(board).scores[0].sha256])
+    assert outcome.state == rerun.REPRODUCED
+    shutil.copytree(code / "honest", board.parent / "submissions" / "renamed")
+    (outcome,) = again(board, records=[store.load(board).scores[0].sha256], work=tmp_path / "other")
+    assert outcome.state == rerun.REPRODUCED
+
+
+def test_the_command_says_all_three(
+    board: Path, code: Path, simulators, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(frozen, "load", lambda version=1, path=None: simulators)
+    in_this_process = functools.partial(
+        rerun.rerun, load=lambda: simulators, runner=InProcessRunner
+    )
+    monkeypatch.setattr(rerun, "rerun", in_this_process)
+    arguments = ["board", "verify", "--folder", str(board), "--out", str(tmp_path / "kept")]
+    said = CliRunner().invoke(app, [*arguments, "--rerun", "--source", str(code)])
+    assert said.exit_code == 1
+    text = " ".join(said.output.split())
+    assert "(softer, performance): different: commands differ" in text
+    assert "(absent, robustness): not re-run: no folder at hand" in text
+    assert "1 problem: 3 records, 3 replayed" in text
+    assert "1 reproduced by their code" in text
+    refused = CliRunner().invoke(app, [*arguments, "abc"])
+    assert isinstance(refused.exception, InputError)
+
+
+@pytest.mark.slow
+def test_published_records_are_reproduced_in_two_processes(tmp_path: Path) -> None:
+    """The PIDs of this repository's leaderboard, in the sandbox."""
+    folder = Path(__file__).parents[2] / "leaderboard"
+    pids = [s.sha256 for s in store.load(folder).scores if s.name.startswith("pid_")]
+    outcomes = rerun.rerun(folder, records=pids, work=tmp_path / "work", jobs=2)
+    assert {outcome.state for outcome in outcomes} == {rerun.REPRODUCED}

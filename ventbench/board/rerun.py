@@ -1,0 +1,259 @@
+"""The code of a record once more in the sandbox: does it give the recorded commands, to the bit?
+
+Replay proves that errors follow from commands; a second run proves that the commands come from the
+code whose hashes the record names. What has been reproduced is kept in a folder, so that an
+interrupted run continues, and several processes can share the work.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench import data_files, draws, protocol
+from ventbench.board import actions, canonical, create, store
+from ventbench.board.record import Record
+from ventbench.board.replay import Simulators
+from ventbench.errors import InputError
+from ventbench.resume import WorkFolder
+from ventbench.submissions.folder import Submission, file_hashes, open_submission
+from ventbench.submissions.runner import Runner
+from ventbench.submissions.scoring import run_protocol
+
+#: What a second run can show.
+REPRODUCED, DIFFERENT, NOT_RERUN = "reproduced", "different", "not re-run"
+
+#: Most folders of submissions that are looked through in one place.
+MAX_FOLDERS = 5000
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the second run of a record showed.
+
+    Attributes:
+        record: SHA-256 of the record.
+        name: of the entry.
+        track: of the record.
+        state: ``"reproduced"``, ``"different"`` or ``"not re-run"``.
+        detail: what differs, or why it was not run again; else empty.
+        seconds: that the run took.
+    """
+
+    record: str
+    name: str
+    track: str
+    state: str
+    detail: str = ""
+    seconds: float = 0.0
+
+    def __str__(self) -> str:
+        detail = f": {self.detail}" if self.detail else ""
+        return f"record {self.record} ({self.name}, {self.track}): {self.state}{detail}"
+
+
+def sandboxed() -> Runner:
+    """The runner of official scores.
+
+    Raises:
+        SandboxError: if this machine lacks a layer that they need.
+    """
+    from ventbench.sandbox.runner import SandboxRunner
+
+    return SandboxRunner(require_official=True)
+
+
+def frozen_simulators() -> Simulators:
+    """The frozen simulators of this ventbench.
+
+    Raises:
+        InputError: if they were changed.
+    """
+    from ventbench.plants import frozen
+
+    return frozen.load()
+
+
+def rerun(
+    folder: Path,
+    *,
+    records: Sequence[str] = (),
+    sources: Sequence[Path] = (),
+    work: Path,
+    jobs: int = 1,
+    load: Callable[[], Simulators] = frozen_simulators,
+    runner: Callable[[], Runner] = sandboxed,
+    progress: Callable[[Outcome], None] | None = None,
+) -> list[Outcome]:
+    """Run the code of records again and compare commands.
+
+    Args:
+        folder: of the leaderboard.
+        records: hashes of the records, or the beginnings of them; all scores if empty.
+        sources: folders with the code: of one submission, or of several.
+        work: folder for what is finished; the same one continues.
+        jobs: number of processes.
+        load: gives the simulators; with several processes, a function of a module.
+        runner: gives the runner; with several processes, a function of a module.
+        progress: called after each record.
+
+    Returns:
+        One outcome a record, in the order of the chain.
+
+    Raises:
+        InputError: if a hash names no record, ``work`` belongs to other versions, or this machine
+            cannot run submissions as official scores are run.
+        OSError: if a file cannot be read or written.
+    """
+    board = store.load(folder)
+    chosen = {store.find_record(board, sha256).sha256 for sha256 in records}
+    scores = [score for score in board.scores if not chosen or score.sha256 in chosen]
+    about = canonical.through_json(load().about())
+    done = WorkFolder(work, {"simulators": about, "versions": create.versions()})
+    outcomes: dict[str, Outcome] = {}
+    todo: list[tuple[Record, Path]] = []
+
+    def note(outcome: Outcome) -> None:
+        outcomes[outcome.record] = outcome
+        # A run that differed may have met a limit of time: it is tried anew.
+        if outcome.state == REPRODUCED and not done.has(outcome.record):
+            done.put(outcome.record, asdict(outcome))
+        if progress is not None:
+            progress(outcome)
+
+    available = list(_folders([folder.parent / "submissions", *sources]))
+    for score in scores:
+        if done.has(score.sha256):
+            note(Outcome(**done.read(score.sha256)))
+            continue
+        code, why = _code_of(score, available, about)
+        if code is None:
+            note(Outcome(score.sha256, score.name, score.track, NOT_RERUN, why))
+        else:
+            todo.append((score, code))
+    if jobs == 1 or len(todo) < 2:
+        for score, code in todo:
+            note(_run(score, code, folder, load(), runner()))
+    else:
+        # Fresh processes: JAX has threads, which a fork would cut off.
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(jobs, mp_context=context) as pool:
+            running = [
+                pool.submit(_run_in_process, score.sha256, code, folder, load, runner)
+                for score, code in todo
+            ]
+            for finished in as_completed(running):
+                note(finished.result())
+    return [outcomes[score.sha256] for score in scores]
+
+
+def _folders(places: Sequence[Path]) -> Iterator[Path]:
+    """Folders that may hold a submission: the places themselves and those in them."""
+    for place in (*places, data_files.submissions_folder()):
+        if not place.is_dir():
+            continue
+        yield place
+        inside = (path for path in sorted(place.iterdir())[:MAX_FOLDERS] if not path.is_symlink())
+        yield from (path for path in inside if path.is_dir())
+
+
+def _code_of(
+    score: Record, available: Sequence[Path], simulators: Mapping[str, Any]
+) -> tuple[Path | None, str]:
+    """Find the code that a record names by its hashes; else why it cannot be run again."""
+    if score.version != protocol.VERSION:
+        return None, f"its protocol version is {score.version}; an older ventbench runs it"
+    if score.header.simulators != simulators:
+        return None, "it was scored on other simulators than those of this ventbench"
+    wanted = score.header.submission.files
+    for folder in available:
+        # By its files first: hashing every folder for every record would take long.
+        if all((folder / name).is_file() for name in wanted) and file_hashes(folder) == wanted:
+            return folder, ""
+    return None, "no folder at hand has the files that it names; give --source DIR"
+
+
+def _run_in_process(
+    sha256: str,
+    code: Path,
+    folder: Path,
+    load: Callable[[], Simulators],
+    runner: Callable[[], Runner],
+) -> Outcome:
+    """Run one record in a process of its own, which reads it again."""
+    score = store.find_record(store.load(folder), sha256)
+    return _run(score, code, folder, load(), runner())
+
+
+def _run(
+    score: Record, code: Path, folder: Path, simulators: Simulators, runner: Runner
+) -> Outcome:
+    """Run the code of one record and compare."""
+    begun = time.perf_counter()
+    try:
+        submission = open_submission(str(code))
+        _check_same(submission, score)
+        result = run_protocol(
+            submission,
+            simulators.plants,
+            track=score.track,
+            draws=draws.COUNT,
+            runner=runner,
+            simulators=simulators.about(),
+        )
+        _check_same(open_submission(str(code)), score)
+        recorded = actions.load(score, folder / store.RECORDS)
+        detail = difference(score, recorded, result.requested)
+        failed = {(x.lung, x.pip, x.draw) for x in result.failures}
+        if not detail and failed != {(x.lung, x.pip, x.draw) for x in score.header.failures}:
+            detail = f"{len(failed)} cells failed, {score.header.failed_cells} in the record"
+    except (InputError, FloatingPointError) as error:
+        detail = f"its code cannot be run: {error}"
+    seconds = round(time.perf_counter() - begun, 1)
+    state = DIFFERENT if detail else REPRODUCED
+    return Outcome(score.sha256, score.name, score.track, state, detail, seconds)
+
+
+def _check_same(submission: Submission, score: Record) -> None:
+    """Refuse code that has changed since it was found."""
+    if submission.sha256 != score.header.submission.sha256:
+        raise InputError(f"{submission.label} was changed while it ran")
+
+
+def difference(score: Record, recorded: Floats, again: Floats) -> str:
+    """Describe how commands differ from the recorded ones; empty if they are the same bits.
+
+    Args:
+        score: whose commands they are.
+        recorded: %, shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``.
+        again: commands of the second run, of the same shape.
+    """
+    if recorded.shape != again.shape:
+        return f"commands of shape {again.shape}, {recorded.shape} in the record"
+    apart = np.ascontiguousarray(recorded).view(np.uint64) != np.ascontiguousarray(again).view(
+        np.uint64
+    )
+    if not apart.any():
+        return ""
+    lung, draw, pip, breath, step = np.argwhere(apart)[0]
+    cells = int(apart.any(axis=(-2, -1)).sum())
+    run = f"draw {draw}" if draw else "nominal"
+    where = (
+        f"{score.lungs[lung]}, PIP {score.pips[pip]:g}, {run}, breath {breath + 1}, step {step + 1}"
+    )
+    first = lung, draw, pip, breath, step
+    return (
+        f"commands differ in {cells} of {apart[..., 0, 0].size} cells, by up to "
+        f"{np.abs(recorded - again).max():.3g} %; first in {where}: {recorded[first]:.12g} % in "
+        f"the record, {again[first]:.12g} % now"
+    )

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from ventbench.errors import InputError
-from ventbench.interfaces import Task
 from ventbench.sandbox.child.failures import SubmissionError
 from ventbench.sandbox.child.preload import NUMPY
 from ventbench.sandbox.reader import UnreadableError, read_apart
@@ -81,15 +79,12 @@ def modules_needed(folder: Path) -> tuple[tuple[str, ...], bool]:
 _THREADED_MEMORY = 4 * GIB
 
 
-def configuration(
-    folder: str, label: str, tasks: Sequence[Task], allowance: Allowance
-) -> dict[str, object]:
+def configuration(folder: str, label: str, allowance: Allowance) -> dict[str, object]:
     """What a zygote is told.
 
     Args:
         folder: the submission's, absolute.
         label: how messages name it.
-        tasks: those that its cells may have.
         allowance: what they may use.
     """
     modules, threads = modules_needed(Path(folder))
@@ -98,6 +93,5 @@ def configuration(
         "folder": folder,
         "label": label,
         "packages": modules,
-        "tasks": tasks,
         "limits": {"memory": memory, "cpu_s": allowance.cpu_s, "threads": threads},
     }

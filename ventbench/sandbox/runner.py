@@ -30,7 +30,7 @@ def layers() -> tuple[str, ...]:
     """
     pipes = Pipes()
     with tempfile.TemporaryDirectory() as folder:
-        zygote = ZygoteClient(configuration(os.path.realpath(folder), "probe", [], Allowance()))
+        zygote = ZygoteClient(configuration(os.path.realpath(folder), "probe", Allowance()))
         try:
             pipes.open(0, lambda far: zygote.start(0, None, far))
             outcomes = pipes.collect({0}, 0, wire.LOCKED, _PROBE_S, float("inf"))

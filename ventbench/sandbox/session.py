@@ -83,18 +83,17 @@ class SandboxSession:
             stack.callback(show_process)
             self._pipes = Pipes(self._clock)
             stack.callback(self._pipes.close_all)
-            distinct = sorted(set(tasks), key=repr)
             self._zygote = ZygoteClient(
-                configuration(str(submission.folder), submission.label, distinct, allowance)
+                configuration(str(submission.folder), submission.label, allowance)
             )
             stack.callback(self._zygote.close)
             # Ended first: cells then leave by themselves, and the zygote need not kill.
             stack.callback(self._pipes.close_all)
-            self._lock_down([distinct.index(task) for task in tasks], layers)
+            self._lock_down(tasks, layers)
             self._reset()
             self._stack = stack.pop_all()
 
-    def _lock_down(self, tasks: list[int], layers: tuple[str, ...]) -> None:
+    def _lock_down(self, tasks: Sequence[Task], layers: tuple[str, ...]) -> None:
         # In an order that nobody knows: a process's number says nothing about its cell.
         for cell in random.SystemRandom().sample(range(self._count), self._count):
 

@@ -1,6 +1,7 @@
 """The scorer's end of the zygote: starts it, asks it for cells, hears how they ended.
 
-Where bubblewrap is installed, the zygote starts inside it: a file system with nothing else in it.
+Where the zygote may not make namespaces of its own (Ubuntu 24.04 as an ordinary user), it starts in
+bubblewrap if that is installed and may.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import contextlib
 import functools
 import json
 import os
+import secrets
 import shutil
 import signal
 import socket
@@ -20,24 +22,28 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from ventbench.interfaces import Task
+from ventbench.sandbox.child.isolation import RANDOM
 from ventbench.sandbox.child.zygote import (
     ENDED,
     INTERRUPT,
     KILL,
-    NO_TASK,
     PREPARED,
-    RANDOM,
     REQUEST,
     SIZE,
     START,
+    TOKEN,
 )
 from ventbench.sandbox.configuration import SandboxError
 from ventbench.sandbox.interpreter import ENVIRONMENT, OPTIONS, ROOT, SITE
 
 _BOOT = (
     "import sys; sys.path.insert(0, sys.argv[2]); from ventbench.sandbox.child import zygote; "
-    "del sys.path[0]; zygote.main(int(sys.argv[1]))"
+    "del sys.path[0]; zygote.main(int(sys.argv[1]), sys.argv[3])"
 )
+
+_TASK = REQUEST.size - TOKEN - 1
+
 _START_S = 60.0
 
 
@@ -45,20 +51,25 @@ class ZygoteClient:
     """A running zygote.
 
     Args:
-        config: what the zygote is told, but for ``site`` and ``bubblewrap``.
+        config: what the zygote is told, but for ``site``.
 
     Raises:
         SandboxError: if it does not start.
     """
 
     def __init__(self, config: dict[str, Any]):
-        words = bubblewrap_prefix([SITE, os.path.join(ROOT, "ventbench"), config["folder"]])
-        config = {**config, "site": [SITE], "bubblewrap": bool(words)}
-        self._ended: dict[int, int] = {}
+        words: list[str] = []
+        apart = "own" if namespaces_work() else ""
+        if not apart:
+            words = bubblewrap_prefix([SITE, os.path.join(ROOT, "ventbench"), config["folder"]])
+        config = {**config, "site": [SITE]}
+        self._tokens: dict[int, bytes] = {}  # of each cell
+        self._ended: dict[bytes, int] = {}
         self._data = b""
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed in close()
         self._control, theirs = socket.socketpair()
-        command = [*words, sys.executable, *OPTIONS, "-c", _BOOT, str(theirs.fileno()), ROOT]
+        told = (str(theirs.fileno()), ROOT, "bubblewrap" if words else apart)
+        command = [*words, sys.executable, *OPTIONS, "-c", _BOOT, *told]
         try:
             self._process = subprocess.Popen(
                 command,
@@ -93,24 +104,31 @@ class ZygoteClient:
             self.close()
             raise SandboxError(f"the sandbox's process ended before it was ready: {said}")
 
-    def start(self, cell: int, task: int | None, pipes: Sequence[int]) -> None:
+    def start(self, cell: int, task: Task | None, pipes: Sequence[int]) -> None:
         """Start a cell.
 
         Args:
-            cell: any number, named when it ends.
-            task: index of its task, or None for one that only locks itself down.
+            cell: names it in this process; the zygote knows it by a random token.
+            task: what it is told, or None for one that only locks itself down.
             pipes: the ends for its observations and its replies; may be closed afterwards.
         """
-        request = REQUEST.pack(START, cell, NO_TASK if task is None else task)
-        socket.send_fds(self._control, [request], pipes)
+        self._tokens[cell] = secrets.token_bytes(TOKEN)
+        told = b"" if task is None else json.dumps(task).encode()
+        if len(told) > _TASK:
+            raise SandboxError(f"a task of {len(told)} bytes, at most {_TASK} are possible")
+        self._ask(START, cell, told, pipes)
 
     def interrupt(self, cell: int) -> None:
         """Ask a cell to say where it is and end."""
-        self._control.sendall(REQUEST.pack(INTERRUPT, cell, 0))
+        self._ask(INTERRUPT, cell)
 
     def kill(self, cell: int) -> None:
         """End a cell."""
-        self._control.sendall(REQUEST.pack(KILL, cell, 0))
+        self._ask(KILL, cell)
+
+    def _ask(self, what: bytes, cell: int, told: bytes = b"", pipes: Sequence[int] = ()) -> None:
+        request = REQUEST.pack(what, self._tokens[cell], told.ljust(_TASK))
+        socket.send_fds(self._control, [request], pipes)
 
     def status(self, cell: int, timeout_s: float) -> int | None:
         """How a cell ended.
@@ -123,7 +141,8 @@ class ZygoteClient:
             Exit code, or minus the signal's number; None if it has not ended.
         """
         deadline = time.monotonic() + timeout_s
-        while cell not in self._ended:
+        token = self._tokens[cell]
+        while token not in self._ended:
             self._control.settimeout(max(deadline - time.monotonic(), 1e-3))
             try:
                 data = self._control.recv(4096)
@@ -135,10 +154,10 @@ class ZygoteClient:
                 return None
             self._data += data
             while len(self._data) >= ENDED.size:
-                number, status = ENDED.unpack_from(self._data)
-                self._ended[number] = os.waitstatus_to_exitcode(status)
+                ended, status = ENDED.unpack_from(self._data)
+                self._ended[ended] = os.waitstatus_to_exitcode(status)
                 self._data = self._data[ENDED.size :]
-        return self._ended[cell]
+        return self._ended[token]
 
     def close(self) -> None:
         """End it and all its cells; may be called more than once."""
@@ -157,6 +176,17 @@ def signal_name(status: int) -> str:
         return signal.Signals(-status).name
     except ValueError:
         return f"signal {-status}"
+
+
+@functools.cache
+def namespaces_work() -> bool:
+    """Whether a zygote can make its own namespaces and root here; else bubblewrap may help."""
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1]); "
+        "from ventbench.sandbox.child import isolation as i; "
+        "sys.exit(not (i.enter_namespaces() and i.change_root([], '/nonexistent')))"
+    )
+    return sys.platform == "linux" and _works((sys.executable, *OPTIONS, "-c", code, ROOT))
 
 
 _SYSTEM = ("/lib", "/lib64", "/usr/lib", "/usr/lib64", "/etc/ld.so.cache")
@@ -185,8 +215,8 @@ def _bubblewrap_options(folders: Sequence[str]) -> list[str]:
         options += ["--ro-bind-try", path, path]
     for device in ("/dev/null", RANDOM):
         options += ["--dev-bind", device, device]
-    # The zygote reads there how much memory it has; its cells cannot.
-    return [*options, "--proc", "/proc", "--chdir", "/"]
+    # No /proc: the sizes in it are a way for cells to talk.
+    return [*options, "--chdir", "/"]
 
 
 @functools.cache

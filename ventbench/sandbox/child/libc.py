@@ -61,6 +61,10 @@ def syscall(number: int, *arguments: object) -> int:
     return checked(_libc.syscall(ctypes.c_long(number), *longs), f"system call {number}")
 
 
+#: A user namespace of one's own.
+NEW_USER = 0x10000000
+
+
 def unshare(flags: int) -> None:
     """``unshare(2)``, which Python has only since 3.12.
 
@@ -70,3 +74,26 @@ def unshare(flags: int) -> None:
     if _libc is None:
         raise OSError(f"unshare needs Linux, this is {sys.platform}")
     checked(_libc.unshare(ctypes.c_int(flags)), "unshare")
+
+
+def mount(source: bytes, target: bytes, kind: bytes, flags: int, options: bytes) -> None:
+    """``mount(2)``.
+
+    Raises:
+        OSError: if the kernel refuses or this is not Linux.
+    """
+    if _libc is None:
+        raise OSError(f"mount needs Linux, this is {sys.platform}")
+    result = _libc.mount(source, target, kind, ctypes.c_ulong(flags), options)
+    checked(result, f"mount {target.decode(errors='replace')}")
+
+
+def umount(target: bytes, flags: int) -> None:
+    """``umount2(2)``.
+
+    Raises:
+        OSError: if the kernel refuses or this is not Linux.
+    """
+    if _libc is None:
+        raise OSError(f"umount needs Linux, this is {sys.platform}")
+    checked(_libc.umount2(target, ctypes.c_int(flags)), f"umount {target.decode()}")

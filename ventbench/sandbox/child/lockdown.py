@@ -13,7 +13,7 @@ import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from . import landlock, libc, privileges, seccomp
+from . import isolation, landlock, libc, privileges, seccomp
 
 #: Every layer, in the order of the bits of a ``LOCKED`` reply.
 LAYERS = (
@@ -26,10 +26,13 @@ LAYERS = (
     "landlock",
     "seccomp",
     "bubblewrap",
+    "empty-root",
+    "own-descriptors",
+    "clean-fork",
 )
 
-#: A result may be called official only with these.
-OFFICIAL = ("landlock", "seccomp")
+#: A result may be called official only with these. Older records name fewer: theirs are data.
+OFFICIAL = ("namespaces", "empty-root", "own-descriptors", "clean-fork", "landlock", "seccomp")
 
 
 @dataclass(frozen=True)
@@ -53,33 +56,47 @@ class Lockdown:
     Args:
         readable: folders and files that stay readable.
         listable: folders of which the names alone stay readable, with all below.
-        bubblewrap: whether the zygote runs in it.
+        layers: those that are in force already.
+        folder: the submission's, readable too.
+        change_root: whether to leave the machine's root for one with these files alone.
     """
 
-    def __init__(self, readable: Sequence[str], listable: Sequence[str], *, bubblewrap: bool):
-        self._layers = ["bubblewrap"] if bubblewrap else []
+    def __init__(
+        self,
+        readable: Sequence[str],
+        listable: Sequence[str],
+        *,
+        layers: Sequence[str] = (),
+        folder: str | None = None,
+        change_root: bool = False,
+    ):
+        self._layers = list(layers)
         self._ruleset: int | None = None
+        self._root = os.geteuid() == 0
+        self._used = privileges.address_space()
         if not libc.LINUX:
             return
-        self._layers += (
-            ["namespaces", "read-only-mounts"] if bubblewrap else privileges.enter_namespaces()
-        )
         privileges.no_new_privs()
-        privileges.drop_capabilities()
+        if folder is not None and change_root:
+            if isolation.change_root(readable, folder):
+                self._layers += ["empty-root", "read-only-mounts"]
+            elif isolation.read_only():
+                self._layers.append("read-only-mounts")
         privileges.undumpable()
-        self._layers += ["no-new-privileges", "no-capabilities", "undumpable"]
         if landlock.abi():
+            readable = [*readable, *([folder] if folder else [])]
             handle = landlock.ruleset(readable, listable)
             # Out of the way of the numbers that a cell's pipes will have.
             self._ruleset = fcntl.fcntl(handle, fcntl.F_DUPFD_CLOEXEC, 16)
             os.close(handle)
 
-    def finish(self, limits: CellLimits, keep: int) -> list[str]:
+    def finish(self, limits: CellLimits, keep: int, parent: int | None = None) -> list[str]:
         """Lock this process, a fork of the zygote, down for good.
 
         Args:
             limits: what it may use.
             keep: descriptors below this number are its wire; all others are closed.
+            parent: the process with which this one shall end.
 
         Returns:
             The layers that are in force, shown by trying.
@@ -87,21 +104,42 @@ class Lockdown:
         Raises:
             OSError: if one that this system has does not come into force.
         """
-        privileges.limit_resources(limits.memory, limits.cpu_s, limits.threads)
         layers = [*self._layers, "rlimits"]
+        if self._root and "empty-root" in self._layers:
+            privileges.become_stranger()
+        processes = None if limits.threads else 0
+        if limits.threads and privileges.count_processes_apart():
+            processes = privileges.THREADS
+        memory = None if self._used is None else self._used + limits.memory
+        privileges.limit_resources(memory, limits.cpu_s, processes)
         if libc.LINUX:
-            privileges.undumpable()  # a fork inherits it; once more costs nothing
+            privileges.drop_capabilities()
+            privileges.undumpable()  # a fork inherits it, but another user is another matter
+            if parent is not None:
+                privileges.die_with(parent)
+            layers += ["no-new-privileges", "no-capabilities", "undumpable"]
         if self._ruleset is not None:
             landlock.enforce(self._ruleset)
             layers.append("landlock")
         os.closerange(keep, 1 << 16)
         if self._ruleset is not None:
             _prove_no_files()
+        if "empty-root" in self._layers:
+            _prove_no_names()
         if libc.LINUX and seccomp.available():
             seccomp.restrict(limits.threads)
             _prove_no_sockets()
             layers.append("seccomp")
         return layers
+
+
+def _prove_no_names() -> None:
+    for path in ("/proc", "/etc", "/sys", "/tmp/.old"):
+        try:
+            os.stat(path)
+        except FileNotFoundError:
+            continue
+        raise OSError(f"the root was changed and {path} is there nevertheless")
 
 
 def _prove_no_files() -> None:

@@ -1,13 +1,9 @@
-"""What the zygote and its cells give up: capabilities, being looked into, namespaces, resources.
-
-Namespaces: no network; no shared memory and message queues of others; and every file system
-read-only. The last does more than forbid writing, which other layers do too: reading then leaves no
-access time behind that another cell could look at.
-"""
+"""What the zygote and its cells give up: capabilities, their user, being looked into, resources."""
 
 from __future__ import annotations
 
 import ctypes
+import mmap
 import os
 import resource
 import signal
@@ -73,53 +69,52 @@ def drop_capabilities() -> None:
     libc.syscall(number, ctypes.byref(header), ctypes.byref(nothing))
 
 
-_NETWORK, _IPC, _HOST_NAME, _USER, _MOUNT = 0x40000000, 0x08000000, 0x04000000, 0x10000000, 0x20000
-_MOUNT_SETATTR, _HERE, _RECURSIVE, _NOW_READ_ONLY, _PRIVATE = 442, -100, 0x8000, 0x1, 1 << 18
+#: The user that cells of a scorer run by root become: one that owns nothing. Any number would do
+#: that no system gives away.
+_STRANGER = 1_879_048_193
 
 
-class _MountAttributes(ctypes.Structure):
-    _fields_ = tuple((name, ctypes.c_uint64) for name in ("set", "clear", "propagation", "userns"))
+def become_stranger() -> bool:
+    """Stop being root; say whether that was allowed. Capabilities stay until they are dropped."""
+    try:
+        os.setgroups([])
+        os.setresgid(_STRANGER, _STRANGER, _STRANGER)
+        os.setresuid(_STRANGER, _STRANGER, _STRANGER)
+    except OSError:  # a container that does not know the number
+        return False
+    return True
 
 
-def enter_namespaces() -> list[str]:
-    """Leave the machine's network, shared memory, host name and writable file systems behind.
+def count_processes_apart() -> bool:
+    """Enter a user namespace of one's own, in which the kernel counts one's processes from 1.
 
     Returns:
-        Which layers that gave: none where it is not allowed.
+        Whether that was allowed, and the kernel (from 5.14) counts so.
     """
-    apart = _NETWORK | _IPC | _HOST_NAME | _MOUNT
-    for flags in (apart, apart | _USER):  # root; an ordinary user
-        try:
-            libc.unshare(flags)
-        except OSError:
-            continue
-        return ["namespaces", *(["read-only-mounts"] if _read_only() else [])]
-    return []
-
-
-def _read_only() -> bool:
-    # First apart from the machine's own mounts, lest those become read-only.
-    for attributes in (_MountAttributes(propagation=_PRIVATE), _MountAttributes(_NOW_READ_ONLY)):
-        size = ctypes.sizeof(attributes)
-        try:
-            libc.syscall(_MOUNT_SETATTR, _HERE, b"/", _RECURSIVE, ctypes.byref(attributes), size)
-        except OSError:
-            return False
+    release = os.uname().release.split(".")
+    if not libc.LINUX or (int(release[0]), int(release[1].partition("-")[0])) < (5, 14):
+        return False
+    try:
+        libc.unshare(libc.NEW_USER)
+    except OSError:
+        return False
     return True
 
 
 #: Most descriptors: the wire, /dev/null, and a few files of weights.
 _FILES = 64
+#: Most threads of a cell that may have some: what JAX starts on a machine with many processors.
+THREADS = 32
 _STACK = 8 << 20
 
 
-def limit_resources(memory: int, cpu_s: int, threads: bool) -> None:
+def limit_resources(memory: int | None, cpu_s: int, processes: int | None) -> None:
     """Limit this process, soft and hard.
 
     Args:
-        memory: bytes of address space beyond what the process has now.
+        memory: bytes of address space; None for no limit.
         cpu_s: seconds of processor time in total.
-        threads: whether threads are allowed; the kernel counts them as processes.
+        processes: how many more may be started, threads among them; None for no limit.
 
     Raises:
         OSError: if the system refuses a limit.
@@ -133,10 +128,10 @@ def limit_resources(memory: int, cpu_s: int, threads: bool) -> None:
         "MEMLOCK": 0,
         "MSGQUEUE": 0,
     }
-    if (used := _address_space()) is not None:
-        limits["AS"] = used + memory
-    if not threads:
-        limits["NPROC"] = 0  # not for root: there seccomp alone stops new processes
+    if memory is not None:
+        limits["AS"] = memory
+    if processes is not None:
+        limits["NPROC"] = processes  # does not bind root
     for name, value in limits.items():
         kind = getattr(resource, f"RLIMIT_{name}", None)
         if kind is not None:  # not every system knows every limit
@@ -149,9 +144,29 @@ def limit_resources(memory: int, cpu_s: int, threads: bool) -> None:
             resource.setrlimit(kind, wanted)
 
 
-def _address_space() -> int | None:
-    """Bytes of this process's address space; None on systems that do not say."""
+def address_space() -> int | None:
+    """Return the bytes of this process's address space; None on systems that do not say."""
     if not libc.LINUX:
         return None
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[0]) * resource.getpagesize()
+    try:
+        with open("/proc/self/statm") as file:
+            return int(file.read().split()[0]) * resource.getpagesize()
+    except OSError:
+        return _smallest_limit()
+
+
+def _smallest_limit() -> int:
+    """Where there is no /proc: the least limit of address space under which a page is to be had."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    low, high = 0, 1 << 46
+    while high - low > resource.getpagesize():
+        middle = (low + high) // 2
+        resource.setrlimit(resource.RLIMIT_AS, (middle, hard))
+        try:
+            mmap.mmap(-1, resource.getpagesize()).close()
+            high = middle
+        except OSError:
+            low = middle
+        finally:
+            resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+    return high

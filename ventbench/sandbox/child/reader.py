@@ -33,7 +33,7 @@ def main(request: str) -> None:
     module, _, name = told["function"].partition(":")
     function = getattr(importlib.import_module(module), name)
     limits = CellLimits(told["memory"], told["cpu_s"], threads=False)
-    Lockdown(told["readable"], [], bubblewrap=False).finish(limits, _END)
+    Lockdown(told["readable"], []).finish(limits, _END)
     try:
         _write(function(*told["arguments"]))
     except MemoryError:

@@ -216,7 +216,9 @@ _REFUSED, _NO_SUCH_CALL = errno_action(errno.EPERM), errno_action(errno.ENOSYS)
 _O_TMPFILE, _O_PATH = 0o20000000, 0o10000000
 _WRITING = 0o3 | 0o100 | 0o1000 | _O_TMPFILE | _O_PATH  # access mode, O_CREAT, O_TRUNC
 _TERMINAL_QUESTION, _CLOSE_ON_EXEC = 0x5401, (0x5450, 0x5451)
-_FCNTL = (0, 1, 2, 3, 4, 1030)  # F_DUPFD, F_GETFD, F_SETFD, F_GETFL, F_SETFL, F_DUPFD_CLOEXEC
+# F_DUPFD, F_GETFD, F_SETFD, F_GETFL, F_DUPFD_CLOEXEC. Not F_SETFL: whoever shares an open file
+# would see the flags.
+_FCNTL = (0, 1, 2, 3, 1030)
 _FUTEX_PRIVATE, _FUTEX_JOIN = 128, 9 | 256
 _MADVISE = (0, 4, 8, 14, 15)  # normal, don't need, free, huge page, no huge page
 _CLONE_THREAD = 0x10000

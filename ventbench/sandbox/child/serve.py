@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import io
+import json
 import os
 import signal
 import sys
@@ -10,7 +12,7 @@ from dataclasses import dataclass
 from importlib.machinery import FileFinder, SourceFileLoader
 from pathlib import Path
 from types import CodeType, FrameType
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 from ventbench.interfaces import Task
 
@@ -66,23 +68,41 @@ class _Replies:
         self.fail("timeout", "")
 
 
-def run(setup: Setup, prepared: Lockdown, task: Task | None) -> NoReturn:
-    """Be a cell; never returns.
+class Start(NamedTuple):
+    """What one cell alone gets from the zygote.
+
+    Attributes:
+        task: what the controller is told, as JSON; empty to lock down, say so and end.
+        pipes: its ends of the two pipes, by number.
+        parent: process number of the zygote.
+    """
+
+    task: bytes
+    pipes: list[int]
+    parent: int
+
+
+def run(given: list[tuple[Setup, Lockdown, Start]]) -> NoReturn:
+    """Be a cell; never returns. Call it with nothing of the zygote's left on the stack.
 
     Args:
-        setup: what all cells share.
-        prepared: what the zygote has prepared.
-        task: what the controller is told; None to lock down, say so and end.
+        given: what all cells share, what the zygote has prepared, and what is this cell's; taken
+            out of the list, so that it stays in no caller's variable.
     """
+    setup, prepared, start = given.pop()
+    _take_descriptors(start.pipes)
+    os.chdir(setup.folder)
     replies = _Replies(setup)
     signal.signal(signal.SIGTERM, replies.interrupted)
     try:
-        layers = prepared.finish(setup.limits, END)
-        replies.send(wire.LOCKED, lockdown.bits(layers))
+        layers = prepared.finish(setup.limits, END, start.parent)
+        replies.send(wire.LOCKED, lockdown.bits([*layers, "own-descriptors", "clean-fork"]))
     except BaseException as error:
         replies.fail("sandbox", f"{type(error).__name__}: {error}")
-    if task is None or os.read(OBSERVATIONS, len(wire.BEGIN)) != wire.BEGIN:
+    if not start.task or os.read(OBSERVATIONS, len(wire.BEGIN)) != wire.BEGIN:
         os._exit(0)
+    task = Task(*json.loads(start.task))
+    del prepared, start, layers
     try:
         only_sources(setup.folder)
         cell = Cell(controller_class(setup.folder, setup.label), task, setup.folder)
@@ -94,6 +114,19 @@ def run(setup: Setup, prepared: Lockdown, task: Task | None) -> NoReturn:
         replies.fail(failed.failure.kind, failed.failure.what, failed.failure.detail)
     except BaseException as error:  # KeyboardInterrupt and the like, raised by the submission
         replies.fail("act" if replies.sequence else "reset", *describe(error, setup.folder))
+
+
+def _take_descriptors(pipes: list[int]) -> None:
+    # Away from the numbers they shall have, then there.
+    away = [fcntl.fcntl(pipe, fcntl.F_DUPFD, 16) for pipe in pipes]
+    for number in (0, 1, 2):
+        # Each opened anew: an open file that cells share would carry flags between them.
+        null = os.open(os.devnull, os.O_RDWR)
+        if null != number:
+            os.dup2(null, number)
+            os.close(null)
+    for source, number in zip(away, (OBSERVATIONS, REPLIES), strict=True):
+        os.dup2(source, number)
 
 
 def _answer(replies: _Replies, cell: Cell) -> NoReturn:

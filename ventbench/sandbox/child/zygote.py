@@ -1,13 +1,14 @@
 """Starts cells: a new interpreter that holds nothing worth reading and forks on request.
 
 It is executed afresh, so none of the scorer's memory is in it, and it never runs submitted code.
-Requests and answers are of fixed size; the configuration comes first, as JSON.
+A cell is named by a random token and told its task as bytes that the zygote never reads. A fork
+leaves the loop by returning to :func:`main`, so that no frame of the zygote stays below the
+submission's, and takes along nothing but its own task and pipes.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import gc
 import json
 import os
@@ -17,27 +18,25 @@ import socket
 import struct
 import sys
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
-from ventbench.interfaces import Task
-
-from . import libc, preload, privileges, serve
+from . import isolation, preload, serve
+from .isolation import RANDOM
 from .lockdown import CellLimits, Lockdown
 
-#: Request: what to do, cell, index of its task. A start brings the cell's ends of two pipes.
-REQUEST = struct.Struct("<cIH")
+#: Bytes of a token.
+TOKEN = 16
+#: Request: what to do, token of the cell, its task as JSON in spaces to one length (or only
+#: spaces: lock down and end). A start brings the cell's ends of two pipes.
+REQUEST = struct.Struct(f"<c{TOKEN}s238s")
 START, INTERRUPT, KILL = b"s", b"i", b"k"
-NO_TASK = 0xFFFF
 
 #: Answer: a cell has ended, with this status as of ``waitpid``.
-ENDED = struct.Struct("<Ii")
+ENDED = struct.Struct(f"<{TOKEN}si")
 
 #: Size of the configuration, before it; and the word that follows the preparation.
 SIZE = struct.Struct("<I")
 PREPARED = b"prepared"
-
-#: Read by C++ libraries to seed their generators.
-RANDOM = "/dev/urandom"
 
 
 class Zygote:
@@ -45,26 +44,26 @@ class Zygote:
 
     Args:
         control: socket to the scorer.
-        setup: what cells share.
-        prepared: their lock-down.
-        tasks: what requests choose from.
     """
 
-    def __init__(
-        self, control: socket.socket, setup: serve.Setup, prepared: Lockdown, tasks: list[Task]
-    ):
-        self._control, self._setup, self._prepared, self._tasks = control, setup, prepared, tasks
-        self._cells: dict[int, int] = {}  # process -> cell
+    def __init__(self, control: socket.socket):
+        self._control = control
+        self._cells: dict[int, bytes] = {}  # process -> token
+        self._request = bytearray(REQUEST.size)
         self._out = bytearray()
-        self._wake, wake = os.pipe2(os.O_NONBLOCK) if libc.LINUX else os.pipe()
-        os.set_blocking(wake, False)
+        self._wake, self._signalled = os.pipe()
+        os.set_blocking(self._signalled, False)
         os.set_blocking(self._wake, False)
-        signal.signal(signal.SIGCHLD, lambda *_: None)
-        signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
+        signal.signal(signal.SIGCHLD, _ignore)
+        signal.set_wakeup_fd(self._signalled, warn_on_full_buffer=False)
         self._pid = os.getpid()
 
-    def run(self) -> None:
-        """Serve until the scorer closes the socket."""
+    def run(self) -> serve.Start | None:
+        """Serve until the scorer closes the socket.
+
+        Returns:
+            None then; in a fork that is to be a cell, what it needs, with all else forgotten.
+        """
         poll = select.poll()
         poll.register(self._wake, select.POLLIN)
         while True:
@@ -75,53 +74,51 @@ class Zygote:
                     with contextlib.suppress(BlockingIOError):
                         os.read(self._wake, 4096)
                 elif event & select.POLLIN:
-                    if not self._request():
-                        return
+                    pipes = self._receive()
+                    if pipes is None:
+                        return None
+                    if self._request[:1] != START:
+                        self._signal()
+                    elif (process := os.fork()) == 0:
+                        return self._forget(pipes)
+                    else:
+                        self._cells[process] = bytes(self._request[1 : 1 + TOKEN])
+                    for pipe in pipes:
+                        os.close(pipe)
+                    self._request[:] = bytes(REQUEST.size)
                 elif event & select.POLLOUT:
                     del self._out[: self._control.send(self._out)]
                 else:
-                    return
+                    return None
             self._reap()
 
-    def _request(self) -> bool:
-        data, pipes, _, _ = socket.recv_fds(self._control, REQUEST.size, 2)
-        if len(data) < REQUEST.size:
-            return False
-        what, cell, task = REQUEST.unpack(data)
-        if what == START:
-            self._start(cell, self._tasks[task] if task != NO_TASK else None, pipes)
-            return True
-        for process, number in self._cells.items():
-            if number == cell:  # not reaped yet, hence still this process
+    def _receive(self) -> list[int] | None:
+        """Read one request in place, so that no copy of a cell's task lies anywhere else."""
+        size, extra, _, _ = self._control.recvmsg_into([self._request], socket.CMSG_SPACE(8))
+        if size < REQUEST.size:
+            return None
+        return [pipe for _, _, data in extra for pipe in struct.unpack(f"{len(data) // 4}i", data)]
+
+    def _signal(self) -> None:
+        what, token, _ = REQUEST.unpack(self._request)
+        for process, name in self._cells.items():
+            if name == token:  # not reaped yet, hence still this process
                 os.kill(process, signal.SIGTERM if what == INTERRUPT else signal.SIGKILL)
-        return True
 
-    def _start(self, cell: int, task: Task | None, pipes: list[int]) -> None:
-        process = os.fork()
-        if process == 0:
-            try:
-                self._become_cell(task, pipes)
-            finally:
-                os._exit(70)
-        self._cells[process] = cell
-        for descriptor in pipes:
-            os.close(descriptor)
-
-    def _become_cell(self, task: Task | None, pipes: list[int]) -> NoReturn:
+    def _forget(self, pipes: list[int]) -> serve.Start:
+        """Be a zygote no more: keep this cell's task and pipes."""
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-        if libc.LINUX:
-            privileges.die_with(self._pid)
-        # Away from the numbers they shall have, then there.
-        away = [fcntl.fcntl(pipe, fcntl.F_DUPFD, 16) for pipe in pipes]
-        null = 0
-        numbers = (1, 2, serve.OBSERVATIONS, serve.REPLIES)
-        for source, number in zip((null, null, *away), numbers, strict=True):
-            os.dup2(source, number)
-        os.chdir(self._setup.folder)
-        setup, prepared = self._setup, self._prepared
+        task = bytes(self._request[1 + TOKEN :]).strip(b" ")
+        for secret in (self._request, self._out):
+            secret[:] = bytes(len(secret))
+        self._cells.clear()
+        self._control.close()
+        os.close(self._wake)
+        os.close(self._signalled)
+        start = serve.Start(task, pipes, self._pid)
         self.__dict__.clear()
-        serve.run(setup, prepared, task)
+        return start
 
     def _reap(self) -> None:
         while self._cells:
@@ -138,7 +135,11 @@ class Zygote:
             os.waitpid(process, 0)
 
 
-def _receive(control: socket.socket) -> dict[str, Any]:
+def _ignore(_signal: int, _frame: object) -> None:
+    """Let a child's end wake the loop, which needs some handler."""
+
+
+def _configuration(control: socket.socket) -> dict[str, Any]:
     with control.makefile("rb", buffering=0) as file:
         size = SIZE.unpack(file.read(SIZE.size) or b"\0\0\0\0")[0]
         data = b""
@@ -147,27 +148,63 @@ def _receive(control: socket.socket) -> dict[str, Any]:
         return json.loads(data)
 
 
-def main(descriptor: int) -> None:
+def _serve(descriptor: int, layers: list[str]) -> list[tuple[serve.Setup, Lockdown, serve.Start]]:
     """Prepare, say so, serve.
 
     Args:
         descriptor: the socket to the scorer.
+        layers: those that are in force already.
+
+    Returns:
+        Nothing at the end; in each cell, once, the arguments of :func:`serve.run`.
     """
     control = socket.socket(fileno=descriptor)
-    config = _receive(control)
+    config = _configuration(control)
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as file:
         file.write("1000")  # if memory runs out, a cell ends and not the scorer
     readable, listable = preload.load(config["packages"], config["site"])
+    bubblewrap = "bubblewrap" in layers
     prepared = Lockdown(
-        [config["folder"], RANDOM, *readable], listable, bubblewrap=config["bubblewrap"]
+        [RANDOM, *readable],
+        listable,
+        layers=layers,
+        folder=config["folder"],
+        change_root="namespaces" in layers and not bubblewrap,
     )
     setup = serve.Setup(Path(config["folder"]), config["label"], CellLimits(**config["limits"]))
-    sys.argv[:] = [""]
-    zygote = Zygote(control, setup, prepared, [Task(*task) for task in config["tasks"]])
+    sys.argv[:], sys.orig_argv[:] = [""], []
+    del config
+    zygote = Zygote(control)
     gc.collect()
     gc.freeze()  # else the first collection in each cell copies all of the zygote's memory
     control.sendall(PREPARED)
+    process = os.getpid()
     try:
-        zygote.run()
+        start = zygote.run()
     finally:
-        zygote.end()
+        if os.getpid() == process:
+            zygote.end()
+    return [] if start is None else [(setup, prepared, start)]
+
+
+def main(descriptor: int, apart: str) -> None:
+    """Be the zygote, and in each fork a cell, which runs from here and not from the loop.
+
+    Args:
+        descriptor: the socket to the scorer.
+        apart: who makes namespaces and root: ``"own"`` for this process, ``"bubblewrap"`` if that
+            has, nothing if nobody may.
+    """
+    layers: list[str] = []
+    if apart == "bubblewrap":
+        layers += ["bubblewrap", "namespaces", "empty-root", "read-only-mounts"]
+    elif apart == "own" and isolation.enter_namespaces():
+        layers.append("namespaces")
+    process = os.getpid()
+    try:
+        cell = _serve(descriptor, layers)
+        if cell:
+            serve.run(cell)
+    finally:
+        if os.getpid() != process:
+            os._exit(70)

@@ -1,0 +1,186 @@
+"""Namespaces of the zygote's own, and a root folder with nothing in it but what cells may read.
+
+After :func:`enter_namespaces` and :func:`change_root` there is no network, no ``/proc``, no other
+process, and no path of the machine: what cannot be named cannot be asked for its size or times.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from . import libc
+from .sources import walk
+
+_NETWORK, _IPC, _HOST_NAME, _USER = 0x40000000, 0x08000000, 0x04000000, libc.NEW_USER
+_MOUNT, _PROCESSES = 0x20000, 0x20000000
+_APART = _NETWORK | _IPC | _HOST_NAME | _MOUNT | _PROCESSES
+
+_MOUNT_SETATTR, _HERE, _RECURSIVE = 442, -100, 0x8000
+_READ_ONLY, _NO_SUID, _PRIVATE = 0x1, 0x2, 1 << 18
+_MS_NO_SUID, _MS_NO_DEV, _MS_BIND, _MS_RECURSIVE = 2, 4, 4096, 16384
+_DETACH = 2
+_PIVOT_ROOT = {"x86_64": 155, "aarch64": 41}
+
+#: Any of these is covered while the new root is made; the machine's own is not touched.
+_BASES = ("/tmp", "/mnt", "/var", "/usr")
+#: Largest copy of a submission, bytes: many times what is accepted.
+_COPY = 64 << 20
+
+#: Devices of the new root.
+NULL, RANDOM = "/dev/null", "/dev/urandom"
+
+
+def enter_namespaces() -> bool:
+    """Continue in namespaces of our own, as their first process; the caller's process waits.
+
+    When either process ends, the other and all below the first end too.
+
+    Returns:
+        Whether that was allowed; if not, nothing has changed.
+    """
+    user, group = os.geteuid(), os.getegid()
+    ways = (_APART, _APART | _USER) if user == 0 else (_APART | _USER,)
+    for flags in ways:
+        try:
+            libc.unshare(flags)
+        except OSError:
+            continue
+        if flags & _USER:
+            for file, text in (
+                ("uid_map", f"{user} {user} 1"),
+                ("setgroups", "deny"),
+                ("gid_map", f"{group} {group} 1"),
+            ):
+                Path("/proc/self", file).write_text(text)
+        _continue_as_first_process()
+        return True
+    return False
+
+
+def _continue_as_first_process() -> None:
+    child = os.fork()
+    if child == 0:
+        libc.prctl(libc.PR_SET_PDEATHSIG, signal.SIGKILL)
+        return
+    os.closerange(0, 1 << 16)  # else the scorer would not notice that the zygote has ended
+    _, status = os.waitpid(child, 0)
+    os._exit(os.waitstatus_to_exitcode(status) & 0xFF)
+
+
+class _MountAttributes(ctypes.Structure):
+    _fields_ = tuple((name, ctypes.c_uint64) for name in ("set", "clear", "propagation", "userns"))
+
+
+def change_root(readable: Iterable[str], folder: str) -> bool:
+    """Make a root that holds some files of the machine, read-only, and a copy of a folder.
+
+    Args:
+        readable: absolute paths of files and folders, which keep their names.
+        folder: whose plain files are copied, so that they can be read whatever their modes, and
+            leave no times behind; keeps its name too.
+
+    Returns:
+        Whether mounting was allowed; if not, nothing has changed.
+
+    Raises:
+        OSError: if the kernel refuses half-way.
+    """
+    # Opened now, as some may lie below the folder that will be covered.
+    sources = {path: _opened(path) for path in sorted({*readable, NULL, RANDOM})}
+    copy = dict(_plain_files(folder))
+    base = next(path for path in _BASES if os.path.isdir(path))
+    try:
+        _set_attributes("/", propagation=_PRIVATE)
+        options = b"mode=0755,size=%d" % (_COPY + (16 << 20))
+        libc.mount(b"none", base.encode(), b"tmpfs", _MS_NO_SUID | _MS_NO_DEV, options)
+    except OSError:
+        _close(sources)
+        return False
+    bound: list[str] = []
+    for path, source in sources.items():
+        if source is not None and not any(path.startswith(f"{top}/") for top in bound):
+            _bind(source, base + path)
+            bound.append(path)
+    _close(sources)
+    os.makedirs(base + folder, 0o755, exist_ok=True)
+    for name, content in copy.items():
+        target = Path(base + folder, name)
+        target.parent.mkdir(0o755, parents=True, exist_ok=True)
+        target.write_bytes(content)
+        target.chmod(0o644)
+    os.mkdir(f"{base}/.old")
+    os.chdir(base)
+    libc.syscall(_PIVOT_ROOT[libc.MACHINE], b".", b".old")
+    os.chdir("/")
+    libc.umount(b"/.old", _DETACH)
+    os.rmdir("/.old")
+    _set_attributes("/", attributes=_READ_ONLY | _NO_SUID)
+    return True
+
+
+def read_only() -> bool:
+    """Make every mount read-only in a root that stays; say whether that was allowed."""
+    try:
+        _set_attributes("/", propagation=_PRIVATE)
+        _set_attributes("/", attributes=_READ_ONLY)
+    except OSError:
+        return False
+    return True
+
+
+def _set_attributes(path: str, *, attributes: int = 0, propagation: int = 0) -> None:
+    wanted = _MountAttributes(attributes, 0, propagation, 0)
+    size = ctypes.sizeof(wanted)
+    name = path.encode()
+    libc.syscall(_MOUNT_SETATTR, _HERE, name, _RECURSIVE, ctypes.byref(wanted), size)
+
+
+def _opened(path: str) -> int | None:
+    try:
+        return os.open(path, os.O_PATH | os.O_CLOEXEC)  # type: ignore[attr-defined]
+    except OSError:
+        return None
+
+
+def _close(sources: dict[str, int | None]) -> None:
+    for source in sources.values():
+        if source is not None:
+            os.close(source)
+
+
+def _bind(source: int, target: str) -> None:
+    here = f"/proc/self/fd/{source}"
+    if os.path.isdir(here):
+        os.makedirs(target, 0o755, exist_ok=True)
+    else:
+        os.makedirs(os.path.dirname(target), 0o755, exist_ok=True)
+        os.close(os.open(target, os.O_CREAT | os.O_WRONLY, 0o644))
+    libc.mount(here.encode(), os.fsencode(target), b"", _MS_BIND | _MS_RECURSIVE, b"")
+
+
+def _plain_files(folder: str) -> Iterator[tuple[str, bytes]]:
+    total = 0
+    for parent, folders, names in walk(Path(folder)):
+        folders[:] = [name for name in folders if name != "__pycache__"]
+        for name in names:
+            path = parent / name
+            if path.is_symlink() or not path.is_file():
+                continue
+            total += path.stat().st_size
+            if total > _COPY:
+                raise OSError(f"the submission has more than {_COPY >> 20} MiB")
+            yield path.relative_to(folder).as_posix(), _content(path)
+
+
+def _content(path: Path) -> bytes:
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC
+    try:
+        descriptor = os.open(path, flags | os.O_NOATIME)
+    except PermissionError:  # not ours
+        descriptor = os.open(path, flags)
+    with open(descriptor, "rb") as file:
+        return file.read()

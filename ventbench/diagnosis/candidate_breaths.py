@@ -84,8 +84,8 @@ def _sized(rig: Rig, dt: float, u: Floats, peaks: Floats, settings: ExperimentSe
     """Scale inspirations to the peak pressures, cmH2O, that an R-C lung would reach."""
     flow = rig.gain * u
     rise = np.cumsum(flow, axis=1) * dt / rig.C + rig.R * flow / 1000.0
-    wanted = np.maximum(peaks - rig.peep, 2.0)
-    return np.clip(u * (wanted / rise.max(axis=1))[:, None], 0.0, settings.max_opening)
+    rise_limit = np.maximum(peaks - rig.peep, 2.0)
+    return np.clip(u * (rise_limit / rise.max(axis=1))[:, None], 0.0, settings.max_opening)
 
 
 def _opens(t: Floats, at: float) -> Floats:
@@ -158,8 +158,8 @@ def _shutters(rig: Rig, t: Floats, settings: ExperimentSettings) -> tuple[Floats
     """Open and shut the expiratory valve in turn, at another pace in each breath."""
     u = (t < settings.fast_inspiration).astype(float)
     pace = settings.shutter * np.linspace(0.7, 1.6, len(t))[:, None]
-    late = t - settings.fast_inspiration
-    out = (late >= -1e-9) & ((late // pace).astype(int) % 2 == 0)
+    since_end = t - settings.fast_inspiration
+    out = (since_end >= -1e-9) & ((since_end // pace).astype(int) % 2 == 0)
     return u, out.astype(float), _levels(t, 20.0, 32.0)
 
 

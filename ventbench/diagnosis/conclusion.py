@@ -268,10 +268,10 @@ def _best_input(
 
 def _held_out_gains(evaluator: Evaluator, selected: FittedModel) -> dict[str, float]:
     """Held-out log-likelihood that is lost without each mechanism, nats."""
-    here = evaluator.held_out_log_likelihood(selected)
+    with_all = evaluator.held_out_log_likelihood(selected)
 
     def lost(name: str) -> float:
         left = evaluator.fit(selected.hypothesis.without(name), selected.noise, selected)
-        return float((here - evaluator.held_out_log_likelihood(left)).sum())
+        return float((with_all - evaluator.held_out_log_likelihood(left)).sum())
 
     return dict(zip(selected.names, parallel_map(lost, selected.names), strict=True))

@@ -66,21 +66,26 @@ def correct(
         pressures = {"before": before, "refit": refit, "after": after}
         return _correct_base_model(breaths, recording_model, held, pressures, training)
     # The simulator's own model, and the same with the recording's R, C, R_ex and PEEP.
-    own = simulator_model.pressures(simulator_model.conclusion.full, held, first)
+    identified = simulator_model.pressures(simulator_model.conclusion.full, held, first)
     data, noise = recording_model.evaluator.training.data, recording_model.conclusion.noise
     refitted = refit_base_parameters(simulator_model, data, noise)
     refit = simulator_model.pressures(refitted, held, first)
-    pressures = {"before": before, "refit": before + refit - own, "after": before + after - own}
-    errors, wanted = _training_errors(breaths, pressures, training), recording_model.plants()
+    pressures = {
+        "before": before,
+        "refit": before + refit - identified,
+        "after": before + after - identified,
+    }
+    errors = _training_errors(breaths, pressures, training)
+    recording_plants = recording_model.plants()
     if unchanged := bool(errors[1] >= errors[0]):
-        pressures, wanted = dict.fromkeys(pressures, before), simulator_model.plants()
+        pressures, recording_plants = dict.fromkeys(pressures, before), simulator_model.plants()
     if not simulators.has_plants:
         note = (
             f"{simulators.name} has no plant that could be corrected, so there is no "
             "corrected.json; the corrected pressures of the recorded breaths are in the diagnosis."
         )
         return Correction(pressures, errors, {}, unchanged, (_capital(note),))
-    plants = _corrected_plants(breaths, simulators, wanted, simulator_model.plants())
+    plants = _corrected_plants(breaths, simulators, recording_plants, simulator_model.plants())
     return Correction(pressures, errors, plants, unchanged)
 
 
@@ -108,19 +113,19 @@ def _correct_base_model(
     if has_efforts or is_acceptable(pressures["after"]):
         errors = _training_errors(breaths, pressures, training)
         return Correction(pressures, errors, estimates.plants(recording_model.fit))
-    kept, left_out = conclusion.base, "the identified mechanisms"
+    model, left_out = conclusion.base, "the identified mechanisms"
     if conclusion.unnamed is not None and conclusion.named.names:
         pressure = recording_model.pressures(conclusion.named, held, breaths.pressure[:, 0])
         if is_acceptable(pressure):
-            kept, left_out = conclusion.named, "the nonparametric term"
+            model, left_out = conclusion.named, "the nonparametric term"
             pressures = pressures | {"after": pressure}
-    if kept is conclusion.base:
+    if model is conclusion.base:
         pressures = pressures | {"after": pressures["refit"]}
     note = (
         f"With {left_out}, the simulator would err more on the training breaths than with R and C "
         "refitted alone, so the corrected simulator does without."
     )
-    plants = estimates.plants_of(kept, recording_model.evaluator)
+    plants = estimates.plants_of(model, recording_model.evaluator)
     errors = _training_errors(breaths, pressures, training)
     return Correction(pressures, errors, plants, notes=(note,))
 
@@ -136,11 +141,18 @@ def _training_errors(
 
 
 def _corrected_plants(
-    breaths: Breaths, simulators: Simulators, wanted: dict[str, Plant], own: dict[str, Plant]
+    breaths: Breaths,
+    simulators: Simulators,
+    recording_plants: dict[str, Plant],
+    simulator_plants: dict[str, Plant],
 ) -> dict[str, Plant]:
     """The given plant of each lung plus the difference of two physics."""
     return {
-        name: Corrected(simulators.plant_of_breath(breaths, int(index[0])), wanted[name], own[name])
+        name: Corrected(
+            simulators.plant_of_breath(breaths, int(index[0])),
+            recording_plants[name],
+            simulator_plants[name],
+        )
         for name, index in breaths.by_lung_index.items()
     }
 

@@ -73,10 +73,10 @@ def request_breaths(
     noise, data = noise or chosen.problem.noise, chosen.problem.data
     best: _Design | None = None
     for label in np.unique(data.lung):
-        here = np.flatnonzero((data.lung == label) & (data.weight[:, 0].any(axis=1)))
-        if not here.size:
+        recorded_rows = np.flatnonzero((data.lung == label) & (data.weight[:, 0].any(axis=1)))
+        if not recorded_rows.size:
             continue
-        design = _best_on_lung(chosen, alternatives, noise, settings, here)
+        design = _best_on_lung(chosen, alternatives, noise, settings, recorded_rows)
         if design and (best is None or design.nats > best.nats):
             best = design
     if best is None or best.nats < settings.min_information:
@@ -188,8 +188,8 @@ class Contrast:
 def contrast(truth: Forecast, refitted: Forecast, noise: Noise) -> Contrast:
     """Contrast of two hypotheses, if the first is true and the second is refitted."""
     count, extra = len(truth.white), len(refitted.own_precision)
-    more = np.zeros((count, extra))
-    difference = np.concatenate([truth.white - refitted.white, more], axis=1)
+    no_difference = np.zeros((count, extra))
+    difference = np.concatenate([truth.white - refitted.white, no_difference], axis=1)
     rows = np.concatenate(
         [refitted.rows, np.zeros((*refitted.rows.shape[:2], extra))], axis=2
     )  # fmt: skip
@@ -238,22 +238,26 @@ class _Design:
 
 def _best_on_lung(
     chosen: FittedHypothesis, alternatives: Sequence[FittedHypothesis], noise: Noise,
-    settings: ExperimentSettings, here: NDArray[np.intp],
+    settings: ExperimentSettings, recorded_rows: NDArray[np.intp],
 ) -> _Design | None:  # fmt: skip
     """The best design on the lung of the recorded breaths ``here``."""
     problem = chosen.problem
-    values = problem.values(chosen.minimum.x)[here]
+    values = problem.values(chosen.minimum.x)[recorded_rows]
     columns = (*problem.predictor.names, START)
     rig = Rig(*(float(np.median(values[:, columns.index(n)])) for n in ("R", "C", "gain", "PEEP")))
     start = float(np.median(values[:, -1]))
     samples, dt = problem.data.u_in.shape[1], float(np.median(problem.data.dt))
     every = (chosen, *alternatives)
-    kinds = _safe(families(rig, samples, dt, settings), every, problem.data, here, start, settings)
+    kinds = _safe(
+        families(rig, samples, dt, settings), every, problem.data, recorded_rows, start, settings
+    )
     if not kinds:
         return None
-    data = _data(kinds, problem.data, here)
+    data = _data(kinds, problem.data, recorded_rows)
     predictor = Predictor(data, problem.predictor.names, problem.predictor.substeps)
-    expected = [forecast(hypothesis, data, predictor, here, start, noise) for hypothesis in every]
+    expected = [
+        forecast(hypothesis, data, predictor, recorded_rows, start, noise) for hypothesis in every
+    ]
     pairs = [
         pair
         for other in expected[1:]
@@ -262,7 +266,7 @@ def _best_on_lung(
             contrast(other, expected[0], noise),
         )
     ]
-    lung = Lung(float(problem.data.R[here[0]]), float(problem.data.C[here[0]]))
+    lung = Lung(float(problem.data.R[recorded_rows[0]]), float(problem.data.C[recorded_rows[0]]))
     return _best(kinds, pairs, settings.breaths, lung)
 
 
@@ -289,17 +293,17 @@ def _best(
 
 def _safe(
     kinds: tuple[Family, ...], hypotheses: Sequence[FittedHypothesis], recorded: Data,
-    here: NDArray[np.intp], start: float, settings: ExperimentSettings,
+    recorded_rows: NDArray[np.intp], start: float, settings: ExperimentSettings,
 ) -> tuple[Family, ...]:  # fmt: skip
     """Breaths that every hypothesis predicts within the pressure limits, weakened where needed."""
     low, high = settings.pressure_limits
     for attempt in range(settings.attempts + 1):
-        data = _data(kinds, recorded, here)
+        data = _data(kinds, recorded, recorded_rows)
         safe = np.ones(len(data), bool)
         for hypothesis in hypotheses:
             known = hypothesis.problem.predictor
             predictor = Predictor(data, known.names, known.substeps)
-            pressure = predictor.predict(values_of(hypothesis, data, here, start))[:, 0]
+            pressure = predictor.predict(values_of(hypothesis, data, recorded_rows, start))[:, 0]
             inside = (pressure >= low) & (pressure <= high)  # False where it is not finite
             safe &= inside.all(axis=1)
         parts = np.split(safe, np.cumsum([len(kind.u_in) for kind in kinds])[:-1])
@@ -313,7 +317,7 @@ def _safe(
     return tuple(kind for kind in left if len(kind.u_in))
 
 
-def _data(kinds: Sequence[Family], recorded: Data, here: NDArray[np.intp]) -> Data:
+def _data(kinds: Sequence[Family], recorded: Data, recorded_rows: NDArray[np.intp]) -> Data:
     """Breaths of all families as data without readings, on the lung of recorded breaths."""
     u_in = np.concatenate([kind.u_in for kind in kinds])
     u_out = np.concatenate([kind.u_out for kind in kinds])
@@ -324,7 +328,7 @@ def _data(kinds: Sequence[Family], recorded: Data, here: NDArray[np.intp]) -> Da
     ones: Floats = np.ones(count)
     return Data(
         u_in, u_out, np.full(u_in.shape, float(np.median(recorded.dt))), np.zeros(shape), weight,
-        recorded.R[here[0]] * ones, recorded.C[here[0]] * ones, ones,
+        recorded.R[recorded_rows[0]] * ones, recorded.C[recorded_rows[0]] * ones, ones,
     )  # fmt: skip
 
 

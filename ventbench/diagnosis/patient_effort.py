@@ -168,12 +168,12 @@ class PatientEffortTerm:
         passive = values.copy()
         passive[:, names.index(AMPLITUDE)] = 0.0
         own, none = make_unknowns(problem.data, (START,)), np.zeros(len(values))
-        still = replace(problem, unknowns=own, fixed=passive, mean=none, precision=none)
+        passive_problem = replace(problem, unknowns=own, fixed=passive, mean=none, precision=none)
         at = own.pack({START: values[:, -1]})
-        evidence = self.evidence([self._linearise(still, at, np.inf)], duration)[0]
+        evidence = self.evidence([self._linearise(passive_problem, at, np.inf)], duration)[0]
         tried = {AMPLITUDE: evidence.amplitude, ONSET: evidence.onset}
         if refit:
-            breathwise, minimum = self._fit_each_breath(still, at, evidence)
+            breathwise, minimum = self._fit_each_breath(passive_problem, at, evidence)
             tried = {p: minimum.x[breathwise.unknowns.of(p)] for p in (*tried, START)}
         trial = x.copy()
         columns = [layout.index[:, layout.paths.index(path)] for path in tried]
@@ -292,20 +292,24 @@ class PatientEffortTerm:
         return Evidence(nats, duration, amplitudes[rows, top], np.asarray(prior.onsets)[top])
 
     def _fit_each_breath(
-        self, still: Problem, x: Floats, start: Evidence
+        self, passive_problem: Problem, x: Floats, start: Evidence
     ) -> tuple[Problem, Minimum]:
         """Fit an effort to each breath, together with the breath's other own parameters."""
-        paths, none = still.unknowns.paths, np.zeros(len(still.data))
+        paths, none = passive_problem.unknowns.paths, np.zeros(len(passive_problem.data))
         every = np.arange(len(none))
-        layout = make_unknowns(still.data, (*paths, AMPLITUDE, ONSET), dict.fromkeys(paths, every))
+        layout = make_unknowns(
+            passive_problem.data, (*paths, AMPLITUDE, ONSET), dict.fromkeys(paths, every)
+        )
         precision = self._precision
         problem = replace(
-            still,
+            passive_problem,
             unknowns=layout,
-            mean=np.concatenate([still.mean, none, none + np.mean(self.prior.onsets)]),
-            precision=np.concatenate([still.precision, none + precision[0], none + precision[1]]),
+            mean=np.concatenate([passive_problem.mean, none, none + np.mean(self.prior.onsets)]),
+            precision=np.concatenate(
+                [passive_problem.precision, none + precision[0], none + precision[1]]
+            ),
         )
-        first = dict(zip(paths, still.unknowns.unpack(x).T, strict=True))
+        first = dict(zip(paths, passive_problem.unknowns.unpack(x).T, strict=True))
         first |= {AMPLITUDE: start.amplitude, ONSET: start.onset}
         low, high = layout.bounds()
         return problem, minimise(

@@ -147,14 +147,14 @@ def drop_compensating_terms(
 def _compensating_term(wide: Evaluator, selected: FittedModel) -> str | None:
     """The weakest of the mechanisms that only compensate for another one."""
     base = wide.fit(Hypothesis(), selected.noise)
-    here = wide.training_log_likelihood(selected)
-    whole = max(here - base.log_likelihood, 1e-9)
+    log_likelihood = wide.training_log_likelihood(selected)
+    whole = max(log_likelihood - base.log_likelihood, 1e-9)
     most = wide.settings.refinement.max_compensating_share * whole
     reduced = parallel_map(
         lambda name: wide.fit(selected.hypothesis.without(name), selected.noise, selected),
         selected.names,
     )
-    lost = [here - wide.training_log_likelihood(model) for model in reduced]
+    lost = [log_likelihood - wide.training_log_likelihood(model) for model in reduced]
     for name, model, nats in sorted(
         zip(selected.names, reduced, lost, strict=True), key=itemgetter(2)
     ):

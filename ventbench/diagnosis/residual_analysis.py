@@ -82,9 +82,9 @@ def compare_open_loop(
     lungs = breaths.by_lung_index
     if len(lungs) > 1:
         for name, index in lungs.items():
-            here = np.zeros(len(breaths), bool)
-            here[index] = True
-            parts[f"lung {name}"] = inspiration & here[:, None]
+            of_lung = np.zeros(len(breaths), bool)
+            of_lung[index] = True
+            parts[f"lung {name}"] = inspiration & of_lung[:, None]
     ids = tuple(int(i) for i in breaths.breath_id[held_out])
     groups = {name: by_stage(mask) for name, mask in parts.items() if mask.any()}
     return OpenLoopComparison(
@@ -276,10 +276,10 @@ def p_values(
 
 
 def _scaled(values: Floats, weight: Floats | None, min_breaths: int) -> tuple[Floats, Floats]:
-    there = np.isfinite(values)
-    filled = np.where(there, values, 0.0)
+    known = np.isfinite(values)
+    filled = np.where(known, values, 0.0)
     norm = np.sqrt(np.sum(filled**2, axis=0))
-    enough = (there.sum(axis=0) >= min_breaths) & (norm > 0)
+    enough = (known.sum(axis=0) >= min_breaths) & (norm > 0)
     scale = np.divide(1.0, norm, out=np.zeros_like(norm), where=enough)
     return filled, scale if weight is None else scale * weight
 
@@ -332,8 +332,8 @@ def _test_columns(
 
 def _nanmean(values: Floats) -> Floats:
     """Mean over the first axis without NaN; unlike NumPy's it does not warn of empty columns."""
-    there = np.isfinite(values)
-    total, count = np.where(there, values, 0.0).sum(axis=0), there.sum(axis=0)
+    known = np.isfinite(values)
+    total, count = np.where(known, values, 0.0).sum(axis=0), known.sum(axis=0)
     return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
 
 

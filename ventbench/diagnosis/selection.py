@@ -216,9 +216,11 @@ def is_negligible(
     weak = settings.negligible_strength * abs(about.mild - about.neutral)
     if varies_by_breath(name) or strength > weak:
         return False
-    here = evaluator.criterion(with_term)
+    criterion = evaluator.criterion(with_term)
     base = evaluator.criterion(evaluator.fit(Hypothesis(), with_term.noise, with_term))
-    return evaluator.criterion(without_term) - here < settings.negligible_share * (base - here)
+    return evaluator.criterion(without_term) - criterion < settings.negligible_share * (
+        base - criterion
+    )
 
 
 def compare_candidates(

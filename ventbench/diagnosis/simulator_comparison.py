@@ -129,8 +129,8 @@ def missing_mechanisms(
         The missing mechanisms, the most important first, and whether the simulator has each with
         other parameters; and notes on what the simulator has and the recording does not show.
     """
-    wanted = recording_model.conclusion
-    order = sorted(wanted.names, key=lambda name: -wanted.held_out_gains.get(name, 0.0))
+    conclusion = recording_model.conclusion
+    order = sorted(conclusion.names, key=lambda name: -conclusion.held_out_gains.get(name, 0.0))
     if simulator_model is None:
         return dict.fromkeys(order, False), []
     present = simulator_model.conclusion.names
@@ -142,7 +142,7 @@ def missing_mechanisms(
     notes = [
         f"The simulator has {mechanism(name).description.title}, which the recording does not show."
         for name in present
-        if name not in wanted.names
+        if name not in conclusion.names
     ]
     return missing, notes
 

@@ -27,15 +27,15 @@ def resolution(dt: float) -> tuple[int, int]:
 
 
 def windows(
-    dt: Array, past: Array, late: tuple[Array | float, ...], held: tuple[Array, ...], count: int,
-    skip_idle: bool = False,
+    dt: Array, past: Array, dead_times: tuple[Array | float, ...], held: tuple[Array, ...],
+    count: int, skip_idle: bool = False,
 ) -> tuple[Array, ...]:  # fmt: skip
     """Cut a sample into substeps, and average delayed commands over each of them.
 
     Args:
         dt: length of the sample, s, ``(...)``.
         past: durations of the samples before, the latest first, s, ``(..., P)``.
-        late: dead times, s, the most important first; numbers where no mechanism has one.
+        dead_times: dead times, s, the most important first; numbers where no mechanism has one.
         held: the command that each of them delays, the latest first, ``(..., P + 1)``.
         count: number of substeps, at least 3.
         skip_idle: skip the computation of dead times that are zero in all elements.
@@ -44,22 +44,24 @@ def windows(
         Lengths, s, and the mean of each command, ``(..., count)`` each.
     """
     dt = dt + 0.0 * held[0][..., 0]
-    delays = [delay for delay in late if isinstance(delay, jax.Array)]
+    delays = [delay for delay in dead_times if isinstance(delay, jax.Array)]
     cut = substep_lengths(dt, past, (), count)
     if delays:
-        some = _some(delays) if skip_idle else None
-        cut = apply_if_active(some, lambda _: substep_lengths(dt, past, tuple(delays), count), cut)
+        active = _any_active(delays) if skip_idle else None
+        cut = apply_if_active(
+            active, lambda _: substep_lengths(dt, past, tuple(delays), count), cut
+        )
     means = []
-    for delay, values in zip(late, held, strict=True):
+    for delay, values in zip(dead_times, held, strict=True):
         mean = values[..., :1] + 0.0 * cut
         if isinstance(delay, jax.Array):
-            delayed = partial(_mean, late=delay, lengths=cut, past=past, values=values)
-            mean = apply_if_active(_some([delay]) if skip_idle else None, delayed, mean)
+            delayed = partial(_mean, delay=delay, lengths=cut, past=past, values=values)
+            mean = apply_if_active(_any_active([delay]) if skip_idle else None, delayed, mean)
         means.append(mean)
     return cut, *means
 
 
-def substep_lengths(dt: Array, past: Array, late: tuple[Array, ...], count: int) -> Array:
+def substep_lengths(dt: Array, past: Array, dead_times: tuple[Array, ...], count: int) -> Array:
     """Cut a sample into substeps.
 
     A valve that opens within a substep is not the same as one that is half open throughout, so that
@@ -69,7 +71,7 @@ def substep_lengths(dt: Array, past: Array, late: tuple[Array, ...], count: int)
     Args:
         dt: length of the sample, s, ``(...)``.
         past: durations of the samples before, the latest first, s, ``(..., P)``.
-        late: dead times, s, the most important first.
+        dead_times: dead times, s, the most important first.
         count: number of substeps, at least 3.
 
     Returns:
@@ -79,14 +81,14 @@ def substep_lengths(dt: Array, past: Array, late: tuple[Array, ...], count: int)
     room = (dt - short)[..., None]
     cuts = room * (jnp.arange(1, count - 1) / (count - 1)).astype(dt.dtype)
     free = jnp.ones_like(cuts)
-    for delay in late[: count - 2]:
+    for delay in dead_times[: count - 2]:
         behind = jnp.concatenate([jnp.zeros_like(room), _sums(past)], axis=-1)
         arrives = (delay + 0.0 * dt)[..., None] - behind
-        here = (arrives > 0.0) & (arrives < room)
-        edge = jnp.sum(jnp.where(here, arrives, 0.0) * _first(here), axis=-1, keepdims=True)
+        inside = (arrives > 0.0) & (arrives < room)
+        edge = jnp.sum(jnp.where(inside, arrives, 0.0) * _first(inside), axis=-1, keepdims=True)
         away = jnp.where(free > 0, jnp.abs(cuts - edge), jnp.inf)
         nearest = _first(away == jnp.min(away, axis=-1, keepdims=True))
-        nearest = nearest * jnp.any(here, axis=-1, keepdims=True)
+        nearest = nearest * jnp.any(inside, axis=-1, keepdims=True)
         cuts = jnp.where(nearest > 0, edge, cuts)
         free = free * (1.0 - nearest)
     ends = jnp.concatenate([jnp.zeros_like(room), _sorted(cuts), room, dt[..., None]], -1)
@@ -95,7 +97,7 @@ def substep_lengths(dt: Array, past: Array, late: tuple[Array, ...], count: int)
 
 
 def window_weights(start: Array, length: Array, past: Array) -> Array:
-    """How much of a window falls into this sample, each of P samples before, and all earlier ones.
+    """Shares of a window in this sample, in each of P samples before, and in all earlier ones.
 
     Args:
         start: start of the window, s after the start of this sample; negative reaches back;
@@ -116,14 +118,14 @@ def window_weights(start: Array, length: Array, past: Array) -> Array:
     return jnp.maximum(inside, 0.0) / length[..., None]
 
 
-def _mean(_: Array, late: Array, lengths: Array, past: Array, values: Array) -> Array:
-    """Mean over each substep of what was commanded ``late`` seconds before, ``(..., K)``."""
-    starts = _sums(lengths) - lengths - (late + 0.0 * lengths[..., 0])[..., None]
+def _mean(_: Array, delay: Array, lengths: Array, past: Array, values: Array) -> Array:
+    """Mean over each substep of what was commanded ``delay`` seconds before, ``(..., K)``."""
+    starts = _sums(lengths) - lengths - (delay + 0.0 * lengths[..., 0])[..., None]
     weights = window_weights(starts, lengths, past[..., None, :])
     return jnp.sum(weights * values[..., None, :], axis=-1)
 
 
-def _some(delays: list[Array]) -> Array:
+def _any_active(delays: list[Array]) -> Array:
     """Whether any dead time is not zero in any element, ``()``."""
     return jnp.any(jnp.stack([jnp.any(delay != 0.0) for delay in delays]))
 

@@ -233,8 +233,10 @@ def assemble(
     chosen = sorted((n for n in library if n in owners), key=lambda n: (library[n].rank, n))
     own = {}
     for name in chosen:
-        items = library[name].description.parameters
-        own[name] = {p.name: named.get(f"{name}.{p.name}", jnp.asarray(p.neutral)) for p in items}
+        parameters = library[name].description.parameters
+        own[name] = {
+            p.name: named.get(f"{name}.{p.name}", jnp.asarray(p.neutral)) for p in parameters
+        }
     given = {name: named.get(name, jnp.asarray(value)) for name, value in _NEUTRAL_BASE.items()}
     active = {name: is_active(library[name], own[name]) for name in chosen if skip_idle}
     return Assembly(given, {name: library[name] for name in chosen}, own, active)

@@ -123,19 +123,24 @@ class Physics:
         flow, memory = solver.commanded(assembly, u_in + zero, state.memory)
         commanded = _push(flow, state.commanded)
         opened = _push(u_out + zero, state.opened)
-        late = assembly.total(lambda mechanism, own: mechanism.dead_time(own))
-        late_out = assembly.total(lambda mechanism, own: mechanism.outlet_dead_time(own, u_out))
-        lengths, open_for, wanted = dead_time.windows(
-            dt, state.past, (late_out, late), (opened, commanded), self.substeps, self.skip_idle
+        delay = assembly.total(lambda mechanism, own: mechanism.dead_time(own))
+        outlet_delay = assembly.total(lambda mechanism, own: mechanism.outlet_dead_time(own, u_out))
+        lengths, open_for, commanded_flow = dead_time.windows(
+            dt,
+            state.past,
+            (outlet_delay, delay),
+            (opened, commanded),
+            self.substeps,
+            self.skip_idle,
         )
 
         def substep(carry: tuple[Any, Array], held: tuple[Array, ...]) -> tuple[Any, None]:
-            (now, time), (wanted, opened, h) = carry, held
-            now = solver.substep(assembly, now, wanted, opened, time, h, state.peep)
+            (now, time), (commanded_flow, opened, h) = carry, held
+            now = solver.substep(assembly, now, commanded_flow, opened, time, h, state.peep)
             return (now, time + h), None
 
         # As a loop: unrolled, XLA compiles for minutes and repeats computations.
-        held = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), (wanted, open_for, lengths))
+        held = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), (commanded_flow, open_for, lengths))
         (now, time), _ = jax.lax.scan(substep, (state.continuous, state.time), held)
         after = PhysicsState(
             now, memory, commanded[..., :-1], opened[..., :-1],

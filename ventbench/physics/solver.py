@@ -48,9 +48,9 @@ def commanded(
     """Steady-state flow of the inspiratory valve at a command, L/s, and the new memory."""
     memory = dict(memory)
     for name, mechanism in assembly.mechanisms.items():
-        u_in, kept = assembly.change(name, _command, (u_in, memory.get(name, u_in)))
+        u_in, new_memory = assembly.change(name, _command, (u_in, memory.get(name, u_in)))
         if mechanism.has_memory:
-            memory[name] = kept
+            memory[name] = new_memory
     return assembly.base["gain"] * 1e-3 * u_in, memory
 
 
@@ -75,10 +75,10 @@ def at_rest(assembly: Assembly, recorded: Array, flow: Array) -> ContinuousState
     volume = goal * 1e-3 * assembly.base["C"] + zero
 
     def closer(volume: Array, _: None) -> tuple[Array, None]:
-        still = now.replace(volume=volume)  # type: ignore[attr-defined]
+        at_volume = now.replace(volume=volume)  # type: ignore[attr-defined]
         # A long step, in which stresses relax; before the breath, so that no muscle pulls.
-        view = _view(assembly, still, still, zero, zero - 1e3, zero + 1e6, pressure)
-        network = _network(assembly, still, flow, view, lambda name: internal.get(name, zero))
+        view = _view(assembly, at_volume, at_volume, zero, zero - 1e3, zero + 1e6, pressure)
+        network = _network(assembly, at_volume, flow, view, lambda name: internal.get(name, zero))
         return volume - (network.recoil - goal) / network.elastance, None
 
     # A loop, as unrolled it would be most of what is to be compiled.
@@ -89,7 +89,7 @@ def at_rest(assembly: Assembly, recorded: Array, flow: Array) -> ContinuousState
 def substep(
     assembly: Assembly,
     now: ContinuousState,
-    wanted: Array,
+    commanded_flow: Array,
     opened: Array,
     time: Array,
     h: Array,
@@ -100,7 +100,9 @@ def substep(
     def advance(guess: ContinuousState, place: tuple[Array, Array]) -> tuple[ContinuousState, None]:
         ahead, share = place
         end = time + share * h
-        return _implicit(assembly, now, guess, ahead, wanted, opened, end, _GAMMA * h, peep), None
+        return _implicit(
+            assembly, now, guess, ahead, commanded_flow, opened, end, _GAMMA * h, peep
+        ), None
 
     places = jnp.asarray([[0.0, _GAMMA], [(1.0 - _GAMMA) / _GAMMA, 1.0]], h.dtype)
     return jax.lax.scan(advance, now, (places[:, 0], places[:, 1]))[0]
@@ -118,7 +120,7 @@ def _implicit(
     now: ContinuousState,
     guess: ContinuousState,
     ahead: Array,
-    wanted: Array,
+    commanded_flow: Array,
     opened: Array,
     time: Array,
     length: Array,
@@ -140,12 +142,12 @@ def _implicit(
         )
 
     start = between(now.replace(internal={}), guess.replace(internal={}))  # type: ignore[attr-defined]
-    internal, flow = dict(guess.internal), wanted
+    internal, flow = dict(guess.internal), commanded_flow
     for name, mechanism in assembly.mechanisms.items():
         if _has(mechanism, "inflow"):
             before = (flow, internal.get(name, flow))
-            flow, kept = assembly.change(name, _inflow, before, partial(state, name), length)
-            internal |= {name: kept} if mechanism.stateful else {}
+            flow, new_state = assembly.change(name, _inflow, before, partial(state, name), length)
+            internal |= {name: new_state} if mechanism.stateful else {}
     view = _view(assembly, start, guess, opened, time, length, peep)
     network = _network(assembly, start, flow, view, state)
     pressure, flow = network.solve(start.pressure, start.flow, length)
@@ -154,8 +156,8 @@ def _implicit(
         if _has(mechanism, "reading") or _has(mechanism, "next_state"):
             before = (reading, internal.get(name, reading))
             first = None if _has(mechanism, "inflow") else partial(state, name)
-            reading, kept = assembly.change(name, _after, before, first, flow, view)
-            internal |= {name: kept} if mechanism.stateful else {}
+            reading, new_state = assembly.change(name, _after, before, first, flow, view)
+            internal |= {name: new_state} if mechanism.stateful else {}
     return ContinuousState(start.volume + flow * length, flow, pressure, reading, internal)
 
 
@@ -218,12 +220,14 @@ def _after(
     mechanism: Mechanism, own: Values, before: Pair, state: Callable[[], Array] | None, flow: Array,
     view: View,
 ) -> Pair:  # fmt: skip
-    reading, kept = before
+    reading, new_state = before
     if mechanism.stateful and state is not None:
-        kept = state()
-    reading, kept = mechanism.reading(own, reading, kept, view.length)
-    view = view.replace(state=kept)  # type: ignore[attr-defined]
-    return reading, mechanism.next_state(own, kept, flow, view) if mechanism.stateful else kept
+        new_state = state()
+    reading, new_state = mechanism.reading(own, reading, new_state, view.length)
+    view = view.replace(state=new_state)  # type: ignore[attr-defined]
+    return reading, mechanism.next_state(
+        own, new_state, flow, view
+    ) if mechanism.stateful else new_state
 
 
 def _has(mechanism: Mechanism, hook: str) -> bool:

@@ -59,8 +59,8 @@ class ValveHysteresis(Mechanism):
         half = 0.5 * values["width"]
         hard = jnp.minimum(jnp.maximum(memory, u_in - half), u_in + half)
         soft = u_in - half * jnp.tanh((u_in - memory) / (half + _THIN))
-        stands = hard + values["give"] * (soft - hard)
-        return stands, stands
+        position = hard + values["give"] * (soft - hard)
+        return position, position
 
 
 MECHANISM = ValveHysteresis()

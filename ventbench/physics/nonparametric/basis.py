@@ -114,8 +114,8 @@ class BasisTerm(Mechanism):
 
     def magnitude(self, values: Values) -> float:
         """Largest coefficient, as a multiple of its prior standard deviation."""
-        items = self.description.parameters
-        return max(abs(float(values[p.name])) / (p.spread or 1.0) for p in items)
+        parameters = self.description.parameters
+        return max(abs(float(values[p.name])) / (p.spread or 1.0) for p in parameters)
 
     def decay(self, values: Values, taus: tuple[float, ...], time: Floats) -> Floats:
         """Sum over the coefficients, each decaying with its time constant, at ``time``."""

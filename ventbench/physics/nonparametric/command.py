@@ -114,8 +114,8 @@ class CommandMemory(BasisTerm):
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Answer of the flow to a step of the command."""
         t = np.linspace(0.0, 2.0, 401)
-        late = self.decay(values, _MEMORY_TAUS, t)
-        return (Curve(t, -late, "time after a step, s", "flow that is missing (-), share"),)
+        missing = self.decay(values, _MEMORY_TAUS, t)
+        return (Curve(t, -missing, "time after a step, s", "flow that is missing (-), share"),)
 
 
 #: Widths of the plays, %.
@@ -153,19 +153,19 @@ class CommandPlays(BasisTerm):
         half = 0.5 * per_state(
             _PLAYS_WIDTHS, jnp.broadcast_to(u_in, (len(_PLAYS_WIDTHS), *u_in.shape))
         )
-        stands = jnp.minimum(jnp.maximum(memory, u_in - half), u_in + half)
-        late = jnp.sum(self.stacked(values, stands) * (stands - u_in), axis=0)
-        return u_in + late, stands
+        positions = jnp.minimum(jnp.maximum(memory, u_in - half), u_in + half)
+        shift = jnp.sum(self.stacked(values, positions) * (positions - u_in), axis=0)
+        return u_in + shift, positions
 
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Change of the flow while the command rises to 30 % and falls again."""
         u = np.concatenate([np.linspace(0.0, 30.0, 121), np.linspace(30.0, 0.0, 121)[1:]])
-        stands, change = np.zeros(len(_PLAYS_WIDTHS)), []
+        positions, change = np.zeros(len(_PLAYS_WIDTHS)), []
         half = 0.5 * np.array(_PLAYS_WIDTHS)
         for command in u:
-            stands = np.clip(stands, command - half, command + half)
-            late = np.array([float(c) for c in self.coefficients(values)]) @ (stands - command)
-            change.append(base["gain"] * late)
+            positions = np.clip(positions, command - half, command + half)
+            shift = np.array([float(c) for c in self.coefficients(values)]) @ (positions - command)
+            change.append(base["gain"] * shift)
         return (Curve(u, np.array(change), "command up and down, %", "extra flow, mL/s"),)
 
 

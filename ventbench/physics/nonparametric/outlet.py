@@ -110,8 +110,8 @@ class OutletMemory(BasisTerm):
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Opening at the end of the step."""
         states = self.next_state(values, view.state, view.flow, view)
-        late = jnp.sum(self.stacked(values, states) * (states - view.opened), axis=0)
-        opened = jnp.maximum(view.opened + late, 0.0)
+        shift = jnp.sum(self.stacked(values, states) * (states - view.opened), axis=0)
+        opened = jnp.maximum(view.opened + shift, 0.0)
         return network.plus(outlet=view.outlet * (opened - view.opened))
 
     def next_state(self, values: Values, state: Array, flow: Array, view: View) -> Array:

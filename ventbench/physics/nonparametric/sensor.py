@@ -124,15 +124,15 @@ class SensorMemory(BasisTerm):
         """Implicit step of all filters."""
         taus = per_state(_MEMORY_TAUS, state)
         after = (taus * state + length * pressure) / (taus + length)
-        late = jnp.sum(self.stacked(values, state) * (after - pressure), axis=0)
-        return pressure + late, after
+        shift = jnp.sum(self.stacked(values, state) * (after - pressure), axis=0)
+        return pressure + shift, after
 
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Error of the reading after a step of the pressure."""
         t = np.linspace(0.0, 1.0, 401)
-        late = self.decay(values, _MEMORY_TAUS, t)
+        missing = self.decay(values, _MEMORY_TAUS, t)
         unit = "error after a step of 10 cmH2O, cmH2O"
-        return (Curve(t, -10.0 * late, "time after a step, s", unit),)
+        return (Curve(t, -10.0 * missing, "time after a step, s", unit),)
 
 
 #: Positions in the recording where the curve bends; at the first it is zero.

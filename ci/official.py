@@ -1,7 +1,8 @@
 """The official score: a maintainer names a submission and a commit, and gets records.
 
 Scorer and simulators are those of the branch that this file lies on; of the commit, only the plain
-files of ``submissions/NAME/`` are taken, and their code runs in the sandbox alone.
+files of ``submissions/NAME/`` are taken, and their code runs in the sandbox alone. Every track is
+scored twice, and both runs must give the same commands to the bit.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def tracks(wanted: str, entered: Sequence[str]) -> list[str]:
 def score_taken(
     taken: Taken, source: str, wanted: str, simulators: Simulators, runner: Runner, out: Path
 ) -> list[str]:
-    """Check and score a submission, and write a record for each track.
+    """Check and score a submission twice, and write a record for each track.
 
     Args:
         taken: from its commit.
@@ -60,7 +61,8 @@ def score_taken(
         Lines for the maintainer.
 
     Raises:
-        InputError: if it is not ready, or a score does not replay.
+        InputError: if it is not ready, a second run gives other commands, or a score does not
+            replay.
     """
     report = contract.check(str(taken.folder), runner)
     lines = [line.replace(str(taken.folder), taken.name) for line in report.lines()]
@@ -71,14 +73,23 @@ def score_taken(
         raise TakeError(f"submission.toml calls it {submission.manifest.name}, not {taken.name}")
     where = {"repository": source, "commit": taken.commit, "tree": taken.tree}
     for track in tracks(wanted, submission.manifest.tracks):
-        result = run_protocol(
-            submission,
-            simulators.plants,
-            track=track,
-            draws=draws.COUNT,
-            runner=runner,
-            simulators=simulators.about(),
+        result, again = (
+            run_protocol(
+                submission,
+                simulators.plants,
+                track=track,
+                draws=draws.COUNT,
+                runner=runner,
+                simulators=simulators.about(),
+            )
+            for _ in range(2)
         )
+        if result.requested.tobytes() != again.requested.tobytes():
+            apart = (result.requested != again.requested).any(axis=(-2, -1)).sum()
+            raise TakeError(
+                f"{taken.name}: {track}: a second run gave other commands in {apart} cells; an "
+                "official score must be reproducible to the bit"
+            )
         path = create.create(result, simulators, source=where).save(out)
         lines.append(f"{taken.name}: {track}: {result.score:.3f} cmH2O nominal; {path.name}")
         if result.not_official_because:

@@ -96,6 +96,14 @@ def test_a_flipped_record_and_its_replay_are_named(leaderboard: Path, check) -> 
     assert report.replayed == 7
 
 
+def test_a_file_of_gigabytes_is_not_read(leaderboard: Path, check) -> None:
+    path = sorted((leaderboard / store.RECORDS).glob("*.json"))[3]
+    with open(path, "r+b") as file:
+        file.truncate(50 * 2**30)  # sparse: it takes no disk
+    (problem,) = check(leaderboard).problems
+    assert f"{path} has been changed: no record has" in problem
+
+
 def test_flipped_commands_are_named(leaderboard: Path, check) -> None:
     path = sorted((leaderboard / store.RECORDS).glob("*.actions"))[2]
     flip(path, 1000, 3)

@@ -152,6 +152,31 @@ def test_what_is_not_ready_is_not_scored(demo, score_demo):
         score_demo(demo | {f"{PATH}/controller.py": b"import torch\n"})
 
 
+class Unsteady(InProcessRunner):
+    """Answers a little differently in each run of the whole protocol."""
+
+    runs = 0
+
+    def start(self, submission, tasks):
+        session = super().start(submission, tasks)
+        if len(tasks) == 6 * 21 * 6:
+            self.runs += 1
+            act, shift = session.act, 1e-12 * self.runs
+            session.act = lambda observations: act(observations) + shift  # type: ignore[method-assign]
+        return session
+
+
+def test_what_two_runs_do_not_agree_on_is_not_scored(repository, simulators, tmp_path):
+    files = {f"{PATH}/{name}": content for name, content in contents("demo", "pid").items()}
+    commit = repository.commit(files, repository.base)
+    taken = take(repository.url, repository.base, commit, "demo", tmp_path / "taken")
+    runner, out = Unsteady(), tmp_path / "out"
+    with pytest.raises(TakeError, match="a second run gave other commands in 756 cells"):
+        official.score_taken(taken, "url", "robustness", simulators, runner, out)
+    assert runner.runs == 2
+    assert not out.exists()
+
+
 def test_another_name_is_not_scored(demo, score_demo):
     manifest = f"{PATH}/submission.toml"
     with pytest.raises(TakeError, match="calls it other, not demo"):

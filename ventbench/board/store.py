@@ -157,6 +157,8 @@ def read_record(folder: Path, link: Link, *, strict: bool = False) -> Record | W
     path = folder / RECORDS / f"{link.record}{record.SUFFIX}"
     if not path.is_file() or path.is_symlink():
         raise InputError(f"{path} is missing, but {CHAIN} names it")
+    if path.stat().st_size > schema.MAX_BYTES:
+        raise InputError(f"{path} has been changed: no record has {path.stat().st_size} bytes")
     content = path.read_bytes()
     sha256 = canonical.digest(content)
     if sha256 != link.record:

@@ -168,8 +168,8 @@ def _confusion(result: Any) -> Any:
     table.add_column("n", justify="right")
     table.add_column("answers")
     for truth, counts in result.confusion.items():
-        said = ", ".join(f"{answer} {count}" for answer, count in counts.items())
-        table.add_row(truth, str(sum(counts.values())), said)
+        answers = ", ".join(f"{answer} {count}" for answer, count in counts.items())
+        table.add_row(truth, str(sum(counts.values())), answers)
     return table
 
 

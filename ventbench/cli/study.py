@@ -60,8 +60,8 @@ def samples(
         def progress(method: str, done: float, best: float) -> None:
             if method not in tasks:
                 tasks[method] = shown.add_task(method, total=1.0)
-            said = f"{method}: {best:.3f} cmH2O"
-            shown.update(tasks[method], completed=done, description=said)
+            description = f"{method}: {best:.3f} cmH2O"
+            shown.update(tasks[method], completed=done, description=description)
 
         result = work.sample_efficiency(
             scored_lung(lung), range(seeds), out, share=share, progress=progress

@@ -268,8 +268,8 @@ def _train_policies(
         def progress(label: str, share: float, best: float) -> None:
             if label not in tasks:
                 tasks[label] = shown.add_task(label, total=1.0)
-            said = f"{method}, {label}: {best:.3f} cmH2O"
-            shown.update(tasks[label], completed=share, description=said)
+            description = f"{method}, {label}: {best:.3f} cmH2O"
+            shown.update(tasks[label], completed=share, description=description)
 
         trained = work(
             networks,

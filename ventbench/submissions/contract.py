@@ -25,6 +25,7 @@ from ventbench.submissions.contract_runs import (
     ContractRun,
     breaths,
     driven,
+    joined,
     plain,
     repeated,
     run_all,
@@ -122,21 +123,25 @@ def _ran(
 ) -> CheckReport:
     name, tracks = submission.label, submission.manifest.tracks
     plain_runs = plain(tracks)
-    repetitions = repeated(plain_runs[0].task)
-    runs = [*plain_runs, *repetitions, *unusual(plain_runs[0].task)]
+    again, thrice = repeated(plain_runs[0].task)
+    runs = [*plain_runs, again, *unusual(plain_runs[0].task)]
     sandbox = None if runner.sandbox is None else dict(runner.sandbox)
     try:
+        # The folder as it is, through the runner that scores it: what can be told from a score by
+        # its frames or files is the last run alone, whose answers show nothing but its resets.
+        answers = run_all(submission, runs, runner, clock)
+        # By itself, so that the time does not depend on how many run beside it.
+        timed_run = plain_runs[0]._replace(script=breaths())
+        timed_answers = run_all(submission, [timed_run], runner, clock)
         with driven(submission) as driver:
-            answers = run_all(driver, runs, runner, clock)
-            # By itself, so that the time does not depend on how many run beside it.
-            timed_run = plain_runs[0]._replace(script=breaths())
-            timed_answers = run_all(driver, [timed_run], runner, clock)
+            answers = joined(answers, run_all(driver, [thrice], runner, clock))
+            runs = [*runs, thrice]
     except SubmissionError as error:
         problems = [_import_finding(problem, name) for problem in error.problems]
         return _report(name, [*findings, *problems], left_out=_TO_RUN[1:], sandbox=sandbox)
     findings += _failure_findings(runs, answers) or _failure_findings([timed_run], timed_answers)
     findings += _clipping_notes(answers.commands[: len(plain_runs)])
-    repeats = (0, len(plain_runs), len(plain_runs) + 1)
+    repeats = (0, len(plain_runs), len(runs) - 1)
     if timed_answers.failures or set(repeats) & set(answers.failures):
         return _report(name, findings, left_out=_TO_RUN[1:], sandbox=sandbox)
     findings += repetition_findings(*(answers.commands[k] for k in repeats))

@@ -1,7 +1,8 @@
 """Runs that the contract shows a controller, and its answers; :mod:`contract` judges them.
 
-Plain runs, repetitions in the same and in another process, and unusual inputs. The controller runs
-from a copy of the submission in which it can be reset and made anew in the middle of a run.
+Plain runs, repetitions in the same and in another process, and unusual inputs. They run from the
+submission itself; only where a controller is reset and made anew in the middle of a run is a copy
+needed in which it can be.
 """
 
 from __future__ import annotations
@@ -215,6 +216,13 @@ class Answers:
     commands: tuple[Floats, ...]
     failures: dict[int, Failure]
     act_seconds: Floats
+
+
+def joined(first: Answers, second: Answers) -> Answers:
+    """Return the answers of two sets of runs as those of one, with the times of the first."""
+    shift = len(first.commands)
+    failures = {**first.failures, **{k + shift: v for k, v in second.failures.items()}}
+    return Answers((*first.commands, *second.commands), failures, first.act_seconds)
 
 
 def run_all(

@@ -10,12 +10,13 @@ from ventbench.sandbox.reader import UnreadableError, read_apart
 from ventbench.submissions.errors import Finding
 from ventbench.submissions.file_checks import check_files
 from ventbench.submissions.manifest import check_manifest
+from ventbench.submissions.review import review
 from ventbench.submissions.static_checks import check_sources
 
 #: Most findings of one kind that are listed.
 LISTED = 200
 
-_CHECKS = ("manifest", "files", "sources")
+_CHECKS = ("manifest", "files", "sources", "review")
 
 
 def findings_as_json(folder: str, check: str) -> list[dict[str, Any]]:
@@ -23,13 +24,14 @@ def findings_as_json(folder: str, check: str) -> list[dict[str, Any]]:
 
     Args:
         folder: the submission's.
-        check: ``"manifest"``, ``"files"`` or ``"sources"``.
+        check: ``"manifest"``, ``"files"``, ``"sources"`` or ``"review"``.
     """
     path = Path(folder)
     if check == "manifest":
         findings = check_manifest(path)[0]
     else:
-        findings = check_files(path) if check == "files" else check_sources(path)
+        checks = {"files": check_files, "sources": check_sources, "review": review}
+        findings = checks[check](path)
     # Problems first: what is cut off must not be what stops the submission.
     kept = sorted(findings, key=lambda finding: not finding.problem)[:LISTED]
     return [dataclasses.asdict(finding) for finding in findings if finding in kept]
@@ -47,7 +49,7 @@ def inspect_folder(folder: Path) -> tuple[Finding, ...]:
             function = "ventbench.submissions.inspection:findings_as_json"
             found = read_apart(function, folder, [check])
         except UnreadableError as error:
-            group = "source" if check == "sources" else check
+            group = check if check in ("manifest", "files") else "source"
             advice = "make its files smaller and plainer"
             findings.append(Finding(group, "the folder", str(error), advice))  # type: ignore[arg-type]
             continue

@@ -1,0 +1,114 @@
+"""What a reviewer should look at: what a controller seldom needs, with file and line.
+
+None of it is forbidden, and the sandbox does not rest on it. But each of these has served an
+attack, and a reader of a pull request should see them all without searching.
+"""
+
+from __future__ import annotations
+
+import ast
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+from ventbench.sandbox.child.sources import sources
+from ventbench.submissions.errors import Finding
+
+_MODULES = {
+    **dict.fromkeys(("gc", "inspect", "traceback"), "looks into Python's own objects and frames"),
+    **dict.fromkeys(("ctypes", "mmap", "cffi"), "reaches memory beside Python's objects"),
+    **dict.fromkeys(("os", "posix", "fcntl", "resource"), "calls the system"),
+    **dict.fromkeys(("signal", "socket", "select", "selectors"), "calls the system"),
+    **dict.fromkeys(
+        ("threading", "_thread", "concurrent", "asyncio"), "runs beside the controller"
+    ),
+    **dict.fromkeys(("importlib", "runpy", "pkgutil", "imp", "zipimport"), "imports by name"),
+    **dict.fromkeys(("pickle", "marshal", "codeop", "code"), "makes objects or code of bytes"),
+    **dict.fromkeys(("time", "datetime"), "sees the clock"),
+    "builtins": "changes or finds what Python offers",
+}
+_CALLS = {
+    **dict.fromkeys(("exec", "eval", "compile"), "runs code made of text or bytes"),
+    **dict.fromkeys(("__import__", "globals", "locals", "vars"), "finds or imports by name"),
+}
+_FRAMES = (
+    *("_getframe", "_current_frames", "settrace", "setprofile", "f_back", "f_locals"),
+    *("f_globals", "tb_frame", "gi_frame", "cr_frame", "ag_frame"),
+)
+_ATTRIBUTES = {
+    **dict.fromkeys(_FRAMES, "looks into frames"),
+    **dict.fromkeys(
+        ("__subclasses__", "__globals__", "__builtins__"), "finds what it never imported"
+    ),
+    **dict.fromkeys(("__code__", "CodeType", "FunctionType"), "makes or changes code"),
+    **dict.fromkeys(("import_module", "exec_module", "load_module"), "imports by name"),
+}
+_ADVICE = "for the reviewer: make sure that it is what it seems to be"
+
+
+def review(folder: Path) -> list[Finding]:
+    """List what a reviewer should look at, as notes.
+
+    Call it in a limited process, see :mod:`ventbench.sandbox.reader`.
+
+    Args:
+        folder: the submission's.
+    """
+    notes = []
+    for path in sources(folder):
+        name = path.relative_to(folder).as_posix()
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                tree = ast.parse(path.read_bytes(), name)
+        except (SyntaxError, ValueError, RecursionError, MemoryError, OSError):
+            continue  # check_sources says so
+        seen = set()
+        for node in ast.walk(tree):
+            for used, why in _uses(node):
+                line = getattr(node, "lineno", None)
+                if (used, line) not in seen:
+                    seen.add((used, line))
+                    what = f"uses {used}, which {why}"
+                    notes.append(Finding("source", name, what, _ADVICE, line, problem=False))
+    return sorted(notes, key=lambda note: (note.file, note.line or 0))
+
+
+def _uses(node: ast.AST) -> Iterator[tuple[str, str]]:
+    if isinstance(node, ast.Import):
+        for alias in node.names:
+            yield from _module(alias.name)
+    elif isinstance(node, ast.ImportFrom):
+        if not node.level:
+            yield from _module(node.module or "")
+        for alias in node.names:
+            if alias.name in _ATTRIBUTES:
+                yield alias.name, _ATTRIBUTES[alias.name]
+    elif isinstance(node, ast.Attribute):
+        if node.attr in _ATTRIBUTES:
+            yield node.attr, _ATTRIBUTES[node.attr]
+    elif isinstance(node, ast.Name) and node.id in _CALLS:
+        yield node.id, _CALLS[node.id]
+    elif isinstance(node, ast.Name) and node.id in _ATTRIBUTES:
+        yield node.id, _ATTRIBUTES[node.id]
+    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+        if node.func.attr in ("tobytes", "decode") and isinstance(node.func.value, ast.Subscript):
+            yield f".{node.func.attr}()", "makes text or code of an array's bytes"
+    elif isinstance(node, ast.Constant) and _is_packed(node.value):
+        yield "a long text without spaces", "may be packed data or code"
+
+
+#: Characters from which a text without spaces is no word.
+_LONG = 200
+
+
+def _is_packed(value: object) -> bool:
+    if isinstance(value, bytes):
+        value = value.decode("latin-1")
+    return isinstance(value, str) and len(value) > max(_LONG, 40 * value.count(" "))
+
+
+def _module(name: str) -> Iterator[tuple[str, str]]:
+    top = name.partition(".")[0]
+    if top in _MODULES:
+        yield name, _MODULES[top]

@@ -100,13 +100,17 @@ def change_root(readable: Iterable[str], folder: str) -> bool:
     except OSError:
         _close(sources)
         return False
+    os.umask(0o022)  # cells of another user must get through
     bound: list[str] = []
     for path, source in sources.items():
         if source is not None and not any(path.startswith(f"{top}/") for top in bound):
             _bind(source, base + path)
             bound.append(path)
     _close(sources)
-    os.makedirs(base + folder, 0o755, exist_ok=True)
+    if any(f"{folder}/".startswith(f"{top}/") for top in bound):
+        copy = {}  # it is there already, and the files are the machine's own
+    else:
+        os.makedirs(base + folder, 0o755, exist_ok=True)
     for name, content in copy.items():
         target = Path(base + folder, name)
         target.parent.mkdir(0o755, parents=True, exist_ok=True)

@@ -10,6 +10,7 @@ import errno
 import fcntl
 import os
 import socket
+import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -72,7 +73,8 @@ class Lockdown:
     ):
         self._layers = list(layers)
         self._ruleset: int | None = None
-        self._root = os.geteuid() == 0
+        # Another user must be able to read the interpreter.
+        self._root = os.geteuid() == 0 and bool(os.stat(os.__file__).st_mode & stat.S_IROTH)
         self._used = privileges.address_space()
         if not libc.LINUX:
             return

@@ -65,13 +65,9 @@ PLAIN = {
     "times": CallNumber(100, 153),
     "time": CallNumber(201, None),
     "gettimeofday": CallNumber(96, 169),
-    "clock_gettime": CallNumber(228, 113),
-    "clock_getres": CallNumber(229, 114),
-    "clock_nanosleep": CallNumber(230, 115),
     "nanosleep": CallNumber(35, 101),
     "restart_syscall": CallNumber(219, 128),
     "sched_yield": CallNumber(24, 124),
-    "sched_getaffinity": CallNumber(204, 123),
     "getcpu": CallNumber(309, 168),
     "getrandom": CallNumber(318, 278),
     "poll": CallNumber(7, None),
@@ -110,6 +106,10 @@ CHECKED = {
     "futex": CallNumber(202, 98),
     "madvise": CallNumber(28, 233),
     "prlimit64": CallNumber(302, 261),
+    "clock_gettime": CallNumber(228, 113),
+    "clock_getres": CallNumber(229, 114),
+    "clock_nanosleep": CallNumber(230, 115),
+    "sched_getaffinity": CallNumber(204, 123),
     "tgkill": CallNumber(234, 131),
     "clone": CallNumber(56, 220),
 }
@@ -222,6 +222,8 @@ _FCNTL = (0, 1, 2, 3, 1030)
 _FUTEX_PRIVATE, _FUTEX_JOIN = 128, 9 | 256
 _MADVISE = (0, 4, 8, 14, 15)  # normal, don't need, free, huge page, no huge page
 _CLONE_THREAD = 0x10000
+# The system's clocks and one's own. Larger numbers are the processor time of any process.
+_CLOCKS = tuple(range(12))
 
 _Rules = list[Rule]
 
@@ -257,6 +259,11 @@ def _checked(machine: str, pid: int, threads: bool) -> _Rules:
         # One's own limits, to be read.
         ("prlimit64", [Condition(0, (0,)), Condition(2, (0,), whole=True)]),
         ("tgkill", [Condition(0, (pid,))]),  # abort()
+        ("clock_gettime", [Condition(0, _CLOCKS)]),
+        ("clock_getres", [Condition(0, _CLOCKS)]),
+        ("clock_nanosleep", [Condition(0, _CLOCKS)]),
+        # Of others it would say whether they live.
+        ("sched_getaffinity", [Condition(0, (0, pid))]),
     ):
         rules += _allow(machine, CHECKED[name], *conditions)
     if threads:

@@ -173,7 +173,9 @@ def fit(table: CrossProducts, which: NDArray[np.bool_], columns: Sequence[int]) 
     """
     columns = tuple(columns)
     pick = [*columns, -1]
-    total = table.products[np.ix_(which, range(len(GRID)), pick, pick)].sum(axis=0)
+    total = table.products[
+        np.ix_(np.flatnonzero(which).tolist(), range(len(GRID)), pick, pick)
+    ].sum(axis=0)
     freedom = float(table.freedom[which].sum())
     constants = table.constant[which].sum(axis=0)
     right = total[:, :-1, -1]

@@ -216,7 +216,7 @@ def _figures(run: ProtocolRun, cells: Scenario) -> dict[str, Floats]:
     pressure, u_in, requested = (
         x[:, 0][:, :, protocol.SCORED_BREATHS, :] for x in (run.pressure, run.u_in, run.requested)
     )
-    peep, pip, dt = (x[0, :, None] for x in (cells.peep, cells.pip, cells.dt))
+    peep, pip, dt = (np.asarray(x)[0, :, None] for x in (cells.peep, cells.pip, cells.dt))
     return figures(InspirationSignals(pressure, u_in, requested, peep, pip, dt))
 
 

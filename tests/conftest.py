@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import sys
@@ -30,7 +31,10 @@ description = "A test."
 Make = Callable[..., Path]
 
 #: Seconds of compiling from which the result is kept for other workers and later runs.
-KEPT_FROM_S = 0.2
+KEPT_FROM_S = 0.1
+
+#: Memory of a worker, MiB, from which it forgets what it compiled: two of them shall fit in 2 GiB.
+FORGOTTEN_FROM_MIB = 600.0
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -47,11 +51,22 @@ def _compiled_once(pytestconfig: pytest.Config) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def _memory_given_back() -> Iterator[None]:
-    """Forget what a file's tests compiled: all files together would need several GiB."""
+    """Forget what was compiled once it takes much memory: all files would need several GiB."""
     yield
-    if "jax" in sys.modules:
+    if _resident_mib() > FORGOTTEN_FROM_MIB and "jax" in sys.modules:
         sys.modules["jax"].clear_caches()
-    gc.collect()
+        gc.collect()
+        if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+            trim(0)  # the C library keeps what the compiler has freed
+
+
+def _resident_mib() -> float:
+    """Memory of this process, MiB; infinite where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return float("inf")
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 @pytest.fixture(scope="session")

@@ -86,6 +86,7 @@ def test_a_mechanism_is_enough():
     assert found.base.hypothesis.names == ()
 
 
+@pytest.mark.slow
 def test_resistance_that_depends_on_volume_is_an_unnamed_effect():
     found = concluded(small.made(small.effect("volume_resistance", "R(V)", change=0.65)))
     assert found.names == ()
@@ -133,6 +134,7 @@ def test_a_mechanism_stands_beside_an_unnamed_effect():
     assert shown.y_unit.startswith("share of the flow")
 
 
+@pytest.mark.slow
 def test_scatter_of_the_valves_gain_is_no_missing_physics():
     rng = np.random.default_rng(4)
     rows = []

@@ -151,6 +151,7 @@ def test_held_out_readings_change_no_answer(found, other):
     assert other.open_loop.after != found.open_loop.after
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["found", "own", "strange"])
 def test_the_corrected_plant_in_its_file_gives_the_same_answers(which, request, tmp_path):
     diagnosis: Diagnosis = request.getfixturevalue(which)

@@ -71,6 +71,7 @@ def expected(truth, other, u_in, u_out):
     return contrast(one, two, NOISE).nats(np.arange(n))
 
 
+@pytest.mark.slow
 def test_pulses_tell_a_lag_from_a_delay():
     lag, delay = both({"valve_lag.tau": 0.04}, "valve_lag", "valve_delay")
     found = request_breaths(lag, [delay])

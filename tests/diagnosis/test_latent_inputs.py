@@ -55,6 +55,7 @@ def test_an_input_at_the_alveolus_acts_as_muscles_do(clean):
     np.testing.assert_allclose(drawn, seen, atol=0.06)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sample", [5, 17, 29])
 def test_an_input_at_the_supply_acts_as_more_command(clean, sample):
     partition, values, before = clean

@@ -59,6 +59,7 @@ def left(*effects):
     return named
 
 
+@pytest.mark.slow
 def test_a_mechanism_that_compensates_for_anothers_form_is_dropped():
     """A linear leak is no square root, and a viscoelastic lung compensates for that."""
     named = left(small.effect("leak", "linear", conductance=20.0))

@@ -108,6 +108,7 @@ def test_thirty_samples_a_second_with_jitter():
     assert found.terms == ()
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth():
     inside = np.zeros(2)
     for seed in range(60):
@@ -180,6 +181,7 @@ def test_a_leak_is_gas_that_does_not_come_back():
     near(term.parameters["conductance"], 5.0, 0.2)
 
 
+@pytest.mark.slow
 def test_nothing_is_found_where_nothing_is():
     rng = np.random.default_rng(0)
     false = 0

@@ -70,6 +70,7 @@ def test_all_at_once_and_none(skipping, whole, off):
         np.testing.assert_allclose(there, other, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_what_acts_in_one_breath_of_one_point_is_not_skipped(skipping, whole, off):
     points = np.stack([off, off, off])
     points[1, 4, NAMES.index("patient_effort.amplitude")] = 5.0
@@ -79,6 +80,7 @@ def test_what_acts_in_one_breath_of_one_point_is_not_skipped(skipping, whole, of
     assert np.argwhere(changed).tolist() == [[1, 4]]
 
 
+@pytest.mark.slow
 def test_slopes_at_neutral_are_those_of_the_whole_model(skipping, whole, off):
     order = (*NAMES, START)
     columns = tuple(order.index(f"{n}.{m.description.strength.name}") for n, m in library().items())
@@ -86,6 +88,7 @@ def test_slopes_at_neutral_are_those_of_the_whole_model(skipping, whole, off):
     np.testing.assert_allclose(slopes, whole.derivatives(off, columns)[1], rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_without_skipping_idle_strengths_have_slopes():
     def pressure(strength, skip):
         plant = Physics((), (), skip_idle=skip).having(R=20.0, C=20.0)

@@ -84,6 +84,7 @@ def test_stable_at_any_parameter_in_range(data):
     assert np.abs(p).max() < 50.0 * (gas + flow * (values["R"] + 80 * flow + 200) + 100.0)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_and_not_zero():
     """By every parameter, at neutral strengths and at mild ones."""
     with precision.float64():
@@ -113,6 +114,7 @@ def test_single_precision_agrees():
     np.testing.assert_allclose(found[0], found[1], atol=0.02)
 
 
+@pytest.mark.slow
 def test_half_the_interval_gives_the_same():
     """Commands held for two samples each, with all mechanisms that look at flows, not at edges."""
     with precision.float64():
@@ -126,6 +128,7 @@ def test_half_the_interval_gives_the_same():
     assert resolution(0.01) == (4, 16)
 
 
+@pytest.mark.slow
 def test_stacks_and_variations():
     with precision.float64():
         stacked = everything().having(R=np.array([5.0, 20.0, 20.0, 50.0]))

@@ -85,6 +85,7 @@ def test_a_model_has_its_effect(relieved):
     assert data.measured.max() < breaths.pressure.max() - 1.0
 
 
+@pytest.mark.slow
 def test_a_fit_estimates_its_strength(relieved):
     with extended(RELIEF_VALVE):
         predictor = Predictor(relieved[1], paths(NAMES))

@@ -112,6 +112,7 @@ def test_coefficients_tend_to_zero_and_strengths_of_the_library_do_not(bench):
     assert strength_path("recoil_shape") == "recoil_shape.c1"
 
 
+@pytest.mark.slow
 def test_all_at_zero_are_off(bench):
     """Beside others, of which none may be moved."""
     given = {

@@ -122,6 +122,7 @@ BREATH = (np.arange(30) >= 16) * 1.0
 LINEAR = {"K2": 0.0, "stiffening": np.zeros(5)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "u_out"),
     [

@@ -21,6 +21,7 @@ def run(plant, u_in, dt=0.03, u_out=0.0, start=5.0):
     return np.asarray(open_loop(plant, full[:, 0] * start, u_in, full * u_out, full * dt))
 
 
+@pytest.mark.slow
 def test_depth_counts_matrices_as_the_paper_does():
     plant = learned(jax.random.key(0), Architecture())
     shapes = [w.shape for w in plant.general.weights]

@@ -94,6 +94,7 @@ def test_finds_nothing_in_nothing(name):
     assert not np.any(np.isnan(found.covariance))
 
 
+@pytest.mark.slow
 def test_several_at_once_and_held_out():
     m = {
         "valve_lag": {"tau": 0.05},

@@ -72,6 +72,7 @@ def exact(predictor):
     return found
 
 
+@pytest.mark.slow
 def test_are_those_of_automatic_differentiation(predictor, values, exact):
     names = (*ACTING, START)
     seen, slopes = predictor.derivatives(values, columns(names))

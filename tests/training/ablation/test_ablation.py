@@ -69,6 +69,7 @@ def test_each_variant_differs_in_one_thing():
             assert name.endswith(f" {getattr(one, changed[0])}")
 
 
+@pytest.mark.slow
 def test_controllers_are_compared(tmp_path):
     told = []
 
@@ -118,6 +119,7 @@ def test_the_table_of_controllers_pairs_seeds():
     assert rows.loc["wide", "draws_change_low"] == 0.0
 
 
+@pytest.mark.slow
 def test_networks_are_compared(tmp_path, make_synthetic):
     folder, out = tmp_path / "recordings", tmp_path / "out"
     folder.mkdir()

@@ -84,6 +84,7 @@ def mean_errors(pooled, breaths, sessions):
     return open_loop_report.errors(of, breaths)
 
 
+@pytest.mark.slow
 def test_finds_known_lungs_again(fitted, true_parameters, make_synthetic, known_sessions):
     """On breaths it has not seen; the numbers are of a fit five times shorter than the real one."""
     new = make_synthetic(THREE, each=8, seed=2)
@@ -102,6 +103,7 @@ def test_finds_known_lungs_again(fitted, true_parameters, make_synthetic, known_
         assert np.abs(off).max() < allowed, name
 
 
+@pytest.mark.slow
 def test_finds_the_expiratory_valve(fitted, measured, known_sessions):
     """The second stage changes what its list names, and expirations come nearer."""
     with float64():
@@ -121,6 +123,7 @@ def test_finds_the_expiratory_valve(fitted, measured, known_sessions):
             assert equal(getattr(refitted, name), getattr(fitted, name)), name
 
 
+@pytest.mark.slow
 def test_what_is_held_out_has_no_influence_at_all(fitted, measured, reconstructed, known_sessions):
     out = FOLD == MEMBER
     pressure = measured.pressure.copy()
@@ -134,6 +137,7 @@ def test_what_is_held_out_has_no_influence_at_all(fitted, measured, reconstructe
     assert not equal(other, fitted)
 
 
+@pytest.mark.slow
 def test_sessions_without_breaths_stay_at_what_the_lungs_share(fitted, known_sessions):
     seen = {known_sessions.table.index(s) for s in known_sessions.table if lung(s.lung) in THREE}
     gain = np.asarray(fitted.session_gain)

@@ -61,6 +61,7 @@ def test_varies_like_the_textbook_lung(trained):
     assert float(jnp.abs(mine - off).mean()) < 0.35
 
 
+@pytest.mark.slow
 def test_is_reproducible_and_seeds_differ():
     data = recordings(10)
     one, again, other = (
@@ -110,6 +111,7 @@ def test_missing_pressures_are_masked():
     assert error(plant, recordings(30, seed=1)) < 0.7
 
 
+@pytest.mark.slow
 def test_the_penalty_makes_pressure_rise_with_the_valve():
     config = dataclasses.replace(SHORT, rising=1.0)
     plant = fit(*recordings(10), architecture=SHAPE, config=config, tau=0.2)

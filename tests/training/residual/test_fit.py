@@ -219,6 +219,7 @@ def test_benches_deviate_as_the_draws_do_but_are_none_of_them():
     assert np.asarray(wider.delay).max() < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("round_robin", [False, True])
 def test_training_lowers_the_error(ensemble, round_robin):
     config = replace(PARTIAL, round_robin=round_robin)

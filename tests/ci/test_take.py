@@ -271,6 +271,7 @@ def test_large_together(repository, demo, refused):
     assert "the folder has 6.7 MB; at most 5 MB are accepted" in said
 
 
+@pytest.mark.slow
 def test_many_files(repository, demo, refused):
     many = {f"{PATH}/{k}.txt": b"" for k in range(1001)}
     said = refused(repository.commit(demo | many, repository.base))

@@ -216,6 +216,7 @@ def test_stacked_plants_are_each_their_own(name):
     np.testing.assert_allclose(together[1], run(plants[1]), atol=2e-4)
 
 
+@pytest.mark.slow
 @every_plant
 def test_float32_agrees_with_float64(name):
     u_in = np.random.default_rng(2).uniform(0, 15, (2, T))
@@ -227,6 +228,7 @@ def test_float32_agrees_with_float64(name):
     np.testing.assert_allclose(single, double, atol=5e-4)
 
 
+@pytest.mark.slow
 @every_plant
 def test_gradients_are_finite(name):
     by_plant, by_command = gradients(PLANTS[name](), jnp.full((1, T), 8.0))

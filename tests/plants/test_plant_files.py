@@ -213,5 +213,5 @@ def test_score_on_the_plants_of_a_file(tmp_path: Path) -> None:
     assert "R5C20" not in text
     code, text = run(*options, "--draws", 20, "--record", tmp_path / "records")
     assert code == 2
-    assert "leave --plant out" in text
+    assert "leave out --plant" in text
     assert run("score", "pid_best", "--plant", "nothing")[0] == 2

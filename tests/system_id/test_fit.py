@@ -136,6 +136,7 @@ def test_answers_of_a_simulator_and_the_fitted_plant():
         data.with_pressure(np.full_like(answer, np.nan))
 
 
+@pytest.mark.slow
 def test_flow_and_groups_and_priors():
     """Two lungs, one valve; flow pins the gain, which pressure alone leaves to the prior."""
     one = cases.recording(4, {}, noise=NOISE, R=10.0, C=25.0, gain=20.0, seed=1)

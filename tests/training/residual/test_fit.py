@@ -239,6 +239,7 @@ def test_training_lowers_the_error(ensemble, round_robin):
     assert error(trained) < 0.95 * error(PID(*GAINS))
 
 
+@pytest.mark.slow
 def test_same_seed_same_bits_also_after_ctrl_c(ensemble, tmp_path):
     config = PARTIAL
     whole = fit(ensemble, GAINS, config=config, seed=1)
@@ -347,6 +348,7 @@ def test_an_interrupted_training_continues_to_the_same_bytes(tmp_path):
     assert tuple(whole.report["networks"][ALL]["error"]) == LUNG_IDS
 
 
+@pytest.mark.slow
 def test_no_controller_beats_the_rise_and_the_search_comes_near():
     plants = lungs(3)
     least = bound.rise(plants, (10.0, 30.0))

@@ -68,6 +68,7 @@ def lungs(index: int) -> Any:
 WALK = RandomWalk()
 
 
+@pytest.mark.slow
 def test_same_seed_same_bits_and_resuming_changes_nothing(tmp_path):
     whole = parallel.train(WALK, lungs(0), (0, 1), chunk=2, file=tmp_path / "a.npz")
 

@@ -16,7 +16,7 @@ from ci import workflow
 from ci.take import TakeError, Taken, take
 from ventbench import draws
 from ventbench.board import create
-from ventbench.board.replay import Simulators
+from ventbench.board.replay import ReplayPlants
 from ventbench.errors import InputError
 from ventbench.submissions import contract
 from ventbench.submissions.folder import open_submission
@@ -45,7 +45,7 @@ def tracks(wanted: str, entered: Sequence[str]) -> list[str]:
 
 
 def score_taken(
-    taken: Taken, source: str, wanted: str, simulators: Simulators, runner: Runner, out: Path
+    taken: Taken, source: str, wanted: str, simulators: ReplayPlants, runner: Runner, out: Path
 ) -> list[str]:
     """Check and score a submission twice, and write a record for each track.
 

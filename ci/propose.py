@@ -15,7 +15,7 @@ from ci import workflow
 from ci.git import AUTHOR, Git
 from ci.take import submission_name
 from ventbench.board import attestation, build, create, record, store
-from ventbench.board.replay import Simulators
+from ventbench.board.replay import ReplayPlants
 from ventbench.errors import InputError
 
 TITLE = "Record"
@@ -48,7 +48,7 @@ def records(folder: Path) -> list[Path]:
 
 
 def add(
-    folder: Path, leaderboard: Path, simulators: Simulators, secret: str | None = None
+    folder: Path, leaderboard: Path, simulators: ReplayPlants, secret: str | None = None
 ) -> list[record.Record]:
     """Add records to a leaderboard, each replayed, and build its pages.
 

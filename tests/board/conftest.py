@@ -15,7 +15,7 @@ import pytest
 from ventbench import draws
 from ventbench.board import build, create, layout, record, store
 from ventbench.board.record import Record
-from ventbench.board.replay import Simulators, replay
+from ventbench.board.replay import ReplayPlants, replay
 from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
 from ventbench.submissions.errors import Failure
@@ -148,7 +148,7 @@ def leaderboard(full: Path, tmp_path: Path) -> Path:
     return shutil.copytree(full, tmp_path / "leaderboard")
 
 
-def put(folder: Path, made: create.Draft, simulators: Simulators | None = None) -> Record:
+def put(folder: Path, made: create.Draft, simulators: ReplayPlants | None = None) -> Record:
     """Save a draft and add it, accepted as official if it says so."""
     added = store.add(folder, made.save(folder.parent / "drafts"), simulators)
     accept(folder)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 import ventbench
 from ventbench import draws, files, protocol
 from ventbench.board import actions, canonical, record, schema
-from ventbench.board.replay import TRACE_BREATH, Replayed, Simulators, differences, replay
+from ventbench.board.replay import TRACE_BREATH, Replayed, ReplayPlants, differences, replay
 from ventbench.errors import InputError
 from ventbench.submissions.folder import combined_hash, file_hashes
 from ventbench.submissions.result import CellFailure, Score
@@ -64,7 +64,7 @@ class Draft:
 
 def create(
     score: Score,
-    simulators: Simulators,
+    simulators: ReplayPlants,
     *,
     official: bool = True,
     source: Mapping[str, Any] | None = None,
@@ -156,7 +156,7 @@ def create(
     return draft
 
 
-def keep(folder: Path, scores: Sequence[Score], simulators: Simulators) -> list[Path]:
+def keep(folder: Path, scores: Sequence[Score], simulators: ReplayPlants) -> list[Path]:
     """Write the records of some scores.
 
     Args:

@@ -57,7 +57,7 @@ class Record:
         return self.manifest.name
 
     @property
-    def manifest(self) -> schema.Manifest:
+    def manifest(self) -> schema.RecordedManifest:
         """What the authors say about the submission."""
         return self.header.submission.manifest
 

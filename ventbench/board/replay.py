@@ -45,7 +45,7 @@ MEAN_TOLERANCE = 1e-11
 _CENTI, _TENTH = 0.005 + 1e-6, 0.05 + 1e-6
 
 
-class Simulators(Protocol):
+class ReplayPlants(Protocol):
     """What :func:`ventbench.plants.frozen.load` returns.
 
     Attributes:
@@ -139,7 +139,7 @@ def _breaths_last(values: Array, count: int) -> Floats:
     return np.moveaxis(split, (0, 2), (1, -2))
 
 
-def pressures(simulators: Simulators, pips: Sequence[float], requested: Floats) -> Floats:
+def pressures(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -> Floats:
     """True airway pressures that commands give.
 
     Args:
@@ -157,7 +157,7 @@ def pressures(simulators: Simulators, pips: Sequence[float], requested: Floats) 
     return _breaths_last(pressure, len(requested))
 
 
-def spread(simulators: Simulators, pips: Sequence[float], requested: Floats) -> Floats:
+def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -> Floats:
     """Disagreement of the ensemble along an entry's own nominal trajectory.
 
     Sample standard deviation over members of the pressure that the same commands give, averaged
@@ -188,7 +188,7 @@ def spread(simulators: Simulators, pips: Sequence[float], requested: Floats) -> 
 
 
 def replay(
-    simulators: Simulators, pips: Sequence[float], requested: Sequence[Floats]
+    simulators: ReplayPlants, pips: Sequence[float], requested: Sequence[Floats]
 ) -> Iterator[Replayed]:
     """Replay the commands of records of one shape, a few at a time.
 

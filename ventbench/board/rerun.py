@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ventbench import data_files, draws, protocol
 from ventbench.board import actions, canonical, create, store
 from ventbench.board.record import Record
-from ventbench.board.replay import Simulators
+from ventbench.board.replay import ReplayPlants
 from ventbench.errors import InputError
 from ventbench.resume import WorkFolder
 from ventbench.submissions.folder import Submission, file_hashes, open_submission
@@ -73,7 +73,7 @@ def sandboxed() -> Runner:
     return SandboxRunner(require_official=True)
 
 
-def frozen_simulators() -> Simulators:
+def frozen_simulators() -> ReplayPlants:
     """The frozen simulators of this ventbench.
 
     Raises:
@@ -91,7 +91,7 @@ def rerun(
     sources: Sequence[Path] = (),
     work: Path,
     jobs: int = 1,
-    load: Callable[[], Simulators] = frozen_simulators,
+    load: Callable[[], ReplayPlants] = frozen_simulators,
     runner: Callable[[], Runner] = sandboxed,
     progress: Callable[[Outcome], None] | None = None,
 ) -> list[Outcome]:
@@ -187,7 +187,7 @@ def _run_in_process(
     sha256: str,
     code: Path,
     folder: Path,
-    load: Callable[[], Simulators],
+    load: Callable[[], ReplayPlants],
     runner: Callable[[], Runner],
 ) -> Outcome:
     """Run one record in a process of its own, which reads it again."""
@@ -196,7 +196,7 @@ def _run_in_process(
 
 
 def _run(
-    score: Record, code: Path, folder: Path, simulators: Simulators, runner: Runner
+    score: Record, code: Path, folder: Path, simulators: ReplayPlants, runner: Runner
 ) -> Outcome:
     """Run the code of one record and compare."""
     begun = time.perf_counter()

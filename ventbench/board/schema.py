@@ -80,7 +80,7 @@ class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A JSON object with exactly these keys."""
 
 
-class Manifest(_Table, frozen=True):
+class RecordedManifest(_Table, frozen=True):
     """What the authors say about a submission; see :class:`ventbench.submissions.manifest`."""
 
     name: EntryName
@@ -93,12 +93,12 @@ class Manifest(_Table, frozen=True):
     training: FreeForm
 
 
-class Submission(_Table, frozen=True):
+class RecordedSubmission(_Table, frozen=True):
     """What was scored: the SHA-256 of all files together and of each by its path."""
 
     sha256: Sha256
     files: FreeForm
-    manifest: Manifest
+    manifest: RecordedManifest
 
 
 class Draws(_Table, frozen=True):
@@ -131,7 +131,7 @@ class Clipped(_Table, frozen=True):
     commands: Count
 
 
-class Failure(_Table, frozen=True):
+class RecordedFailure(_Table, frozen=True):
     """A failed cell; ``draw`` is null in the nominal run."""
 
     lung: LungId
@@ -173,7 +173,7 @@ class ScoreHeader(_Table, frozen=True):
     reason: Text
     provenance: FreeForm
     track: Track
-    submission: Submission
+    submission: RecordedSubmission
     simulators: FreeForm
     draws: Draws
     lungs: Annotated[list[LungName], msgspec.Meta(min_length=1)]
@@ -181,7 +181,7 @@ class ScoreHeader(_Table, frozen=True):
     safe: list[bool]
     peak_pressure_cmH2O: list[float]
     clipped: Clipped
-    failures: list[Failure]
+    failures: list[RecordedFailure]
     failed_cells: Count
     actions: Actions
     sandbox: FreeForm | None
@@ -371,7 +371,7 @@ def _check_time(created: str, where: str) -> None:
         raise InputError(f"{where}: {created} is no date and time") from None
 
 
-def _check_submission(submission: Submission, where: str) -> None:
+def _check_submission(submission: RecordedSubmission, where: str) -> None:
     """Check that the hashes of the files have their form and give the hash of the submission."""
     for name, sha256 in submission.files.items():
         parts = name.split("/")

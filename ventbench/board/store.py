@@ -21,7 +21,7 @@ from ventbench.board.record import Record, Withdrawal
 from ventbench.errors import InputError
 
 if TYPE_CHECKING:
-    from ventbench.board.replay import Simulators
+    from ventbench.board.replay import ReplayPlants
 
 #: Stands for the hash of the line before the first.
 CHAIN_START = "0" * 64
@@ -201,7 +201,7 @@ def find_record(store: Store, sha256: str) -> Record:
     return matches[0]
 
 
-def add(folder: Path, path: Path, simulators: Simulators | None = None) -> Record:
+def add(folder: Path, path: Path, simulators: ReplayPlants | None = None) -> Record:
     """Add a record to a leaderboard.
 
     Args:

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from ventbench import draws, protocol
 from ventbench.board import actions, attestation, build, canonical, layout, ranking, record, store
 from ventbench.board.record import Record, Withdrawal
-from ventbench.board.replay import BATCH, Simulators, deviation, differences, replay
+from ventbench.board.replay import BATCH, ReplayPlants, deviation, differences, replay
 from ventbench.errors import InputError
 
 Floats = NDArray[np.float64]
 
 #: Loads the frozen simulators of a version.
-Load = Callable[[int], Simulators]
+Load = Callable[[int], ReplayPlants]
 
 #: Told how many records of how many have been replayed.
 Progress = Callable[[int, int], None]
@@ -213,7 +213,7 @@ def _by_simulators(scores: Sequence[Record], report: Report) -> list[list[Record
     return list(groups.values())
 
 
-def _simulators(recorded: Mapping[str, Any], load: Load, report: Report) -> Simulators | None:
+def _simulators(recorded: Mapping[str, Any], load: Load, report: Report) -> ReplayPlants | None:
     """Load the simulators that records name; None, and a problem, where that is impossible."""
     version = recorded.get("version")
     if not isinstance(version, int):  # it becomes part of a path
@@ -238,7 +238,7 @@ def _simulators(recorded: Mapping[str, Any], load: Load, report: Report) -> Simu
 
 
 def _replay_batch(
-    folder: Path, batch: Sequence[Record], simulators: Simulators, report: Report
+    folder: Path, batch: Sequence[Record], simulators: ReplayPlants, report: Report
 ) -> dict[str, Floats]:
     sound, requested = [], []
     by_draw: dict[str, Floats] = {}

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from ventbench import draws
 from ventbench.board import build, canonical, create, layout, record, store
-from ventbench.board.replay import Simulators, replay
+from ventbench.board.replay import ReplayPlants, replay
 from ventbench.board.verify import verify
 from ventbench.plants import frozen
 from ventbench.submissions.folder import open_submission
@@ -31,7 +31,7 @@ SANDBOX = {"layers": ["landlock", "seccomp"], "official": True}
 FACTORS = (1.0, 0.99, 0.98, 0.97, 0.96, 0.95, 0.94, 0.93)
 
 
-def drafts(plants: Simulators) -> list[create.Draft]:
+def drafts(plants: ReplayPlants) -> list[create.Draft]:
     """Return real records whose commands are those of the PID times a factor."""
     result = run_protocol(open_submission("pid_best"), plants.plants, draws=draws.COUNT)
     made = []

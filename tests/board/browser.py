@@ -81,10 +81,24 @@ class Page:
         """Wait until a page whose address ends so is complete."""
         until = time.monotonic() + _PATIENCE_S
         expression = "document.readyState == 'complete' && location.pathname"
-        while not str(self.run(expression)).endswith(name):
+        while True:
+            try:
+                if str(self.run(expression)).endswith(name):
+                    return
+            except RuntimeError as error:  # the page that was asked has just been left
+                if "navigated" not in str(error) and "context" not in str(error):
+                    raise
             if time.monotonic() > until:
                 raise TimeoutError(f"{name} did not load")
             time.sleep(0.02)
+
+    def follow(self, link: str, name: str) -> None:
+        """Click on what a selector finds and wait for the page that it leads to.
+
+        The click comes after the answer, which a page that is being left could not give.
+        """
+        self.run(f"setTimeout(() => document.querySelector({link!r}).click()) > 0")
+        self.settle(name)
 
     def run(self, expression: str) -> Any:
         """Value of a JavaScript expression."""

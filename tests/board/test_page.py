@@ -74,15 +74,13 @@ def test_tables_sort_by_keyboard(quiet: Page, full: Path) -> None:
 
 def test_an_entry_opens_and_leads_back(quiet: Page, full: Path) -> None:
     quiet.open(full / "index.html", 1280)
-    quiet.run("document.querySelector('tbody a').click()")
-    quiet.settle("performance/softer.html")
+    quiet.follow("tbody a", "performance/softer.html")
     assert quiet.run("document.querySelector('h1').innerText") == "softer"
     assert quiet.run("document.querySelectorAll('.grid figure').length") == 36
     assert quiet.run("document.querySelectorAll('.heat tbody td:not(.mean)').length") == 72
     boxes = "[...document.querySelectorAll('.grid path.p')].every(x => x.getBBox().width > 500)"
     assert quiet.run(boxes)
-    quiet.run("document.querySelector('.kicker a').click()")
-    quiet.settle("index.html")
+    quiet.follow(".kicker a", "index.html")
 
 
 def test_foreign_text_is_text(quiet: Page, full: Path) -> None:

@@ -1,7 +1,9 @@
 """The official simulators: six lungs learned from real recordings, fixed by their hashes.
 
-An ensemble of five: member k has seen every recording but those of fold k, so that each measured
-breath is new to one of them. Member 0 is the official simulator, by which scores are made.
+Version 1 is an ensemble of five: member k has seen every recording but those of fold k, so that
+each measured breath is new to one of them. Member 0 is the official simulator, by which scores are
+made. Version 2 makes of each lung a set of rigs: the sessions of the recordings that are what their
+label says, by a test whose figures the manifest holds.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ from ventbench.plants.sessions import Sessions
 from ventbench.plants.stacking import VmappedPlant
 from ventbench.recordings.breaths import Breaths
 
-FORMAT = "ventbench-simulators-1"
+#: Formats of the manifest: one rig a lung, and a set of rigs a lung.
+FORMAT, RIGS_FORMAT = "ventbench-simulators-1", "ventbench-simulators-2"
 #: SHA-256 of the manifest of version 1, which holds those of all its files.
 MANIFEST_SHA256 = "10d5cc74ada5ed307dfc0f26e2b90820fe110f69437992042fd02b3735ebeed7"
 MANIFEST, MEMBERS, LEARNED, SEEN = "manifest.toml", "hybrid.npz", "learned.npz", "seen.npz"
@@ -83,6 +86,41 @@ class Frozen:
         return np.array([self.manifest["lungs"][name]["session"] for name in LUNG_IDS])
 
     @property
+    def rigs(self) -> tuple[tuple[int, ...], ...]:
+        """Sessions that are scored, for each lung in the order of ``LUNGS``.
+
+        They passed the test of their label. The first is the lung's reference rig, whose plant is
+        in :attr:`plants`. Version 1 scores that one only.
+        """
+        lungs = [self.manifest["lungs"][name] for name in LUNG_IDS]
+        return tuple(tuple(about.get("rigs", [about["session"]])) for about in lungs)
+
+    @property
+    def held_out_rigs(self) -> tuple[int | None, ...]:
+        """For each lung the scored session on which no entry of ours may be trained.
+
+        None where too few sessions passed to spare one, and in version 1.
+        """
+        return tuple(self.manifest["lungs"][name].get("held_out_rig") for name in LUNG_IDS)
+
+    @property
+    def training_rigs(self) -> tuple[tuple[int, ...], ...]:
+        """For each lung :attr:`rigs` without the one of :attr:`held_out_rigs`."""
+        pairs = zip(self.rigs, self.held_out_rigs, strict=True)
+        return tuple(tuple(rig for rig in rigs if rig != apart) for rigs, apart in pairs)
+
+    @property
+    def rejected(self) -> dict[int, str]:
+        """Why a session is not scored, by its index; empty in version 1, which did not test."""
+        tests = self.manifest.get("label_tests", ())
+        return {test["session"]: test["reason"] for test in tests if "reason" in test}
+
+    @property
+    def sessions_plants(self) -> Hybrid:
+        """Plants of all sessions and members, leaves ``(members, sessions, ...)``."""
+        return self.members
+
+    @property
     def plants(self) -> Hybrid:
         """The six simulators, leaves ``(6, ...)`` in the order of ``LUNGS``."""
         at = self._references
@@ -90,7 +128,7 @@ class Frozen:
 
     @property
     def ensemble(self) -> Hybrid:
-        """All members of the six, leaves ``(5, 6, ...)``; the first are :attr:`plants`."""
+        """All members of the six, leaves ``(members, 6, ...)``; the first are :attr:`plants`."""
         at = self._references
         return jax.tree.map(lambda leaf: leaf[:, at], self.members)
 
@@ -214,7 +252,7 @@ def load(version: int = 1, path: Path | None = None) -> Frozen:
     """Read the official simulators and check every file against the manifest.
 
     Args:
-        version: version of the simulators; 1 is the only one so far.
+        version: version of the simulators, 1 or 2.
         path: another folder, such as one that ``ventbench train simulator`` wrote.
 
     Raises:
@@ -223,7 +261,8 @@ def load(version: int = 1, path: Path | None = None) -> Frozen:
     path = path or folder(version)
     manifest = _manifest(path)
     members = load_plant(_checked(path, MEMBERS, manifest), as_array=np.asarray)
-    _checked(path, LEARNED, manifest)  # its hash is told with every score too
+    if manifest["format"] == FORMAT:
+        _checked(path, LEARNED, manifest)  # its hash is told with every score too
     return Frozen(
         path,
         manifest,
@@ -247,10 +286,10 @@ def _manifest(path: Path) -> dict[str, Any]:
         manifest = tomllib.loads((path / MANIFEST).read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path / MANIFEST} cannot be read: {error}") from error
-    if manifest.get("format") != FORMAT:
+    if manifest.get("format") not in (FORMAT, RIGS_FORMAT):
         raise InputError(
-            f"{path / MANIFEST}, key format: {manifest.get('format')!r} is not {FORMAT!r}; "
-            "this ventbench reads no other"
+            f"{path / MANIFEST}, key format: {manifest.get('format')!r} is neither {FORMAT!r} nor "
+            f"{RIGS_FORMAT!r}; this ventbench reads no other"
         )
     return manifest
 

@@ -193,6 +193,14 @@ class Hybrid:
         )  # fmt: skip
         return after, reading
 
+    def airway_pressure(self, state: HybridState) -> Array:
+        """Pressure at the airway, cmH2O, shape ``(...)``.
+
+        What :meth:`step` returns is the sensor's reading: it lags, and shifts while the command
+        changes direction.
+        """
+        return self.recoil(state.elastic)[0] + state.drop
+
     def _fill(
         self, elastic: Array, drop: Array, inflow: Array, outlet: Array, behind: Array, h: Array
     ) -> tuple[Array, Array, Array]:

@@ -1,0 +1,99 @@
+"""Version 2 of the official simulators: each lung is a set of rigs that passed a test."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ventbench import files
+from ventbench.lungs import LUNGS
+from ventbench.plants import frozen
+from ventbench.plants.hybrid import Hybrid
+from ventbench.precision import float64
+
+
+@pytest.fixture(scope="module")
+def official():
+    return frozen.load(version=2)
+
+
+def test_files_are_what_the_manifest_says(official):
+    manifest = official.manifest
+    assert (manifest["format"], manifest["version"]) == (frozen.RIGS_FORMAT, 2)
+    for name, entry in manifest["files"].items():
+        assert files.sha256(frozen.folder(2) / name) == entry["sha256"]
+    assert official.about()["version"] == 2
+    assert official.manifest_sha256 != frozen.MANIFEST_SHA256
+
+
+def test_version_1_has_one_rig_a_lung():
+    version_1 = frozen.load()
+    references = tuple((version_1.manifest["lungs"][lung.id]["session"],) for lung in LUNGS)
+    assert version_1.rigs == version_1.training_rigs == references
+    assert version_1.held_out_rigs == (None,) * len(LUNGS)
+    assert version_1.rejected == {}
+    assert version_1.sessions_plants is version_1.members
+
+
+def test_rigs_are_sessions_of_their_lung_that_passed(official):
+    assert len(official.rigs) == len(LUNGS)
+    for lung, rigs in zip(LUNGS, official.rigs, strict=True):
+        assert len(rigs) >= 2
+        assert len(set(rigs)) == len(rigs)
+        assert all(official.sessions.table[rig].lung == lung.id for rig in rigs)
+        assert not official.rejected.keys() & set(rigs)
+        everything = {i for i, row in enumerate(official.sessions.table) if row.lung == lung.id}
+        assert everything == set(rigs) | (everything & official.rejected.keys())
+    assert all(reason for reason in official.rejected.values())
+
+
+def test_the_reference_rig_has_the_most_measured_breaths(official):
+    measured = {test["session"]: test["measured"] for test in official.manifest["label_tests"]}
+    for rigs in official.rigs:
+        assert measured[rigs[0]] == max(measured[rig] for rig in rigs)
+
+
+def test_a_rig_is_held_out_wherever_three_passed(official):
+    everything = zip(official.rigs, official.held_out_rigs, official.training_rigs, strict=True)
+    for rigs, apart, training in everything:
+        assert (apart is not None) == (len(rigs) >= 3)
+        assert apart is None or (apart in rigs[1:] and apart not in training)
+        assert set(training) == set(rigs) - {apart}
+        assert training[0] == rigs[0]
+
+
+def test_fitted_resistance_and_compliance_are_those_of_the_label(official):
+    plants = official.sessions_plants
+    for lung, rigs in zip(LUNGS, official.rigs, strict=True):
+        compliance = 1000.0 / plants.E[:, list(rigs)]
+        np.testing.assert_allclose(np.median(compliance, axis=0), lung.C, rtol=0.2)
+
+
+def test_reference_plants_are_the_first_rigs(official):
+    first = np.array([rigs[0] for rigs in official.rigs])
+    for plants, sessions in zip(
+        jax.tree.leaves(official.ensemble), jax.tree.leaves(official.sessions_plants), strict=True
+    ):
+        np.testing.assert_array_equal(plants, sessions[:, first])
+    for plants, member in zip(
+        jax.tree.leaves(official.plants), jax.tree.leaves(official.ensemble), strict=True
+    ):
+        np.testing.assert_array_equal(plants, member[0])
+
+
+def test_airway_pressure_is_the_reading_without_sensor(official):
+    """Without lag and shift the sensor shows the airway pressure."""
+    with float64():
+        plant = jax.tree.map(jnp.asarray, official.plants)
+        zero = jnp.zeros(len(LUNGS))
+        ideal: Hybrid = plant.replace(sensor_lag=zero + 1e-6, rising=zero, falling=zero)
+        states = [p.init(zero + 5.0) for p in (plant, ideal)]
+        np.testing.assert_allclose(plant.airway_pressure(states[0]), 5.0, rtol=1e-12)
+        for u_in in (30.0, 60.0, 10.0):
+            states[0], reading = plant.step(states[0], zero + u_in, zero, zero + 0.03)
+            states[1], ideally = ideal.step(states[1], zero + u_in, zero, zero + 0.03)
+            airway = plant.airway_pressure(states[0])
+            np.testing.assert_allclose(airway, ideally, rtol=1e-9)
+            assert float(jnp.abs(airway - reading).max()) > 0.01

@@ -6,7 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ventbench import files
-from ventbench.board import entry_page, frames, index_page, layout, pages, ranking, store
+from ventbench.board import (
+    entry_page,
+    frames,
+    hardware_table,
+    index_page,
+    layout,
+    pages,
+    ranking,
+    store,
+)
 from ventbench.board.store import Store
 
 
@@ -44,7 +53,8 @@ def content(leaderboard: Store) -> dict[str, bytes]:
         page = index_page.render(environment, leaderboard, version, versions, tracks)
         built[pages.version_path(version, versions)] = page.encode()
         for track in tracks:
-            built.update(entry_page.render_all(environment, track, versions))
+            measured = hardware_table.rows(leaderboard.records, track)
+            built.update(entry_page.render_all(environment, track, versions, measured))
     return built
 
 

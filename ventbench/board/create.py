@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 import ventbench
 from ventbench import draws, files, protocol
 from ventbench.board import actions, canonical, record, schema
+from ventbench.board.hardware import HardwareRecord
 from ventbench.board.replay import TRACE_BREATH, Replayed, ReplayPlants, differences, replay
 from ventbench.errors import InputError
 from ventbench.submissions.folder import combined_hash, file_hashes
@@ -198,7 +199,10 @@ def amend(
         InputError: if it is not the record of a score.
         OSError: if a file cannot be read or written.
     """
-    if not isinstance(record.load(path), record.Record):
+    loaded = record.load(path)
+    if isinstance(loaded, HardwareRecord) and not (supersedes or reason or source):
+        return path
+    if not isinstance(loaded, record.Record):
         raise InputError(f"{path} is not the record of a score")
     values = canonical.parse(path.read_bytes(), str(path))
     if supersedes is not None:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ventbench import protocol
-from ventbench.board import pages, plots
+from ventbench.board import hardware_table, pages, plots
+from ventbench.board.hardware_table import HardwareRow
 from ventbench.board.ranking import BASELINES, Row, Track
 from ventbench.board.record import Record
 from ventbench.board.schema import ScoreHeader
@@ -23,7 +24,10 @@ MAX_FAILURES = 12
 
 
 def render_all(
-    environment: jinja2.Environment, track: Track, versions: Sequence[int]
+    environment: jinja2.Environment,
+    track: Track,
+    versions: Sequence[int],
+    measured: Sequence[HardwareRow] = (),
 ) -> dict[str, bytes]:
     """Return the pages of all entries of a track by their paths; see ``index_page.render``."""
     template = environment.get_template("entry.html.j2")
@@ -37,6 +41,9 @@ def render_all(
         same = base is not None and row.record.sha256 == base.sha256
         values = _values(track, status, row, None if same else base)
         values["panels"] = _panels(row.record, None if same else other)
+        values["hardware"] = [
+            hardware_table.shown(own) for own in measured if own.record.name == row.record.name
+        ]
         values["back"] = "../" * path.count("/") + pages.version_path(track.version, versions)
         values["root"] = "../" * path.count("/")
         made[path] = template.render(values).encode()

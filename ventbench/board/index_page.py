@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ventbench import protocol
-from ventbench.board import pages
+from ventbench.board import hardware_table, pages
+from ventbench.board.hardware_table import HardwareRow
 from ventbench.board.ranking import BASELINES, Row, Track
 from ventbench.board.store import Store
 from ventbench.text import number
@@ -35,6 +36,7 @@ def render(
         versions: all of them, newest first.
         tracks: of the version.
     """
+    measured = {track.name: hardware_table.rows(store.records, track) for track in tracks}
     rows = [(track, status, row) for track in tracks for status, row in track.rows]
     header = rows[0][2].record.header if rows else None
     return environment.get_template("index.html.j2").render(
@@ -43,17 +45,22 @@ def render(
             {"number": v, "path": pages.version_path(v, versions), "here": v == version}
             for v in versions
         ],
-        tracks=[_track(track) for track in tracks],
+        tracks=[_track(track, measured[track.name]) for track in tracks],
         aside=[_aside(*row) for row in rows],
         simulators=pages.flatten(header.simulators) if header else [],
         draws=header.draws if header else None,
         head=store.head,
         records=len(store.records),
+        hardware=[
+            {**hardware_table.shown(row), "track": track.name}
+            for track in tracks
+            for row in measured[track.name]
+        ],
         protocol=protocol,
     )
 
 
-def _track(track: Track) -> dict[str, Any]:
+def _track(track: Track, measured: Sequence[HardwareRow]) -> dict[str, Any]:
     scores = [row.score for row in track.ranked if row.score is not None]
     low = min((x.low for x in scores), default=1.0)
     high = max((x.high for x in scores), default=1.0)
@@ -61,12 +68,15 @@ def _track(track: Track) -> dict[str, Any]:
         "name": track.name,
         "title": pages.TITLES[track.name],
         "baseline": BASELINES[track.name],
-        "rows": [_row(track, row, low, high) for row in track.ranked],
+        "rows": [_row(track, row, low, high, measured) for row in track.ranked],
     }
 
 
-def _row(track: Track, row: Row, low: float, high: float) -> dict[str, Any]:
+def _row(
+    track: Track, row: Row, low: float, high: float, measured: Sequence[HardwareRow]
+) -> dict[str, Any]:
     record = row.record
+    own = hardware_table.of_entry(measured, record.name)
     worst, lung, pip = row.worst
     step = pages.step_time(record.header.timing)
     return {
@@ -85,6 +95,7 @@ def _row(track: Track, row: Row, low: float, high: float) -> dict[str, Any]:
         "exploitation": _figure(record.exploitation),
         "clipped": _figure(100.0 * record.clipped_share, 1),
         "step": _figure(step, 0),
+        "hardware": None if own is None else hardware_table.shown(own),
     }
 
 

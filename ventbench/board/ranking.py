@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.board.record import Record, Withdrawal
+from ventbench.board.record import AnyRecord, Record, Withdrawal
 from ventbench.metrics import bootstrap
 from ventbench.submissions.manifest import TRACKS
 
@@ -154,9 +154,7 @@ class Track:
         return [(kind, row) for kind, rows in zip(kinds, groups, strict=True) for row in rows]
 
 
-def boards(
-    records: Sequence[Record | Withdrawal], attested: Container[str]
-) -> dict[int, tuple[Track, ...]]:
+def boards(records: Sequence[AnyRecord], attested: Container[str]) -> dict[int, tuple[Track, ...]]:
     """Rank all records.
 
     Args:
@@ -193,7 +191,7 @@ def _track(version: int, name: str, standing: Standing) -> Track:
 
 
 def standings(
-    records: Sequence[Record | Withdrawal], attested: Container[str]
+    records: Sequence[AnyRecord], attested: Container[str]
 ) -> dict[int, dict[str, Standing]]:
     """Sort records into boards.
 

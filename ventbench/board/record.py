@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.board import canonical, layout, schema
+from ventbench.board import canonical, hardware, layout, schema
+from ventbench.board.hardware import HardwareRecord
 from ventbench.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -131,7 +133,15 @@ class Withdrawal:
     created: str
 
 
-def from_bytes(content: bytes, label: str, *, strict: bool = True) -> Record | Withdrawal:
+#: Everything that a leaderboard keeps.
+AnyRecord = Record | Withdrawal | HardwareRecord
+
+_DECODER: msgspec.json.Decoder[Any] = msgspec.json.Decoder(
+    schema.ScoreContent | schema.WithdrawalContent | hardware.HardwareContent
+)
+
+
+def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
     """Read and check a record.
 
     Args:
@@ -144,10 +154,12 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> Record | W
     """
     if strict:
         canonical.parse(content, label)
-    values = schema.read(content, label)
+    values = schema.read(content, label, _DECODER)
     sha256 = canonical.digest(content)
     if isinstance(values, schema.WithdrawalContent):
         return Withdrawal(sha256, values.withdraws, values.reason, values.created)
+    if isinstance(values, hardware.HardwareContent):
+        return hardware.checked(values, sha256, label)
     size = len(values.lungs), len(values.pips)
     return Record(
         sha256,
@@ -163,7 +175,7 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> Record | W
     )
 
 
-def load(path: Path, *, strict: bool = True) -> Record | Withdrawal:
+def load(path: Path, *, strict: bool = True) -> AnyRecord:
     """Read a record's file, whatever it is called; see :func:`from_bytes`.
 
     Raises:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from datetime import datetime
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import msgspec
 
@@ -21,6 +21,9 @@ from ventbench.lungs import LUNG_IDS
 from ventbench.submissions.folder import CONTROLLER, combined_hash
 from ventbench.submissions.manifest import FAMILIES, MANIFEST, NAME, TRACKS
 from ventbench.text import plain
+
+if TYPE_CHECKING:
+    from ventbench.board.hardware import HardwareContent
 
 #: Version of the record's form.
 FORMAT = 1
@@ -222,32 +225,49 @@ class ChainLine(_Table, frozen=True):
     previous: Sha256
 
 
-_RECORD: msgspec.json.Decoder[Any] = msgspec.json.Decoder(ScoreContent | WithdrawalContent)
 _LINE = msgspec.json.Decoder(ChainLine)
 
 
-def read(content: bytes, label: str) -> ScoreContent | WithdrawalContent:
+#: Reads scores and withdrawals; :mod:`~ventbench.board.record` knows one for all kinds.
+SCORES: msgspec.json.Decoder[Any] = msgspec.json.Decoder(ScoreContent | WithdrawalContent)
+
+
+def read(
+    content: bytes, label: str, decoder: msgspec.json.Decoder[Any] = SCORES
+) -> ScoreContent | WithdrawalContent | HardwareContent:
     """Read and check the content of a record.
 
     Args:
         content: JSON, canonical or not.
         label: names the file in messages.
+        decoder: of the kinds of records that are accepted.
 
     Raises:
         InputError: naming the first key that is wrong.
     """
-    record = decoded(_RECORD, content, label)
+    record = decoded(decoder, content, label)
     _check_time(record.created, f"{label}, key created")
+    if not isinstance(record, ScoreContent | WithdrawalContent):
+        for key in ("plan", "control", "safety", "timing", "sandbox", "provenance", "versions"):
+            _check_free(getattr(record, key), f"{label}, key {key}")
+        _check_free(record.machine, f"{label}, key machine")
+        _check_free(record.device.about, f"{label}, key device.about")
+        _check_submitted(record, label)
     if isinstance(record, ScoreContent):
         for key in ("provenance", "simulators", "sandbox", "versions", "machine", "timing"):
             _check_free(getattr(record, key), f"{label}, key {key}")
-        _check_free(record.submission.files, f"{label}, key submission.files")
-        _check_free(record.submission.manifest.training, f"{label}, key submission.manifest")
         _check_shapes(record, label)
         _check_consistent(record, label)
-        _check_submission(record.submission, f"{label}, key submission")
-        _check_origin(record, label)
+        _check_submitted(record, label)
     return record
+
+
+def _check_submitted(record: ScoreContent | HardwareContent, label: str) -> None:
+    """Check what records of scores and of hardware say alike: the submission and the origin."""
+    _check_free(record.submission.files, f"{label}, key submission.files")
+    _check_free(record.submission.manifest.training, f"{label}, key submission.manifest")
+    _check_submission(record.submission, f"{label}, key submission")
+    _check_origin(record, label)
 
 
 def read_line(content: bytes, label: str) -> ChainLine:
@@ -318,14 +338,15 @@ def _check_shapes(record: ScoreContent, label: str) -> None:
         "trace.u_in_tenths_percent": (record.trace.u_in_tenths_percent, (lungs, pips, steps)),
     }
     for key, (table, shape) in shapes.items():
-        if not _has_shape(table, shape):
+        if not has_shape(table, shape):
             raise InputError(f"{label}, key {key}: does not have the shape {shape}")
 
 
-def _has_shape(table: list[Any], shape: tuple[int, ...]) -> bool:
+def has_shape(table: list[Any], shape: tuple[int, ...]) -> bool:
+    """Whether nested lists have a shape."""
     if len(table) != shape[0]:
         return False
-    return len(shape) == 1 or all(_has_shape(part, shape[1:]) for part in table)
+    return len(shape) == 1 or all(has_shape(part, shape[1:]) for part in table)
 
 
 def _check_consistent(record: ScoreContent, label: str) -> None:
@@ -386,7 +407,7 @@ def _check_submission(submission: RecordedSubmission, where: str) -> None:
         raise InputError(f"{where}.sha256: is not that of its files")
 
 
-def _check_origin(record: ScoreContent, label: str) -> None:
+def _check_origin(record: ScoreContent | HardwareContent, label: str) -> None:
     """Refuse a record that does not say by which versions and on what machine it was made."""
     for table, keys in (("versions", REQUIRED_VERSIONS), ("machine", REQUIRED_MACHINE)):
         for key in keys:

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 
 from ventbench import files, protocol
 from ventbench.board import actions, attestation, canonical, record, schema
+from ventbench.board.hardware import HardwareRecord
 from ventbench.board.layout import CHAIN, RECORDS
-from ventbench.board.record import Record, Withdrawal
+from ventbench.board.record import AnyRecord, Record, Withdrawal
 from ventbench.errors import InputError
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ class Store:
 
     folder: Path
     links: tuple[Link, ...]
-    records: tuple[Record | Withdrawal, ...]
+    records: tuple[AnyRecord, ...]
     attested: frozenset[str]
 
     @property
@@ -74,7 +75,7 @@ class Store:
         return [entry for entry in self.records if isinstance(entry, Record)]
 
 
-def chain_line(index: int, added: Record | Withdrawal, previous: str) -> bytes:
+def chain_line(index: int, added: AnyRecord, previous: str) -> bytes:
     """Return the chain's line of a record.
 
     Args:
@@ -143,7 +144,7 @@ def read_chain(folder: Path) -> list[Link]:
     return parse_chain(path.read_bytes(), str(path)) if path.exists() else []
 
 
-def read_record(folder: Path, link: Link, *, strict: bool = False) -> Record | Withdrawal:
+def read_record(folder: Path, link: Link, *, strict: bool = False) -> AnyRecord:
     """Read the record that a line of the chain names.
 
     Args:
@@ -201,12 +202,14 @@ def find_record(store: Store, sha256: str) -> Record:
     return matches[0]
 
 
-def add(folder: Path, path: Path, simulators: ReplayPlants | None = None) -> Record:
+def add(
+    folder: Path, path: Path, simulators: ReplayPlants | None = None
+) -> Record | HardwareRecord:
     """Add a record to a leaderboard.
 
     Args:
         folder: of the leaderboard; made if missing.
-        path: of the record; its action file lies beside it.
+        path: of the record; its action file lies beside it, that of a hardware record excepted.
         simulators: to replay it on first; not replayed if not given.
 
     Returns:
@@ -217,17 +220,20 @@ def add(folder: Path, path: Path, simulators: ReplayPlants | None = None) -> Rec
         OSError: if a file cannot be read or written.
     """
     store, added = load(folder), record.load(path)
-    if not isinstance(added, Record):
+    if isinstance(added, Withdrawal):
         raise InputError(f"{path} is a withdrawal; use ventbench board withdraw")
     if added.version != protocol.VERSION:
         raise InputError(
             f"{path} is of protocol version {added.version}; this ventbench scores and replays "
             f"version {protocol.VERSION}"
         )
-    requested = actions.load(added, path.parent)
     problems = conflicts([*store.records, added], start=len(store.records))
     if problems:
         raise InputError(f"{path}: {'; '.join(problems)}")
+    if isinstance(added, HardwareRecord):  # no commands to replay: its pressures are measured
+        _append(store, added, path.read_bytes())
+        return added
+    requested = actions.load(added, path.parent)
     if simulators is not None:
         from ventbench.board.replay import differences, replay
 
@@ -256,7 +262,11 @@ def withdraw(folder: Path, sha256: str, reason: str) -> Withdrawal:
         InputError: if there is no such record, no reason, or it was withdrawn before.
     """
     store = load(folder)
-    withdrawn = find_record(store, sha256).sha256
+    kept = [entry for entry in store.records if not isinstance(entry, Withdrawal)]
+    matches = [entry.sha256 for entry in kept if entry.sha256.startswith(sha256)]
+    if len(matches) != 1:
+        raise InputError(f"{store.folder} holds no single record that begins with {sha256!r}")
+    withdrawn = matches[0]
     if any(isinstance(x, Withdrawal) and x.withdraws == withdrawn for x in store.records):
         raise InputError(f"record {withdrawn[:12]} is withdrawn already")
     content = record.withdrawal(withdrawn, reason)
@@ -266,7 +276,7 @@ def withdraw(folder: Path, sha256: str, reason: str) -> Withdrawal:
     return withdrawal
 
 
-def _append(store: Store, added: Record | Withdrawal, content: bytes) -> None:
+def _append(store: Store, added: AnyRecord, content: bytes) -> None:
     """Write the record, then the chain: a crash between leaves a file that nothing names."""
     path = store.folder / RECORDS / f"{added.sha256}{record.SUFFIX}"
     files.write_atomically(path, lambda file: file.write(content))
@@ -276,7 +286,7 @@ def _append(store: Store, added: Record | Withdrawal, content: bytes) -> None:
     files.write_atomically(path, lambda file: file.write(lines))
 
 
-def conflicts(records: Sequence[Record | Withdrawal], start: int = 0) -> list[str]:
+def conflicts(records: Sequence[AnyRecord], start: int = 0) -> list[str]:
     """Find records that contradict those before them: what no record can say by itself.
 
     Args:
@@ -304,6 +314,7 @@ class _Before:
         first_of_name: first record of each entry's name, on any track.
         newest: of each entry, by version, track and name.
         known: all scores, by their hash.
+        hardware: hashes of all hardware records.
         withdrawn: hashes of those that were taken back.
     """
 
@@ -311,11 +322,15 @@ class _Before:
     first_of_name: dict[str, Record] = field(default_factory=dict)
     newest: dict[tuple[int, str, str], Record] = field(default_factory=dict)
     known: dict[str, Record] = field(default_factory=dict)
+    hardware: set[str] = field(default_factory=set)
     withdrawn: set[str] = field(default_factory=set)
 
-    def append(self, entry: Record | Withdrawal) -> None:
+    def append(self, entry: AnyRecord) -> None:
         if isinstance(entry, Withdrawal):
             self.withdrawn.add(entry.withdraws)
+            return
+        if isinstance(entry, HardwareRecord):
+            self.hardware.add(entry.sha256)
             return
         self.first_of_version.setdefault(entry.version, entry)
         self.first_of_name.setdefault(entry.name, entry)
@@ -323,19 +338,19 @@ class _Before:
         self.known[entry.sha256] = entry
 
 
-def _conflicts(entry: Record | Withdrawal, before: _Before) -> list[str]:
+def _conflicts(entry: AnyRecord, before: _Before) -> list[str]:
     name = f"record {entry.sha256}"
     if isinstance(entry, Withdrawal):
-        if entry.withdraws not in before.known:
+        if entry.withdraws not in before.known and entry.withdraws not in before.hardware:
             return [f"{name} withdraws {entry.withdraws[:12]}, which is not there"]
         if entry.withdraws in before.withdrawn:
             return [f"{name} withdraws {entry.withdraws[:12]} once more"]
         return []
-    if entry.sha256 in before.known:
+    if entry.sha256 in before.known or entry.sha256 in before.hardware:
         return [f"{name} is on the leaderboard already"]
     sentences = []
     first = before.first_of_version.get(entry.version)
-    if first is not None:
+    if first is not None and isinstance(entry, Record):
         # Records of one version can only be compared over the same simulators and draws.
         pairs = zip(("simulators", "draws"), entry.basis, first.basis, strict=True)
         sentences = [
@@ -350,6 +365,8 @@ def _conflicts(entry: Record | Withdrawal, before: _Before) -> list[str]:
             f"{name} ({entry.name}), key submission.manifest.authors: the name belongs to the "
             f"authors of record {owner.sha256[:12]}; choose another name"
         )
+    if isinstance(entry, HardwareRecord):
+        return sentences
     superseded, newest = entry.header.supersedes, before.newest.get(entry.key)
     if superseded is None:
         if newest is not None:

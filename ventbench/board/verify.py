@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ventbench import draws, protocol
 from ventbench.board import actions, attestation, build, canonical, layout, ranking, record, store
-from ventbench.board.record import Record, Withdrawal
+from ventbench.board.record import AnyRecord, Record
 from ventbench.board.replay import BATCH, ReplayPlants, deviation, differences, replay
 from ventbench.errors import InputError
 
@@ -79,7 +79,7 @@ def verify(
     report.head = store.chain_head(links)
     if head is not None and head not in {store.CHAIN_START, *(link.sha256 for link in links)}:
         report.problems.append(f"{folder / store.CHAIN} does not hold the line {head}")
-    entries: list[Record | Withdrawal] = []
+    entries: list[AnyRecord] = []
     for link in links:
         try:
             entries.append(store.read_record(folder, link, strict=True))
@@ -164,7 +164,7 @@ def _check_replay(
 
 
 def _check_ranks(
-    entries: Sequence[Record | Withdrawal],
+    entries: Sequence[AnyRecord],
     attested: Container[str],
     by_draw: Mapping[str, Floats],
 ) -> list[str]:

@@ -44,9 +44,12 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """Arguments of each diagnosis, which is the same made-up one every time."""
     seen: list[dict[str, Any]] = []
 
-    def diagnose(breaths, *, simulator, lung, passive, progress):
+    def diagnose(breaths, *, simulator, lung, passive, drive, progress):
         progress("fitting", 0.5)
-        seen.append({"breaths": breaths, "simulator": simulator, "lung": lung, "passive": passive})
+        seen.append(
+            {"breaths": breaths, "simulator": simulator, "lung": lung, "passive": passive,
+             "drive": drive}
+        )  # fmt: skip
         return made.diagnosis(12)
 
     module = types.ModuleType("ventbench.diagnosis.diagnose")

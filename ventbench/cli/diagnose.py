@@ -20,6 +20,22 @@ def diagnose(
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")],
     plant: PlantName = "physics",
+    simulated: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Instead of --plant: CSV or Parquet with breath_id, a column simulated (cmH2O) "
+            "and perhaps time_step (s); may be the recording itself with that column.",
+        ),
+    ] = None,
+    drive: Annotated[
+        str,
+        typer.Option(
+            metavar="valve|flow",
+            help="What the model follows: the recorded commands, or the recorded flow. By default "
+            "the flow only if u_in is zero throughout.",
+        ),
+    ] = "auto",
     lung: Annotated[
         str | None, typer.Option(metavar="R20C50", help="Only the breaths of this lung.")
     ] = None,
@@ -42,12 +58,21 @@ def diagnose(
     diagnosis.json, report.html, diagnosis.rrd and, if the simulator has plants, corrected.json,
     which every `--plant` option accepts.
 
+    Sampling rates from 20 to 1000 Hz are taken as they are. A simulator in plain Python is
+    `--plant module:function`; one in another program writes `--simulated answers.csv`.
+
     Example: `ventbench diagnose recording.csv --lung R20C50 --out runs/diagnosis`
     """
     from rich.console import Console
 
     from ventbench import extras
     from ventbench import recordings as files
+    from ventbench.errors import InputError
+
+    if drive not in ("auto", "valve", "flow"):
+        raise InputError(f"--drive {drive}: choose auto, valve or flow")
+    if simulated is not None and plant != "physics":
+        raise InputError("--simulated stands in place of --plant; give one of them")
 
     extras.require("jinja2", "rerun")
     progress = Console(stderr=True)
@@ -55,7 +80,7 @@ def diagnose(
         breaths = files.load(recordings, clip=clip, pad=pad)
     for note in breaths.notes:
         progress.print(f"note: {note}", markup=False, highlight=False)
-    diagnosis = _diagnose(breaths, plant, lung, passive)
+    diagnosis = _diagnose(breaths, plant, simulated, lung, passive, drive)
     written = diagnosis.save(out)
     emit(diagnosis.as_dict(), json)
     console = Console(stderr=str(json) == "-")
@@ -67,17 +92,20 @@ def diagnose(
         console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
 
 
-def _diagnose(breaths: Breaths, plant: str, lung: str | None, passive: bool) -> Diagnosis:
+def _diagnose(
+    breaths: Breaths, plant: str, simulated: Path | None, lung: str | None, passive: bool,
+    drive: str,
+) -> Diagnosis:  # fmt: skip
     """Diagnose with a progress bar."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from ventbench import compilation
     from ventbench.diagnosis.diagnose import diagnose as find
-    from ventbench.plants.catalog import load_simulators
+    from ventbench.plants.catalog import load_simulated, load_simulators
 
     compilation.keep()
-    simulators = load_simulators(plant)
+    simulators = load_simulated(simulated, breaths) if simulated else load_simulators(plant)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
         task = bars.add_task("diagnosing", total=1.0)
@@ -85,7 +113,14 @@ def _diagnose(breaths: Breaths, plant: str, lung: str | None, passive: bool) -> 
         def progress(what: str, share: float) -> None:
             bars.update(task, description=what, completed=share)
 
-        return find(breaths, simulator=simulators, lung=lung, passive=passive, progress=progress)
+        return find(
+            breaths,
+            simulator=simulators,
+            lung=lung,
+            passive=passive,
+            drive=drive,  # type: ignore[arg-type]
+            progress=progress,
+        )
 
 
 def register(app: typer.Typer) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 
-from ventbench.diagnosis import estimates
+from ventbench.diagnosis import estimates, flow_drive
 from ventbench.diagnosis.conclusion import Conclusion
 from ventbench.diagnosis.corrected import Correction, correct
 from ventbench.diagnosis.experiment_design import request_breaths
@@ -27,12 +28,22 @@ from ventbench.diagnosis.simulator_comparison import (
 from ventbench.errors import InputError
 from ventbench.lungs import lung as parse_lung
 from ventbench.mechanics.labels import LungMatch
+from ventbench.physics.catalogue import parameter
 from ventbench.plants.catalog import Given, Simulators, load_simulators
 from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.decimation import decimate, is_fast
 from ventbench.system_id import Fit, Noise, make_data
 
 #: Receives the current step in words, and the share of the whole that is done.
 Progress: TypeAlias = Callable[[str, float], None]
+
+#: What a diagnosis follows.
+Drive: TypeAlias = Literal["auto", "valve", "flow"]
+
+_NOTE_ON_FLOW = (
+    "No valve command: the recorded flow drives the model, so nothing is said of the valves, R_ex "
+    "and PEEP, and an offset of the flow sensor looks like a leak."
+)
 
 
 def diagnose(
@@ -41,6 +52,7 @@ def diagnose(
     simulator: Given = "physics",
     lung: str | None = None,
     passive: bool = False,
+    drive: Drive = "auto",
     progress: Progress | None = None,
     settings: SelectionConfig = DEFAULT,
 ) -> Diagnosis:
@@ -56,15 +68,20 @@ def diagnose(
             ``"two_balloon"``), a path to a plant file, a plant, plants by lung id, an array of
             simulated pressures of these breaths, cmH2O, ``(n, T)``, or a Python function of one
             breath's commands, ``f(u_in, u_out, dt, *, R, C, initial_pressure)``, that returns the
-            pressures, cmH2O, ``(T,)``; see :class:`~ventbench.plants.catalog.PressureFunction`.
+            pressures, cmH2O, ``(T,)``, or a class with ``step``, in plain Python or NumPy; see
+            :mod:`~ventbench.plants.python_simulator`.
         lung: use only the breaths of this label.
         passive: True if nobody breathes, as with a test lung: patient efforts are excluded.
+        drive: what the model follows: ``"valve"``, the recorded commands; ``"flow"``, the recorded
+            flow, which says nothing of the valves; ``"auto"``, the flow only if ``u_in`` is zero
+            throughout, so that no command was recorded.
         progress: receives the current step in words, and the share that is done.
         settings: every threshold.
 
     Returns:
         The diagnosis. Functions and arrays have no plants, so that ``plants`` is empty; the
-        corrected pressures are in ``corrected_pressures``.
+        corrected pressures are in ``corrected_pressures``. Of a recording faster than about 65 Hz,
+        ``traces`` has some of the samples (see :mod:`ventbench.recordings.decimation`).
 
     Raises:
         InputError: if there are too few breaths, or no simulator for their lung.
@@ -84,12 +101,31 @@ def diagnose(
     simulators = load_simulators(simulator, breaths=breaths)
     if lung is not None:
         breaths = _of_lung(breaths, parse_lung(lung).id)
+    by_flow = drive == "flow" or (drive == "auto" and flow_drive.lacks_commands(breaths))
+    notes_on_flow: list[str] = []
+    if by_flow:
+        breaths, notes_on_flow = flow_drive.with_flow(breaths)
     breaths, notes = usable(breaths, settings.data)
-    held = held_out(breaths, settings.data)
-    tell("simulating", 0.02)
-    before = simulators.pressures(breaths)
-    data = make_data(breaths)
+    recorded, held = breaths, held_out(breaths, settings.data)
     excluded = ("patient_effort",) if passive else ()
+    tell("simulating", 0.02)
+    if by_flow:
+        driven, index = flow_drive.drive_grid(recorded)
+        before = flow_drive.simulate(simulators, recorded, driven, index)
+        data = make_data(driven)
+        u_out = np.take_along_axis(recorded.u_out, index, axis=1)
+        breaths = replace(driven, u_out=u_out)  # phases of the report are those of the recording
+        excluded += flow_drive.VENTILATOR_SIDE
+        settings = flow_drive.without_ventilator(settings)
+        notes += [*notes_on_flow, _NOTE_ON_FLOW]
+    else:
+        before = simulators.pressures(breaths)
+        if is_fast(breaths):
+            rate = 1.0 / float(np.median(breaths.dt[breaths.valid]))
+            grid = decimate(breaths)
+            breaths, before = grid.breaths, grid.of(before)
+            notes.append(_note_on_rate(rate, breaths))
+        data = make_data(breaths)
     recording_only_model = identify(data, held, excluded, lambda what: tell(what, 0.3), settings)
     recording_model, simulator_model = recording_only_model, None
     if not simulators.is_base_physics:
@@ -113,9 +149,13 @@ def diagnose(
     rejected = correction.unchanged and (bool(missing) or term is not None)
     if rejected:
         missing, term, notes_on_simulator = {}, None, [_note_on_unchanged(correction)]
-    lungs, notes_on_lungs = _lungs(breaths, recording_only_model.fit)
+    lungs, notes_on_lungs = _lungs(recorded, recording_only_model.fit)
     noise, pressures = conclusion.noise, correction.pressures
-    flow, volume = flow_and_volume(breaths, recording_model.fit, pressures["refit"])
+    if by_flow and breaths.flow is not None:
+        flow = breaths.flow
+        volume = np.cumsum(data.u_in * data.dt, axis=1) * float(parameter("gain").neutral)
+    else:
+        flow, volume = flow_and_volume(breaths, recording_model.fit, pressures["refit"])
     here = np.flatnonzero(~np.isnan(pressures["refit"]).all(axis=1))
     location = locate(
         breaths.select(here), pressures["refit"][here], noise.sigma[0], flow[here], volume[here],
@@ -135,7 +175,7 @@ def diagnose(
             breaths, held, pressures, float(noise.sigma[0]), settings.residuals
         ),
         lungs=lungs,
-        request=None if rejected else _request(conclusion, settings),
+        request=None if rejected or by_flow else _request(conclusion, settings),
         traces=Traces(breaths, held, pressures["before"], pressures["refit"], pressures["after"],
                       flow, volume),
         plants=correction.plants,
@@ -145,6 +185,16 @@ def diagnose(
         settings=settings,
         seconds=time.perf_counter() - began,
     )  # fmt: skip
+
+
+def _note_on_rate(rate: float, breaths: Breaths) -> str:
+    """Note on what was kept of a fast recording."""
+    kept = breaths.valid.sum(axis=1)
+    readings = np.isfinite(breaths.pressure).sum(axis=1)
+    return (
+        f"Recorded at {rate:.0f} Hz: {int(np.median(readings))} readings of a breath are used, "
+        f"and {int(np.median(kept))} samples of its commands, whose changes keep their times."
+    )
 
 
 def _of_lung(breaths: Breaths, lung: str) -> Breaths:

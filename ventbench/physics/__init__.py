@@ -1,7 +1,7 @@
 """Model of a lung on its ventilator: base model, mechanisms and nonparametric components."""
 
 from ventbench.physics.catalogue import library, mechanism, parameter, paths, strength_path
-from ventbench.physics.dead_time import resolution
+from ventbench.physics.dead_time import resolution, resolution_of
 from ventbench.physics.mechanism import Description, Mechanism
 from ventbench.physics.model import Physics, PhysicsState, physics
 from ventbench.physics.parameters import Parameter
@@ -18,5 +18,6 @@ __all__ = [
     "paths",
     "physics",
     "resolution",
+    "resolution_of",
     "strength_path",
 ]

@@ -7,7 +7,9 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from numpy.typing import NDArray
 
 from ventbench.physics.mechanism import apply_if_active
 
@@ -17,6 +19,9 @@ SUBSTEPS, MEMORY = 5, 6
 #: Longest dead time, and longest substep, s.
 LONGEST_DEAD_TIME, LONGEST_SUBSTEP = 0.15, 0.007
 
+#: Quantile of uneven sampling intervals that decides on their substeps.
+_LONG = 0.9
+
 #: Length of the substep before a sample, s.
 LAST_SUBSTEP = 0.001
 
@@ -24,6 +29,24 @@ LAST_SUBSTEP = 0.001
 def resolution(dt: float) -> tuple[int, int]:
     """Numbers of substeps and of past samples that samples of ``dt`` seconds need."""
     return max(4, round(dt / LONGEST_SUBSTEP + 0.4)), math.ceil(LONGEST_DEAD_TIME / dt) + 1
+
+
+def resolution_of(dt: NDArray[np.float64]) -> tuple[int, int]:
+    """Numbers of substeps and of past samples that unevenly spaced samples need.
+
+    Args:
+        dt: intervals between samples, s, ``(n, T)``.
+    """
+    substeps, memory = resolution(float(np.median(dt)))
+    substeps = max(substeps, resolution(float(np.quantile(dt, _LONG)))[0])
+    # Where samples lie close together, more of them are needed to reach back as far.
+    passed = np.cumsum(dt, axis=1)
+    for row in passed:
+        reaches = np.searchsorted(row, row + LONGEST_DEAD_TIME)
+        whole = reaches < len(row)
+        if whole.any():
+            memory = max(memory, int((reaches - np.arange(len(row)))[whole].max()) + 1)
+    return substeps, memory
 
 
 def windows(

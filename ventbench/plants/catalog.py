@@ -1,8 +1,8 @@
 """The simulators behind every ``--plant``: one resolver for names, files, functions and arrays.
 
-====================================  ===========================================================
+====================================  ============================================================
 What is given                         What it stands for
-====================================  ===========================================================
+====================================  ============================================================
 ``frozen`` (or ``hybrid``)            the official simulators
 ``learned``                           the paper's networks, trained on the same breaths
 ``physics``                           R-C lungs at their labels
@@ -10,12 +10,13 @@ What is given                         What it stands for
 ``FILE.json``, ``FILE.npz``           plants of some lungs, such as a ``corrected.json``
 ``FOLDER``                            what ``ventbench train simulator`` wrote
 ``FILE.csv``, ``FILE.parquet``        simulated pressures of recorded breaths, in the public schema
-``module:name``                       a Python function of commands, a plant, or plants by lung
+``module:name``                       a function or class in plain Python, or a plant; or a mapping
 a plant                               that plant for every lung
-a mapping                             plants by lung id
-a function                            ``f(u_in, u_out, dt, *, R, C, initial_pressure)``
+a mapping                             plants, functions or classes by lung id
+a function, class or object           a simulator in plain Python or NumPy; see
+                                      :mod:`~ventbench.plants.python_simulator`
 an array                              simulated pressures of given breaths
-====================================  ===========================================================
+====================================  ============================================================
 """
 
 from __future__ import annotations
@@ -42,10 +43,12 @@ from ventbench.lungs import LUNGS, Lung, lung
 from ventbench.physics import physics
 from ventbench.plants import frozen
 from ventbench.plants.plant_files import load_plants
+from ventbench.plants.python_simulator import PythonSimulator, is_jax_plant, python_simulator
 from ventbench.plants.registry import FAMILIES
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import VmappedPlant, nominal_plants, stack_heterogeneous, take
 from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.simulated import read_simulated
 from ventbench.rollouts import PlantsFor, open_loop, open_loop_breaths
 
 Floats = NDArray[np.float64]
@@ -116,7 +119,7 @@ class Simulators:
     _cross_fitted: PlantsFor | None = None
     _training: frozen.Frozen | None = field(default=None, repr=False)
     _make: Callable[[Lung], Plant] | None = None
-    _function: PressureFunction | None = None
+    _function: PythonSimulator | None = None
     _table: Mapping[int, tuple[Lung, Floats, Floats]] = field(default_factory=dict, repr=False)
 
     @property
@@ -226,7 +229,15 @@ class Simulators:
             return self._by_function(self._function, breaths)
         if self._for_breaths is None:
             return self._by_table(breaths)
-        return open_loop_breaths(self.cross_fitted if cross_fitted else self.for_breaths, breaths)
+        plants_for = self.cross_fitted if cross_fitted else self.for_breaths
+        try:
+            return open_loop_breaths(plants_for, breaths)
+        except jax.errors.JAXTypeError as error:
+            raise InputError(
+                f"{self.name}: JAX cannot trace this plant's init or step "
+                f"({str(error).splitlines()[0]}); write them with jax.numpy, or do not register "
+                "the class as a pytree: plain NumPy is then run sample by sample"
+            ) from error
 
     def respond(
         self, lung_id: str, u_in: Floats, u_out: Floats, dt: Floats, *, initial_pressure: float
@@ -262,26 +273,33 @@ class Simulators:
             return f"{self.name} is a function of whole commands, not a plant with init and step."
         return f"{self.name} holds simulated pressures of recorded breaths, not a simulator."
 
-    def _by_function(self, function: PressureFunction, breaths: Breaths) -> Floats:
+    def _by_function(self, function: PythonSimulator, breaths: Breaths) -> Floats:
         answers = np.full(breaths.pressure.shape, np.nan)
         for i, start in enumerate(breaths.pressure[:, 0].tolist()):
             if np.isfinite(start):
                 label = Lung(float(breaths.R[i]), float(breaths.C[i]))
-                commands = breaths.u_in[i], breaths.u_out[i].astype(float), breaths.dt[i]
+                samples = breaths.valid[i]
+                commands = (
+                    column[i, samples] for column in (breaths.u_in, breaths.u_out, breaths.dt)
+                )
+                flow = None if breaths.flow is None else breaths.flow[i, samples].copy()
                 what = f"breath {breaths.breath_id[i]}"
-                answers[i] = self._call(function, *commands, label, start, what)
+                answer = self._call(function, *commands, label, start, what, flow)
+                answers[i, samples], answers[i, ~samples] = answer, answer[-1]
         return answers
 
     def _call(
-        self, function: PressureFunction, u_in: Floats, u_out: Floats, dt: Floats, label: Lung,
-        start: float, what: str,
+        self, function: PythonSimulator, u_in: Floats, u_out: Floats, dt: Floats, label: Lung,
+        start: float, what: str, flow: Floats | None = None,
     ) -> Floats:  # fmt: skip
         try:
             answer = function(
                 np.array(u_in, float), np.array(u_out, float), np.array(dt, float),
-                R=label.R, C=label.C, initial_pressure=float(start),
+                R=label.R, C=label.C, initial_pressure=float(start), flow=flow,
             )  # fmt: skip
             pressure = np.asarray(answer, float)
+        except InputError as error:
+            raise InputError(f"{what} of lung {label}: {error}") from error
         except Exception as error:
             raise InputError(
                 f"{self.name} raised {type(error).__name__} at {what} of lung {label}: {error}"
@@ -350,15 +368,68 @@ def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) 
     if isinstance(given, str | Path):
         return _by_text(str(given))
     if isinstance(given, Mapping):
+        if any(_is_python(value) for value in given.values()):
+            return _python_by_lung(given, "the given simulators")
         digest = _leaves_sha256(given)
         about = {"kind": "plants", "sha256": digest}
         return _plants(dict(given), "the given plants", about, digest)
-    if isinstance(given, Plant) and not isinstance(given, type):
-        return _single(given, type(given).__name__, _leaves_sha256(given))
-    if callable(given):
+    if _is_python(given):
         name = getattr(given, "__qualname__", type(given).__name__)
         return _of_function(given, name)
+    if isinstance(given, Plant):
+        return _single(given, type(given).__name__, _leaves_sha256(given))
     return _of_array(given, breaths)
+
+
+def load_simulated(path: str | Path, breaths: Breaths) -> Simulators:
+    """Load simulated pressures that stand in a table beside the recorded ones.
+
+    Args:
+        path: CSV or Parquet; see :func:`~ventbench.recordings.simulated.read_simulated`.
+        breaths: the recording that they answer to.
+
+    Raises:
+        InputError: if the table has no such pressures for a breath.
+    """
+    digest, name = files.sha256(Path(path)) if Path(path).is_file() else None, Path(path).name
+    pressures = read_simulated(path, breaths)
+    about: dict[str, Any] = {"kind": "pressures", "file": name, "sha256": digest}
+    return _of_pressures(breaths, pressures, name, about, digest)
+
+
+def _is_python(value: Any) -> bool:
+    """Whether a value is a simulator in plain Python: a function, or a class or object with step.
+
+    Arrays, and pytrees that JAX can trace, are none.
+    """
+    if isinstance(value, np.ndarray | jax.Array) or is_jax_plant(value):
+        return False
+    return callable(value) or hasattr(value, "step")
+
+
+def _python_by_lung(given: Mapping[str, Any], name: str, sha256: str | None = None) -> Simulators:
+    """Simulators in plain Python by lung id."""
+    by_lung = {}
+    for key, value in given.items():
+        if not _is_python(value):
+            raise InputError(
+                f"{name}, lung {key}: a {type(value).__name__} beside functions and classes; give "
+                "plants alone, or functions and classes alone"
+            )
+        label = lung(key)
+        by_lung[label.R, label.C] = python_simulator(value, f"{name}, lung {key}")
+
+    def run(arguments: dict[str, Any]) -> ArrayLike:
+        label = arguments["R"], arguments["C"]
+        if label not in by_lung:
+            known = ", ".join(lung(key).id for key in given)
+            raise InputError(f"{name} have no such lung; they have {known}")
+        return by_lung[label].run(arguments)
+
+    about: dict[str, Any] = {"kind": "function", "function": name, "lungs": sorted(given)}
+    if sha256 is not None:
+        about["sha256"] = sha256
+    return Simulators("function", name, about, sha256=sha256, _function=PythonSimulator(name, run))
 
 
 def _leaves_sha256(plants: Any) -> str:
@@ -502,7 +573,8 @@ def _of_function(function: Any, name: str, sha256: str | None = None) -> Simulat
     about: dict[str, Any] = {"kind": "function", "function": name}
     if sha256 is not None:
         about["sha256"] = sha256
-    return Simulators("function", name, about, sha256=sha256, _function=function)
+    adapted = python_simulator(function, name)
+    return Simulators("function", name, about, sha256=sha256, _function=adapted)
 
 
 def _imported(module: str, attribute: str) -> Simulators:
@@ -521,11 +593,13 @@ def _imported(module: str, attribute: str) -> Simulators:
     source = inspect.getsourcefile(loaded)
     digest = files.sha256(Path(source)) if source is not None else None
     if isinstance(value, Mapping):
+        if any(_is_python(entry) for entry in value.values()):
+            return _python_by_lung(value, text, digest)
         return _plants(dict(value), text, {"kind": "plants", "module": text}, digest)
-    if isinstance(value, Plant) and not isinstance(value, type):
-        return _single(value, text, digest)
-    if callable(value):
+    if _is_python(value):
         return _of_function(value, text, digest)
+    if isinstance(value, Plant):
+        return _single(value, text, digest)
     raise InputError(
         f"--plant {text}: a {type(value).__name__} is neither a function, a plant nor plants by "
         "lung id"

@@ -15,7 +15,7 @@ from jax import Array
 
 from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import parameter
-from ventbench.physics.dead_time import resolution
+from ventbench.physics.dead_time import resolution_of
 from ventbench.physics.model import Physics
 from ventbench.precision import float64
 from ventbench.system_id.data import Data, Floats
@@ -105,7 +105,7 @@ class Predictor:
         self._part = next((size for size in sizes if size >= len(data)), sizes[-1])
         parts = max(-(-len(data) // self._part), 1)
         padded = data.padded(parts * self._part)
-        enough, memory = resolution(float(np.median(data.dt)))
+        enough, memory = resolution_of(data.dt)
         self.substeps, self.memory = substeps or enough, memory
         flow = data.measured.shape[1] > 1
         self._static = {

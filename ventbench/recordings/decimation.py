@@ -1,0 +1,173 @@
+"""Recordings at high sampling rates, on a coarser grid that keeps the commands as they were.
+
+Averaging or interpolating commands to a lower rate moves their edges; a simulator that follows them
+then seems to lag. Here, a sample is kept wherever a command changes. Between two kept samples the
+commands are constant up to a small tolerance and stand at their mean, so that the delivered volume
+is exact. Readings are those of the kept samples, never averages.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
+
+#: Median sampling interval, s, below which a recording is decimated. The dynamics that pressure can
+#: show have time constants of 10 ms and more.
+FAST = 0.015
+
+#: Interval of the readings that are kept, s.
+_READINGS = 0.02
+
+#: Least time between two readings that are kept, s: where commands change at every sample, more
+#: readings would only weigh a few milliseconds of the breath more than the rest.
+_LEAST = 0.005
+
+#: Largest departure of a command from its mean between two kept samples, %. At R = 50 it makes a
+#: difference of 0.3 cmH2O for a few milliseconds.
+_TOLERANCE = 0.25
+
+#: Most samples of a breath. A command that follows the noise of a fast sensor changes at every
+#: sample; the tolerance is then raised, since the lung averages such changes.
+_MOST = 400
+
+#: Factor by which the tolerance is raised.
+_COARSER = 1.6
+
+#: Numbers of samples are multiples of this, so that compiled functions are used again.
+_MULTIPLE = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Decimation:
+    """Breaths on a coarser grid.
+
+    Attributes:
+        breaths: n breaths; pressures at samples that are only kept for a command are blank.
+        index: sample of the full recording at each kept sample, ``(n, T)``; padding repeats the
+            last.
+    """
+
+    breaths: Breaths
+    index: NDArray[np.int64]
+
+    def of(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values at the kept samples, ``(n, T)``, of values at all samples."""
+        return np.take_along_axis(values, self.index, axis=1)
+
+
+def is_fast(breaths: Breaths) -> bool:
+    """Whether breaths are sampled so fast that a diagnosis decimates them."""
+    return bool(np.median(breaths.dt[breaths.valid]) < FAST)
+
+
+def decimate(breaths: Breaths) -> Decimation:
+    """Keep a reading every 20 ms and a sample at every change of a command.
+
+    Args:
+        breaths: n breaths at any rate, for instance 1000 Hz.
+
+    Returns:
+        The breaths with ``valid``, ``time`` and ``dt`` of the kept samples; ``time_inferred``,
+        labels and ids are the same. ``sha256`` still names the file.
+    """
+    lengths = breaths.valid.sum(axis=1)
+    kept = [_kept(breaths, i, int(length)) for i, length in enumerate(lengths)]
+    counts = np.array([len(nodes) for nodes in kept])
+    columns: dict[str, list[NDArray]] = {name: [] for name in ("time", *FILL)}
+    for i, nodes in enumerate(kept):
+        time = breaths.time[i, nodes]
+        columns["time"].append(time)
+        columns["u_out"].append(breaths.u_out[i, nodes])
+        columns["u_in"].append(_means(breaths.u_in[i], breaths.dt[i], nodes))
+        reading = breaths.pressure[i, nodes].copy()
+        reading[~_spaced(time)] = np.nan
+        columns["pressure"].append(reading)
+        for name in ("flow", "volume"):
+            values = getattr(breaths, name)
+            columns[name].append(np.zeros(0) if values is None else values[i, nodes])
+    width = -(-int(counts.max()) // _MULTIPLE) * _MULTIPLE
+    flat = {name: np.concatenate(parts) for name, parts in columns.items()}
+    time, dt = _widened(*stack_times(flat["time"], counts), width)
+    optional = {
+        name: None
+        if getattr(breaths, name) is None
+        else _wide(stack(flat[name], counts, np.nan), width, np.nan)
+        for name in ("flow", "volume")
+    }
+    index = np.stack([np.append(nodes, np.full(width - len(nodes), nodes[-1])) for nodes in kept])
+    fewer = replace(
+        breaths,
+        time=time,
+        dt=dt,
+        u_in=_wide(stack(flat["u_in"], counts, FILL["u_in"]), width, FILL["u_in"]),
+        u_out=_wide(stack(flat["u_out"], counts, FILL["u_out"]), width, FILL["u_out"]),
+        pressure=_wide(stack(flat["pressure"], counts, np.nan), width, np.nan),
+        valid=_wide(valid_mask(counts), width, False),
+        **optional,
+    )
+    return Decimation(fewer, index)
+
+
+def _kept(breaths: Breaths, i: int, length: int) -> NDArray[np.int64]:
+    """Samples of a breath that are kept, in order; the first and the last are among them."""
+    time, u_out = breaths.time[i, :length], breaths.u_out[i, :length]
+    every = max(_READINGS, time[-1] / (_MOST / 2))
+    # The first sample at or after each multiple of the interval.
+    readings = np.searchsorted(time, np.arange(0.0, time[-1] + every, every) - 1e-9)
+    switched = np.flatnonzero(np.diff(u_out)) + 1
+    fixed = np.concatenate([readings[readings < length], switched, [0, length - 1]])
+    tolerance = _TOLERANCE
+    while True:
+        nodes = np.unique(np.concatenate([fixed, _changes(breaths.u_in[i, :length], tolerance)]))
+        if len(nodes) <= max(_MOST, len(np.unique(fixed)) + 2):
+            return nodes
+        tolerance *= _COARSER
+
+
+def _changes(u_in: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
+    """First samples of runs in which the command stays within a band of twice the tolerance."""
+    starts, low, high = [0], u_in[0], u_in[0]
+    for k, value in enumerate(u_in.tolist()):
+        low, high = min(low, value), max(high, value)
+        if high - low > 2.0 * tolerance:
+            starts.append(k)
+            low = high = value
+    return np.array(starts)
+
+
+def _means(
+    u_in: NDArray[np.float64], dt: NDArray[np.float64], nodes: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Mean command from each kept sample to the next, ``(k,)``; the last stands as it is."""
+    volume = np.concatenate([[0.0], np.cumsum(u_in * dt)])
+    passed = np.concatenate([[0.0], np.cumsum(dt)])
+    means = np.diff(volume[nodes]) / np.diff(passed[nodes])
+    return np.append(means, u_in[nodes[-1]])
+
+
+def _spaced(time: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether a sample comes long enough after the last reading that is kept, ``(k,)``."""
+    kept, last = np.zeros(len(time), bool), -np.inf
+    for k, now in enumerate(time.tolist()):
+        if now - last >= _LEAST - 1e-9:
+            kept[k], last = True, now
+    return kept
+
+
+def _wide(values: NDArray, width: int, fill: float) -> NDArray:
+    """Append columns of a value up to a width."""
+    more = np.full((len(values), width - values.shape[1]), fill, values.dtype)
+    return np.concatenate([values, more], axis=1)
+
+
+def _widened(
+    time: NDArray[np.float64], dt: NDArray[np.float64], width: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Times and intervals that go on at the last interval, up to a width."""
+    beyond = np.arange(1, width - time.shape[1] + 1)
+    time = np.concatenate([time, time[:, -1:] + dt[:, -1:] * beyond], axis=1)
+    return time, np.concatenate([dt, np.repeat(dt[:, -1:], len(beyond), axis=1)], axis=1)

@@ -1,0 +1,1 @@
+"""The device's side: the program of the ventilator's computer, and the hardware below it."""

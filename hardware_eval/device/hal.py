@@ -1,0 +1,64 @@
+"""Hardware abstraction: the little that the device's program needs of a ventilator."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+from hardware_eval.messages import Capability
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One look at the sensors.
+
+    Attributes:
+        time: when it was taken, s, on the clock that the program is stepped with.
+        pressure: airway pressure, cmH2O; NaN if the sensor did not answer.
+        flow: flow into the lung, mL/s; NaN if it is not measured.
+        saturated: whether the pressure stands at the end of the sensor's range.
+    """
+
+    time: float
+    pressure: float
+    flow: float = math.nan
+    saturated: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What a device tells about itself.
+
+    Attributes:
+        name: what people call it, at most 32 bytes of UTF-8.
+        device_id: its own number, 8 bytes.
+        calibration: SHA-256 of its calibration, 32 bytes.
+        capabilities: what it is and has.
+    """
+
+    name: str
+    device_id: bytes
+    calibration: bytes
+    capabilities: Capability
+
+
+class Hal(Protocol):
+    """One ventilator: a pressure sensor and two valves.
+
+    Both methods return within about 2 ms. When nobody calls them any more, the hardware itself
+    should vent: a normally open expiratory and a normally closed inspiratory valve.
+    """
+
+    @property
+    def identity(self) -> Identity:
+        """What the device tells about itself."""
+        ...
+
+    def sample(self, now: float) -> Sample:
+        """Read the sensors at device time ``now``, s. A sensor that fails gives NaN, no error."""
+        ...
+
+    def actuate(self, now: float, u_in: float, u_out: int) -> None:
+        """Set the inspiratory valve, %, 0..100, and the expiratory valve, 0 closed, 1 open."""
+        ...

@@ -1,0 +1,285 @@
+"""The program of the ventilator's computer: a pure state machine that guards the lung.
+
+It is stepped with the time, the bytes that arrived and the newest sample, and answers with the
+valves' positions and the bytes to send. The lung is *vented* when the inspiratory valve is closed
+and the expiratory valve open. It is vented whenever the device is not running a host's commands,
+and the device stops running them when no acceptable command came for :data:`WATCHDOG` seconds, when
+a command is out of range, when the pressure exceeds the limit, and when the sensor is lost. What
+the host says cannot change these limits, except to lower the pressure limit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from hardware_eval.device.hal import Identity, Sample
+from hardware_eval.messages import (
+    CAUSES,
+    PROTOCOL_VERSION,
+    Arm,
+    Command,
+    Counters,
+    DeviceMessage,
+    Flag,
+    Heartbeat,
+    Hello,
+    Mode,
+    Packet,
+    Reading,
+    Reason,
+    Refusal,
+    Statistics,
+    Vent,
+    Welcome,
+    encode,
+    milliseconds,
+)
+from hardware_eval.parser import Fault, ParserState, feed_bytes
+from ventbench import protocol
+
+#: Version of this program: what a device tells as its firmware.
+FIRMWARE = (1, 0, 0)
+
+#: Time without an acceptable command after which the device vents, s. The lung must be vented
+#: within 0.1 s of the last command; the rest is for the device's own period and its valves.
+WATCHDOG = 0.080
+
+#: Oldest reading on which a command may rest, s: a command that waited in a buffer is refused.
+OLDEST_SEEN = 0.100
+
+#: Time without a valid sample after which the device vents, s: ten samples at 5 ms.
+SENSOR_TIMEOUT = 0.050
+
+#: Largest step of the sequence number: a lost cable loses fewer messages than this.
+SEQUENCE_WINDOW = 1 << 16
+
+#: Period at which the program is stepped, s, besides the arrival of bytes.
+PERIOD = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceSettings:
+    """Limits of a device, fixed when its program starts.
+
+    Attributes:
+        pressure_limit: pressure above which the device vents, cmH2O.
+        u_in_limit: largest command, %.
+        watchdog: time without an acceptable command after which it vents, s, at most
+            :data:`WATCHDOG`.
+    """
+
+    pressure_limit: float = protocol.SAFETY_PRESSURE
+    u_in_limit: float = protocol.U_MAX
+    watchdog: float = WATCHDOG
+
+    def __post_init__(self) -> None:
+        """Check the limits.
+
+        Raises:
+            ValueError: if a limit is outside what is safe.
+        """
+        if not 0.0 < self.watchdog <= WATCHDOG:
+            raise ValueError(
+                f"watchdog {self.watchdog} s: it must be above 0 and at most {WATCHDOG}"
+            )
+        if not 0.0 < self.pressure_limit <= 100.0:
+            raise ValueError(f"pressure limit {self.pressure_limit} cmH2O is outside 0..100")
+        if not 0.0 < self.u_in_limit <= protocol.U_MAX:
+            raise ValueError(f"limit {self.u_in_limit} % of u_in is outside 0..{protocol.U_MAX:g}")
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceState:
+    """State between two steps.
+
+    Attributes:
+        parser: place in the stream of bytes.
+        mode: what the device does with the valves.
+        session: number of the open session, None before the first.
+        sequence: last sequence number of the session.
+        pressure_limit: limit of the session, cmH2O.
+        u_in: inspiratory valve, %.
+        u_out: expiratory valve, 0 or 1.
+        fed: when the last acceptable command or arming came, s.
+        valid: when the last valid sample was taken, s.
+        stepped: time of the last step, s.
+        causes: why the device vented since it was last armed.
+        counters: counts since the program started.
+    """
+
+    pressure_limit: float
+    valid: float
+    stepped: float
+    parser: ParserState = field(default_factory=ParserState)
+    mode: Mode = Mode.CLOSED
+    session: int | None = None
+    sequence: int = 0
+    u_in: float = 0.0
+    u_out: int = 1
+    fed: float = 0.0
+    causes: Flag = Flag.NONE
+    counters: Counters = field(default_factory=Counters)
+
+
+def init(settings: DeviceSettings, now: float) -> DeviceState:
+    """Vented, no session."""
+    return DeviceState(settings.pressure_limit, valid=now, stepped=now)
+
+
+def step(
+    settings: DeviceSettings,
+    identity: Identity,
+    state: DeviceState,
+    now: float,
+    data: bytes,
+    sample: Sample,
+) -> tuple[DeviceState, bytes]:
+    """Guard the lung, then do what arrived.
+
+    The guards come first: a command that arrives after the watchdog's time is too late, however
+    long the device itself was held up.
+
+    Args:
+        settings: limits of the device.
+        identity: what the device tells about itself.
+        state: state from ``init`` or ``step``.
+        now: time, s; never less than in the step before.
+        data: bytes that arrived since, in order.
+        sample: newest sample of the sensors.
+
+    Returns:
+        The next state, whose ``u_in`` and ``u_out`` the valves must take at once, and the bytes to
+        send.
+    """
+    held_up = now - state.stepped
+    valid = sample.time if sample.pressure == sample.pressure else state.valid
+    state = replace(state, valid=max(valid, state.valid), stepped=now)
+    if state.mode is Mode.RUNNING:
+        causes = _dangers(state, now, sample)
+        if now - state.fed > settings.watchdog:
+            causes |= Flag.COMMANDS_STOPPED
+            causes |= Flag.DEVICE_LATE if held_up > 0.5 * settings.watchdog else Flag.NONE
+        if causes:
+            state = _vented(state, causes)
+    answers: list[bytes] = []
+    if data:
+        parser, events = feed_bytes(state.parser, data)
+        state = replace(state, parser=parser)
+        for event in events:
+            if isinstance(event, Fault):
+                state = _counted(state, event.value)
+                continue
+            state, answer = _received(
+                settings, identity, _counted(state, "frames"), now, event, sample
+            )
+            if answer is not None:
+                answers.append(encode(Packet(event.session, event.sequence, answer)))
+    return state, b"".join(answers)
+
+
+def _received(
+    settings: DeviceSettings,
+    identity: Identity,
+    state: DeviceState,
+    now: float,
+    packet: Packet,
+    sample: Sample,
+) -> tuple[DeviceState, DeviceMessage | None]:
+    """Do what one message asks."""
+    message, sequence = packet.message, packet.sequence
+
+    def refused(state: DeviceState, reason: Reason) -> tuple[DeviceState, DeviceMessage]:
+        return state, Refusal(sequence, reason, state.mode, _flags(state, sample))
+
+    def reading(state: DeviceState) -> tuple[DeviceState, DeviceMessage]:
+        return state, Reading(
+            sequence, sample.time, sample.pressure, sample.flow, state.u_in, state.u_out,
+            state.mode, _flags(state, sample),
+        )  # fmt: skip
+
+    fresh = 0 < sequence - state.sequence <= SEQUENCE_WINDOW
+    if isinstance(message, Vent):  # from whomever, and whenever: it is always safe
+        if packet.session == state.session and fresh:
+            state = replace(state, sequence=sequence)
+        return reading(_vented(state, Flag.HOST_VENTED))
+    if isinstance(message, Hello):
+        if message.version != PROTOCOL_VERSION:
+            return refused(state, Reason.VERSION)
+        if packet.session == state.session and not fresh:
+            return refused(_counted(state, "sequence"), Reason.SEQUENCE)
+        asked = message.pressure_limit
+        limit = settings.pressure_limit if asked is None else min(asked, settings.pressure_limit)
+        state = replace(
+            _vented(state, Flag.NONE), mode=Mode.READY, session=packet.session, sequence=sequence,
+            pressure_limit=limit,
+        )  # fmt: skip
+        return state, Welcome(
+            PROTOCOL_VERSION, FIRMWARE, identity.capabilities, settings.watchdog, limit,
+            identity.device_id, identity.calibration, identity.name,
+        )  # fmt: skip
+    if not isinstance(message, Arm | Command | Heartbeat | Statistics):
+        return _counted(state, "malformed"), None  # a message of devices: an echo, or crossed wires
+    if packet.session != state.session:
+        return refused(_counted(state, "session"), Reason.SESSION)
+    if not fresh:
+        return refused(_counted(state, "sequence"), Reason.SEQUENCE)
+    state = replace(state, sequence=sequence)
+    match message:
+        case Heartbeat():
+            return reading(state)
+        case Statistics():
+            return state, state.counters
+        case Arm():
+            if _dangers(state, now, sample):
+                return refused(_vented(state, _dangers(state, now, sample)), Reason.UNSAFE)
+            return reading(
+                replace(state, mode=Mode.RUNNING, fed=now, u_in=0.0, u_out=1, causes=Flag.NONE)
+            )
+        case Command(u_in, u_out, seen):
+            if u_in > settings.u_in_limit or u_out not in (0, 1):
+                state = _counted(_vented(state, Flag.OUT_OF_RANGE), "out_of_range")
+                return refused(state, Reason.OUT_OF_RANGE)
+            if state.mode is not Mode.RUNNING:
+                return refused(_counted(state, "not_armed"), Reason.NOT_ARMED)
+            age = (milliseconds(now) - seen) & 0xFFFFFFFF
+            if age > OLDEST_SEEN * 1000.0:  # also a time ahead of the device's own
+                return refused(_counted(state, "stale"), Reason.STALE)
+            state = replace(_counted(state, "commands"), u_in=u_in, u_out=u_out, fed=now)
+            return reading(state)
+
+
+def _dangers(state: DeviceState, now: float, sample: Sample) -> Flag:
+    """Causes of venting that the sensor gives."""
+    causes = Flag.NONE
+    if sample.pressure > state.pressure_limit:
+        causes |= Flag.OVERPRESSURE
+    if now - state.valid > SENSOR_TIMEOUT:
+        causes |= Flag.SENSOR_LOST
+    return causes
+
+
+_COUNTED = {
+    Flag.COMMANDS_STOPPED: "watchdog",
+    Flag.OVERPRESSURE: "overpressure",
+    Flag.SENSOR_LOST: "sensor",
+    Flag.DEVICE_LATE: "device_late",
+}
+
+
+def _vented(state: DeviceState, causes: Flag) -> DeviceState:
+    """Close the inspiratory valve and open the expiratory valve; remember why."""
+    if state.mode is Mode.RUNNING:
+        for cause, name in _COUNTED.items():
+            if cause in causes:
+                state = _counted(state, name)
+    mode = Mode.CLOSED if state.mode is Mode.CLOSED else Mode.VENTED
+    return replace(state, mode=mode, u_in=0.0, u_out=1, causes=state.causes | causes)
+
+
+def _counted(state: DeviceState, name: str) -> DeviceState:
+    count = getattr(state.counters, name) + 1
+    return replace(state, counters=replace(state.counters, **{name: count}))
+
+
+def _flags(state: DeviceState, sample: Sample) -> Flag:
+    return (state.causes & CAUSES) | (Flag.SATURATED if sample.saturated else Flag.NONE)

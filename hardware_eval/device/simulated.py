@@ -1,0 +1,261 @@
+"""A simulated lung as hardware: any ventbench plant, in real or virtual time, with faults.
+
+The plant advances from one change of the command to the next, as in scoring; a sample in between
+is what the plant shows by then. A loop of 30 ms so reads what a scored run reads.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from hardware_eval.device.hal import Identity, Sample
+from hardware_eval.messages import Capability
+from ventbench import protocol
+from ventbench.errors import InputError
+from ventbench.interfaces import Plant
+from ventbench.plants.catalog import load_simulators
+from ventbench.plants.hybrid import Hybrid, HybridState
+
+#: A command that does not change is taken into the plant's state after this time, s; above the
+#: control step, so that a loop decides when, and within the dead times that plants remember.
+LONGEST_HOLD = 0.040
+
+#: Shorter holds than this, s, are replaced by the command that follows.
+SHORTEST_HOLD = 1e-4
+
+#: Time in which the sensor of a disconnected tube falls to ambient pressure, s.
+_AMBIENT_LAG = 0.05
+
+
+class FaultKind(Enum):
+    """What can go wrong with a lung on its ventilator; ``strength`` is in the unit given here."""
+
+    #: The sensor keeps showing what it showed when the fault began.
+    SENSOR_STUCK = "sensor_stuck"
+    #: The sensor shows ``strength`` cmH2O too much.
+    SENSOR_OFFSET = "sensor_offset"
+    #: The sensor gives no value.
+    SENSOR_LOST = "sensor_lost"
+    #: The inspiratory valve stays where it was.
+    VALVE_STUCK = "valve_stuck"
+    #: The inspiratory valve opens to the share ``strength`` of what is commanded.
+    VALVE_WEAK = "valve_weak"
+    #: The expiratory valve stays closed.
+    EXPIRATORY_STUCK = "expiratory_stuck"
+    #: The tube is off: nothing reaches the lung, the sensor shows ambient pressure.
+    DISCONNECTED = "disconnected"
+    #: The airway's resistance is ``strength`` times its value (a pinched tube: 3).
+    PINCHED = "pinched"
+    #: The airway's resistance is a hundred times its value.
+    OCCLUDED = "occluded"
+    #: A leak as if the expiratory valve stood open by the share ``strength``.
+    LEAK = "leak"
+
+
+_OCCLUSION = 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class LungFault:
+    """A fault of the simulated hardware.
+
+    Attributes:
+        kind: what goes wrong.
+        start: from when, s on the device's clock.
+        end: until when, s.
+        strength: how much; see :class:`FaultKind`.
+    """
+
+    kind: FaultKind
+    start: float
+    end: float = math.inf
+    strength: float = 1.0
+
+    def active(self, now: float) -> bool:
+        """Whether the fault acts at ``now``, s."""
+        return self.start <= now < self.end
+
+
+class SimulatedHal:
+    """A plant as a ventilator; compiles the plant once, before any time passes.
+
+    Attributes:
+        faults: what goes wrong; may be replaced while it runs.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        *,
+        name: str = "simulated lung",
+        faults: Sequence[LungFault] = (),
+        noise: float = 0.0,
+        quantum: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        """Put a lung at rest at PEEP on the ventilator.
+
+        Args:
+            plant: the lung on its ventilator, without a batch shape.
+            name: what the device is called.
+            faults: what goes wrong, and when.
+            noise: standard deviation of the sensor's noise, cmH2O.
+            quantum: step of the sensor's converter, cmH2O; 0 for none.
+            seed: of the noise.
+        """
+        self.faults = tuple(faults)
+        self._noise, self._quantum = noise, quantum
+        self._random = np.random.default_rng(seed)
+        leaves = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(plant))
+        calibration = hashlib.sha256(type(plant).__name__.encode() + leaves).digest()
+        self._flow = hasattr(plant, "observe") or isinstance(plant, Hybrid)
+        capabilities = Capability.SIMULATED | (Capability.FLOW if self._flow else Capability.NONE)
+        self.identity = Identity(name, calibration[:8], calibration, capabilities)
+        start = jnp.asarray(protocol.PEEP, jnp.float32)
+        plant = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), plant)
+        vector, unravel = ravel_pytree(plant.init(start, start))
+        varies = hasattr(plant, "vary")
+        self._can_pinch = varies
+
+        def advance(vector: jax.Array, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+            u_in, u_out, dt, r_scale, restart = inputs
+            state = unravel(vector)
+            if hasattr(state, "time"):  # mechanisms that know when the breath began
+                state = state.replace(time=state.time * (1.0 - restart))
+            own = plant.vary(r_scale, jnp.ones_like(r_scale)) if varies else plant  # type: ignore[attr-defined]
+            after, pressure, flow = _observed(own, state, u_in, u_out, dt)
+            return ravel_pytree(after)[0], jnp.stack([pressure, flow])
+
+        self._state = vector
+        inputs = np.array([0.0, 1.0, LONGEST_HOLD, 1.0, 0.0], np.float32)
+        self._advance = jax.jit(advance).lower(vector, inputs).compile()
+        jax.block_until_ready(self._advance(vector, inputs))
+        self._since: float | None = None
+        self._command = (0.0, 1)
+        self._restart = 0.0
+        self._stuck_reading = math.nan
+        self._stuck_valve = math.nan
+        self._ambient_from: tuple[float, float] | None = None
+        self._last = Sample(0.0, protocol.PEEP)
+
+    def sample(self, now: float) -> Sample:
+        """Pressure and flow by now; see :class:`~hardware_eval.device.hal.Hal`."""
+        kinds = {fault.kind: fault for fault in self.faults if fault.active(now)}
+        _, shown = self._by(now, kinds)
+        pressure, flow = (float(x) for x in np.asarray(shown))
+        flow = flow if self._flow else math.nan
+        if FaultKind.DISCONNECTED in kinds:
+            begun, before = self._ambient_from or (now, self._last.pressure)
+            self._ambient_from = begun, before
+            pressure, flow = before * math.exp(-(now - begun) / _AMBIENT_LAG), 0.0
+        else:
+            self._ambient_from = None
+        if self._noise:
+            pressure += self._noise * float(self._random.standard_normal())
+        if FaultKind.SENSOR_OFFSET in kinds:
+            pressure += kinds[FaultKind.SENSOR_OFFSET].strength
+        if self._quantum:
+            pressure = round(pressure / self._quantum) * self._quantum
+        if FaultKind.SENSOR_STUCK in kinds:
+            if math.isnan(self._stuck_reading):
+                self._stuck_reading = self._last.pressure
+            pressure = self._stuck_reading
+        else:
+            self._stuck_reading = math.nan
+        if FaultKind.SENSOR_LOST in kinds:
+            pressure = math.nan
+        self._last = Sample(now, pressure, flow)
+        return self._last
+
+    def actuate(self, now: float, u_in: float, u_out: int) -> None:
+        """Hold a command from now on; see :class:`~hardware_eval.device.hal.Hal`."""
+        if self._since is None:
+            self._since = now
+        changed = (u_in, u_out) != self._command
+        held = now - self._since
+        if not (changed or held >= LONGEST_HOLD):
+            return
+        if held >= SHORTEST_HOLD:
+            kinds = {fault.kind: fault for fault in self.faults if fault.active(now)}
+            self._state, _ = self._by(now, kinds)
+            self._since, self._restart = now, 0.0
+        if self._command[1] == 1 and u_out == 0:
+            self._restart = 1.0
+        self._command = (u_in, u_out)
+
+    def _by(self, now: float, kinds: dict[FaultKind, LungFault]) -> tuple[jax.Array, jax.Array]:
+        """State and readings at ``now`` if the present command is held until then."""
+        u_in, u_out = self._command
+        share, r_scale = float(u_out), 1.0
+        if FaultKind.VALVE_STUCK in kinds:
+            if math.isnan(self._stuck_valve):
+                self._stuck_valve = u_in
+            u_in = self._stuck_valve
+        else:
+            self._stuck_valve = math.nan
+        if FaultKind.VALVE_WEAK in kinds:
+            u_in *= kinds[FaultKind.VALVE_WEAK].strength
+        if FaultKind.EXPIRATORY_STUCK in kinds:
+            share = 0.0
+        if FaultKind.LEAK in kinds:
+            share = max(share, kinds[FaultKind.LEAK].strength)
+        if FaultKind.DISCONNECTED in kinds:
+            u_in, share = 0.0, 1.0
+        if FaultKind.PINCHED in kinds:
+            r_scale = self._pinch(kinds[FaultKind.PINCHED].strength)
+        if FaultKind.OCCLUDED in kinds:
+            r_scale = self._pinch(_OCCLUSION)
+        held = max(now - (now if self._since is None else self._since), SHORTEST_HOLD)
+        # A gap of seconds, as after a suspended machine, goes in steps that the plant can take.
+        while held > 2.0 * LONGEST_HOLD:
+            inputs = np.array([u_in, share, LONGEST_HOLD, r_scale, self._restart], np.float32)
+            self._state, _ = self._advance(self._state, inputs)
+            self._since = (self._since or now) + LONGEST_HOLD
+            self._restart, held = 0.0, held - LONGEST_HOLD
+        inputs = np.array([u_in, share, held, r_scale, self._restart], np.float32)
+        return self._advance(self._state, inputs)
+
+    def _pinch(self, scale: float) -> float:
+        if not self._can_pinch:
+            raise InputError("this plant's resistance cannot be changed: it cannot be pinched")
+        return scale
+
+
+def _observed(
+    plant: Any, state: Any, u_in: jax.Array, u_out: jax.Array, dt: jax.Array
+) -> tuple[Any, jax.Array, jax.Array]:
+    """Next state, pressure, cmH2O, and flow into the lung, mL/s (0 where the plant has none)."""
+    if hasattr(plant, "observe"):
+        after, (pressure, flow, _) = plant.observe(state, u_in, u_out, dt)
+        return after, pressure, flow
+    after, pressure = plant.step(state, u_in, u_out, dt)
+    if isinstance(plant, Hybrid) and isinstance(after, HybridState):
+        drop = after.drop
+        resistance = 0.5 * (plant.R + jnp.sqrt(plant.R**2 + 4.0 * plant.K2 * jnp.abs(drop)))
+        return after, pressure, 1000.0 * drop / resistance
+    return after, pressure, jnp.zeros_like(pressure)
+
+
+def simulated_lung(lung_id: str, simulator: Any = "frozen", **settings: Any) -> SimulatedHal:
+    """Put a lung of a simulator on a simulated ventilator.
+
+    Args:
+        lung_id: id of the lung, such as ``"R20C50"``.
+        simulator: whatever :func:`ventbench.load_simulators` takes.
+        settings: further arguments of :class:`SimulatedHal`.
+
+    Raises:
+        InputError: if there is no such simulator or lung.
+    """
+    plant = load_simulators(simulator).plant(lung_id)
+    return SimulatedHal(plant, **{"name": f"emulated {lung_id}", **settings})

@@ -1,0 +1,470 @@
+"""Messages of the wire protocol: types, units, scaling, and their coding to packets and frames.
+
+Pure. A *packet* is kind, session, sequence number, body and CRC-32; a *frame* is a packet in COBS
+between zero bytes. ``PROTOCOL.md`` has the layouts.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from binascii import crc32
+from dataclasses import dataclass, fields
+from enum import IntEnum, IntFlag
+from typing import ClassVar
+
+from cobs import cobs
+
+#: Version of the wire protocol; host and device must have the same.
+PROTOCOL_VERSION = 1
+
+#: Longest packet, bytes: COBS then adds one byte of overhead, and a parser needs no more memory.
+LONGEST_PACKET = 254
+
+#: Units of the wire: steps in 1 % of u_in, in 1 cmH2O, in 1 mL/s and in 1 s of the watchdog.
+U_IN_STEPS, PRESSURE_STEPS, FLOW_STEPS, WATCHDOG_STEPS = 100, 100, 1, 1000
+
+_HEADER = struct.Struct("<BII")  # kind, session, sequence
+_CRC = struct.Struct("<I")
+_NO_VALUE = -32768  # a pressure or flow that is not known
+_OWN_LIMIT = 0xFFFF  # a host that asks for no lower pressure limit
+_NAME_BYTES = 32
+
+
+class Kind(IntEnum):
+    """Kinds of packets; the device's have the highest bit set."""
+
+    HELLO = 0x01
+    ARM = 0x02
+    COMMAND = 0x03
+    HEARTBEAT = 0x04
+    VENT = 0x05
+    STATISTICS = 0x06
+    WELCOME = 0x81
+    READING = 0x82
+    REFUSAL = 0x83
+    COUNTERS = 0x84
+
+
+class Mode(IntEnum):
+    """What the device does with the valves."""
+
+    #: No session since the device started: vented.
+    CLOSED = 0
+    #: A session is open, and no run: vented.
+    READY = 1
+    #: Commands move the valves and feed the watchdog.
+    RUNNING = 2
+    #: Vented by a fault or by the host until the host arms again.
+    VENTED = 3
+
+
+class Flag(IntFlag):
+    """Why the device vented, and what it measures; the causes stay until the host arms again."""
+
+    NONE = 0
+    #: No acceptable command arrived within the watchdog's time.
+    COMMANDS_STOPPED = 1
+    #: A command was outside the valves' range.
+    OUT_OF_RANGE = 2
+    #: The pressure exceeded the limit of the device or of the session.
+    OVERPRESSURE = 4
+    #: The sensor gave no valid pressure for too long.
+    SENSOR_LOST = 8
+    #: The host asked for it.
+    HOST_VENTED = 16
+    #: The device's own loop ran too late to guard the lung.
+    DEVICE_LATE = 32
+    #: The pressure of this reading is at the end of the sensor's range.
+    SATURATED = 64
+
+
+#: Flags that name a cause of venting.
+CAUSES = (
+    Flag.COMMANDS_STOPPED
+    | Flag.OUT_OF_RANGE
+    | Flag.OVERPRESSURE
+    | Flag.SENSOR_LOST
+    | Flag.HOST_VENTED
+    | Flag.DEVICE_LATE
+)
+
+
+class Reason(IntEnum):
+    """Why the device refuses a message."""
+
+    #: Another protocol version.
+    VERSION = 1
+    #: The message belongs to another session.
+    SESSION = 2
+    #: The sequence number is not above that of the last message, or too far above it.
+    SEQUENCE = 3
+    #: A command while the device is not armed.
+    NOT_ARMED = 4
+    #: The command rests on a reading that is too old.
+    STALE = 5
+    #: A value outside its range; the device vents.
+    OUT_OF_RANGE = 6
+    #: The device cannot be armed while a cause of venting lasts.
+    UNSAFE = 7
+
+
+class Capability(IntFlag):
+    """What a device is and has."""
+
+    NONE = 0
+    #: No hardware: a simulated lung.
+    SIMULATED = 1
+    #: Readings hold a flow.
+    FLOW = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """Open a session; the device vents and answers with :class:`Welcome`.
+
+    Attributes:
+        version: protocol version of the host.
+        pressure_limit: pressure at which the device shall vent, cmH2O, if that is below its own
+            limit; None for the device's own.
+    """
+
+    kind: ClassVar[Kind] = Kind.HELLO
+    version: int = PROTOCOL_VERSION
+    pressure_limit: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """Clear the causes of venting and begin a run; the watchdog starts at once."""
+
+    kind: ClassVar[Kind] = Kind.ARM
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """Set the valves.
+
+    Attributes:
+        u_in: inspiratory valve, %, 0..100.
+        u_out: expiratory valve, 0 closed, 1 open.
+        seen: device time of the newest reading that the host had, ms, modulo 2**32. The device
+            refuses the command when that is too long ago, so that nothing that waited in a buffer
+            moves a valve.
+    """
+
+    kind: ClassVar[Kind] = Kind.COMMAND
+    u_in: float
+    u_out: int
+    seen: int
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    """Ask for a reading; moves no valve and does not feed the watchdog."""
+
+    kind: ClassVar[Kind] = Kind.HEARTBEAT
+
+
+@dataclass(frozen=True, slots=True)
+class Vent:
+    """Vent now, until the host arms again."""
+
+    kind: ClassVar[Kind] = Kind.VENT
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """Ask for the device's error counters."""
+
+    kind: ClassVar[Kind] = Kind.STATISTICS
+
+
+@dataclass(frozen=True, slots=True)
+class Welcome:
+    """Identity and limits of a device.
+
+    Attributes:
+        version: protocol version of the device.
+        firmware: version of the device's program, (major, minor, patch).
+        capabilities: what the device is and has.
+        watchdog: time without an acceptable command after which the device vents, s.
+        pressure_limit: pressure above which the device vents in this session, cmH2O.
+        device_id: the device's own number, 8 bytes.
+        calibration: SHA-256 of the device's calibration (sensor and valve tables), 32 bytes.
+        name: what people call the device, at most 32 bytes of UTF-8.
+    """
+
+    kind: ClassVar[Kind] = Kind.WELCOME
+    version: int
+    firmware: tuple[int, int, int]
+    capabilities: Capability
+    watchdog: float
+    pressure_limit: float
+    device_id: bytes
+    calibration: bytes
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """State of the device; the answer to arm, command, heartbeat and vent.
+
+    Attributes:
+        sequence: sequence number of the message that it answers (from the packet's header).
+        time: time of the sample on the device's clock, s.
+        pressure: airway pressure, cmH2O; NaN if the sensor gives none.
+        flow: flow into the lung, mL/s; NaN if the device does not measure it.
+        u_in: inspiratory valve as applied, %.
+        u_out: expiratory valve as applied, 0 or 1.
+        mode: what the device does with the valves.
+        flags: why it vented, and remarks on the sample.
+    """
+
+    kind: ClassVar[Kind] = Kind.READING
+    sequence: int
+    time: float
+    pressure: float
+    flow: float
+    u_in: float
+    u_out: int
+    mode: Mode
+    flags: Flag
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """The device did not do what a message asks.
+
+    Attributes:
+        sequence: sequence number of the refused message (from the packet's header).
+        reason: why.
+        mode: what the device does with the valves.
+        flags: as in :class:`Reading`.
+    """
+
+    kind: ClassVar[Kind] = Kind.REFUSAL
+    sequence: int
+    reason: Reason
+    mode: Mode
+    flags: Flag
+
+
+@dataclass(frozen=True, slots=True)
+class Counters:
+    """Counts of the device since it started, each modulo 2**32.
+
+    Attributes:
+        frames: intact packets.
+        commands: commands that moved the valves.
+        framing: runs of bytes that are no frame: bad COBS, too long, too short.
+        checksum: packets with a wrong CRC.
+        malformed: intact packets of unknown kind or wrong length.
+        session: messages of another session.
+        sequence: messages whose sequence number was not above the last.
+        stale: commands that rest on a reading too old.
+        out_of_range: commands outside the valves' range.
+        not_armed: commands while the device was not armed.
+        watchdog: times that the watchdog vented.
+        overpressure: times that the pressure limit vented.
+        sensor: times that the loss of the sensor vented.
+        device_late: times that the device's own lateness vented.
+    """
+
+    kind: ClassVar[Kind] = Kind.COUNTERS
+    frames: int = 0
+    commands: int = 0
+    framing: int = 0
+    checksum: int = 0
+    malformed: int = 0
+    session: int = 0
+    sequence: int = 0
+    stale: int = 0
+    out_of_range: int = 0
+    not_armed: int = 0
+    watchdog: int = 0
+    overpressure: int = 0
+    sensor: int = 0
+    device_late: int = 0
+
+
+HostMessage = Hello | Arm | Command | Heartbeat | Vent | Statistics
+DeviceMessage = Welcome | Reading | Refusal | Counters
+Message = HostMessage | DeviceMessage
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """A message with its header.
+
+    Attributes:
+        session: number that the host drew at random for this session.
+        sequence: from the host: its own count; from the device: the count that it answers.
+        message: the message.
+    """
+
+    session: int
+    sequence: int
+    message: Message
+
+
+class MalformedPacketError(ValueError):
+    """An intact packet is of unknown kind, of wrong length, or holds no value of its type."""
+
+
+_HELLO = struct.Struct("<BH")
+_COMMAND = struct.Struct("<HBI")
+_WELCOME = struct.Struct("<BBBBHHH8s32sB")
+_READING = struct.Struct("<QhhHBBH")
+_REFUSAL = struct.Struct("<BBH")
+_COUNTED = tuple(field.name for field in fields(Counters))
+_COUNTERS = struct.Struct(f"<{len(_COUNTED)}I")
+
+
+def encode(packet: Packet) -> bytes:
+    """Return the frame of a packet, ready for the wire.
+
+    Raises:
+        ValueError: if a value cannot be expressed, such as a command that is not a number.
+    """
+    return to_frame(to_packet(packet))
+
+
+def to_frame(packet: bytes) -> bytes:
+    """Return a packet in COBS between zero bytes.
+
+    The zero byte in front ends whatever garbage came before, so that it costs no frame.
+    """
+    return b"\0" + cobs.encode(packet) + b"\0"
+
+
+def to_packet(packet: Packet) -> bytes:
+    """Return header, body and CRC-32 of a packet; see :func:`encode`."""
+    content = _HEADER.pack(packet.message.kind, packet.session, packet.sequence) + _body(
+        packet.message
+    )
+    return content + _CRC.pack(crc32(content))
+
+
+def checked(packet: bytes) -> bytes | None:
+    """Return the content of a packet if its CRC-32 is right, else None."""
+    content, check = packet[: -_CRC.size], packet[-_CRC.size :]
+    intact = len(packet) >= _HEADER.size + _CRC.size and _CRC.unpack(check)[0] == crc32(content)
+    return content if intact else None
+
+
+def decode(content: bytes) -> Packet:
+    """Decode header and body of an intact packet.
+
+    Raises:
+        MalformedPacketError: if the kind is unknown, the length wrong, or a value not of its type.
+    """
+    number, session, sequence = _HEADER.unpack_from(content)
+    body = content[_HEADER.size :]
+    try:
+        return Packet(session, sequence, _message(Kind(number), sequence, body))
+    except (struct.error, ValueError) as error:
+        raise MalformedPacketError(
+            f"kind 0x{number:02x} with a body of {len(body)} bytes: {error}"
+        ) from error
+
+
+def milliseconds(time: float) -> int:
+    """Device time, s, as :attr:`Command.seen` holds it.
+
+    By way of the microseconds of a reading, so that no rounding makes a reading newer than now.
+    """
+    return round(time * 1e6) // 1000 & 0xFFFFFFFF
+
+
+def _body(message: Message) -> bytes:
+    match message:
+        case Hello(version, limit):
+            return _HELLO.pack(
+                version, _OWN_LIMIT if limit is None else _scaled(limit, PRESSURE_STEPS, 0, 65534)
+            )
+        case Command(u_in, u_out, seen):
+            return _COMMAND.pack(_scaled(u_in, U_IN_STEPS, 0, 65535), u_out, seen)
+        case Welcome():
+            name = message.name.encode()[:_NAME_BYTES]
+            return _WELCOME.pack(
+                message.version, *message.firmware, message.capabilities,
+                _scaled(message.watchdog, WATCHDOG_STEPS, 0, 65535),
+                _scaled(message.pressure_limit, PRESSURE_STEPS, 0, 65535),
+                message.device_id, message.calibration, len(name),
+            ) + name  # fmt: skip
+        case Reading():
+            return _READING.pack(
+                round(message.time * 1e6), _known(message.pressure, PRESSURE_STEPS),
+                _known(message.flow, FLOW_STEPS), _scaled(message.u_in, U_IN_STEPS, 0, 65535),
+                message.u_out, message.mode, message.flags,
+            )  # fmt: skip
+        case Refusal():
+            return _REFUSAL.pack(message.reason, message.mode, message.flags)
+        case Counters():
+            return _COUNTERS.pack(*(getattr(message, name) & 0xFFFFFFFF for name in _COUNTED))
+        case _:
+            return b""
+
+
+def _message(kind: Kind, sequence: int, body: bytes) -> Message:
+    match kind:
+        case Kind.HELLO:
+            version, limit = _HELLO.unpack(body)
+            return Hello(version, None if limit == _OWN_LIMIT else limit / PRESSURE_STEPS)
+        case Kind.COMMAND:
+            u_in, u_out, seen = _COMMAND.unpack(body)
+            return Command(u_in / U_IN_STEPS, u_out, seen)
+        case Kind.WELCOME:
+            fixed, name = body[: _WELCOME.size], body[_WELCOME.size :]
+            version, *firmware, capabilities, watchdog, limit, device_id, calibration, length = (
+                _WELCOME.unpack(fixed)
+            )
+            if len(name) != length:
+                raise ValueError(f"a name of {len(name)} bytes, announced were {length}")
+            major, minor, patch = firmware
+            return Welcome(
+                version, (major, minor, patch), Capability(capabilities), watchdog / WATCHDOG_STEPS,
+                limit / PRESSURE_STEPS, device_id, calibration, name.decode(),
+            )  # fmt: skip
+        case Kind.READING:
+            time, pressure, flow, u_in, u_out, mode, flags = _READING.unpack(body)
+            return Reading(
+                sequence, time / 1e6, _or_nan(pressure, PRESSURE_STEPS), _or_nan(flow, FLOW_STEPS),
+                u_in / U_IN_STEPS, u_out, Mode(mode), Flag(flags),
+            )  # fmt: skip
+        case Kind.REFUSAL:
+            reason, mode, flags = _REFUSAL.unpack(body)
+            return Refusal(sequence, Reason(reason), Mode(mode), Flag(flags))
+        case Kind.COUNTERS:
+            return Counters(*_COUNTERS.unpack(body))
+    if body:
+        raise ValueError("this kind has no body")
+    return _EMPTY[kind]
+
+
+_EMPTY: dict[Kind, Message] = {
+    Kind.ARM: Arm(),
+    Kind.HEARTBEAT: Heartbeat(),
+    Kind.VENT: Vent(),
+    Kind.STATISTICS: Statistics(),
+}
+
+
+def _scaled(value: float, steps: int, low: int, high: int) -> int:
+    if not math.isfinite(value):
+        raise ValueError(f"{value} cannot be sent")
+    number = round(value * steps)
+    if not low <= number <= high:
+        raise ValueError(f"{value:g} is outside {low / steps:g}..{high / steps:g}")
+    return number
+
+
+def _known(value: float, steps: int) -> int:
+    if not math.isfinite(value):
+        return _NO_VALUE
+    return max(-32767, min(32767, round(value * steps)))
+
+
+def _or_nan(number: int, steps: int) -> float:
+    return math.nan if number == _NO_VALUE else number / steps

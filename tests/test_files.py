@@ -1,6 +1,8 @@
+import errno
 import json
 import os
 import stat
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -44,6 +46,49 @@ def test_folder_in_the_way(tmp_path):
     with pytest.raises(OSError, match="directory"):
         files.write_text(tmp_path, "x")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_symbolic_link_is_followed(tmp_path):
+    target, link = tmp_path / "target.txt", tmp_path / "link.txt"
+    target.write_text("old")
+    link.symlink_to(target)
+    files.write_text(link, "new")
+    assert link.is_symlink()
+    assert target.read_text() == "new"
+
+
+def test_symbolic_link_to_a_file_not_there_yet(tmp_path):
+    link = tmp_path / "link.txt"
+    link.symlink_to(tmp_path / "later" / "target.txt")
+    files.write_text(link, "new")
+    assert link.is_symlink()
+    assert (tmp_path / "later" / "target.txt").read_text() == "new"
+
+
+def test_pipe_is_written_to(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    files.write_text(pipe, "through")
+    assert os.read(reader, 100) == b"through"
+    os.close(reader)
+    assert stat.S_ISFIFO(os.stat(pipe).st_mode)
+    assert [p.name for p in tmp_path.iterdir()] == ["pipe"]
+
+
+def test_device_stays_a_device():
+    with pytest.raises(OSError, match="/dev/full"):
+        files.write_text(Path("/dev/full"), "x")
+    assert stat.S_ISCHR(os.stat("/dev/full").st_mode)
+    assert not list(Path("/dev").glob(".full*"))
+
+
+def test_error_names_the_target(tmp_path):
+    def full(file):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OSError, match=r"answer\.json"):
+        files.write_atomically(tmp_path / "answer.json", full)
 
 
 def test_json(tmp_path):

@@ -1,8 +1,13 @@
-"""Writing that is never half done: to a temporary file beside the target, then renamed."""
+"""Writing that is never half done: to a temporary file beside the target, then renamed.
+
+A symbolic link keeps pointing where it did: the file that it names is replaced. A target that is no
+regular file (``/dev/stdout``, ``/dev/full``, a named pipe) is written to directly, never replaced.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
 import os
@@ -20,10 +25,34 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
         write: receives a binary file object and writes the content to it.
 
     Raises:
-        OSError: if the folder or file cannot be written; the old content then stays.
+        OSError: if the folder or file cannot be written; it names the target, whose old content
+            stays.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    given, path = path, Path(os.path.realpath(path))
+    try:
+        if path.exists() and not path.is_file():
+            _write_directly(path, write)
+        else:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _replace(path, write)
+    except OSError as error:
+        # Whoever reads the message knows the target, not the temporary file beside it; a full disk
+        # names no file at all.
+        nameless = error.errno is not None and error.filename is None
+        if nameless or Path(str(error.filename)).name.startswith(f".{path.name}."):
+            error.filename = str(given)
+        raise
+
+
+def _write_directly(path: Path, write: Callable[[IO[bytes]], object]) -> None:
+    """Write the content to what is no regular file, such as a device or a pipe."""
+    content = io.BytesIO()  # writers may seek, which a pipe cannot
+    write(content)
+    with open(path, "wb") as file:
+        file.write(content.getvalue())
+
+
+def _replace(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:

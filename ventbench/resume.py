@@ -30,6 +30,14 @@ TreeT = TypeVar("TreeT")
 SETTINGS = "settings.json"
 
 
+_opened: dict[Path, None] = {}  # in order, each once
+
+
+def opened() -> Path | None:
+    """Return the folder or file in which this process keeps unfinished work, the newest one."""
+    return next((path for path in reversed(list(_opened)) if path.exists()), None)
+
+
 class Format(NamedTuple):
     """Format in which a result is stored.
 
@@ -79,6 +87,7 @@ class WorkFolder:
             _check(folder, _read(path, JSON), wanted)
         else:
             files.write_json(path, wanted)
+        _opened[folder] = None
 
     def get(self, name: str, compute: Callable[[], Any], format: Format = JSON) -> Any:
         """Return a result: read if it is finished, else computed and kept.
@@ -169,6 +178,7 @@ class Checkpoint:
         content["settings"] = np.asarray(json.dumps(self._settings))
         content["done"] = np.asarray(done)
         files.write_atomically(self.path, lambda file: np.savez(file, **content))
+        _opened[self.path] = None
 
     def delete(self) -> None:
         """Delete the file, if there is one."""

@@ -1,12 +1,16 @@
 """The command line ``ventbench``: parses, calls, prints. One module per group of commands.
 
-Exit codes: 0 done; 1 the command ran and the answer is no; 2 bad input. Heavy packages are
-imported inside the commands, so that ``ventbench --help`` answers at once.
+Exit codes: 0 done; 1 the command ran and the answer is no; 2 bad input; 130 stopped by Ctrl-C.
+Heavy packages are imported inside the commands, so that ``ventbench --help`` answers at once.
 """
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
+import threading
+from typing import NoReturn
 
 import typer
 
@@ -28,6 +32,9 @@ from ventbench.cli import (
 )
 from ventbench.errors import InputError
 from ventbench.text import plain
+
+#: Exit code after Ctrl-C, as shells have it.
+INTERRUPTED = 130
 
 app = typer.Typer(
     name="ventbench",
@@ -71,6 +78,7 @@ app.add_typer(data.app)
 
 def main() -> None:
     """Entry point of the console script."""
+    sys.unraisablehook = _interrupt_again
     try:
         app()
     except (InputError, OSError) as error:
@@ -78,3 +86,30 @@ def main() -> None:
         lines = [plain(line) for line in str(error).split("\n")]
         print("ventbench:", "\n".join(lines), file=sys.stderr)
         sys.exit(2)
+    except SystemExit as end:
+        if end.code == INTERRUPTED:
+            _stop()
+        raise
+
+
+def _stop() -> NoReturn:
+    """End after Ctrl-C, and say whether the same command goes on from here."""
+    resume = sys.modules.get("ventbench.resume")
+    kept = resume.opened() if resume else None
+    print(
+        "ventbench: stopped"
+        + (f"; what is finished is kept in {kept}: the same command continues" if kept else ""),
+        file=sys.stderr,
+    )
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # Threads of the compiler may be at work; they crash if the interpreter is taken down normally.
+    os._exit(INTERRUPTED)
+
+
+def _interrupt_again(unraisable: sys.UnraisableHookArgs) -> None:
+    """Repeat a Ctrl-C that came while Python called back from compiled code, which drops it."""
+    if unraisable.exc_type is KeyboardInterrupt:
+        threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
+    else:
+        sys.__unraisablehook__(unraisable)

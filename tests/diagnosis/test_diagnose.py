@@ -155,12 +155,10 @@ def test_held_out_readings_change_no_answer(found, other):
 @pytest.mark.parametrize("which", ["found", "own", "strange"])
 def test_the_corrected_plant_in_its_file_gives_the_same_answers(which, request, tmp_path):
     diagnosis: Diagnosis = request.getfixturevalue(which)
-    path, held = tmp_path / "corrected.json", diagnosis.traces.held_out
+    path = tmp_path / "corrected.json"
     save_plants(path, diagnosis.plants)
     answer = load_simulators(path).pressures(diagnosis.traces.breaths)
-    # Its parameters are fitted to all breaths, those of the traces to the training breaths.
-    apart = answer[held] - diagnosis.traces.after[held]
-    assert np.sqrt(np.mean(apart**2)) < 0.25
+    np.testing.assert_allclose(answer, diagnosis.traces.after, atol=1e-3)
 
 
 def test_nothing_is_missing_where_the_simulator_has_it(own):

@@ -44,10 +44,10 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """Arguments of each diagnosis, which is the same made-up one every time."""
     seen: list[dict[str, Any]] = []
 
-    def diagnose(breaths, *, simulator, lung, passive, drive, progress):
+    def diagnose(breaths, *, simulator, lung, patient, drive, progress):
         progress("fitting", 0.5)
         seen.append(
-            {"breaths": breaths, "simulator": simulator, "lung": lung, "passive": passive,
+            {"breaths": breaths, "simulator": simulator, "lung": lung, "patient": patient,
              "drive": drive}
         )  # fmt: skip
         return made.diagnosis(12)
@@ -75,7 +75,7 @@ def test_four_files_and_the_words(recording, tmp_path, calls):
     text = run(recording, "--lung", "R20C50", "--out", out)
     assert sorted(item.name for item in out.iterdir()) == FILES
     assert (calls[0]["simulator"].name, calls[0]["lung"]) == ("physics", "R20C50")
-    assert not calls[0]["passive"]
+    assert not calls[0]["patient"]
     words = " ".join(text.split())
     assert words.startswith("Missing in the physics simulator: dead time of the inspiratory valve")
     assert "Dead time of the inspiratory valve: 41 ms [38, 44]." in words
@@ -86,9 +86,11 @@ def test_four_files_and_the_words(recording, tmp_path, calls):
     again = run(recording, "--out", out)
     assert again.splitlines()[0] == text.splitlines()[0]
     assert calls[1]["lung"] is None
-    assert not calls[1]["passive"]
-    run(recording, "--passive", "--out", out)
-    assert calls[2]["passive"]
+    assert not calls[1]["patient"]
+    run(recording, "--patient", "--out", out)
+    assert calls[2]["patient"]
+    run(recording, "--passive", "--out", out)  # what earlier versions asked for a test lung
+    assert not calls[3]["patient"]
     assert len(calls[1]["breaths"]) == 10
     assert sorted(item.name for item in out.iterdir()) == FILES, "written over, nothing left behind"
 

@@ -30,7 +30,7 @@ def test_the_larger_of_two_lags_comes_first(monkeypatch, found):
         problem=SimpleNamespace(unknowns=unknowns, data=SimpleNamespace(lung=np.zeros(3))),
     )  # fmt: skip
     monkeypatch.setattr(estimates, "fit", lambda *_, start, **__: start)
-    partition: Any = SimpleNamespace(data=None, predictor=None)
+    partition: Any = SimpleNamespace(data=None, predictor=None, gain_sd=0.0)
     start: Any = estimates.final_fit(fitted, partition, partition)
     assert start["R"] == 20.0
     assert start[LAGS[0]] == 0.08

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ventbench.diagnosis.identification import held_out, usable
+from ventbench.diagnosis.identification import held_out, split, usable
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.errors import InputError
 
@@ -74,3 +74,30 @@ def test_one_breath_of_each_lung_is_not_enough():
         usable(breaths)
     twice = dataclasses.replace(breaths, R=np.array([5.0, 10.0, 20.0, 20.0]))
     assert held_out(usable(twice)[0]).tolist() == [False, False, False, True]
+
+
+@pytest.mark.parametrize("n", [4, 12, 18, 60])
+def test_each_breath_has_one_use_where_there_are_enough(n):
+    uses = split(made.breaths(n=n, samples=6))
+    training = ~uses.testing & ~uses.judging
+    assert training.sum() >= 2
+    assert uses.testing.any()
+    assert uses.judging.any()
+    if n >= DEFAULT.data.judging_from:
+        assert not uses.reused.any()
+        assert uses.judging.sum() == n // DEFAULT.data.judging_every
+        assert np.array_equal(uses.identifying, ~uses.judging)
+    else:
+        assert np.array_equal(uses.judging, uses.testing)
+        assert uses.identifying.all()
+    assert np.array_equal(uses.fitted, ~uses.judging), "what judges is never fitted"
+
+
+def test_breaths_that_judged_an_earlier_correction_judge_again():
+    breaths = made.breaths(n=24, samples=6)
+    earlier = (2, 7, 11)  # of another split
+    uses = split(breaths, never_fitted=earlier)
+    assert breaths.breath_id[uses.judging].tolist() == list(earlier)
+    assert not uses.reused.any()
+    everything = tuple(breaths.breath_id.tolist())
+    assert np.array_equal(split(breaths, never_fitted=everything).judging, split(breaths).judging)

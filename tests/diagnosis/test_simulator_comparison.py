@@ -157,14 +157,14 @@ def test_what_recording_and_simulator_share_is_no_mismatch():
         recording_model.fit.column("R"), simulator_model.conclusion.full.column("R")[0]
     )
     first = breaths.pressure[:, 0]
-    own = simulator_model.pressures(simulator_model.conclusion.full, held, first)
-    after = before + recording_model.pressures(recording_model.conclusion.full, held, first) - own
+    own = simulator_model.pressures(simulator_model.conclusion.full, data, first)
+    after = before + recording_model.pressures(recording_model.conclusion.full, data, first) - own
     inside = breaths.inspiratory & (breaths.time > 0) & held[:, None]
 
     def error(answer: np.ndarray) -> float:
         return float(np.sqrt(np.mean((answer - breaths.pressure)[inside] ** 2)))
 
     refitted = refit_base_parameters(simulator_model, recording_model.evaluator.training.data)
-    refit = before + simulator_model.pressures(refitted, held, first) - own
+    refit = before + simulator_model.pressures(refitted, data, first) - own
     assert error(after) < 0.6 * error(refit)
     assert error(after) < 0.4 * error(before)

@@ -63,8 +63,8 @@ class Diagnoses:
         self.names = names
         self.asked: list[dict[str, Any]] = []
 
-    def __call__(self, breaths, *, simulator, passive, progress) -> Diagnosis:
-        assert passive  # nobody breathed on the rig
+    def __call__(self, breaths, *, simulator, patient, progress) -> Diagnosis:
+        assert not patient  # nobody breathed on the rig
         self.asked.append({"breaths": breaths, "plant": simulator})
         progress("fitting", 0.5)
         one = made.diagnosis(12)
@@ -209,7 +209,7 @@ def test_what_changed_is_done_again(recordings, tmp_path, diagnoses):
 
 
 def test_a_part_that_was_stopped_does_not_count(recordings, tmp_path):
-    def stopped(breaths, *, simulator, passive, progress):
+    def stopped(breaths, *, simulator, patient, progress):
         raise KeyboardInterrupt
 
     fake = Diagnoses()

@@ -39,13 +39,15 @@ def diagnose(
     lung: Annotated[
         str | None, typer.Option(metavar="R20C50", help="Only the breaths of this lung.")
     ] = None,
-    passive: Annotated[
+    patient: Annotated[
         bool,
         typer.Option(
-            "--passive",
-            help="The lung is a test lung: nobody breathes, so patient effort is excluded.",
+            "--patient",
+            help="A patient (or an active simulator) is ventilated and may breathe. Without this "
+            "option the lung is a test lung, which makes no effort.",
         ),
     ] = False,
+    passive: Annotated[bool, typer.Option("--passive", hidden=True)] = False,
     clip: Clip = False,
     pad: Pad = False,
     json: JsonFile = None,
@@ -74,13 +76,15 @@ def diagnose(
     if simulated is not None and plant != "physics":
         raise InputError("--simulated stands in place of --plant; give one of them")
 
+    if patient and passive:
+        raise InputError("--patient and --passive contradict each other; choose one of them")
     extras.require("jinja2", "rerun")
     progress = Console(stderr=True)
     with progress.status(f"reading {recordings}"):
         breaths = files.load(recordings, clip=clip, pad=pad)
     for note in breaths.notes:
         progress.print(f"note: {note}", markup=False, highlight=False)
-    diagnosis = _diagnose(breaths, plant, simulated, lung, passive, drive)
+    diagnosis = _diagnose(breaths, plant, simulated, lung, patient, drive)
     written = diagnosis.save(out)
     emit(diagnosis.as_dict(), json)
     console = Console(stderr=str(json) == "-")
@@ -93,7 +97,7 @@ def diagnose(
 
 
 def _diagnose(
-    breaths: Breaths, plant: str, simulated: Path | None, lung: str | None, passive: bool,
+    breaths: Breaths, plant: str, simulated: Path | None, lung: str | None, patient: bool,
     drive: str,
 ) -> Diagnosis:  # fmt: skip
     """Diagnose with a progress bar."""
@@ -117,7 +121,7 @@ def _diagnose(
             breaths,
             simulator=simulators,
             lung=lung,
-            passive=passive,
+            patient=patient,
             drive=drive,  # type: ignore[arg-type]
             progress=progress,
         )

@@ -1,22 +1,38 @@
-"""The corrected simulator: its pressures for the recorded commands, and its plants."""
+"""The corrected simulator: its pressures for the recorded commands, and its plants.
+
+A correction may not make a simulator worse, whatever an identification has concluded. Three
+simulators compete for each lung: as given; with R, C, R_ex and PEEP refitted; and corrected. The
+*judging* breaths, which no fit and no test of a term has seen, decide: the refit replaces the given
+simulator, and the correction the refit, only where neither the root-mean-square nor the mean
+absolute error rises. Errors in reports are measured on the same breaths, so that on every lung
+``after <= refit <= before`` holds by construction.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.diagnosis import estimates
-from ventbench.diagnosis.hypothesis import varies_by_breath
-from ventbench.diagnosis.identification import IdentifiedModel
+from ventbench.diagnosis.evaluator import Evaluator
+from ventbench.diagnosis.findings import Stage
+from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
+from ventbench.diagnosis.identification import IdentifiedModel, Split
 from ventbench.diagnosis.residual_analysis import open_loop_error
+from ventbench.diagnosis.settings import CorrectionSettings
 from ventbench.diagnosis.simulator_comparison import refit_base_parameters
 from ventbench.interfaces import Plant
 from ventbench.plants.catalog import Simulators
 from ventbench.plants.corrected import Corrected
 from ventbench.recordings.breaths import Breaths
-from ventbench.system_id.data import Floats
+from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.problem import parameter_of, parameter_values
+
+#: Plants of the lungs, by label.
+Plants = dict[str, Plant]
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,135 +42,267 @@ class Correction:
     Attributes:
         pressures: pressures of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n, T)``
             each.
-        training_errors: mean absolute error of ``before`` and ``after`` on the training breaths,
-            inspirations and expirations, cmH2O.
+        training_errors: mean absolute error of the simulator as given and of the correction, before
+            any choice, on the breaths of the final fits, inspirations and expirations, cmH2O.
         plants: the corrected simulator of each lung, by label; empty if the simulator has none.
+        chosen: what each lung's corrected simulator is, by label: as given, refitted or corrected.
         unchanged: True if the simulator is left as it is, because a correction would be worse.
         notes: notes for the reader.
     """
 
     pressures: dict[str, Floats]
     training_errors: tuple[float, float]
-    plants: dict[str, Plant]
+    plants: Plants
+    chosen: dict[str, Stage] = field(default_factory=dict)
     unchanged: bool = False
     notes: tuple[str, ...] = ()
 
+    @property
+    def helps(self) -> bool:
+        """Whether the correction is chosen for any lung."""
+        return "after" in self.chosen.values()
+
 
 def correct(
-    breaths: Breaths, held: NDArray[np.bool_], before: Floats, recording_model: IdentifiedModel,
+    breaths: Breaths, data: Data, split: Split, before: Floats, recording_model: IdentifiedModel,
     simulator_model: IdentifiedModel | None, simulators: Simulators,
 ) -> Correction:  # fmt: skip
     """Correct a simulator by the difference of the models of the recording and of itself.
 
     A simulator that is not the base model stays as it is if the correction raises its mean error on
-    the training breaths. Likelihoods of coloured noise excuse slow errors, which a learned
-    simulator may not make; the mean error does not.
+    the breaths of the fits. Likelihoods of coloured noise excuse slow errors, which a learned
+    simulator may not make; the mean error does not. The judging breaths choose among the rest.
 
     Args:
         breaths: n recorded ones.
-        held: which of them are held out, ``(n,)``.
+        data: the same as fits see them.
+        split: their uses.
         before: pressures of the simulator, cmH2O, ``(n, T)``.
         recording_model: identified from the recording.
         simulator_model: identified from the simulator's response; None for the base model.
         simulators: what was diagnosed.
     """
-    first = breaths.pressure[:, 0]  # where every simulation starts
-    after = recording_model.pressures(recording_model.conclusion.full, held, first)
-    training = breaths.valid & (breaths.time > 0) & ~held[:, None]
     if simulator_model is None:
-        refit = recording_model.pressures(recording_model.conclusion.base, held, first)
-        pressures = {"before": before, "refit": refit, "after": after}
-        return _correct_base_model(breaths, recording_model, held, pressures, training)
-    # The simulator's own model, and the same with the recording's R, C, R_ex and PEEP.
-    identified = simulator_model.pressures(simulator_model.conclusion.full, held, first)
-    data, noise = recording_model.evaluator.training.data, recording_model.conclusion.noise
-    refitted = refit_base_parameters(simulator_model, data, noise)
-    refit = simulator_model.pressures(refitted, held, first)
-    pressures = {
+        pressures, plants, notes = _base_model(breaths, data, split, before, recording_model)
+    else:
+        pressures, plants, notes = _any_model(
+            breaths, data, before, recording_model, simulator_model
+        )
+    fitted = breaths.valid & (breaths.time > 0) & split.fitted[:, None]
+    errors = (
+        open_loop_error(breaths.pressure, before, fitted).mae,
+        open_loop_error(breaths.pressure, pressures["after"], fitted).mae,
+    )
+    unchanged = simulator_model is not None and bool(errors[1] >= errors[0])
+    if unchanged:
+        pressures = dict.fromkeys(pressures, before)
+    refitted, chosen = choose(breaths, split, pressures)
+    if unchanged:
+        refitted = chosen = dict.fromkeys(chosen, "before")
+    final = {
         "before": before,
-        "refit": before + refit - identified,
-        "after": before + after - identified,
+        "refit": _by_lung(breaths, pressures, refitted),
+        "after": _by_lung(breaths, pressures, chosen),
     }
-    errors = _training_errors(breaths, pressures, training)
-    recording_plants = recording_model.plants()
-    if unchanged := bool(errors[1] >= errors[0]):
-        pressures, recording_plants = dict.fromkeys(pressures, before), simulator_model.plants()
     if not simulators.has_plants:
         note = (
             f"{simulators.name} has no plant that could be corrected, so there is no "
             "corrected.json; the corrected pressures of the recorded breaths are in the diagnosis."
         )
-        return Correction(pressures, errors, {}, unchanged, (_capital(note),))
-    plants = _corrected_plants(breaths, simulators, recording_plants, simulator_model.plants())
-    return Correction(pressures, errors, plants, unchanged)
-
-
-def _correct_base_model(
-    breaths: Breaths, recording_model: IdentifiedModel, held: NDArray[np.bool_],
-    pressures: dict[str, Floats], training: NDArray[np.bool_],
-) -> Correction:  # fmt: skip
-    """The base model with everything that was identified, or with less if that errs less.
-
-    Robust likelihoods excuse breaths that a term throws far off, but whoever uses the plant does
-    not. Patient efforts belong to single breaths: their mean, which is the prediction for other
-    breaths, may be off in all of them, so they are kept without this check.
-    """
-    least = open_loop_error(breaths.pressure, pressures["refit"], training)
-    # A mild mechanism may raise the error a little, since the fit discounts coloured noise.
-    ratio = recording_model.evaluator.settings.simulator.max_error_ratio
-
-    def is_acceptable(pressure: Floats) -> bool:
-        # The mean square sees a few breaths that are far off; the mean error hides them.
-        error = open_loop_error(breaths.pressure, pressure, training)
-        return error.mae <= ratio * least.mae and error.rmse <= ratio * least.rmse
-
-    conclusion = recording_model.conclusion
-    has_efforts = any(varies_by_breath(name) for name in conclusion.full.names)
-    if has_efforts or is_acceptable(pressures["after"]):
-        errors = _training_errors(breaths, pressures, training)
-        return Correction(pressures, errors, estimates.plants(recording_model.fit))
-    model, left_out = conclusion.base, "the identified mechanisms"
-    if conclusion.unnamed is not None and conclusion.named.names:
-        pressure = recording_model.pressures(conclusion.named, held, breaths.pressure[:, 0])
-        if is_acceptable(pressure):
-            model, left_out = conclusion.named, "the nonparametric term"
-            pressures = pressures | {"after": pressure}
-    if model is conclusion.base:
-        pressures = pressures | {"after": pressures["refit"]}
-    note = (
-        f"With {left_out}, the simulator would err more on the training breaths than with R and C "
-        "refitted alone, so the corrected simulator does without."
-    )
-    plants = estimates.plants_of(model, recording_model.evaluator)
-    errors = _training_errors(breaths, pressures, training)
-    return Correction(pressures, errors, plants, notes=(note,))
-
-
-def _training_errors(
-    breaths: Breaths, pressures: dict[str, Floats], training: NDArray[np.bool_]
-) -> tuple[float, float]:
-    before, after = (
-        open_loop_error(breaths.pressure, pressures[key], training).mae
-        for key in ("before", "after")
-    )
-    return before, after
-
-
-def _corrected_plants(
-    breaths: Breaths,
-    simulators: Simulators,
-    recording_plants: dict[str, Plant],
-    simulator_plants: dict[str, Plant],
-) -> dict[str, Plant]:
-    """The given plant of each lung plus the difference of two physics."""
-    return {
-        name: Corrected(
-            simulators.plant_of_breath(breaths, int(index[0])),
-            recording_plants[name],
-            simulator_plants[name],
-        )
+        return Correction(final, errors, {}, chosen, unchanged, (*notes, _capital(note)))
+    given = {
+        name: simulators.plant_of_breath(breaths, int(index[0]))
         for name, index in breaths.by_lung_index.items()
     }
+    result: Plants = {}
+    for name, stage in chosen.items():
+        if simulator_model is None:
+            result[name] = given[name] if stage == "before" else plants[stage][name]
+        else:
+            own = plants["before"][name]
+            result[name] = Corrected(given[name], plants[stage][name], own)
+    return Correction(final, errors, result, chosen, unchanged, tuple(notes))
+
+
+def choose(
+    breaths: Breaths, split: Split, pressures: dict[str, Floats]
+) -> tuple[dict[str, Stage], dict[str, Stage]]:
+    """Choose the refitted and the corrected simulator of each lung, by its judging breaths.
+
+    Args:
+        breaths: n recorded breaths.
+        split: their uses; a lung without judging breaths follows those of all lungs together.
+        pressures: pressures of the candidates ``before``, ``refit`` and ``after``, cmH2O, ``(n,
+            T)`` each.
+
+    Returns:
+        The candidate that stands for the refitted simulator, which is ``before`` where a refit is
+        worse, and the one that stands for the corrected simulator, both by label.
+    """
+    # What reports measure: inspirations, from the second sample on.
+    judged = breaths.inspiratory & (breaths.time > 0) & split.judging[:, None]
+    refitted: dict[str, Stage] = {}
+    corrected: dict[str, Stage] = {}
+    for name, index in breaths.by_lung_index.items():
+        own = np.zeros(len(breaths), bool)
+        own[index] = True
+        mask = judged & own[:, None]
+        mask = mask if mask.any() else judged
+        best: Stage = "before"
+        if _is_no_worse(breaths, pressures["refit"], pressures[best], mask):
+            best = "refit"
+        refitted[name] = corrected[name] = best
+        if _is_no_worse(breaths, pressures["after"], pressures[best], mask):
+            corrected[name] = "after"
+    return refitted, corrected
+
+
+def _is_no_worse(breaths: Breaths, trial: Floats, current: Floats, mask: NDArray[np.bool_]) -> bool:
+    """Whether neither error rises; a simulator whose pressures are unknown never wins."""
+    new, old = (open_loop_error(breaths.pressure, p, mask) for p in (trial, current))
+    if not np.isfinite(old.rmse):
+        return bool(np.isfinite(new.rmse))
+    return bool(new.rmse <= old.rmse and new.mae <= old.mae)
+
+
+def _by_lung(breaths: Breaths, pressures: dict[str, Floats], stages: dict[str, Stage]) -> Floats:
+    """Pressures of the stage that is chosen for each lung, cmH2O, ``(n, T)``."""
+    result = pressures["before"].copy()
+    for name, index in breaths.by_lung_index.items():
+        result[index] = pressures[stages[name]][index]
+    return result
+
+
+def _base_model(
+    breaths: Breaths, data: Data, split: Split, before: Floats, recording_model: IdentifiedModel
+) -> tuple[dict[str, Floats], dict[str, Plants], list[str]]:
+    """Candidates for the base model: refitted, and with everything that was identified.
+
+    The refit errs least in open loop on its breaths. The correction has the reported parameters,
+    unless coloured noise let them drift: then it is fitted anew for the least error. The
+    nonparametric term is left out if it throws breaths far off, as robust likelihoods allow.
+    """
+    first = breaths.pressure[:, 0]
+    evaluator, conclusion = recording_model.evaluator, recording_model.conclusion
+    settings = evaluator.settings.correction
+    of_fits = breaths.valid & (breaths.time > 0) & split.fitted[:, None]
+
+    def error(pressure: Floats) -> float:
+        return open_loop_error(breaths.pressure, pressure, of_fits).rmse
+
+    base = fit_open_loop(evaluator, conclusion.base, recording_model.final, settings, label=True)
+    refit = recording_model.pressures(base, data, first)
+    final = recording_model.final_model
+    after, notes = recording_model.pressures(final, data, first), []
+    model = final
+    if not any(varies_by_breath(name) for name in final.names):
+        again = fit_open_loop(evaluator, final, recording_model.final, settings)
+        pressure = recording_model.pressures(again, data, first)
+        if error(pressure) < settings.drift_ratio * error(after):
+            model, after = again, pressure
+            notes.append(
+                "The corrected simulator is fitted for the least open-loop error: with the "
+                "reported parameters, which allow for slow noise and for valve gains that scatter, "
+                "it would err more."
+            )
+        named = conclusion.named
+        if conclusion.unnamed is not None and named.names and error(after) > error(refit):
+            pressure = recording_model.pressures(named, data, first)
+            if error(pressure) < error(after):
+                model, after = named, pressure
+                notes.append(
+                    "With the nonparametric term, the simulator would err more than with R and C "
+                    "refitted alone, so the corrected simulator does without."
+                )
+    plants = {
+        "refit": estimates.plants_of(base, evaluator),
+        "after": estimates.plants_of(model, evaluator),
+    }
+    return {"before": before, "refit": refit, "after": after}, plants, notes
+
+
+def _any_model(
+    breaths: Breaths, data: Data, before: Floats, recording_model: IdentifiedModel,
+    simulator_model: IdentifiedModel,
+) -> tuple[dict[str, Floats], dict[str, Plants], list[str]]:  # fmt: skip
+    """Candidates for any simulator: itself plus differences of the physics of both models."""
+    first = breaths.pressure[:, 0]
+    conclusion = recording_model.conclusion
+    # The simulator's own model, and the same with the recording's R, C, R_ex and PEEP.
+    own = simulator_model.conclusion.full
+    noise = replace(conclusion.noise, ar=(0.0, 0.0))
+    refitted = refit_base_parameters(
+        simulator_model, recording_model.evaluator.training.data, noise
+    )
+    identified = simulator_model.pressures(own, data, first)
+    pressures = {
+        "before": before,
+        "refit": before + simulator_model.pressures(refitted, data, first) - identified,
+        "after": before + recording_model.pressures(conclusion.full, data, first) - identified,
+    }
+    plants = {
+        "before": simulator_model.plants(),
+        "refit": estimates.plants_of(refitted, simulator_model.evaluator),
+        "after": recording_model.plants(),
+    }
+    return pressures, plants, []
+
+
+def fit_open_loop(
+    evaluator: Evaluator, fitted: FittedModel, partition: Partition, settings: CorrectionSettings,
+    *, label: bool = False,
+) -> FittedModel:  # fmt: skip
+    """Fit a hypothesis for the least open-loop error: at white noise, from several starts.
+
+    Coloured noise excuses slow errors, and a fit from one start may end in a local minimum far off.
+    The result never errs more on its breaths than its starts do.
+
+    Args:
+        evaluator: evaluator of the recording.
+        fitted: the hypothesis, fitted to some breaths.
+        partition: breaths to fit.
+        settings: which starts to try.
+        label: also start from the labels' R and C, and from other lungs around them.
+    """
+    evaluator = replace(evaluator, gain_sd=0.0)  # a breath to come has the usual gain
+    noise = replace(fitted.noise, ar=(0.0,) * len(fitted.noise.ar), tail=settings.tail)
+    values, names = evaluator.transferred_values(fitted, partition), partition.predictor.names
+    known = {p: values[:, names.index(p)] for p in fitted.hypothesis.paths if p in names}
+    starts = [known]
+    if label:
+        data = partition.data
+        starts.append({"R": data.R, "C": data.C})
+        starts.append(_best_lung(partition, settings))
+    models = [evaluator.fit(fitted.hypothesis, noise, start=s, partition=partition) for s in starts]
+    return min(models, key=lambda model: _square(evaluator, model, partition))
+
+
+def _best_lung(partition: Partition, settings: CorrectionSettings) -> dict[str, Floats]:
+    """R and C of each lung, of a grid around its label, with which the base model errs least."""
+    data, names = partition.data, partition.predictor.names
+    label = parameter_values(data, names, {})
+    factors = list(product(settings.lung_factors, repeat=2))
+    points = np.repeat(label[None], len(factors), axis=0)
+    for point, (of_R, of_C) in zip(points, factors, strict=True):
+        for path, factor in (("R", of_R), ("C", of_C)):
+            about, column = parameter_of(path), names.index(path)
+            point[:, column] = np.clip(point[:, column] * factor, about.low, about.high)
+    seen = partition.predictor.predict_all(points)
+    square = np.sum(((seen - data.measured) * data.weight) ** 2, axis=(2, 3))  # (m, n)
+    start = {"R": data.R.copy(), "C": data.C.copy()}
+    for lung in np.unique(data.lung):
+        own = data.lung == lung
+        best = int(np.argmin(square[:, own].sum(axis=1)))
+        for path in start:
+            start[path][own] = points[best][own, names.index(path)]
+    return start
+
+
+def _square(evaluator: Evaluator, model: FittedModel, partition: Partition) -> float:
+    """Sum of squared errors of a simulation that starts from the first readings."""
+    data = partition.data
+    error = (evaluator.predict(model, partition) - data.measured) * data.weight
+    return float(np.sum(error**2))
 
 
 def _capital(text: str) -> str:

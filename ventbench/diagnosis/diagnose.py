@@ -14,10 +14,23 @@ from ventbench.diagnosis import estimates, flow_drive
 from ventbench.diagnosis.conclusion import Conclusion
 from ventbench.diagnosis.corrected import Correction, correct
 from ventbench.diagnosis.experiment_design import request_breaths
-from ventbench.diagnosis.findings import BreathRequest, MissingMechanism, Traces, Verdict
-from ventbench.diagnosis.identification import IdentifiedModel, held_out, identify, usable
+from ventbench.diagnosis.findings import (
+    BreathRequest,
+    MissingMechanism,
+    OpenLoopComparison,
+    Traces,
+    Verdict,
+)
+from ventbench.diagnosis.hypothesis import make_partition
+from ventbench.diagnosis.identification import IdentifiedModel, Split, identify, split, usable
 from ventbench.diagnosis.refinement import Alternatives
-from ventbench.diagnosis.residual_analysis import compare_open_loop, flow_and_volume, locate
+from ventbench.diagnosis.residual_analysis import (
+    compare_open_loop,
+    flow_and_volume,
+    is_unexplained,
+    locate,
+    noise_floor,
+)
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.diagnosis.simulator_comparison import (
@@ -32,7 +45,7 @@ from ventbench.physics.catalogue import parameter
 from ventbench.plants.catalog import Given, Simulators, load_simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.decimation import decimate, is_fast
-from ventbench.system_id import Fit, Noise, make_data
+from ventbench.system_id import Data, Fit, Noise, make_data
 
 #: Receives the current step in words, and the share of the whole that is done.
 Progress: TypeAlias = Callable[[str, float], None]
@@ -51,7 +64,8 @@ def diagnose(
     *,
     simulator: Given = "physics",
     lung: str | None = None,
-    passive: bool = False,
+    patient: bool = False,
+    passive: bool | None = None,
     drive: Drive = "auto",
     progress: Progress | None = None,
     settings: SelectionConfig = DEFAULT,
@@ -63,7 +77,8 @@ def diagnose(
     missing.
 
     Args:
-        breaths: n recorded breaths; every third breath of a lung is held out.
+        breaths: n recorded breaths. Of each lung, every third tests which terms are needed, and
+            every sixth, which nothing else sees, judges the corrected simulator.
         simulator: what to diagnose. A name (``"physics"``, ``"frozen"``, ``"learned"``,
             ``"two_balloon"``), a path to a plant file, a plant, plants by lung id, an array of
             simulated pressures of these breaths, cmH2O, ``(n, T)``, or a Python function of one
@@ -71,7 +86,9 @@ def diagnose(
             pressures, cmH2O, ``(T,)``, or a class with ``step``, in plain Python or NumPy; see
             :mod:`~ventbench.plants.python_simulator`.
         lung: use only the breaths of this label.
-        passive: True if nobody breathes, as with a test lung: patient efforts are excluded.
+        patient: True if the lung is a patient's or an active simulator's, so that somebody may
+            breathe; False for a test lung, which makes no effort.
+        passive: the opposite of ``patient``; for callers of earlier versions.
         drive: what the model follows: ``"valve"``, the recorded commands; ``"flow"``, the recorded
             flow, which says nothing of the valves; ``"auto"``, the flow only if ``u_in`` is zero
             throughout, so that no command was recorded.
@@ -97,6 +114,10 @@ def diagnose(
         >>> print(diagnosis)  # doctest: +SKIP
     """
     began = time.perf_counter()
+    if passive is not None:
+        if patient and passive:
+            raise InputError("patient=True and passive=True contradict each other; give patient")
+        patient = not passive
     tell = progress or (lambda what, share: None)
     simulators = load_simulators(simulator, breaths=breaths)
     if lung is not None:
@@ -106,8 +127,10 @@ def diagnose(
     if by_flow:
         breaths, notes_on_flow = flow_drive.with_flow(breaths)
     breaths, notes = usable(breaths, settings.data)
-    recorded, held = breaths, held_out(breaths, settings.data)
-    excluded = ("patient_effort",) if passive else ()
+    recorded, uses = breaths, split(breaths, settings.data, _never_fitted(breaths, simulators))
+    seen = uses.identifying  # nothing below looks at other breaths until a simulator is chosen
+    held, fitted = uses.testing[seen], uses.fitted[seen]
+    excluded = () if patient else ("patient_effort",)
     tell("simulating", 0.02)
     if by_flow:
         driven, index = flow_drive.drive_grid(recorded)
@@ -126,13 +149,16 @@ def diagnose(
             breaths, before = grid.breaths, grid.of(before)
             notes.append(_note_on_rate(rate, breaths))
         data = make_data(breaths)
-    recording_only_model = identify(data, held, excluded, lambda what: tell(what, 0.3), settings)
+    recording_only_model = identify(
+        data.select(seen), held, excluded, lambda what: tell(what, 0.3), settings, fitted
+    )
     recording_model, simulator_model = recording_only_model, None
     if not simulators.is_base_physics:
         tell("fitting the simulator's response", 0.6)
         recording_model, simulator_model = identify_both(
-            data, held, before, recording_only_model, excluded, lambda what: tell(what, 0.7)
-        )
+            data.select(seen), held, before[seen], recording_only_model, excluded,
+            lambda what: tell(what, 0.7), fitted,
+        )  # fmt: skip
     tell("drawing conclusions", 0.9)
     missing, notes_on_simulator = missing_mechanisms(recording_model, simulator_model)
     if simulator_model is not None:
@@ -141,27 +167,39 @@ def diagnose(
             (recording_model, kept), notes_on_simulator = steady, []
             missing = {name: changed for name, changed in missing.items() if name in kept}
     conclusion = recording_model.conclusion
-    correction = correct(breaths, held, before, recording_model, simulator_model, simulators)
+    correction = correct(breaths, data, uses, before, recording_model, simulator_model, simulators)
     term = estimates.nonparametric_term(conclusion)
     own = simulator_model.conclusion.unnamed if simulator_model is not None else None
     if own is not None and term is not None and own.name == term.name:
         notes_on_simulator.append(f"The simulator needs a nonparametric term at {term.name} too.")
-    rejected = correction.unchanged and (bool(missing) or term is not None)
-    if rejected:
-        missing, term, notes_on_simulator = {}, None, [_note_on_unchanged(correction)]
     lungs, notes_on_lungs = _lungs(recorded, recording_only_model.fit)
     noise, pressures = conclusion.noise, correction.pressures
+    open_loop = compare_open_loop(
+        breaths, uses.judging, pressures, noise_floor(breaths, float(noise.sigma[0])),
+        settings.residuals,
+    )  # fmt: skip
+    is_input = conclusion.unnamed is not None and conclusion.unnamed.latent_input is not None
+    rejected = (bool(missing) or term is not None) and not _helps(
+        correction, recording_model, open_loop, data.select(uses.judging), by_breath=is_input
+    )
+    if rejected:
+        missing, notes_on_simulator = {}, [_note_on_unchanged(correction)]
+        term = term if is_input and not correction.unchanged else None
     if by_flow and breaths.flow is not None:
         flow = breaths.flow
         volume = np.cumsum(data.u_in * data.dt, axis=1) * float(parameter("gain").neutral)
     else:
         flow, volume = flow_and_volume(breaths, recording_model.fit, pressures["refit"])
     here = np.flatnonzero(~np.isnan(pressures["refit"]).all(axis=1))
-    location = locate(
-        breaths.select(here), pressures["refit"][here], noise.sigma[0], flow[here], volume[here],
-        settings=settings.residuals,
+    location, remaining = (
+        locate(
+            breaths.select(here), pressures[stage][here], noise.sigma[0], flow[here], volume[here],
+            settings=settings.residuals,
+        )
+        for stage in ("refit", "after")
     )  # fmt: skip
     unnamed = term is not None or conclusion.unresolved or (rejected and location)
+    unnamed = unnamed or is_unexplained(open_loop, settings.correction)
     verdict: Verdict = "named" if missing else "unnamed" if unnamed else "nothing_missing"
     return Diagnosis(
         verdict=verdict,
@@ -171,13 +209,15 @@ def diagnose(
         ),
         nonparametric=term,
         location=location,
-        open_loop=compare_open_loop(
-            breaths, held, pressures, float(noise.sigma[0]), settings.residuals
-        ),
+        remaining=remaining,
+        open_loop=open_loop,
         lungs=lungs,
         request=None if rejected or by_flow else _request(conclusion, settings),
-        traces=Traces(breaths, held, pressures["before"], pressures["refit"], pressures["after"],
-                      flow, volume),
+        traces=Traces(breaths, uses.judging, pressures["before"], pressures["refit"],
+                      pressures["after"], flow, volume),
+        split=_ids(breaths, uses),
+        chosen=correction.chosen,
+        gain_scatter=conclusion.gain_sd,
         plants=correction.plants,
         simulator=_name(simulator, simulators),
         noise=(float(noise.sigma[0]), float(noise.ar[0])),
@@ -195,6 +235,51 @@ def _note_on_rate(rate: float, breaths: Breaths) -> str:
         f"Recorded at {rate:.0f} Hz: {int(np.median(readings))} readings of a breath are used, "
         f"and {int(np.median(kept))} samples of its commands, whose changes keep their times."
     )
+
+
+def _helps(
+    correction: Correction,
+    recording_model: IdentifiedModel,
+    open_loop: OpenLoopComparison,
+    judging: Data,
+    *,
+    by_breath: bool,
+) -> bool:
+    """Whether breaths that no fit and no test has seen speak for the correction.
+
+    Its error need not be lower in a recording where a mild effect drowns in slow noise, but then
+    the likelihood of those breaths must rise. A latent input, which differs from breath to breath
+    (``by_breath``), corrects nothing and is not judged here.
+    """
+    if correction.unchanged:
+        return False
+    if correction.helps and open_loop.after.rmse < open_loop.refit.rmse:
+        return True
+    evaluator, conclusion = recording_model.evaluator, recording_model.conclusion
+    if conclusion.base.hypothesis == conclusion.full.hypothesis:
+        return by_breath or correction.helps
+    partition = make_partition(judging, evaluator.training.predictor.names, evaluator.settings)
+    base = evaluator.fit(conclusion.base.hypothesis, conclusion.full.noise)
+    gained = evaluator.log_likelihood(conclusion.full, partition)
+    return bool(np.sum(gained - evaluator.log_likelihood(base, partition)) > 0.0)
+
+
+def _never_fitted(breaths: Breaths, simulators: Simulators) -> tuple[int, ...]:
+    """Breaths that were held out when the simulator was made of the same recording."""
+    origin = simulators.origin
+    if breaths.sha256 is None or origin.get("recording_sha256") != breaths.sha256:
+        return ()
+    return tuple(int(breath) for breath in origin.get("held_out_breaths", ()))
+
+
+def _ids(breaths: Breaths, uses: Split) -> dict[str, tuple[int, ...]]:
+    """Ids of the breaths by their use."""
+    masks = {
+        "training": ~uses.testing & ~uses.judging,
+        "testing": uses.testing,
+        "judging": uses.judging,
+    }
+    return {name: tuple(int(i) for i in breaths.breath_id[mask]) for name, mask in masks.items()}
 
 
 def _of_lung(breaths: Breaths, lung: str) -> Breaths:
@@ -215,6 +300,11 @@ def _name(given: Given, simulators: Simulators) -> str:
 def _note_on_unchanged(correction: Correction) -> str:
     """Note on why a simulator is left as it is."""
     before, after = correction.training_errors
+    if not correction.unchanged:
+        return (
+            "What was identified helps on none of the breaths that were set aside to judge it, so "
+            "it is withdrawn, and the simulator stays as it is or is refitted."
+        )
     return (
         "The identified correction would raise the simulator's mean absolute error on the training "
         f"breaths from {before:.2f} to {after:.2f} cmH2O, so the simulator is left as it is."

@@ -9,7 +9,7 @@ import numpy as np
 
 from ventbench import mechanics
 from ventbench.diagnosis.conclusion import Conclusion, UnnamedEffect
-from ventbench.diagnosis.evaluator import Evaluator
+from ventbench.diagnosis.evaluator import Evaluator, groups_by_label
 from ventbench.diagnosis.findings import NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
 from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY, LatentInput
@@ -57,18 +57,26 @@ def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
     known = fitted.problem.data
     if len(np.unique(known.lung)) > 1:
         same = (partition.data.R[:, None] == known.R) & (partition.data.C[:, None] == known.C)
-        start |= {path: fitted.column(path)[np.argmax(same, axis=1)] for path in ("R", "C")}
+        grouped = ("R", "C", *groups_by_label(known, hypothesis.paths))
+        start |= {path: fitted.column(path)[np.argmax(same, axis=1)] for path in grouped}
     if hypothesis.breath_terms:  # the efforts of each breath start where they are likeliest
         near = evaluator.fit(
             hypothesis, fitted.noise, start=start, partition=partition, restart=True
         )
         start |= {path: near.column(path) for path in near.problem.unknowns.paths}
+    # Where rigs differ, gains that are the same in all breaths would be made up for by mechanisms.
+    by_breath = ("gain",) if evaluator.gain_sd else ()
+    neutral = float(np.log(parameter("gain").neutral))
+    start = {path: value for path, value in start.items() if path not in by_breath}
     return fit(
         partition.data,
         hypothesis.names,
-        free=dict.fromkeys((*hypothesis.free, *free)),
+        free=dict.fromkeys((*hypothesis.free, *free, *by_breath)),
         fixed=dict(hypothesis.fixed),
         start=start,
+        groups=groups_by_label(partition.data, hypothesis.paths)
+        | {path: np.arange(len(partition.data)) for path in by_breath},
+        prior={path: (neutral, evaluator.gain_sd) for path in by_breath},
         noise=fitted.noise,
         predictor=partition.predictor,
     )
@@ -77,7 +85,8 @@ def final_fit(fitted: FittedModel, partition: Partition, evaluator: Evaluator) -
 def parameter_estimates(fitted: Fit, name: str) -> dict[str, Estimate]:
     """Estimates of a mechanism's free parameters, by short name.
 
-    Of a parameter that differs between breaths: median and central 95 % over the breaths.
+    Of a parameter that differs between breaths: median and central 95 % over the breaths. Of one
+    that differs between lungs: median over the lungs, and an interval that holds those of all.
     """
     values = {}
     for about in mechanism(name).description.parameters:
@@ -89,8 +98,11 @@ def parameter_estimates(fitted: Fit, name: str) -> dict[str, Estimate]:
             low, middle, high = np.quantile(column, [0.025, 0.5, 0.975])
             values[about.name] = Estimate(float(middle), about.unit, (float(low), float(high)))
         else:
-            ends = interval(fitted, path)
-            values[about.name] = Estimate(ends.value, about.unit, (ends.low, ends.high))
+            groups = range(len(fitted.problem.unknowns.of(path)))
+            ends = [interval(fitted, path, group) for group in groups]
+            low, high = min(end.low for end in ends), max(end.high for end in ends)
+            middle = float(np.median([end.value for end in ends]))
+            values[about.name] = Estimate(middle, about.unit, (low, high))
     return values
 
 
@@ -131,14 +143,13 @@ def lung_matches_by_flow(breaths: Breaths) -> tuple[tuple[LungMatch, ...], tuple
     return tuple(matches), tuple(note for lung in lungs for note in lung.notes)
 
 
-def plants(fitted: Fit) -> dict[str, Plant]:
-    """The fitted plant of each lung, by label, without parameters that differ between breaths."""
-    problem = fitted.problem
-    return _by_label(problem.data, problem.predictor, fitted.mechanisms, fitted.values)
-
-
 def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
-    """The plant of each lung, by label, of a model that was fitted to the training breaths."""
+    """The plant of each lung, by label; it answers as :meth:`Evaluator.predict` does.
+
+    Args:
+        fitted: the model, fitted to any breaths of the lungs.
+        evaluator: evaluator with which it was fitted.
+    """
     partition = evaluator.training
     return _by_label(
         partition.data,

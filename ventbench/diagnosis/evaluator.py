@@ -218,11 +218,14 @@ class Evaluator:
         held-out breaths themselves; patient effort is integrated out.
         """
         if fitted not in self._held_out:
-            problem, x = self.refit_breath_parameters(fitted)
-            plain = problem.log_likelihood(x)
-            term = self.breath_term(fitted)
-            self._held_out[fitted] = plain + term.log_likelihood_gain(problem, x, fitted)
+            self._held_out[fitted] = self.log_likelihood(fitted, self.held_out)
         return self._held_out[fitted]
+
+    def log_likelihood(self, fitted: FittedModel, partition: Partition) -> Floats:
+        """Log-likelihood of each of other breaths; see :meth:`held_out_log_likelihood`."""
+        problem, x = self.refit_breath_parameters(fitted, partition)
+        plain = problem.log_likelihood(x)
+        return plain + self.breath_term(fitted).log_likelihood_gain(problem, x, fitted)
 
     def training_log_likelihood(self, fitted: FittedModel, noise: Noise | None = None) -> float:
         """Log-likelihood of the training breaths, nats; patient effort is integrated out.

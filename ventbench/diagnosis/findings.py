@@ -19,6 +19,9 @@ Floats = NDArray[np.float64]
 #: something is missing that the library does not have; a nonparametric term may say where it acts.
 Verdict = Literal["named", "nothing_missing", "unnamed"]
 
+#: A simulator as given, with R, C, R_ex and PEEP refitted, and corrected.
+Stage = Literal["before", "refit", "after"]
+
 
 @dataclass(frozen=True)
 class MissingMechanism:
@@ -103,8 +106,11 @@ class OpenLoopError:
 class OpenLoopComparison:
     """Open-loop errors over the inspirations of held-out breaths.
 
+    On each lung, ``after`` is at most ``refit``, and ``refit`` at most ``before``: these breaths
+    choose the corrected simulator.
+
     Attributes:
-        held_out_breaths: ids of the held-out breaths.
+        held_out_breaths: ids of the held-out breaths, which no fit and no test has seen.
         before: error of the simulator as given.
         refit: error after R, C, R_ex and PEEP are refitted.
         after: error of the corrected simulator.
@@ -120,6 +126,12 @@ class OpenLoopComparison:
     noise_floor: float
     groups: dict[str, dict[str, OpenLoopError]]
 
+    @property
+    def unexplained(self) -> float:
+        """Root-mean-square error of the corrected simulator beyond the noise, cmH2O."""
+        beyond = self.after.rmse**2 - self.noise_floor**2
+        return float(np.sqrt(max(beyond, 0.0))) if np.isfinite(beyond) else float("nan")
+
 
 @dataclass(frozen=True, eq=False)
 class Traces:
@@ -127,7 +139,7 @@ class Traces:
 
     Attributes:
         breaths: n recorded breaths.
-        held_out: which of them no fit has seen, bool ``(n,)``.
+        held_out: which of them no fit and no test of a term has seen, bool ``(n,)``.
         before: pressure of the simulator as given, cmH2O.
         refit: pressure with R, C, R_ex and PEEP refitted, cmH2O.
         after: pressure of the corrected simulator, cmH2O.
@@ -185,6 +197,13 @@ class Findings:
         notes: further information for the reader, a sentence each.
         seconds: computing time.
         settings: every threshold of the diagnosis.
+        remaining: regions in which the corrected simulator still errs, the most certain first.
+        split: ids of the breaths by use: ``training``, ``testing`` and ``judging``; few breaths of
+            a lung have both of the last two uses.
+        chosen: what the corrected simulator of each lung is, by label: the simulator as given,
+            refitted or corrected, whichever errs least on the judging breaths.
+        gain_scatter: standard deviation of the logarithm of the breaths' valve gains; 0 if all
+            breaths have the same gain.
     """
 
     verdict: Verdict
@@ -201,3 +220,7 @@ class Findings:
     notes: tuple[str, ...]
     seconds: float
     settings: SelectionConfig = DEFAULT
+    remaining: tuple[ErrorRegion, ...] = ()
+    split: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    chosen: dict[str, Stage] = field(default_factory=dict)
+    gain_scatter: float = 0.0

@@ -1,8 +1,13 @@
-"""Identification of a model from breaths: the data split, and a conclusion with its final fit."""
+"""Identification of a model from breaths: use of the breaths, and a conclusion with its final fit.
+
+Each breath has one use, so that no question is answered by breaths that an earlier one has used up:
+*training* breaths fit hypotheses, *testing* breaths decide which terms are needed, and *judging*
+breaths, which no fit and no test has seen, choose the corrected simulator and measure its error.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +16,7 @@ from numpy.typing import NDArray
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.conclusion import Conclusion, conclude
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
-from ventbench.diagnosis.hypothesis import FittedModel, make_partition
+from ventbench.diagnosis.hypothesis import FittedModel, Partition, make_partition
 from ventbench.diagnosis.screening import all_parameter_paths
 from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
 from ventbench.errors import InputError
@@ -28,12 +33,67 @@ _INSPIRATORY = 3
 _LISTED = 5
 
 
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Use of n breaths; masks ``(n,)``.
+
+    Attributes:
+        testing: breaths that decide which terms a model needs.
+        judging: breaths that choose the corrected simulator and measure its error. A lung with few
+            breaths has none to spare: its testing breaths judge as well.
+    """
+
+    testing: NDArray[np.bool_]
+    judging: NDArray[np.bool_]
+
+    @property
+    def identifying(self) -> NDArray[np.bool_]:
+        """Breaths that the identification may see: training and testing breaths."""
+        return ~self.judging | self.testing
+
+    @property
+    def fitted(self) -> NDArray[np.bool_]:
+        """Breaths of the final fits: all but the judging ones."""
+        return ~self.judging
+
+    @property
+    def reused(self) -> NDArray[np.bool_]:
+        """Breaths that both test terms and judge the corrected simulator."""
+        return self.judging & self.testing
+
+
 def held_out(breaths: Breaths, settings: DataSettings = DEFAULT.data) -> NDArray[np.bool_]:
     """Every third breath (by default) of each lung, from its second on, bool, ``(n,)``."""
     chosen = np.zeros(len(breaths), bool)
     for index in breaths.by_lung_index.values():
         chosen[np.sort(index)[1 :: settings.held_out_every]] = True
     return chosen
+
+
+def split(
+    breaths: Breaths, settings: DataSettings = DEFAULT.data, never_fitted: Collection[int] = ()
+) -> Split:
+    """Assign the breaths to their uses.
+
+    Args:
+        breaths: n breaths.
+        settings: how many are held out, and for what.
+        never_fitted: ids of breaths that were held out when the simulator was made; they judge it.
+    """
+    testing, judging = held_out(breaths, settings), np.zeros(len(breaths), bool)
+    earlier = np.isin(breaths.breath_id, list(never_fitted))
+    for index in map(np.sort, breaths.by_lung_index.values()):
+        tests, judges = testing[index], np.zeros(len(index), bool)
+        if earlier[index].any() and not np.all(earlier[index] | tests):
+            judges = earlier[index]
+        elif len(index) >= settings.judging_from:
+            judges[settings.judging_every - 1 :: settings.judging_every] = True
+        else:
+            judges = tests
+        judging[index] = judges
+        if np.any(tests & ~judges):
+            testing[index] = tests & ~judges
+    return Split(testing, judging)
 
 
 def usable(breaths: Breaths, settings: DataSettings = DEFAULT.data) -> tuple[Breaths, list[str]]:
@@ -74,24 +134,33 @@ class IdentifiedModel:
         evaluator: evaluator of the breaths.
         conclusion: base model, mechanisms and nonparametric term that the breaths need.
         fit: final fit of the conclusion, with intervals.
+        final: breaths of the final fit, with a predictor of the conclusion's parameters.
     """
 
     evaluator: Evaluator
     conclusion: Conclusion
     fit: Fit
+    final: Partition
 
-    def pressures(self, fitted: FittedModel, held: NDArray[np.bool_], first: Floats) -> Floats:
-        """Open-loop pressures of a model for the commands of all n breaths, cmH2O, ``(n, T)``.
+    @property
+    def final_model(self) -> FittedModel:
+        """The conclusion with the parameters of the final fit, which reports show."""
+        hypothesis, fit = self.conclusion.full.hypothesis, self.fit
+        likelihood = float(fit.log_likelihood.sum())
+        return FittedModel(hypothesis, fit.problem, fit.minimum, likelihood)
+
+    def pressures(self, fitted: FittedModel, data: Data, first: Floats | None = None) -> Floats:
+        """Open-loop pressures of a model for the commands of n breaths, cmH2O, ``(n, T)``.
 
         Args:
             fitted: a model that was fitted with this evaluator.
-            held: which breaths are held out, ``(n,)``.
-            first: pressures that the breaths start from, cmH2O, ``(n,)``.
+            data: any breaths of its lungs.
+            first: pressures that the breaths start from, cmH2O, ``(n,)``; their first readings if
+                None.
         """
-        pressure = np.empty((len(held), self.evaluator.training.data.u_in.shape[1]))
-        for which, partition in ((~held, self.evaluator.training), (held, self.evaluator.held_out)):
-            pressure[which] = self.evaluator.predict(fitted, partition, first[which])[:, 0]
-        return pressure
+        names = self.evaluator.training.predictor.names
+        partition = make_partition(data, names, self.evaluator.settings)
+        return self.evaluator.predict(fitted, partition, first)[:, 0]
 
     def plants(self) -> dict[str, Plant]:
         """The identified plant of each lung, by label; it answers as :meth:`pressures` does."""
@@ -104,15 +173,17 @@ def identify(
     excluded: tuple[str, ...],
     tell: Callable[[str], None],
     settings: SelectionConfig = DEFAULT,
+    fitted: NDArray[np.bool_] | None = None,
 ) -> IdentifiedModel:
     """Find the mechanisms that breaths need, and fit them.
 
     Args:
         data: n breaths.
-        held: which of them are held out, ``(n,)``.
+        held: which of them test the terms, ``(n,)``.
         excluded: mechanisms that cannot act.
         tell: receives the current step, in words.
         settings: every threshold.
+        fitted: which breaths the final fit may use, ``(n,)``; all but the testing ones if None.
     """
     narrow = make_evaluator(data, held, paths(), excluded, settings)
     wide: list[Evaluator] = []
@@ -124,12 +195,11 @@ def identify(
     conclusion = conclude(narrow, widened, tell)
     # Gains that differ between breaths are parameters of each breath, unknown of held-out ones.
     gain_sd = conclusion.gain_sd
-    if conclusion.unnamed is not None and conclusion.unnamed.term is not None:
-        # With a nonparametric term, the training breaths alone: all would be one more compilation.
-        evaluator = replace(wide[0], gain_sd=gain_sd)
-        fit = estimates.final_fit(conclusion.full, evaluator.training, evaluator)
-        return IdentifiedModel(evaluator, conclusion, fit)
-    evaluator = replace(narrow, gain_sd=gain_sd)
-    everything = make_partition(data, paths(), settings)
-    fit = estimates.final_fit(conclusion.named, everything, evaluator)
-    return IdentifiedModel(evaluator, conclusion, fit)
+    has_term = conclusion.unnamed is not None and conclusion.unnamed.term is not None
+    evaluator = replace(wide[0] if has_term else narrow, gain_sd=gain_sd)
+    final = evaluator.training
+    if not has_term:  # a nonparametric term is fitted to the training breaths alone, to save time
+        chosen = ~held if fitted is None else fitted
+        final = make_partition(data.select(chosen), paths(), settings)
+    fit = estimates.final_fit(conclusion.full, final, evaluator)
+    return IdentifiedModel(evaluator, conclusion, fit, final)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ventbench.diagnosis.findings import ErrorRegion, OpenLoopComparison, OpenLoopError
 from ventbench.diagnosis.residual_axes import Axis, axes
-from ventbench.diagnosis.settings import DEFAULT, ResidualSettings
+from ventbench.diagnosis.settings import DEFAULT, CorrectionSettings, ResidualSettings
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit
 
@@ -89,6 +89,49 @@ def compare_open_loop(
     groups = {name: by_stage(mask) for name, mask in parts.items() if mask.any()}
     return OpenLoopComparison(
         ids, whole["before"], whole["refit"], whole["after"], noise_floor, groups
+    )
+
+
+def is_unexplained(
+    errors: OpenLoopComparison, settings: CorrectionSettings = DEFAULT.correction
+) -> bool:
+    """Whether the corrected simulator errs far more than the measurement scatters."""
+    return bool(
+        errors.after.rmse > settings.unexplained_ratio * errors.noise_floor
+        and errors.unexplained > settings.unexplained_error
+    )
+
+
+def noise_floor(
+    breaths: Breaths, noise_sd: float, settings: ResidualSettings = DEFAULT.residuals
+) -> float:
+    """Standard deviation of the measurement, cmH2O, which no simulator can beat.
+
+    The noise of a model that fits badly contains the model's own slow errors. Late in an expiration
+    hardly anything moves, so that the scatter about a parabola shows the sensor alone; the floor is
+    never more than a few times that.
+
+    Args:
+        breaths: the recording.
+        noise_sd: standard deviation of the noise that the identified model leaves, cmH2O.
+        settings: which part of expirations is quiet, and the factor.
+    """
+    late = (breaths.u_out == 1) & breaths.valid & np.isfinite(breaths.pressure)
+    scatter = []
+    for time, pressure, u_in, use in zip(
+        breaths.time, breaths.pressure, breaths.u_in, late, strict=True
+    ):
+        if use.sum() < settings.quiet_samples:
+            continue
+        use = use & (time > time[use][0] + settings.quiet_after)
+        use &= np.abs(u_in - np.median(u_in[use]) if use.any() else u_in) < settings.edge
+        if use.sum() >= settings.quiet_samples:
+            left = pressure[use] - np.polyval(np.polyfit(time[use], pressure[use], 2), time[use])
+            scatter.append(1.4826 * np.median(np.abs(left)))
+    if not scatter:
+        return noise_sd
+    return min(
+        noise_sd, settings.quiet_factor * max(float(np.median(scatter)), settings.least_noise)
     )
 
 

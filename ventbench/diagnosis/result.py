@@ -137,6 +137,8 @@ class Diagnosis(Findings):
             "mechanisms": [missing.name for missing in self.mechanisms],
             "recording": breaths.source,
             "recording_sha256": breaths.sha256,
+            "held_out_breaths": list(self.open_loop.held_out_breaths),
+            "chosen": dict(self.chosen),
             "ventbench": ventbench.__version__,
         }
         save_plants(corrected, self.plants, about)
@@ -165,12 +167,16 @@ class Diagnosis(Findings):
             "mechanisms": [_mechanism(mechanism) for mechanism in self.mechanisms],
             "slot": None if self.nonparametric is None else _nonparametric(self.nonparametric),
             "location": [_region(region) for region in self.location],
+            "remaining": [_region(region) for region in self.remaining],
             "open_loop": _open_loop(self.open_loop),
             "lung": lungs[0] if lungs else None,
             "lungs": lungs,
             "request": None if self.request is None else _request(self.request),
             "noise": {"sd": self.noise[0], "correlation": self.noise[1], "unit": "cmH2O"},
             "plant": self.simulator,
+            "split": {name: list(ids) for name, ids in self.split.items()},
+            "chosen": dict(self.chosen),
+            "gain_scatter": self.gain_scatter,
             "sentences": report_text.sentences(self),
             "notes": list(self.notes),
             "seconds": self.seconds,
@@ -235,6 +241,7 @@ def _open_loop(comparison: OpenLoopComparison) -> dict[str, Any]:
         "refit": _error(comparison.refit),
         "after": _error(comparison.after),
         "noise_floor": comparison.noise_floor,
+        "unexplained": comparison.unexplained,
         "groups": {
             name: {stage: _error(value) for stage, value in group.items()}
             for name, group in comparison.groups.items()

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 #: Raised when a value or the meaning of a setting changes.
-VERSION = "selection-1"
+VERSION = "selection-2"
 
 
 @dataclass(frozen=True)
@@ -22,13 +22,19 @@ class DataSettings:
 
     Attributes:
         min_breaths: fewest usable breaths, since each side of the split needs two.
-        held_out_every: every how many-th breath of a lung is held out.
+        held_out_every: every how many-th breath of a lung is held out to test terms.
+        judging_every: every how many-th breath of a lung is held out of fits and tests alike, to
+            choose the corrected simulator and to measure its error.
+        judging_from: breaths of a lung from which some can be spared for that; with fewer, those
+            that test terms judge as well, and fits never see them.
         batch_size: breaths that are simulated at once. One size means one compilation; two thirds
             of 60 breaths are one batch.
     """
 
     min_breaths: int = 4
     held_out_every: int = 3
+    judging_every: int = 6
+    judging_from: int = 18
     batch_size: int = 40
 
 
@@ -266,6 +272,29 @@ class LatentInputSettings:
 
 
 @dataclass(frozen=True)
+class CorrectionSettings:
+    """The corrected simulator, and what it leaves unexplained.
+
+    Attributes:
+        lung_factors: factors on the labels' R and C from which refits start as well; a label may be
+            that of another lung.
+        tail: whitened size, in standard deviations, from which outliers count less in refits for
+            the least open-loop error.
+        drift_ratio: error of such a refit over that of the reported parameters, below which the
+            corrected simulator has the refit's parameters.
+        unexplained_ratio: error of the corrected simulator over the measurement noise from which
+            something is missing, named or not.
+        unexplained_error: least root-mean-square error beyond the noise, cmH2O, for the same.
+    """
+
+    lung_factors: tuple[float, ...] = (0.3, 0.5, 0.7, 1.0, 1.5, 2.2, 3.3)
+    tail: float = 5.0
+    drift_ratio: float = 0.98
+    unexplained_ratio: float = 2.0
+    unexplained_error: float = 0.5
+
+
+@dataclass(frozen=True)
 class SimulatorSettings:
     """Comparison of the recording with the simulator under diagnosis.
 
@@ -274,13 +303,11 @@ class SimulatorSettings:
             modelled as the simulator plus a residual model.
         separation: times the joint half-width of two 95 % intervals by which strengths differ; each
             mechanism of many simulators is compared, and false alarms are to be rare.
-        max_error_ratio: times the error of the refitted simulator that the corrected one may err.
         noise_seed: seed of the noise that is added to the simulator's response.
     """
 
     residual_model_share: float = 0.9
     separation: float = 1.4
-    max_error_ratio: float = 1.05
     noise_seed: int = 20260101
 
 
@@ -304,6 +331,11 @@ class ResidualSettings:
             variance. Noise that differs a little from range to range is no missing physics.
         certain: p-value below which ranges are ordered by their share of the error.
         beginning: length of what is reported as the beginning of inspiration, s.
+        quiet_after: time after the start of expiration from which little moves, s.
+        quiet_samples: fewest quiet samples of a breath that show the sensor's scatter.
+        quiet_factor: times that scatter that the noise may have; it is coloured, and a converter
+            rounds a quiet signal more than a moving one.
+        least_noise: least scatter that is taken seriously, cmH2O: a converter hides less.
     """
 
     phase_step: float = 0.1
@@ -321,6 +353,10 @@ class ResidualSettings:
     min_excess: float = 0.3
     certain: float = 0.01
     beginning: float = 0.2
+    quiet_after: float = 0.6
+    quiet_samples: int = 10
+    quiet_factor: float = 3.0
+    least_noise: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -369,6 +405,7 @@ class SelectionConfig:
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
     patient_effort: PatientEffortSettings = field(default_factory=PatientEffortSettings)
     latent_inputs: LatentInputSettings = field(default_factory=LatentInputSettings)
+    correction: CorrectionSettings = field(default_factory=CorrectionSettings)
     simulator: SimulatorSettings = field(default_factory=SimulatorSettings)
     residuals: ResidualSettings = field(default_factory=ResidualSettings)
     experiments: ExperimentSettings = field(default_factory=ExperimentSettings)

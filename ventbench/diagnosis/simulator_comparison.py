@@ -28,6 +28,7 @@ from ventbench.system_id.problem import free_paths, parameter_of
 def identify_both(
     data: Data, held: NDArray[np.bool_], response: Floats, recording_only_model: IdentifiedModel,
     excluded: tuple[str, ...], tell: Callable[[str], None],
+    fitted: NDArray[np.bool_] | None = None,
 ) -> tuple[IdentifiedModel, IdentifiedModel]:  # fmt: skip
     """Identify the models of a simulator and of its recording.
 
@@ -43,6 +44,7 @@ def identify_both(
         recording_only_model: identified from the recording alone.
         excluded: mechanisms that cannot act.
         tell: receives the current step, in words.
+        fitted: which breaths final fits may use, ``(n,)``; all but the testing ones if None.
 
     Returns:
         The models of the recording and of the simulator.
@@ -50,16 +52,16 @@ def identify_both(
     settings, noise = recording_only_model.evaluator.settings, recording_only_model.conclusion.noise
     measured = with_sensor_noise(data, response, noise, settings.simulator.noise_seed)
     simulator_model = identify(
-        measured, held, excluded, lambda what: tell(f"simulator: {what}"), settings
+        measured, held, excluded, lambda what: tell(f"simulator: {what}"), settings, fitted
     )
     first = response[:, 0]
-    own = simulator_model.pressures(simulator_model.conclusion.full, held, first)
+    own = simulator_model.pressures(simulator_model.conclusion.full, data, first)
     unmodelled = np.nan_to_num(response - own)
     reduced = data.with_pressure(data.measured[:, 0] - unmodelled)
     refitted = refit_base_parameters(simulator_model, reduced.select(~held))
-    refit = simulator_model.pressures(refitted, held, first) + unmodelled
+    refit = simulator_model.pressures(refitted, data, first) + unmodelled
     # Predicted as breaths to come: parameters of each breath are not known of them.
-    predicted = recording_only_model.pressures(recording_only_model.conclusion.full, held, first)
+    predicted = recording_only_model.pressures(recording_only_model.conclusion.full, data, first)
     seen = data.select(~held)
     error = min(_mean_error(seen, response[~held]), _mean_error(seen, refit[~held]))
     share = settings.simulator.residual_model_share
@@ -71,6 +73,7 @@ def identify_both(
         excluded,
         lambda what: tell(f"recording less the simulator's part: {what}"),
         settings,
+        fitted,
     )
     fit = _noiseless_fit(simulator_model, data.with_pressure(own), held, recording_model)
     return recording_model, replace(simulator_model, fit=fit)
@@ -200,7 +203,7 @@ def refit_at_simulator_parameters(
         result, fitted = result_without, without
         names = tuple(other for other in names if other != name)
     conclusion = replace(recording_model.conclusion, full=fitted)
-    return IdentifiedModel(evaluator, conclusion, result), names
+    return IdentifiedModel(evaluator, conclusion, result, evaluator.training), names
 
 
 def is_faint(fitted: FittedModel, own: FittedModel, name: str, share: float) -> bool:

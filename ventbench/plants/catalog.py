@@ -26,7 +26,7 @@ import importlib
 import inspect
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
@@ -42,7 +42,7 @@ from ventbench.interfaces import Plant
 from ventbench.lungs import LUNGS, Lung, lung
 from ventbench.physics import physics
 from ventbench.plants import frozen
-from ventbench.plants.plant_files import load_plants
+from ventbench.plants.plant_files import load_plants, origin
 from ventbench.plants.python_simulator import PythonSimulator, is_jax_plant, python_simulator
 from ventbench.plants.registry import FAMILIES
 from ventbench.plants.single_compartment import single_compartment
@@ -106,6 +106,8 @@ class Simulators:
         lungs: lungs for which :attr:`stacked` has plants, in its order; empty where there is none.
         sha256: SHA-256 of the file or manifest that they come from; None if there is none.
         official: the official set if they are it, else None.
+        origin: JSON values that a file of plants says of its making, such as the recording that
+            they were fitted to and its breaths that no fit has seen.
     """
 
     kind: str
@@ -121,6 +123,7 @@ class Simulators:
     _make: Callable[[Lung], Plant] | None = None
     _function: PythonSimulator | None = None
     _table: Mapping[int, tuple[Lung, Floats, Floats]] = field(default_factory=dict, repr=False)
+    origin: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
     def has_plants(self) -> bool:
@@ -566,7 +569,7 @@ def _single(plant: Plant, name: str, sha256: str | None = None) -> Simulators:
 def _plant_file(path: Path) -> Simulators:
     digest = files.sha256(path)
     about = {"kind": "file", "file": path.name, "sha256": digest}
-    return _plants(load_plants(path), path.name, about, digest)
+    return replace(_plants(load_plants(path), path.name, about, digest), origin=origin(path))
 
 
 def _of_function(function: Any, name: str, sha256: str | None = None) -> Simulators:

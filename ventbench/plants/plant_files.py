@@ -92,6 +92,24 @@ def load_plants(path: Path, as_array: Callable[[Any], Any] = np.asarray) -> dict
         ) from error
 
 
+def origin(path: Path) -> dict[str, Any]:
+    """What a file of :func:`save_plants` says of the making of its plants; empty if nothing.
+
+    Raises:
+        OSError: if the file cannot be read.
+    """
+    try:
+        if Path(path).suffix == ".npz":
+            with np.load(path, allow_pickle=False) as npz:
+                head = json.loads(str(npz[_STRUCTURE]))
+        else:
+            head = json.loads(Path(path).read_bytes())
+        about = head["about"]
+    except (KeyError, TypeError, ValueError):
+        return {}
+    return dict(about) if isinstance(about, dict) else {}
+
+
 def save_plant(path: Path, plant: Any) -> None:
     """Write one plant, or a stack of plants, as ``.npz`` in one step.
 

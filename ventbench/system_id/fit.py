@@ -69,7 +69,10 @@ class Fit:
     @property
     def freedom(self) -> int:
         """Degrees of freedom of intervals: breaths in excess of the shared unknowns."""
-        shared = int(self.problem.unknowns.shared.sum())
+        layout = self.problem.unknowns
+        own = [len(np.unique(column)) == len(column) > 1 for column in layout.index.T]
+        by_breath = np.array(own, bool)[layout.path_of]  # such as a gain of each breath
+        shared = int((layout.shared & ~by_breath).sum())
         return max(len(self.problem.data) - shared, _LEAST_FREEDOM)
 
     def value(self, path: str) -> Floats:

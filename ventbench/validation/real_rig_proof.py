@@ -165,8 +165,8 @@ def _run(
         if progress is not None:
             progress(part.name, step, share)
 
-    # Passive: the ventilator was connected to a test lung.
-    diagnosis = diagnose(setting.breaths, simulator=setting.plant, passive=True, progress=tell)
+    # The ventilator was connected to a test lung.
+    diagnosis = diagnose(setting.breaths, simulator=setting.plant, patient=False, progress=tell)
     diagnosis = dataclasses.replace(diagnosis, simulator=setting.plant_name)
     out.mkdir(parents=True, exist_ok=True)
     (out / DONE).unlink(missing_ok=True)

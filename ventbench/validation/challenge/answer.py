@@ -144,7 +144,8 @@ def _ventbench_diagnosis(breaths: Breaths, lung: str) -> Answer:
     from ventbench.diagnosis.diagnose import diagnose
 
     compilation.keep()
-    return diagnose(breaths, simulator="physics", lung=lung)
+    # Whether somebody breathes is part of the question.
+    return diagnose(breaths, simulator="physics", lung=lung, patient=True)
 
 
 def _peak_memory() -> float:

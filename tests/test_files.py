@@ -2,6 +2,8 @@ import errno
 import json
 import os
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +91,39 @@ def test_error_names_the_target(tmp_path):
 
     with pytest.raises(OSError, match=r"answer\.json"):
         files.write_atomically(tmp_path / "answer.json", full)
+
+
+CLAIM = """
+import sys
+from pathlib import Path
+from ventbench import files
+from ventbench.errors import InputError
+try:
+    files.claim_folder(Path(sys.argv[1]))
+except InputError as error:
+    print(error)
+"""
+
+
+def test_two_processes_cannot_claim_a_folder(tmp_path):
+    def other():
+        command = [sys.executable, "-c", CLAIM, str(tmp_path / "out")]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    assert other() == ""  # its claim ended with it
+    files.claim_folder(tmp_path / "out")
+    files.claim_folder(tmp_path / "out")
+    assert "another ventbench writes to this folder" in other()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_cannot_be_claimed(tmp_path):
+    file = tmp_path / "recording.csv"
+    file.touch()
+    with pytest.raises(InputError, match=r"recording\.csv is a file, not a folder"):
+        files.claim_folder(file)
+    with pytest.raises(InputError, match="cannot be written to"):
+        files.claim_folder(file / "below")
 
 
 def test_json(tmp_path):

@@ -16,6 +16,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
+from ventbench.errors import InputError
+
+try:
+    import fcntl
+except ImportError:  # not a POSIX system
+    fcntl = None
+
 
 def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     """Create or replace a file in one step.
@@ -99,6 +106,44 @@ def json_values(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+#: Locks of this process, by folder; the system releases them when it ends.
+_claims: dict[Path, int] = {}
+
+
+def claim_folder(folder: Path) -> None:
+    """Check that results can be written to a folder, and keep other processes out of it.
+
+    The claim lasts until this process ends, however it ends. A process may claim a folder again.
+    The lock itself lies in the folder of temporary files; nothing is created in ``folder``.
+
+    Raises:
+        InputError: if it is a file, cannot be written to, or another process has claimed it.
+    """
+    real = Path(os.path.realpath(folder))
+    if real in _claims:
+        return
+    if real.exists() and not real.is_dir():
+        raise InputError(f"--out {folder} is a file, not a folder; choose another one")
+    nearest = next(parent for parent in (real, *real.parents) if parent.exists())
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
+        raise InputError(f"--out {folder}: {nearest} cannot be written to; choose another folder")
+    if fcntl is None:  # no locks on this system
+        return
+    locks = Path(tempfile.gettempdir()) / f"ventbench-locks-{os.getuid()}"
+    locks.mkdir(mode=0o700, exist_ok=True)
+    name = hashlib.sha256(os.fsencode(real)).hexdigest()
+    lock = os.open(locks / name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(lock)
+        raise InputError(
+            f"--out {folder}: another ventbench writes to this folder; wait for it or choose "
+            "another folder"
+        ) from error
+    _claims[real] = lock
 
 
 def sha256(path: Path) -> str:

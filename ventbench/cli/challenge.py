@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from ventbench.cli.options import JsonFile, emit
+from ventbench.cli.options import JsonFile, claim_out, emit
 
 challenge = typer.Typer(
     name="challenge",
@@ -32,7 +32,9 @@ Kind = Literal["single", "null", "pair", "four", "outside", "form", "masked", "a
 @challenge.command()
 def make(
     seed: Seed,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the challenge.")],
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder of the challenge.")
+    ],
     cases: Annotated[int, typer.Option(min=1, help="Number of recordings.")] = 200,
     kind: Annotated[
         Kind,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, emit
+from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, claim_out, emit
 
 if TYPE_CHECKING:
     from ventbench.diagnosis.result import Diagnosis
@@ -18,7 +18,9 @@ def diagnose(
     recordings: Annotated[
         Path, typer.Argument(help="CSV, CSV.GZ or Parquet file in the public schema.")
     ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")],
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
+    ],
     plant: PlantName = "physics",
     simulated: Annotated[
         Path | None,

@@ -7,6 +7,16 @@ from typing import Annotated, Any
 
 import typer
 
+
+def claim_out(folder: Path | None) -> Path | None:
+    """Check a folder of results before anything is computed; see ``files.claim_folder``."""
+    from ventbench import files
+
+    if folder is not None:
+        files.claim_folder(folder)
+    return folder
+
+
 JsonFile = Annotated[
     Path | None,
     typer.Option("--json", metavar="FILE", help="Also write the result as JSON; '-' for stdout."),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ventbench.cli.options import JsonFile, emit
+from ventbench.cli.options import JsonFile, claim_out, emit
 
 if TYPE_CHECKING:
     from ventbench.validation.real_rig_proof import Proof
@@ -17,7 +17,9 @@ def proof(
     out: Annotated[
         Path,
         typer.Option(
-            metavar="DIR", help="Folder for the results: a folder for each part, and proof.json."
+            metavar="DIR",
+            callback=claim_out,
+            help="Folder for the results: a folder for each part, and proof.json.",
         ),
     ],
     recordings: Annotated[

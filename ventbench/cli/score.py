@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ventbench.cli.options import JsonFile, PlantName, emit
+from ventbench.cli.options import JsonFile, PlantName, claim_out, emit
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -32,6 +32,7 @@ def score(
         Path | None,
         typer.Option(
             metavar="DIR",
+            callback=claim_out,
             help="Write score.json and trajectories to a folder for each submission here.",
         ),
     ] = None,

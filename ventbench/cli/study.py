@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ventbench.cli.options import JsonFile, RecordingsDir, bars, emit, recordings_folder
+from ventbench.cli.options import JsonFile, RecordingsDir, bars, claim_out, emit, recordings_folder
 
 study = typer.Typer(
     name="study", help="Compare training methods, and variants of a design.", no_args_is_help=True
@@ -31,9 +31,9 @@ def samples(
     seeds: Annotated[
         int, typer.Option(min=1, max=32, help="Number of trainings of each method.")
     ] = 5,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")] = Path(
-        "runs/study"
-    ),
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
+    ] = Path("runs/study"),
     share: Annotated[
         float,
         typer.Option(min=0.001, max=1.0, help="Share of the full length of each training to run."),
@@ -113,9 +113,9 @@ def controllers(
     ] = 3,
     updates: Annotated[int, typer.Option(min=1, help="Number of updates of each training.")] = 1000,
     only: Only = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")] = Path(
-        "runs/controllers"
-    ),
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
+    ] = Path("runs/controllers"),
     json: JsonFile = None,
 ) -> None:
     """Remove or change one part of the residual controller at a time.
@@ -158,9 +158,9 @@ def controllers(
 def networks(
     recordings: RecordingsDir = None,
     only: Only = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")] = Path(
-        "runs/networks"
-    ),
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
+    ] = Path("runs/networks"),
     json: JsonFile = None,
 ) -> None:
     """Change windows, width, depth and boundary networks of the paper's simulators, one at a time.

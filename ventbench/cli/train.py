@@ -7,7 +7,15 @@ from typing import Annotated, Any
 
 import typer
 
-from ventbench.cli.options import JsonFile, PlantName, RecordingsDir, bars, emit, recordings_folder
+from ventbench.cli.options import (
+    JsonFile,
+    PlantName,
+    RecordingsDir,
+    bars,
+    claim_out,
+    emit,
+    recordings_folder,
+)
 
 train = typer.Typer(name="train", help="Train simulators and controllers.", no_args_is_help=True)
 
@@ -39,9 +47,9 @@ def _group() -> None:
 @train.command()
 def simulator(
     recordings: RecordingsDir = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the simulators.")] = Path(
-        "runs/simulators"
-    ),
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the simulators.")
+    ] = Path("runs/simulators"),
 ) -> None:
     """Train the six simulators on the public recordings, as the frozen ones were.
 
@@ -113,9 +121,9 @@ def residual(
     round_robin: Annotated[
         bool, typer.Option("--round-robin", help="Each update uses one lung at one PIP, in turn.")
     ] = False,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")] = Path(
-        "runs/residual"
-    ),
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
+    ] = Path("runs/residual"),
     plant: PlantName = "frozen",
     json: JsonFile = None,
 ) -> None:
@@ -199,9 +207,9 @@ def ppo(
     seed: Seed = 0,
     seeds: Seeds = 2,
     steps: Steps = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")] = Path(
-        "runs/ppo"
-    ),
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
+    ] = Path("runs/ppo"),
     plant: PlantName = "frozen",
     json: JsonFile = None,
 ) -> None:
@@ -223,9 +231,9 @@ def dqn(
     seed: Seed = 0,
     seeds: Seeds = 2,
     steps: Steps = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")] = Path(
-        "runs/dqn"
-    ),
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
+    ] = Path("runs/dqn"),
     plant: PlantName = "frozen",
     json: JsonFile = None,
 ) -> None:

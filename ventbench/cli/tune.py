@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ventbench.cli.options import JsonFile, PlantName, emit
+from ventbench.cli.options import JsonFile, PlantName, claim_out, emit
 
 app = typer.Typer(name="tune", help="Search for the gains of a controller.", no_args_is_help=True)
 
@@ -34,7 +34,8 @@ def pid(
         bool, typer.Option("--robust", help="All six lungs: only the best single set.")
     ] = False,
     out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder for table, plot and result.")
+        Path,
+        typer.Option(metavar="DIR", callback=claim_out, help="Folder for table, plot and result."),
     ] = Path("runs/pid"),
     workers: Annotated[
         int, typer.Option(min=0, help="Number of processes; 0 uses this one, with all cores.")

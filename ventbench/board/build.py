@@ -43,7 +43,7 @@ def content(leaderboard: Store) -> dict[str, bytes]:
     Raises:
         InputError: if jinja2 is not installed.
     """
-    boards = ranking.boards(leaderboard.records, leaderboard.attested) or {
+    boards = ranking.boards(leaderboard.records, leaderboard.attested, leaderboard.breaches) or {
         pages.CURRENT: ranking.empty(pages.CURRENT)
     }
     built = {"leaderboard.csv": frames.csv_text(boards).encode()}

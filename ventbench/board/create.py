@@ -187,7 +187,7 @@ def amend(
     The amended record is a file of its own, beside the given one.
 
     Args:
-        path: of the record; its commands lie beside it.
+        path: of the record, sealed or not; its commands lie beside it.
         supersedes: SHA-256 of the record that it corrects.
         reason: why, for the page.
         source: where the submission came from, such as its commit; joins what is there.
@@ -202,7 +202,7 @@ def amend(
     loaded = record.load(path)
     if isinstance(loaded, HardwareRecord) and not (supersedes or reason or source):
         return path
-    if not isinstance(loaded, record.Record):
+    if not isinstance(loaded, record.Record | record.Sealed):
         raise InputError(f"{path} is not the record of a score")
     values = canonical.parse(path.read_bytes(), str(path))
     if supersedes is not None:

@@ -142,7 +142,7 @@ def load_tracks(
     """Read and rank a leaderboard; arguments and errors as of :func:`load_board`."""
     path = FOLDER if folder is None else Path(folder)
     leaderboard = store.load(path)
-    boards = ranking.boards(leaderboard.records, leaderboard.attested)
+    boards = ranking.boards(leaderboard.records, leaderboard.attested, leaderboard.breaches)
     if not boards:
         raise InputError(f"{path} holds no record; add one with `ventbench board add`")
     chosen = next(iter(boards)) if version is None else version

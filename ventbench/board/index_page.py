@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 from ventbench import protocol
 from ventbench.board import hardware_table, pages
 from ventbench.board.hardware_table import HardwareRow
-from ventbench.board.ranking import BASELINES, Row, Track
+from ventbench.board.ranking import BASELINES, Row, SealedEntry, Track
+from ventbench.board.sealed import DECIMALS
 from ventbench.board.store import Store
 from ventbench.text import number
 
@@ -47,6 +48,8 @@ def render(
         ],
         tracks=[_track(track, measured[track.name]) for track in tracks],
         aside=[_aside(*row) for row in rows],
+        sealed=[_sealed(track, entry) for track in tracks for entry in track.sealed],
+        seasons=sorted(store.seasons.values(), key=lambda season: season.id),
         simulators=pages.flatten(header.simulators) if header else [],
         draws=header.draws if header else None,
         head=store.head,
@@ -110,6 +113,23 @@ def _aside(track: Track, status: str, row: Row) -> dict[str, Any] | None:
         "official": status != "not official",
         "score": pages.interval(row.score),
         "reasons": list(row.entry.reasons),
+    }
+
+
+def _sealed(track: Track, entry: SealedEntry) -> dict[str, Any]:
+    """A line of the list of entries on hidden draws."""
+    content = entry.record.content
+    return {
+        "season": content.season.id,
+        "name": entry.record.name,
+        "track": track.name,
+        "created": content.created,
+        "scores": {
+            key: pages.NONE if value is None else number(value, DECIMALS)
+            for key, value in sorted(content.scores.items())
+        },
+        "state": "official" if entry.official else "not official",
+        "reasons": list(entry.reasons),
     }
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -22,6 +23,13 @@ INDEX = "index.html"
 
 #: End of the name of a record, of its commands and of its signature, after a SHA-256.
 RECORD_SUFFIX, ACTIONS_SUFFIX, SIGNATURE_SUFFIX = ".json", ".actions", ".sig"
+
+#: End of the name of a sealed record's ciphertext, which stands in the place of its commands.
+SEALED_SUFFIX = ".sealed"
+
+#: Folder of the season files.
+SEASONS = "seasons"
+_SEASON = re.compile(rf"{SEASONS}/[a-z0-9][a-z0-9-]{{0,39}}\.toml")
 
 #: Keys that sign records, and records that count as official without a signature.
 KEYS, ACCEPTED = "keys.toml", "accepted.toml"
@@ -52,7 +60,7 @@ def files_of_chain(chain: bytes) -> set[str]:
             continue
         for key, suffixes in (
             ("record", (RECORD_SUFFIX, SIGNATURE_SUFFIX)),
-            ("actions", (ACTIONS_SUFFIX,)),
+            ("actions", (ACTIONS_SUFFIX, SEALED_SUFFIX)),
         ):
             sha256 = link.get(key)
             if isinstance(sha256, str) and _SHA256.fullmatch(sha256):
@@ -66,7 +74,32 @@ def stray(names: Iterable[str], chain: bytes) -> list[str]:
     A page may have the name of a built one and still be none; a rebuild shows that.
     """
     known = {CHAIN, KEYS, ACCEPTED} | files_of_chain(chain)
-    return sorted(name for name in names if name not in known and not BUILT.fullmatch(name))
+    return sorted(
+        name
+        for name in names
+        if name not in known and not BUILT.fullmatch(name) and not _SEASON.fullmatch(name)
+    )
+
+
+def is_season(name: str) -> bool:
+    """Whether a relative path is that of a season file."""
+    return _SEASON.fullmatch(name) is not None
+
+
+def same_season(published: bytes, now: bytes) -> bool:
+    """Whether a season file is still the published one, but for a seed that joined it.
+
+    Args:
+        published: its content as published.
+        now: its content.
+    """
+    try:
+        before, after = (tomllib.loads(text.decode("utf-8")) for text in (published, now))
+    except (ValueError, RecursionError):
+        return published == now
+    if "seed" not in before:
+        after.pop("seed", None)
+    return before == after
 
 
 def walk(folder: Path) -> tuple[set[str], list[str]]:

@@ -8,13 +8,13 @@ difference is a paired one, and ranks can be counted within each resample.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.board.record import AnyRecord, Record, Withdrawal
+from ventbench.board.record import AnyRecord, Record, Sealed, Withdrawal
 from ventbench.metrics import bootstrap
 from ventbench.submissions.manifest import TRACKS
 
@@ -38,11 +38,13 @@ class Event:
         record: the record.
         withdrawn: why it was taken back; None if it was not.
         attested: whether it is signed or accepted; see :mod:`ventbench.board.attestation`.
+        breach: why it does not count by the rules of its season; empty if it does.
     """
 
     record: Record
     withdrawn: str | None
     attested: bool
+    breach: str = ""
 
     @property
     def official(self) -> bool:
@@ -65,6 +67,21 @@ class Entry:
     reasons: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class SealedEntry:
+    """A submission on hidden draws, whose rank is not known before the season's seed is.
+
+    Attributes:
+        record: the newest sealed record of the season, track and name.
+        official: whether it will be ranked if it is complete and safe.
+        reasons: why it is not official, or not ranked.
+    """
+
+    record: Sealed
+    official: bool
+    reasons: tuple[str, ...]
+
+
 @dataclass
 class Standing:
     """One track of one version of the board.
@@ -73,11 +90,13 @@ class Standing:
         ranked: official, complete and safe entries, in no order yet.
         unranked: official entries that are not ranked, with reasons.
         unofficial: newest unofficial record of each submission without a newer official one.
+        sealed: newest sealed record of each submission in each season that is not revealed yet.
     """
 
     ranked: list[Entry] = field(default_factory=list)
     unranked: list[Entry] = field(default_factory=list)
     unofficial: list[Entry] = field(default_factory=list)
+    sealed: list[SealedEntry] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -137,6 +156,7 @@ class Track:
         unofficial: entries that nobody vouches for, or without a full sandbox, by name.
         baseline: record of the track's PID, that the others are compared with; None if there is no
             ranked one.
+        sealed: entries on hidden draws, by season and name.
     """
 
     version: int
@@ -145,6 +165,7 @@ class Track:
     unranked: tuple[Row, ...]
     unofficial: tuple[Row, ...]
     baseline: Record | None
+    sealed: tuple[SealedEntry, ...] = ()
 
     @property
     def rows(self) -> list[tuple[str, Row]]:
@@ -154,17 +175,22 @@ class Track:
         return [(kind, row) for kind, rows in zip(kinds, groups, strict=True) for row in rows]
 
 
-def boards(records: Sequence[AnyRecord], attested: Container[str]) -> dict[int, tuple[Track, ...]]:
+def boards(
+    records: Sequence[AnyRecord],
+    attested: Container[str],
+    breaches: Mapping[str, str] | None = None,
+) -> dict[int, tuple[Track, ...]]:
     """Rank all records.
 
     Args:
         records: in the order of the chain.
         attested: hashes of the records that are signed or accepted.
+        breaches: why records of seasons do not count, by their hashes.
 
     Returns:
         Tracks by version, newest version first.
     """
-    by_version = standings(records, attested)
+    by_version = standings(records, attested, breaches)
     return {
         version: tuple(_track(version, *track) for track in by_version[version].items())
         for version in sorted(by_version, reverse=True)
@@ -187,32 +213,61 @@ def _track(version: int, name: str, standing: Standing) -> Track:
         unranked=tuple(unranked_rows(standing.unranked)),
         unofficial=tuple(unranked_rows(standing.unofficial)),
         baseline=None if base is None else records[base],
+        sealed=tuple(sorted(standing.sealed, key=lambda entry: entry.record.key)),
     )
 
 
 def standings(
-    records: Sequence[AnyRecord], attested: Container[str]
+    records: Sequence[AnyRecord],
+    attested: Container[str],
+    breaches: Mapping[str, str] | None = None,
 ) -> dict[int, dict[str, Standing]]:
     """Sort records into boards.
 
     Args:
         records: in the order of the chain: later is newer, whatever their clocks said.
         attested: hashes of the records that are signed or accepted.
+        breaches: why records of seasons do not count, by their hashes.
 
     Returns:
         By version of the protocol, oldest first, then by track.
     """
+    against = breaches or {}
     withdrawn = {w.withdraws: w.reason for w in records if isinstance(w, Withdrawal)}
+    of_seasons = {entry.content.record: entry for entry in records if isinstance(entry, Sealed)}
+    for inside, sealed in of_seasons.items():
+        if sealed.sha256 in withdrawn:
+            withdrawn[inside] = withdrawn[sealed.sha256]
     grouped: dict[tuple[int, str, str], list[Event]] = defaultdict(list)
     for record in records:
         if isinstance(record, Record):
-            event = Event(record, withdrawn.get(record.sha256), record.sha256 in attested)
+            sha256 = record.sha256
+            breach = against.get(sha256, "")
+            event = Event(record, withdrawn.get(sha256), sha256 in attested, breach)
             grouped[record.version, record.track, record.name].insert(0, event)
     boards: dict[int, dict[str, Standing]] = {}
     for (version, track, _), history in sorted(grouped.items(), key=lambda group: group[0]):
         tracks = boards.setdefault(version, {name: Standing() for name in TRACKS})
         _place(tracks[track], tuple(history))
+    opened = {record.sha256 for record in records if isinstance(record, Record)}
+    newest = {x.key: x for x in of_seasons.values() if x.content.record not in opened}
+    for sealed in newest.values():
+        tracks = boards.setdefault(sealed.version, {name: Standing() for name in TRACKS})
+        event = (withdrawn.get(sealed.sha256), sealed.sha256 in attested)
+        tracks[sealed.track].sealed.append(_sealed(sealed, *event, against.get(sealed.sha256, "")))
     return boards
+
+
+def _sealed(record: Sealed, withdrawn: str | None, attested: bool, breach: str) -> SealedEntry:
+    official = record.official and attested and not breach
+    why = [] if official else [_why_not_official(record.official, breach)]
+    if withdrawn is not None:
+        why.append(f"withdrawn: {withdrawn}")
+    if not record.content.complete:
+        why.append("a cell failed; its message is sealed")
+    if not record.content.safe:
+        why.append("did not pass the safety gate")
+    return SealedEntry(record, official, tuple(why))
 
 
 def _place(standing: Standing, history: tuple[Event, ...]) -> None:
@@ -223,13 +278,14 @@ def _place(standing: Standing, history: tuple[Event, ...]) -> None:
         (standing.unranked if why else standing.ranked).append(entry)
     newest = history[0]
     if not newest.official:
-        why = (_not_official(newest), *reasons(newest))
+        why = (_why_not_official(newest.record.official, newest.breach), *reasons(newest))
         standing.unofficial.append(Entry(newest.record, history, why))
 
 
-def _not_official(event: Event) -> str:
-    """Why a record is not official."""
-    if not event.record.official:
+def _why_not_official(sandboxed: bool, breach: str) -> str:
+    if breach:
+        return breach
+    if not sandboxed:
         return "not official: its sandbox lacked a layer, or there was none"
     return "not official: no key of this leaderboard has signed the record"
 

@@ -133,12 +133,62 @@ class Withdrawal:
     created: str
 
 
+@dataclass(frozen=True)
+class Sealed:
+    """What is public of a score on hidden draws; see :mod:`ventbench.board.sealed`.
+
+    Attributes:
+        sha256: of its bytes: its name.
+        content: all that it says.
+    """
+
+    sha256: str
+    content: schema.SealedContent
+
+    @property
+    def name(self) -> str:
+        """Name of the submission."""
+        return self.manifest.name
+
+    @property
+    def manifest(self) -> schema.RecordedManifest:
+        """What the authors say about the submission."""
+        return self.content.submission.manifest
+
+    @property
+    def track(self) -> str:
+        """Track of the score."""
+        return self.content.track
+
+    @property
+    def version(self) -> int:
+        """Version of the protocol."""
+        return self.content.protocol
+
+    @property
+    def official(self) -> bool:
+        """Whether it was scored in a sandbox that deserves the word."""
+        return self.content.official
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """Season, track and name: what a newer record may supersede."""
+        return self.content.season.id, self.track, self.name
+
+
 #: Everything that a leaderboard keeps.
-AnyRecord = Record | Withdrawal | HardwareRecord
+AnyRecord = Record | Withdrawal | Sealed | HardwareRecord
 
 _DECODER: msgspec.json.Decoder[Any] = msgspec.json.Decoder(
-    schema.ScoreContent | schema.WithdrawalContent | hardware.HardwareContent
+    schema.ScoreContent | schema.WithdrawalContent | schema.SealedContent | hardware.HardwareContent
 )
+
+
+def commands_of(entry: AnyRecord) -> str | None:
+    """SHA-256 of the file beside a record: its commands or its ciphertext; None if it has none."""
+    if isinstance(entry, Record):
+        return entry.header.actions.sha256
+    return entry.content.sealed.sha256 if isinstance(entry, Sealed) else None
 
 
 def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
@@ -160,6 +210,8 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
         return Withdrawal(sha256, values.withdraws, values.reason, values.created)
     if isinstance(values, hardware.HardwareContent):
         return hardware.checked(values, sha256, label)
+    if isinstance(values, schema.SealedContent):
+        return Sealed(sha256, values)
     size = len(values.lungs), len(values.pips)
     return Record(
         sha256,

@@ -116,7 +116,14 @@ def rerun(
         OSError: if a file cannot be read or written.
     """
     board = store.load(folder)
-    chosen = {store.find_record(board, sha256).sha256 for sha256 in records}
+    named = [store.find_record(board, sha256) for sha256 in records]
+    for entry in named:
+        if not isinstance(entry, Record):
+            raise InputError(
+                f"record {entry.sha256[:12]} is sealed; it can be run again once season "
+                f"{entry.content.season.id} is revealed"
+            )
+    chosen = {entry.sha256 for entry in named}
     scores = [score for score in board.scores if not chosen or score.sha256 in chosen]
     about = canonical.through_json(load().about())
     done = WorkFolder(work, {"simulators": about, "versions": create.versions()})
@@ -192,6 +199,7 @@ def _run_in_process(
 ) -> Outcome:
     """Run one record in a process of its own, which reads it again."""
     score = store.find_record(store.load(folder), sha256)
+    assert isinstance(score, Record)
     return _run(score, code, folder, load(), runner())
 
 

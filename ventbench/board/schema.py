@@ -37,6 +37,9 @@ MAX_TEXT = 4000
 #: Deepest nesting of what a record says freely about its machine and the like.
 MAX_DEPTH = 6
 
+#: Most scores that a sealed record publishes: each can be made to tell something of the draws.
+MAX_SCORES = 4
+
 #: How times are written; always UTC.
 TIME_FORMAT = "%Y-%m-%dT%H:%M:%SZ"
 
@@ -216,8 +219,50 @@ class WithdrawalContent(_Table, frozen=True, tag_field="kind", tag="withdrawal")
     reason: Annotated[str, msgspec.Meta(max_length=MAX_TEXT, pattern=r"\S")]
 
 
+class RecordedSeason(_Table, frozen=True):
+    """The season whose hidden draws were used; see :class:`ventbench.seasons.Season`."""
+
+    id: Text
+    commitment: Sha256
+    draws: Annotated[int, msgspec.Meta(ge=1, lt=2**53)]
+
+
+class SealedFile(_Table, frozen=True):
+    """The file of the ciphertext; see :mod:`ventbench.board.sealed`."""
+
+    sha256: Sha256
+    bytes: Count
+    encoding: Literal["chacha20-poly1305"]
+
+
+class SealedContent(_Table, frozen=True, tag_field="kind", tag="sealed"):
+    """What is public of a score on hidden draws before their seed is revealed.
+
+    ``record`` names the record inside; ``scores`` are rounded, and null where a cell failed.
+    """
+
+    format: Literal[1]
+    protocol: Version
+    created: Time
+    official: bool
+    supersedes: Sha256 | None
+    reason: Text
+    provenance: FreeForm
+    track: Track
+    submission: RecordedSubmission
+    season: RecordedSeason
+    scores: dict[EntryName, Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)] | None]
+    complete: bool
+    safe: bool
+    record: Sha256
+    sealed: SealedFile
+    sandbox: FreeForm | None
+    versions: FreeForm
+    machine: FreeForm
+
+
 class ChainLine(_Table, frozen=True):
-    """A line of the chain; ``actions`` is null for a withdrawal."""
+    """A line of the chain; ``actions`` names commands or a ciphertext, null for a withdrawal."""
 
     index: Count
     record: Sha256
@@ -234,7 +279,7 @@ SCORES: msgspec.json.Decoder[Any] = msgspec.json.Decoder(ScoreContent | Withdraw
 
 def read(
     content: bytes, label: str, decoder: msgspec.json.Decoder[Any] = SCORES
-) -> ScoreContent | WithdrawalContent | HardwareContent:
+) -> ScoreContent | WithdrawalContent | SealedContent | HardwareContent:
     """Read and check the content of a record.
 
     Args:
@@ -247,22 +292,27 @@ def read(
     """
     record = decoded(decoder, content, label)
     _check_time(record.created, f"{label}, key created")
-    if not isinstance(record, ScoreContent | WithdrawalContent):
+    if isinstance(record, WithdrawalContent):
+        return record
+    if isinstance(record, ScoreContent | SealedContent):
+        for key in ("provenance", "simulators", "sandbox", "versions", "machine", "timing"):
+            _check_free(getattr(record, key, None), f"{label}, key {key}")
+        _check_claims(record, label)
+    else:
         for key in ("plan", "control", "safety", "timing", "sandbox", "provenance", "versions"):
             _check_free(getattr(record, key), f"{label}, key {key}")
         _check_free(record.machine, f"{label}, key machine")
         _check_free(record.device.about, f"{label}, key device.about")
-        _check_submitted(record, label)
+    _check_submitted(record, label)
     if isinstance(record, ScoreContent):
-        for key in ("provenance", "simulators", "sandbox", "versions", "machine", "timing"):
-            _check_free(getattr(record, key), f"{label}, key {key}")
         _check_shapes(record, label)
         _check_consistent(record, label)
-        _check_submitted(record, label)
+    elif isinstance(record, SealedContent) and len(record.scores) > MAX_SCORES:
+        raise InputError(f"{label}, key scores: are more than {MAX_SCORES}")
     return record
 
 
-def _check_submitted(record: ScoreContent | HardwareContent, label: str) -> None:
+def _check_submitted(record: ScoreContent | SealedContent | HardwareContent, label: str) -> None:
     """Check what records of scores and of hardware say alike: the submission and the origin."""
     _check_free(record.submission.files, f"{label}, key submission.files")
     _check_free(record.submission.manifest.training, f"{label}, key submission.manifest")
@@ -357,10 +407,6 @@ def _check_consistent(record: ScoreContent, label: str) -> None:
         raise InputError(f"{label}: does not cover all lungs and PIPs of the protocol")
     if record.actions.shape != list(actions.shape(len(lungs), draws, len(pips))):
         raise InputError(f"{label}, key actions.shape: does not fit lungs, draws and PIPs")
-    if record.track not in record.submission.manifest.tracks:
-        raise InputError(f"{label}, key track: the submission does not enter it")
-    if record.official and not (record.sandbox and record.sandbox.get("official") is True):
-        raise InputError(f"{label}, key official: its sandbox was not official")
     # Every failed cell has no error and one failure, and no other cell has either.
     runs = [(None, record.errors.nominal), *enumerate(record.errors.drawn, 1)]
     failed = [
@@ -382,6 +428,13 @@ def _check_consistent(record: ScoreContent, label: str) -> None:
                     f"{label}, key spread: {lung} at PIP {pip:g} has an error without a spread of "
                     "the ensemble, or the reverse"
                 )
+
+
+def _check_claims(record: ScoreContent | SealedContent, label: str) -> None:
+    if record.track not in record.submission.manifest.tracks:
+        raise InputError(f"{label}, key track: the submission does not enter it")
+    if record.official and not (record.sandbox and record.sandbox.get("official") is True):
+        raise InputError(f"{label}, key official: its sandbox was not official")
 
 
 def _check_time(created: str, where: str) -> None:
@@ -407,7 +460,7 @@ def _check_submission(submission: RecordedSubmission, where: str) -> None:
         raise InputError(f"{where}.sha256: is not that of its files")
 
 
-def _check_origin(record: ScoreContent | HardwareContent, label: str) -> None:
+def _check_origin(record: ScoreContent | SealedContent | HardwareContent, label: str) -> None:
     """Refuse a record that does not say by which versions and on what machine it was made."""
     for table, keys in (("versions", REQUIRED_VERSIONS), ("machine", REQUIRED_MACHINE)):
         for key in keys:

@@ -9,17 +9,18 @@ head can check that it is still there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ventbench import files, protocol
+from ventbench import files, protocol, seasons
 from ventbench.board import actions, attestation, canonical, record, schema
 from ventbench.board.hardware import HardwareRecord
-from ventbench.board.layout import CHAIN, RECORDS
-from ventbench.board.record import AnyRecord, Record, Withdrawal
+from ventbench.board.layout import CHAIN, RECORDS, SEASONS
+from ventbench.board.record import AnyRecord, Record, Sealed, Withdrawal, commands_of
 from ventbench.errors import InputError
+from ventbench.seasons import Season
 
 if TYPE_CHECKING:
     from ventbench.board.replay import ReplayPlants
@@ -35,7 +36,7 @@ class Link:
     Attributes:
         index: of the line, from 0.
         record: SHA-256 of the record.
-        actions: SHA-256 of its action file; None for a withdrawal.
+        actions: SHA-256 of its action file, or of its ciphertext; None for a withdrawal.
         previous: SHA-256 of the line before, newline included.
         sha256: of this line, newline included.
     """
@@ -56,13 +57,19 @@ class Store:
         links: lines of the chain.
         records: one for each line.
         attested: hashes of the records that are signed or accepted; see
-            :mod:`ventbench.board.attestation`.
+            :mod:`ventbench.board.attestation`. A record that was sealed is attested where the
+            sealed one is.
+        seasons: by id.
+        breaches: why records of seasons are not official, by their hashes; see
+            :func:`ventbench.board.sealed.breaches`.
     """
 
     folder: Path
     links: tuple[Link, ...]
     records: tuple[AnyRecord, ...]
     attested: frozenset[str]
+    seasons: Mapping[str, Season] = field(default_factory=dict)
+    breaches: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def head(self) -> str:
@@ -74,6 +81,11 @@ class Store:
         """Records of scores only."""
         return [entry for entry in self.records if isinstance(entry, Record)]
 
+    @property
+    def sealed(self) -> list[Sealed]:
+        """Sealed records only."""
+        return [entry for entry in self.records if isinstance(entry, Sealed)]
+
 
 def chain_line(index: int, added: AnyRecord, previous: str) -> bytes:
     """Return the chain's line of a record.
@@ -83,10 +95,13 @@ def chain_line(index: int, added: AnyRecord, previous: str) -> bytes:
         added: the record.
         previous: SHA-256 of the line before; :data:`CHAIN_START` for the first.
     """
-    commands = added.header.actions.sha256 if isinstance(added, Record) else None
-    return canonical.canonical(
-        {"index": index, "record": added.sha256, "actions": commands, "previous": previous}
-    )
+    line = {
+        "index": index,
+        "record": added.sha256,
+        "actions": commands_of(added),
+        "previous": previous,
+    }
+    return canonical.canonical(line)
 
 
 def chain_head(links: Sequence[Link]) -> str:
@@ -131,7 +146,50 @@ def load(folder: Path) -> Store:
     if problems:
         raise InputError(problems[0])
     records = tuple(read_record(folder, link) for link in links)
-    return Store(folder, tuple(links), records, attested)
+    return assembled(folder, links, records, attested, read_seasons(folder))
+
+
+def assembled(
+    folder: Path,
+    links: Sequence[Link],
+    records: Sequence[AnyRecord],
+    attested: frozenset[str],
+    known: Mapping[str, Season],
+) -> Store:
+    """Put together what was read, and judge the records of seasons by the rules of these.
+
+    Args:
+        folder: of the leaderboard.
+        links: lines of the chain.
+        records: one for each line.
+        attested: hashes of the records that are signed or accepted.
+        known: seasons by id.
+    """
+    from ventbench.board.sealed import breaches
+
+    vouched = {
+        entry.content.record
+        for entry in records
+        if isinstance(entry, Sealed) and entry.sha256 in attested
+    }
+    against = breaches(records, known, attested)
+    counting = frozenset((attested | vouched) - against.keys())
+    return Store(folder, tuple(links), tuple(records), counting, known, against)
+
+
+def season_path(folder: Path, name: str) -> Path:
+    """Where the file of a season lies."""
+    return folder / SEASONS / f"{name}.toml"
+
+
+def read_seasons(folder: Path) -> dict[str, Season]:
+    """Read the seasons of a leaderboard, by id.
+
+    Raises:
+        InputError: naming the first season file that is wrong.
+    """
+    paths = sorted((folder / SEASONS).glob("*.toml"))
+    return {path.stem: seasons.read_season(path) for path in paths}
 
 
 def read_chain(folder: Path) -> list[Link]:
@@ -168,8 +226,7 @@ def read_record(folder: Path, link: Link, *, strict: bool = False) -> AnyRecord:
         )
     # Its canonical form was checked when it was added, and no byte has changed since.
     entry = record.from_bytes(content, str(path), strict=strict)
-    commands = entry.header.actions.sha256 if isinstance(entry, Record) else None
-    if commands != link.actions:
+    if commands_of(entry) != link.actions:
         raise InputError(f"{path} names other commands than {CHAIN} line {link.index + 1}")
     return entry
 
@@ -184,22 +241,136 @@ def _what_changed(content: bytes) -> str:
     return ""
 
 
-def newest_of(store: Store, record: Record) -> Record | None:
-    """The newest record of the same entry, track and version; None if there is none."""
-    of_entry = [entry for entry in store.scores if entry.key == record.key]
+def newest_of(store: Store, record: Record | Sealed) -> Record | Sealed | None:
+    """The newest record of the same entry, track and version or season; None if there is none."""
+    of_entry = [entry for entry in (*store.scores, *store.sealed) if entry.key == record.key]
     return of_entry[-1] if of_entry else None
 
 
-def find_record(store: Store, sha256: str) -> Record:
-    """Find the record of a score by its hash, or by the unique beginning of one.
+def find_record(store: Store, sha256: str) -> Record | Sealed:
+    """Find the record of a score, sealed or not, by its hash or the unique beginning of one.
 
     Raises:
         InputError: if none or several begin so.
     """
-    matches = [entry for entry in store.scores if entry.sha256.startswith(sha256)]
+    entries = (*store.scores, *store.sealed)
+    matches = [entry for entry in entries if entry.sha256.startswith(sha256)]
     if len(matches) != 1:
         raise InputError(f"{store.folder} holds no single record that begins with {sha256!r}")
     return matches[0]
+
+
+def add_sealed(
+    folder: Path, path: Path, *, seed: bytes | None = None, simulators: ReplayPlants | None = None
+) -> Sealed:
+    """Add a sealed record to a leaderboard.
+
+    Args:
+        folder: of the leaderboard.
+        path: of the record; its ciphertext lies beside it.
+        seed: of the season, to look inside first; else nobody can until it is revealed.
+        simulators: to replay what is inside.
+
+    Returns:
+        The record.
+
+    Raises:
+        InputError: if it is not a sealed record of a season that is open, holds something else than
+            it says, or does not fit the records that are there.
+        OSError: if a file cannot be read or written.
+    """
+    from ventbench.board import sealed
+
+    store, added = load(folder), record.load(path)
+    if not isinstance(added, Sealed):
+        raise InputError(f"{path} is not a sealed record")
+    ciphertext = sealed.load(added, path.parent)
+    season = store.seasons.get(added.content.season.id)
+    if season is None:
+        raise InputError(f"{path}: {season_path(folder, added.content.season.id)} is missing")
+    problems = sealed.belongs(added, season)
+    if season.seed is not None:
+        problems.append(f"season {season.id} is over: its seed is public")
+    problems += conflicts([*store.records, added], start=len(store.records))
+    if problems:
+        raise InputError(f"{path}: {'; '.join(problems)}")
+    if seed is not None:
+        inside = sealed.unseal(added, ciphertext, season, seed)
+        if simulators is not None:
+            require_replay(inside.record, inside.commands, simulators, str(path))
+    kept = sealed.path_of(added, folder / RECORDS)
+    files.write_atomically(kept, lambda file: file.write(ciphertext))
+    _append(store, added, path.read_bytes())
+    return added
+
+
+def reveal(
+    folder: Path, name: str, seed: bytes, simulators: ReplayPlants | None = None
+) -> list[Record]:
+    """Reveal the seed of a season and open its sealed records.
+
+    What was opened before is left alone, so that an interrupted call can be repeated.
+
+    Args:
+        folder: of the leaderboard.
+        name: of the season.
+        seed: of the season.
+        simulators: to replay each record on; not replayed if not given.
+
+    Returns:
+        The records that were opened.
+
+    Raises:
+        InputError: if there is no such season, the seed is not the one that was committed to, or a
+            sealed record holds something else than it says; the seed is then not written.
+        OSError: if a file cannot be read or written.
+    """
+    from ventbench.board import sealed
+
+    store = load(folder)
+    if name not in store.seasons:
+        raise InputError(f"{season_path(folder, name)} is missing")
+    season = seasons.reveal(store.seasons[name], seed)
+    there = {entry.sha256 for entry in store.records}
+    waiting = [
+        sealed.unseal(entry, sealed.load(entry, folder / RECORDS), season, seed)
+        for entry in store.sealed
+        if entry.content.season.id == name and entry.content.record not in there
+    ]
+    for inside in waiting:
+        if simulators is not None:
+            label = f"the record of {inside.record.name}"
+            require_replay(inside.record, inside.commands, simulators, label)
+    seasons.write_season(season_path(folder, name), season)
+    for inside in waiting:
+        kept = actions.path_of(inside.record, folder / RECORDS)
+        commands = inside.commands
+        files.write_atomically(kept, lambda file, commands=commands: file.write(commands))
+        _append(load(folder), inside.record, inside.content)
+    return [inside.record for inside in waiting]
+
+
+def require_replay(score: Record, commands: bytes, simulators: ReplayPlants, label: str) -> None:
+    """Replay a record.
+
+    Args:
+        score: the record.
+        commands: content of its action file.
+        simulators: that it names.
+        label: names it in messages.
+
+    Raises:
+        InputError: if it was scored on other simulators, or does not replay.
+    """
+    from ventbench.board.replay import differences, replay
+
+    if score.header.simulators != canonical.through_json(simulators.about()):
+        raise InputError(f"{label} was scored on other simulators than those of this ventbench")
+    requested = actions.decode(commands, score.header.actions.shape, label)
+    (replayed,) = replay(simulators, score.pips, [requested])
+    problems = differences(score, replayed)
+    if problems:
+        raise InputError(f"{label} does not replay: {'; '.join(problems)}")
 
 
 def add(
@@ -220,6 +391,8 @@ def add(
         OSError: if a file cannot be read or written.
     """
     store, added = load(folder), record.load(path)
+    if isinstance(added, Sealed):
+        raise InputError(f"{path} is a sealed record; use add_sealed")
     if isinstance(added, Withdrawal):
         raise InputError(f"{path} is a withdrawal; use ventbench board withdraw")
     if added.version != protocol.VERSION:
@@ -233,17 +406,10 @@ def add(
     if isinstance(added, HardwareRecord):  # no commands to replay: its pressures are measured
         _append(store, added, path.read_bytes())
         return added
-    requested = actions.load(added, path.parent)
-    if simulators is not None:
-        from ventbench.board.replay import differences, replay
-
-        if added.header.simulators != canonical.through_json(simulators.about()):
-            raise InputError(f"{path} was scored on other simulators than those of this ventbench")
-        (replayed,) = replay(simulators, added.pips, [requested])
-        problems = differences(added, replayed)
-        if problems:
-            raise InputError(f"{path} does not replay: {'; '.join(problems)}")
+    actions.load(added, path.parent)
     content = actions.path_of(added, path.parent).read_bytes()
+    if simulators is not None:
+        require_replay(added, content, simulators, str(path))
     kept = actions.path_of(added, folder / RECORDS)
     files.write_atomically(kept, lambda file: file.write(content))
     _append(store, added, path.read_bytes())
@@ -311,19 +477,21 @@ class _Before:
 
     Attributes:
         first_of_version: first record of each protocol version.
-        first_of_name: first record of each entry's name, on any track.
-        newest: of each entry, by version, track and name.
+        first_of_name: first record of each entry's name, on any track, sealed or not.
+        newest: of each entry, by version, track and name; or by season, track and name.
         known: all scores, by their hash.
         hardware: hashes of all hardware records.
         withdrawn: hashes of those that were taken back.
+        inside: sealed records, by the hash of the record inside.
     """
 
     first_of_version: dict[int, Record] = field(default_factory=dict)
-    first_of_name: dict[str, Record] = field(default_factory=dict)
-    newest: dict[tuple[int, str, str], Record] = field(default_factory=dict)
-    known: dict[str, Record] = field(default_factory=dict)
+    first_of_name: dict[str, Record | Sealed] = field(default_factory=dict)
+    newest: dict[tuple[int | str, str, str], Record | Sealed] = field(default_factory=dict)
+    known: dict[str, Record | Sealed] = field(default_factory=dict)
     hardware: set[str] = field(default_factory=set)
     withdrawn: set[str] = field(default_factory=set)
+    inside: dict[str, Sealed] = field(default_factory=dict)
 
     def append(self, entry: AnyRecord) -> None:
         if isinstance(entry, Withdrawal):
@@ -332,7 +500,10 @@ class _Before:
         if isinstance(entry, HardwareRecord):
             self.hardware.add(entry.sha256)
             return
-        self.first_of_version.setdefault(entry.version, entry)
+        if isinstance(entry, Sealed):
+            self.inside.setdefault(entry.content.record, entry)
+        elif entry.sha256 not in self.inside:  # the draws of a season are its own
+            self.first_of_version.setdefault(entry.version, entry)
         self.first_of_name.setdefault(entry.name, entry)
         self.newest[entry.key] = entry
         self.known[entry.sha256] = entry
@@ -349,6 +520,13 @@ def _conflicts(entry: AnyRecord, before: _Before) -> list[str]:
     if entry.sha256 in before.known or entry.sha256 in before.hardware:
         return [f"{name} is on the leaderboard already"]
     sentences = []
+    sealed = before.inside.get(entry.sha256)
+    if sealed is not None and isinstance(entry, Record):
+        from ventbench.board.sealed import differences
+
+        return [f"{name}: {text}" for text in differences(sealed, entry)]
+    if isinstance(entry, Sealed) and entry.content.record in {*before.inside, *before.known}:
+        return [f"{name}, key record: {entry.content.record[:12]} is on the leaderboard already"]
     first = before.first_of_version.get(entry.version)
     if first is not None and isinstance(entry, Record):
         # Records of one version can only be compared over the same simulators and draws.
@@ -367,7 +545,8 @@ def _conflicts(entry: AnyRecord, before: _Before) -> list[str]:
         )
     if isinstance(entry, HardwareRecord):
         return sentences
-    superseded, newest = entry.header.supersedes, before.newest.get(entry.key)
+    header = entry.content if isinstance(entry, Sealed) else entry.header
+    superseded, newest = header.supersedes, before.newest.get(entry.key)
     if superseded is None:
         if newest is not None:
             sentences.append(

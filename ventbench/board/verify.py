@@ -5,7 +5,7 @@ Nothing stops at the first problem: each names its file, and the key, line or by
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench import draws, protocol
-from ventbench.board import actions, attestation, build, canonical, layout, ranking, record, store
+from ventbench import seasons as season_files
+from ventbench.board import (
+    actions,
+    attestation,
+    build,
+    canonical,
+    layout,
+    ranking,
+    record,
+    sealed,
+    store,
+)
 from ventbench.board.record import AnyRecord, Record
 from ventbench.board.replay import BATCH, ReplayPlants, deviation, differences, replay
 from ventbench.errors import InputError
@@ -37,6 +48,7 @@ class Report:
         head: SHA-256 that stands for all records and their order.
         records: how many there are.
         replayed: how many were replayed.
+        unsealed: how many sealed records were looked into.
         reproduced: how many were run again and gave the same commands; see
             :mod:`ventbench.board.rerun`.
         deviation: largest difference between a recorded error and its replay, cmH2O.
@@ -47,6 +59,7 @@ class Report:
     head: str = store.CHAIN_START
     records: int = 0
     replayed: int = 0
+    unsealed: int = 0
     reproduced: int = 0
     deviation: float = 0.0
     problems: list[str] = field(default_factory=list)
@@ -54,7 +67,12 @@ class Report:
 
 
 def verify(
-    folder: Path, load: Load, *, head: str | None = None, progress: Progress | None = None
+    folder: Path,
+    load: Load,
+    *,
+    head: str | None = None,
+    seed: bytes | None = None,
+    progress: Progress | None = None,
 ) -> Report:
     """Verify a leaderboard.
 
@@ -62,6 +80,7 @@ def verify(
         folder: of the leaderboard.
         load: of the frozen simulators, by their version; raises InputError where they were changed.
         head: of the chain, noted earlier: it must still be on it.
+        seed: of a season that is not revealed yet, to look into its sealed records.
         progress: called after each batch of records.
 
     Raises:
@@ -92,13 +111,91 @@ def verify(
     if links:  # else nobody knows which records there are
         vouched, problems = attestation.attested(folder, [link.record for link in links])
         report.problems += problems
-    scores = [entry for entry in entries if isinstance(entry, Record)]
-    by_draw = _check_replay(folder, scores, load, report, progress)
+    known = _check_seasons(folder, report)
+    leaderboard = store.assembled(folder, links, entries, vouched, known)
+    hidden = _check_sealed(leaderboard, seed, report)
+    by_draw = _check_replay(folder, leaderboard.scores, load, report, progress)
+    _check_hidden(hidden, load, report)
     if not report.problems:  # else whatever is wrong has been said, and moves the ranks
-        report.problems += _check_ranks(entries, vouched, by_draw)
+        report.problems += _check_ranks(leaderboard, by_draw)
     if len(entries) == len(links) > 0:
-        report.problems += _check_pages(store.Store(folder, tuple(links), tuple(entries), vouched))
+        report.problems += _check_pages(leaderboard)
     return report
+
+
+def _check_seasons(folder: Path, report: Report) -> dict[str, season_files.Season]:
+    """Read each season file; one whose seed is not that of its commitment is a problem."""
+    known = {}
+    for path in sorted((folder / layout.SEASONS).glob("*.toml")):
+        try:
+            known[path.stem] = season_files.read_season(path)
+        except InputError as error:
+            report.problems.append(str(error))
+    return known
+
+
+def _check_sealed(
+    leaderboard: store.Store, seed: bytes | None, report: Report
+) -> list[sealed.Opened]:
+    """Check sealed records; look into them where the seed of their season is known.
+
+    Returns:
+        What was inside those that are not on the chain yet.
+    """
+    opened = []
+    there = {entry.sha256 for entry in leaderboard.records}
+    closed = 0
+    for entry in leaderboard.sealed:
+        folder = leaderboard.folder / store.RECORDS
+        season = leaderboard.seasons.get(entry.content.season.id)
+        label = folder / f"{entry.sha256}{record.SUFFIX}"
+        if season is None:
+            name = f"{layout.SEASONS}/{entry.content.season.id}.toml"
+            report.problems.append(f"{label}, key season.id: {name} is missing or wrong")
+            continue
+        try:
+            ciphertext = sealed.load(entry, folder)
+            problems = sealed.belongs(entry, season)
+            if problems:
+                raise InputError(f"{label}: {'; '.join(problems)}")
+            own = season.revealed
+            if own is None and seed is not None:
+                own = seed if season_files.commitment(seed) == season.commitment else None
+            if own is None:
+                closed += 1
+                continue
+            inside = sealed.unseal(entry, ciphertext, season, own)
+        except (InputError, OSError) as error:
+            report.problems.append(str(error))
+            continue
+        report.unsealed += 1
+        if inside.record.sha256 in there:
+            continue
+        if season.seed is not None:
+            report.problems.append(
+                f"{label} belongs to season {season.id}, which is revealed, and is still sealed; "
+                "run `ventbench board reveal` again"
+            )
+        opened.append(inside)
+    if closed:
+        report.notes.append(
+            f"{closed} sealed records cannot be looked into before their season is revealed"
+        )
+    return opened
+
+
+def _check_hidden(hidden: Sequence[sealed.Opened], load: Load, report: Report) -> None:
+    """Replay what is inside sealed records."""
+    for inside in hidden:
+        label = f"what is sealed of record {inside.record.sha256}"
+        simulators = _simulators(inside.record.header.simulators, load, report)
+        if simulators is None:
+            continue
+        try:
+            store.require_replay(inside.record, inside.commands, simulators, label)
+            report.replayed += 1
+        except InputError as error:
+            report.problems.append(str(error))
 
 
 def _strange_files(folder: Path, readable: bool) -> list[str]:
@@ -163,20 +260,16 @@ def _check_replay(
     return by_draw
 
 
-def _check_ranks(
-    entries: Sequence[AnyRecord],
-    attested: Container[str],
-    by_draw: Mapping[str, Floats],
-) -> list[str]:
+def _check_ranks(leaderboard: store.Store, by_draw: Mapping[str, Floats]) -> list[str]:
     """Ranks that recorded errors give and replayed ones do not: nobody gains by a rounding error.
 
     Args:
-        entries: all that could be read, in the order of the chain.
-        attested: hashes of the records that are signed or accepted.
+        leaderboard: all that could be read.
         by_draw: replayed scores of each draw; a record without one keeps its own.
     """
     problems = []
-    for tracks in ranking.standings(entries, attested).values():
+    standings = ranking.standings(leaderboard.records, leaderboard.attested, leaderboard.breaches)
+    for tracks in standings.values():
         for name, standing in tracks.items():
             records = [entry.record for entry in standing.ranked]
             recorded = ranking.ranks([score.by_draw for score in records])

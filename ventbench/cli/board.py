@@ -26,7 +26,19 @@ Folder = Annotated[
         "--folder", metavar="DIR", help="Folder of the leaderboard; default: leaderboard."
     ),
 ]
+SeedFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--seed", metavar="FILE", help="Secret seed of the season, to look into sealed records."
+    ),
+]
 FOLDER = Path("leaderboard")
+
+
+def _seed(path: Path | None) -> bytes | None:
+    from ventbench import seasons
+
+    return None if path is None else seasons.read_seed(path)
 
 
 @app.command()
@@ -48,13 +60,18 @@ def add(
         list[str] | None,
         typer.Option(metavar="KEY=TEXT", help="Origin of the submission; may be repeated."),
     ] = None,
+    seed: SeedFile = None,
     folder: Folder = FOLDER,
 ) -> None:
     """Add a record if its replay gives the recorded numbers.
 
+    A sealed record of a season can only be replayed by those who hold the seed of the season
+    (--seed); else it is checked once the season is revealed.
+
     Example: `ventbench board add runs/record/3f2a....json --source commit=9c1e5d0`
     """
     from ventbench.board import create, store
+    from ventbench.board import record as records
     from ventbench.errors import InputError
     from ventbench.plants import frozen
 
@@ -65,7 +82,12 @@ def add(
     if supersedes is not None:
         supersedes = store.find_record(store.load(folder), supersedes).sha256
     new = create.amend(record, supersedes=supersedes, reason=reason, source=about)
-    added = store.add(folder, new, frozen.load())
+    if isinstance(records.load(new), records.Sealed):
+        held = _seed(seed)
+        simulators = None if held is None else frozen.load()
+        added = store.add_sealed(folder, new, seed=held, simulators=simulators)
+    else:
+        added = store.add(folder, new, frozen.load())
     typer.echo(f"added {added.name} ({added.track}): record {added.sha256}")
     typer.echo("next: ventbench board build")
 
@@ -124,6 +146,84 @@ def new_key() -> None:
     typer.echo(f"# public: for leaderboard/keys.toml\n{lines}", nl=False)
 
 
+@app.command(name="new-season")
+def new_season(
+    season: Annotated[str, typer.Argument(help="Name: lower-case letters, digits, hyphens.")],
+    seed: Annotated[
+        Path,
+        typer.Option(metavar="FILE", help="New file for the secret seed; outside of --folder."),
+    ],
+    opens: Annotated[str, typer.Option(metavar="DATE", help="First day of scores, UTC.")],
+    closes: Annotated[str, typer.Option(metavar="DATE", help="Last day of scores, UTC.")],
+    protocol: Annotated[int, typer.Option(min=1, help="Version of the protocol.")] = 2,
+    draws: Annotated[int, typer.Option(min=1, help="Number of hidden draws.")] = 20,
+    runs_per_week: Annotated[
+        int, typer.Option(min=1, help="Official scores of an author in a calendar week.")
+    ] = 3,
+    folder: Folder = FOLDER,
+) -> None:
+    """Open a season: a secret seed, and a season file with the commitment to it.
+
+    The season file is for everybody, the seed for the scorer alone until the season is over.
+
+    Example: `ventbench board new-season 2027-spring --opens 2027-03-01 --closes 2027-06-30
+    --seed ~/2027-spring.seed`
+    """
+    from datetime import date
+
+    from ventbench import seasons
+    from ventbench.board import store
+    from ventbench.errors import InputError
+
+    try:
+        days = {"opens": date.fromisoformat(opens), "closes": date.fromisoformat(closes)}
+    except ValueError as error:
+        raise InputError(f"--opens and --closes need days such as 2027-03-01: {error}") from None
+    if seed.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"{seed} lies in {folder}, which is published; choose another place")
+    path = store.season_path(folder, season)
+    if path.exists():
+        raise InputError(f"{path} exists; a season is opened once")
+    opened, secret = seasons.new_season(
+        id=season, protocol=protocol, draws=draws, runs_per_week=runs_per_week, **days
+    )
+    # The seed first: a season whose seed is lost can never be verified.
+    seasons.write_seed(seed, secret)
+    seasons.write_season(path, opened)
+    typer.echo(f"secret seed: {seed}; back it up, and show it to nobody before {opened.closes}")
+    typer.echo(f"commitment: {opened.commitment}; {path} is to be published before the first score")
+
+
+@app.command()
+def reveal(
+    season: Annotated[str, typer.Argument(help="Name of the season.")],
+    seed: Annotated[Path, typer.Option(metavar="FILE", help="File of the secret seed.")],
+    folder: Folder = FOLDER,
+) -> None:
+    """Publish the seed of a season that is over, and open all of its sealed records.
+
+    Example: `ventbench board reveal 2027-spring --seed ~/2027-spring.seed`
+    """
+    from datetime import UTC, datetime
+
+    from ventbench import seasons
+    from ventbench.board import store
+    from ventbench.errors import InputError
+    from ventbench.plants import frozen
+
+    secret = seasons.read_seed(seed)
+    known = store.read_seasons(folder)
+    if season in known and datetime.now(UTC).date() <= known[season].closes:
+        raise InputError(
+            f"season {season} is open until {known[season].closes}; its draws stay secret so long"
+        )
+    opened = store.reveal(folder, season, secret, frozen.load())
+    for score in opened:
+        typer.echo(f"opened {score.name} ({score.track}): record {score.sha256}")
+    typer.echo(f"season {season} is revealed, {len(opened)} records opened")
+    typer.echo("next: ventbench board build")
+
+
 @app.command()
 def build(folder: Folder = FOLDER, json: JsonFile = None) -> None:
     """Build the CSV and all pages from the records; the same records give the same bytes.
@@ -154,6 +254,7 @@ def verify(
     head: Annotated[
         str | None, typer.Option(help="Earlier head of the chain, which must still be part of it.")
     ] = None,
+    seed: SeedFile = None,
     rerun: Annotated[
         bool,
         typer.Option("--rerun", help="Also run the code of records again, in the sandbox."),
@@ -198,6 +299,7 @@ def verify(
             folder,
             frozen.load,
             head=head,
+            seed=_seed(seed),
             progress=lambda done, all_: status.update(f"replayed {done} of {all_} records"),
         )
     if rerun and not report.problems:  # else the records are not what they were
@@ -238,6 +340,8 @@ def _summary(console: Console, report: Report) -> None:
     count = len(report.problems)
     state = f"{count} problem{'s' if count > 1 else ''}" if count else "no problems"
     reproduced = f", {report.reproduced} reproduced by their code" if report.reproduced else ""
+    if report.unsealed:
+        reproduced += f", {report.unsealed} sealed ones looked into"
     console.print(
         f"{state}: {report.records} records, {report.replayed} replayed "
         f"(largest difference {report.deviation:.1e} cmH2O){reproduced}\nhead {report.head}",
@@ -273,6 +377,8 @@ def show(
     console = Console(stderr=str(json) == "-")
     for track in tracks:
         console.print(_table(track))
+        if track.sealed:
+            console.print(_sealed_table(track))
 
 
 def _table(track: Track) -> Table:
@@ -296,6 +402,28 @@ def _table(track: Track) -> Table:
             f"{row.nominal:.3f}" if row.nominal == row.nominal else "failed",
             f"{worst:.3f} {lung} {pip:g}" if lung else "",
             escape(plain("; ".join((status, *row.entry.reasons)))[:120]),
+        )
+    return table
+
+
+def _sealed_table(track: Track) -> Table:
+    from rich.markup import escape
+    from rich.table import Table
+
+    from ventbench.text import plain
+
+    table = Table(title=f"{track.name}, version {track.version}: hidden draws, not revealed yet")
+    for name in ("season", "entry", "scores", "state"):
+        table.add_column(name)
+    for entry in track.sealed:
+        content = entry.record.content
+        scores = (f"{key} {value}" for key, value in content.scores.items() if value is not None)
+        state = ("official" if entry.official else "not official", *entry.reasons)
+        table.add_row(
+            escape(plain(content.season.id)),
+            entry.record.name,
+            ", ".join(scores) or "failed",
+            escape(plain("; ".join(state))[:200]),
         )
     return table
 

@@ -9,6 +9,7 @@ import stat
 from datetime import date
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,8 +39,8 @@ def exact(seed: bytes, label: str, count: int) -> list[Fraction]:
     return numbers[:count]
 
 
-def new(**changes: object) -> tuple[seasons.Season, bytes]:
-    values: dict = {
+def new(**changes: Any) -> tuple[seasons.Season, bytes]:
+    values: dict[str, Any] = {
         "id": "2027-spring",
         "protocol": 2,
         "draws": 20,

@@ -139,7 +139,7 @@ def scenarios(pips: Sequence[float] = protocol.PIPS, n: int = COUNT) -> Scenario
     drawn = {name: values[:n, columns] for name, values in _frozen().items()}
     pip = np.asarray(pips, float)
     noise = drawn.pop("noise")
-    cells = _deviate(pip, drawn, np.full((n, len(pips)), QUANTUM), noise)
+    cells = deviate(pip, drawn, np.full((n, len(pips)), QUANTUM), noise)
     return jax.tree.map(jnp.asarray, cells)
 
 
@@ -192,7 +192,7 @@ def random_scenarios(
         noise = scale[:, None, None] * noise
         quantum = jnp.where(scale > 0, quantum, 0.0)
         drawn["delay"] = jnp.minimum(drawn["delay"], 0.99)
-    return _deviate(pip, drawn, quantum, noise)
+    return deviate(pip, drawn, quantum, noise)
 
 
 def _nominal(name: str) -> float:
@@ -200,8 +200,15 @@ def _nominal(name: str) -> float:
     return 1.0 if name.endswith("scale") else 0.0
 
 
-def _deviate(pip: Any, deviations: Mapping[str, Any], quantum: Any, noise: Any) -> Scenario:
-    """Cells of a nominal PIP, cmH2O, with the deviations of :data:`RANGES`."""
+def deviate(pip: Any, deviations: Mapping[str, Any], quantum: Any, noise: Any) -> Scenario:
+    """Cells of nominal PIPs with deviations.
+
+    Args:
+        pip: nominal, cmH2O, shape ``(...)``.
+        deviations: by the keys of :data:`RANGES`, shapes ``(...)``.
+        quantum: step of the converter, cmH2O, shape ``(...)``.
+        noise: cmH2O, shape ``(..., BREATHS, INSPIRATION_STEPS)``.
+    """
     peep = protocol.PEEP + deviations["peep_shift"]
     return Scenario(
         pip=pip + deviations["pip_shift"],

@@ -81,7 +81,7 @@ class LoopState:
 
     Attributes:
         plant: states of the plants.
-        pressure: true airway pressure, cmH2O, shape ``(...)``.
+        pressure: reading of the pressure sensor without noise, cmH2O, shape ``(...)``.
         previous: command of the previous step as applied, %, shape ``(...)``.
     """
 
@@ -135,6 +135,16 @@ def observe(
     )
     now = jnp.broadcast_to(target(scenario, step), measured.shape)
     return Observation(step * scenario.dt, scenario.dt, measured, now, ahead, loop.previous)
+
+
+def airway_pressure(plant: Plant, loop: LoopState) -> Array:
+    """Airway pressure, cmH2O, shape ``(...)``: what protocol version 2 scores.
+
+    It differs from the reading, ``loop.pressure``, by the lag and the offsets of the sensor. For a
+    plant without ``airway_pressure(state)`` it is the reading.
+    """
+    method = getattr(plant, "airway_pressure", None)
+    return loop.pressure if method is None else method(loop.plant)
 
 
 def inspire(

@@ -82,7 +82,7 @@ class Inspirations:
     """Inspirations of a closed-loop run; every array has shape ``(..., BREATHS, steps)``.
 
     Attributes:
-        pressure: true airway pressure at each step, cmH2O.
+        pressure: scored pressure at each step, cmH2O.
         requested: what the controller asked for, %.
         u_in: what was applied, %.
     """
@@ -108,17 +108,26 @@ class Expirations:
 
 
 def _breath(
-    plant: Plant, controller: Controller, scenario: Scenario, whole: bool, state: Any, breath: Array
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    whole: bool,
+    airway: bool,
+    state: Any,
+    breath: Array,
 ) -> tuple[Any, tuple[Inspirations, Expirations | None]]:
+    def scored(loop: env.LoopState) -> Array:
+        return env.airway_pressure(plant, loop) if airway else loop.pressure
+
     def inspire(carry: tuple[env.LoopState, Any], step: Array) -> tuple[Any, Inspirations]:
         loop, state = carry
         state, requested = controller.step(state, env.observe(scenario, loop, breath, step))
         after, applied = env.inspire(plant, scenario, loop, requested)
-        return (after, state), Inspirations(loop.pressure, requested, applied)
+        return (after, state), Inspirations(scored(loop), requested, applied)
 
     def expire(loop: env.LoopState, step: Array) -> tuple[env.LoopState, Expirations]:
         after, u_in = env.expire(plant, scenario, loop, step)
-        return after, Expirations(loop.pressure, u_in)
+        return after, Expirations(scored(loop), u_in)
 
     steps = jnp.arange(protocol.BREATH_STEPS)
     start = (env.start_breath(plant, scenario), state)
@@ -129,9 +138,14 @@ def _breath(
     return state, (inspirations, expirations)
 
 
-@partial(jax.jit, static_argnames="whole")
+@partial(jax.jit, static_argnames=("whole", "airway"))
 def closed_loop(
-    plant: Plant, controller: Controller, scenario: Scenario, *, whole: bool = False
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    *,
+    whole: bool = False,
+    airway: bool = False,
 ) -> tuple[Inspirations, Expirations | None]:
     """Run a pure controller through the protocol on one lung, all cells at once.
 
@@ -140,12 +154,13 @@ def closed_loop(
         controller: parameters broadcast against the cells.
         scenario: the cells, batch shape ``(...)``.
         whole: simulate the expirations too (for pictures; no score depends on them).
+        airway: return the airway pressure, which protocol version 2 scores, not the reading.
 
     Returns:
         The inspirations, and the expirations if asked for.
     """
     varied = env.vary(plant, scenario)
-    run = partial(_breath, varied, controller, scenario, whole)
+    run = partial(_breath, varied, controller, scenario, whole, airway)
     _, out = jax.lax.scan(run, controller.init(scenario.pip.shape), jnp.arange(BREATHS))
     # Scans stack time in front: (breath, step, ...) -> (..., breath, step).
     return jax.tree.map(lambda x: jnp.moveaxis(x, (0, 1), (-2, -1)), out)

@@ -47,6 +47,15 @@ def score(
         typer.Option(metavar="DIR", help="Write a record for `board add` here; needs --draws 20."),
     ] = None,
     plant: PlantName = "frozen",
+    protocol: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            max=2,
+            help="Version of the protocol: 2 scores airway pressure, draws on the rigs of each "
+            "lung.",
+        ),
+    ] = 1,
     in_process: Annotated[
         bool,
         typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
@@ -76,16 +85,21 @@ def score(
     entries = [entry.manifest.name for entry in opened]
     if len(set(entries)) < len(entries):
         raise InputError(f"two submissions have the same name: {', '.join(sorted(entries))}")
-    simulators = load_simulators(plant)
-    if record is not None and simulators.official is None:
+    if record is not None and plant != "frozen":
         raise InputError("--record needs the official simulators: leave out --plant")
+    simulators = load_simulators(plant)
     progress = Console(stderr=True)
     scores = []
     for entry in opened:
         with progress.status(f"scoring {entry.label}"):
             scores.append(
                 scoring.score(
-                    entry, simulator=simulators, track=track, draws=draws, sandbox=not in_process
+                    entry,
+                    simulator=plant if protocol == 2 else simulators,
+                    track=track,
+                    draws=draws,
+                    sandbox=not in_process,
+                    protocol=protocol,
                 )
             )
     results = [result.to_json() for result in scores]

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 import ventbench
 from ventbench import draws, files, protocol
 from ventbench.lungs import LUNG_IDS
-from ventbench.metrics import bootstrap
+from ventbench.metrics import bootstrap, rig_bootstrap
 from ventbench.metrics.score import lung_score
 from ventbench.plants import frozen
+from ventbench.rig_draws import RigDraws
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import Submission
 from ventbench.trajectories import Trajectories
@@ -84,6 +85,8 @@ class Score:
         draws_sha256: hash of the file of the draws; None without draws.
         trajectories: nominal runs with their expirations.
         timing: seconds, by name; the only numbers that differ from run to run.
+        protocol: version of the protocol.
+        rig_draws: the draws of protocol version 2; None without draws, and in version 1.
     """
 
     submission: Submission
@@ -106,6 +109,8 @@ class Score:
     draws_sha256: str | None
     trajectories: Trajectories
     timing: Mapping[str, float]
+    protocol: int = 1
+    rig_draws: RigDraws | None = None
 
     @property
     def by_lung(self) -> Floats:
@@ -128,9 +133,11 @@ class Score:
         """Everything that an official score needs and this one lacks, in words."""
         reasons = {
             "no full sandbox": (self.sandbox or {}).get("official") is not True,
-            "not on the frozen simulators": self.frozen_sha256 != frozen.MANIFEST_SHA256,
+            "not on the frozen simulators": self.frozen_sha256
+            != _official_simulators(self.protocol),
             "not all lungs and PIPs": not self.complete,
             "other draws than the published ones": len(self.drawn) > 0
+            and self.protocol == 1
             and self.draws_sha256 != draws.SHA256,
         }
         return tuple(reason for reason, holds in reasons.items() if holds)
@@ -144,14 +151,14 @@ class Score:
         """Return the score as JSON values, in the order in which a person reads it."""
         manifest = self.submission.manifest
         return {
-            "protocol": protocol.VERSION,
+            "protocol": self.protocol,
             "score": _number(self.score),
             "name": manifest.name,
             "track": self.track,
             "official": self.official,
             "complete": self.complete,
             "safe": bool(np.all(self.safe)),
-            "draws": self._draws(lung_score(self.drawn).mean(axis=1), published=True),
+            "draws": self._draws(lung_score(self.drawn), published=True),
             "lungs": {lung: self._lung(i) for i, lung in enumerate(self.lungs)},
             **self._secondary(slice(None)),
             "clipped": self._clipped(slice(None)),
@@ -245,23 +252,42 @@ class Score:
             "pips": {f"{pip:g}": _number(error) for pip, error in pips},
             "safe": bool(self.safe[i]),
             "peak_pressure_cmH2O": _number(self.peak[i]),
-            "draws": self._draws(lung_score(self.drawn[:, i])),
+            "draws": self._draws(lung_score(self.drawn)[:, i : i + 1], first=i),
             **self._secondary(slice(i, i + 1)),
             "clipped": self._clipped(slice(i, i + 1)),
         }
 
-    def _draws(self, values: Floats, *, published: bool = False) -> dict[str, Any] | None:
+    def _draws(
+        self, values: Floats, *, first: int = 0, published: bool = False
+    ) -> dict[str, Any] | None:
+        """Mean over draws, shape ``(K, lungs)``, of all lungs or of those from ``first`` on."""
         if not len(values):
             return None
+        means = values.mean(axis=1)
         # A draw that failed must not be left out of a mean.
-        summary = bootstrap.summary(values if np.isfinite(values).all() else [])
-        about = {"version": draws.VERSION, "sha256": self.draws_sha256} if published else {}
+        finite = bool(np.isfinite(means).all())
+        if self.rig_draws is None:
+            summary = bootstrap.summary(means if finite else [])
+            score, ci95 = summary.mean, summary.ci95
+            about = {"version": draws.VERSION, "sha256": self.draws_sha256}
+        else:
+            score, ci95 = self._over_rigs(values, first) if finite else (math.nan, (math.nan,) * 2)
+            about = self.rig_draws.about()
         return {
-            "score": _number(summary.mean),
-            "ci95": [_number(limit) for limit in summary.ci95],
-            "values": [_number(value) for value in values],
-            **about,
+            "score": _number(score),
+            "ci95": [_number(limit) for limit in ci95],
+            "values": [_number(value) for value in means],
+            **(about if published else {}),
         }
+
+    def _over_rigs(self, values: Floats, first: int) -> tuple[float, tuple[float, float]]:
+        """Mean over draws with its interval, which resamples draws, rigs and members."""
+        assert self.rig_draws is not None
+        lungs = slice(first, first + values.shape[1])
+        rig, member = self.rig_draws.rig[lungs], self.rig_draws.member[lungs]
+        resampled = rig_bootstrap.resampled_scores(values.T, rig, member)
+        low, high = np.quantile(resampled, (0.025, 0.975))
+        return float(values.mean()), (float(low), float(high))
 
     def _secondary(self, lungs: slice) -> dict[str, Any]:
         means, missing = {}, {}
@@ -281,6 +307,13 @@ class Score:
             "commands": total,
             "share": (below + above) / total,
         }
+
+
+def _official_simulators(version: int) -> str:
+    """SHA-256 of the manifest of the simulators that a version of the protocol is scored on."""
+    if version == 1:
+        return frozen.MANIFEST_SHA256
+    return files.sha256(frozen.folder(version) / frozen.MANIFEST)
 
 
 def _number(value: float | np.floating) -> float | None:

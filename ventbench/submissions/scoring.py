@@ -14,19 +14,18 @@ from numpy.typing import NDArray
 from ventbench import draws as published
 from ventbench import environment, precision, protocol
 from ventbench.environment import Scenario
-from ventbench.interfaces import Plant, Task
+from ventbench.errors import InputError
+from ventbench.interfaces import Plant
 from ventbench.lungs import LUNGS, Lung
-from ventbench.metrics.figures import InspirationSignals, figures
-from ventbench.metrics.score import passes_safety_gate, run_error
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators
 from ventbench.plants.hybrid import Hybrid
-from ventbench.submissions.errors import SubmissionError
+from ventbench.submissions import rig_scoring
+from ventbench.submissions.assembly import assemble, enter
 from ventbench.submissions.folder import Submission, open_submission, submission_of
-from ventbench.submissions.result import CellFailure, Score
+from ventbench.submissions.result import Score
 from ventbench.submissions.runner import InProcessRunner, Runner
-from ventbench.submissions.stepping import ProtocolRun, as_float64, replay, step_through
-from ventbench.trajectories import end_to_end
+from ventbench.submissions.stepping import as_float64, replay, step_through
 
 Floats = NDArray[np.float64]
 
@@ -38,6 +37,7 @@ def score(
     track: str | None = None,
     draws: int = 0,
     sandbox: bool = True,
+    protocol: int = 1,
 ) -> Score:
     """Score a controller on the lungs of a set of simulators.
 
@@ -53,6 +53,8 @@ def score(
         draws: how many of the 20 published draws to run besides the nominal cells.
         sandbox: run a folder in locked-down processes. Without it, its code runs in this process
             with all rights: only for code that you trust, and never official.
+        protocol: version of the protocol. Version 2 scores airway pressure, draws on the rigs of
+            each lung, and adds the normalised score.
 
     Returns:
         The score; ``print`` and notebooks show one row a lung.
@@ -61,7 +63,7 @@ def score(
         SubmissionError: if there is no such submission, it cannot be run at all, or it does not
             enter the track.
         SandboxError: if this machine cannot run submissions apart.
-        InputError: if there are no such simulators or draws.
+        InputError: if there are no such simulators, draws or protocol.
         FloatingPointError: if a plant answers with NaN or infinity.
 
     Example:
@@ -79,11 +81,16 @@ def score(
         entry = open_submission(str(submission))
     else:
         entry = submission_of(submission)
-    simulators = load_simulators(simulator)
     if sandbox and entry.controller is None:
         from ventbench.sandbox.runner import SandboxRunner
 
         runner = SandboxRunner()
+    if protocol == 2:
+        rigs = rig_scoring.load_rigs(simulator)
+        return rig_scoring.run_on_rigs(entry, rigs, track=track, draws=draws, runner=runner)
+    if protocol != 1:
+        raise InputError(f"protocol {protocol} is not known; the versions are 1 and 2")
+    simulators = load_simulators(simulator)
     return run_protocol(
         entry,
         simulators.stacked,
@@ -126,67 +133,28 @@ def run_protocol(
     """
     started = time.perf_counter()
     runner = runner or InProcessRunner()
-    if submission.controller is not None and runner.sandbox is not None:
-        raise SubmissionError(f"{submission.label}: only a folder can run in a sandbox")
-    entered = submission.manifest.tracks
-    track = track or entered[0]
-    if track not in entered:
-        raise SubmissionError(
-            f"{submission.label}: submission.toml, key tracks: enters {', '.join(entered)}; "
-            f"it cannot be scored for {track}"
-        )
     names, pips = tuple(lung.id for lung in lungs), tuple(float(pip) for pip in pips)
-    known = track == "performance"
-    tasks = [
-        Task(track, name if known else None, protocol.DT, protocol.INSPIRATION_STEPS)
-        for name in names
-    ]
+    track, tasks = enter(submission, track, names, runner)
     with precision.float64():
         plants = as_float64(plants, len(names))
         frozen_sha256 = _frozen_sha256(plants)
         cells = protocol_cells(pips, draws)
         run = step_through(plants, cells, runner, submission, tasks)
         nominal = jax.tree.map(lambda x: x[0], cells)
-        inspired, expired = replay(plants, nominal, run.requested[:, 0])
-
-    # The expiration of the last breath is run for the picture only; no score depends on either.
-    joined = [
-        np.concatenate([getattr(inspired, name), getattr(expired, name)], axis=-1)
-        for name in ("pressure", "u_in")
-    ]
-    trajectories = end_to_end(submission.manifest.name, track, names, pips, *joined)
-
-    timing = {
-        "seconds": time.perf_counter() - started,
-        "act_median_us": 1e6 * float(np.median(run.act_seconds)),
-        "act_max_us": 1e6 * float(np.max(run.act_seconds)),
-    }
-    pip = cells.pip[..., None]  # the target of every inspiratory step
-    errors = run_error(run.pressure, pip[..., None])
-    for cell in run.failures:
-        errors[cell] = np.nan
-    requested = run.requested[:, 0]
-    return Score(
-        submission=submission,
-        track=track,
-        lungs=names,
-        pips=pips,
-        nominal=errors[:, 0],
-        drawn=np.moveaxis(errors[:, 1:], 1, 0),
-        safe=np.all(passes_safety_gate(run.pressure, pip, cells.dt[..., None]), axis=(1, 2, 3)),
-        peak=run.pressure.max(axis=(1, 2, 3, 4)),
-        figures=_figures(run, cells),
-        below=np.sum(requested < 0.0, axis=(1, 2, 3)),
-        above=np.sum(requested > protocol.U_MAX, axis=(1, 2, 3)),
-        commands=requested[0].size,
-        failures=_failures(run, submission, tasks, names, pips),
-        requested=run.requested,
+        replayed = replay(plants, nominal, run.requested[:, 0])
+    return assemble(
+        submission,
+        tasks,
+        names,
+        pips,
+        cells,
+        run,
+        replayed,
+        seconds=time.perf_counter() - started,
         sandbox=runner.sandbox,
         simulators=simulators,
         frozen_sha256=frozen_sha256,
         draws_sha256=published.SHA256 if draws else None,
-        trajectories=trajectories,
-        timing=timing,
     )
 
 
@@ -209,27 +177,3 @@ def protocol_cells(pips: tuple[float, ...], draws: int) -> Scenario:
     if draws == 0:
         return cells
     return jax.tree.map(lambda *x: np.concatenate(x), cells, published.scenarios(pips, draws))
-
-
-def _figures(run: ProtocolRun, cells: Scenario) -> dict[str, Floats]:
-    """Secondary figures of the scored nominal inspirations, shape ``(L, P, scored breaths)``."""
-    pressure, u_in, requested = (
-        x[:, 0][:, :, protocol.SCORED_BREATHS, :] for x in (run.pressure, run.u_in, run.requested)
-    )
-    peep, pip, dt = (np.asarray(x)[0, :, None] for x in (cells.peep, cells.pip, cells.dt))
-    return figures(InspirationSignals(pressure, u_in, requested, peep, pip, dt))
-
-
-def _failures(
-    run: ProtocolRun,
-    submission: Submission,
-    tasks: Sequence[Task],
-    lungs: tuple[str, ...],
-    pips: tuple[float, ...],
-) -> tuple[CellFailure, ...]:
-    return tuple(
-        CellFailure(
-            lungs[i], pips[p], k or None, failure, failure.message(submission.label, tasks[i].lung)
-        )
-        for (i, k, p), failure in sorted(run.failures.items())
-    )

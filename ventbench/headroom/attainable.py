@@ -1,0 +1,224 @@
+"""Least error that any commands attain in a cell, by sequential linear programming.
+
+The error of an inspiration is ``f(u) = mean over steps 2 to 34 of |p_t(u) - PIP|`` for commands
+``u`` in 0 to 100 %, with plant, deviations and target known and no noise: more than any controller
+knows. Every breath begins at the same rest, so one inspiration stands for all.
+
+**Upper bound.** At ``u`` the pressures are linearised by automatic differentiation, and a linear
+program finds the best change of the commands within the valve's range and a trust region (Fletcher
+and Sainz de la Maza's method for piecewise smooth functions); it is taken if the true error falls.
+Several starts keep the best. The commands are kept as a witness: anybody can apply them.
+
+**Certificate.** At the result, the last linear program within :data:`CERTIFICATE_RADIUS` says by
+how much ``f`` could fall at first order: zero at a stationary point. And no commands can be better
+than a valve that is fully open throughout as long as the pressure is below PIP, if more command
+never means less pressure: ``mean max(PIP - p_t(100 %), 0)`` is a lower bound on the error of every
+controller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.optimize import linprog
+
+from ventbench import environment as env
+from ventbench import precision, protocol
+from ventbench.environment import Scenario
+from ventbench.interfaces import Plant
+
+#: Commands that act before the last scored pressure, and pressures that they can change.
+COMMANDS = protocol.INSPIRATION_STEPS - 1
+
+#: Steps that each start opens the valve fully for, before a command that holds the pressure.
+STARTS = (1, 4, 12)
+
+#: Command after the opening of a start, %.
+HOLD = 8.0
+
+#: Iterations of each start; most cells end earlier, by the trust region.
+ITERATIONS = 60
+
+#: Trust region, %: first, smallest (the search ends there), and that of the certificate.
+FIRST_RADIUS, SMALLEST_RADIUS, CERTIFICATE_RADIUS = 50.0, 1e-4, 0.1
+
+#: Share of the predicted decrease that must happen for a step to be taken, and for a larger region.
+ACCEPTED, GOOD = 0.1, 0.7
+
+#: Cells whose derivatives are computed together: bounds memory.
+BATCH = 64
+
+Floats = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Attainable:
+    """Bounds of n cells.
+
+    Attributes:
+        error: error that :attr:`commands` attain, cmH2O, shape ``(n,)``: an upper bound on the
+            least error.
+        lower: error of the rise with a fully open valve, cmH2O, shape ``(n,)``: a lower bound.
+        stationarity: by how much the error could fall at first order when every command moves by
+            at most :data:`CERTIFICATE_RADIUS`, cmH2O, shape ``(n,)``.
+        commands: %, shape ``(n, COMMANDS)``.
+    """
+
+    error: Floats
+    lower: Floats
+    stationarity: Floats
+    commands: Floats
+
+
+def _pressures(plant: Plant, cell: Scenario, u_in: Array) -> Array:
+    """Airway pressures of one inspiration after the first step, cmH2O, shape ``(COMMANDS,)``."""
+    varied = env.vary(plant, cell)
+
+    def step(loop: env.LoopState, command: Array) -> tuple[env.LoopState, Array]:
+        after, _ = env.inspire(varied, cell, loop, command)
+        return after, env.airway_pressure(varied, after)
+
+    return jax.lax.scan(step, env.start_breath(varied, cell), u_in)[1]
+
+
+_all_pressures = jax.jit(jax.vmap(_pressures))
+_all_slopes = jax.jit(jax.vmap(jax.jacfwd(_pressures, argnums=2)))
+
+
+def pressures(plants: Plant, cells: Scenario, u_in: Floats) -> Floats:
+    """Airway pressures that commands give, cmH2O, shape ``(n, COMMANDS)``; call it in float64.
+
+    Args:
+        plants: leaves ``(n, ...)``.
+        cells: batch shape ``(n,)``.
+        u_in: %, shape ``(n, COMMANDS)``.
+    """
+    return _in_batches(_all_pressures, plants, cells, u_in)
+
+
+def _in_batches(function: Any, plants: Plant, cells: Scenario, u_in: Floats) -> Floats:
+    n = len(u_in)
+    parts = []
+    for first in range(0, n, BATCH):
+        # The last batch is padded, so that all compile once.
+        index = np.minimum(np.arange(first, first + BATCH), n - 1)
+        some, cell = jax.tree.map(lambda x, i=index: np.asarray(x)[i], (plants, cells))
+        parts.append(np.asarray(function(some, cell, u_in[index]))[: n - first])
+    return np.concatenate(parts)
+
+
+def attainable(
+    plants: Plant,
+    cells: Scenario,
+    *,
+    starts: tuple[int, ...] = STARTS,
+    iterations: int = ITERATIONS,
+    progress: Progress | None = None,
+) -> Attainable:
+    """Bound the least error of cells from above and below; see the module.
+
+    Args:
+        plants: leaves ``(n, ...)``.
+        cells: batch shape ``(n,)``; their noise is not used.
+        starts: see :data:`STARTS`.
+        iterations: most linear programs of a cell and start.
+        progress: called with the number of programs solved, and of all at most.
+    """
+    # One breath of noise is as good as any: none is used.
+    cells = cells.replace(noise=np.zeros((*np.shape(cells.pip), 1, 1)))  # type: ignore[attr-defined]
+    n, pip = np.shape(cells.pip)[0], np.asarray(cells.pip)[:, None]
+    best, witness = np.full(n, np.inf), np.zeros((n, COMMANDS))
+    total = len(starts) * iterations
+    with precision.float64():
+        for turn, opened in enumerate(starts):
+            u_in = np.where(np.arange(COMMANDS) < opened, protocol.U_MAX, HOLD)
+            u_in = np.broadcast_to(u_in, (n, COMMANDS)).copy()
+            error = _descend(
+                plants, cells, pip, u_in, iterations,
+                lambda k, turn=turn: progress and progress(turn * iterations + k, total),
+            )  # fmt: skip
+            better = error < best - 1e-12
+            best, witness = np.where(better, error, best), np.where(better[:, None], u_in, witness)
+        miss = pip - pressures(plants, cells, witness)
+        slopes = _in_batches(_all_slopes, plants, cells, witness)
+        gains = [
+            np.mean(np.abs(miss[i])) - _program(miss[i], slopes[i], witness[i], radius)[1]
+            for i, radius in enumerate(np.full(n, CERTIFICATE_RADIUS))
+        ]
+        full = np.full((n, COMMANDS), protocol.U_MAX)
+        lower = np.mean(np.maximum(pip - pressures(plants, cells, full), 0.0), axis=1)
+    return Attainable(best, lower, np.array(gains), witness)
+
+
+def _descend(
+    plants: Plant,
+    cells: Scenario,
+    pip: Floats,
+    u_in: Floats,
+    iterations: int,
+    progress: Callable[[int], object],
+) -> Floats:
+    """Improve commands in place; returns their errors, cmH2O, shape ``(n,)``."""
+    n = len(u_in)
+    miss = pip - pressures(plants, cells, u_in)
+    error = np.mean(np.abs(miss), axis=1)
+    radius, live = np.full(n, FIRST_RADIUS), np.arange(n)
+    slopes = np.zeros((n, COMMANDS, COMMANDS))
+    stale = np.ones(n, bool)
+    for k in range(iterations):
+        progress(k)
+        anew = live[stale[live]]
+        if len(anew):
+            some, cell = jax.tree.map(lambda x, i=anew: np.asarray(x)[i], (plants, cells))
+            slopes[anew] = _in_batches(_all_slopes, some, cell, u_in[anew])
+        tried, predicted = u_in[live].copy(), np.zeros(len(live))
+        for at, i in enumerate(live):
+            change, value = _program(miss[i], slopes[i], u_in[i], radius[i])
+            tried[at] = np.clip(u_in[i] + change, 0.0, protocol.U_MAX)
+            predicted[at] = error[i] - value
+        some, cell = jax.tree.map(lambda x, i=live: np.asarray(x)[i], (plants, cells))
+        missed = pip[live] - pressures(some, cell, tried)
+        reached = np.mean(np.abs(missed), axis=1)
+        ratio = (error[live] - reached) / np.maximum(predicted, 1e-15)
+        taken, stale[live] = ratio > ACCEPTED, ratio > ACCEPTED
+        moved = live[taken]
+        u_in[moved], miss[moved], error[moved] = tried[taken], missed[taken], reached[taken]
+        radius[live] = np.where(ratio > GOOD, np.minimum(2.0 * radius[live], 100.0), radius[live])
+        radius[live] = np.where(ratio < ACCEPTED, 0.25 * radius[live], radius[live])
+        done = (radius[live] < SMALLEST_RADIUS) | (predicted < 1e-9)
+        live = live[~done]
+        if not len(live):
+            break
+    return error
+
+
+def _program(miss: Floats, slopes: Floats, u_in: Floats, radius: float) -> tuple[Floats, float]:
+    """Least mean of ``|miss - slopes change|`` within the valve's range and a trust region.
+
+    Args:
+        miss: target minus pressure, cmH2O, shape ``(m,)``.
+        slopes: derivative of each pressure by each command, cmH2O per %, shape ``(m, m)``.
+        u_in: commands, %, shape ``(m,)``.
+        radius: most that a command may change by, %.
+
+    Returns:
+        Change of the commands, %, and the mean, cmH2O.
+    """
+    m = len(miss)
+    # miss - slopes change = above - below, with both parts at least zero.
+    constraint = sparse.hstack([slopes, sparse.eye(m), -sparse.eye(m)], format="csc")
+    cost = np.concatenate([np.zeros(m), np.full(2 * m, 1.0 / m)])
+    low, high = np.maximum(-radius, -u_in), np.minimum(radius, protocol.U_MAX - u_in)
+    bounds = np.vstack([np.column_stack([low, high]), np.tile([0.0, np.inf], (2 * m, 1))])
+    result = linprog(cost, A_eq=constraint, b_eq=miss, bounds=bounds, method="highs-ds")
+    if result.status != 0:  # degenerate to rounding: stay
+        return np.zeros(m), float(np.mean(np.abs(miss)))
+    return result.x[:m], float(result.fun)

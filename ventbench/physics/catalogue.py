@@ -1,4 +1,4 @@
-"""All mechanisms and basis terms by name, and their parameters by path."""
+"""All mechanisms, basis terms and events by name, and their parameters by path."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from functools import cached_property, lru_cache
 from types import ModuleType
 
 from ventbench.errors import InputError
+from ventbench.physics import events as event_modules
 from ventbench.physics import mechanisms, nonparametric
 from ventbench.physics.mechanism import Mechanism
 from ventbench.physics.parameters import BASE_PARAMETERS, Parameter
@@ -23,15 +24,17 @@ class Catalogue:
     Attributes:
         library: mechanisms by name, in alphabetical order.
         basis_terms: basis terms of nonparametric components, by name, in alphabetical order.
+        events: what happens to a circuit in operation, by name, in alphabetical order.
     """
 
     library: dict[str, Mechanism]
     basis_terms: dict[str, Mechanism]
+    events: dict[str, Mechanism]
 
     @cached_property
     def everything(self) -> dict[str, Mechanism]:
-        """The library, then the basis terms."""
-        return self.library | self.basis_terms
+        """The library, then the basis terms, then the events."""
+        return self.library | self.basis_terms | self.events
 
 
 #: The catalogue in use, once it has been asked for.
@@ -79,13 +82,22 @@ def basis_terms() -> dict[str, Mechanism]:
     return _catalogue().basis_terms
 
 
+def events() -> dict[str, Mechanism]:
+    """Every event by name, in alphabetical order.
+
+    Each module of the package ``events`` defines one, as ``MECHANISM``. They are not in the
+    library: no fit searches for them.
+    """
+    return _catalogue().events
+
+
 def everything() -> dict[str, Mechanism]:
-    """The library, then the basis terms."""
+    """The library, then the basis terms, then the events."""
     return _catalogue().everything
 
 
 def mechanism(name: str) -> Mechanism:
-    """A mechanism or basis term.
+    """A mechanism, basis term or event.
 
     Raises:
         InputError: if there is none of this name.
@@ -132,7 +144,7 @@ def strength_path(name: str) -> str:
 def _catalogue() -> Catalogue:
     global _current
     if _current is None:
-        _current = Catalogue(_library(), _basis_terms())
+        _current = Catalogue(_by_module(mechanisms), _basis_terms(), _by_module(event_modules))
     return _current
 
 
@@ -147,12 +159,12 @@ def _paths(catalogue: Catalogue, names: tuple[str, ...] | None) -> tuple[str, ..
     return (*(parameter.name for parameter in BASE_PARAMETERS), *own)
 
 
-def _library() -> dict[str, Mechanism]:
-    library = {module.__name__.rpartition(".")[2]: module.MECHANISM for module in _in(mechanisms)}
-    for name, mechanism in library.items():
+def _by_module(package: ModuleType) -> dict[str, Mechanism]:
+    by_name = {module.__name__.rpartition(".")[2]: module.MECHANISM for module in _in(package)}
+    for name, mechanism in by_name.items():
         if mechanism.description.name != name:
             raise ValueError(f"{name}.py describes {mechanism.description.name!r}")
-    return library
+    return by_name
 
 
 def _basis_terms() -> dict[str, Mechanism]:

@@ -110,7 +110,8 @@ def substep_lengths(dt: Array, past: Array, dead_times: tuple[Array, ...], count
         inside = (arrives > 0.0) & (arrives < room)
         edge = jnp.sum(jnp.where(inside, arrives, 0.0) * _first(inside), axis=-1, keepdims=True)
         away = jnp.where(free > 0, jnp.abs(cuts - edge), jnp.inf)
-        nearest = _first(away == jnp.min(away, axis=-1, keepdims=True))
+        # With a tolerance: compilers may round a difference in two ways, and no cut would match.
+        nearest = _first(away <= jnp.min(away, axis=-1, keepdims=True) + 1e-9 * dt[..., None])
         nearest = nearest * jnp.any(inside, axis=-1, keepdims=True)
         cuts = jnp.where(nearest > 0, edge, cuts)
         free = free * (1.0 - nearest)

@@ -149,6 +149,18 @@ class Physics:
         volume = 1000.0 * (now.volume - state.first)
         return after, (solver.sensor_output(assembly, now.reading), 1000.0 * now.flow, volume)
 
+    def airway_pressure(self, state: PhysicsState) -> Array:
+        """True pressure at the airway, cmH2O, which a sensor may show late or shifted."""
+        return state.continuous.pressure
+
+    def reading(self, state: PhysicsState) -> Array:
+        """Pressure that the sensor shows, cmH2O: what the step into this state returned."""
+        return solver.sensor_output(self._assembly(), state.continuous.reading)
+
+    def reading_of(self, pressure: Array) -> Array:
+        """What the sensor shows of a pressure that does not change, cmH2O."""
+        return solver.sensor_output(self._assembly(), jnp.asarray(pressure))
+
     def vary(self, r_scale: Array, c_scale: Array) -> Physics:
         """Return the model with scaled resistance and compliance."""
         scales = {"R": r_scale, "C": c_scale}

@@ -1,0 +1,63 @@
+"""Cells and loop: paired draws, hidden stress, and one score by two ways."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ventbench import precision, protocol
+from ventbench.controllers.pid import PID
+from ventbench.metrics.score import run_error
+from ventbench.plants import frozen
+from ventbench.stress.run import StressDraws, closed_loop, draw_cells, flat
+from ventbench.stress.score import StressScore
+from ventbench.stress.stressors import Condition
+
+
+def test_draws_cover_every_pip_on_every_lung_and_come_from_the_seed() -> None:
+    official = frozen.load(version=2)
+    six, two = draw_cells(official, 6), draw_cells(official, 2)
+    for pips in six.nominal_pip:
+        assert sorted(pips) == list(protocol.PIPS)
+    assert all(len(set(column)) == 6 for column in six.nominal_pip.T)
+    np.testing.assert_array_equal(six.scenario.noise[:, :2], two.scenario.noise)
+    np.testing.assert_array_equal(six.rigs[:, :2], two.rigs)
+    other = draw_cells(official, 2, seed=bytes(32))
+    assert not np.any(other.scenario.r_scale == two.scenario.r_scale)
+    for own, allowed in zip(six.rigs, official.rigs, strict=True):
+        assert set(own.tolist()) <= set(allowed)
+
+
+@pytest.mark.slow
+def test_the_scan_and_the_steps_give_the_same_score(
+    score: StressScore, draws: StressDraws, chosen: tuple[Condition, ...]
+) -> None:
+    with precision.float64():
+        plants, scenario = flat(draws, chosen)
+        gains = PID(jnp.asarray(2.0), jnp.asarray(4.0), jnp.asarray(0.0))
+        pressure, requested, _, _ = closed_loop(plants, gains, scenario)
+    pip = np.asarray(scenario.pip)[:, None, None]
+    error = run_error(np.asarray(pressure), pip).reshape(score.error.shape)
+    np.testing.assert_allclose(error, score.error, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        np.asarray(requested).reshape(score.requested.shape), score.requested, rtol=0, atol=1e-7
+    )
+
+
+@pytest.mark.slow
+def test_every_condition_is_finite_and_differs_from_none() -> None:
+    from ventbench.stress.stressors import conditions
+
+    every, draws = conditions(), draw_cells(frozen.load(version=2), 1)
+    with precision.float64():
+        plants, scenario = flat(draws, every)
+        gains = PID(*(jnp.asarray(gain) for gain in (6.0, 6.0, 0.3)))
+        pressure, *_, volume = closed_loop(plants, gains, scenario)
+    pressure, volume = (np.asarray(x).reshape(len(every), -1) for x in (pressure, volume))
+    assert np.isfinite(pressure).all()
+    assert np.isfinite(volume).all()
+    assert pressure.min() > -20.0
+    assert pressure.max() < 90.0
+    for condition, own in zip(every[1:], pressure[1:], strict=True):
+        assert np.abs(own - pressure[0]).max() > 1e-3, condition.id

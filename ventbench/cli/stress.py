@@ -1,0 +1,99 @@
+"""The stress track of ``ventbench score``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from ventbench.cli.options import emit
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def score_entries(
+    names: list[str],
+    draws: int,
+    out: Path | None,
+    report: bool,
+    plant: str,
+    in_process: bool,
+    json: Path | None,
+) -> None:
+    """Score entries on the stress track; arguments are the options of ``ventbench score``."""
+    from rich.console import Console
+
+    from ventbench.errors import InputError
+    from ventbench.stress.run import DRAWS
+    from ventbench.stress.score import score_stress
+    from ventbench.submissions.folder import open_submission
+
+    if report and out is None:
+        raise InputError("--report needs --out DIR to write to")
+    opened = [open_submission(name) for name in names]
+    progress = Console(stderr=True)
+    scores = []
+    for entry in opened:
+        with progress.status(f"stressing {entry.label}"):
+            scores.append(
+                score_stress(
+                    entry,
+                    simulator=None if plant == "frozen" else plant,
+                    draws=draws or DRAWS,
+                    sandbox=not in_process,
+                )
+            )
+    results = [result.to_json() for result in scores]
+    emit(results[0] if len(results) == 1 else {"submissions": results}, json)
+    console = Console(stderr=str(json) == "-")
+    console.print(_table(results))
+    if out is not None:
+        written = [out / result.submission.manifest.name for result in scores]
+        for folder, result in zip(written, scores, strict=True):
+            result.save(folder)
+        if report:
+            from ventbench.views.stress import write_stress_chart
+
+            written.append(write_stress_chart(out / "stress.png", results))
+        for path in written:
+            console.print(f"wrote {path}", markup=False, highlight=False)
+    failed = [failure for result in results for failure in result["failures"]]
+    for failure in failed[:3]:
+        place = f"{failure['condition']}, {failure['lung']}, draw {failure['draw']}"
+        progress.print(f"{place}: {failure['what']}", style="red", markup=False)
+    if failed:
+        raise typer.Exit(1)
+
+
+def _table(scores: list[dict[str, Any]]) -> Table:
+    """Return a table with the figures above, then a row for each category."""
+    from rich.table import Table
+
+    def show(value: float | None, digits: int = 2) -> str:
+        return "failed" if value is None else f"{value:.{digits}f}"
+
+    table = Table(title="Stress track: mean |airway pressure - PIP|, cmH2O (lower is better)")
+    table.add_column("")
+    for entry in scores:
+        table.add_column(entry["name"], justify="right")
+    table.add_row("all stressors", *(show(entry["score"], 3) for entry in scores), style="bold")
+    limits = [entry["ci95"] for entry in scores]
+    if None not in limits[0]:
+        table.add_row("95 % interval", *("..".join(map(show, ends)) for ends in limits))
+    table.add_row("without stressors", *(show(entry["unstressed"], 3) for entry in scores))
+    table.add_row("runs survived", *(f"{100 * entry['survived']:.1f} %" for entry in scores))
+    table.add_row("unsafe runs", *(f"{e['unsafe_runs']} of {e['stressed_runs']}" for e in scores))
+    table.add_row("longest above PIP + 15 %, mean, s", *(show(e["above_alarm_s"]) for e in scores))
+    table.add_row("worst", *(f"{show(e['worst_error'])}\n{e['worst_condition']}" for e in scores))
+    table.add_section()
+    for category in scores[0]["categories"]:
+        table.add_row(
+            category,
+            *(
+                f"{show(own['error_cmH2O'])}, {100 * own['survived']:.0f} % survived"
+                for own in (entry["categories"][category] for entry in scores)
+            ),
+        )
+    return table

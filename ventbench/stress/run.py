@@ -1,0 +1,288 @@
+"""Cells of the stress track, and the loop between them and a submission.
+
+A cell is a lung on one of its rigs, a PIP, deviations of ventilator and sensor, and a condition.
+The same draws serve every condition, so that each stressed run has an unstressed twin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from ventbench import draws as deviations
+from ventbench import environment as env
+from ventbench import precision, protocol, seasons, waveform
+from ventbench.environment import Scenario
+from ventbench.interfaces import Controller, Plant, Task
+from ventbench.lungs import LUNGS, Lung
+from ventbench.plants.frozen import Frozen
+from ventbench.stress.plants import Stressed, stressed_plants
+from ventbench.stress.stressors import Condition
+from ventbench.submissions.errors import Failure
+from ventbench.submissions.folder import Submission
+from ventbench.submissions.runner import Runner, pack
+
+Floats = NDArray[np.float64]
+
+#: Name of the track.
+TRACK = "stress"
+
+#: Number of draws of an official score: each lung has each PIP once under every condition.
+DRAWS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class StressDraws:
+    """Lungs, rigs and deviations that every condition shares; L lungs, n draws.
+
+    Attributes:
+        lungs: length L.
+        plants: scored plants, leaves ``(L, n, ...)``.
+        scenario: deviations, batch shape ``(L, n)``.
+        rigs: session of each cell's plant, ``(L, n)``; -1 where the plants are no rigs.
+        nominal_pip: PIP before its deviation, cmH2O, ``(L, n)``.
+    """
+
+    lungs: tuple[Lung, ...]
+    plants: Plant
+    scenario: Scenario
+    rigs: NDArray[np.int64]
+    nominal_pip: Floats
+
+
+def draw_cells(
+    simulators: Frozen | Plant,
+    n: int = DRAWS,
+    *,
+    seed: bytes = seasons.DEVELOPMENT_SEED,
+    lungs: Sequence[Lung] = LUNGS,
+) -> StressDraws:
+    """Draw rigs, PIPs and deviations, the same on every machine.
+
+    In each draw the lungs have different PIPs, and over six draws each lung has each PIP once.
+
+    Args:
+        simulators: official simulators, whose rigs are drawn from; or plants stacked over lungs.
+        n: number of draws.
+        seed: 32 bytes, that of the development draws or of a season.
+        lungs: those of stacked plants.
+    """
+    shape = (len(lungs), n)
+
+    def uniform(name: str, *more: int) -> Floats:
+        # Draws in front, so that the first of more draws are the same ones.
+        drawn = seasons.uniforms(seed, f"{TRACK} {name}", (n, len(lungs), *more))
+        return np.swapaxes(drawn, 0, 1)
+
+    order = np.arange(len(lungs))[:, None] + np.array([0, 3, 1, 4, 2, 5])[np.arange(n) % 6]
+    nominal = np.asarray(protocol.PIPS)[order % len(protocol.PIPS)]
+    ranges = deviations.RANGES.items()
+    drawn = {name: low + (high - low) * uniform(name) for name, (low, high) in ranges}
+    low, high = deviations.NOISE_SD
+    sd = low + (high - low) * uniform("noise_sd")
+    normal = np.vectorize(NormalDist().inv_cdf, otypes=[float])
+    noise = normal(uniform("noise", protocol.BREATHS, protocol.INSPIRATION_STEPS))
+    peep = protocol.PEEP + drawn["peep_shift"]
+    scenario = Scenario(
+        pip=nominal + drawn["pip_shift"],
+        peep=peep,
+        start=peep + drawn["start_shift"],
+        dt=protocol.DT * drawn["dt_scale"],
+        r_scale=drawn["r_scale"],
+        c_scale=drawn["c_scale"],
+        delay=drawn["delay"],
+        quantum=np.full(shape, deviations.QUANTUM),
+        noise=sd[..., None, None] * noise,
+    )
+    if not isinstance(simulators, Frozen):
+        plants = jax.tree.map(
+            lambda leaf: np.repeat(np.asarray(leaf)[:, None], n, axis=1), simulators
+        )
+        return StressDraws(tuple(lungs), plants, scenario, np.full(shape, -1), nominal)
+    share = uniform("rig")
+    rigs = np.empty(shape, np.int64)
+    for index, sessions in enumerate(simulators.rigs):
+        rigs[index] = np.asarray(sessions)[(share[index] * len(sessions)).astype(int)]
+    plants = jax.tree.map(lambda leaf: np.asarray(leaf)[0, rigs], simulators.sessions_plants)
+    return StressDraws(tuple(lungs), plants, scenario, rigs, nominal)
+
+
+@dataclass(frozen=True)
+class StressRun:
+    """Inspirations of all cells; arrays of shape ``(S, L, n, BREATHS, INSPIRATION_STEPS)``.
+
+    Attributes:
+        pressure: true airway pressure at each step, cmH2O.
+        requested: what the controllers asked for, %; 0 once a cell has failed.
+        u_in: what was applied, %.
+        volume: gas in the lung above that at the start of the breath, mL.
+        failures: what failed, by cell, index ``(condition, lung, draw)``.
+    """
+
+    pressure: Floats
+    requested: Floats
+    u_in: Floats
+    volume: Floats
+    failures: Mapping[tuple[int, int, int], Failure]
+
+
+@jax.jit
+def _start(plant: Stressed, scenario: Scenario) -> tuple[Stressed, env.LoopState]:
+    varied = plant.vary(scenario.r_scale, scenario.c_scale)
+    rest = jnp.full_like(scenario.start, waveform.expiratory_command(protocol.BREATH_STEPS - 1))
+    state = varied.init(scenario.start, scenario.peep)
+    loop = env.LoopState(state, varied.first_reading(scenario.start), rest)
+    return _strong((varied, loop))
+
+
+@jax.jit
+def _observe(scenario: Scenario, loop: env.LoopState, breath: Array, step: Array) -> Any:
+    return env.observe(scenario, loop, breath, step)
+
+
+@jax.jit
+def _inspire(
+    plant: Stressed, scenario: Scenario, loop: env.LoopState, u_in: Array
+) -> tuple[env.LoopState, Array, Array, Array]:
+    after, applied = env.inspire(plant, scenario, loop, u_in)
+    truth = plant.airway_pressure(after.plant, after.pressure)
+    return _strong((after, applied, truth, plant.volume(after.plant)))
+
+
+def _strong(tree: Any) -> Any:
+    """Drop weak types, which would make the second step compile anew."""
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), tree)
+
+
+@jax.jit
+def closed_loop(
+    plants: Stressed, controller: Controller, scenario: Scenario
+) -> tuple[Array, Array, Array, Array]:
+    """Run a pure controller through all cells in one compiled scan.
+
+    Args:
+        plants: a plant for each breath, from :func:`flat`.
+        controller: parameters broadcast against the cells.
+        scenario: batch shape ``(N,)``.
+
+    Returns:
+        Pressure, cmH2O, request and command, %, and volume, mL, as in :class:`StressRun`, of shape
+        ``(N, BREATHS, INSPIRATION_STEPS)``.
+    """
+
+    def run(state: Any, inputs: tuple[Stressed, Array]) -> Any:
+        plant, breath = inputs
+        varied, loop = _start(plant, scenario)
+
+        def inspire(carry: Any, step: Array) -> Any:
+            loop, truth, volume, state = carry
+            state, requested = controller.step(state, env.observe(scenario, loop, breath, step))
+            after, applied, reached, filled = _inspire(varied, scenario, loop, requested)
+            return (after, reached, filled, state), (truth, requested, applied, volume)
+
+        start = (loop, scenario.start, jnp.zeros_like(scenario.start), state)
+        (*_, state), out = jax.lax.scan(inspire, start, jnp.arange(protocol.INSPIRATION_STEPS))
+        return state, out
+
+    breaths = (plants, jnp.arange(protocol.BREATHS))
+    _, out = jax.lax.scan(run, controller.init(scenario.pip.shape), breaths)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, (0, 1), (-2, -1)), out)
+
+
+def flat(draws: StressDraws, conditions: Sequence[Condition]) -> tuple[Stressed, Scenario]:
+    """All cells on one axis, as 64-bit arrays: call it within ``precision.float64()``.
+
+    Returns:
+        Plants as of :func:`~ventbench.stress.plants.stressed_plants`, and cells of batch shape
+        ``(S * L * n,)``.
+    """
+    plants = stressed_plants(draws.plants, draws.lungs, conditions)
+
+    def repeated(leaf: Any) -> Any:
+        leaf = np.asarray(leaf)
+        every = np.broadcast_to(leaf, (len(conditions), *leaf.shape))
+        return every.reshape(-1, *leaf.shape[2:])
+
+    scenario = jax.tree.map(repeated, draws.scenario)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float), (plants, scenario))
+
+
+def step_through(
+    draws: StressDraws, conditions: Sequence[Condition], runner: Runner, submission: Submission
+) -> StressRun:
+    """Run a submission under every condition; the lung is not told.
+
+    The draws run one after the other, all conditions and lungs of one together.
+
+    Raises:
+        SubmissionError: if the submission cannot be run at all.
+        FloatingPointError: if a plant answers with NaN or infinity.
+    """
+    count = draws.nominal_pip.shape[1]
+    parts, failures = [], {}
+    for draw in range(count):
+        one = _only(draws, draw)
+        arrays, failed = _batch(one, conditions, runner, submission)
+        parts.append(arrays)
+        for cell, failure in failed.items():
+            condition, lung = divmod(cell, len(draws.lungs))
+            failures[condition, lung, draw] = failure
+    shape = (len(conditions), len(draws.lungs))
+    joined = [
+        np.stack([part[k].reshape(*shape, *part[k].shape[1:]) for part in parts], axis=2)
+        for k in range(4)
+    ]
+    return StressRun(*joined, failures)
+
+
+def _only(draws: StressDraws, draw: int) -> StressDraws:
+    """Take one draw."""
+
+    def chosen(leaf: Any) -> Any:
+        return np.asarray(leaf)[:, draw : draw + 1]
+
+    scenario, plants = jax.tree.map(chosen, (draws.scenario, draws.plants))
+    return StressDraws(draws.lungs, plants, scenario, chosen(draws.rigs), chosen(draws.nominal_pip))
+
+
+def _batch(
+    draws: StressDraws, conditions: Sequence[Condition], runner: Runner, submission: Submission
+) -> tuple[tuple[Floats, ...], Mapping[int, Failure]]:
+    """Arrays of :class:`StressRun` with all cells on one axis, and failures by cell."""
+    with precision.float64():
+        plants, scenario = flat(draws, conditions)
+        cells = scenario.pip.shape[0]
+        out = np.zeros((4, cells, protocol.BREATHS, protocol.INSPIRATION_STEPS))
+        pressure, requested, u_in, volume = out
+        # Nothing tells a controller that it is stressed.
+        task = Task("robustness", None, protocol.DT, protocol.INSPIRATION_STEPS)
+        with precision.float32():  # a submission that uses JAX finds it as it is elsewhere
+            session = runner.start(submission, [task] * cells)
+        try:
+            for breath in range(protocol.BREATHS):
+                own = jax.tree.map(lambda leaf, k=breath: leaf[k], plants)
+                varied, loop = _start(own, scenario)
+                truth, filled = scenario.start, np.zeros(cells)
+                for step in range(protocol.INSPIRATION_STEPS):
+                    rows = pack(_observe(scenario, loop, breath, step))
+                    with precision.float32():
+                        commands = session.act(rows)
+                    now = (slice(None), breath, step)
+                    pressure[now], volume[now], requested[now] = truth, filled, commands
+                    loop, u_in[now], truth, filled = _inspire(varied, scenario, loop, commands)
+            failures = dict(session.failures)
+        finally:
+            session.close()
+    broken = np.flatnonzero(~np.isfinite(out).all(axis=(0, 2, 3)))
+    if broken.size:
+        condition = conditions[broken[0] // len(draws.lungs)]
+        raise FloatingPointError(f"the plant under {condition.id} answered with NaN or infinity")
+    return tuple(out), failures

@@ -1,0 +1,475 @@
+"""The stress score: error, safety and volume under every condition, beside the same run without it.
+
+A run is *survived* if the controller did not fail, passed the protocol's safety gate in every
+breath, and held the plateau of the last breath (mean of its last 0.3 s) within
+``2 cmH2O + 4 % of PIP`` of PIP. That is the tolerance that makers of ventilators declare for airway
+pressure; the last breath, because a controller may take two breaths to notice.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import html
+import math
+import platform
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ventbench
+from ventbench import files, protocol, seasons
+from ventbench.errors import InputError
+from ventbench.lungs import LUNG_IDS
+from ventbench.metrics.bootstrap import RESAMPLES, SEED
+from ventbench.metrics.figures import time_above_alarm
+from ventbench.metrics.score import passes_safety_gate, run_error
+from ventbench.metrics.step_response import steady_error
+from ventbench.plants import frozen
+from ventbench.plants.catalog import Given, load_simulators
+from ventbench.stress.run import DRAWS, TRACK, StressDraws, StressRun, draw_cells, step_through
+from ventbench.stress.stressors import CATEGORIES, VERSION, Condition, conditions, stressor
+from ventbench.submissions.errors import Failure, SubmissionError
+from ventbench.submissions.folder import Submission, open_submission, submission_of
+from ventbench.submissions.runner import InProcessRunner, Runner
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Floats = NDArray[np.float64]
+
+#: Tolerance of the plateau, cmH2O and share of PIP: "2 cmH2O + 4 % of the actual reading", as data
+#: sheets of intensive-care ventilators declare for airway pressure.
+PLATEAU_TOLERANCE, PLATEAU_SHARE = 2.0, 0.04
+
+#: Version of the protocol that the track belongs to.
+PROTOCOL = 2
+
+#: Conditions that a printed score shows, the worst first.
+_SHOWN = 10
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StressScore:
+    """Result of one submission on the stress track; S conditions, L lungs, n draws.
+
+    The first condition is none: the same cells without a stressor. ``print(score)`` shows the
+    conditions that cost most.
+
+    Attributes:
+        submission: what was scored.
+        conditions: length S.
+        lungs: ids, length L.
+        pips: nominal PIP, cmH2O, ``(L, n)``.
+        rigs: session of each cell's plant, ``(L, n)``; -1 where the plants are no rigs.
+        error: mean |airway pressure - PIP| over the scored inspirations, cmH2O, ``(S, L, n)``; NaN
+            where the controller failed.
+        safe: whether a run passed the safety gate in all breaths, ``(S, L, n)``.
+        plateau_error: |mean of the last 0.3 s - PIP| of the last breath, cmH2O, ``(S, L, n)``.
+        survived: see the module, ``(S, L, n)``.
+        alarm_s: time above PIP + 15 % in a breath, the longest of the run, s, ``(S, L, n)``.
+        peak: highest pressure, cmH2O, ``(S, L, n)``.
+        volume: volume in the lung at the end of the scored inspirations, mean, mL, ``(S, L, n)``.
+        requested: all commands, %, ``(S, L, n, BREATHS, INSPIRATION_STEPS)``.
+        failures: what failed, by (condition, lung, draw).
+        sandbox: the runner's layers; None in this process.
+        simulators: what is known of the plants.
+        seed_name: ``"development"``, or the id of the season whose seed made the draws.
+        timing: seconds, by name.
+    """
+
+    submission: Submission
+    conditions: tuple[Condition, ...]
+    lungs: tuple[str, ...]
+    pips: Floats
+    rigs: NDArray[np.int64]
+    error: Floats
+    safe: NDArray[np.bool_]
+    plateau_error: Floats
+    survived: NDArray[np.bool_]
+    alarm_s: Floats
+    peak: Floats
+    volume: Floats
+    requested: Floats
+    failures: Mapping[tuple[int, int, int], Failure]
+    sandbox: Mapping[str, Any] | None
+    simulators: Mapping[str, Any] | None
+    seed_name: str
+    timing: Mapping[str, float]
+
+    track = TRACK
+
+    @property
+    def score(self) -> float:
+        """Stress score, cmH2O: mean error over all stressed conditions, NaN if any cell failed."""
+        return float(np.mean(self.error[1:]))
+
+    @property
+    def unstressed(self) -> float:
+        """Mean error of the same cells without a stressor, cmH2O."""
+        return float(np.mean(self.error[0]))
+
+    @property
+    def survived_share(self) -> float:
+        """Share of the stressed runs that were survived, 0..1."""
+        return float(np.mean(self.survived[1:]))
+
+    @property
+    def rise(self) -> Floats:
+        """Error less that of the same cell without a stressor, cmH2O, ``(S, L, n)``."""
+        return self.error - self.error[:1]
+
+    @property
+    def volume_ratio(self) -> Floats:
+        """Volume over that of the same cell without a stressor, ``(S, L, n)``."""
+        return self.volume / self.volume[:1]
+
+    @property
+    def complete(self) -> bool:
+        """Whether all conditions, lungs and draws of the track were run."""
+        return (
+            self.conditions == conditions()
+            and self.lungs == LUNG_IDS
+            and self.pips.shape[1] == DRAWS
+        )
+
+    def interval(self, values: Floats) -> tuple[float, float]:
+        """95 % interval of a mean over cells, by resampling the draws of each lung.
+
+        Args:
+            values: ``(L, n)``, such as a mean over conditions; any unit.
+        """
+        if values.shape[1] < 2 or not np.isfinite(values).all():
+            return math.nan, math.nan
+        bits = np.random.PCG64(SEED)
+        lungs, n = values.shape
+        raw = bits.random_raw((RESAMPLES, lungs, n)) >> np.uint64(32)
+        index = ((raw * np.uint64(n)) >> np.uint64(32)).astype(np.intp)
+        means = values[np.arange(lungs)[:, None], index].mean(axis=(1, 2))
+        low, high = np.quantile(means, (0.025, 0.975))
+        return float(low), float(high)
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row a run: condition, severity, lung, PIP, draw and all figures."""
+        import pandas as pd
+
+        shape = self.error.shape
+        s, lung, draw = (axis.ravel() for axis in np.indices(shape))
+        return pd.DataFrame(
+            {
+                "condition": np.array([c.id for c in self.conditions])[s],
+                "lung": np.array(self.lungs)[lung],
+                "pip_cmH2O": self.pips[lung, draw],
+                "rig": self.rigs[lung, draw],
+                "draw": draw + 1,
+                "error_cmH2O": self.error.ravel(),
+                "rise_cmH2O": self.rise.ravel(),
+                "plateau_error_cmH2O": self.plateau_error.ravel(),
+                "survived": self.survived.ravel(),
+                "safe": self.safe.ravel(),
+                "above_alarm_s": self.alarm_s.ravel(),
+                "peak_cmH2O": self.peak.ravel(),
+                "volume_mL": self.volume.ravel(),
+                "volume_ratio": self.volume_ratio.ravel(),
+            }
+        )
+
+    def summary(self) -> pd.DataFrame:
+        """One row a condition, by its id: means over cells, and the worst run."""
+        import pandas as pd
+
+        return pd.DataFrame([self._condition(k) for k in range(len(self.conditions))]).set_index(
+            "condition"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the score as JSON values, in the order in which a person reads it."""
+        manifest = self.submission.manifest
+        stressed = self.error[1:].mean(axis=0)
+        worst = [self._condition(k) for k in range(1, len(self.conditions))]
+        worst_one = max(worst, key=lambda row: _order(row["error_cmH2O"]))
+        return {
+            "protocol": PROTOCOL,
+            "track": TRACK,
+            "stressors_version": VERSION,
+            "name": manifest.name,
+            "score": _number(self.score),
+            "ci95": [_number(limit) for limit in self.interval(stressed)],
+            "unstressed": _number(self.unstressed),
+            "rise": _number(np.mean(self.rise[1:])),
+            "rise_ci95": [_number(limit) for limit in self.interval(self.rise[1:].mean(axis=0))],
+            "survived": self.survived_share,
+            "survived_ci95": [
+                _number(limit) for limit in self.interval(self.survived[1:].mean(axis=0))
+            ],
+            "survived_unstressed": float(np.mean(self.survived[0])),
+            "unsafe_runs": int(np.sum(~self.safe[1:])),
+            "stressed_runs": int(self.safe[1:].size),
+            "above_alarm_s": _number(np.mean(self.alarm_s[1:])),
+            "worst_condition": worst_one["condition"],
+            "worst_error": worst_one["error_cmH2O"],
+            "complete": self.complete,
+            "categories": self._categories(),
+            "conditions": [self._condition(k) for k in range(len(self.conditions))],
+            "draws": {"count": int(self.pips.shape[1]), "seed": self.seed_name},
+            "failures": [
+                {
+                    "condition": self.conditions[s].id,
+                    "lung": self.lungs[lung],
+                    "draw": draw + 1,
+                    **failure.to_json(),
+                }
+                for (s, lung, draw), failure in sorted(self.failures.items())
+            ],
+            "sandbox": None if self.sandbox is None else dict(self.sandbox),
+            "submission": {"sha256": self.submission.sha256, **dataclasses.asdict(manifest)},
+            "simulators": None if self.simulators is None else dict(self.simulators),
+            "versions": {
+                "ventbench": ventbench.__version__,
+                "python": platform.python_version(),
+                **{name: version(name) for name in ("jax", "jaxlib", "numpy")},
+            },
+            "timing": dict(self.timing),
+        }
+
+    def save(self, folder: Path) -> None:
+        """Write ``stress.json`` and, one row a run, ``stress.csv`` to a folder.
+
+        Raises:
+            OSError: if they cannot be written.
+        """
+        files.write_json(folder / "stress.json", self.to_json())
+        table = self.to_frame().to_csv(index=False, lineterminator="\n").encode()
+        files.write_atomically(folder / "stress.csv", lambda file: file.write(table))
+
+    def _categories(self) -> dict[str, dict[str, float | None]]:
+        by_category = {}
+        for category in (*CATEGORIES, "pairs"):
+            at = [k for k, c in enumerate(self.conditions) if _category(c) == category]
+            if at:
+                by_category[category] = {
+                    "error_cmH2O": _number(np.mean(self.error[at])),
+                    "rise_cmH2O": _number(np.mean(self.rise[at])),
+                    "survived": float(np.mean(self.survived[at])),
+                    "unsafe_runs": int(np.sum(~self.safe[at])),
+                }
+        return by_category
+
+    def _condition(self, k: int) -> dict[str, Any]:
+        condition, error = self.conditions[k], self.error[k]
+        lung, draw = np.unravel_index(np.argmax(np.nan_to_num(error, nan=np.inf)), error.shape)
+        return {
+            "condition": condition.id,
+            "stressors": list(condition.stressors),
+            "severity": condition.severity,
+            "category": _category(condition),
+            "error_cmH2O": _number(np.mean(error)),
+            "ci95": [_number(limit) for limit in self.interval(error)],
+            "rise_cmH2O": _number(np.mean(self.rise[k])),
+            "rise_ci95": [_number(limit) for limit in self.interval(self.rise[k])],
+            "survived": float(np.mean(self.survived[k])),
+            "unsafe_runs": int(np.sum(~self.safe[k])),
+            "above_alarm_s": _number(np.mean(self.alarm_s[k])),
+            "peak_cmH2O": _number(np.max(self.peak[k])),
+            "volume_ratio": _number(np.median(self.volume_ratio[k])),
+            "worst": {
+                "lung": self.lungs[lung],
+                "pip": float(self.pips[lung, draw]),
+                "error_cmH2O": _number(error[lung, draw]),
+            },
+        }
+
+    def _headline(self) -> str:
+        name = self.submission.manifest.name
+        if math.isnan(self.score):
+            return f"{name}, stress: failed in {len(self.failures)} runs"
+        low, high = self.interval(self.error[1:].mean(axis=0))
+        return (
+            f"{name}, stress: {self.score:.3f} cmH2O [{low:.3f}, {high:.3f}], "
+            f"{self.unstressed:.3f} without stressors; {100 * self.survived_share:.0f} % survived, "
+            f"{int(np.sum(~self.safe[1:]))} of {self.safe[1:].size} runs unsafe"
+        )
+
+    def _rows(self) -> pd.DataFrame:
+        columns = ["error_cmH2O", "rise_cmH2O", "survived", "unsafe_runs", "volume_ratio"]
+        table = self.summary().iloc[1:].sort_values("error_cmH2O", ascending=False)
+        return table[columns].head(_SHOWN).reset_index()
+
+    def __repr__(self) -> str:
+        return f"<StressScore of {self._headline()}>"
+
+    def __str__(self) -> str:
+        rows = self._rows().to_string(index=False, float_format="{:.2f}".format)
+        return f"{self._headline()}\nWhat costs most:\n{rows}"
+
+    def _repr_html_(self) -> str:
+        rows = self._rows().to_html(index=False, float_format="{:.2f}".format)
+        return f"<div><p>{html.escape(self._headline())}</p>{rows}</div>"
+
+
+def score_stress(
+    submission: Any,
+    *,
+    simulator: Given | None = None,
+    draws: int = DRAWS,
+    only: Sequence[str] = (),
+    seed: bytes = seasons.DEVELOPMENT_SEED,
+    seed_name: str = "development",
+    sandbox: bool = True,
+) -> StressScore:
+    """Score a controller under missing physics that it is not told of.
+
+    Args:
+        submission: as for :func:`ventbench.score`.
+        simulator: other simulators with plants than the official ones of version 2; see
+            :func:`ventbench.load_simulators`.
+        draws: cells of each lung under each condition.
+        only: stressors to run; all conditions if empty.
+        seed: 32 bytes that the draws follow from.
+        seed_name: what the result calls that seed.
+        sandbox: run a folder in locked-down processes, as for :func:`ventbench.score`.
+
+    Raises:
+        SubmissionError: if there is no such submission, or it cannot be run at all.
+        SandboxError: if this machine cannot run submissions apart.
+        InputError: if there are no such simulators or stressors.
+        FloatingPointError: if a plant answers with NaN or infinity.
+    """
+    if draws < 1:
+        raise InputError(f"{draws} draws: the stress track needs at least one")
+    runner: Runner = InProcessRunner()
+    if isinstance(submission, Submission):
+        entry = submission
+    elif isinstance(submission, str | Path):
+        entry = open_submission(str(submission))
+    else:
+        entry = submission_of(submission)
+    if sandbox and entry.controller is None:
+        from ventbench.sandbox.runner import SandboxRunner
+
+        runner = SandboxRunner()
+    if simulator is None:
+        official = frozen.load(version=2)
+        cells, about = draw_cells(official, draws, seed=seed), official.about()
+    else:
+        given = load_simulators(simulator)
+        cells = draw_cells(given.stacked, draws, seed=seed, lungs=given.lungs)
+        about = given.about
+    return run_stress(
+        entry, cells, chosen_conditions(only), runner=runner, simulators=about, seed_name=seed_name
+    )
+
+
+def chosen_conditions(only: Sequence[str]) -> tuple[Condition, ...]:
+    """All conditions, or no stressor and those of some stressors alone.
+
+    Raises:
+        InputError: if there is no such stressor.
+    """
+    names = {stressor(name).name for name in only}
+    return tuple(c for c in conditions() if not names or set(c.stressors) <= names)
+
+
+def run_stress(
+    submission: Submission,
+    draws: StressDraws,
+    chosen: Sequence[Condition],
+    *,
+    runner: Runner | None = None,
+    simulators: Mapping[str, Any] | None = None,
+    seed_name: str = "development",
+) -> StressScore:
+    """Run a submission on drawn cells, by any runner; see :func:`score_stress`.
+
+    Args:
+        submission: from :func:`ventbench.submissions.folder.open_submission`.
+        draws: from :func:`ventbench.stress.run.draw_cells`.
+        chosen: conditions; the first must be none.
+        runner: runs the controllers; in this process if not given.
+        simulators: what is known of the plants.
+        seed_name: see :class:`StressScore`.
+    """
+    started = time.perf_counter()
+    runner = runner or InProcessRunner()
+    if submission.controller is not None and runner.sandbox is not None:
+        raise SubmissionError(f"{submission.label}: only a folder can run in a sandbox")
+    if "robustness" not in submission.manifest.tracks:
+        raise SubmissionError(
+            f"{submission.label}: submission.toml, key tracks: enters performance only; the stress "
+            "track does not tell the lung and needs an entry of the robustness track"
+        )
+    if not chosen or chosen[0].stressors:
+        raise ValueError("the first condition must be none")
+    run = step_through(draws, chosen, runner, submission)
+    timing = {"seconds": time.perf_counter() - started}
+    return assess(
+        run,
+        draws,
+        tuple(chosen),
+        submission=submission,
+        sandbox=runner.sandbox,
+        simulators=simulators,
+        seed_name=seed_name,
+        timing=timing,
+    )
+
+
+def assess(
+    run: StressRun,
+    draws: StressDraws,
+    chosen: tuple[Condition, ...],
+    *,
+    submission: Submission,
+    sandbox: Mapping[str, Any] | None = None,
+    simulators: Mapping[str, Any] | None = None,
+    seed_name: str = "development",
+    timing: Mapping[str, float] | None = None,
+) -> StressScore:
+    """Compute all figures of a run; arguments as of :class:`StressScore`."""
+    pip, dt = np.asarray(draws.scenario.pip), np.asarray(draws.scenario.dt)
+    by_breath = (run.pressure, pip[..., None], dt[..., None])
+    safe = passes_safety_gate(*by_breath).all(axis=-1)
+    plateau = steady_error(run.pressure[..., -1, :], pip)
+    error = run_error(run.pressure, pip[..., None, None])
+    survived = safe & (plateau <= PLATEAU_TOLERANCE + PLATEAU_SHARE * pip)
+    for cell in run.failures:
+        error[cell], plateau[cell], survived[cell] = np.nan, np.nan, False
+    return StressScore(
+        submission=submission,
+        conditions=chosen,
+        lungs=tuple(lung.id for lung in draws.lungs),
+        pips=draws.nominal_pip,
+        rigs=draws.rigs,
+        error=error,
+        safe=safe,
+        plateau_error=plateau,
+        survived=survived,
+        alarm_s=time_above_alarm(*by_breath).max(axis=-1),
+        peak=run.pressure.max(axis=(-2, -1)),
+        volume=run.volume[..., protocol.SCORED_BREATHS, -1].mean(axis=-1),
+        requested=run.requested,
+        failures=run.failures,
+        sandbox=sandbox,
+        simulators=simulators,
+        seed_name=seed_name,
+        timing=timing or {},
+    )
+
+
+def _category(condition: Condition) -> str:
+    if not condition.stressors:
+        return "none"
+    return "pairs" if len(condition.stressors) > 1 else stressor(condition.stressors[0]).category
+
+
+def _number(value: float | np.floating) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _order(value: float | None) -> float:
+    return math.inf if value is None else value

@@ -45,14 +45,21 @@ def make(
         ),
     ] = "all",
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
+    generator: Annotated[
+        Literal["first", "stranger"],
+        typer.Option(
+            help="Who records: the first generator, or the stranger, with other equations, another "
+            "integrator and the nuisances of real laboratories."
+        ),
+    ] = "first",
 ) -> None:
     """Write recordings with concealed effects, and the sealed answers.
 
     Anyone may read DIR/recordings and DIR/cases.json. commitment.txt holds the SHA-256 of the
-    answers: publish it before the first diagnosis. The same seed, kind and number of recordings
-    give the same files.
+    answers: publish it before the first diagnosis. The same seed, kind, number of recordings and
+    generator give the same files.
 
-    Example: `ventbench challenge make --seed "$SECRET" --out runs/challenge --cases 200`
+    Example: `ventbench challenge make --generator stranger --seed "$SECRET" --out runs/strangers`
     """
     from ventbench.cli.options import bars
     from ventbench.validation.challenge.make import make as work
@@ -60,7 +67,7 @@ def make(
     with bars() as shown:
         task = shown.add_task("recording", total=cases)
         hashed = work(
-            seed, out, kind, cases, jobs=jobs,
+            seed, out, kind, cases, jobs=jobs, source=generator,
             progress=lambda done: shown.update(task, completed=done),
         )  # fmt: skip
     typer.echo(f"wrote {cases} recordings to {out}; commitment {hashed}")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ventbench.recordings.breaths import Breaths
 from ventbench.validation.challenge.cases import Base, Case
-from ventbench.validation.challenge.rig import replay
+from ventbench.validation.challenge.generators import generator_of
 
 Floats = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def log_likelihood_loss(case: Case, breaths: Breaths, index: int) -> float:
     count = min(_BREATHS, len(breaths))
     chosen = breaths.select(np.linspace(0, len(breaths) - 1, count).astype(int))
     start = np.full(count, case.base.peep)
-    response = replay(case, chosen, start, seed=index)
+    response = generator_of(case).replay(case, chosen, start, seed=index)
     rest = replace(case, effects=case.effects[:index] + case.effects[index + 1 :])
     error = _refitted(rest, case.base, chosen, start, response, seed=index)
     noise = max(case.noise**2 + case.step**2 / 12.0, _LEAST_VARIANCE)
@@ -65,6 +65,7 @@ def _refitted(
     case: Case, base: Base, breaths: Breaths, start: Floats, response: Floats, seed: int
 ) -> Floats:
     """Residuals of the best rig, by Gauss-Newton steps that are halved until the error falls."""
+    replay = generator_of(case).replay
 
     def run(at: Base, first: Floats) -> Floats:
         return response - replay(replace(case, base=at), breaths, first, seed)

@@ -16,6 +16,7 @@ import numpy as np
 from ventbench import files
 from ventbench.errors import InputError
 from ventbench.validation.challenge.cases import Base, Case, DrawnCase, Effect
+from ventbench.validation.challenge.stranger.effects import StrangerCase
 
 _FORMAT = "ventbench-challenge-1"
 
@@ -59,7 +60,8 @@ def decode_answers(text: bytes) -> Truth:
 def _case(value: dict[str, Any]) -> Case:
     effects = tuple(Effect(**effect) for effect in value["effects"])
     base = None if value["base"] is None else Base(**value["base"])
-    return Case(**(value | {"effects": effects, "base": base}))
+    kind = StrangerCase if value.get("generator") == "stranger" else Case
+    return kind(**(value | {"effects": effects, "base": base}))
 
 
 def commitment(text: bytes) -> str:

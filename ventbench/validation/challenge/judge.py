@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from ventbench.validation.challenge.cases import (
-    EFFECTS,
     NOMINAL_GAIN,
     Case,
     DrawnCase,
@@ -18,6 +17,8 @@ from ventbench.validation.challenge.cases import (
     in_library,
 )
 from ventbench.validation.challenge.detectability import LIMIT
+from ventbench.validation.challenge.generators import in_library as is_inside
+from ventbench.validation.challenge.stranger import effects as stranger
 
 #: Places that are right for an effect outside the library.
 PLACES: dict[str, frozenset[str]] = {
@@ -49,17 +50,33 @@ _ALTERNATIVES = 2
 
 def library_names(case: Case) -> frozenset[str]:
     """Mechanisms of the library that are in the case."""
-    return frozenset(effect.name for effect in case.effects if EFFECTS[effect.name].inside)
+    return frozenset(effect.name for effect in case.effects if is_inside(case, effect.name))
 
 
-def acceptable_names(case: Case) -> frozenset[str]:
-    """Mechanisms of the library that are in the case, or are equivalent to an effect in it."""
+def acceptable_names(case: Case, named: frozenset[str] = frozenset()) -> frozenset[str]:
+    """Mechanisms of the library that are in the case, or are equivalent to an effect in it.
+
+    Args:
+        case: the case.
+        named: names of the answer. A stranger's effect outside the library has names that are right
+            if the library has come to have one of them; and its inertance comes with a circuit's
+            compliance, which may be named or not.
+    """
+    if isinstance(case, stranger.StrangerCase):
+        other = {n for e in case.effects if not is_inside(case, e.name)
+                 for n in stranger.EFFECTS[e.name].names}  # fmt: skip
+        if any(effect.name == "inertance" for effect in case.effects):
+            other.add("circuit_compliance")
+        return library_names(case) | (named & other)
     equivalents = {EQUIVALENTS[e.name] for e in case.effects if e.name in EQUIVALENTS}
     return library_names(case) | equivalents
 
 
 def right_places(case: Case) -> frozenset[str]:
     """Places that are right for the case's effects outside the library."""
+    if isinstance(case, stranger.StrangerCase):
+        own = [e.name for e in case.effects if not is_inside(case, e.name)]
+        return frozenset(place for name in own for place in stranger.EFFECTS[name].places)
     return frozenset().union(*(PLACES.get(effect.name, frozenset()) for effect in case.effects))
 
 
@@ -79,7 +96,10 @@ def true_values(case: Case) -> dict[str, float]:
     ratio = case.base.gain / NOMINAL_GAIN
     values = {}
     for effect in case.effects:
-        if in_library(effect):
+        same = in_library(effect)
+        if isinstance(case, stranger.StrangerCase):
+            same = effect.form == stranger.SAME
+        if same:
             values |= _values_of(effect, ratio)
     return values
 
@@ -219,9 +239,9 @@ def judge(drawn: DrawnCase, nats: list[float], answer: dict[str, Any]) -> Judged
         answer: content of the answer's file.
     """
     case, diagnosis = drawn.case, answer["diagnosis"]
-    library = acceptable_names(case)
     mechanisms = diagnosis["mechanisms"]
     named = frozenset(mechanism["name"] for mechanism in mechanisms)
+    library = acceptable_names(case, named)
     alternatives = {name for m in mechanisms for name in m["alternatives"][:_ALTERNATIVES]}
     place = diagnosis["slot"]["name"] if diagnosis["slot"] else None
     equivalent = drawn.kind == "outside" and bool(library) and named == library

@@ -24,8 +24,7 @@ from ventbench.validation.challenge.folder import (
     encrypt,
     random_generator,
 )
-from ventbench.validation.challenge.plan import draw
-from ventbench.validation.challenge.rig import record
+from ventbench.validation.challenge.generators import generator, generator_of
 
 #: Limits of a recorded pressure.
 PRESSURE = COLUMNS["pressure"]
@@ -34,17 +33,19 @@ PRESSURE = COLUMNS["pressure"]
 #: gentler ones, each this share of the attempt before.
 _USUAL_ATTEMPTS, _GENTLE_ATTEMPTS, _GENTLER = 10, 10, 0.85
 
-#: Records a case; has the arguments of :func:`~ventbench.validation.challenge.rig.record`.
-Record = Callable[..., Breaths]
+#: Records a case; has the arguments of :func:`~ventbench.validation.challenge.rig.record`. That of
+#: the case's generator if None.
+Record = Callable[..., Breaths] | None
 
 
 def make(
     secret: str, out: Path, kind: Kind | Literal["all"], count: int, *, jobs: int = 1,
-    record: Record = record, progress: Callable[[int], None] = lambda done: None,
+    source: str = "first", record: Record = None,
+    progress: Callable[[int], None] = lambda done: None,
 ) -> str:  # fmt: skip
     """Write a challenge.
 
-    The same secret, kind and count give the same bytes.
+    The same secret, kind, count and generator give the same bytes.
 
     Args:
         secret: seed of everything that is drawn.
@@ -52,6 +53,7 @@ def make(
         kind: kind of the cases.
         count: number of cases.
         jobs: number of processes.
+        source: name of the generator, ``"first"`` or ``"stranger"``.
         record: see :data:`Record`; a function of a module if there are processes.
         progress: called with the number of finished recordings.
 
@@ -66,7 +68,9 @@ def make(
         raise InputError(f"{out} holds a challenge already; choose another folder")
     drawn = [
         DrawnCase(question.kind, replace(question.case, name=f"case_{k:04d}"))
-        for k, question in enumerate(draw(kind, count, random_generator(secret, "plan")), start=1)
+        for k, question in enumerate(
+            generator(source).draw(kind, count, random_generator(secret, "plan")), start=1
+        )
     ]
     names = [question.case.name for question in drawn]
     nats: dict[str, list[float]] = {}
@@ -103,7 +107,7 @@ def _make_case(
 
 def record_within_limits(
     secret: str, drawn: DrawnCase, *, usual: int = _USUAL_ATTEMPTS, gentle: int = _GENTLE_ATTEMPTS,
-    record: Record = record,
+    record: Record = None,
 ) -> Breaths:  # fmt: skip
     """Record a case, repeatedly until the pressures are within the limits of a recording.
 
@@ -119,13 +123,14 @@ def record_within_limits(
     Raises:
         InputError: if every attempt leaves the limits.
     """
-    name = drawn.case.name
+    name, take = drawn.case.name, record or generator_of(drawn.case).record
     for attempt in range(usual + gentle):
         repeated = () if attempt == 0 else (f"again {attempt}",)
         share = _GENTLER ** max(attempt - usual + 1, 0)
         rng = random_generator(secret, "recording", name, *repeated)
-        breaths = record(drawn.case, rng, share=share)
-        if np.all((breaths.pressure >= PRESSURE.low) & (breaths.pressure <= PRESSURE.high)):
+        breaths = take(drawn.case, rng, share=share)
+        pressure = breaths.pressure[np.isfinite(breaths.pressure)]
+        if np.all((pressure >= PRESSURE.low) & (pressure <= PRESSURE.high)):
             return breaths
     span = f"{PRESSURE.low:g}..{PRESSURE.high:g} cmH2O"
     raise InputError(f"{name} leaves {span} at every attempt; take another seed")

@@ -17,7 +17,7 @@ from ventbench.recordings.breaths import join
 from ventbench.recordings.read import load
 from ventbench.recordings.write import write as write_recording
 from ventbench.validation.challenge.folder import ChallengeFolder, random_generator
-from ventbench.validation.challenge.rig import record_commands
+from ventbench.validation.challenge.generators import generator_of
 
 Floats = NDArray[np.float64]
 
@@ -113,6 +113,7 @@ def record(folder: ChallengeFolder, secret: str) -> list[str]:
         if path.is_file():
             requested = read(path)
             rng = random_generator(secret, "second recording", case.name)
+            record_commands = generator_of(case).record_commands
             more = record_commands(case, requested.time, requested.u_in, requested.u_out, rng)
             both = join([load(folder.recording(case.name)), more])
             write_recording(both, second.recording(case.name))

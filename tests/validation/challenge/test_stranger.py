@@ -1,0 +1,178 @@
+"""The second generator: its physics against exact solutions, its cases, and its challenge."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from ventbench.errors import InputError
+from ventbench.plants.catalog import load_simulators
+from ventbench.validation.challenge.cases import Base, Effect
+from ventbench.validation.challenge.folder import ChallengeFolder
+from ventbench.validation.challenge.judge import acceptable_names, right_places, true_values
+from ventbench.validation.challenge.make import make
+from ventbench.validation.challenge.stranger import effects as stranger
+from ventbench.validation.challenge.stranger.effects import SAME, StrangerCase, draw
+from ventbench.validation.challenge.stranger.laboratory import record, replay
+
+QUIET = StrangerCase(
+    "", 20.0, 20.0, (), Base(20.0, 20.0, 5.0, 5.0, 22.8), noise=0.0, step=0.0, jitter=3e-4,
+    breaths=4, samples=40, dead_space=0.002,
+)  # fmt: skip
+
+
+def replayed(effect: Effect | None, u_in: float = 20.0, samples: int = 40) -> np.ndarray:
+    """Pressures of one breath from rest at PEEP: small commands, ``u_in``, shut at sample 30."""
+    effects = () if effect is None else (effect,)
+    breaths = record(replace(QUIET, jitter=0.0, breaths=2), np.random.default_rng(0))
+    k = np.arange(samples)
+    small = np.where(k < 3, 1.2, 2.5)
+    u = np.where(k < 6, small, np.where(k < 30, u_in, 0.0)) + np.zeros((2, 1))
+    u_out = (np.arange(samples) >= 30).astype(np.int8) + np.zeros((2, 1), np.int8)
+    given = replace(breaths, u_in=u, u_out=u_out)
+    case = replace(QUIET, effects=effects, breaths=2)
+    return replay(case, given, np.full(2, 5.0), 0)[0]
+
+
+def test_without_effects_it_is_the_exact_solution():
+    breaths = record(QUIET, np.random.default_rng(0))
+    exact = load_simulators("physics").pressures(breaths)
+    inspired = breaths.inspiratory & (breaths.time > 0)
+    assert np.abs(exact - breaths.pressure)[inspired].max() < 0.05
+    assert breaths.pressure.max() > 15.0
+
+
+@pytest.mark.parametrize(
+    ("effect", "friction"),
+    [
+        (Effect("turbulent_resistance", "strong", SAME, {"quadratic": 10.0}), lambda q: 10 * q * q),
+        (
+            Effect("turbulent_resistance", "strong", "Blasius", {"quadratic": 10.0}),
+            lambda q: 10 * 0.6**0.25 * q**1.75,
+        ),
+    ],
+)
+def test_friction_adds_its_drop(effect, friction):
+    extra = replayed(effect) - replayed(None)
+    np.testing.assert_allclose(extra[8:29], friction(0.456), rtol=0.02)
+
+
+def test_a_leak_and_a_circuit_against_solve_ivp():
+    """The stiff circuit and the orifice, by an integrator of scipy."""
+    circuit, orifice, R, C = 0.003, 0.01, 20.0, 0.02
+    leak = replace(QUIET, dead_space=1e3 * circuit)
+    effect = Effect("leak", "strong", SAME, {"conductance": 1e3 * orifice})
+    breaths = record(replace(leak, jitter=0.0, breaths=1), np.random.default_rng(0))
+    u = np.full((1, 40), 20.0)
+    given = replace(breaths, u_in=u, u_out=np.zeros((1, 40), np.int8))
+    found = replay(replace(leak, effects=(effect,), breaths=1), given, np.array([5.0]), 0)[0]
+
+    def slope(t, y):
+        p, v = y
+        q = (p - 5.0 - v / C) / R
+        return (0.456 - q - orifice * np.sqrt(max(p, 0.0))) / circuit, q
+
+    exact = solve_ivp(slope, (0.0, 1.4), (5.0, 0.0), t_eval=given.time[0], rtol=1e-8, method="BDF")
+    np.testing.assert_allclose(found, exact.y[0], atol=0.25)
+
+
+def test_every_effect_acts_and_a_strong_one_more():
+    quiet = replayed(None, 37.4)
+    for name, family in stranger.EFFECTS.items():
+        for form in family.forms:
+            sizes = []
+            for size in (family.mild, family.strong):
+                further = {key: 0.5 * (low + high) for key, (low, high) in family.ranges}
+                effect = Effect(name, "mild", form, {family.parameter: size} | further)
+                sizes.append(float(np.abs(replayed(effect, 37.4) - quiet).mean()))
+            if name in ("sensor_drift", "compliance_change", "resistance_change"):
+                assert sizes == [0.0, 0.0], "the first breath is not yet changed"
+                continue
+            assert sizes[0] > 0.01, (name, form)
+            if name != "inertance" and family.mild != family.strong:  # its circuit changes more
+                assert sizes[1] > sizes[0], (name, form)
+
+
+def test_cases_cover_the_laboratory():
+    cases = draw("all", 120, np.random.default_rng(0))
+    assert set(Counter(drawn.kind for drawn in cases)) == set(stranger.SHARES)
+    lungs = Counter(drawn.case.lung for drawn in cases)
+    assert len(lungs) == 9
+    breaths = [drawn.case.breaths for drawn in cases]
+    assert min(breaths) < 20
+    assert max(breaths) > 150
+    off = [drawn.case.base.R / drawn.case.lung_R for drawn in cases if drawn.case.base]
+    assert max(off) > 1.4
+    assert max(drawn.case.proportional for drawn in cases) > 9.0
+    for drawn in cases:
+        names = {effect.name for effect in drawn.case.effects}
+        assert len(names) == {"pair": 2, "four": 4, "null": 0}.get(drawn.kind, 1)
+    with pytest.raises(InputError, match="no kind form"):
+        draw("form", 9, np.random.default_rng(0))
+
+
+def test_a_recording_has_the_nuisances_of_its_case():
+    case = replace(
+        QUIET, breaths=30, samples=60, noise=0.2, step=0.1, outliers=0.01, missing=0.02,
+        clock_step=1e-3, jitter=1e-3, proportional=10.0,
+    )  # fmt: skip
+    breaths = record(case, np.random.default_rng(1))
+    known = breaths.pressure[np.isfinite(breaths.pressure)]
+    assert 0.005 < np.isnan(breaths.pressure).mean() < 0.05
+    assert np.isfinite(breaths.pressure[:, 0]).all()
+    np.testing.assert_allclose(np.round(breaths.time, 3), breaths.time, atol=1e-9)
+    residual = replay(case, breaths, breaths.pressure[:, 0], 0) - breaths.pressure
+    far = np.abs(residual[np.isfinite(residual)]) > 1.6
+    assert 0.003 < far.mean() < 0.05
+    assert known.max() < 60.0
+    again = record(case, np.random.default_rng(1))
+    np.testing.assert_array_equal(breaths.pressure, again.pressure)
+
+
+def test_judged_by_what_pressure_can_tell():
+    def case(*effects: Effect) -> StrangerCase:
+        return replace(QUIET, effects=effects)
+
+    heavy = case(Effect("inertance", "strong", SAME, {"inertance": 0.1, "circuit": 0.8}))
+    assert acceptable_names(heavy, frozenset({"inertance", "circuit_compliance"})) == {
+        "inertance", "circuit_compliance",
+    }  # fmt: skip
+    assert acceptable_names(heavy, frozenset({"inertance"})) == {"inertance"}
+    two = case(Effect("second_compartment", "strong", "Otis", {"share": 0.3, "time": 1.0}))
+    assert acceptable_names(two, frozenset({"viscoelasticity"})) == {"viscoelasticity"}
+    assert acceptable_names(two, frozenset({"leak"})) == frozenset()
+    assert "memory of p" in right_places(two)
+    assert true_values(case(Effect("sensor_lag", "mild", SAME, {"tau": 0.05}))) == {
+        "sensor_lag.tau": 0.05
+    }
+    assert true_values(case(Effect("sensor_lag", "mild", "second order", {"tau": 0.05}))) == {}
+
+
+def test_a_challenge_of_strangers_keeps_its_seal(tmp_path, monkeypatch):
+    small = replace(QUIET, breaths=6, effects=())
+    lag = Effect("sensor_lag", "strong", SAME, {"tau": 0.1})
+
+    def few(kind, count, rng):
+        drawn = draw("single", 2, rng)
+        return [replace(d, case=replace(small, effects=e)) for d, e in zip(drawn, ((), (lag,)))]  # noqa: B905
+
+    from ventbench.validation.challenge import generators
+
+    listed = dict(generators.GENERATORS)
+    listed["stranger"] = replace(generators.STRANGER, draw=few)
+    monkeypatch.setattr(generators, "GENERATORS", listed)
+    hashed = make("words", tmp_path / "a", "all", 2, source="stranger")
+    assert hashed == make("words", tmp_path / "b", "all", 2, source="stranger")
+    truth = ChallengeFolder(tmp_path / "a").truth("words")
+    assert [type(drawn.case) for drawn, _ in truth] == [StrangerCase] * 2
+    assert truth[1][0].case.effects == (lag,)
+    assert truth[1][1][0] > 100.0, "a strong lag is detectable"
+    with pytest.raises(InputError, match="published"):
+        ChallengeFolder(tmp_path / "a").truth("other words")
+    public = json.loads((tmp_path / "a" / "cases.json").read_text())
+    assert "stranger" not in json.dumps(public)

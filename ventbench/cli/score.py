@@ -84,6 +84,7 @@ def score(
     """
     from rich.console import Console
 
+    from ventbench import extras
     from ventbench.errors import InputError
     from ventbench.plants.catalog import load_simulators
     from ventbench.submissions import scoring
@@ -99,6 +100,8 @@ def score(
         raise InputError("--record needs all published draws: add --draws 20")
     if report and out is None:
         raise InputError("--report needs --out DIR to write to")
+    if report:
+        extras.require("jinja2", "rerun")
     opened = [open_submission(name) for name in names]
     entries = [entry.manifest.name for entry in opened]
     if len(set(entries)) < len(entries):

@@ -16,7 +16,7 @@ DEMO := $(VENV)/bin/ventbench score submissions/pid_best submissions/pid_robust 
 	--out runs/demo --report
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow lint format lock bench wheel clean
+.PHONY: help setup demo test test-slow lint format docs lock bench wheel clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -43,6 +43,10 @@ lint: setup ## ruff, arrows between rooms and pyright, changing nothing
 format: setup ## let ruff mend and format the code
 	$(PY) -m ruff check --fix .
 	$(PY) -m ruff format .
+
+docs: setup ## build the documentation as a site in runs/site, warnings as errors
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
+	@echo "open runs/site/index.html"
 
 lock: setup ## write requirements.lock anew from pyproject.toml
 	$(PY) -m uv pip compile pyproject.toml --all-extras --universal --python-version 3.11 \

@@ -47,7 +47,7 @@ def example(name: str) -> Path:
     Raises:
         InputError: if there is no such example.
 
-    Example:
+    Examples:
         >>> import ventbench
         >>> ventbench.example("sound").name
         'sound.csv'

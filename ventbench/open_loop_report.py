@@ -165,7 +165,7 @@ def open_loop(breaths: Breaths | Path | str, simulator: Given = "frozen") -> Ope
     Raises:
         InputError: if there is no simulator for a lung of the recording.
 
-    Example:
+    Examples:
         >>> import ventbench
         >>> report = ventbench.open_loop(ventbench.example("sound"), "physics")
         >>> bool(report.to_frame().loc["R5C20", "mae"] < 1.0)

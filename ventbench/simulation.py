@@ -106,7 +106,7 @@ def simulate(
     Raises:
         InputError: if a command is wrong, or there is no simulator for the lung.
 
-    Example:
+    Examples:
         >>> import numpy as np
         >>> import ventbench
         >>> u_in = np.full(30, 10.0)  # the inspiratory valve held at 10 % for 0.9 s

@@ -149,7 +149,7 @@ def rollout(
     Raises:
         InputError: if the simulators have no plants, or none for a lung.
 
-    Example:
+    Examples:
         >>> import ventbench
         >>> from ventbench.controllers.pid import PID
         >>> run = ventbench.rollout(PID(1.0, 5.0), simulator="physics", lungs=["R20C50"], pips=[20])

@@ -72,7 +72,7 @@ def load_board(
             not there.
         OSError: if a file cannot be read.
 
-    Example:
+    Examples:
         >>> import ventbench
         >>> board = ventbench.load_board("leaderboard", track="performance")
         >>> board[["rank", "name", "score_cmH2O", "score_R5C10_cmH2O"]].shape[1]

@@ -103,7 +103,7 @@ def diagnose(
     Raises:
         InputError: if there are too few breaths, or no simulator for their lung.
 
-    Example:
+    Examples:
         >>> import numpy as np
         >>> def ideal(u_in, u_out, dt, *, R, C, initial_pressure):
         ...     flow = 22.8 * u_in / 1000.0  # L/s

@@ -361,7 +361,7 @@ def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) 
     Raises:
         InputError: if there are no such simulators, or a file is damaged.
 
-    Example:
+    Examples:
         >>> from ventbench import load_simulators
         >>> load_simulators("physics").plant("R20C50").get("C").item()
         50.0

@@ -43,7 +43,7 @@ def load(path: FilePath, *, clip: bool = False, pad: bool = False) -> Breaths:
     Raises:
         RecordingError: if the file cannot be used; the error carries its problems.
 
-    Example:
+    Examples:
         >>> import ventbench
         >>> breaths = ventbench.load_recording(ventbench.example("concealed"))
         >>> breaths.pressure.shape, list(breaths.by_lung_index)

@@ -66,7 +66,7 @@ def score(
         InputError: if there are no such simulators, draws or protocol.
         FloatingPointError: if a plant answers with NaN or infinity.
 
-    Example:
+    Examples:
         >>> from ventbench import score
         >>> def proportional(observation):
         ...     return 5.0 + 2.0 * (observation.target - observation.pressure)

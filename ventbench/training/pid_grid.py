@@ -230,7 +230,7 @@ def tune_pid(
         InputError: if a lung or a simulator is unknown, ``out`` holds an unfinished search with
             other settings, or a worker died.
 
-    Example:
+    Examples:
         >>> from ventbench import tune_pid
         >>> gains = [(2.0, 4.0, 0.0), (5.0, 5.0, 0.0)]  # %/cmH2O
         >>> grid, result = tune_pid(["R20C50"], simulator="physics", gains=gains)

@@ -1,0 +1,30 @@
+"""The documentation as a site: every page is in it, and every link leads somewhere."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_the_site_builds_without_a_warning_and_needs_no_network(tmp_path):
+    built = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)],
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert built.returncode == 0, built.stderr
+    pages = {path.stem for path in tmp_path.glob("*.html")}
+    assert pages > {path.stem for path in (ROOT / "docs").glob("*.md")} | {"index", "contributing"}
+    for page in tmp_path.glob("*.html"):
+        loaded = re.findall(r'(?:src|<link[^>]*href)="(https?:[^"]*)"', page.read_text("utf-8"))
+        assert not loaded, f"{page.name} loads {loaded}"
+    reference = (tmp_path / "python.html").read_text("utf-8")
+    import ventbench
+
+    for name in set(ventbench.__all__) - {"__version__", "LUNGS"}:
+        assert f"ventbench.{name}<" in reference, f"docs/python.md lacks {name}"

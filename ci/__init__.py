@@ -11,6 +11,7 @@ is not a plain small file in ``submissions/NAME/`` is refused.
 - :mod:`ci.workflow`: variables, summaries and exit codes of a job;
 - :mod:`ci.advisory`: what a pull request's author is told;
 - :mod:`ci.official`: the score that a maintainer starts, as a record;
+- :mod:`ci.seed`: the seed of a season of hidden draws, to the scorer and to nobody else;
 - :mod:`ci.propose`: the record into the leaderboard, on a branch;
 - :mod:`ci.publish`: the leaderboard as a branch of pages.
 """

@@ -3,24 +3,31 @@
 Scorer and simulators are those of the branch that this file lies on; of the commit, only the plain
 files of ``submissions/NAME/`` are taken, and their code runs in the sandbox alone. Every track is
 scored twice, and both runs must give the same commands to the bit.
+
+On the hidden draws of a season the record is sealed at once, and nothing else of the runs is said:
+no message of a submission, no number of cells, no error of one; all of them can carry draws.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from ci import seed as seeds
 from ci import workflow
 from ci.take import TakeError, Taken, take
-from ventbench import draws
-from ventbench.board import create
+from ventbench import draws, protocol
+from ventbench.board import create, record, sealed
 from ventbench.board.replay import ReplayPlants
 from ventbench.errors import InputError
+from ventbench.seasons import Season
 from ventbench.submissions import contract
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.manifest import TRACKS
+from ventbench.submissions.result import Score
 from ventbench.submissions.runner import Runner
 from ventbench.submissions.scoring import run_protocol
 
@@ -45,7 +52,13 @@ def tracks(wanted: str, entered: Sequence[str]) -> list[str]:
 
 
 def score_taken(
-    taken: Taken, source: str, wanted: str, simulators: ReplayPlants, runner: Runner, out: Path
+    taken: Taken,
+    source: str,
+    wanted: str,
+    simulators: ReplayPlants,
+    runner: Runner,
+    out: Path,
+    hidden: tuple[Season, bytes] | None = None,
 ) -> list[str]:
     """Check and score a submission twice, and write a record for each track.
 
@@ -56,6 +69,7 @@ def score_taken(
         simulators: the frozen ones.
         runner: the sandbox.
         out: folder for the records and their commands.
+        hidden: season and seed, for hidden draws; published draws if not given.
 
     Returns:
         Lines for the maintainer.
@@ -71,6 +85,11 @@ def score_taken(
     submission = open_submission(str(taken.folder))
     if submission.manifest.name != taken.name:
         raise TakeError(f"submission.toml calls it {submission.manifest.name}, not {taken.name}")
+    if hidden is not None and hidden[0].protocol != protocol.VERSION:
+        raise InputError(
+            f"season {hidden[0].id} is of protocol version {hidden[0].protocol}; this ventbench "
+            f"scores version {protocol.VERSION}"
+        )
     where = {"repository": source, "commit": taken.commit, "tree": taken.tree}
     for track in tracks(wanted, submission.manifest.tracks):
         result, again = (
@@ -86,10 +105,14 @@ def score_taken(
         )
         if result.requested.tobytes() != again.requested.tobytes():
             apart = (result.requested != again.requested).any(axis=(-2, -1)).sum()
+            where_apart = "some" if hidden is not None else apart
             raise TakeError(
-                f"{taken.name}: {track}: a second run gave other commands in {apart} cells; an "
-                "official score must be reproducible to the bit"
+                f"{taken.name}: {track}: a second run gave other commands in {where_apart} cells; "
+                "an official score must be reproducible to the bit"
             )
+        if hidden is not None:
+            lines += _seal(result, simulators, where, hidden, out)
+            continue
         path = create.create(result, simulators, source=where).save(out)
         lines.append(f"{taken.name}: {track}: {result.score:.3f} cmH2O nominal; {path.name}")
         if result.not_official_because:
@@ -97,6 +120,28 @@ def score_taken(
         failed = [failure.message for failure in result.failures[:3]]
         lines += [message.replace(str(taken.folder), taken.name) for message in failed]
     return lines
+
+
+def _seal(
+    result: Score,
+    simulators: ReplayPlants,
+    where: Mapping[str, str],
+    hidden: tuple[Season, bytes],
+    out: Path,
+) -> list[str]:
+    """Write a sealed record; say no more than it does."""
+    name = f"{result.submission.manifest.name}: {result.track}"
+    try:
+        draft = create.create(result, simulators, source=where)
+        made = sealed.seal(draft.content, draft.commands, *hidden)
+    except InputError:  # its text may hold numbers of a cell
+        raise TakeError(f"{name}: no record can be made of this score") from None
+    path = made.save(out)
+    public = record.load(path)
+    assert isinstance(public, record.Sealed)
+    scores = ", ".join(f"{key} {value}" for key, value in public.content.scores.items())
+    state = "official" if public.official else "not official"
+    return [f"{name}: {scores}, {state}; {path.name}"]
 
 
 def main() -> int:
@@ -107,10 +152,14 @@ def main() -> int:
     source, out = workflow.required("SOURCE"), Path(workflow.required("OUT"))
     wanted = workflow.required("TRACK")
     base, commit, name = (workflow.required(key) for key in ("BASE", "COMMIT", "NAME"))
+    season, hidden = os.environ.get("SEASON", ""), None
+    if season:
+        file = Path(workflow.required("SEED_FILE"))
+        hidden = seeds.take_over(season, file, Path.cwd() / "leaderboard")
     runner = SandboxRunner(require_official=True)
     with tempfile.TemporaryDirectory() as folder:
         taken = take(source, base, commit, name, Path(folder))
-        lines = score_taken(taken, source, wanted, frozen.load(), runner, out)
+        lines = score_taken(taken, source, wanted, frozen.load(), runner, out, hidden)
     workflow.summary(TITLE, lines)
     return 0
 

@@ -9,14 +9,17 @@ from __future__ import annotations
 import os
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from ci import workflow
 from ci.git import AUTHOR, Git
+from ci.seed import SECRET as SECRET_SEED
 from ci.take import submission_name
 from ventbench.board import attestation, build, create, record, store
 from ventbench.board.replay import ReplayPlants
 from ventbench.errors import InputError
+from ventbench.seasons import parse_seed
 
 TITLE = "Record"
 
@@ -48,8 +51,12 @@ def records(folder: Path) -> list[Path]:
 
 
 def add(
-    folder: Path, leaderboard: Path, simulators: ReplayPlants, secret: str | None = None
-) -> list[record.Record]:
+    folder: Path,
+    leaderboard: Path,
+    simulators: ReplayPlants,
+    secret: str | None = None,
+    seed: bytes | None = None,
+) -> list[record.Record | record.Sealed]:
     """Add records to a leaderboard, each replayed, and build its pages.
 
     The record of an entry that has one already names the old one as superseded.
@@ -59,27 +66,33 @@ def add(
         leaderboard: to add them to.
         simulators: the frozen ones.
         secret: key that signs them; without one they are listed as not official.
+        seed: of the season of sealed records, to replay what is inside; without it they are not
+            signed.
 
     Raises:
         InputError: if a record is not what it must be, or the key is not one of the leaderboard's.
     """
-    added = []
+    added: list[record.Record | record.Sealed] = []
     for path in records(folder):
         scored = record.load(path)
-        if not isinstance(scored, record.Record):
+        if not isinstance(scored, record.Record | record.Sealed):
             raise InputError(f"{path} is not the record of a score")
         older = store.newest_of(store.load(leaderboard), scored)
         if older is not None and older.sha256 != scored.sha256:
             path = create.amend(path, supersedes=older.sha256, reason=SCORED_AGAIN)
-        new = store.add(leaderboard, path, simulators)
-        if secret:
+        if isinstance(scored, record.Sealed):
+            new = store.add_sealed(leaderboard, path, seed=seed, simulators=simulators)
+        else:
+            new = store.add(leaderboard, path, simulators)
+            assert isinstance(new, record.Record)
+        if secret and (seed is not None or isinstance(new, record.Record)):
             attestation.sign(leaderboard, new.sha256, secret)
         added.append(new)
     build.build(leaderboard)
     return added
 
 
-def commit(checkout: Path, added: list[record.Record]) -> str:
+def commit(checkout: Path, added: Sequence[record.Record | record.Sealed]) -> str:
     """Commit the leaderboard to a new branch.
 
     Args:
@@ -109,7 +122,9 @@ def main() -> int:
     # Read here, where no code of a submission runs.
     secret = os.environ.get(attestation.SECRET) or None
     downloaded = Path(workflow.required("RECORDS"))
-    added = add(downloaded, checkout / "leaderboard", frozen.load(), secret)
+    text = os.environ.get(SECRET_SEED) or None
+    seed = None if text is None else parse_seed(text, SECRET_SEED)
+    added = add(downloaded, checkout / "leaderboard", frozen.load(), secret, seed)
     branch = commit(checkout, added)
     workflow.output(branch=branch, name=added[0].name)
     workflow.summary(

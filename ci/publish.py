@@ -36,7 +36,8 @@ def pages(git: Git, commit: str, previous: str | None = None) -> str | None:
 
     Raises:
         InputError: if there is no leaderboard, anything but its own plain files in it, or a chain
-            that does not begin with the one published until now.
+            that does not begin with the one published until now, or a published season that was
+            changed.
     """
     tree = f"{commit}:{LEADERBOARD}"
     try:
@@ -60,6 +61,8 @@ def pages(git: Git, commit: str, previous: str | None = None) -> str | None:
             f"{LEADERBOARD}/{layout.CHAIN} does not begin with the published chain: records were "
             "dropped, changed or put into another order"
         )
+    if previous:
+        _require_seasons(git, tree, names, previous)
     with tempfile.TemporaryDirectory() as folder:
         index = {"GIT_INDEX_FILE": str(Path(folder) / "index")}
         git.output("read-tree", tree, more=index)
@@ -93,6 +96,22 @@ def published(git: Git, previous: str) -> bytes:
     if not git.output("ls-tree", "-z", previous, "--", layout.CHAIN):
         return b""
     return chain_of(git, f"{previous}:{layout.CHAIN}")
+
+
+def _require_seasons(git: Git, tree: str, names: set[str], previous: str) -> None:
+    """Refuse a season that was published and is gone, or says something else than then.
+
+    Else whoever holds several seeds could choose among their commitments afterwards.
+    """
+    listing = git.output("ls-tree", "-r", "--name-only", "-z", previous, limit=50_000_000)
+    for name in sorted(filter(layout.is_season, listing.decode().split("\0"))):
+        before = git.output("cat-file", "blob", f"{previous}:{name}")
+        if name not in names:
+            raise InputError(f"{LEADERBOARD}/{name} was published and is missing")
+        if not layout.same_season(before, git.output("cat-file", "blob", f"{tree}/{name}")):
+            raise InputError(
+                f"{LEADERBOARD}/{name} is not the one that was published; only its seed may join it"
+            )
 
 
 def head(git: Git, previous: str | None) -> str:

@@ -158,3 +158,31 @@ def test_the_standard_library_is_enough():
     subprocess.run(
         [sys.executable, "-S", "-c", code], check=True, cwd=root, env={"PATH": os.environ["PATH"]}
     )
+
+
+SEASON = b'id = "spring"\nprotocol = 2\ncommitment = "%s"\n' % (b"a" * 64)
+
+
+def test_a_published_season_stays(repository):
+    git, name = Git(repository.folder), "seasons/spring.toml"
+    first = publish.pages(git, repository.commit(files(RECORD, **{name: SEASON}), repository.base))
+    for content, message in (
+        (None, "was published and is missing"),
+        (SEASON.replace(b"aaaa", b"bbbb"), "is not the one that was published"),
+        (SEASON + b"more = 1\n", "is not the one that was published"),
+        (b"\xff", "is not the one that was published"),
+    ):
+        changed = files(RECORD, **({} if content is None else {name: content}))
+        commit = repository.commit(changed, repository.base)
+        assert publish.pages(git, commit) is not None, "control: nothing was published before"
+        with pytest.raises(InputError, match=message):
+            publish.pages(git, commit, first)
+    seed = SEASON + b'seed = "00"\n'
+    revealed = publish.pages(
+        git, repository.commit(files(RECORD, **{name: seed}), repository.base), first
+    )
+    assert revealed is not None
+    for content in (SEASON, seed.replace(b"00", b"01")):
+        commit = repository.commit(files(RECORD, **{name: content}), repository.base)
+        with pytest.raises(InputError, match="is not the one that was published"):
+            publish.pages(git, commit, revealed)

@@ -31,6 +31,8 @@ TRUSTED = {
 #: Texts of a maintainer, and outputs of our own scripts: as environment variables only.
 ONLY_ENV = {
     "secrets.VENTBENCH_SIGNING_KEY",
+    "secrets.VENTBENCH_SEASON_SEED",
+    "inputs.season",
     "inputs.commit",
     "inputs.name",
     "inputs.track",
@@ -75,7 +77,9 @@ class TestEach:
             assert not extra or content[True].keys() <= {"push", "workflow_dispatch"}
 
     def test_no_secret_and_no_foreign_pull_request_with_rights(self, path):
-        text = path.read_text().replace("${{ secrets.VENTBENCH_SIGNING_KEY }}", "")
+        text = re.sub(
+            r"\$\{\{ secrets\.VENTBENCH_(SIGNING_KEY|SEASON_SEED) \}\}", "", path.read_text()
+        )
         assert not re.search(r"\bsecrets\b *[.\[]", text.replace("no secrets.", ""))
         assert "pull_request_target" not in text
         assert "workflow_run" not in text
@@ -119,13 +123,21 @@ def test_the_key_that_signs_is_where_no_submission_runs():
         (path.stem, name, job)
         for path in FILES
         for name, job in read(path)["jobs"].items()
-        if "secrets." in str(job)
+        if "secrets.VENTBENCH_SIGNING_KEY" in str(job)
     ]
     ((workflow, name, job),) = with_key
     assert (workflow, name) == ("score-official", "propose")
     assert job["environment"] == "records"
     (step,) = [step for step in job["steps"] if "secrets." in str(step)]
     assert step["run"] == ".venv/bin/python -m ci.propose"
+
+
+def test_the_seed_of_a_season_is_in_no_environment_of_a_submission():
+    jobs = read(FOLDER / "score-official.yml")["jobs"]
+    assert jobs["score"]["environment"] == "season"
+    (step,) = [step for step in jobs["score"]["steps"] if "secrets." in str(step)]
+    assert step["run"] == ".venv/bin/python -m ci.seed"
+    assert "secrets." not in str(jobs["score"].get("env", ""))
 
 
 def test_exploits_may_not_be_skipped():

@@ -1,0 +1,164 @@
+"""Scores on hidden draws: what the workflow hands on and says, and where the seed is seen."""
+
+from datetime import date
+
+import msgspec
+import pytest
+
+from ci import official, propose, publish, seed
+from ci.git import Git
+from ci.take import TakeError, take
+from ventbench import seasons
+from ventbench.board import attestation, record, store
+from ventbench.board.verify import verify
+from ventbench.errors import InputError
+from ventbench.submissions.errors import Failure
+from ventbench.submissions.runner import InProcessRunner
+from ventbench.submissions.scaffold import contents
+
+from .conftest import PATH
+from .test_official import checked_out
+
+SECRET = "01" * 32
+
+
+@pytest.fixture
+def opened(repository, tmp_path):
+    """A leaderboard with a season and a key; of protocol 1, which can be scored everywhere."""
+    leaderboard = checked_out(repository, tmp_path / "checkout") / "leaderboard"
+    season, secret = seasons.new_season(
+        id="spring", protocol=1, draws=20, opens=date(2000, 1, 1), closes=date(9999, 1, 1),
+        runs_per_week=3,
+    )  # fmt: skip
+    seasons.write_season(store.season_path(leaderboard, "spring"), season)
+    public = attestation._private(SECRET).public_key().public_bytes_raw()
+    (leaderboard / "keys.toml").write_text(
+        f'[[keys]]\nid = "{attestation.key_id(public)}"\npublic = "{public.hex()}"\n'
+        'added = 2026-11-23\nholder = "a test"\n'
+    )
+    return leaderboard, season, secret
+
+
+def test_from_hidden_draws_to_the_pages(repository, simulators, opened, tmp_path):
+    leaderboard, season, secret = opened
+    files = {f"{PATH}/{name}": content for name, content in contents("demo", "pid").items()}
+    commit = repository.commit(files, repository.base)
+    taken = take(repository.url, repository.base, commit, "demo", tmp_path / "taken")
+    out = tmp_path / "records"
+    lines = official.score_taken(
+        taken, repository.url, "robustness", simulators, InProcessRunner(), out, (season, secret)
+    )
+    assert sorted(path.suffix for path in out.iterdir()) == [".json", ".sealed"]
+    public = record.load(next(out.glob("*.json")))
+    assert isinstance(public, record.Sealed)
+    score = public.content.scores["score_cmh2o"]
+    assert lines[-1].startswith(f"demo: robustness: score_cmh2o {score}, not official; ")
+
+    (unsigned,) = propose.add(out, leaderboard, simulators, SECRET)
+    assert not attestation.signature_path(leaderboard, unsigned.sha256).exists()
+    for path in (leaderboard / "chain.jsonl", leaderboard / "records" / f"{unsigned.sha256}.json"):
+        path.unlink()
+    (added,) = propose.add(out, leaderboard, simulators, SECRET, secret)
+    assert attestation.signature_path(leaderboard, added.sha256).exists()
+    assert verify(leaderboard, lambda _: simulators).problems == []
+    assert verify(leaderboard, lambda _: simulators, seed=secret).replayed == 1
+
+    branch = propose.commit(leaderboard.parent, [added])
+    git = Git(leaderboard.parent)
+    pages = publish.pages(git, git.text("rev-parse", branch))
+    assert pages is not None
+    listed = git.text("ls-tree", "-r", "--name-only", pages).splitlines()
+    assert "seasons/spring.toml" in listed
+    assert f"records/{public.content.sealed.sha256}.sealed" in listed
+
+
+class Talkative(InProcessRunner):
+    """Fails in a scored cell with a text that quotes what the controller saw."""
+
+    def start(self, submission, tasks):
+        session = super().start(submission, tasks)
+        if len(tasks) == 6 * 21 * 6:
+            act = session.act
+
+            def tell(observations):
+                commands = act(observations)
+                for cell in (5, 300):
+                    told = f"I saw {observations[cell, 1]!r}"
+                    failure = Failure("act", "raised ValueError", told, 1, 1)
+                    session.failures.setdefault(cell, failure)
+                return commands
+
+            session.act = tell  # type: ignore[method-assign]
+        return session
+
+
+@pytest.mark.parametrize("hide", [True, False])
+def test_messages_of_hidden_cells_are_not_said(repository, simulators, opened, tmp_path, hide):
+    _, season, secret = opened
+    files = {f"{PATH}/{name}": content for name, content in contents("demo", "pid").items()}
+    commit = repository.commit(files, repository.base)
+    taken = take(repository.url, repository.base, commit, "demo", tmp_path / "taken")
+    hidden = (season, secret) if hide else None
+    given = (taken, repository.url, "robustness", simulators, Talkative(), tmp_path / "out", hidden)
+    lines = official.score_taken(*given)
+    published = b"".join(path.read_bytes() for path in (tmp_path / "out").iterdir())
+    told = "\n".join(lines).encode() + published
+    assert (b"I saw" in told) is not hide, "the control says it"
+
+
+def test_a_season_of_another_protocol_is_not_scored(repository, simulators, opened, tmp_path, demo):
+    _, season, secret = opened
+    commit = repository.commit(demo, repository.base)
+    taken = take(repository.url, repository.base, commit, "demo", tmp_path / "taken")
+    later = msgspec.structs.replace(season, protocol=99)
+    with pytest.raises(InputError, match="protocol version 99"):
+        official.score_taken(
+            taken, "url", "all", simulators, InProcessRunner(), tmp_path / "out", (later, secret)
+        )
+
+
+def test_the_seed_goes_through_a_private_file_that_does_not_stay(opened, tmp_path, monkeypatch):
+    leaderboard, season, secret = opened
+    path = tmp_path / "seed"
+    assert not seed.hand_over("", secret.hex(), path)
+    assert not path.exists()
+    assert seed.hand_over("spring", secret.hex() + "\n", path)
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert seed.take_over("spring", path, leaderboard) == (season, secret)
+    assert not path.exists()
+    seasons.write_seed(path, bytes(32))
+    with pytest.raises(InputError, match="not the one of its commitment"):
+        seed.take_over("spring", path, leaderboard)
+    assert not path.exists()
+    with pytest.raises(InputError, match="VENTBENCH_SEASON_SEED does not hold a seed"):
+        seed.hand_over("spring", "", path)
+
+
+def test_main_hands_over_what_the_environment_holds(opened, tmp_path, monkeypatch, capsys):
+    _, _, secret = opened
+    monkeypatch.setenv("SEED_FILE", str(tmp_path / "seed"))
+    monkeypatch.setenv("SEASON", "spring")
+    monkeypatch.setenv(seed.SECRET, secret.hex())
+    assert seed.main() == 0
+    assert seasons.read_seed(tmp_path / "seed") == secret
+    assert secret.hex() not in capsys.readouterr().out
+
+
+def test_errors_of_hidden_scores_are_not_said(
+    repository, simulators, opened, tmp_path, monkeypatch
+):
+    _, season, secret = opened
+    files = {f"{PATH}/{name}": content for name, content in contents("demo", "pid").items()}
+    commit = repository.commit(files, repository.base)
+    taken = take(repository.url, repository.base, commit, "demo", tmp_path / "taken")
+
+    def fail(*_, **__):
+        raise InputError("does not replay: says 1.2345 in cell 7")
+
+    monkeypatch.setattr(official.create, "create", fail)
+    with pytest.raises(TakeError) as raised:
+        official.score_taken(
+            taken, "url", "robustness", simulators, InProcessRunner(), tmp_path / "out",
+            (season, secret),
+        )  # fmt: skip
+    assert "1.2345" not in str(raised.value)

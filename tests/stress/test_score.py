@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -13,11 +14,12 @@ from typer.testing import CliRunner
 from tests.stress.conftest import NAMES, Controller
 from ventbench.cli import app
 from ventbench.interfaces import Task
-from ventbench.stress.run import StressDraws, StressRun
+from ventbench.stress.run import StressDraws, StressRun, draw_cells
 from ventbench.stress.score import StressScore, assess, chosen_conditions, run_stress
 from ventbench.stress.stressors import Condition
 from ventbench.submissions.errors import SubmissionError
 from ventbench.submissions.folder import open_submission, submission_of
+from ventbench.submissions.rig_scoring import load_rigs
 
 
 def _made(draws: StressDraws, pressure: np.ndarray) -> StressScore:
@@ -52,11 +54,17 @@ def test_the_plateau_may_be_off_by_2_cmH2O_and_4_percent(draws: StressDraws) -> 
         assert np.all(score.survived[1] == held)
 
 
-def test_intervals_resample_the_draws_of_each_lung(score: StressScore) -> None:
-    values = np.array([[1.0, 3.0], [10.0, 10.0]])
-    low, high = score.interval(values)
-    assert (low, high) == (5.5, 6.5)  # one lung does not vary, the other's mean is 1, 2 or 3
-    assert all(math.isnan(x) for x in score.interval(values[:, :1]))
+def test_an_interval_needs_two_draws_and_holds_the_mean(score: StressScore) -> None:
+    assert all(math.isnan(x) for x in score.interval(score.error[0]))
+    cells = draw_cells(load_rigs(), 6)
+    six = dataclasses.replace(score, drawn=cells.drawn, pips=cells.nominal_pip)
+    lung, noise = np.arange(6.0)[:, None], np.random.default_rng(0).normal(size=(6, 6))
+    low, high = six.interval(lung + 0.1 * cells.nominal_pip)
+    assert high - low < 1e-9  # lungs and PIPs are no chance
+    low, high = six.interval(lung + 0.1 * cells.nominal_pip + noise)
+    mean = 2.5 + 2.25 + noise.mean()
+    assert low < mean < high
+    assert high - low > 0.5 * 2 * 1.96 * noise.std() / 6
 
 
 def test_the_controller_is_not_told(draws: StressDraws, chosen: tuple[Condition, ...]) -> None:

@@ -40,7 +40,7 @@ def score_entries(
             scores.append(
                 score_stress(
                     entry,
-                    simulator=None if plant == "frozen" else plant,
+                    simulator=plant,
                     draws=draws or DRAWS,
                     sandbox=not in_process,
                 )

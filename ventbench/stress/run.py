@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import Any
 
 import jax
@@ -17,23 +16,26 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from ventbench import draws as deviations
 from ventbench import environment as env
-from ventbench import precision, protocol, seasons, waveform
+from ventbench import precision, protocol, rig_draws, waveform
 from ventbench.environment import Scenario
 from ventbench.interfaces import Controller, Plant, Task
-from ventbench.lungs import LUNGS, Lung
-from ventbench.plants.frozen import Frozen
+from ventbench.lungs import Lung
+from ventbench.rig_draws import RigDraws
 from ventbench.stress.plants import Stressed, stressed_plants
 from ventbench.stress.stressors import Condition
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import Submission
+from ventbench.submissions.rig_scoring import Rigs
 from ventbench.submissions.runner import Runner, pack
 
 Floats = NDArray[np.float64]
 
 #: Name of the track.
 TRACK = "stress"
+
+#: Place of the PIP of the first lung in each draw; the other lungs follow it.
+_TURNS = (0, 3, 1, 4, 2, 5)
 
 #: Number of draws of an official score: each lung has each PIP once under every condition.
 DRAWS = 6
@@ -47,72 +49,44 @@ class StressDraws:
         lungs: length L.
         plants: scored plants, leaves ``(L, n, ...)``.
         scenario: deviations, batch shape ``(L, n)``.
-        rigs: session of each cell's plant, ``(L, n)``; -1 where the plants are no rigs.
         nominal_pip: PIP before its deviation, cmH2O, ``(L, n)``.
+        drawn: the draws of protocol version 2 that they are taken from.
     """
 
     lungs: tuple[Lung, ...]
     plants: Plant
     scenario: Scenario
-    rigs: NDArray[np.int64]
     nominal_pip: Floats
+    drawn: RigDraws
 
 
-def draw_cells(
-    simulators: Frozen | Plant,
-    n: int = DRAWS,
-    *,
-    seed: bytes = seasons.DEVELOPMENT_SEED,
-    lungs: Sequence[Lung] = LUNGS,
-) -> StressDraws:
-    """Draw rigs, PIPs and deviations, the same on every machine.
+def draw_cells(rigs: Rigs, n: int = DRAWS, *, drawn: RigDraws | None = None) -> StressDraws:
+    """Take cells of the draws of protocol version 2, one PIP of each lung and draw.
 
     In each draw the lungs have different PIPs, and over six draws each lung has each PIP once.
 
     Args:
-        simulators: official simulators, whose rigs are drawn from; or plants stacked over lungs.
+        rigs: from :func:`ventbench.submissions.rig_scoring.load_rigs`.
         n: number of draws.
-        seed: 32 bytes, that of the development draws or of a season.
-        lungs: those of stacked plants.
+        drawn: other draws than the development ones, such as those of a season.
+
+    Raises:
+        InputError: if there are not so many draws.
     """
-    shape = (len(lungs), n)
-
-    def uniform(name: str, *more: int) -> Floats:
-        # Draws in front, so that the first of more draws are the same ones.
-        drawn = seasons.uniforms(seed, f"{TRACK} {name}", (n, len(lungs), *more))
-        return np.swapaxes(drawn, 0, 1)
-
-    order = np.arange(len(lungs))[:, None] + np.array([0, 3, 1, 4, 2, 5])[np.arange(n) % 6]
-    nominal = np.asarray(protocol.PIPS)[order % len(protocol.PIPS)]
-    ranges = deviations.RANGES.items()
-    drawn = {name: low + (high - low) * uniform(name) for name, (low, high) in ranges}
-    low, high = deviations.NOISE_SD
-    sd = low + (high - low) * uniform("noise_sd")
-    normal = np.vectorize(NormalDist().inv_cdf, otypes=[float])
-    noise = normal(uniform("noise", protocol.BREATHS, protocol.INSPIRATION_STEPS))
-    peep = protocol.PEEP + drawn["peep_shift"]
-    scenario = Scenario(
-        pip=nominal + drawn["pip_shift"],
-        peep=peep,
-        start=peep + drawn["start_shift"],
-        dt=protocol.DT * drawn["dt_scale"],
-        r_scale=drawn["r_scale"],
-        c_scale=drawn["c_scale"],
-        delay=drawn["delay"],
-        quantum=np.full(shape, deviations.QUANTUM),
-        noise=sd[..., None, None] * noise,
-    )
-    if not isinstance(simulators, Frozen):
+    drawn = rigs.draws(n) if drawn is None else drawn.first(n)
+    count = len(rigs.lungs)
+    order = np.arange(count)[:, None] + np.array(_TURNS)[np.arange(n) % len(_TURNS)]
+    at = (np.arange(count)[:, None], np.arange(n), order % len(protocol.PIPS))
+    scenario = jax.tree.map(lambda leaf: np.asarray(leaf)[at], drawn.cells)
+    if rigs.sessions is None:
         plants = jax.tree.map(
-            lambda leaf: np.repeat(np.asarray(leaf)[:, None], n, axis=1), simulators
+            lambda leaf: np.repeat(np.asarray(leaf)[:, None], n, axis=1), rigs.plants
         )
-        return StressDraws(tuple(lungs), plants, scenario, np.full(shape, -1), nominal)
-    share = uniform("rig")
-    rigs = np.empty(shape, np.int64)
-    for index, sessions in enumerate(simulators.rigs):
-        rigs[index] = np.asarray(sessions)[(share[index] * len(sessions)).astype(int)]
-    plants = jax.tree.map(lambda leaf: np.asarray(leaf)[0, rigs], simulators.sessions_plants)
-    return StressDraws(tuple(lungs), plants, scenario, rigs, nominal)
+    else:
+        each = rig_draws.plants_of(rigs.plants, drawn.rig, drawn.member)
+        plants = jax.tree.map(lambda leaf: leaf[:, :, 0], each)
+    nominal = np.asarray(protocol.PIPS)[at[2]]
+    return StressDraws(rigs.lungs, plants, scenario, nominal, drawn)
 
 
 @dataclass(frozen=True)
@@ -250,7 +224,7 @@ def _only(draws: StressDraws, draw: int) -> StressDraws:
         return np.asarray(leaf)[:, draw : draw + 1]
 
     scenario, plants = jax.tree.map(chosen, (draws.scenario, draws.plants))
-    return StressDraws(draws.lungs, plants, scenario, chosen(draws.rigs), chosen(draws.nominal_pip))
+    return StressDraws(draws.lungs, plants, scenario, chosen(draws.nominal_pip), draws.drawn)
 
 
 def _batch(

@@ -23,19 +23,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ventbench
-from ventbench import files, protocol, seasons
-from ventbench.errors import InputError
+from ventbench import files, protocol
 from ventbench.lungs import LUNG_IDS
-from ventbench.metrics.bootstrap import RESAMPLES, SEED
 from ventbench.metrics.figures import time_above_alarm
+from ventbench.metrics.rig_bootstrap import resampled_scores
 from ventbench.metrics.score import passes_safety_gate, run_error
 from ventbench.metrics.step_response import steady_error
-from ventbench.plants import frozen
-from ventbench.plants.catalog import Given, load_simulators
+from ventbench.plants.catalog import Given
+from ventbench.rig_draws import RigDraws
 from ventbench.stress.run import DRAWS, TRACK, StressDraws, StressRun, draw_cells, step_through
 from ventbench.stress.stressors import CATEGORIES, VERSION, Condition, conditions, stressor
 from ventbench.submissions.errors import Failure, SubmissionError
 from ventbench.submissions.folder import Submission, open_submission, submission_of
+from ventbench.submissions.rig_scoring import load_rigs
 from ventbench.submissions.runner import InProcessRunner, Runner
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class StressScore:
         conditions: length S.
         lungs: ids, length L.
         pips: nominal PIP, cmH2O, ``(L, n)``.
-        rigs: session of each cell's plant, ``(L, n)``; -1 where the plants are no rigs.
+        drawn: the draws: rig and member of each lung and draw.
         error: mean |airway pressure - PIP| over the scored inspirations, cmH2O, ``(S, L, n)``; NaN
             where the controller failed.
         safe: whether a run passed the safety gate in all breaths, ``(S, L, n)``.
@@ -79,7 +79,6 @@ class StressScore:
         failures: what failed, by (condition, lung, draw).
         sandbox: the runner's layers; None in this process.
         simulators: what is known of the plants.
-        seed_name: ``"development"``, or the id of the season whose seed made the draws.
         timing: seconds, by name.
     """
 
@@ -87,7 +86,7 @@ class StressScore:
     conditions: tuple[Condition, ...]
     lungs: tuple[str, ...]
     pips: Floats
-    rigs: NDArray[np.int64]
+    drawn: RigDraws
     error: Floats
     safe: NDArray[np.bool_]
     plateau_error: Floats
@@ -99,7 +98,6 @@ class StressScore:
     failures: Mapping[tuple[int, int, int], Failure]
     sandbox: Mapping[str, Any] | None
     simulators: Mapping[str, Any] | None
-    seed_name: str
     timing: Mapping[str, float]
 
     track = TRACK
@@ -139,18 +137,22 @@ class StressScore:
         )
 
     def interval(self, values: Floats) -> tuple[float, float]:
-        """95 % interval of a mean over cells, by resampling the draws of each lung.
+        """95 % interval of a mean over cells: draws, rigs and ensemble members are resampled.
+
+        PIPs are chosen, not drawn, and lungs and PIPs form a Latin square: what a PIP adds on
+        average is taken out before, as what a lung adds is.
 
         Args:
             values: ``(L, n)``, such as a mean over conditions; any unit.
         """
         if values.shape[1] < 2 or not np.isfinite(values).all():
             return math.nan, math.nan
-        bits = np.random.PCG64(SEED)
-        lungs, n = values.shape
-        raw = bits.random_raw((RESAMPLES, lungs, n)) >> np.uint64(32)
-        index = ((raw * np.uint64(n)) >> np.uint64(32)).astype(np.intp)
-        means = values[np.arange(lungs)[:, None], index].mean(axis=(1, 2))
+        levels, index, count = np.unique(self.pips, return_inverse=True, return_counts=True)
+        if count.min() > 1:
+            index = index.reshape(values.shape)
+            sums = np.bincount(index.ravel(), weights=values.ravel(), minlength=len(levels))
+            values = values - (sums / count)[index] + values.mean()
+        means = resampled_scores(values, self.drawn.rig, self.drawn.member)
         low, high = np.quantile(means, (0.025, 0.975))
         return float(low), float(high)
 
@@ -165,7 +167,8 @@ class StressScore:
                 "condition": np.array([c.id for c in self.conditions])[s],
                 "lung": np.array(self.lungs)[lung],
                 "pip_cmH2O": self.pips[lung, draw],
-                "rig": self.rigs[lung, draw],
+                "rig": self.drawn.rig[lung, draw],
+                "member": self.drawn.member[lung, draw],
                 "draw": draw + 1,
                 "error_cmH2O": self.error.ravel(),
                 "rise_cmH2O": self.rise.ravel(),
@@ -216,7 +219,7 @@ class StressScore:
             "complete": self.complete,
             "categories": self._categories(),
             "conditions": [self._condition(k) for k in range(len(self.conditions))],
-            "draws": {"count": int(self.pips.shape[1]), "seed": self.seed_name},
+            "draws": self.drawn.about() | {"count": int(self.pips.shape[1])},
             "failures": [
                 {
                     "condition": self.conditions[s].id,
@@ -315,33 +318,37 @@ class StressScore:
 def score_stress(
     submission: Any,
     *,
-    simulator: Given | None = None,
+    simulator: Given = "frozen",
     draws: int = DRAWS,
+    drawn: RigDraws | None = None,
     only: Sequence[str] = (),
-    seed: bytes = seasons.DEVELOPMENT_SEED,
-    seed_name: str = "development",
     sandbox: bool = True,
 ) -> StressScore:
     """Score a controller under missing physics that it is not told of.
 
     Args:
         submission: as for :func:`ventbench.score`.
-        simulator: other simulators with plants than the official ones of version 2; see
-            :func:`ventbench.load_simulators`.
+        simulator: ``"frozen"`` for the official rigs of protocol version 2; else simulators with
+            plants, see :func:`ventbench.load_simulators`.
         draws: cells of each lung under each condition.
+        drawn: other draws than the development ones, such as those of a season.
         only: stressors to run; all conditions if empty.
-        seed: 32 bytes that the draws follow from.
-        seed_name: what the result calls that seed.
         sandbox: run a folder in locked-down processes, as for :func:`ventbench.score`.
 
     Raises:
         SubmissionError: if there is no such submission, or it cannot be run at all.
         SandboxError: if this machine cannot run submissions apart.
-        InputError: if there are no such simulators or stressors.
+        InputError: if there are no such simulators, draws or stressors.
         FloatingPointError: if a plant answers with NaN or infinity.
+
+    Example:
+        >>> from ventbench.stress.score import score_stress
+        >>> def proportional(observation):
+        ...     return 5.0 + 2.0 * (observation.target - observation.pressure)
+        >>> result = score_stress(proportional, simulator="physics", draws=1, only=["leak"])
+        >>> result.complete
+        False
     """
-    if draws < 1:
-        raise InputError(f"{draws} draws: the stress track needs at least one")
     runner: Runner = InProcessRunner()
     if isinstance(submission, Submission):
         entry = submission
@@ -353,16 +360,9 @@ def score_stress(
         from ventbench.sandbox.runner import SandboxRunner
 
         runner = SandboxRunner()
-    if simulator is None:
-        official = frozen.load(version=2)
-        cells, about = draw_cells(official, draws, seed=seed), official.about()
-    else:
-        given = load_simulators(simulator)
-        cells = draw_cells(given.stacked, draws, seed=seed, lungs=given.lungs)
-        about = given.about
-    return run_stress(
-        entry, cells, chosen_conditions(only), runner=runner, simulators=about, seed_name=seed_name
-    )
+    rigs = load_rigs(simulator)
+    cells = draw_cells(rigs, draws, drawn=drawn)
+    return run_stress(entry, cells, chosen_conditions(only), runner=runner, simulators=rigs.about)
 
 
 def chosen_conditions(only: Sequence[str]) -> tuple[Condition, ...]:
@@ -382,7 +382,6 @@ def run_stress(
     *,
     runner: Runner | None = None,
     simulators: Mapping[str, Any] | None = None,
-    seed_name: str = "development",
 ) -> StressScore:
     """Run a submission on drawn cells, by any runner; see :func:`score_stress`.
 
@@ -392,7 +391,6 @@ def run_stress(
         chosen: conditions; the first must be none.
         runner: runs the controllers; in this process if not given.
         simulators: what is known of the plants.
-        seed_name: see :class:`StressScore`.
     """
     started = time.perf_counter()
     runner = runner or InProcessRunner()
@@ -414,7 +412,6 @@ def run_stress(
         submission=submission,
         sandbox=runner.sandbox,
         simulators=simulators,
-        seed_name=seed_name,
         timing=timing,
     )
 
@@ -427,7 +424,6 @@ def assess(
     submission: Submission,
     sandbox: Mapping[str, Any] | None = None,
     simulators: Mapping[str, Any] | None = None,
-    seed_name: str = "development",
     timing: Mapping[str, float] | None = None,
 ) -> StressScore:
     """Compute all figures of a run; arguments as of :class:`StressScore`."""
@@ -444,7 +440,7 @@ def assess(
         conditions=chosen,
         lungs=tuple(lung.id for lung in draws.lungs),
         pips=draws.nominal_pip,
-        rigs=draws.rigs,
+        drawn=draws.drawn,
         error=error,
         safe=safe,
         plateau_error=plateau,
@@ -456,7 +452,6 @@ def assess(
         failures=run.failures,
         sandbox=sandbox,
         simulators=simulators,
-        seed_name=seed_name,
         timing=timing or {},
     )
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import count
 
 from hardware_eval.clock import VirtualClock
+from hardware_eval.device.faults import Line
 from hardware_eval.device.hal import Hal
 from hardware_eval.device.program import PERIOD, DeviceSettings
 from hardware_eval.device.service import DeviceService
@@ -30,6 +31,7 @@ class LoopbackDevice:
         start: time at which the device started, s.
         service: program and hardware of the device.
         latency: time that bytes take each way, s; may be changed while it runs.
+        line: what the line does to bytes; its faults may be changed while it runs.
         actuations: every change of the valves.
         plugged: whether the cable is in; :meth:`unplug` and :meth:`plug` change it.
     """
@@ -40,8 +42,10 @@ class LoopbackDevice:
         settings: DeviceSettings | None = None,
         clock: VirtualClock | None = None,
         latency: float = 0.001,
+        line: Line | None = None,
     ) -> None:
         """Start the device on a clock, its own if none is given."""
+        self.line = line or Line()
         self.clock = clock or VirtualClock()
         self.start = self.clock.now()
         self.latency = latency
@@ -62,7 +66,9 @@ class LoopbackDevice:
         """
         self._require_cable()
         arrival = self.clock.now() + self.latency
-        heapq.heappush(self._incoming, (arrival, next(self._order), data))
+        data = self.line.to_device(self.clock.now() - self.start, data)
+        if data:
+            heapq.heappush(self._incoming, (arrival, next(self._order), data))
 
     def read(self, timeout: float) -> bytes:
         """Wait for bytes from the device; empty if none come within ``timeout``, s.
@@ -120,7 +126,9 @@ class LoopbackDevice:
                 self._next += PERIOD
             answers = self.service.step(now, data)
             if answers and self.plugged:
-                heapq.heappush(self._outgoing, (now + self.latency, next(self._order), answers))
+                due, answers = self.line.to_host(now - self.start, answers)
+                due += self.start + self.latency
+                heapq.heappush(self._outgoing, (due, next(self._order), answers))
             state, last = self.service.state, self.actuations[-1]
             if (state.u_in, state.u_out) != (last.u_in, last.u_out):
                 self.actuations.append(Actuation(now, state.u_in, state.u_out))

@@ -6,11 +6,10 @@ is what the plant shows by then. A loop of 30 ms so reads what a scored run read
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import Enum
 from typing import Any
 
 import jax
@@ -18,11 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from hardware_eval.device.faults import FaultKind, LungFault, active
 from hardware_eval.device.hal import Identity, Sample
 from hardware_eval.messages import Capability
 from ventbench import protocol
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
+from ventbench.physics.model import PhysicsState
 from ventbench.plants.catalog import load_simulators
 from ventbench.plants.hybrid import Hybrid, HybridState
 
@@ -37,53 +38,8 @@ SHORTEST_HOLD = 1e-4
 _AMBIENT_LAG = 0.05
 
 
-class FaultKind(Enum):
-    """What can go wrong with a lung on its ventilator; ``strength`` is in the unit given here."""
-
-    #: The sensor keeps showing what it showed when the fault began.
-    SENSOR_STUCK = "sensor_stuck"
-    #: The sensor shows ``strength`` cmH2O too much.
-    SENSOR_OFFSET = "sensor_offset"
-    #: The sensor gives no value.
-    SENSOR_LOST = "sensor_lost"
-    #: The inspiratory valve stays where it was.
-    VALVE_STUCK = "valve_stuck"
-    #: The inspiratory valve opens to the share ``strength`` of what is commanded.
-    VALVE_WEAK = "valve_weak"
-    #: The expiratory valve stays closed.
-    EXPIRATORY_STUCK = "expiratory_stuck"
-    #: The tube is off: nothing reaches the lung, the sensor shows ambient pressure.
-    DISCONNECTED = "disconnected"
-    #: The airway's resistance is ``strength`` times its value (a pinched tube: 3).
-    PINCHED = "pinched"
-    #: The airway's resistance is a hundred times its value.
-    OCCLUDED = "occluded"
-    #: A leak as if the expiratory valve stood open by the share ``strength``.
-    LEAK = "leak"
-
-
+#: Factor of the airway's resistance when it is occluded.
 _OCCLUSION = 100.0
-
-
-@dataclass(frozen=True, slots=True)
-class LungFault:
-    """A fault of the simulated hardware.
-
-    Attributes:
-        kind: what goes wrong.
-        start: from when, s on the device's clock.
-        end: until when, s.
-        strength: how much; see :class:`FaultKind`.
-    """
-
-    kind: FaultKind
-    start: float
-    end: float = math.inf
-    strength: float = 1.0
-
-    def active(self, now: float) -> bool:
-        """Whether the fault acts at ``now``, s."""
-        return self.start <= now < self.end
 
 
 class SimulatedHal:
@@ -113,9 +69,7 @@ class SimulatedHal:
             quantum: step of the sensor's converter, cmH2O; 0 for none.
             seed: of the noise.
         """
-        self.faults = tuple(faults)
         self._noise, self._quantum = noise, quantum
-        self._random = np.random.default_rng(seed)
         leaves = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(plant))
         calibration = hashlib.sha256(type(plant).__name__.encode() + leaves).digest()
         self._flow = hasattr(plant, "observe") or isinstance(plant, Hybrid)
@@ -130,16 +84,27 @@ class SimulatedHal:
         def advance(vector: jax.Array, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
             u_in, u_out, dt, r_scale, restart = inputs
             state = unravel(vector)
-            if hasattr(state, "time"):  # mechanisms that know when the breath began
-                state = state.replace(time=state.time * (1.0 - restart))
+            state = _breath_begun(state, restart)
             own = plant.vary(r_scale, jnp.ones_like(r_scale)) if varies else plant  # type: ignore[attr-defined]
             after, pressure, flow = _observed(own, state, u_in, u_out, dt)
             return ravel_pytree(after)[0], jnp.stack([pressure, flow])
 
-        self._state = vector
         inputs = np.array([0.0, 1.0, LONGEST_HOLD, 1.0, 0.0], np.float32)
         self._advance = jax.jit(advance).lower(vector, inputs).compile()
         jax.block_until_ready(self._advance(vector, inputs))
+        self._rest = vector
+        self._reset(faults, seed)
+
+    def at_rest(self, faults: Sequence[LungFault] = (), seed: int = 0) -> SimulatedHal:
+        """Return the same lung at rest, with other faults; nothing is compiled again."""
+        fresh = copy.copy(self)
+        fresh._reset(faults, seed)
+        return fresh
+
+    def _reset(self, faults: Sequence[LungFault], seed: int) -> None:
+        self.faults = tuple(faults)
+        self._random = np.random.default_rng(seed)
+        self._state = self._rest
         self._since: float | None = None
         self._command = (0.0, 1)
         self._restart = 0.0
@@ -150,7 +115,7 @@ class SimulatedHal:
 
     def sample(self, now: float) -> Sample:
         """Pressure and flow by now; see :class:`~hardware_eval.device.hal.Hal`."""
-        kinds = {fault.kind: fault for fault in self.faults if fault.active(now)}
+        kinds = active(self.faults, now)
         _, shown = self._by(now, kinds)
         pressure, flow = (float(x) for x in np.asarray(shown))
         flow = flow if self._flow else math.nan
@@ -174,6 +139,10 @@ class SimulatedHal:
             self._stuck_reading = math.nan
         if FaultKind.SENSOR_LOST in kinds:
             pressure = math.nan
+        if FaultKind.SENSOR_DROPOUTS in kinds and self._random.uniform() < (
+            kinds[FaultKind.SENSOR_DROPOUTS].strength
+        ):
+            pressure = math.nan
         self._last = Sample(now, pressure, flow)
         return self._last
 
@@ -186,14 +155,14 @@ class SimulatedHal:
         if not (changed or held >= LONGEST_HOLD):
             return
         if held >= SHORTEST_HOLD:
-            kinds = {fault.kind: fault for fault in self.faults if fault.active(now)}
+            kinds = active(self.faults, now)
             self._state, _ = self._by(now, kinds)
             self._since, self._restart = now, 0.0
         if self._command[1] == 1 and u_out == 0:
             self._restart = 1.0
         self._command = (u_in, u_out)
 
-    def _by(self, now: float, kinds: dict[FaultKind, LungFault]) -> tuple[jax.Array, jax.Array]:
+    def _by(self, now: float, kinds: dict[object, LungFault]) -> tuple[jax.Array, jax.Array]:
         """State and readings at ``now`` if the present command is held until then."""
         u_in, u_out = self._command
         share, r_scale = float(u_out), 1.0
@@ -229,6 +198,17 @@ class SimulatedHal:
         if not self._can_pinch:
             raise InputError("this plant's resistance cannot be changed: it cannot be pinched")
         return scale
+
+
+def _breath_begun(state: Any, restart: jax.Array) -> Any:
+    """Restart the time in the breath where ``restart`` is 1: some mechanisms act by it."""
+
+    def restarted(part: Any) -> Any:
+        if not isinstance(part, PhysicsState):
+            return part
+        return part.replace(time=part.time * (1.0 - restart))  # type: ignore[attr-defined]
+
+    return jax.tree.map(restarted, state, is_leaf=lambda part: isinstance(part, PhysicsState))
 
 
 def _observed(

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import pytest
 
 from hardware_eval.client import Client
-from hardware_eval.device.hal import Identity, Sample
 from hardware_eval.device.loopback import LoopbackDevice
 from hardware_eval.device.program import OLDEST_SEEN, PERIOD, SENSOR_TIMEOUT, DeviceSettings
 from hardware_eval.errors import RefusedError
 from hardware_eval.messages import (
-    Capability,
     Command,
     Flag,
     Mode,
@@ -22,26 +18,10 @@ from hardware_eval.messages import (
     Refusal,
     encode,
 )
+from tests.hardware_eval.bench import Bench
 
 #: From the last command to vented valves, s.
 VENTED_WITHIN = 0.100
-
-
-@dataclass
-class Bench:
-    """Hardware of which a test says what the sensor shows."""
-
-    pressure: float = 5.0
-    identity: Identity = field(
-        default_factory=lambda: Identity("bench", b"12345678", bytes(32), Capability.NONE)
-    )
-    valves: list[tuple[float, float, int]] = field(default_factory=list)
-
-    def sample(self, now: float) -> Sample:
-        return Sample(now, self.pressure)
-
-    def actuate(self, now: float, u_in: float, u_out: int) -> None:
-        self.valves.append((now, u_in, u_out))
 
 
 @pytest.fixture

@@ -1,0 +1,330 @@
+"""An emulated device on a real pseudo-terminal: the device's own program over a simulated lung.
+
+``ventbench-hardware emulate`` and ``python -m hardware_eval.emulator`` run it. The path that it
+prints is a serial port for any program. The cable can be pulled, and faults can begin, while it
+runs: by lines of text on a socket (``--control``), see :class:`Emulator`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import heapq
+import os
+import select
+import signal
+import socket
+import sys
+import time
+import tty
+from collections import deque
+from collections.abc import Callable, Sequence
+from itertools import count
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from hardware_eval.device.faults import AnyFault, Line, LineFault, LungFault, parse
+from hardware_eval.device.hal import Hal
+from hardware_eval.device.loopback import Actuation
+from hardware_eval.device.program import PERIOD, DeviceSettings
+from hardware_eval.device.service import DeviceService
+from hardware_eval.messages import Flag
+from ventbench.errors import InputError
+
+#: Changes of the valves that are remembered.
+_REMEMBERED = 100_000
+
+#: Bytes that are read at once.
+_CHUNK = 4096
+
+
+class Emulator:
+    """A device on a pseudo-terminal, stepped in real time.
+
+    Lines of text on the control socket: a fault as in ``--fault`` with times from now on
+    (``leak@0-3:0.1``), ``clear`` to end all faults, ``unplug SECONDS`` to pull the cable.
+
+    Attributes:
+        port: path that a host opens; of another name after the cable was pulled, unless there is a
+            link.
+        service: program and hardware.
+        actuations: the last changes of the valves; their times are those of ``time.monotonic``,
+            which all processes of a machine share.
+        lateness: longest time by which a step of the device came late, s.
+    """
+
+    def __init__(
+        self,
+        hal: Hal,
+        settings: DeviceSettings | None = None,
+        *,
+        link: Path | None = None,
+        control: Path | None = None,
+        line_faults: Sequence[LineFault] = (),
+        log: Path | None = None,
+    ) -> None:
+        """Open the terminal.
+
+        Args:
+            hal: simulated hardware; its clock counts from now.
+            settings: limits of the device.
+            link: symbolic link to make to the terminal, so that its name stays.
+            control: path of the control socket to make.
+            line_faults: what goes wrong on the line.
+            log: file to which each change of the valves is written as it happens: time of
+                ``time.monotonic``, s, u_in, %, u_out, flags.
+
+        Raises:
+            InputError: if the link or the socket cannot be made.
+        """
+        self._begun = time.monotonic()
+        self.service = DeviceService(hal, settings or DeviceSettings(), 0.0)
+        self.actuations: deque[Actuation] = deque(maxlen=_REMEMBERED)
+        self.actuations.append(Actuation(self._begun, 0.0, 1))
+        self.lateness = 0.0
+        self._line = Line(line_faults)
+        self._outgoing: list[tuple[float, int, bytes]] = []
+        self._order = count()
+        self._replug: float | None = None
+        self._log = log.open("w", buffering=1) if log else None
+        self._link, self._control_path = link, control
+        self._master = self._slave = -1
+        self._open()
+        self._control = self._open_control() if control else None
+
+    def run(self, stop: Callable[[], bool] = lambda: False) -> None:
+        """Serve until ``stop()``; then vent and remove link and socket."""
+        gc.collect()
+        gc.freeze()  # what is there stays; a collection in the loop would walk over all of it
+        due = self._now() + PERIOD
+        try:
+            while not stop():
+                now = self._now()
+                wait = min([due, *(entry[0] for entry in self._outgoing[:1])]) - now
+                data = self._wait(max(wait, 0.0))
+                now = self._now()
+                if now >= due:
+                    self.lateness = max(self.lateness, now - due)
+                    due = max(due + PERIOD, now)
+                self._step(now, data)
+        finally:
+            self.service.vent(self._now())
+            self.close()
+
+    def close(self) -> None:
+        """Remove terminal, link and socket."""
+        self._close()
+        if self._control is not None and self._control_path is not None:
+            self._control.close()
+            self._control_path.unlink(missing_ok=True)
+            self._control = None
+        if self._log:
+            self._log.close()
+            self._log = None
+
+    def _now(self) -> float:
+        return time.monotonic() - self._begun
+
+    def _wait(self, seconds: float) -> bytes:
+        """Wait for bytes of the host or lines of the control socket."""
+        sources = [self._master] if self._master >= 0 else []
+        if self._control is not None:
+            sources.append(self._control.fileno())
+        ready, _, _ = select.select(sources, [], [], seconds)
+        if self._control is not None and self._control.fileno() in ready:
+            self._obey(self._control.recv(_CHUNK).decode(errors="replace"))
+        if self._master >= 0 and self._master in ready:
+            with contextlib.suppress(BlockingIOError):
+                return self._line.to_device(self._now(), os.read(self._master, _CHUNK))
+        return b""
+
+    def _step(self, now: float, data: bytes) -> None:
+        answers = self.service.step(now, data)
+        state, last = self.service.state, self.actuations[-1]
+        if (state.u_in, state.u_out) != (last.u_in, last.u_out):
+            self.actuations.append(Actuation(time.monotonic(), state.u_in, state.u_out))
+            if self._log:
+                done = self.actuations[-1]
+                self._log.write(
+                    f"{done.time:.6f},{done.u_in:g},{done.u_out},{Flag(state.causes).name}\n"
+                )
+        if answers:
+            due, answers = self._line.to_host(now, answers)
+            heapq.heappush(self._outgoing, (due, next(self._order), answers))
+        while self._outgoing and self._outgoing[0][0] <= now:
+            answers = heapq.heappop(self._outgoing)[2]
+            if self._master >= 0:
+                # A host that reads nothing fills the terminal's buffer: the rest is lost, as on
+                # a wire.
+                with contextlib.suppress(BlockingIOError):
+                    os.write(self._master, answers)
+        if self._replug is not None and now >= self._replug:
+            self._replug = None
+            self._open()
+
+    def _obey(self, text: str) -> None:
+        """Do what lines of the control socket say; a wrong one is named on stderr."""
+        hal: Any = self.service.hal
+        for line in text.splitlines():
+            word, _, argument = line.strip().partition(" ")
+            try:
+                if word == "clear":
+                    hal.faults, self._line.faults = (), ()
+                elif word == "unplug":
+                    self._close()
+                    self._replug = self._now() + float(argument or 1.0)
+                elif word:
+                    self.add_fault(parse(line, self._now()))
+            except ValueError as error:
+                print(f"control: {error}", file=sys.stderr, flush=True)
+
+    def add_fault(self, fault: AnyFault) -> None:
+        """Add a fault of the lung or of the line; times on the device's clock."""
+        if isinstance(fault, LungFault):
+            hal: Any = self.service.hal
+            hal.faults = (*hal.faults, fault)
+        else:
+            self._line.faults = (*self._line.faults, fault)
+
+    def _open(self) -> None:
+        self._master, self._slave = os.openpty()  # ours keeps it open between hosts
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.port = os.ttyname(self._slave)
+        if self._link is not None:
+            if self._link.exists() and not self._link.is_symlink():
+                raise InputError(f"--link {self._link}: there is a file of that name; remove it")
+            try:
+                self._link.parent.mkdir(parents=True, exist_ok=True)
+                self._link.unlink(missing_ok=True)
+                self._link.symlink_to(self.port)
+            except OSError as error:
+                raise InputError(f"--link {self._link} cannot be made: {error}") from error
+            self.port = str(self._link)
+
+    def _close(self) -> None:
+        for descriptor in (self._master, self._slave):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._master = self._slave = -1
+        self._outgoing.clear()
+        if self._link is not None and self._link.is_symlink():
+            self._link.unlink()
+
+    def _open_control(self) -> socket.socket:
+        assert self._control_path is not None
+        self._control_path.unlink(missing_ok=True)
+        control = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            control.bind(str(self._control_path))
+        except OSError as error:
+            control.close()
+            raise InputError(
+                f"--control {self._control_path} cannot be made: {error}; a short path helps"
+            ) from error
+        control.setblocking(False)
+        return control
+
+
+def tell(control: Path, text: str) -> None:
+    """Send a line to a running emulator.
+
+    Args:
+        control: path of its control socket.
+        text: see :class:`Emulator`.
+
+    Raises:
+        InputError: if no emulator listens there.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+        try:
+            sender.sendto(text.encode(), str(control))
+        except OSError as error:
+            raise InputError(f"--control {control}: no emulator listens there: {error}") from error
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run an emulated device until it is interrupted; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        "ventbench-hardware emulate",
+        description="Emulate a ventilator with a lung on a pseudo-terminal.",
+        epilog="Example: ventbench-hardware emulate --lung R20C50 --link ./lung --fault "
+        "leak@10-13:0.1",
+    )
+    parser.add_argument("--lung", default="R20C50", help="lung on the ventilator")
+    parser.add_argument(
+        "--plant", default="frozen", help="simulator: a name, a file or module:function"
+    )
+    parser.add_argument(
+        "--conceal",
+        metavar="WORDS",
+        help="a lung with physics that the simulator lacks; the words determine it",
+    )
+    parser.add_argument(
+        "--seal", type=Path, help="where the sealed answer of --conceal goes (JSON)"
+    )
+    parser.add_argument("--link", type=Path, help="symbolic link to make to the terminal")
+    parser.add_argument("--control", type=Path, help="control socket to make")
+    parser.add_argument("--log", type=Path, help="CSV of every change of the valves")
+    parser.add_argument(
+        "--fault", action="append", default=[], help="KIND@START[-END][:STRENGTH], repeatedly"
+    )
+    parser.add_argument("--noise", type=float, default=0.0, help="sensor noise, cmH2O (SD)")
+    parser.add_argument(
+        "--quantum", type=float, default=0.0, help="step of the sensor's converter, cmH2O"
+    )
+    parser.add_argument("--pressure-limit", type=float, help="device's own limit, cmH2O")
+    given = parser.parse_args(arguments)
+    try:
+        return _emulate(given)
+    except InputError as error:
+        print(f"ventbench-hardware emulate: {error}", file=sys.stderr)
+        return 2
+
+
+def _emulate(given: argparse.Namespace) -> int:
+    from hardware_eval.device.simulated import SimulatedHal, simulated_lung
+
+    faults = [parse(text) for text in given.fault]
+    lung_faults = [fault for fault in faults if isinstance(fault, LungFault)]
+    line_faults = [fault for fault in faults if isinstance(fault, LineFault)]
+    sensor = {"noise": given.noise, "quantum": given.quantum, "faults": lung_faults}
+    if given.conceal is None:
+        hal = simulated_lung(given.lung, given.plant, **sensor)
+        told = given.lung
+    else:
+        from hardware_eval.concealed import conceal
+
+        concealed = conceal(given.conceal, given.plant)
+        hal = SimulatedHal(concealed.plant, name=f"emulated {concealed.lung}", **sensor)
+        told = f"{concealed.lung}, with concealed physics {concealed.seal['commitment'][:16]}..."
+        if given.seal:
+            concealed.write(given.seal)
+    limit = given.pressure_limit
+    try:
+        settings = DeviceSettings() if limit is None else DeviceSettings(limit)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    emulator = Emulator(
+        hal, settings, link=given.link, control=given.control, line_faults=line_faults,
+        log=given.log,
+    )  # fmt: skip
+    ended = False
+
+    def end(number: int, frame: FrameType | None) -> None:
+        nonlocal ended
+        ended = True
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, end)
+    print(f"{emulator.port}", flush=True)
+    print(f"emulated lung {told}; Ctrl-C ends it", file=sys.stderr, flush=True)
+    emulator.run(lambda: ended)
+    print(f"longest lateness of the device: {1e3 * emulator.lateness:.1f} ms", file=sys.stderr)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

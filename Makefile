@@ -58,9 +58,11 @@ bench: setup ## every benchmark
 		echo "== $$file"; $(PY) $$file; \
 	done
 
-wheel: setup ## dist/ventbench-*.whl, with the frozen simulators and the submissions in it
+wheel: setup ## wheel and source archive in dist/, checked
 	rm -rf dist
-	$(PY) -m build --wheel --no-isolation --outdir dist
+	$(PY) -m build --no-isolation --outdir dist
+	$(PY) -m twine check --strict dist/*
+	$(VENV)/bin/check-wheel-contents dist/*.whl
 
 clean: ## remove what was built; .venv, runs and records stay
 	rm -rf build dist .pytest_cache .ruff_cache .hypothesis

@@ -30,6 +30,7 @@ TRUSTED = {
 }
 #: Texts of a maintainer, and outputs of our own scripts: as environment variables only.
 ONLY_ENV = {
+    "github.ref_name",
     "secrets.VENTBENCH_SIGNING_KEY",
     "secrets.VENTBENCH_SEASON_SEED",
     "inputs.season",
@@ -66,14 +67,14 @@ class TestEach:
     def test_actions_are_pinned(self, path):
         used = re.findall(r"uses: (.*)", path.read_text())
         for line in used:
-            assert re.fullmatch(r"actions/[a-z-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+", line), line
+            assert re.fullmatch(r"(actions|pypa)/[a-z-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+", line), line
 
     def test_rights_are_named_and_few(self, path):
         content = read(path)
         assert content["permissions"] == {}
         for job in content["jobs"].values():
             extra = {key for key, value in job["permissions"].items() if value != "read"}
-            assert extra <= {"contents", "pull-requests"}
+            assert extra <= {"contents", "pull-requests", "id-token"}
             assert not extra or content[True].keys() <= {"push", "workflow_dispatch"}
 
     def test_no_secret_and_no_foreign_pull_request_with_rights(self, path):
@@ -99,7 +100,31 @@ class TestEach:
 
 
 def test_expected_workflows_are_there():
-    assert {path.stem for path in FILES} >= {"test", "score-pr", "score-official", "publish"}
+    assert {path.stem for path in FILES} >= {
+        "test",
+        "score-pr",
+        "score-official",
+        "publish",
+        "release",
+    }
+
+
+def test_a_release_needs_a_maintainer_and_runs_nothing_of_ours_with_its_identity():
+    with_identity = [
+        (path.stem, job)
+        for path in FILES
+        for job in read(path)["jobs"].values()
+        if "id-token" in job["permissions"]
+    ]
+    ((workflow, job),) = with_identity
+    assert workflow == "release"
+    assert job["permissions"] == {"id-token": "write"}
+    assert job["environment"] == "release"
+    assert not [step for step in job["steps"] if "run" in step or "checkout" in step["uses"]]
+
+
+def test_only_the_tests_fill_a_cache():
+    assert [path.stem for path in FILES if "cache:" in path.read_text()] == ["test"]
 
 
 def test_the_advisory_job_can_only_read():
@@ -141,5 +166,5 @@ def test_the_seed_of_a_season_is_in_no_environment_of_a_submission():
 
 
 def test_exploits_may_not_be_skipped():
-    (job,) = read(FOLDER / "test.yml")["jobs"].values()
-    assert job["env"]["VENTBENCH_REQUIRE_SANDBOX"] == "1"
+    for job in read(FOLDER / "test.yml")["jobs"].values():
+        assert job["env"]["VENTBENCH_REQUIRE_SANDBOX"] == "1"

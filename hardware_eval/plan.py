@@ -1,0 +1,245 @@
+"""What is run on the bench, in which order: a plan that survives restarts.
+
+A lung must be set by hand, so that lungs are the outer loop. Within a lung every run is in random
+order, drawn from the plan's seed, so that a drift of the bench does not favour an entry; the PID of
+the paper runs in between as a control and shows the drift. The order depends on nothing but the
+plan, so that a restarted session continues it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ventbench import protocol
+from ventbench.errors import InputError
+from ventbench.lungs import scored_lung
+
+#: Kinds of runs: PIP rises step by step before an entry is scored on a lung; scored; the PID
+#: between them; with a leak or a pinched tube at an announced moment; exploring for recordings.
+Kind = Literal["ramp", "scored", "control", "perturbed", "explore"]
+
+#: What happens to the tube in a perturbed run.
+PERTURBATIONS = ("leak", "pinch")
+
+#: Breath of a perturbed run, from 0, and step in it, from which on the tube is disturbed.
+PERTURBED_BREATH, PERTURBED_STEP = 1, 10
+
+#: Name of the control; no submission has it.
+CONTROL = "control_pid"
+
+#: The paper's best gains on the physical lung (P, I), %/cmH2O (table 2), with D = 0.
+CONTROL_GAINS = {
+    "R5C10": (10.0, 0.2), "R5C20": (10.0, 10.0), "R5C50": (10.0, 10.0),
+    "R20C10": (8.0, 1.0), "R20C20": (5.0, 10.0), "R20C50": (5.0, 10.0),
+}  # fmt: skip
+
+#: PIP of the control, cmH2O: in the middle.
+CONTROL_PIP = 20.0
+
+#: A control run stands before each so many scored runs, and after the last.
+CONTROL_EVERY = 10
+
+#: Repetitions of each cell, as on the hardware boards of double pendulums.
+REPEATS = 10
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run: a fresh controller, three breaths.
+
+    Attributes:
+        number: its place in the plan, from 0.
+        kind: see :data:`Kind`.
+        entry: name of the submission; :data:`CONTROL` for the control.
+        lung: label of the lung that must be mounted.
+        pip: cmH2O.
+        repeat: repetition, from 1.
+        perturbation: what happens to the tube; empty for nothing.
+    """
+
+    number: int
+    kind: Kind
+    entry: str
+    lung: str
+    pip: float
+    repeat: int
+    perturbation: str = ""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A plan of runs.
+
+    Attributes:
+        entries: names of the submissions.
+        track: what controllers are told: ``"performance"`` names the lung.
+        lungs: labels, in the order in which they are mounted.
+        pips: cmH2O.
+        repeats: repetitions of each cell.
+        control_every: see :data:`CONTROL_EVERY`; 0 for no control.
+        perturbations: of each entry on each lung, see :data:`PERTURBATIONS`.
+        seed: of the order.
+        runs: all runs in their order.
+    """
+
+    entries: tuple[str, ...]
+    track: str
+    lungs: tuple[str, ...]
+    pips: tuple[float, ...]
+    repeats: int
+    control_every: int
+    perturbations: tuple[str, ...]
+    seed: int
+    runs: tuple[PlannedRun, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values without the runs, which follow from them."""
+        values = asdict(self)
+        del values["runs"]
+        return values
+
+    @property
+    def breaths(self) -> int:
+        """Breaths of all runs."""
+        return len(self.runs) * protocol.BREATHS
+
+
+def make_plan(
+    entries: Sequence[str],
+    lungs: Sequence[str],
+    *,
+    track: str = "performance",
+    pips: Sequence[float] = protocol.PIPS,
+    repeats: int = REPEATS,
+    control_every: int = CONTROL_EVERY,
+    perturbations: Sequence[str] = (),
+    seed: int = 0,
+) -> Plan:
+    """Plan the evaluation of entries.
+
+    Each entry starts on each lung with a ramp: one unscored run at each PIP from the lowest to the
+    highest. All other runs of a lung are shuffled together.
+
+    Args:
+        entries: names of the submissions.
+        lungs: labels; mounted in random order.
+        track: ``"performance"`` or ``"robustness"``.
+        pips: cmH2O, of the protocol.
+        repeats: repetitions of each cell.
+        control_every: see :data:`CONTROL_EVERY`; 0 for no control.
+        perturbations: see :data:`PERTURBATIONS`; each once, at the middle PIP of ``pips``.
+        seed: of the order.
+
+    Raises:
+        InputError: if something occurs twice, is unknown, or there is nothing to run.
+    """
+    for name, values in (("entry", entries), ("lung", lungs), ("PIP", pips)):
+        if not values:
+            raise InputError(f"the plan has no {name}; give one at least")
+        if len(set(values)) != len(values):
+            raise InputError(f"the plan names a {name} twice: {', '.join(map(str, values))}")
+    for pip in pips:
+        if pip not in protocol.PIPS:
+            raise InputError(f"PIP {pip:g} cmH2O is not one of {_listed(protocol.PIPS)}")
+    for name in perturbations:
+        if name not in PERTURBATIONS:
+            raise InputError(f"perturbation {name!r} is not one of {', '.join(PERTURBATIONS)}")
+    if repeats < 1:
+        raise InputError(f"{repeats} repetitions: run each cell once at least")
+    if CONTROL in entries:
+        raise InputError(f"no entry can be called {CONTROL}; that is the PID in between")
+    named = tuple(scored_lung(lung).id for lung in lungs)
+    order = np.random.default_rng(seed)
+    mounted = tuple(named[i] for i in order.permutation(len(named)))
+    rising = tuple(sorted(float(pip) for pip in pips))
+    runs: list[PlannedRun] = []
+
+    def add(kind: Kind, entry: str, lung: str, pip: float, repeat: int, tube: str = "") -> None:
+        runs.append(PlannedRun(len(runs), kind, entry, lung, pip, repeat, tube))
+
+    for lung in mounted:
+        for entry, pip in itertools.product(entries, rising):
+            add("ramp", entry, lung, pip, 1)
+        scored = [
+            ("scored", entry, pip, repeat, "")
+            for entry, pip, repeat in itertools.product(entries, rising, range(1, repeats + 1))
+        ]
+        middle = rising[len(rising) // 2]
+        scored += [
+            ("perturbed", entry, middle, 1, tube)
+            for entry, tube in itertools.product(entries, perturbations)
+        ]
+        controls = 0
+        for place, index in enumerate(order.permutation(len(scored)).tolist()):
+            if control_every and place % control_every == 0:
+                controls += 1
+                add("control", CONTROL, lung, CONTROL_PIP, controls)
+            kind, entry, pip, repeat, tube = scored[index]
+            add(kind, entry, lung, pip, repeat, tube)  # type: ignore[arg-type]
+        if control_every:
+            add("control", CONTROL, lung, CONTROL_PIP, controls + 1)
+    return Plan(
+        tuple(entries), track, mounted, rising, repeats, control_every, tuple(perturbations),
+        seed, tuple(runs),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a plan has come.
+
+    Attributes:
+        done: numbers of the runs that need not run again.
+        attempts: how often each run has been begun.
+    """
+
+    done: frozenset[int]
+    attempts: Mapping[int, int]
+
+    def remaining(self, plan: Plan) -> list[PlannedRun]:
+        """Runs that are still to do, in the plan's order.
+
+        A ramp is done again on a lung that still has scored runs of its entry: after a restart
+        nobody knows what has happened to the bench.
+        """
+        return [run for run in plan.runs if run.number not in self.done]
+
+
+def progress(plan: Plan, lines: Iterable[Mapping[str, Any]]) -> Progress:
+    """How far a plan has come by its log.
+
+    A run is done when it is complete, or when a check tripped that blames its controller. A run
+    that was cut off or that the bench spoilt runs again from its first breath, as its controller is
+    gone; its logged breaths stay in the log.
+
+    Raises:
+        InputError: if the log is of another plan.
+    """
+    done: set[int] = set()
+    attempts: dict[int, int] = {}
+    for line in lines:
+        if line["type"] == "plan" and line["plan"] != _plain(plan):
+            keys = [key for key, value in _plain(plan).items() if line["plan"].get(key) != value]
+            raise InputError(
+                f"the log is of another plan ({', '.join(keys)} differ); give its options, or "
+                "another --out"
+            )
+        if line["type"] == "run_begins":
+            attempts[line["run"]] = line["attempt"] + 1
+        if line["type"] == "run" and line["status"] in ("complete", "failed"):
+            done.add(line["run"])
+    return Progress(frozenset(done), attempts)
+
+
+def _plain(plan: Plan) -> dict[str, Any]:
+    """The plan as it reads back from JSON."""
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in plan.as_dict().items()}
+
+
+def _listed(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:g}" for value in values)

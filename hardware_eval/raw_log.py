@@ -1,0 +1,216 @@
+"""The raw recording: JSON lines, only ever appended to, on the disk after every breath.
+
+A crash, a power cut or ``kill -9`` loses at most the breath under way. A line that was cut off by
+one stays where it is; the next session says so in the line that follows, and readers skip it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from ventbench.errors import InputError
+from ventbench.lungs import lung as parse_lung
+from ventbench.recordings.breaths import Breaths, make_breaths
+
+#: First line of every log.
+FORMAT = "ventbench-hardware-log-1"
+
+#: What follows a line that was cut off.
+_CUT = {"type": "cut_off"}
+
+
+class RawLog:
+    """Appends to a log.
+
+    Args:
+        path: of the file; its folder is made if missing.
+
+    Raises:
+        InputError: if another process appends to it, or it is no log.
+    """
+
+    def __init__(self, path: Path) -> None:
+        import fcntl
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.path = path
+        self._file = open(path, "ab")  # noqa: SIM115 - it stays open as long as the log
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._file.close()
+            raise InputError(
+                f"{path} is being written by another session; end that first"
+            ) from None
+        size = path.stat().st_size
+        if size == 0:
+            self.append({"type": "log", "format": FORMAT})
+            return
+        with open(path, "rb") as file:
+            file.seek(-1, os.SEEK_END)
+            cut = file.read(1) != b"\n"
+        if cut:
+            self._file.write(b"\n")
+            self.append(_CUT)
+
+    def append(self, line: dict[str, Any]) -> None:
+        """Append one line and wait until it is on the disk."""
+        self._file.write(json.dumps(line, separators=(",", ":")).encode() + b"\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> RawLog:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def lines(path: Path) -> Iterator[dict[str, Any]]:
+    """Read a log; a line that was cut off is left out.
+
+    Raises:
+        InputError: if it is no log, or a line is damaged otherwise.
+        OSError: if it cannot be read.
+    """
+    with open(path, "rb") as file:
+        raw = file.read().split(b"\n")
+    complete, tail = raw[:-1], raw[-1]
+    for number, text in enumerate(complete):
+        try:
+            line = json.loads(text)
+        except ValueError:
+            after = complete[number + 1] if number + 1 < len(complete) else b""
+            if after == json.dumps(_CUT, separators=(",", ":")).encode():
+                continue
+            raise InputError(
+                f"{path} line {number + 1} is damaged and was not cut off by a crash; restore the "
+                "file from a copy"
+            ) from None
+        if number == 0 and (not isinstance(line, dict) or line.get("format") != FORMAT):
+            raise InputError(f"{path} is no log of ventbench-hardware")
+        if line != _CUT:
+            yield line
+    if not complete and tail:
+        raise InputError(f"{path} is no log of ventbench-hardware")
+
+
+@dataclass(frozen=True, eq=False)
+class LoggedBreath:
+    """One breath of a log.
+
+    Attributes:
+        run: number of its run in the plan.
+        attempt: how often the run had been begun before, from 0.
+        breath: its place in the run, from 0.
+        entry: name of the controller.
+        kind: kind of the run.
+        lung: label.
+        pip: cmH2O.
+        repeat: repetition, from 1.
+        complete: whether its run was finished and no check had tripped.
+        time, u_in, u_out, pressure, flow, requested, late: arrays ``(T,)``: s, %, 0/1, cmH2O,
+            mL/s, %, s.
+    """
+
+    run: int
+    attempt: int
+    breath: int
+    entry: str
+    kind: str
+    lung: str
+    pip: float
+    repeat: int
+    complete: bool
+    time: np.ndarray
+    u_in: np.ndarray
+    u_out: np.ndarray
+    pressure: np.ndarray
+    flow: np.ndarray
+    requested: np.ndarray
+    late: np.ndarray
+
+
+def _floats(values: list[float | None]) -> np.ndarray:
+    return np.array([np.nan if value is None else value for value in values], float)
+
+
+def breaths(path: Path) -> list[LoggedBreath]:
+    """All breaths of a log, in order.
+
+    Raises:
+        InputError: as of :func:`lines`.
+    """
+    logged = list(lines(path))
+    finished = {
+        (line["run"], line["attempt"])
+        for line in logged
+        if line["type"] == "run" and line["status"] == "complete"
+    }
+    return [
+        LoggedBreath(
+            line["run"], line["attempt"], line["breath"], line["entry"], line["kind"],
+            line["lung"], line["pip"], line["repeat"],
+            (line["run"], line["attempt"]) in finished,
+            *(_floats(line[key]) for key in ("time", "u_in", "u_out", "pressure", "flow")),
+            *(_floats(line[key]) for key in ("requested", "late")),
+        )
+        for line in logged
+        if line["type"] == "breath"
+    ]  # fmt: skip
+
+
+def recording(path: Path, *, kinds: tuple[str, ...] = (), whole: bool = True) -> Breaths:
+    """Breaths of a log as a recording in the public schema.
+
+    Args:
+        path: of the log.
+        kinds: kinds of runs that are taken; all if empty.
+        whole: leave out breaths that a safety check cut short.
+
+    Returns:
+        Breaths of equally many samples; the longest are those of most breaths.
+
+    Raises:
+        InputError: if there is no such breath.
+    """
+    taken = [b for b in breaths(path) if (not kinds or b.kind in kinds) and len(b.time) > 1]
+    if whole and taken:
+        lengths = [len(b.time) for b in taken]
+        usual = max(set(lengths), key=lengths.count)
+        taken = [b for b in taken if len(b.time) == usual]
+    taken = [b for b in taken if np.isfinite(b.pressure).all()]
+    if not taken:
+        raise InputError(
+            f"{path} holds no whole breath{' of ' + ', '.join(kinds) if kinds else ''}"
+        )
+    samples = min(len(b.time) for b in taken)
+    labels = [parse_lung(b.lung) for b in taken]
+
+    def stacked(name: str) -> np.ndarray:
+        return np.stack([getattr(b, name)[:samples] for b in taken])
+
+    time = stacked("time")
+    flow = stacked("flow")
+    return make_breaths(
+        np.arange(len(taken)) + 1, [x.R for x in labels], [x.C for x in labels],
+        time - time[:, :1], np.clip(stacked("u_in"), 0.0, 100.0), stacked("u_out"),
+        stacked("pressure"), flow=flow if np.isfinite(flow).all() else None,
+    )  # fmt: skip

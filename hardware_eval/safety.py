@@ -1,0 +1,387 @@
+"""Safety on the host: checks of every step that latch, and limits of every command.
+
+Three layers keep a lung safe, each without trust in the one above: the hardware (a relief valve,
+valves that vent without power), the device's program with its watchdog and pressure limit
+(:mod:`hardware_eval.device.program`), and these checks, which know what the device does not: the
+lung's label, the target, and what the commands of the last second should have done.
+
+The paper's overrides are pressure or volume over a threshold, a disconnected tube and software
+delay (section 2). The others are those of the People's Ventilator Project's alarms and of sensors
+and valves that stop working. A check that has tripped stays tripped until the operator resumes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, NamedTuple
+
+from ventbench import protocol
+from ventbench.errors import InputError
+from ventbench.lungs import Lung
+
+#: Flow of the fully open PVP inspiratory valve, mL/s per % of command (137 L/min).
+VALVE_GAIN = 22.8
+
+#: Resistance of the expiratory valve that the volume estimate empties through, cmH2O/(L/s).
+_OUTLET_RESISTANCE = 5.0
+
+#: A reading is stuck after this even at rest, s (PVP's alarm).
+_STUCK_AT_REST_S = 5.0
+
+
+@dataclass(frozen=True)
+class Check:
+    """One safety check.
+
+    Attributes:
+        threshold: value beyond which the condition holds, in ``unit``.
+        unit: unit of the threshold.
+        duration: how long the condition must hold to trip, s; 0 for one sample.
+        bench: whether the bench is to blame, so that the run is repeated; else the controller is,
+            and its run has no score.
+        reason: why there is such a check, and why this threshold.
+    """
+
+    threshold: float
+    unit: str
+    duration: float
+    bench: bool
+    reason: str
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.threshold) or not self.duration >= 0.0:
+            raise ValueError(f"threshold {self.threshold} or duration {self.duration} is no limit")
+
+
+@dataclass(frozen=True)
+class SafetySettings:
+    """All checks and limits; written into every record.
+
+    Attributes:
+        over_pressure: see the reasons of the checks themselves, also for those that follow.
+        largest_u_in: commands are cut to this, %.
+        largest_rise: largest rise of the command in one step, %; 100 for none, as in simulation.
+    """
+
+    over_pressure: Check = Check(
+        protocol.SAFETY_MARGIN, "cmH2O above PIP", protocol.SAFETY_TIME, False,
+        "Protocol's safety gate: pressure above min(60, PIP + 15) for longer than 0.1 s.",
+    )  # fmt: skip
+    peak_pressure: Check = Check(
+        protocol.SAFETY_PRESSURE + 5.0, "cmH2O", 0.0, False,
+        "One sample is enough: the device vents at 60 itself, so this means that it did not.",
+    )  # fmt: skip
+    over_volume: Check = Check(
+        1.5, "times C (limit - PEEP)", 0.0, False,
+        "Volume that would take the labelled lung half beyond the pressure limit has gone in; "
+        "from flow if it is measured, else from the valve's flow.",
+    )  # fmt: skip
+    disconnected: Check = Check(
+        0.12, "of V / C", 0.15, True,
+        "The volume given should raise the pressure by V / C; less than this share of it says "
+        "that the gas goes elsewhere. Counts once V / C exceeds 8 cmH2O.",
+    )  # fmt: skip
+    software_delay: Check = Check(
+        0.100, "s late", 0.0, True,
+        "Paper's override: the loop stood still so long that the device has vented by itself.",
+    )  # fmt: skip
+    missed_deadlines: Check = Check(
+        0.010, "s late", 0.12, True,
+        "A third of the control step; steps in a row that are so late no longer are 30 ms apart.",
+    )  # fmt: skip
+    stuck_sensor: Check = Check(
+        8.0, "cmH2O of expected change", 0.15, True,
+        "The same reading to the last digit while the commands should have changed the pressure; "
+        "or for 5 s at rest (PVP's alarm).",
+    )  # fmt: skip
+    implausible_slope: Check = Check(
+        90.0, "cmH2O in a step", 0.0, True,
+        "The fully open valve into the stiffest lung gives 53 cmH2O in 30 ms; more is no pressure.",
+    )  # fmt: skip
+    no_reading: Check = Check(
+        0.0, "readings", 0.06, True,
+        "Two steps without a number, or one outside -20..110 cmH2O: nothing can be controlled.",
+    )  # fmt: skip
+    low_pressure: Check = Check(
+        1.0, "cmH2O", 0.5, True,
+        "Airway near ambient or below for half a second: PEEP is lost, or the sensor's tube is "
+        "off.",
+    )  # fmt: skip
+    expiratory_valve: Check = Check(
+        18.0, "cmH2O above PEEP", 0.15, True,
+        "So much pressure 0.6 s after the expiratory valve was told to open: it has not opened.",
+    )  # fmt: skip
+    inspiratory_valve: Check = Check(
+        6.0, "cmH2O of rise", 0.06, True,
+        "The pressure rises with both valves told to be closed: the inspiratory one has not "
+        "closed.",
+    )  # fmt: skip
+    applied_command: Check = Check(
+        2.0, "% apart", 0.1, True,
+        "The device reports a position of the valve that it was not told.",
+    )  # fmt: skip
+    largest_u_in: float = protocol.U_MAX
+    largest_rise: float = 100.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.largest_u_in <= protocol.U_MAX:
+            raise InputError(
+                f"the largest u_in is {self.largest_u_in:g} %; it must be above 0 and at most "
+                f"{protocol.U_MAX:g} %"
+            )
+        if not 0.0 < self.largest_rise <= 100.0:
+            raise InputError(
+                f"the largest rise of u_in is {self.largest_rise:g} % a step; it must be above 0 "
+                "and at most 100 %"
+            )
+
+    def checks(self) -> dict[str, Check]:
+        """All checks by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, Check)}
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values for records and logs."""
+        return asdict(self)
+
+
+DEFAULT = SafetySettings()
+
+
+class SafetySample(NamedTuple):
+    """What one step of the loop knows.
+
+    Attributes:
+        time: of the reading, s, on the loop's clock.
+        pressure: measured airway pressure, cmH2O; NaN if there is none.
+        flow: measured flow into the lung, mL/s; NaN if it is not measured.
+        u_in: command in force until now, %.
+        u_out: expiratory valve in force until now, 0/1.
+        pip: target of this breath, cmH2O.
+        late: how late this step began, s.
+        applied: position of the inspiratory valve as the device reports it, %; NaN if unknown.
+    """
+
+    time: float
+    pressure: float
+    flow: float
+    u_in: float
+    u_out: int
+    pip: float
+    late: float
+    applied: float = math.nan
+
+
+@dataclass(frozen=True)
+class Trip:
+    """A check that has tripped.
+
+    Attributes:
+        check: its name.
+        time: when, s, on the loop's clock.
+        held: how long its condition had held, s.
+        value: value that was compared, in the check's unit.
+        message: one sentence for a person.
+        bench: see :class:`Check`.
+    """
+
+    check: str
+    time: float
+    held: float
+    value: float
+    message: str
+    bench: bool
+
+
+@dataclass(frozen=True)
+class SafetyState:
+    """State of all checks between two steps.
+
+    Attributes:
+        lung: label of the mounted lung.
+        since: when each condition that holds began to hold, s.
+        trips: checks that have tripped, in order; they stay.
+        previous: sample before; None before the first.
+        volume: estimate of the volume above that at PEEP, mL.
+        delivered: volume given since this inspiration began, mL.
+        start: pressure when this inspiration began, cmH2O.
+        switched: when the expiratory valve last changed its command, s.
+        unchanged: since when the reading has been the same, s.
+        expected: pressure change that the commands should have brought since then, cmH2O.
+        closed: since when both valves have been told to be closed, s; NaN if they are not.
+        closed_pressure: pressure then, cmH2O.
+    """
+
+    lung: Lung
+    since: dict[str, float] = field(default_factory=dict)
+    trips: tuple[Trip, ...] = ()
+    previous: SafetySample | None = None
+    volume: float = 0.0
+    delivered: float = 0.0
+    start: float = protocol.PEEP
+    switched: float = -math.inf
+    unchanged: float = -math.inf
+    expected: float = 0.0
+    closed: float = math.nan
+    closed_pressure: float = math.nan
+
+
+def init(lung: Lung) -> SafetyState:
+    """State before the first sample, for a lung at rest."""
+    return SafetyState(lung)
+
+
+def pressure_limit(settings: SafetySettings, pip: float) -> float:
+    """Pressure that a breath may not exceed for long, cmH2O."""
+    return min(protocol.SAFETY_PRESSURE, pip + settings.over_pressure.threshold)
+
+
+def step(settings: SafetySettings, state: SafetyState, sample: SafetySample) -> SafetyState:
+    """Look at one sample.
+
+    Args:
+        settings: all thresholds.
+        state: state from :func:`init` or from the step before.
+        sample: the sample; its time is not before that of the sample before.
+
+    Returns:
+        The next state; ``trips`` is longer if a check tripped at this sample.
+    """
+    state = _estimated(state, sample)
+    values = _values(settings, state, sample)
+    since: dict[str, float] = {}
+    trips = list(state.trips)
+    tripped = {trip.check for trip in trips}
+    # A condition that first shows at this sample has held since the sample before, at the latest.
+    began = sample.time if state.previous is None else state.previous.time
+    for name, check in settings.checks().items():
+        value, holds = values[name]
+        if not holds:
+            continue
+        since[name] = state.since.get(name, began if check.duration else sample.time)
+        held = sample.time - since[name]
+        if held >= check.duration - 1e-9 and name not in tripped:
+            trips.append(
+                Trip(
+                    name, sample.time, held, value,
+                    f"{name.replace('_', ' ')}: {value:.3g} {check.unit}, the limit is "
+                    f"{check.threshold:g} for {check.duration:g} s", check.bench,
+                )
+            )  # fmt: skip
+    return replace(state, since=since, trips=tuple(trips), previous=sample)
+
+
+def _estimated(state: SafetyState, sample: SafetySample) -> SafetyState:
+    """Update volumes and expectations by what was in force since the sample before."""
+    before = state.previous
+    if before is None:
+        return replace(state, switched=sample.time, unchanged=sample.time, start=sample.pressure)
+    dt = max(sample.time - before.time, 0.0)
+    C, R = state.lung.C, state.lung.R
+    valve = VALVE_GAIN * sample.u_in * dt  # mL
+    measured = sample.flow * dt if math.isfinite(sample.flow) else math.nan
+    if sample.u_out:
+        gone = math.exp(-dt / (1e-3 * C * (R + _OUTLET_RESISTANCE)))
+        volume = state.volume * gone
+    else:
+        volume = state.volume + (measured if math.isfinite(measured) else valve)
+    begins = before.u_out == 1 and sample.u_out == 0
+    delivered = (0.0 if begins or sample.u_out else state.delivered) + (
+        0.0 if sample.u_out else valve
+    )
+    switched = sample.time - dt if before.u_out != sample.u_out else state.switched
+    same = sample.pressure == before.pressure
+    resistive = 1e-3 * R * VALVE_GAIN * abs(sample.u_in - before.u_in)
+    elastic = (volume - state.volume) / C
+    expected = state.expected + abs(elastic) + (resistive if not sample.u_out else 0.0)
+    shut = sample.u_in <= 0.0 and sample.u_out == 0
+    closed = (
+        state.closed if shut and not math.isnan(state.closed) else sample.time if shut else math.nan
+    )
+    return replace(
+        state,
+        volume=volume,
+        delivered=delivered,
+        start=before.pressure if begins else state.start,
+        switched=switched,
+        unchanged=state.unchanged if same else sample.time,
+        expected=expected if same else 0.0,
+        closed=closed,
+        closed_pressure=state.closed_pressure if closed == state.closed else sample.pressure,
+    )
+
+
+#: Readings outside this are no airway pressures, cmH2O.
+_PLAUSIBLE = (-20.0, 110.0)
+
+#: Volume over compliance from which a disconnected tube shows, cmH2O.
+_SHOWS = 8.0
+
+#: How long an expiratory valve may take until the pressure must have fallen, s; and how long the
+#: pressure of a closed circuit may settle, s.
+_OPENS_S, _SETTLES_S = 0.6, 0.12
+
+
+def _values(
+    settings: SafetySettings, state: SafetyState, sample: SafetySample
+) -> dict[str, tuple[float, bool]]:
+    """Value of each check, and whether its condition holds."""
+    before, pressure, C = state.previous, sample.pressure, state.lung.C
+    limit = pressure_limit(settings, sample.pip)
+    number = math.isfinite(pressure) and _PLAUSIBLE[0] <= pressure <= _PLAUSIBLE[1]
+    open_for = sample.time - state.switched if sample.u_out else 0.0
+    rise = state.delivered / C
+    share = (pressure - state.start) / rise if rise > _SHOWS else math.nan
+    jump = 0.0
+    if before is not None and math.isfinite(before.pressure) and math.isfinite(pressure):
+        steps = max((sample.time - before.time) / protocol.DT, 1.0)
+        jump = abs(pressure - before.pressure) / steps
+    largest = settings.over_volume.threshold * C * (limit - protocol.PEEP)
+    still = sample.time - state.unchanged
+    climbed = pressure - state.closed_pressure if not math.isnan(state.closed) else 0.0
+    settled = not math.isnan(state.closed) and sample.time - state.closed >= _SETTLES_S
+    apart = abs(sample.applied - sample.u_in)
+    return {
+        "over_pressure": (pressure - sample.pip, number and pressure > limit),
+        "peak_pressure": (pressure, number and pressure > settings.peak_pressure.threshold),
+        "over_volume": (
+            state.volume / (C * (limit - protocol.PEEP)),
+            state.volume > largest and not sample.u_out,
+        ),
+        "disconnected": (share, not sample.u_out and share < settings.disconnected.threshold),
+        "software_delay": (sample.late, sample.late > settings.software_delay.threshold),
+        "missed_deadlines": (sample.late, sample.late > settings.missed_deadlines.threshold),
+        "stuck_sensor": (
+            state.expected,
+            number and still > 0.0
+            and (state.expected > settings.stuck_sensor.threshold or still > _STUCK_AT_REST_S),
+        ),
+        "implausible_slope": (jump, jump > settings.implausible_slope.threshold),
+        "no_reading": (0.0 if number else 1.0, not number),
+        "low_pressure": (pressure, number and pressure < settings.low_pressure.threshold),
+        "expiratory_valve": (
+            pressure - protocol.PEEP,
+            open_for > _OPENS_S
+            and pressure - protocol.PEEP > settings.expiratory_valve.threshold,
+        ),
+        "inspiratory_valve": (
+            climbed, settled and climbed > settings.inspiratory_valve.threshold
+        ),
+        "applied_command": (apart, apart > settings.applied_command.threshold),
+    }  # fmt: skip
+
+
+def limit_command(settings: SafetySettings, previous: float, wanted: float) -> tuple[float, bool]:
+    """Cut a command to what is safe.
+
+    Args:
+        settings: the limits.
+        previous: command of the step before, %.
+        wanted: what the controller asked for, %; finite.
+
+    Returns:
+        The command, %, and whether a limit beyond the protocol's 0..100 % changed it.
+    """
+    asked = min(max(wanted, 0.0), protocol.U_MAX)
+    applied = min(asked, settings.largest_u_in, previous + settings.largest_rise)
+    return applied, applied < asked

@@ -202,11 +202,7 @@ class Progress:
     attempts: Mapping[int, int]
 
     def remaining(self, plan: Plan) -> list[PlannedRun]:
-        """Runs that are still to do, in the plan's order.
-
-        A ramp is done again on a lung that still has scored runs of its entry: after a restart
-        nobody knows what has happened to the bench.
-        """
+        """Runs that are still to do, in the plan's order."""
         return [run for run in plan.runs if run.number not in self.done]
 
 

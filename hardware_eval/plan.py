@@ -17,7 +17,7 @@ import numpy as np
 
 from ventbench import protocol
 from ventbench.errors import InputError
-from ventbench.lungs import scored_lung
+from ventbench.lungs import LUNG_IDS, scored_lung
 
 #: Kinds of runs: PIP rises step by step before an entry is scored on a lung; scored; the PID
 #: between them; with a leak or a pinched tube at an announced moment; exploring for recordings.
@@ -153,7 +153,8 @@ def make_plan(
         raise InputError(f"{repeats} repetitions: run each cell once at least")
     if CONTROL in entries:
         raise InputError(f"no entry can be called {CONTROL}; that is the PID in between")
-    named = tuple(scored_lung(lung).id for lung in lungs)
+    # In one order, whatever order they were given in: a log names them in that of mounting.
+    named = sorted((scored_lung(lung).id for lung in lungs), key=LUNG_IDS.index)
     order = np.random.default_rng(seed)
     mounted = tuple(named[i] for i in order.permutation(len(named)))
     rising = tuple(sorted(float(pip) for pip in pips))

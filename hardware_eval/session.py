@@ -21,13 +21,13 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
-from hardware_eval.client import Client
-from hardware_eval.clock import Clock
-from hardware_eval.errors import DisconnectedError, LinkError, NoAnswerError, RefusedError
-from hardware_eval.messages import Flag, Reading
 from numpy.typing import NDArray
 
 from hardware_eval import safety
+from hardware_eval.client import Client
+from hardware_eval.clock import Clock
+from hardware_eval.errors import LinkError, NoAnswerError, RefusedError
+from hardware_eval.messages import Flag, Reading
 from hardware_eval.plan import (
     CONTROL,
     CONTROL_GAINS,
@@ -325,7 +325,7 @@ def run_once(
             that was cut short.
 
     Raises:
-        DisconnectedError: if the port goes away; the device vents by itself.
+        LinkError: if the port goes away or the device is silent; it vents by itself.
         EmergencyStop: if the operator pressed the key; the lung is vented.
     """
     loop = _Loop(bench, run, controller, on_breath)
@@ -585,6 +585,9 @@ def run_plan(
         )
     except EmergencyStop:
         end = SessionEnd(False, "the operator pressed the emergency stop", 0)
+    except BaseException as error:
+        end = SessionEnd(False, f"{type(error).__name__}: {error}", 0)
+        raise
     finally:
         with contextlib.suppress(LinkError):
             bench.client.vent()
@@ -617,10 +620,21 @@ def _runs(
             return SessionEnd(False, "the operator did not confirm the next PIP", made)
         prepare_run(run)
         try:
-            result = _one(bench, run, attempts, make_controller, log)
-        except DisconnectedError as error:
-            log.append({"type": "event", "what": "disconnected", "message": str(error)})
+            result = _one(
+                bench,
+                run,
+                attempts,
+                make_controller,
+                log,
+                (len(plan.runs) - len(queue), len(plan.runs)),
+            )
+        except LinkError as error:
+            # The device has vented or will: by the vent that follows, or by its watchdog.
+            log.append({"type": "event", "what": "link", "message": str(error)})
             log.append(_run_line(run, attempts[run.number] - 1, "aborted", str(error)))
+            spoilt += 1
+            if spoilt > MAX_ATTEMPTS:
+                raise
             bench.operator.tell(f"{error}; connecting again")
             bench.client.reconnect()
             log.append({"type": "event", "what": "reconnected"})
@@ -635,9 +649,6 @@ def _runs(
             continue
         spoilt = 0
         queue.pop(0)
-        if bench.view is not None and result.breaths:
-            done = len(plan.runs) - len(queue)
-            bench.view.breath(run, result.breaths[-1], done, len(plan.runs))
         if result.status == "failed" and run.kind == "ramp":
             # What fails on the way up would fail at the top, with more pressure.
             reason = f"{run.entry} failed on {run.lung} at PIP {run.pip:g}: {result.reason}"
@@ -663,7 +674,9 @@ def _one(
     attempts: dict[int, int],
     make_controller: MakeController,
     log: RawLog,
+    place: tuple[int, int],
 ) -> RunResult:
+    done, total = place
     attempt = attempts.get(run.number, 0)
     attempts[run.number] = attempt + 1
     log.append({"type": "run_begins", "run": run.number, "attempt": attempt, "time": time.time()})
@@ -672,11 +685,14 @@ def _one(
     except ControllerFailedError as error:
         log.append(_run_line(run, attempt, "failed", str(error)))
         return RunResult("failed", str(error), (), (), 0, 0)
+
+    def on_breath(index: int, breath: BreathLog) -> None:
+        log.append(breath.line(run, attempt, index))
+        if bench.view is not None:
+            bench.view.breath(run, breath, done, total)
+
     try:
-        result = run_once(
-            bench, run, controller,
-            on_breath=lambda index, breath: log.append(breath.line(run, attempt, index)),
-        )  # fmt: skip
+        result = run_once(bench, run, controller, on_breath=on_breath)
     finally:
         controller.close()
     line = _run_line(run, attempt, result.status, result.reason)
@@ -714,18 +730,19 @@ def dry_run(plan: Plan, make_controller: MakeController, settings: SafetySetting
     from hardware_eval.device.loopback import loopback
     from hardware_eval.device.simulated import simulated_lung
 
-    problems, seen, hal, mounted = [], set(), None, ""
+    problems: list[str] = []
+    seen: set[tuple[Any, ...]] = set()
+    mounted, bench = "", None
     for run in plan.runs:
         key = (run.kind == "control", run.entry, run.lung, run.pip)
         if key in seen or run.kind == "perturbed":
             continue
         seen.add(key)
-        if run.lung != mounted:
-            hal, mounted = simulated_lung(run.lung), run.lung
-        device = loopback(hal)  # type: ignore[arg-type]
-        client = Client(device, device.clock)
-        client.hello()
-        bench = Bench(client, device.clock, settings, SilentOperator(), rest=1.0)
+        if bench is None or run.lung != mounted:
+            device, mounted = loopback(simulated_lung(run.lung)), run.lung
+            client = Client(device, device.clock)
+            client.hello()
+            bench = Bench(client, device.clock, settings, SilentOperator(), rest=1.0)
         try:
             controller = control_pid(run) if run.entry == CONTROL else make_controller(run)
         except ControllerFailedError as error:

@@ -109,8 +109,9 @@ class SafetySettings:
         "off.",
     )  # fmt: skip
     expiratory_valve: Check = Check(
-        18.0, "cmH2O above PEEP", 0.15, True,
-        "So much pressure 0.6 s after the expiratory valve was told to open: it has not opened.",
+        0.7, "of the pressure above PEEP", 0.15, True,
+        "So much is left 0.6 s after the expiratory valve was told to open, and more than 4 cmH2O: "
+        "it has not opened. The slowest lung leaves a fifth.",
     )  # fmt: skip
     inspiratory_valve: Check = Check(
         6.0, "cmH2O of rise", 0.06, True,
@@ -206,6 +207,7 @@ class SafetyState:
         delivered: volume given since this inspiration began, mL.
         start: pressure when this inspiration began, cmH2O.
         switched: when the expiratory valve last changed its command, s.
+        switched_pressure: pressure then, cmH2O.
         unchanged: since when the reading has been the same, s.
         expected: pressure change that the commands should have brought since then, cmH2O.
         closed: since when both valves have been told to be closed, s; NaN if they are not.
@@ -220,6 +222,7 @@ class SafetyState:
     delivered: float = 0.0
     start: float = protocol.PEEP
     switched: float = -math.inf
+    switched_pressure: float = protocol.PEEP
     unchanged: float = -math.inf
     expected: float = 0.0
     closed: float = math.nan
@@ -289,7 +292,7 @@ def _estimated(state: SafetyState, sample: SafetySample) -> SafetyState:
     delivered = (0.0 if begins or sample.u_out else state.delivered) + (
         0.0 if sample.u_out else valve
     )
-    switched = sample.time - dt if before.u_out != sample.u_out else state.switched
+    switches = before.u_out != sample.u_out
     same = sample.pressure == before.pressure
     resistive = 1e-3 * R * VALVE_GAIN * abs(sample.u_in - before.u_in)
     elastic = (volume - state.volume) / C
@@ -303,7 +306,8 @@ def _estimated(state: SafetyState, sample: SafetySample) -> SafetyState:
         volume=volume,
         delivered=delivered,
         start=before.pressure if begins else state.start,
-        switched=switched,
+        switched=before.time if switches else state.switched,
+        switched_pressure=before.pressure if switches else state.switched_pressure,
         unchanged=state.unchanged if same else sample.time,
         expected=expected if same else 0.0,
         closed=closed,
@@ -320,6 +324,9 @@ _SHOWS = 8.0
 #: How long an expiratory valve may take until the pressure must have fallen, s; and how long the
 #: pressure of a closed circuit may settle, s.
 _OPENS_S, _SETTLES_S = 0.6, 0.12
+
+#: Pressure above PEEP that an open expiratory valve may always leave, cmH2O.
+_LEAST_LEFT = 4.0
 
 
 def _values(
@@ -341,6 +348,7 @@ def _values(
     climbed = pressure - state.closed_pressure if not math.isnan(state.closed) else 0.0
     settled = not math.isnan(state.closed) and sample.time - state.closed >= _SETTLES_S
     apart = abs(sample.applied - sample.u_in)
+    left = (pressure - protocol.PEEP) / max(state.switched_pressure - protocol.PEEP, 1.0)
     return {
         "over_pressure": (pressure - sample.pip, number and pressure > limit),
         "peak_pressure": (pressure, number and pressure > settings.peak_pressure.threshold),
@@ -360,9 +368,10 @@ def _values(
         "no_reading": (0.0 if number else 1.0, not number),
         "low_pressure": (pressure, number and pressure < settings.low_pressure.threshold),
         "expiratory_valve": (
-            pressure - protocol.PEEP,
+            left,
             open_for > _OPENS_S
-            and pressure - protocol.PEEP > settings.expiratory_valve.threshold,
+            and pressure - protocol.PEEP > _LEAST_LEFT
+            and left > settings.expiratory_valve.threshold,
         ),
         "inspiratory_valve": (
             climbed, settled and climbed > settings.inspiratory_valve.threshold

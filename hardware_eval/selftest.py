@@ -1,4 +1,4 @@
-"""The self-test before a session: sensor, valves, tubes, clock, and whether the lung is the label's.
+"""The self-test before a session: sensor, valves, tubes, clock, and whether the lung is as told.
 
 Every breath of it is closed-loop or small, and watched by the same checks as a session, so that a
 wrongly set lung cannot be hurt by the test that finds it. What is measured is compared with limits
@@ -386,7 +386,7 @@ def _errors(probes: list[Driven], simulator: Any) -> dict[str, float]:
     """Open-loop error of each lung's simulator over the inspirations of the probes, cmH2O."""
     from ventbench.plants.catalog import load_simulators
 
-    # The reference rig of each lung: which rig a recording is of cannot be told from its clock here.
+    # The reference rig of each lung: a clock of exactly 30 ms tells no rig from another.
     simulators = load_simulators(simulator)
     inspiration = protocol.INSPIRATION_STEPS + 1
     errors = {}

@@ -1,0 +1,43 @@
+"""One emulated device on a virtual clock, compiled once; each test gets it healthy and vented."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from hardware_eval.client import Client
+from hardware_eval.device.loopback import LoopbackDevice, loopback
+from hardware_eval.device.simulated import simulated_lung
+from hardware_eval.evaluate import Line
+from hardware_eval.safety import DEFAULT
+from hardware_eval.session import Bench, SilentOperator
+
+LUNG = "R5C20"
+
+
+@pytest.fixture(scope="session")
+def shared_device() -> LoopbackDevice:
+    return loopback(simulated_lung(LUNG, "physics"))
+
+
+@pytest.fixture
+def device(shared_device: LoopbackDevice) -> Iterator[LoopbackDevice]:
+    hal: Any = shared_device.service.hal
+    yield shared_device
+    hal.faults = ()
+    shared_device.plug()
+    shared_device.clock.advance(6.0)  # the watchdog vents, and the lung empties
+
+
+@pytest.fixture
+def line(device: LoopbackDevice) -> Line:
+    client = Client(device, device.clock)
+    client.hello()
+    return Line(client, device.clock)
+
+
+@pytest.fixture
+def bench(line: Line) -> Bench:
+    return Bench(line.client, line.clock, DEFAULT, SilentOperator(), rest=2.0)

@@ -1,7 +1,13 @@
-"""What holds for every command: how it ends."""
+"""What holds for every command: how it ends; and the command that looks at the machine."""
 
+import json
 import subprocess
 import sys
+
+from typer.testing import CliRunner
+
+from ventbench import cli
+from ventbench.sandbox.runner import SandboxRunner
 
 STOPPED = """
 import sys
@@ -62,3 +68,21 @@ def test_ctrl_c_that_a_callback_drops_still_stops():
 def test_python_m_ventbench():
     command = [sys.executable, "-m", "ventbench", "--version"]
     assert subprocess.run(command, capture_output=True, text=True).stdout.startswith("ventbench ")
+
+
+def test_doctor_says_what_this_machine_can_do(monkeypatch, tmp_path):
+    monkeypatch.setenv("VENTBENCH_RECORDINGS", str(tmp_path))
+    ended = CliRunner().invoke(cli.app, ["doctor", "--json", "-"])
+    report = json.loads(ended.stdout)
+    assert f"0 files in {tmp_path}" == report["facts"]["recordings"]
+    assert report["facts"]["simulators"].endswith("as published")
+    missing = SandboxRunner().missing
+    assert report["facts"]["official scores"].startswith("no" if missing else "yes")
+    assert ended.exit_code == (1 if report["problems"] else 0)
+
+
+def test_doctor_names_what_is_missing(monkeypatch):
+    monkeypatch.setattr(SandboxRunner, "missing", property(lambda _: ("seccomp",)))
+    ended = CliRunner().invoke(cli.app, ["doctor"])
+    assert ended.exit_code == 1
+    assert "not official: the sandbox lacks seccomp" in " ".join(ended.stdout.split())

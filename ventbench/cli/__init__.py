@@ -20,6 +20,7 @@ from ventbench.cli import (
     challenge,
     data,
     diagnose,
+    doctor,
     mechanics,
     proof,
     score,
@@ -40,7 +41,6 @@ app = typer.Typer(
     name="ventbench",
     help="A benchmark for the control of mechanical ventilators.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
@@ -72,6 +72,7 @@ board.register(app)
 diagnose.register(app)
 challenge.register(app)
 mechanics.register(app)
+doctor.register(app)
 proof.register(app)
 app.add_typer(data.app)
 

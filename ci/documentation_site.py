@@ -34,9 +34,7 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
         if not path.startswith("docs/"):
             name = "index.md" if path == "README.md" else path.lower().replace("/", "-")
             _pages[path] = name
-            page = File.generated(config, name, content=_rewritten(text, path))
-            page.edit_uri = None
-            files.append(page)
+            files.append(File.generated(config, name, content=_rewritten(text, path)))
         for match in _LINK.finditer(text):
             target = _resolve(path, match[3])
             known = target in _pages or target in waiting or target.startswith("docs/")

@@ -86,3 +86,46 @@ def test_what_cannot_be_done_is_said():
     made.reset(seed=0)
     with pytest.raises(InputError, match="the action is nan"):
         made.step(np.array([np.nan], np.float32))
+
+
+def test_many_at_once_are_each_alone():
+    many = gym_env.VentilatorVector(12, noise=False)
+    seen, info = many.reset(seed=3)
+    actions = np.random.default_rng(0).uniform(-1.0, 0.0, (33, 12, 1)).astype(np.float32)
+    at = 7
+    alone = gym_env.Ventilator(lung=info["lung"][at], pip=info["pip"][at], noise=False)
+    seen_alone, _ = alone.reset(seed=0)
+    np.testing.assert_allclose(seen[at], seen_alone, rtol=1e-6)
+    for action in actions:
+        seen, rewards, ended, _, info = many.step(action)
+        seen_alone, reward, ended_alone, _, info_alone = alone.step(action[at])
+        np.testing.assert_allclose(seen[at], seen_alone, rtol=2e-5, atol=1e-6)
+        np.testing.assert_allclose(rewards[at], reward, rtol=2e-5, atol=1e-6)
+        assert ended[at] == ended_alone
+    np.testing.assert_allclose(info["error"][at], info_alone["error"], rtol=2e-5)
+
+
+def test_the_next_step_after_the_end_begins_new_breaths():
+    many = gymnasium.make_vec(NAME, num_envs=6, lung="R5C10")
+    first, info = many.reset(seed=1)
+    assert list(info["lung"]) == ["R5C10"] * 6
+    assert sorted(np.round(info["pip"] / 5.0)) == [2, 3, 4, 5, 6, 7]
+    for _ in range(33):
+        _, _, ended, _, _ = many.step(np.zeros((6, 1), np.float32))
+    assert ended.all()
+    seen, rewards, ended, _, _ = many.step(np.ones((6, 1), np.float32))
+    assert not ended.any()
+    assert not rewards.any()
+    assert not np.array_equal(seen, first), "new deviations for new breaths"
+    np.testing.assert_array_equal(many.reset(seed=1)[0], first)
+
+
+def test_wrong_input_of_many():
+    with pytest.raises(InputError, match="num_envs is 0"):
+        gym_env.VentilatorVector(0)
+    many = gym_env.VentilatorVector(2, lung="R5C10", pip=20.0)
+    with pytest.raises(InputError, match="reset"):
+        many.step(np.zeros((2, 1), np.float32))
+    many.reset(seed=0)
+    with pytest.raises(InputError, match="action 1 is nan"):
+        many.step(np.array([[0.0], [np.nan]], np.float32))

@@ -1,7 +1,8 @@
 """``ventbench/Ventilator-v1``: the benchmark as a Gymnasium environment, one breath an episode.
 
-Importing this module registers it; so does Gymnasium itself, ``gymnasium.make`` by the name
-``"ventbench.gym_env:ventbench/Ventilator-v1"``. Needs the extra ``ventbench[gym]``.
+Importing this module registers it; so does Gymnasium itself, ``gymnasium.make`` and
+``gymnasium.make_vec`` by the name ``"ventbench.gym_env:ventbench/Ventilator-v1"``. Needs the extra
+``ventbench[gym]``.
 """
 
 from __future__ import annotations
@@ -10,15 +11,18 @@ from functools import partial
 from typing import Any, ClassVar
 
 import gymnasium
+import gymnasium.vector
 import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
 from jax import Array
 from numpy.typing import NDArray
 
 from ventbench import environment as env
 from ventbench import precision, protocol
+from ventbench.draws import random_scenarios
 from ventbench.environment import Scenario
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
@@ -55,17 +59,22 @@ def _cell(key: Array, pip: Array, vary: bool) -> Scenario:
     return jax.tree.map(lambda leaf: leaf[0], cells)
 
 
+@partial(jax.jit, static_argnames="vary")
+def _cells(key: Array, pips: Array, vary: bool) -> Scenario:
+    return random_scenarios(key, pips, spread=None if vary else 0.0, breaths=1)
+
+
 def _seen(cell: Scenario, loop: env.LoopState, step: Array | int) -> Array:
     seen = env.observe(cell, loop, 0, step)
     values = [
         seen.pressure / 40.0,
         seen.target / 40.0,
-        *(seen.targets_ahead[k] / 40.0 for k in range(protocol.TARGETS_AHEAD)),
+        *(seen.targets_ahead[..., k] / 40.0 for k in range(protocol.TARGETS_AHEAD)),
         seen.previous_u_in / 50.0 - 1.0,
         seen.time,
         seen.dt / protocol.DT,
     ]
-    return jnp.stack([jnp.asarray(value, jnp.float32) for value in values])
+    return jnp.stack([jnp.asarray(value, jnp.float32) for value in values], axis=-1)
 
 
 class Ventilator(gymnasium.Env[Floats, Floats]):
@@ -158,10 +167,125 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
         return {"lung": self._lung, "pip": float(self._cell.pip), "pressure": pressure}
 
 
+class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, NDArray[np.float64]]):
+    """Many ventilators at once, each step compiled: what :class:`Ventilator` does, batched.
+
+    Every breath has 33 commands, so that all end together. The call of ``step`` after the end
+    ignores its actions and begins new breaths, with reward 0 (``AutoresetMode.NEXT_STEP``).
+
+    Args:
+        num_envs: number of ventilators E.
+        lung: id of the lung; the six in turn if not given.
+        pip: peak pressure, cmH2O; the six of the protocol in turn if not given.
+        noise: as of :class:`Ventilator`.
+        render_mode: must be None.
+
+    Raises:
+        InputError: if there is no such lung, the PIP is outside 5..60 cmH2O, or E is below 1.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": [],
+        "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        lung: str | None = None,
+        pip: float | None = None,
+        noise: bool = True,
+        render_mode: str | None = None,
+    ):
+        if num_envs < 1:
+            raise InputError(f"num_envs is {num_envs}; it must be at least 1")
+        single = Ventilator(lung, pip, noise, render_mode)
+        self.num_envs, self.render_mode = num_envs, None
+        self.single_action_space = single.action_space
+        self.single_observation_space = single.observation_space
+        self.action_space = batch_space(single.action_space, num_envs)
+        self.observation_space = batch_space(single.observation_space, num_envs)
+        lungs = [LUNG_IDS.index(name) for name in single._lungs]
+        self._lungs = [LUNG_IDS[i] for i in np.resize(lungs, num_envs)]
+        # Each lung gets each PIP before the first PIP comes again.
+        turn = np.arange(num_envs) // len(lungs) % len(protocol.PIPS)
+        self._pips = np.asarray(protocol.PIPS)[turn] if pip is None else np.full(num_envs, pip)
+        self._noise = noise
+        with precision.float32():
+            plants = jax.tree.map(
+                lambda *leaf: jnp.stack(leaf), *(single._plants[i] for i in lungs)
+            )
+            self._plants = episodes.plants_of_cells(plants, num_envs)
+        self._loop: env.LoopState | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Floats, dict[str, Any]]:
+        """Begin a breath in each; one seed for all, and no options are known."""
+        super().reset(seed=seed)
+        # PIPs change lungs from breath to breath.
+        shift = int(self.np_random.integers(len(protocol.PIPS))) * len(set(self._lungs))
+        with precision.float32():
+            key = jax.random.key(jnp.asarray(self.np_random.integers(2**32), jnp.uint32))
+            pips = jnp.asarray(np.roll(self._pips, shift), jnp.float32)
+            self._cells = _cells(key, pips, self._noise)
+            loop, seen = _start(self._plants, self._cells)
+        self._loop, self._count = loop, 0
+        error = np.asarray(loop.pressure) - np.asarray(self._cells.pip)
+        self._total = np.abs(error, dtype=float)
+        return np.asarray(seen), self._info()
+
+    def step(
+        self, actions: Floats
+    ) -> tuple[Floats, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Apply a command to each; see :meth:`gymnasium.vector.VectorEnv.step`.
+
+        Args:
+            actions: shape ``(E, 1)``.
+
+        Raises:
+            InputError: if no breath is under way, or an action is not finite.
+        """
+        if self._loop is None:
+            raise InputError("no breath is under way: call reset() first")
+        nothing = np.zeros(self.num_envs, bool)
+        if self._count == episodes.STEPS:
+            seen, info = self.reset()
+            return seen, np.zeros(self.num_envs), nothing, nothing.copy(), info
+        values = np.asarray(actions, np.float32).reshape(self.num_envs)
+        if not np.isfinite(values).all():
+            at = int(np.argmin(np.isfinite(values)))
+            raise InputError(f"action {at} is {values[at]}; it must be a number from -1 to 1")
+        with precision.float32():
+            u_in, step = jnp.asarray(50.0 + 50.0 * values), jnp.asarray(self._count)
+            self._loop, seen, error = _step(self._plants, self._cells, self._loop, u_in, step)
+        self._count += 1
+        errors = np.asarray(error, float)
+        self._total += errors
+        ended = np.full(self.num_envs, self._count == episodes.STEPS)
+        info = self._info()
+        if ended[0]:
+            info |= {"error": self._total / protocol.INSPIRATION_STEPS, "_error": ended.copy()}
+        return np.asarray(seen), -errors / episodes.REWARD_SCALE, ended, nothing, info
+
+    def _info(self) -> dict[str, Any]:
+        assert self._loop is not None
+        values = {
+            "lung": np.array(self._lungs, object),
+            "pip": np.asarray(self._cells.pip, float),
+            "pressure": np.asarray(self._loop.pressure, float),
+        }
+        return values | {f"_{name}": np.ones(self.num_envs, bool) for name in values}
+
+
 def register() -> None:
     """Make the environment known to Gymnasium, once."""
     if "ventbench/Ventilator-v1" not in gymnasium.registry:
-        gymnasium.register("ventbench/Ventilator-v1", "ventbench.gym_env:Ventilator")
+        gymnasium.register(
+            "ventbench/Ventilator-v1",
+            "ventbench.gym_env:Ventilator",
+            vector_entry_point="ventbench.gym_env:VentilatorVector",
+        )
 
 
 register()

@@ -148,11 +148,10 @@ def _cache(problems: list[str]) -> str:
 
 
 def _ports() -> str:
-    try:
-        from serial.tools import list_ports
-    except ImportError:
-        return "unknown without ventbench[hardware]"
-    return ", ".join(port.device for port in list_ports.comports()) or "none"
+    """Serial ports of microcontrollers and adapters, by their names on Linux and macOS."""
+    patterns = ("ttyUSB*", "ttyACM*", "ttyAMA*", "cu.usb*")
+    names = [str(path) for pattern in patterns for path in sorted(Path("/dev").glob(pattern))]
+    return ", ".join(names) or "none"
 
 
 def register(app: typer.Typer) -> None:

@@ -21,6 +21,7 @@ from ventbench.cli import (
     data,
     diagnose,
     doctor,
+    headroom,
     mechanics,
     proof,
     score,
@@ -28,6 +29,7 @@ from ventbench.cli import (
     study,
     submit,
     train,
+    transfer,
     tune,
     view,
 )
@@ -62,6 +64,8 @@ def _root(
 
 
 score.register(app)
+headroom.register(app)
+transfer.register(app)
 submit.register(app)
 simulators.register(app)
 tune.register(app)

@@ -127,6 +127,8 @@ def score(
     emit(results[0] if len(results) == 1 else {"submissions": results}, json)
     console = Console(stderr=str(json) == "-")
     console.print(_table(results))
+    if protocol == 2:
+        console.print(_normalised_table(results))
     because = dict.fromkeys(reason for result in scores for reason in result.not_official_because)
     if because:
         progress.print(f"These scores are not official: {', '.join(because)}.", style="yellow")
@@ -163,6 +165,34 @@ def _table(scores: list[dict[str, Any]]) -> Table:
     if scores[0]["draws"]:
         drawn = [entry["draws"] for entry in scores]
         table.add_row("mean of the draws", *(show(draws["score"]) for draws in drawn))
+        table.add_row("95 % interval", *("..".join(map(show, draws["ci95"])) for draws in drawn))
+    return table
+
+
+def _normalised_table(scores: list[dict[str, Any]]) -> Table | str:
+    """Return the normalised scores: a row for each lung, a column for each submission."""
+    from rich.table import Table
+
+    if any(entry["normalised"] is None for entry in scores):
+        return "There are no normalised scores: `ventbench headroom` has not computed these cells."
+
+    def show(value: float | None) -> str:
+        return "failed" if value is None else f"{value:.1f}"
+
+    def mean(values: dict[str, Any]) -> float | None:
+        return (values["draws"] or {"score": values["nominal"]})["score"]
+
+    over = "over the draws" if scores[0]["draws"] else "nominal"
+    table = Table(title=f"Normalised score, {over}: 0 = best attainable, 100 = best PID")
+    table.add_column("lung")
+    for entry in scores:
+        table.add_column(f"{entry['name']}\n{entry['track']}", justify="right")
+    for lung in scores[0]["lungs"]:
+        table.add_row(lung, *(show(mean(entry["lungs"][lung]["normalised"])) for entry in scores))
+    table.add_section()
+    table.add_row("mean", *(show(mean(entry["normalised"])) for entry in scores), style="bold")
+    if scores[0]["draws"]:
+        drawn = [entry["normalised"]["draws"] for entry in scores]
         table.add_row("95 % interval", *("..".join(map(show, draws["ci95"])) for draws in drawn))
     return table
 

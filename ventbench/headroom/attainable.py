@@ -38,7 +38,7 @@ from ventbench.interfaces import Plant
 COMMANDS = protocol.INSPIRATION_STEPS - 1
 
 #: Steps that each start opens the valve fully for, before a command that holds the pressure.
-STARTS = (1, 4, 12)
+STARTS = (1, 2, 4, 8, 16, 33)
 
 #: Command after the opening of a start, %.
 HOLD = 8.0
@@ -89,8 +89,9 @@ def _pressures(plant: Plant, cell: Scenario, u_in: Array) -> Array:
     return jax.lax.scan(step, env.start_breath(varied, cell), u_in)[1]
 
 
-_all_pressures = jax.jit(jax.vmap(_pressures))
-_all_slopes = jax.jit(jax.vmap(jax.jacfwd(_pressures, argnums=2)))
+#: Pressures of n cells under commands, ``(n, COMMANDS)``, and their derivatives by the commands.
+all_pressures = jax.jit(jax.vmap(_pressures))
+all_slopes = jax.jit(jax.vmap(jax.jacfwd(_pressures, argnums=2)))
 
 
 def pressures(plants: Plant, cells: Scenario, u_in: Floats) -> Floats:
@@ -101,7 +102,7 @@ def pressures(plants: Plant, cells: Scenario, u_in: Floats) -> Floats:
         cells: batch shape ``(n,)``.
         u_in: %, shape ``(n, COMMANDS)``.
     """
-    return _in_batches(_all_pressures, plants, cells, u_in)
+    return _in_batches(all_pressures, plants, cells, u_in)
 
 
 def _in_batches(function: Any, plants: Plant, cells: Scenario, u_in: Floats) -> Floats:
@@ -148,7 +149,7 @@ def attainable(
             better = error < best - 1e-12
             best, witness = np.where(better, error, best), np.where(better[:, None], u_in, witness)
         miss = pip - pressures(plants, cells, witness)
-        slopes = _in_batches(_all_slopes, plants, cells, witness)
+        slopes = _in_batches(all_slopes, plants, cells, witness)
         gains = [
             np.mean(np.abs(miss[i])) - _program(miss[i], slopes[i], witness[i], radius)[1]
             for i, radius in enumerate(np.full(n, CERTIFICATE_RADIUS))
@@ -178,7 +179,7 @@ def _descend(
         anew = live[stale[live]]
         if len(anew):
             some, cell = jax.tree.map(lambda x, i=anew: np.asarray(x)[i], (plants, cells))
-            slopes[anew] = _in_batches(_all_slopes, some, cell, u_in[anew])
+            slopes[anew] = _in_batches(all_slopes, some, cell, u_in[anew])
         tried, predicted = u_in[live].copy(), np.zeros(len(live))
         for at, i in enumerate(live):
             change, value = _program(miss[i], slopes[i], u_in[i], radius[i])

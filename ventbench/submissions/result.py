@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 import ventbench
 from ventbench import draws, files, protocol
+from ventbench.headroom.reference import Reference
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics import bootstrap, rig_bootstrap
 from ventbench.metrics.score import lung_score
@@ -87,6 +88,10 @@ class Score:
         timing: seconds, by name; the only numbers that differ from run to run.
         protocol: version of the protocol.
         rig_draws: the draws of protocol version 2; None without draws, and in version 1.
+        controllable: error of each run without the first step of an inspiration, nominal runs
+            first, cmH2O, shape ``(L, 1 + K, P)``; None in version 1.
+        reference: best attainable and best PID of the same runs; None in version 1, and where it
+            was not computed for these simulators and draws.
     """
 
     submission: Submission
@@ -111,6 +116,8 @@ class Score:
     timing: Mapping[str, float]
     protocol: int = 1
     rig_draws: RigDraws | None = None
+    controllable: Floats | None = None
+    reference: Reference | None = None
 
     @property
     def by_lung(self) -> Floats:
@@ -122,6 +129,17 @@ class Score:
     def score(self) -> float:
         """Mean nominal score over lungs, cmH2O; NaN if any cell failed."""
         return float(np.mean(self.by_lung))
+
+    @property
+    def normalised(self) -> Floats | None:
+        """Normalised score of each run, nominal runs first, shape ``(L, 1 + K, P)``.
+
+        0 is the best that any commands attain, 100 the lung's best PID; NaN where the controller
+        failed; None where there is no :attr:`reference`.
+        """
+        if self.reference is None or self.controllable is None:
+            return None
+        return self.reference.normalised(self.controllable)
 
     @property
     def official(self) -> bool:
@@ -159,6 +177,7 @@ class Score:
             "complete": self.complete,
             "safe": bool(np.all(self.safe)),
             "draws": self._draws(lung_score(self.drawn), published=True),
+            **self._normalised(),
             "lungs": {lung: self._lung(i) for i, lung in enumerate(self.lungs)},
             **self._secondary(slice(None)),
             "clipped": self._clipped(slice(None)),
@@ -212,13 +231,18 @@ class Score:
 
         Returns:
             Columns ``score_cmH2O`` (nominal), ``draws_cmH2O`` (mean over the draws; only with
-            draws), ``safe`` and ``peak_cmH2O`` (highest pressure of any run).
+            draws), ``normalised`` (over the draws, or nominal without; only in version 2), ``safe``
+            and ``peak_cmH2O`` (highest pressure of any run).
         """
         import pandas as pd
 
         columns: dict[str, Any] = {"score_cmH2O": self.by_lung}
         if len(self.drawn):
             columns["draws_cmH2O"] = lung_score(self.drawn).mean(axis=0)
+        if (values := self.normalised) is not None:
+            columns["normalised"] = (
+                values[:, 1:].mean((1, 2)) if len(self.drawn) else values[:, 0].mean(1)
+            )
         columns |= {"safe": self.safe, "peak_cmH2O": self.peak}
         return pd.DataFrame(columns, index=pd.Index(self.lungs, name="lung"))
 
@@ -253,6 +277,7 @@ class Score:
             "safe": bool(self.safe[i]),
             "peak_pressure_cmH2O": _number(self.peak[i]),
             "draws": self._draws(lung_score(self.drawn)[:, i : i + 1], first=i),
+            **self._normalised(i),
             **self._secondary(slice(i, i + 1)),
             "clipped": self._clipped(slice(i, i + 1)),
         }
@@ -278,6 +303,24 @@ class Score:
             "ci95": [_number(limit) for limit in ci95],
             "values": [_number(value) for value in means],
             **(about if published else {}),
+        }
+
+    def _normalised(self, lung: int | None = None) -> dict[str, Any]:
+        """Normalised score of a lung or of all; no key in version 1, null without a reference."""
+        if self.protocol == 1:
+            return {}
+        values = self.normalised
+        if values is None or self.reference is None:
+            return {"normalised": None}
+        lungs = slice(None) if lung is None else slice(lung, lung + 1)
+        drawn = lung_score(values[lungs, 1:]).T
+        return {
+            "normalised": {
+                "nominal": _number(np.mean(values[lungs, 0])),
+                "draws": self._draws(drawn, first=lung or 0),
+                "attainable_cmH2O": float(self.reference.attainable[lungs].mean()),
+                "pid_cmH2O": float(self.reference.pid[lungs].mean()),
+            }
         }
 
     def _over_rigs(self, values: Floats, first: int) -> tuple[float, tuple[float, float]]:

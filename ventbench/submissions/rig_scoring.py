@@ -8,15 +8,19 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
-from ventbench import precision, protocol, rig_draws
+from ventbench import precision, protocol, rig_draws, seasons
 from ventbench.environment import Scenario
 from ventbench.errors import InputError
+from ventbench.headroom.reference import Reference, reference_of
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNGS, Lung
+from ventbench.metrics.normalised import controllable_error
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators
 from ventbench.plants.frozen import Frozen
@@ -39,6 +43,7 @@ class Rigs:
         sessions: scored sessions of each lung, the reference rig first; None for one rig each.
         about: version and hashes, for the result.
         sha256: of the manifest of the frozen simulators; None for others.
+        held_out: for each lung the scored session that no entry of ours was trained on, or None.
     """
 
     lungs: tuple[Lung, ...]
@@ -46,6 +51,7 @@ class Rigs:
     sessions: tuple[tuple[int, ...], ...] | None
     about: Mapping[str, Any]
     sha256: str | None = None
+    held_out: tuple[int | None, ...] = ()
 
     @property
     def members(self) -> int:
@@ -99,7 +105,35 @@ def rigs_of(official: Frozen) -> Rigs:
         official.rigs,
         official.about(),
         official.manifest_sha256,
+        official.held_out_rigs,
     )
+
+
+def season_draws(rigs: Rigs, season: Path | None, seed: Path | None = None) -> RigDraws:
+    """Return the draws of a season.
+
+    Args:
+        rigs: that are drawn.
+        season: its file; the development draws if not given.
+        seed: file of its secret seed; not needed once the season is revealed.
+
+    Raises:
+        InputError: if the season is of another protocol, or its seed is needed and not the one of
+            its commitment.
+    """
+    if season is None:
+        return rigs.draws(rig_draws.COUNT)
+    about = seasons.read_season(season)
+    if about.protocol != rig_draws.VERSION:
+        raise InputError(f"{season}, key protocol: {about.protocol} is not {rig_draws.VERSION}")
+    secret = about.revealed
+    if secret is None:
+        if seed is None:
+            raise InputError(f"{season} is not revealed yet: give its seed with --seed FILE")
+        secret = seasons.read_seed(seed)
+        seasons.require_seed(about, secret)
+    sessions = rigs.sessions or tuple((0,) for _ in rigs.lungs)
+    return rig_draws.build(sessions, rigs.members, seed=secret, season=about.id, n=about.draws)
 
 
 def run_on_rigs(
@@ -109,6 +143,7 @@ def run_on_rigs(
     track: str | None = None,
     draws: int = 0,
     drawn: RigDraws | None = None,
+    reference: Reference | None = None,
     pips: Sequence[float] = protocol.PIPS,
     runner: Runner | None = None,
 ) -> Score:
@@ -120,12 +155,14 @@ def run_on_rigs(
         track: ``"performance"`` or ``"robustness"``; the manifest's first if not given.
         draws: how many of the development draws to run besides the nominal cells.
         drawn: other draws instead, such as those of a season.
+        reference: best attainable and best PID of these simulators and draws; the published one if
+            not given and it is of these.
         pips: cmH2O.
         runner: runs the controllers; in this process if not given.
 
     Raises:
         SubmissionError: if the submission cannot be run at all, or does not enter the track.
-        InputError: if there are no such draws.
+        InputError: if there are no such draws, or the reference is of others.
         FloatingPointError: if a plant answers with NaN or infinity.
     """
     started = time.perf_counter()
@@ -136,15 +173,22 @@ def run_on_rigs(
         drawn = rigs.draws(draws, pips)
     elif draws < 0:
         raise InputError(f"{draws} draws: there cannot be fewer than none")
+    if pips == protocol.PIPS:
+        about = None if drawn is None else drawn.about()
+        reference = reference_of(rigs.about, about, reference)
     with precision.float64():
         plants, cells = rigs.cells(drawn, pips)
         plants = as_float64(plants, len(names))
         run = step_through(plants, cells, runner, submission, tasks, version=2)
         nominal = jax.tree.map(lambda x: x[:, 0], cells)
-        reference = plants
+        own = plants
         if rigs.sessions is not None:
-            reference = jax.tree.map(lambda leaf: leaf[:, 0, 0], plants)
-        replayed = replay(reference, nominal, run.requested[:, 0], version=2)
+            own = jax.tree.map(lambda leaf: leaf[:, 0, 0], plants)
+        replayed = replay(own, nominal, run.requested[:, 0], version=2)
+    pip = np.asarray(cells.pip)[..., None, None]
+    controllable = controllable_error(run.pressure, pip)
+    for cell in run.failures:
+        controllable[cell] = np.nan
     return assemble(
         submission,
         tasks,
@@ -160,4 +204,6 @@ def run_on_rigs(
         draws_sha256=None if drawn is None else drawn.commitment,
         protocol=2,
         rig_draws=drawn,
+        controllable=controllable,
+        reference=reference,
     )

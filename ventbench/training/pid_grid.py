@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +54,8 @@ def paper_gains() -> NDArray[np.float64]:
     return np.array(list(itertools.product(VALUES, VALUES, VALUES)))
 
 
-@jax.jit
-def _errors(plant: Plant, gains: Array, cells: Scenario) -> Array:
+@partial(jax.jit, static_argnames="airway")
+def _errors(plant: Plant, gains: Array, cells: Scenario, airway: bool = False) -> Array:
     cells = jax.tree.map(
         lambda x: jnp.broadcast_to(jnp.asarray(x, gains.dtype), (len(gains), *jnp.shape(x))), cells
     )
@@ -63,7 +64,8 @@ def _errors(plant: Plant, gains: Array, cells: Scenario) -> Array:
 
     def step(carry: tuple[env.LoopState, Any, Array], index: Array) -> tuple[Any, None]:
         loop, state, total = carry
-        total = total + jnp.abs(loop.pressure - cells.pip)
+        pressure = env.airway_pressure(varied, loop) if airway else loop.pressure
+        total = total + jnp.abs(pressure - cells.pip)
         state, requested = controller.step(state, env.observe(cells, loop, 0, index))
         loop, _ = env.inspire(varied, cells, loop, requested)
         return (loop, state, total), None
@@ -79,6 +81,8 @@ def errors(
     gains: NDArray[np.float64],
     pips: tuple[float, ...] = protocol.PIPS,
     batch: int = BATCH,
+    *,
+    airway: bool = False,
 ) -> NDArray[np.float32]:
     """Nominal error of each PID on each lung at each PIP.
 
@@ -87,6 +91,7 @@ def errors(
         gains: P, I and D, %/cmH2O, shape ``(G, 3)``.
         pips: cmH2O, P of them.
         batch: gains that are run together.
+        airway: take the error of the airway pressure (protocol version 2), not of the reading.
 
     Returns:
         Mean ``|pressure - target|`` of an inspiration, cmH2O, shape ``(L, G, P)``; float32, which
@@ -103,7 +108,7 @@ def errors(
             # The last batch is padded with the last gains, so that all compile once.
             index = np.minimum(np.arange(first, first + batch), count - 1)
             some = jnp.asarray(gains[index], jnp.float32)
-            out[lung, index] = np.asarray(_errors(plant, some, cells))
+            out[lung, index] = np.asarray(_errors(plant, some, cells, airway))
     return out
 
 

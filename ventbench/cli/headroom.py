@@ -1,0 +1,109 @@
+"""``ventbench headroom``: what normalised scores are measured against."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ventbench.cli.options import JsonFile, bars, emit
+
+#: Cells of the second optimiser: every so many of all.
+_EVERY = 31
+
+
+def headroom(
+    out: Annotated[Path, typer.Option(metavar="FILE", help="File of the reference errors.")] = Path(
+        "runs/bounds-v2.npz"
+    ),
+    season: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Season whose draws are meant; default: development."),
+    ] = None,
+    seed: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Its secret seed, while it is secret.")
+    ] = None,
+    check: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Check a file instead of making one: its commands must attain its errors, and a "
+            "second optimiser must find nothing better.",
+        ),
+    ] = None,
+    json: JsonFile = None,
+) -> None:
+    """Compute the best attainable error and the best PID of every cell of protocol version 2.
+
+    Commands are optimised for each cell with everything known; the best PID of a lung comes from
+    the paper's grid on all rigs of the lung. Takes minutes; the same command continues.
+
+    Example: `ventbench headroom --check data/bounds-v2.npz`
+    """
+    import numpy as np
+    from rich.console import Console
+
+    from ventbench import protocol
+    from ventbench.headroom import reference as references
+    from ventbench.submissions import rig_scoring
+    from ventbench.training import rig_pid
+
+    console = Console(stderr=str(json) == "-")
+    rigs = rig_scoring.load_rigs()
+    drawn = rig_scoring.season_draws(rigs, season, seed)
+    plants, cells = rigs.cells(drawn, protocol.PIPS)
+    about = references.settings(rigs.about, drawn.about())
+    if check is not None:
+        found = references.load(check)
+        references.reference_of(rigs.about, drawn.about(), found)
+        result = references.checked(found, plants, cells, every=_EVERY)
+        emit(result, json)
+        for key, value in result.items():
+            console.print(f"{key}: {value}", highlight=False)
+        if not result["sound"]:
+            raise typer.Exit(1)
+        return
+    parts = out.with_suffix(".parts")
+    with bars() as progress:
+        task = progress.add_task("best PID of each lung", total=None)
+        if season is None:
+            gains, _ = rig_pid.best_pids(
+                rigs, progress=lambda done, all_: progress.update(task, completed=done, total=all_)
+            )
+        else:
+            gains = references.published().gains
+        task = progress.add_task("best attainable", total=None)
+        found = references.compute(
+            plants,
+            cells,
+            gains,
+            about,
+            folder=parts,
+            progress=lambda done, all_: progress.update(task, completed=done, total=all_),
+        )
+    sha256 = found.save(out)
+    shutil.rmtree(parts)  # they are in the file now
+    summary = {
+        "file": str(out),
+        "sha256": sha256,
+        "gains": found.gains.tolist(),
+        "attainable": float(found.attainable.mean()),
+        "lower": float(found.lower.mean()),
+        "pid": float(found.pid.mean()),
+        "largest_gap": float(np.max(found.attainable - found.lower)),
+    }
+    emit(summary, json)
+    console.print(
+        f"wrote {out}\nmean over cells, first step left out: best attainable "
+        f"{summary['attainable']:.3f} cmH2O (at least {summary['lower']:.3f}), best PID "
+        f"{summary['pid']:.3f}\nSHA-256 {sha256}",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(headroom)

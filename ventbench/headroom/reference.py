@@ -1,0 +1,327 @@
+"""What normalised scores are measured against: best attainable and best PID of every cell.
+
+``data/bounds-v2.npz`` holds both for the nominal cells and the development draws of protocol
+version 2, with the commands that attain the bound: whoever applies them gets the same errors.
+``ventbench headroom`` makes the file again, and those of other draws.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike, NDArray
+
+from ventbench import data_files, files, precision, rollouts
+from ventbench.controllers.pid import PID
+from ventbench.environment import Scenario
+from ventbench.errors import InputError
+from ventbench.headroom import attainable
+from ventbench.headroom.cross_check import second_optimum
+from ventbench.interfaces import Plant
+from ventbench.metrics import normalised as metric
+from ventbench.resume import ARRAY, WorkFolder, fingerprint
+
+#: The published file for the development draws.
+FILE = "bounds-v2.npz"
+
+#: By how much a second optimiser may do better, cmH2O: a tenth of the least headroom.
+TOLERANCE = 0.1 * metric.LEAST_HEADROOM
+
+#: Largest file that is read, bytes.
+MAX_BYTES = 20_000_000
+
+Floats = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+# Columns of a stored part before the commands.
+_COLUMNS = ("attainable", "lower", "stationarity", "pid")
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Reference errors of L lungs, nominal cells in front of K draws, and P PIPs.
+
+    All errors leave the first step of an inspiration out, see
+    :func:`ventbench.metrics.normalised.controllable_error`.
+
+    Attributes:
+        about: hashes of the simulators, and season, commitment and number of the draws.
+        gains: P, I, D of each lung's best PID, %/cmH2O, shape ``(L, 3)``.
+        attainable: error that :attr:`commands` attain, cmH2O, shape ``(L, 1 + K, P)``.
+        lower: error of the rise alone, below which none can be, cmH2O, shape ``(L, 1 + K, P)``.
+        stationarity: first-order decrease that is left, cmH2O, shape ``(L, 1 + K, P)``; see
+            :class:`ventbench.headroom.attainable.Attainable`.
+        pid: error of the best PID with the noise of the draw, cmH2O, shape ``(L, 1 + K, P)``.
+        commands: of one inspiration, %, shape ``(L, 1 + K, P, COMMANDS)``.
+    """
+
+    about: Mapping[str, Any]
+    gains: Floats
+    attainable: Floats
+    lower: Floats
+    stationarity: Floats
+    pid: Floats
+    commands: Floats
+
+    def normalised(self, error: ArrayLike) -> Floats:
+        """Normalised score of errors over the same cells, shape ``(L, 1 + k, P)`` with k <= K."""
+        error = np.asarray(error, float)
+        count = error.shape[1]
+        return metric.normalised(error, self.attainable[:, :count], self.pid[:, :count])
+
+    def first(self, n: int) -> Reference:
+        """Return the reference of the nominal cells and the first n draws."""
+        parts = {name: getattr(self, name)[:, : 1 + n] for name in (*_COLUMNS, "commands")}
+        return Reference(self.about, self.gains, **parts)
+
+    def save(self, path: Path) -> str:
+        """Write the file in one step and return its SHA-256; the same content gives one hash."""
+        about = np.array(json.dumps(dict(self.about), sort_keys=True))
+        arrays: dict[str, Any] = {"about": about, "gains": self.gains}
+        arrays |= {name: getattr(self, name) for name in (*_COLUMNS, "commands")}
+        # Not compressed: the bytes then depend on no version of zlib.
+        files.write_atomically(path, lambda file: np.savez(file, **arrays))
+        return files.sha256(path)
+
+
+def settings(simulators: Mapping[str, Any], draws: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What a reference belongs to, as JSON values.
+
+    Args:
+        simulators: version and hashes of the simulators.
+        draws: what :meth:`ventbench.rig_draws.RigDraws.about` says; None for nominal cells alone.
+    """
+    about = {"simulators": simulators.get("manifest_sha256"), "draws": draws}
+    return json.loads(json.dumps(about))
+
+
+def load(path: Path) -> Reference:
+    """Read a file of :meth:`Reference.save`.
+
+    Raises:
+        InputError: if it is missing or is not such a file.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path} is larger than {MAX_BYTES / 1e6:g} MB")
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as npz:
+            about = json.loads(str(npz["about"]))
+            arrays = {name: npz[name] for name in ("gains", *_COLUMNS, "commands")}
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"{path} is not a file of reference errors: {error}; make it with `ventbench headroom`"
+        ) from error
+    return Reference(about, **arrays)
+
+
+@functools.cache
+def published() -> Reference:
+    """The reference of the development draws that travels with ventbench.
+
+    Raises:
+        InputError: if it is missing or damaged.
+    """
+    return load(data_files.data_path(FILE))
+
+
+def reference_of(
+    simulators: Mapping[str, Any], draws: Mapping[str, Any] | None, reference: Reference | None
+) -> Reference | None:
+    """Check that a reference belongs to simulators and draws.
+
+    Args:
+        simulators: version and hashes of the simulators.
+        draws: as of :func:`settings`; the first draws of the reference's own are enough.
+        reference: to be checked; the published one if not given.
+
+    Returns:
+        The reference of these draws, or None where the published one is of others.
+
+    Raises:
+        InputError: if a given reference is of other simulators or draws.
+    """
+    given = reference
+    if reference is None:
+        try:
+            reference = published()
+        except InputError:
+            return None
+    own, wanted = dict(reference.about), settings(simulators, draws)
+    has, needed = own["draws"] or {}, wanted["draws"] or {}
+    keys = ("version", "sha256", "season")
+    same = own["simulators"] == wanted["simulators"] and (
+        draws is None or all(has.get(key) == needed.get(key) for key in keys)
+    )
+    count = needed.get("count", 0)
+    if same and count <= has.get("count", 0):
+        return reference.first(count)
+    if given is None:
+        return None
+    raise InputError(
+        f"the reference errors are of simulators {str(own['simulators'])[:12]} and draws {has}, "
+        f"not of {str(wanted['simulators'])[:12]} and {needed}; make them with `ventbench headroom`"
+    )
+
+
+@jax.jit
+def _pid_pressures(plants: Plant, gains: Array, cells: Scenario) -> Array:
+    def run(plant: Plant, gains: Array, cells: Scenario) -> Array:
+        return rollouts.closed_loop(plant, PID(*gains), cells, airway=True)[0].pressure
+
+    return jax.vmap(run)(plants, gains, cells)
+
+
+def pid_errors(plants: Plant, cells: Scenario, gains: Floats) -> Floats:
+    """Controllable errors of one PID a lung, cmH2O, shape of the cells.
+
+    Args:
+        plants: leaves ``(L, n, 1, ...)``.
+        cells: batch shape ``(L, n, P)``.
+        gains: P, I, D, %/cmH2O, shape ``(L, 3)``.
+    """
+    with precision.float64():
+        arrays = jax.tree.map(jnp.asarray, (plants, gains, cells))
+        pressure = np.asarray(_pid_pressures(*arrays))
+    return metric.controllable_error(pressure, np.asarray(cells.pip)[..., None, None])
+
+
+def compute(
+    plants: Plant,
+    cells: Scenario,
+    gains: Floats,
+    about: Mapping[str, Any],
+    *,
+    folder: Path | None = None,
+    starts: tuple[int, ...] = attainable.STARTS,
+    progress: Progress | None = None,
+) -> Reference:
+    """Compute the reference errors of cells; an interrupted call continues.
+
+    Args:
+        plants: leaves ``(L, 1 + K, 1, ...)``.
+        cells: batch shape ``(L, 1 + K, P)``, nominal cells first.
+        gains: of each lung's best PID, %/cmH2O, shape ``(L, 3)``.
+        about: what the reference belongs to, see :func:`settings`.
+        folder: for finished parts; nothing is kept if not given.
+        starts: see :data:`ventbench.headroom.attainable.STARTS`.
+        progress: called with the number of cells done, and of all.
+
+    Raises:
+        InputError: if the folder holds parts of another computation.
+    """
+    lungs, draws, pips = np.shape(cells.pip)
+    work = None
+    if folder is not None:
+        keys = {"about": dict(about), "starts": starts, "iterations": attainable.ITERATIONS}
+        keys["inputs"] = fingerprint((plants, cells, gains))
+        work = WorkFolder(folder, keys)
+    report = progress or (lambda done, total: None)
+    parts = []
+    for draw in range(draws):
+        name = f"draw-{draw}"
+        if work is not None and work.has(name, ARRAY):
+            part = work.read(name, ARRAY)
+        else:
+            part = _part(plants, cells, gains, draw, starts)
+            if work is not None:
+                work.put(name, part, ARRAY)
+        parts.append(part)
+        report((draw + 1) * lungs * pips, lungs * draws * pips)
+    stacked = np.stack(parts, axis=1)
+    columns = {name: stacked[..., k] for k, name in enumerate(_COLUMNS)}
+    return Reference(
+        dict(about), np.asarray(gains), **columns, commands=stacked[..., len(_COLUMNS) :]
+    )
+
+
+def _part(
+    plants: Plant, cells: Scenario, gains: Floats, draw: int, starts: tuple[int, ...]
+) -> Floats:
+    """Reference of one draw, shape ``(L, P, columns)``."""
+    own = jax.tree.map(lambda x: np.asarray(x)[:, draw : draw + 1], plants)
+    cell = jax.tree.map(lambda x: np.asarray(x)[:, draw : draw + 1], cells)
+    lungs, _, pips = np.shape(cell.pip)
+    pid = pid_errors(own, cell, gains)[:, 0]
+    flat = jax.tree.map(lambda x: x.reshape(lungs * pips, *x.shape[3:]), cell)
+    each = jax.tree.map(
+        lambda x: np.broadcast_to(x, (lungs, 1, pips, *x.shape[3:])).reshape(-1, *x.shape[3:]), own
+    )
+    bound = attainable.attainable(each, flat, starts=starts)
+    errors = np.stack([bound.error, bound.lower, bound.stationarity, pid.ravel()], axis=-1)
+    return np.concatenate([errors, bound.commands], axis=-1).reshape(lungs, pips, -1)
+
+
+def witness_errors(reference: Reference, plants: Plant, cells: Scenario) -> Floats:
+    """Errors that the recorded commands of a reference attain, cmH2O, shape ``(L, 1 + K, P)``.
+
+    Args:
+        reference: whose commands they are.
+        plants: leaves ``(L, 1 + K, 1, ...)``.
+        cells: batch shape ``(L, 1 + K, P)``.
+    """
+    shape = np.shape(cells.pip)
+    size = int(np.prod(shape))
+    each = jax.tree.map(
+        lambda x: np.broadcast_to(x, (*shape, *np.shape(x)[3:])).reshape(size, *np.shape(x)[3:]),
+        plants,
+    )
+    flat = jax.tree.map(lambda x: np.asarray(x).reshape(size, *np.shape(x)[3:]), cells)
+    commands = reference.commands.reshape(size, -1)
+    with precision.float64():
+        pressure = attainable.pressures(each, flat, commands)
+    return np.mean(np.abs(pressure - flat.pip[:, None]), axis=1).reshape(shape)
+
+
+def checked(
+    reference: Reference, plants: Plant, cells: Scenario, *, every: int = 1
+) -> dict[str, Any]:
+    """Check a reference: its commands attain its errors, and nothing better is found by Adam.
+
+    Args:
+        reference: to be checked.
+        plants: of its cells, leaves ``(L, 1 + K, 1, ...)``.
+        cells: batch shape ``(L, 1 + K, P)``.
+        every: the second optimiser runs on one cell of so many.
+
+    Returns:
+        ``cells`` and ``second_optimiser_cells``, how many were checked; ``witness_deviation``,
+        largest difference between an error and what its commands give; ``pid_deviation``, the same
+        of the PID; ``gap_mean`` and ``gap_max``, distance to the lower bound;
+        ``stationarity_max``; ``second_optimiser_better_by``, largest lead of the second optimiser,
+        and ``second_optimiser_worse_by``, its mean lag, all cmH2O; ``sound``, whether witnesses
+        agree to 1e-9 and the lead is below :data:`TOLERANCE`.
+    """
+    off = np.abs(witness_errors(reference, plants, cells) - reference.attainable)
+    pid = np.abs(pid_errors(plants, cells, reference.gains) - reference.pid)
+    shape = np.shape(cells.pip)
+    at = np.unravel_index(np.arange(0, int(np.prod(shape)), every), shape)
+    own = jax.tree.map(lambda x: np.asarray(x)[at[0], at[1], 0], plants)
+    second = second_optimum(own, jax.tree.map(lambda x: np.asarray(x)[at], cells))
+    lead = reference.attainable[at] - second
+    gap = reference.attainable - reference.lower
+    result: dict[str, Any] = {
+        "cells": int(np.prod(shape)),
+        "witness_deviation": float(off.max()),
+        "pid_deviation": float(pid.max()),
+        "gap_mean": float(gap.mean()),
+        "gap_max": float(gap.max()),
+        "stationarity_max": float(reference.stationarity.max()),
+        "second_optimiser_cells": len(at[0]),
+        "second_optimiser_better_by": float(lead.max()),
+        "second_optimiser_worse_by": float(-lead.mean()),
+    }
+    sound = max(off.max(), pid.max()) < 1e-9 and lead.max() < TOLERANCE and gap.min() > -1e-9
+    return {**result, "sound": bool(sound)}

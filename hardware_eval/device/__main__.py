@@ -1,0 +1,184 @@
+"""Run the device's program on a ventilator: ``python -m hardware_eval.device --help``."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import FrameType
+
+from hardware_eval.device.hal import Hal
+from hardware_eval.device.program import PERIOD, DeviceSettings
+from hardware_eval.device.service import DeviceService
+from hardware_eval.link import BAUD_RATE
+from ventbench.errors import InputError
+
+#: Priority among real-time processes: above everything but the kernel's own threads.
+_PRIORITY = 40
+
+
+def serve(
+    service: DeviceService, open_line: Callable[[], int | None], stop: Callable[[], bool]
+) -> None:
+    """Step the program in real time until ``stop()``; then vent.
+
+    Args:
+        service: program and hardware; its clock is ``time.monotonic``.
+        open_line: opens the line to a host and returns its descriptor, non-blocking; None while
+            there is none. It is asked again, at most once a period, after a line broke.
+        stop: tells when to end.
+    """
+    gc.collect()
+    gc.freeze()
+    line, due = open_line(), time.monotonic() + PERIOD
+    try:
+        while not stop():
+            wait = max(due - time.monotonic(), 0.0)
+            ready, _, _ = select.select([] if line is None else [line], [], [], wait)
+            data = b""
+            if line is not None and ready:
+                try:
+                    data = os.read(line, 4096)
+                except BlockingIOError:
+                    continue
+                except OSError:
+                    data = b""
+                if not data:  # the host hung up; the watchdog vents
+                    os.close(line)
+                    line = None
+            now = time.monotonic()
+            answers = service.step(now, data)
+            if now >= due:
+                due = max(due + PERIOD, now)
+                line = open_line() if line is None else line
+            if answers and line is not None:
+                with contextlib.suppress(OSError):
+                    os.write(line, answers)
+    finally:
+        service.vent(time.monotonic())
+        if line is not None:
+            os.close(line)
+
+
+def serial_line(path: str, baud_rate: int = BAUD_RATE) -> Callable[[], int | None]:
+    """Return what opens a serial port; None while it is not there."""
+
+    def open_line() -> int | None:
+        import serial
+
+        try:
+            port = serial.Serial(path, baud_rate, exclusive=True)
+        except serial.SerialException:
+            return None
+        descriptor = os.dup(port.fileno())
+        port.close()
+        os.set_blocking(descriptor, False)
+        return descriptor
+
+    return open_line
+
+
+def tcp_line(host: str, port: int) -> tuple[Callable[[], int | None], socket.socket]:
+    """Listen on TCP; one host at a time, the next one when it has gone.
+
+    Raises:
+        InputError: if the address cannot be used.
+    """
+    try:
+        server = socket.create_server((host, port))
+    except OSError as error:
+        raise InputError(f"--listen {host}:{port}: {error}") from error
+    server.setblocking(False)
+
+    def open_line() -> int | None:
+        try:
+            connection, _ = server.accept()
+        except BlockingIOError:
+            return None
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setblocking(False)
+        return connection.detach()
+
+    return open_line, server
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program on the People's Ventilator; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        "python -m hardware_eval.device",
+        description="Guard the lung on a ventilator and do what a host asks.",
+        epilog="Example: python -m hardware_eval.device --config pvp.toml --port /dev/ttyGS0",
+    )
+    parser.add_argument("--config", type=Path, required=True, help="TOML file of the ventilator")
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument("--port", help="serial port to the host, such as /dev/ttyGS0")
+    where.add_argument("--listen", metavar="HOST:PORT", help="TCP address for socket:// hosts")
+    where.add_argument(
+        "--vent", action="store_true", help="vent once and end (for ExecStopPost of systemd)"
+    )
+    parser.add_argument("--pressure-limit", type=float, help="above which to vent, cmH2O")
+    given = parser.parse_args(arguments)
+    try:
+        return _run(given)
+    except (InputError, ValueError) as error:
+        print(f"python -m hardware_eval.device: {error}", file=sys.stderr)
+        return 2
+
+
+def _run(given: argparse.Namespace) -> int:
+    from hardware_eval.device.pvp import PvpHal
+
+    limit = given.pressure_limit
+    settings = DeviceSettings() if limit is None else DeviceSettings(limit)
+    listener: socket.socket | None = None
+    if given.listen:
+        host, _, number = given.listen.rpartition(":")
+        if not number.isdigit():
+            raise InputError(f"--listen {given.listen}: write HOST:PORT, such as 0.0.0.0:5005")
+        open_line, listener = tcp_line(host, int(number))
+    else:
+        open_line = serial_line(given.port or "")
+    hal = PvpHal(given.config)
+    try:
+        if not given.vent:
+            _prefer()
+            _serve_until_signal(hal, settings, open_line)
+    finally:
+        hal.close()
+        if listener is not None:
+            listener.close()
+    return 0
+
+
+def _serve_until_signal(
+    hal: Hal, settings: DeviceSettings, open_line: Callable[[], int | None]
+) -> None:
+    ended = False
+
+    def end(number: int, frame: FrameType | None) -> None:
+        nonlocal ended
+        ended = True
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, end)
+    serve(DeviceService(hal, settings, time.monotonic()), open_line, lambda: ended)
+
+
+def _prefer() -> None:
+    """Ask for real-time scheduling; without the right to it the program runs all the same."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+    except (AttributeError, OSError) as error:
+        print(f"no real-time scheduling: {error}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 
 from ventbench.errors import InputError
 from ventbench.plants.catalog import load_simulators
+from ventbench.recordings.breaths import Breaths, make_breaths
 from ventbench.validation.challenge.cases import Base, Effect
 from ventbench.validation.challenge.folder import ChallengeFolder
 from ventbench.validation.challenge.judge import acceptable_names, right_places, true_values
@@ -26,17 +27,21 @@ QUIET = StrangerCase(
 )  # fmt: skip
 
 
+def held(u_in: np.ndarray, u_out: np.ndarray) -> Breaths:
+    """One breath of given commands at 31.25 Hz."""
+    time = 0.032 * np.arange(len(u_in))
+    return make_breaths([1], [20.0], [20.0], [time], [u_in], [u_out], [np.full(len(u_in), 5.0)])
+
+
 def replayed(effect: Effect | None, u_in: float = 20.0, samples: int = 40) -> np.ndarray:
     """Pressures of one breath from rest at PEEP: small commands, ``u_in``, shut at sample 30."""
     effects = () if effect is None else (effect,)
-    breaths = record(replace(QUIET, jitter=0.0, breaths=2), np.random.default_rng(0))
     k = np.arange(samples)
     small = np.where(k < 3, 1.2, 2.5)
-    u = np.where(k < 6, small, np.where(k < 30, u_in, 0.0)) + np.zeros((2, 1))
-    u_out = (np.arange(samples) >= 30).astype(np.int8) + np.zeros((2, 1), np.int8)
-    given = replace(breaths, u_in=u, u_out=u_out)
-    case = replace(QUIET, effects=effects, breaths=2)
-    return replay(case, given, np.full(2, 5.0), 0)[0]
+    u = np.where(k < 6, small, np.where(k < 30, u_in, 0.0))
+    given = held(u, (k >= 30).astype(np.int8))
+    case = replace(QUIET, effects=effects, breaths=1)
+    return replay(case, given, np.array([5.0]), 0)[0]
 
 
 def test_without_effects_it_is_the_exact_solution():
@@ -67,9 +72,7 @@ def test_a_leak_and_a_circuit_against_solve_ivp():
     circuit, orifice, R, C = 0.003, 0.01, 20.0, 0.02
     leak = replace(QUIET, dead_space=1e3 * circuit)
     effect = Effect("leak", "strong", SAME, {"conductance": 1e3 * orifice})
-    breaths = record(replace(leak, jitter=0.0, breaths=1), np.random.default_rng(0))
-    u = np.full((1, 40), 20.0)
-    given = replace(breaths, u_in=u, u_out=np.zeros((1, 40), np.int8))
+    given = held(np.full(40, 20.0), np.zeros(40, np.int8))
     found = replay(replace(leak, effects=(effect,), breaths=1), given, np.array([5.0]), 0)[0]
 
     def slope(t, y):
@@ -129,7 +132,7 @@ def test_a_recording_has_the_nuisances_of_its_case():
     residual = replay(case, breaths, breaths.pressure[:, 0], 0) - breaths.pressure
     far = np.abs(residual[np.isfinite(residual)]) > 1.6
     assert 0.003 < far.mean() < 0.05
-    assert known.max() < 60.0
+    assert known.max() < 80.0
     again = record(case, np.random.default_rng(1))
     np.testing.assert_array_equal(breaths.pressure, again.pressure)
 

@@ -2,7 +2,7 @@
 
 Everything that a notebook needs is an attribute of this package and is imported at first use:
 
-- recordings: ``load_recording``, ``example``, ``Breaths``;
+- recordings: ``load_recording``, ``import_recording``, ``example``, ``Breaths``;
 - simulators: ``load_simulators``, ``simulate``, ``open_loop``, the protocol ``Plant``;
 - controllers: ``score``, ``rollout``, ``tune_pid``, ``train_residual``, ``train_ppo``,
   ``train_dqn``, the protocol ``Controller``;
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from ventbench.plants.catalog import load_simulators as load_simulators
     from ventbench.recordings import Breaths as Breaths
     from ventbench.recordings import load as load_recording
+    from ventbench.recordings.foreign import import_recording as import_recording
     from ventbench.simulation import Simulation as Simulation
     from ventbench.simulation import simulate as simulate
     from ventbench.submissions.result import Score as Score
@@ -67,6 +68,7 @@ _SOURCES = {
     "Trajectories": ("trajectories", "Trajectories"),
     "diagnose": ("diagnosis.diagnose", "diagnose"),
     "example": ("data_files", "example"),
+    "import_recording": ("recordings.foreign", "import_recording"),
     "load_board": ("board.frames", "load_board"),
     "load_recording": ("recordings", "load"),
     "load_simulators": ("plants.catalog", "load_simulators"),
@@ -99,6 +101,7 @@ __all__ = [
     "__version__",
     "diagnose",
     "example",
+    "import_recording",
     "load_board",
     "load_recording",
     "load_simulators",

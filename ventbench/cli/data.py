@@ -14,7 +14,7 @@ _TOGETHER = 60
 
 app = typer.Typer(
     name="data",
-    help="Check recordings, or make new ones by exploring simulators.",
+    help="Check recordings, import those of others, or make new ones by exploring simulators.",
     no_args_is_help=True,
 )
 
@@ -47,6 +47,120 @@ def check(
         typer.echo(line, err=str(json) == "-")
     if not report.ok:
         raise typer.Exit(2)
+
+
+@app.command("import")
+def import_(
+    file: Annotated[
+        Path, typer.Argument(help="CSV with any separator, Parquet, or MATLAB .mat (-v7).")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="CSV, CSV.GZ or Parquet to write; a preview if not given."
+        ),
+    ] = None,
+    columns: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--map",
+            metavar="NAME=ROLE",
+            help="What a column is: time, pressure, flow, volume, u_in, u_out, R, C, breath, "
+            "group or target. May be repeated; usual names need none.",
+        ),
+    ] = None,
+    layout: Annotated[
+        str | None, typer.Option(help="kaggle, respiraworks or pvp; recognised if not given.")
+    ] = None,
+    lung: Annotated[
+        str | None, typer.Option(metavar="R20C50", help="Label where no columns hold R and C.")
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Sampling rate where there is no time.")
+    ] = None,
+    split_breaths: Annotated[
+        bool,
+        typer.Option(
+            "--split-breaths", help="Split at inspirations, even if a column numbers the breaths."
+        ),
+    ] = False,
+    pressure_unit: Annotated[str | None, typer.Option(help="cmH2O, mbar, hPa, kPa, mmHg.")] = None,
+    flow_unit: Annotated[str | None, typer.Option(help="mL/s, L/s, L/min, mL/min, L/h.")] = None,
+    volume_unit: Annotated[str | None, typer.Option(help="mL or L.")] = None,
+    time_unit: Annotated[str | None, typer.Option(help="s, ms, us or min.")] = None,
+    u_in_unit: Annotated[str | None, typer.Option(help="% or 1 (0 to 1).")] = None,
+    invert: Annotated[
+        list[str] | None, typer.Option(metavar="ROLE", help="Its sign is the opposite: flow.")
+    ] = None,
+    select: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="Only rows with this value; may be repeated."),
+    ] = None,
+    separator: Annotated[str | None, typer.Option(help="Separator of the cells.")] = None,
+    decimal: Annotated[str | None, typer.Option(help="Decimal mark, '.' or ','.")] = None,
+    json: JsonFile = None,
+) -> None:
+    """Bring a recording of another laboratory into the public schema.
+
+    Says what was understood: columns, units with the exact way back, breaths, valves. Without --out
+    only that, and a preview. Nothing is resampled; commands keep their times.
+
+    Example: `ventbench data import lab.csv --map Paw=pressure --flow-unit L/min --lung R20C50`
+    """
+    from rich.console import Console
+
+    from ventbench import recordings
+    from ventbench.recordings.foreign import import_recording
+
+    units = {
+        "pressure": pressure_unit, "flow": flow_unit, "volume": volume_unit, "time": time_unit,
+        "u_in": u_in_unit,
+    }  # fmt: skip
+    with Console(stderr=True).status(f"reading {file}"):
+        imported = import_recording(
+            file,
+            columns=_pairs(columns, "--map"),
+            units={role: unit for role, unit in units.items() if unit is not None},
+            layout=layout,
+            lung=lung,
+            rate=rate,
+            split_breaths=split_breaths,
+            invert=invert or (),
+            select=_pairs(select, "--select"),
+            separator=separator,
+            decimal=decimal,
+        )
+    emit(imported.as_dict(), json)
+    to_stderr = str(json) == "-"
+    for name, role in imported.columns.items():
+        change = imported.conversions.get(role)
+        unit = f" ({change})" if change is not None else ""
+        typer.echo(f"{name}: {role}{unit}", err=to_stderr)
+    for note in imported.understood:
+        typer.echo(note, err=to_stderr)
+    for warning in imported.warnings:
+        typer.echo(f"warning: {warning}", err=True)
+    typer.echo(imported.preview, err=to_stderr)
+    if out is None:
+        typer.echo("Nothing was written; give --out recording.csv to write it.", err=to_stderr)
+        return
+    recordings.write(imported.breaths, out)
+    lengths = imported.breaths.valid.sum(axis=1)
+    pad = " (breaths of unequal length: read it with --pad)" if len(set(lengths)) > 1 else ""
+    typer.echo(f"wrote {len(imported.breaths)} breaths to {out}{pad}", err=to_stderr)
+
+
+def _pairs(given: list[str] | None, option: str) -> dict[str, str]:
+    """Split ``NAME=VALUE``."""
+    from ventbench.errors import InputError
+
+    pairs = {}
+    for text in given or ():
+        name, equals, value = text.rpartition("=")
+        if not equals or not name or not value:
+            raise InputError(f"{option} {text}: NAME=VALUE is wanted, such as Paw=pressure")
+        pairs[name] = value
+    return pairs
 
 
 @app.command()

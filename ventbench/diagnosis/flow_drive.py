@@ -59,6 +59,8 @@ def with_flow(breaths: Breaths) -> tuple[Breaths, list[str]]:
         InputError: if no breath has flow or volume in at least half of its samples.
     """
     notes, flow = [], breaths.flow
+    if flow is not None and not np.isfinite(flow).any():
+        flow = None
     if flow is None:
         if breaths.volume is None:
             raise InputError("the recording has neither flow nor volume to drive a diagnosis with")

@@ -8,6 +8,9 @@ from ventbench.recordings.problems import ProblemLog
 from ventbench.recordings.rows import Rows
 from ventbench.recordings.schema import COLUMNS, Column
 
+#: Rows from which a value that is repeated is reported once.
+_OFTEN = 10
+
 
 def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str, np.ndarray]:
     """Check each cell: blank, infinite, out of range.
@@ -46,8 +49,23 @@ def check_values(rows: Rows, log: ProblemLog, *, clip: bool = False) -> dict[str
             what = "{value} is neither 0 nor 1"
         elif column.positive:
             what = f"{{value}} is not in {column.span}"
-        log.add(rows.row0 + at, name, what, advice, values=values[at], level=level)
+        if name in ("R", "C"):  # the label of a whole recording: one mistake, not one a row
+            _add_once(rows.row0 + at, name, what, advice, values[at], log)
+        else:
+            log.add(rows.row0 + at, name, what, advice, values=values[at], level=level)
     return columns
+
+
+def _add_once(
+    at: np.ndarray, name: str, what: str, advice: str, values: np.ndarray, log: ProblemLog
+) -> None:
+    """Report a value that many rows repeat once, whatever blocks the file is read in."""
+    kinds, first, counts = np.unique(values, return_index=True, return_counts=True)
+    often = counts >= _OFTEN
+    single = ~np.isin(values, kinds[often])
+    log.add(at[single], name, what, advice, values=values[single])
+    for row, value in zip(first[often], kinds[often], strict=True):
+        log.add_once(int(at[row]), name, f"{what}, here and in more rows", advice, value)
 
 
 def _add_blank(rows: Rows, log: ProblemLog, name: str, blank: np.ndarray) -> None:

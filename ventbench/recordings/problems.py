@@ -177,6 +177,12 @@ class ProblemLog:
         kept.sort(key=lambda entry: entry.row)
         del kept[SHOWN:]
 
+    def add_once(self, row: int, column: str, what: str, advice: str, value: np.generic) -> None:
+        """Add a problem of many rows, unless the same value of the column is listed already."""
+        known = {(entry.column, entry.value, entry.what) for entry in self._kept["problem"]}
+        if (column, _text(value), what) not in known:
+            self.add(np.array([row]), column, what, advice, values=np.array([value]))
+
     def listed(self, level: Level, locate: Locate, place: str) -> tuple[RecordingProblem, ...]:
         """Return the kept problems of a level with their lines.
 

@@ -77,7 +77,8 @@ def check(path: FilePath, *, clip: bool = False, pad: bool = False) -> Recording
         pad: see `load`.
 
     Returns:
-        What the file holds and what is wrong with it; also for a file that cannot be read.
+        What the file holds and what is wrong with it; also for a file that cannot be read. A file
+        without any pressure is reported as a problem, though `load` takes it.
     """
     tally = Tally()
     log = ProblemLog(str(path))
@@ -98,7 +99,13 @@ def check(path: FilePath, *, clip: bool = False, pad: bool = False) -> Recording
             warnings=warnings,
             warning_count=len(warnings),
         )
-    return _report(source, log, tally)
+    report = _report(source, log, tally)
+    if report.ok and report.blank_pressures == report.rows:
+        what = f"all {report.rows} pressures are blank"
+        advice = "Fill in the pressure in cmH2O: there is nothing to compare a simulator with."
+        problem = RecordingProblem(source.file, what, advice, column="pressure")
+        return replace(report, problems=(problem,), problem_count=1)
+    return report
 
 
 def iter_breaths(

@@ -74,6 +74,10 @@ def kind_of(path: str | os.PathLike[str]) -> Kind:
         raise fail(name, "this is a zip archive", "Unpack it and name the CSV file in it.")
     if first.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise fail(name, "this is UTF-16 text", "Save the file as UTF-8.")
+    if first in (b"MATL", b"\x89HDF"):
+        what = "MATLAB" if first == b"MATL" else "HDF5 (MATLAB 7.3)"
+        advice = "Bring it into the schema with `ventbench data import`."
+        raise fail(name, f"this is a {what} file", advice)
     return "csv"
 
 

@@ -1,0 +1,214 @@
+"""Recordings of other laboratories: separators, units, MATLAB, breaths, layouts, messages."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+from typer.testing import CliRunner
+
+import ventbench
+from ventbench.cli.data import app
+from ventbench.errors import InputError
+from ventbench.recordings import check, load, write
+from ventbench.recordings.foreign import import_recording
+from ventbench.recordings.foreign.units import UNITS, conversion
+
+RATE, PERIOD = 50.0, 3.0
+
+
+def waveforms(cycles: float = 4.5) -> dict[str, np.ndarray]:
+    """Pressure (cmH2O) and flow (mL/s) of a ventilated lung; a cycle begins at 0, 3, 6, ... s."""
+    t = np.arange(0.0, cycles * PERIOD, 1.0 / RATE)
+    phase = t % PERIOD
+    inward = (phase >= 0.1) & (phase < 1.0)
+    out = phase >= 1.0
+    decay = np.exp(-(phase - 1.0) / 0.4)
+    flow = np.where(inward, 500.0, np.where(out, -700.0 * decay, 0.0))
+    pressure = 5.0 + np.where(inward, 10.0 + 20.0 * (phase - 0.1), np.where(out, 18.0 * decay, 0.0))
+    return {"t": t, "pressure": pressure, "flow": flow}
+
+
+def german(path: Path) -> Path:
+    """Semicolons, decimal commas, two lines above the header, units in it, milliseconds."""
+    made = waveforms()
+    lines = ["Messung 7", "Gerät: Labor", "Zeit [ms];Paw [mbar];Flow [L/min]"]
+    for t, p, q in zip(*made.values(), strict=True):
+        lines.append(f"{1e3 * t:.0f};{p / 1.019716213:.4f};{q * 0.06:.4f}".replace(".", ","))
+    path.write_text("\n".join(lines) + "\n", encoding="latin-1")
+    return path
+
+
+def test_a_table_of_another_country(tmp_path):
+    imported = import_recording(german(tmp_path / "lab.csv"), lung="R20C50")
+    breaths, made = imported.breaths, waveforms()
+    assert len(breaths) == 4, "the last cycle is not whole"
+    assert imported.columns == {"Zeit": "time", "Paw": "pressure", "Flow": "flow"}
+    first = np.argmin(np.abs(made["t"] - 3.0))  # where the second breath begins
+    start = int(np.argmax(breaths.flow[1] > 100.0))
+    np.testing.assert_allclose(
+        breaths.pressure[1, start : start + 100],
+        made["pressure"][first + 5 : first + 105], atol=2e-4,
+    )  # fmt: skip
+    np.testing.assert_allclose(np.nanmax(breaths.flow), 500.0, rtol=1e-5)
+    out = (breaths.u_out[0] == 1) & breaths.valid[0]
+    inward = (breaths.u_out[0] == 0) & breaths.valid[0]
+    assert np.all(breaths.flow[0][out] <= 0.0)
+    assert np.all(breaths.flow[0][inward] >= 0.0)
+    assert not breaths.u_in.any()
+    text = " ".join(imported.understood)
+    for part in ("Latin-1", "decimal ','", "20 ms", "flow turns inwards", "2 lines above"):
+        assert part in text
+
+
+def test_units_are_exact_both_ways():
+    values = np.array([0.1, -3.7, 41.3])
+    for role, units in UNITS.items():
+        for unit in units:
+            change = conversion(role, unit)
+            back = change.invert(change.apply(values))
+            np.testing.assert_allclose(back, values, rtol=4e-16)
+    assert conversion("flow", "lpm").apply(np.array([60.0]))[0] == 1000.0
+    assert conversion("pressure", "kPa").apply(np.array([0.0980665]))[0] == pytest.approx(1.0)
+    assert str(conversion("flow", "L/min")) == "L/min -> mL/s, x 50/3 (back: x 3/50)"
+    with pytest.raises(InputError, match="no unit of flow"):
+        conversion("flow", "furlong")
+
+
+def test_matlab_struct_with_its_rate(tmp_path):
+    made, path = waveforms(), tmp_path / "lab.mat"
+    savemat(path, {"data": {"Paw": made["pressure"], "Flow": made["flow"]}, "fs": RATE})
+    imported = import_recording(path, lung="R5C20")
+    assert len(imported.breaths) == 4
+    assert "50 Hz, from fs" in " ".join(imported.understood)
+    with pytest.raises(InputError, match="MATLAB file"):
+        load(path)
+    assert "data import" in check(path).problems[0].advice
+    (tmp_path / "new.mat").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
+    with pytest.raises(InputError, match="-v7"):
+        import_recording(tmp_path / "new.mat")
+
+
+def test_logs_of_a_pvp(tmp_path):
+    """Quoted names with blanks, as `log2csv` writes them; the cycle numbers the breaths."""
+    made = waveforms(4.0)
+    cycle = np.floor(made["t"] / PERIOD)
+    out = (made["t"] % PERIOD >= 1.0).astype(float)
+    head = (
+        "'timestamp', 'pressure', 'flow_out', 'control_in', 'control_out', 'oxygen', 'cycle_number'"
+    )
+    columns = [made["t"] + 1.6e9, made["pressure"], 0 * out, 20 * (1 - out), out, 0 * out, cycle]
+    path = tmp_path / "waveforms.csv"
+    np.savetxt(path, np.stack(columns, axis=1), delimiter=",", header=head, comments="")
+    imported = import_recording(path, lung="R20C20")
+    assert "Layout pvp" in " ".join(imported.understood)
+    assert len(imported.breaths) == 4
+    np.testing.assert_allclose(imported.breaths.time[:, 1], 0.02, atol=1e-6)
+    assert imported.breaths.u_in.max() == 20.0
+    assert imported.breaths.flow is None
+
+
+def test_kaggle_layout_is_read_as_it_is(tmp_path):
+    recorded = load(ventbench.example("concealed"))
+    imported = import_recording(ventbench.example("concealed"))
+    np.testing.assert_array_equal(imported.breaths.pressure, recorded.pressure)
+    np.testing.assert_allclose(imported.breaths.time, recorded.time, atol=1e-12)
+    np.testing.assert_array_equal(imported.breaths.u_in, recorded.u_in)
+
+
+def test_respiraworks_by_run_and_test(recordings_folder):
+    path = recordings_folder / "respiraworks_quicklung.parquet"
+    imported = import_recording(path, select={"run": "2020-07-31-UFlow-Performance", "test": "4"})
+    assert imported.breaths.lung_ids[0] == "R20C20"
+    assert len(imported.breaths) >= 7
+    assert imported.breaths.flow is not None
+
+
+@pytest.fixture
+def recordings_folder():
+    from ventbench.recordings import recordings_dir
+
+    folder = recordings_dir()
+    if folder is None or not (folder / "respiraworks_quicklung.parquet").is_file():
+        pytest.skip("the public recordings are not here")
+    return folder
+
+
+def test_breaths_from_pressure_alone_and_from_a_rate(tmp_path):
+    made = waveforms()
+    path = tmp_path / "p.txt"
+    path.write_text("\n".join(f"{p:.3f}\t1" for p in made["pressure"]))
+    imported = import_recording(path, columns={"1": "pressure"}, rate=RATE, lung="R20C50")
+    assert len(imported.breaths) == 4
+    assert "where pressure rises" in " ".join(imported.understood)
+    with pytest.raises(InputError, match="--rate 50"):
+        import_recording(path, columns={"1": "pressure"}, lung="R20C50")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"columns": {"Pow": "pressure"}}, r"no column 'Pow'.*Perhaps 'Paw'"),
+        ({"columns": {"Paw": "voltage"}}, "a column may be time"),
+        ({}, "--lung R20C50"),
+        ({"lung": "R20C50", "units": {"flow": "L/s"}}, r"column Flow: \d+ of \d+ values"),
+        ({"lung": "R20C50", "layout": "pvp"}, "no column timestamp"),
+        ({"lung": "R20C50", "layout": "none"}, "choose one of kaggle"),
+        ({"lung": "R20C50", "invert": ["volume"]}, "no column is volume"),
+        ({"lung": "R20C50", "select": {"run": "3"}}, "no column run"),
+        ({"lung": "R20C50", "units": {"time": "s"}}, "no whole breath"),
+    ],
+)
+def test_messages_say_what_to_do(tmp_path, options, message):
+    with pytest.raises(InputError, match=message):
+        import_recording(german(tmp_path / "lab.csv"), **options)
+
+
+def test_blank_pressures_are_refused(tmp_path):
+    path = tmp_path / "blank.csv"
+    path.write_text("time,Paw\n" + "\n".join(f"{0.02 * k:.2f}," for k in range(200)))
+    with pytest.raises(InputError, match="every pressure is blank"):
+        import_recording(path, lung="R20C50")
+    recorded = load(ventbench.example("concealed")).select([0, 1])
+    blank = tmp_path / "public.csv"
+    import dataclasses
+
+    write(dataclasses.replace(recorded, pressure=np.full_like(recorded.pressure, np.nan)), blank)
+    report = check(blank)
+    assert not report.ok
+    assert "all 160 pressures are blank" in report.problems[0].what
+
+
+def test_one_wrong_label_is_one_problem(tmp_path):
+    path = tmp_path / "wrong.csv"
+    text = ventbench.example("concealed").read_text().splitlines()
+    rows = [row.split(",") for row in text]
+    place = rows[0].index("R")
+    for row in rows[1:]:
+        row[place] = "5000"
+    path.write_text("\n".join(",".join(row) for row in rows))
+    report = check(path)
+    assert report.problem_count == 1
+    assert "here and in more rows" in report.problems[0].what
+
+
+def test_the_command_shows_writes_and_reports(tmp_path):
+    lab, out = german(tmp_path / "lab.csv"), tmp_path / "out.csv"
+    run = CliRunner()
+    shown = run.invoke(app, ["import", str(lab), "--lung", "R20C50"])
+    assert shown.exit_code == 0, shown.output
+    assert "Flow: flow (L/min -> mL/s, x 50/3 (back: x 3/50))" in shown.output
+    assert "Nothing was written" in shown.output
+    plain = run.invoke(
+        app, ["import", str(lab), "--lung", "R20C50", "--out", str(out), "--json", "-"]
+    )
+    report = json.loads(plain.stdout)
+    assert report["units"]["flow"] == {
+        "unit": "L/min", "to": "mL/s", "numerator": 50, "denominator": 3,
+    }  # fmt: skip
+    assert len(load(out, pad=True)) == report["breaths"] == 4
+    bad = run.invoke(app, ["import", str(lab), "--map", "Paw"])
+    assert "NAME=VALUE is wanted" in str(bad.exception)

@@ -25,6 +25,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from hardware_eval import realtime
 from hardware_eval.device.faults import AnyFault, Line, LineFault, LungFault, parse
 from hardware_eval.device.hal import Hal
 from hardware_eval.device.loopback import Actuation
@@ -275,6 +276,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--quantum", type=float, default=0.0, help="step of the sensor's converter, cmH2O"
     )
+    parser.add_argument(
+        "--realtime",
+        action="store_true",
+        help="real-time scheduling, as on a device of its own; needs the right to it",
+    )
     parser.add_argument("--pressure-limit", type=float, help="device's own limit, cmH2O")
     given = parser.parse_args(arguments)
     try:
@@ -311,6 +317,8 @@ def _emulate(given: argparse.Namespace) -> int:
         hal, settings, link=given.link, control=given.control, line_faults=line_faults,
         log=given.log,
     )  # fmt: skip
+    if given.realtime and (reason := realtime.prefer()):
+        raise InputError(f"--realtime: {reason}; run as root, or without it")
     ended = False
 
     def end(number: int, frame: FrameType | None) -> None:

@@ -15,14 +15,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
 
+from hardware_eval import realtime
 from hardware_eval.device.hal import Hal
 from hardware_eval.device.program import PERIOD, DeviceSettings
 from hardware_eval.device.service import DeviceService
 from hardware_eval.link import BAUD_RATE
 from ventbench.errors import InputError
-
-#: Priority among real-time processes: above everything but the kernel's own threads.
-_PRIORITY = 40
 
 
 def serve(
@@ -149,7 +147,8 @@ def _run(given: argparse.Namespace) -> int:
     hal = PvpHal(given.config)
     try:
         if not given.vent:
-            _prefer()
+            if reason := realtime.prefer():
+                print(f"no real-time scheduling: {reason}", file=sys.stderr)
             _serve_until_signal(hal, settings, open_line)
     finally:
         hal.close()
@@ -170,14 +169,6 @@ def _serve_until_signal(
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, end)
     serve(DeviceService(hal, settings, time.monotonic()), open_line, lambda: ended)
-
-
-def _prefer() -> None:
-    """Ask for real-time scheduling; without the right to it the program runs all the same."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
-    except (AttributeError, OSError) as error:
-        print(f"no real-time scheduling: {error}", file=sys.stderr)
 
 
 if __name__ == "__main__":

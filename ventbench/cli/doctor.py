@@ -20,7 +20,7 @@ _EXTRAS = {
     "view": ("jinja2", "matplotlib", "rerun-sdk"),
     "hardware": ("pyserial",),
     "dask": ("distributed",),
-    "gym": ("gymnasium",),
+    "gym": ("gymnasium", "safetensors"),
     "attest": ("cryptography",),
 }
 

@@ -1,0 +1,146 @@
+"""Train PPO of Stable-Baselines3 on 144 ventilators at once, and make it a submission.
+
+Needs `pip install stable-baselines3` beside ventbench[gym]. The number of thousands of steps may
+follow as an argument: 1000 by default, about five minutes on two cores.
+"""
+
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+from safetensors.numpy import save_file
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnv
+
+import ventbench
+
+STEPS = 1000 * int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000
+OUT = Path("runs/stable_baselines3/sb3_ppo")
+COMMANDS = 33  # of one breath
+
+
+class Ventilators(VecEnv):
+    """The vector environment as Stable-Baselines3 wants it: breaths begin anew by themselves."""
+
+    def __init__(self, count):
+        self.made = gymnasium.make_vec("ventbench.gym_env:ventbench/Ventilator-v1", num_envs=count)
+        super().__init__(count, self.made.single_observation_space, self.made.single_action_space)
+
+    def reset(self):
+        return self.made.reset(seed=self._seeds[0])[0]
+
+    def step_async(self, actions):
+        self.actions = actions
+
+    def step_wait(self):
+        seen, rewards, ended, _, info = self.made.step(self.actions)
+        infos = [{} for _ in range(self.num_envs)]
+        if ended.all():
+            errors = info["error"]
+            for k in range(self.num_envs):
+                infos[k] = {
+                    "terminal_observation": seen[k],
+                    "episode": {"r": -errors[k], "l": COMMANDS, "t": 0.0},
+                }
+            seen = self.made.step(self.actions)[0]  # the step that begins new breaths
+        return seen, rewards.astype(np.float32), ended, infos
+
+    def close(self):
+        self.made.close()
+
+    def get_attr(self, attr_name, indices=None):
+        return [getattr(self.made, attr_name, None)] * self.num_envs
+
+    def set_attr(self, attr_name, value, indices=None):
+        raise NotImplementedError
+
+    def env_method(self, method_name, *args, indices=None, **kwargs):
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class, indices=None):
+        return [False] * self.num_envs
+
+
+CONTROLLER = '''"""A policy of Stable-Baselines3 in numpy: what it sees, and two tanh layers."""
+
+from pathlib import Path
+
+import numpy as np
+from safetensors.numpy import load_file
+
+weights = load_file(Path(__file__).with_name("weights.safetensors"))
+
+
+class Controller:
+    def reset(self, task):
+        pass
+
+    def act(self, observation):
+        x = np.array(
+            [
+                observation.pressure / 40,
+                observation.target / 40,
+                *(target / 40 for target in observation.targets_ahead),
+                observation.previous_u_in / 50 - 1,
+                observation.time,
+                observation.dt / 0.03,
+            ]
+        )
+        for k in range(2):
+            x = np.tanh(weights[f"w{k}"] @ x + weights[f"b{k}"])
+        action = float((weights["w2"] @ x + weights["b2"])[0])
+        return 50 + 50 * min(max(action, -1.0), 1.0)
+'''
+
+MANIFEST = """name = "sb3_ppo"
+authors = ["you"]
+licence = "Apache-2.0"
+api_version = 1
+family = "ppo"
+tracks = ["robustness"]
+description = "PPO of Stable-Baselines3 on what the Gymnasium environment shows, one network."
+
+[training]
+data = "no recordings; breaths on the six frozen simulators with random deviations"
+simulators = "1"
+seeds = [0]
+"""
+
+
+def export(model, folder):
+    """Write the policy's mean action as a submission."""
+    policy = model.policy
+    layers = [policy.mlp_extractor.policy_net[0], policy.mlp_extractor.policy_net[2]]
+    arrays = {}
+    for k, layer in enumerate([*layers, policy.action_net]):
+        arrays[f"w{k}"] = layer.weight.detach().cpu().numpy()
+        arrays[f"b{k}"] = layer.bias.detach().cpu().numpy()
+    folder.mkdir(parents=True, exist_ok=True)
+    save_file(arrays, folder / "weights.safetensors")
+    (folder / "controller.py").write_text(CONTROLLER)
+    (folder / "submission.toml").write_text(MANIFEST)
+    (folder / "README.md").write_text("PPO of Stable-Baselines3; see examples/.\n")
+
+
+model = PPO(
+    "MlpPolicy",
+    Ventilators(144),
+    n_steps=COMMANDS,
+    batch_size=1188,
+    n_epochs=8,
+    gamma=0.95,
+    gae_lambda=0.9,
+    learning_rate=1e-3,
+    policy_kwargs={"net_arch": [64, 64], "log_std_init": -1.0},
+    seed=0,
+    device="cpu",
+    verbose=1,
+)
+model.learn(STEPS)
+export(model, OUT)
+
+mine = ventbench.score(OUT, draws=3)
+pid = ventbench.score("pid_robust", draws=3, track="robustness")
+print(mine)
+print(f"mean of three draws: PPO {mine.drawn.mean():.3f}, PID {pid.drawn.mean():.3f} cmH2O")

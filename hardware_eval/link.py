@@ -20,6 +20,12 @@ from hardware_eval.errors import (
 #: Bits per second; USB devices ignore it. A control step then takes 9 ms of a real UART.
 BAUD_RATE = 115_200
 
+#: Longest time in which the port does not take what is written, s.
+WRITE_TIMEOUT = 1.0
+
+#: A wait for bytes ends this late at most, s.
+READ_SLICE = 0.002
+
 
 @dataclass(frozen=True, slots=True)
 class ReconnectPolicy:
@@ -83,11 +89,14 @@ class Link:
         Raises:
             DisconnectedError: if the port has gone.
         """
+        end = time.monotonic() + timeout
         try:
-            self._port.timeout = timeout
-            data = self._port.read(1)
-            waiting = self._port.in_waiting if data else 0
-            return data + self._port.read(waiting) if waiting else data
+            while True:
+                if data := self._port.read(1):
+                    waiting = self._port.in_waiting
+                    return data + self._port.read(waiting) if waiting else data
+                if time.monotonic() >= end:
+                    return b""
         except (OSError, TypeError, serial.SerialException) as error:
             raise self._disconnected(error) from error
 
@@ -118,7 +127,8 @@ class Link:
             port = serial.serial_for_url(self.url, self._baud_rate, do_not_open=True)
             if isinstance(port, serial.Serial):
                 port.exclusive = True  # a second program would steal bytes
-            port.write_timeout = 1.0
+            port.write_timeout = WRITE_TIMEOUT
+            port.timeout = READ_SLICE  # fixed: pyserial configures the port anew at each change
             port.open()
         except ValueError as error:
             raise PortMissingError(

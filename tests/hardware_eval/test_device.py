@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from hardware_eval.client import Client
@@ -190,3 +191,33 @@ def test_a_device_that_was_held_up_vents_before_it_listens(
     after = device.service.state
     assert (after.mode, after.u_in, after.u_out) == (Mode.VENTED, 0.0, 1)
     assert Flag.DEVICE_LATE in after.causes
+
+
+@pytest.mark.parametrize(
+    "kills", [60, pytest.param(1000, marks=pytest.mark.slow)], ids=["some", "a thousand"]
+)
+def test_hosts_killed_at_any_moment_leave_a_vented_lung(kills: int) -> None:
+    """Also in the middle of a frame, and whatever the phases of host, device and line are."""
+    rng = np.random.default_rng(0)
+    for _ in range(kills):
+        bench = Bench()
+        device = LoopbackDevice(bench, latency=rng.uniform(0.0, 0.004))
+        device.clock.advance(rng.uniform(0.0, PERIOD))
+        client = Client(device, device.clock)
+        client.hello()
+        client.arm()
+        for _ in range(rng.integers(1, 5)):
+            client.heartbeat()
+            device.clock.advance(rng.uniform(0.0, 0.015))
+            client.command(rng.uniform(1.0, 100.0), 0)
+            device.clock.advance(rng.uniform(0.0, 0.010))
+        assert not _vented(bench)
+        killed, state = device.clock.now(), device.service.state
+        assert state.session is not None
+        seen = round(killed * 1000)
+        frame = encode(Packet(state.session, state.sequence + 1, Command(99.0, 0, seen)))
+        device.write(frame[: rng.integers(0, len(frame))])
+        device.clock.advance(0.3)
+        vented = next(time for time, u_in, u_out in bench.valves if time > killed and u_out == 1)
+        assert vented - killed <= VENTED_WITHIN
+        assert _vented(bench)

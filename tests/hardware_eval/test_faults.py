@@ -161,6 +161,7 @@ def test_faults_of_the_line(kind: LineFaultKind, strength: float, times_out: boo
     assert client.vent().mode is Mode.VENTED  # the line is in order again
     counted = client.statistics()
     assert counted.unanswered == int(times_out)
+    assert counted.unexpected == int(kind is LineFaultKind.LATE and times_out)
 
 
 def test_a_pulled_cable_vents_and_the_client_comes_back() -> None:

@@ -122,6 +122,7 @@ def run(
 
     Example: `ventbench-hardware run submissions/pid_best --port /dev/ttyACM0 --lung R20C50`
     """
+    from hardware_eval import clock
     from hardware_eval import evaluate as ev
     from hardware_eval.console import ConsoleOperator, RerunView, TerminalView, Views
     from hardware_eval.plan import make_plan
@@ -150,7 +151,7 @@ def run(
 
     line = ev.connect(port)
     try:
-        with person.keys():
+        with person.keys(), clock.priority():
             done = ev.evaluate(
                 entries, line, out, person, plan=plan, view=views, sandbox=sandbox, dry=dry_run,
                 before_lung=before_lung, settings=settings, operator_name=operator, notes=notes,
@@ -200,9 +201,15 @@ def emulate(context: typer.Context) -> None:
 
     Example: `ventbench-hardware emulate --lung R20C50 --link ./lung`
     """
+    import os
+
+    # In the thread that asks, which has priority; read when JAX is first imported.
+    os.environ.setdefault("JAX_CPU_ENABLE_ASYNC_DISPATCH", "false")
+    from hardware_eval.clock import priority
     from hardware_eval.emulator import main as run_emulator
 
-    code = run_emulator(context.args)
+    with priority():
+        code = run_emulator(context.args)
     if code:
         raise typer.Exit(code)
 
@@ -218,6 +225,7 @@ def selftest(
 
     Example: `ventbench-hardware selftest --port /dev/ttyACM0 --lung R20C50`
     """
+    from hardware_eval import clock
     from hardware_eval import evaluate as ev
     from hardware_eval.console import ConsoleOperator
     from hardware_eval.safety import DEFAULT
@@ -229,7 +237,7 @@ def selftest(
     person = ConsoleOperator(yes=True)
     line = ev.connect(port)
     try:
-        with person.keys():
+        with person.keys(), clock.priority():
             sheet = run_selftest(
                 Bench(line.client, line.clock, DEFAULT, person), label, simulator=plant
             )

@@ -217,7 +217,6 @@ def drive(bench: Bench, lung: str, commands: Commands, steps: int, *, pip: float
     try:
         client.vent()
         clock.sleep_until(clock.now() + bench.rest)
-        client.heartbeat()
         start = clock.now() + protocol.DT
         client.arm()
         for step in range(steps):

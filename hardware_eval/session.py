@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from hardware_eval import safety
 from hardware_eval.client import Client
-from hardware_eval.clock import Clock
+from hardware_eval.clock import Clock, has_priority, take_priority
 from hardware_eval.errors import LinkError, NoAnswerError, RefusedError
 from hardware_eval.messages import Flag, Reading
 from hardware_eval.plan import (
@@ -104,7 +104,8 @@ class SubmissionController:
         self._session = runner.start(submission, [task])
         self._real_time = real_time
         self._label = submission.manifest.name
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="controller")
+        begin = take_priority if has_priority() else None  # a thread that waits for a pipe
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="controller", initializer=begin)
         self._pending: Future[Floats] | None = None
         self._check()
 
@@ -360,7 +361,6 @@ class _Loop:
         bench = self._bench
         bench.client.vent()
         bench.clock.sleep_until(bench.clock.now() + bench.rest)
-        armed = bench.client.heartbeat()
         start = bench.clock.now() + protocol.DT
         try:
             armed = bench.client.arm()

@@ -29,8 +29,9 @@ app = typer.Typer(
 Port = Annotated[
     str,
     typer.Option(
-        help="Serial port of the device, such as /dev/ttyACM0, socket://HOST:PORT, or the path "
-        "that `emulate` prints."
+        help="Serial port of the device, such as /dev/ttyACM0, socket://HOST:PORT, the path that "
+        "`emulate` prints, or virtual:R20C50, an emulated lung in this process, faster than real "
+        "time."
     ),
 ]
 Lungs = Annotated[
@@ -246,6 +247,136 @@ def selftest(
     emit(sheet.as_dict(), json)
     print(sheet, file=sys.stderr if str(json) == "-" else sys.stdout)
     if not sheet.go:
+        raise typer.Exit(1)
+
+
+@app.command()
+def compare(
+    recorded: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RECORD",
+            help="Hardware record, with its raw.jsonl beside it; or a session's folder, a log, or "
+            "a recording in the public schema.",
+        ),
+    ],
+    log: Annotated[
+        Path | None, typer.Option(help="Raw recording of the record, if it lies elsewhere.")
+    ] = None,
+    plant: Annotated[
+        str, typer.Option(help="Simulators, as of every --plant of ventbench.")
+    ] = "frozen",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for the diagnosis of each lung: report, JSON, corrected simulator.",
+        ),
+    ] = None,
+    diagnose: Annotated[
+        bool, typer.Option(help="Also say which physics is missing; --no-diagnose is quick.")
+    ] = True,
+    json: JsonFile = None,
+) -> None:
+    """Show where simulators and the lung part, by lung and waveform, and diagnose it.
+
+    Example: `ventbench-hardware compare runs/hardware --out runs/mismatch`
+    """
+    from hardware_eval import compare as comparison
+
+    breaths = comparison.recorded_breaths(recorded, log)
+    done = comparison.compare(breaths, simulator=plant, diagnose=diagnose)
+    if out is not None:
+        for lung, diagnosis in done.diagnoses.items():
+            diagnosis.save(out / lung)
+    emit(done.as_dict(), json)
+    print(done, file=sys.stderr if str(json) == "-" else sys.stdout)
+
+
+@app.command()
+def collect(
+    port: Port,
+    lung: Annotated[str, typer.Option(help="Label of the mounted lung.")],
+    breaths: Annotated[int, typer.Option(min=1, help="Breaths in all.")] = 60,
+    seed: Annotated[int, typer.Option(help="Seed of the disturbances.")] = 0,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Log and recording; a collection continues.")
+    ] = Path("runs/exploration"),
+    ease: Annotated[
+        float, typer.Option(help="Pressure above which the valve closes, cmH2O.")
+    ] = 45.0,
+    yes: Yes = False,
+    json: JsonFile = None,
+) -> None:
+    """Explore a lung as in the paper, safely, to make a training recording.
+
+    Example: `ventbench-hardware collect --port /dev/ttyACM0 --lung R20C50 --breaths 600`
+    """
+    from hardware_eval import clock
+    from hardware_eval import collect as collection
+    from hardware_eval import evaluate as ev
+    from hardware_eval.console import ConsoleOperator
+    from hardware_eval.safety import DEFAULT
+    from hardware_eval.session import Bench
+    from ventbench.cli.options import bars
+    from ventbench.lungs import scored_lung
+    from ventbench.training.exploration import Limits
+
+    label = scored_lung(lung).id
+    person = ConsoleOperator(yes=yes)
+    line = ev.connect(port)
+    try:
+        if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
+            raise typer.Exit(1)
+        about = {"device": ev.device_about(line.client.welcome or line.client.hello())}
+        with person.keys(), clock.priority(), bars() as shown:
+            bar = shown.add_task("exploring", total=breaths)
+            done = collection.collect(
+                Bench(line.client, line.clock, DEFAULT, person), label, breaths, out, seed=seed,
+                limits=Limits(ease=ease), about=about,
+                progress=lambda number: shown.update(bar, completed=number),
+            )  # fmt: skip
+    finally:
+        line.client.close()
+    count = len(done.breaths)
+    emit({"breaths": count, "recording": str(done.recording), "stopped": done.stopped}, json)
+    to = sys.stderr if str(json) == "-" else sys.stdout
+    print(f"{count} whole breaths: {done.recording}", file=to)
+    if done.stopped:
+        print(f"stopped: {plain(done.stopped)}; the same command continues", file=to)
+        raise typer.Exit(1)
+
+
+@app.command()
+def demo(
+    conceal: Annotated[
+        str, typer.Option(metavar="WORDS", help="They determine the concealed physics.")
+    ] = "monday",
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Empty folder for everything.")] = Path(
+        "runs/demo"
+    ),
+    fast: Annotated[
+        bool,
+        typer.Option("--fast", help="On a virtual clock in this process, not on a terminal."),
+    ] = False,
+    breaths: Annotated[int, typer.Option(min=12, help="Breaths to explore.")] = 36,
+    sandbox: Annotated[bool, typer.Option(help="Run entries as in scoring.")] = True,
+    json: JsonFile = None,
+) -> None:
+    """Close the loop on an emulated lung that conceals physics: find it, correct, control better.
+
+    Example: `ventbench-hardware demo --conceal "any words" --out runs/demo`
+    """
+    from hardware_eval.demo import demo as run_demo
+
+    to = sys.stderr if str(json) == "-" else sys.stdout
+    done = run_demo(
+        conceal, out, breaths=breaths, real_time=not fast, sandbox=sandbox,
+        tell=lambda text: print(text, file=to, flush=True),
+    )  # fmt: skip
+    emit(done.as_dict(), json)
+    print(f"\n{done}", file=to)
+    if not done.better:
         raise typer.Exit(1)
 
 

@@ -75,14 +75,31 @@ class Line:
         return isinstance(self.clock, RealClock)
 
 
+#: Begins a port that is an emulated device in this process, on a virtual clock.
+VIRTUAL = "virtual:"
+
+
 def connect(port: str) -> Line:
-    """Open a port in real time.
+    """Open a port.
+
+    Args:
+        port: a serial port or socket, in real time; or ``virtual:R20C50``, an emulated lung in this
+            process on a virtual clock, where breaths take a fraction of a second.
 
     Raises:
         LinkError: if it cannot be opened, or no device answers.
+        InputError: if there is no such emulated lung.
     """
     from hardware_eval.link import Link
 
+    if port.startswith(VIRTUAL):
+        from hardware_eval.device.loopback import loopback
+        from hardware_eval.device.simulated import simulated_lung
+
+        device = loopback(simulated_lung(port.removeprefix(VIRTUAL)))
+        virtual = Client(device, device.clock)
+        virtual.hello()
+        return Line(virtual, device.clock)
     client = Client(Link(port))
     try:
         client.hello()

@@ -74,8 +74,9 @@ class SafetySettings:
     )  # fmt: skip
     over_volume: Check = Check(
         1.5, "times C (limit - PEEP)", 0.0, False,
-        "Volume that would take the labelled lung half beyond the pressure limit has gone in; "
-        "from flow if it is measured, else from the valve's flow.",
+        "Volume that would take the labelled lung half beyond the pressure limit has gone in. "
+        "Where no flow is measured, the valve's is taken and twice as much allowed, as a leak "
+        "takes its part; never more than 2.5 L, more than a test lung holds.",
     )  # fmt: skip
     disconnected: Check = Check(
         0.12, "of V / C", 0.15, True,
@@ -325,6 +326,9 @@ _SHOWS = 8.0
 #: pressure of a closed circuit may settle, s.
 _OPENS_S, _SETTLES_S = 0.6, 0.12
 
+#: Volume that no test lung takes, mL.
+_LARGEST_VOLUME = 2500.0
+
 #: Pressure above PEEP that an open expiratory valve may always leave, cmH2O.
 _LEAST_LEFT = 4.0
 
@@ -343,7 +347,8 @@ def _values(
     if before is not None and math.isfinite(before.pressure) and math.isfinite(pressure):
         steps = max((sample.time - before.time) / protocol.DT, 1.0)
         jump = abs(pressure - before.pressure) / steps
-    largest = settings.over_volume.threshold * C * (limit - protocol.PEEP)
+    allowed = settings.over_volume.threshold * (1.0 if math.isfinite(sample.flow) else 2.0)
+    largest = min(allowed * C * (limit - protocol.PEEP), _LARGEST_VOLUME)
     still = sample.time - state.unchanged
     climbed = pressure - state.closed_pressure if not math.isnan(state.closed) else 0.0
     settled = not math.isnan(state.closed) and sample.time - state.closed >= _SETTLES_S

@@ -1,0 +1,443 @@
+"""The loop closed: a lung that conceals physics, found, corrected for, and controlled better.
+
+An emulated lung conceals physics that the simulators lack, drawn from the challenge and sealed. A
+PID that is the best of the paper's grid in simulation runs on it and does worse than there. The
+comparison of a recording with the simulator names what is missing; the corrected simulator chooses
+the PID anew; it runs on the same lung. Only then the seal is opened. Nothing in between reads it.
+"""
+
+from __future__ import annotations
+
+import html
+import itertools
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hardware_eval import evaluate as ev
+from hardware_eval import session
+from hardware_eval.client import Client
+from hardware_eval.collect import collect
+from hardware_eval.compare import Comparison, compare, scored_plants
+from hardware_eval.concealed import conceal, reveal
+from hardware_eval.device.loopback import loopback
+from hardware_eval.device.simulated import SimulatedHal
+from hardware_eval.evaluate import Evaluation, Line
+from hardware_eval.plan import Plan, make_plan
+from hardware_eval.raw_log import lines
+from hardware_eval.safety import DEFAULT
+from hardware_eval.session import Bench, Operator, SilentOperator
+from ventbench import files
+from ventbench.errors import InputError
+from ventbench.interfaces import Plant
+from ventbench.submissions.folder import open_submission
+from ventbench.submissions.scaffold import contents
+
+Floats = NDArray[np.float64]
+
+#: PIPs of the demo, cmH2O: few, so that it takes minutes.
+PIPS = (10.0, 20.0, 30.0)
+
+#: Breaths that are collected for the comparison.
+BREATHS = 36
+
+#: Noise of the emulated sensor, cmH2O, and the step of its converter (PVP's).
+NOISE, QUANTUM = 0.1, 0.0703
+
+#: Patience with an emulator that starts, s.
+_STARTS_S = 90.0
+
+#: Rest before a run, s.
+_REST = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Demo:
+    """Figures of every step; errors in cmH2O.
+
+    Attributes:
+        words: what the lung was drawn from.
+        lung: its label.
+        commitment: hash of the sealed answer, published first.
+        gains: P, I, D of the entry before and after the correction, %/cmH2O.
+        simulated: error of the entry on the emulator of the plain simulator, by PIP.
+        measured: its error on the lung that conceals something, by PIP.
+        comparison: simulators against the collected recording.
+        verdict: of the diagnosis.
+        named: mechanisms that it names, with their parameters.
+        open_loop: held-out open-loop error before, refitted and after the correction.
+        predicted: error of the retuned entry on the corrected simulator, mean over PIPs.
+        retuned: error of the retuned entry on the lung, by PIP.
+        truth: what the seal held.
+        folder: where everything lies.
+        seconds: duration.
+    """
+
+    words: str
+    lung: str
+    commitment: str
+    gains: tuple[tuple[float, ...], tuple[float, ...]]
+    simulated: dict[float, float]
+    measured: dict[float, float]
+    comparison: Comparison
+    verdict: str
+    named: dict[str, dict[str, float]]
+    open_loop: tuple[float, float, float]
+    predicted: float
+    retuned: dict[float, float]
+    truth: dict[str, Any]
+    folder: Path
+    seconds: float
+
+    @property
+    def right(self) -> bool:
+        """Whether the concealed mechanism was named."""
+        return self.truth["name"] in self.named
+
+    @property
+    def better(self) -> bool:
+        """Whether the retuned entry does better on the lung than the first."""
+        return _mean(self.retuned) < _mean(self.measured)
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values."""
+        return files.json_values(
+            {
+                "words": self.words,
+                "lung": self.lung,
+                "commitment": self.commitment,
+                "gains": {"entry": self.gains[0], "retuned": self.gains[1]},
+                "errors": {
+                    "simulated": self.simulated,
+                    "measured": self.measured,
+                    "retuned": self.retuned,
+                    "predicted_mean": self.predicted,
+                },
+                "verdict": self.verdict,
+                "named": self.named,
+                "open_loop_mae": dict(
+                    zip(("before", "refit", "after"), self.open_loop, strict=True)
+                ),
+                "truth": self.truth,
+                "right": self.right,
+                "better": self.better,
+                "seconds": self.seconds,
+            }
+        )
+
+    def steps(self) -> list[tuple[str, str]]:
+        """Title and figures of every step."""
+        named = "; ".join(
+            f"{name} ({', '.join(f'{key} {value:.3g}' for key, value in values.items())})"
+            for name, values in self.named.items()
+        )
+        truth = ", ".join(f"{key} {value:.3g}" for key, value in self.truth["parameters"].items())
+        before, refit, after = self.open_loop
+        first, second = (" ".join(f"{gain:g}" for gain in gains) for gains in self.gains)
+        change = 100.0 * (_mean(self.retuned) / _mean(self.measured) - 1.0)
+        return [
+            ("A lung is sealed", f"{self.lung}; commitment {self.commitment[:16]}..."),
+            ("The best PID in simulation", f"P I D = {first}: {_mean(self.simulated):.2f} cmH2O"),
+            ("The same PID on the lung", f"{_mean(self.measured):.2f} cmH2O"),
+            (
+                "The comparison",
+                f"{len(self.comparison.breaths)} breaths explored; open-loop error "
+                f"{self.comparison.lungs[self.lung].mae:.2f} cmH2O a step",
+            ),
+            ("The diagnosis", f"{self.verdict}: {named or 'no mechanism is named'}"),
+            (
+                "The corrected simulator",
+                f"held-out open-loop error {before:.2f}, refitted {refit:.2f}, corrected "
+                f"{after:.2f}",
+            ),
+            ("The PID retuned on it", f"P I D = {second}: {self.predicted:.2f} cmH2O predicted"),
+            (
+                "The retuned PID on the lung",
+                f"{_mean(self.retuned):.2f} cmH2O, {change:+.0f} % against the first",
+            ),
+            (
+                "The seal is opened",
+                f"{self.truth['name']} ({truth}), {self.truth['strength']}: "
+                f"{'named' if self.right else 'not named'}",
+            ),
+        ]
+
+    def __str__(self) -> str:
+        rows = [f"{k}. {title}: {text}" for k, (title, text) in enumerate(self.steps(), start=1)]
+        return "\n".join([*rows, f"{self.seconds:.0f} s; report: {self.folder / 'report.html'}"])
+
+
+def _mean(errors: Mapping[float, float]) -> float:
+    return float(np.mean(list(errors.values())))
+
+
+def demo(
+    words: str,
+    out: Path,
+    *,
+    pips: tuple[float, ...] = PIPS,
+    breaths: int = BREATHS,
+    real_time: bool = True,
+    sandbox: bool = True,
+    tell: Callable[[str], None] = lambda text: None,
+) -> Demo:
+    """Run the demo.
+
+    Args:
+        words: any words; they determine lung and concealed physics, and open the seal.
+        out: an empty folder for everything.
+        pips: cmH2O.
+        breaths: breaths to collect for the diagnosis.
+        real_time: over a pseudo-terminal in real time; else in this process on a virtual clock.
+        sandbox: run entries as in scoring.
+        tell: told every step as it begins.
+
+    Raises:
+        InputError: if the folder is not empty, or a plan does not finish.
+        LinkError: if the emulator is lost.
+    """
+    began = time.perf_counter()
+    if out.exists() and any(out.iterdir()):
+        raise InputError(f"{out} is not empty; choose another --out")
+    out.mkdir(parents=True, exist_ok=True)
+    # The public half of the concealed lung: its label and the seal. The plant stays in there.
+    hidden = conceal(words)
+    lung, seal = hidden.lung.id, out / "seal.json"
+    hidden.write(seal)
+    commitment = str(hidden.seal["commitment"])
+    tell(f"1. a lung {lung} is sealed: {commitment[:16]}...")
+    plain = scored_plants("frozen", [lung]).plant(lung)
+    gains, _ = best_pid(plain, pips)
+    entry = write_entry(out / "entries", "first_pid", gains)
+    plan = _plan("first_pid", lung, pips)
+    tell(f"2. the best PID in simulation: P I D = {_shown(gains)}")
+    simulated = _on_simulator(plan, entry, SimulatedHal(plain, noise=NOISE, quantum=QUANTUM))
+    with _line(hidden.plant, words, lung, out, real_time) as line:
+        tell("3. it runs on the lung")
+        measured = _errors(_evaluate(plan, entry, line, out / "first", sandbox))
+        tell(f"   {_mean(measured):.2f} cmH2O, {_mean(simulated):.2f} in simulation")
+        tell(f"4. {breaths} breaths are explored")
+        bench = Bench(line.client, line.clock, DEFAULT, SilentOperator(), rest=_REST)
+        explored = collect(bench, lung, breaths, out / "explored")
+    tell("5. simulator and lung are compared")
+    compared = compare(explored.breaths)
+    diagnosis = compared.diagnoses[lung]
+    diagnosis.save(out / "diagnosis")
+    corrected: Plant = diagnosis.plants.get(lung, plain)
+    tell(f"6. {str(diagnosis).splitlines()[0]}")
+    retuned_gains, predicted = best_pid(corrected, pips)
+    second = write_entry(out / "entries", "retuned_pid", retuned_gains)
+    tell(f"7. the best PID on the corrected simulator: P I D = {_shown(retuned_gains)}")
+    with _line(hidden.plant, words, lung, out, real_time) as line:
+        again = _plan("retuned_pid", lung, pips)
+        tell("8. it runs on the lung")
+        retuned = _errors(_evaluate(again, second, line, out / "second", sandbox))
+    _, effect = reveal(seal, words)
+    errors = diagnosis.open_loop
+    done = Demo(
+        words, lung, commitment, (gains, retuned_gains), simulated, measured, compared,
+        diagnosis.verdict,
+        {
+            x.name: {key: estimate.value for key, estimate in x.parameters.items()}
+            for x in diagnosis.mechanisms
+        },
+        (errors.before.mae, errors.refit.mae, errors.after.mae), predicted, retuned,
+        {"name": effect.name, "strength": effect.strength, "parameters": dict(effect.parameters)},
+        out, time.perf_counter() - began,
+    )  # fmt: skip
+    tell(f"9. the seal is opened: {effect.name}")
+    files.write_json(out / "demo.json", done.as_dict())
+    files.write_text(out / "report.html", _report(done))
+    return done
+
+
+def _shown(gains: tuple[float, ...]) -> str:
+    return " ".join(f"{gain:g}" for gain in gains)
+
+
+def best_pid(plant: Plant, pips: tuple[float, ...]) -> tuple[tuple[float, float, float], float]:
+    """The best of the paper's PI gains on a plant, and its mean error, cmH2O."""
+    import jax
+
+    from ventbench.training import pid_grid
+
+    grid = np.array(list(itertools.product(pid_grid.VALUES, pid_grid.VALUES, (0.0,))))
+    stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], plant)
+    error = pid_grid.errors(stacked, grid, pips)[0].mean(axis=1, dtype=np.float64)
+    error = np.where(np.isfinite(error), error, np.inf)
+    best = int(np.argmin(error))
+    P, I, D = grid[best].tolist()  # noqa: E741 - the field's names
+    return (P, I, D), float(error[best])
+
+
+def write_entry(folder: Path, name: str, gains: tuple[float, float, float]) -> Path:
+    """Write a PID as a submission; returns its folder."""
+    for file, content in contents(name, "pid").items():
+        if file == "controller.py":
+            text = content.decode()
+            line = next(x for x in text.splitlines() if x.startswith("GAINS ="))
+            content = text.replace(line, f"GAINS = {gains}  # P, I, D, %/cmH2O").encode()
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        (folder / name / file).write_bytes(content)
+    return folder / name
+
+
+def _plan(name: str, lung: str, pips: tuple[float, ...]) -> Plan:
+    return make_plan([name], [lung], pips=pips, repeats=1, control_every=0)
+
+
+def _on_simulator(plan: Plan, entry: Path, hal: SimulatedHal) -> dict[float, float]:
+    """Errors of an entry on an emulator of a plain simulator, by PIP."""
+    device = loopback(hal)
+    client = Client(device, device.clock)
+    client.hello()
+    bench = Bench(client, device.clock, DEFAULT, SilentOperator(), rest=_REST)
+    make = ev.controllers([open_submission(str(entry))], plan.track, ev.make_runner(False),
+                          real_time=False)  # fmt: skip
+    errors = {}
+    for run in plan.runs:
+        if run.kind == "scored":
+            controller = make(run)
+            errors[run.pip] = session.run_once(bench, run, controller).error
+            controller.close()
+    return dict(sorted(errors.items()))
+
+
+def _evaluate(plan: Plan, entry: Path, line: Line, out: Path, sandbox: bool) -> Evaluation:
+    operator: Operator = SilentOperator()
+    submission = open_submission(str(entry))
+    done = ev.evaluate(
+        [submission], line, out, operator, plan=plan, sandbox=sandbox, dry=False,
+        operator_name="ventbench-hardware demo", notes="emulated lung", rest=_REST,
+    )  # fmt: skip
+    if not done.complete:
+        raise InputError(f"{entry.name} did not finish its plan: {done.reason}")
+    return done
+
+
+def _errors(done: Evaluation) -> dict[float, float]:
+    """Errors of the scored runs by PIP; a stopped run counts as infinite."""
+    errors: dict[float, float] = {}
+    for line in lines(done.log):
+        if line["type"] == "run" and line["kind"] == "scored" and line["status"] != "aborted":
+            error = line.get("error")
+            errors[line["pip"]] = float("inf") if error is None else error
+    return dict(sorted(errors.items()))
+
+
+@contextmanager
+def _line(plant: Plant, words: str, lung: str, out: Path, real_time: bool) -> Iterator[Line]:
+    """A line to the emulated lung: in its own process, or in this one on a virtual clock."""
+    if not real_time:
+        hal = SimulatedHal(plant, name=f"emulated {lung}", noise=NOISE, quantum=QUANTUM)
+        device = loopback(hal)
+        client = Client(device, device.clock)
+        client.hello()
+        yield Line(client, device.clock)
+        return
+    from hardware_eval.clock import priority
+
+    command = [sys.executable, "-m", "hardware_eval", "emulate", "--conceal", words]
+    command += ["--noise", str(NOISE), "--quantum", str(QUANTUM)]
+    with open(out / "emulator.log", "a") as log:
+        emulator = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
+    try:
+        assert emulator.stdout is not None
+        port = emulator.stdout.readline().strip()
+        if not port:
+            raise InputError(f"the emulator did not start; see {out / 'emulator.log'}")
+        line = ev.connect(port)
+        try:
+            with priority():
+                yield line
+        finally:
+            line.client.close()
+    finally:
+        emulator.terminate()
+        emulator.wait(_STARTS_S)
+        if emulator.stdout is not None:
+            emulator.stdout.close()
+
+
+_STYLE = """
+body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:60rem;padding:0 1rem;
+color:#1b1f24;background:#fff}h1{font-size:1.6rem}ol{padding-left:1.4rem}li{margin:.4rem 0}
+table{border-collapse:collapse;margin:1rem 0}
+th,td{padding:.3rem .8rem;text-align:right;border-bottom:1px solid #d7dce2}
+th:first-child,td:first-child{text-align:left}svg{max-width:100%}.note{color:#57606a}
+@media(prefers-color-scheme:dark){body{background:#14181d;color:#e6e9ed}td,th{border-color:#39414b}}
+"""
+
+_COLOURS = {"simulated": "#6b7785", "measured": "#c4462d", "retuned": "#1f7a5c"}
+
+
+def _report(done: Demo) -> str:
+    """One page: the steps, the errors by PIP as bars, the distance, and what was named."""
+    steps = "".join(
+        f"<li><b>{html.escape(title)}.</b> {html.escape(text)}</li>" for title, text in done.steps()
+    )
+    rows = "".join(
+        f"<tr><td>{pip:g}</td><td>{done.simulated[pip]:.2f}</td><td>{done.measured[pip]:.2f}</td>"
+        f"<td>{done.retuned[pip]:.2f}</td></tr>"
+        for pip in done.simulated
+    )
+    waves = "".join(
+        f"<tr><td>{html.escape(name)}</td><td>{x.breaths}</td><td>{x.mae:.2f}</td>"
+        f"<td>{x.bias:+.2f}</td></tr>"
+        for name, x in done.comparison.waveforms[done.lung].items()
+    )
+    sentences = "".join(
+        f"<p>{html.escape(line)}</p>"
+        for line in str(done.comparison.diagnoses[done.lung]).splitlines()
+    )
+    return (
+        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport "
+        f'content="width=device-width"><title>The loop closed: {html.escape(done.lung)}</title>'
+        f"<style>{_STYLE}</style><h1>The loop closed on an emulated {html.escape(done.lung)}</h1>"
+        "<p class=note>Mean |pressure - target| over the scored inspirations, cmH2O: lower is "
+        "better. The lung is emulated in software behind the real wire protocol.</p>"
+        f"<ol>{steps}</ol>{_bars(done)}"
+        "<table><tr><th>PIP</th><th>simulated</th><th>on the lung</th><th>retuned, on the lung"
+        f"</th></tr>{rows}</table><h2>Open-loop distance by waveform</h2><table><tr><th>plateau, "
+        f"cmH2O</th><th>breaths</th><th>error a step</th><th>bias</th></tr>{waves}</table>"
+        f"<h2>The diagnosis in its own words</h2>{sentences}"
+        '<p><a href="diagnosis/report.html">its report</a>, <a href="demo.json">all figures</a>, '
+        f'<a href="seal.json">the seal</a>; the words were "{html.escape(done.words)}".</p>'
+        "</html>\n"
+    )
+
+
+def _bars(done: Demo) -> str:
+    """Errors by PIP as grouped bars."""
+    groups = {"simulated": done.simulated, "measured": done.measured, "retuned": done.retuned}
+    finite = [x for errors in groups.values() for x in errors.values() if np.isfinite(x)]
+    scale = 160.0 / max([*finite, 1e-9])
+    parts = []
+    for place, pip in enumerate(done.simulated):
+        for k, (name, errors) in enumerate(groups.items()):
+            height = scale * min(errors[pip], 1e9) if np.isfinite(errors[pip]) else 160.0
+            x = 40 + 150 * place + 36 * k
+            parts.append(
+                f'<rect x="{x}" y="{190 - height:.1f}" width="32" height="{height:.1f}" '
+                f'fill="{_COLOURS[name]}"><title>{name}, PIP {pip:g}: {errors[pip]:.2f}</title>'
+                "</rect>"
+            )
+        parts.append(f'<text x="{40 + 150 * place}" y="208">PIP {pip:g}</text>')
+    width = 60 + 150 * len(done.simulated)
+    legend = "".join(
+        f'<text x="{40 + 130 * k}" y="234" fill="{colour}">{name}</text>'
+        for k, (name, colour) in enumerate(_COLOURS.items())
+    )
+    return (
+        f'<svg viewBox="0 0 {max(width, 430)} 240" width="{max(width, 430)}" role="img" '
+        f'font-size="14" fill="currentColor" aria-label="Errors by PIP">{"".join(parts)}{legend}'
+        "</svg>"
+    )

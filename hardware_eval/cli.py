@@ -123,8 +123,8 @@ def run(
 
     Example: `ventbench-hardware run submissions/pid_best --port /dev/ttyACM0 --lung R20C50`
     """
-    from hardware_eval import clock
     from hardware_eval import evaluate as ev
+    from hardware_eval import realtime
     from hardware_eval.console import ConsoleOperator, RerunView, TerminalView, Views
     from hardware_eval.plan import make_plan
     from hardware_eval.safety import SafetySettings
@@ -152,7 +152,7 @@ def run(
 
     line = ev.connect(port)
     try:
-        with person.keys(), clock.priority():
+        with person.keys(), realtime.priority():
             done = ev.evaluate(
                 entries, line, out, person, plan=plan, view=views, sandbox=sandbox, dry=dry_run,
                 before_lung=before_lung, settings=settings, operator_name=operator, notes=notes,
@@ -202,15 +202,9 @@ def emulate(context: typer.Context) -> None:
 
     Example: `ventbench-hardware emulate --lung R20C50 --link ./lung`
     """
-    import os
-
-    # In the thread that asks, which has priority; read when JAX is first imported.
-    os.environ.setdefault("JAX_CPU_ENABLE_ASYNC_DISPATCH", "false")
-    from hardware_eval.clock import priority
     from hardware_eval.emulator import main as run_emulator
 
-    with priority():
-        code = run_emulator(context.args)
+    code = run_emulator(context.args)
     if code:
         raise typer.Exit(code)
 
@@ -226,8 +220,8 @@ def selftest(
 
     Example: `ventbench-hardware selftest --port /dev/ttyACM0 --lung R20C50`
     """
-    from hardware_eval import clock
     from hardware_eval import evaluate as ev
+    from hardware_eval import realtime
     from hardware_eval.console import ConsoleOperator
     from hardware_eval.safety import DEFAULT
     from hardware_eval.selftest import selftest as run_selftest
@@ -238,7 +232,7 @@ def selftest(
     person = ConsoleOperator(yes=True)
     line = ev.connect(port)
     try:
-        with person.keys(), clock.priority():
+        with person.keys(), realtime.priority():
             sheet = run_selftest(
                 Bench(line.client, line.clock, DEFAULT, person), label, simulator=plant
             )
@@ -312,9 +306,9 @@ def collect(
 
     Example: `ventbench-hardware collect --port /dev/ttyACM0 --lung R20C50 --breaths 600`
     """
-    from hardware_eval import clock
     from hardware_eval import collect as collection
     from hardware_eval import evaluate as ev
+    from hardware_eval import realtime
     from hardware_eval.console import ConsoleOperator
     from hardware_eval.safety import DEFAULT
     from hardware_eval.session import Bench
@@ -329,7 +323,7 @@ def collect(
         if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
             raise typer.Exit(1)
         about = {"device": ev.device_about(line.client.welcome or line.client.hello())}
-        with person.keys(), clock.priority(), bars() as shown:
+        with person.keys(), realtime.priority(), bars() as shown:
             bar = shown.add_task("exploring", total=breaths)
             done = collection.collect(
                 Bench(line.client, line.clock, DEFAULT, person), label, breaths, out, seed=seed,

@@ -343,10 +343,12 @@ def _line(plant: Plant, words: str, lung: str, out: Path, real_time: bool) -> It
         client.hello()
         yield Line(client, device.clock)
         return
-    from hardware_eval.clock import priority
+    from hardware_eval import realtime
 
     command = [sys.executable, "-m", "hardware_eval", "emulate", "--conceal", words]
     command += ["--noise", str(NOISE), "--quantum", str(QUANTUM)]
+    with realtime.priority() as granted:
+        command += ["--realtime"] if granted else []
     with open(out / "emulator.log", "a") as log:
         emulator = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
     try:
@@ -356,7 +358,7 @@ def _line(plant: Plant, words: str, lung: str, out: Path, real_time: bool) -> It
             raise InputError(f"the emulator did not start; see {out / 'emulator.log'}")
         line = ev.connect(port)
         try:
-            with priority():
+            with realtime.priority():
                 yield line
         finally:
             line.client.close()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 #: Priority among real-time processes: below the kernel's own threads.
@@ -31,3 +33,37 @@ def prefer() -> str | None:
     except OSError as error:
         return str(error)
     return None
+
+
+def take_priority() -> bool:
+    """Let the calling thread run before ordinary work (``SCHED_FIFO``), but none of its children.
+
+    Returns:
+        Whether the system allowed it; it wants root, or a limit ``rtprio``.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        return False
+    try:
+        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        os.sched_setscheduler(0, policy, os.sched_param(PRIORITY))
+    except OSError:
+        return False
+    return True
+
+
+def has_priority() -> bool:
+    """Whether the calling thread runs before ordinary work."""
+    return hasattr(os, "sched_getscheduler") and (
+        os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
+    )
+
+
+@contextlib.contextmanager
+def priority() -> Iterator[bool]:
+    """Take priority for a while; see :func:`take_priority`."""
+    taken = not has_priority() and take_priority()
+    try:
+        yield taken
+    finally:
+        if taken:
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from hardware_eval import safety
 from hardware_eval.client import Client
-from hardware_eval.clock import Clock, has_priority, take_priority
+from hardware_eval.clock import Clock
 from hardware_eval.errors import LinkError, NoAnswerError, RefusedError
 from hardware_eval.messages import Flag, Reading
 from hardware_eval.plan import (
@@ -38,6 +38,7 @@ from hardware_eval.plan import (
     progress,
 )
 from hardware_eval.raw_log import RawLog, lines
+from hardware_eval.realtime import has_priority, take_priority
 from hardware_eval.safety import SafetySample, SafetySettings, Trip
 from ventbench import protocol, waveform
 from ventbench.interfaces import Task

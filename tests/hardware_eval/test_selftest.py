@@ -58,7 +58,8 @@ def test_exploring_continues_where_it_ended(bench: Bench, tmp_path: Path) -> Non
     assert len(both.breaths) == 4
     assert (both.breaths.u_in[:2] == first.breaths.u_in).all()
     assert both.recording.is_file()
-    assert (both.breaths.flow is not None) and both.stopped == ""
+    assert both.breaths.flow is not None
+    assert both.stopped == ""
     with pytest.raises(InputError, match="choose another --out"):
         collect(bench, LUNG, 4, tmp_path, seed=4)
 

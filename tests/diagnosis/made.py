@@ -152,7 +152,7 @@ def unnamed(n: int = 40) -> Diagnosis:
     x = np.linspace(0.0, 900.0, 25)
     y = 2.0 * np.sin(x / 300.0)
     term = NonparametricTerm(
-        "R(V)", "resistance of the airway", 0.83, 41.0, x, "volume, mL", y, "R, cmH2O s/L"
+        "R(V)", "resistance of the airway", 0.83, 41.0, x, "volume, mL", y, "R, cmH2O/(L/s)"
     )
     return dataclasses.replace(
         diagnosis(n), verdict="unnamed", mechanisms=(), nonparametric=term, request=None

@@ -26,7 +26,7 @@ NAN = float("nan")
         (Estimate(0.213, "1", (0.184, 0.243)), "viscoelasticity.ratio", "0.21 [0.18, 0.24]"),
         (Estimate(8.21, "mL/s", (7.5, 8.9)), "leak.conductance", "8.2 mL/s [7.5, 8.9]"),
         (Estimate(-1e-4, "cmH2O", (-0.4, 0.4)), "", "0.0 cmH2O [-0.4, 0.4]"),
-        (Estimate(22.1, "cmH2O s/L", (NAN, NAN)), "", "22.1 cmH2O s/L"),
+        (Estimate(22.1, "cmH2O/(L/s)", (NAN, NAN)), "", "22.1 cmH2O/(L/s)"),
         (Estimate(NAN, "s", (NAN, NAN)), "", "unknown s"),
     ],
 )
@@ -167,7 +167,7 @@ def test_distances_and_a_lung_that_matches():
     )
     match = dataclasses.replace(found.lungs[0], label_matches=True, source="pressure and flow")
     assert report_text.lung(match) == (
-        "The lung matches its label R20C50: R 22.1 cmH2O s/L [21.8, 22.4] and "
+        "The lung matches its label R20C50: R 22.1 cmH2O/(L/s) [21.8, 22.4] and "
         "C 47.4 mL/cmH2O [47.0, 47.8], from pressure and flow."
     )
     assert probability(0.001) == "p < 0.01"

@@ -192,7 +192,7 @@ def lung(match: LungMatch) -> str:
     values = [
         f"{name} {quantity(Estimate(value, unit, ends))}"
         for name, value, ends, unit in (
-            ("R", match.fitted_R, match.ci95_R, "cmH2O s/L"),
+            ("R", match.fitted_R, match.ci95_R, "cmH2O/(L/s)"),
             ("C", match.fitted_C, match.ci95_C, "mL/cmH2O"),
         )
         if math.isfinite(value)

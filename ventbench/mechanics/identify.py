@@ -243,7 +243,7 @@ class LungFit:
             quadratic = x("turbulent_resistance") * flow
             return (x("resistance") + quadratic + x("volume_resistance") * half) * _leak_factor(x)
 
-        estimate = self._derived(value, "cmH2O s/L")
+        estimate = self._derived(value, "cmH2O/(L/s)")
         peak = max(float(segment.flow.max()) for segment in self.segments)
         quadratic = abs(self._coefficient("turbulent_resistance"))
         extrapolated = _EXTRAPOLATION_ERROR * quadratic * max(flow - peak, 0.0)
@@ -291,7 +291,7 @@ class LungFit:
         coefficients = {
             "turbulent_resistance": ("quadratic", "cmH2O s2/L2"),
             "inertance": ("inertance", "cmH2O s2/L"),
-            "direction_resistance": ("difference", "cmH2O s/L"),
+            "direction_resistance": ("difference", "cmH2O/(L/s)"),
             "volume_resistance": ("slope", "cmH2O s/L2"),
             "expiratory_flow": ("quadratic", "cmH2O s2/L2"),
         }

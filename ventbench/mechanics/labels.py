@@ -154,7 +154,7 @@ def _of_fit(fit: Fit) -> list[tuple[Lung, Resistance, Estimate]]:
         ) -> Estimate:
             low, high = ci95  # type: ignore[misc]
             more = quadratic * flow
-            return Estimate(R + more, "cmH2O s/L", (float(low) + more, float(high) + more))
+            return Estimate(R + more, "cmH2O/(L/s)", (float(low) + more, float(high) + more))
 
         low, high = ends["C"]
         compliance = Estimate(C, "mL/cmH2O", (float(low), float(high)))

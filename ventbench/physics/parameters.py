@@ -158,7 +158,7 @@ REFITTED = ("R", "C", "R_ex", "PEEP")
 #: that a breath starts from. R and C stand for a label that must be given.
 BASE_PARAMETERS = (
     Parameter(
-        "R", "cmH2O s/L", "resistance of the airway", 0.5, 200.0, 20.0, 20.0, 50.0, "log",
+        "R", "cmH2O/(L/s)", "resistance of the airway", 0.5, 200.0, 20.0, 20.0, 50.0, "log",
         follows="R",
     ),
     Parameter(
@@ -170,7 +170,7 @@ BASE_PARAMETERS = (
         VALVE_GAIN, "log",
     ),
     Parameter(
-        "R_ex", "cmH2O s/L", "resistance of the expiratory path", 0.3, 100.0,
+        "R_ex", "cmH2O/(L/s)", "resistance of the expiratory path", 0.3, 100.0,
         EXPIRATORY_RESISTANCE, EXPIRATORY_RESISTANCE, EXPIRATORY_RESISTANCE, "log",
     ),
     Parameter(

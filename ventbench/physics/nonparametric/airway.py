@@ -76,7 +76,7 @@ class FlowShape(BasisTerm):
         equation="p = ... + R Q + f(Q), f(0) = df/dQ(0) = 0, df/dQ straight between knots",
         parameters=coefficients(
             (f"{side} {q:g} L/s" for side in ("inwards", "outwards") for q in _FLOW_KNOTS[1:]),
-            unit="cmH2O s/L",
+            unit="cmH2O/(L/s)",
             meaning="resistance above R at",
             low=-15.0,
             high=120.0,
@@ -142,7 +142,7 @@ class VolumeResistance(BasisTerm):
         """Resistance over volume."""
         s = np.linspace(5.0, 45.0, 161)
         y = base["R"] * np.asarray(self._excess(values, jnp.asarray(s)))
-        return (Curve(s * base["C"], y, "volume, mL", "extra resistance, cmH2O s/L", (0,)),)
+        return (Curve(s * base["C"], y, "volume, mL", "extra resistance, cmH2O/(L/s)", (0,)),)
 
     def _excess(self, values: Values, filled: Array) -> Array:
         return PiecewiseLinear(_VOLUME_KNOTS)(filled, [0.0, *self.coefficients(values)])

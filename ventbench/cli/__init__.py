@@ -24,6 +24,7 @@ from ventbench.cli import (
     headroom,
     mechanics,
     proof,
+    real_pairs,
     score,
     simulators,
     study,
@@ -78,6 +79,7 @@ challenge.register(app)
 mechanics.register(app)
 doctor.register(app)
 proof.register(app)
+real_pairs.register(app)
 app.add_typer(data.app)
 
 

@@ -37,7 +37,7 @@ _READINGS, _MOST = 0.02, 150
 
 #: Time before a reading, s, in which the flow stands as it is at the reading: a mean over the whole
 #: interval would lag, and R times that lag is pressure.
-_AT_READING = 0.002
+_AT_READING = 0.0002
 
 #: Least share of a breath's samples that need a flow or volume.
 _KNOWN = 0.5

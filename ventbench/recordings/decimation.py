@@ -30,6 +30,10 @@ _LEAST = 0.005
 #: difference of 0.3 cmH2O for a few milliseconds.
 _TOLERANCE = 0.25
 
+#: Departure of the last command before a reading from that mean, %, from which the sample before
+#: the reading is kept too: a pressure shows the flow of its own moment.
+_AT_READING = 0.02
+
 #: Most samples of a breath. A command that follows the noise of a fast sensor changes at every
 #: sample; the tolerance is then raised, since the lung averages such changes.
 _MOST = 400
@@ -76,15 +80,15 @@ def decimate(breaths: Breaths) -> Decimation:
     """
     lengths = breaths.valid.sum(axis=1)
     kept = [_kept(breaths, i, int(length)) for i, length in enumerate(lengths)]
-    counts = np.array([len(nodes) for nodes in kept])
+    counts = np.array([len(nodes) for nodes, _ in kept])
     columns: dict[str, list[NDArray]] = {name: [] for name in ("time", *FILL)}
-    for i, nodes in enumerate(kept):
+    for i, (nodes, _) in enumerate(kept):
         time = breaths.time[i, nodes]
         columns["time"].append(time)
         columns["u_out"].append(breaths.u_out[i, nodes])
         columns["u_in"].append(_means(breaths.u_in[i], breaths.dt[i], nodes))
         reading = breaths.pressure[i, nodes].copy()
-        reading[~_spaced(time)] = np.nan
+        reading[~np.isin(nodes, kept[i][1])] = np.nan
         columns["pressure"].append(reading)
         for name in ("flow", "volume"):
             values = getattr(breaths, name)
@@ -98,7 +102,9 @@ def decimate(breaths: Breaths) -> Decimation:
         else _wide(stack(flat[name], counts, np.nan), width, np.nan)
         for name in ("flow", "volume")
     }
-    index = np.stack([np.append(nodes, np.full(width - len(nodes), nodes[-1])) for nodes in kept])
+    index = np.stack(
+        [np.append(nodes, np.full(width - len(nodes), nodes[-1])) for nodes, _ in kept]
+    )
     fewer = replace(
         breaths,
         time=time,
@@ -112,8 +118,11 @@ def decimate(breaths: Breaths) -> Decimation:
     return Decimation(fewer, index)
 
 
-def _kept(breaths: Breaths, i: int, length: int) -> NDArray[np.int64]:
-    """Samples of a breath that are kept, in order; the first and the last are among them."""
+def _kept(breaths: Breaths, i: int, length: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Samples of a breath that are kept, in order, and those of them that are readings.
+
+    The first and the last sample are kept.
+    """
     time, u_out = breaths.time[i, :length], breaths.u_out[i, :length]
     every = max(_READINGS, time[-1] / (_MOST / 2))
     # The first sample at or after each multiple of the interval.
@@ -124,8 +133,13 @@ def _kept(breaths: Breaths, i: int, length: int) -> NDArray[np.int64]:
     while True:
         nodes = np.unique(np.concatenate([fixed, _changes(breaths.u_in[i, :length], tolerance)]))
         if len(nodes) <= max(_MOST, len(np.unique(fixed)) + 2):
-            return nodes
+            break
         tolerance *= _COARSER
+    u_in = breaths.u_in[i]
+    apart = np.abs(u_in[nodes[1:] - 1] - _means(u_in, breaths.dt[i], nodes)[:-1]) > _AT_READING
+    spaced = _spaced(time[nodes])
+    before = nodes[1:][spaced[1:] & apart] - 1
+    return np.unique(np.concatenate([nodes, before])), nodes[spaced]
 
 
 def _changes(u_in: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:

@@ -1,0 +1,121 @@
+"""Recordings without a valve command: the flow drives the model."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ventbench.diagnosis import flow_drive
+from ventbench.diagnosis.diagnose import diagnose
+from ventbench.diagnosis.settings import DEFAULT
+from ventbench.errors import InputError
+from ventbench.plants.catalog import load_simulators
+from ventbench.recordings.breaths import Breaths, make_breaths
+
+R, C = 18.0, 42.0
+
+
+def recorded(
+    n: int = 12, rate: float = 100.0, quadratic: float = 0.0, noise: float = 0.0, seed: int = 0
+) -> Breaths:
+    """Pressure and flow of a lung on an unknown ventilator, labelled R20C50; u_in is 0."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, 2.5, 1.0 / rate) * np.ones((n, 1))
+    rise = rng.uniform(0.08, 0.3, (n, 1))
+    size = rng.uniform(300.0, 900.0, (n, 1))
+    since = np.maximum(time - 0.1, 0.0)
+    into = np.where(time < 0.9, size * np.minimum(since / rise, 1.0), 0.0)
+    inside = np.sum(into, axis=1, keepdims=True) / rate
+    out = np.where(time >= 0.9, inside / 0.35 * np.exp(-(time - 0.9) / 0.35), 0.0)
+    flow = into - out * np.minimum((time - 0.9) / 0.05, 1.0) * (time >= 0.9)
+    middle = 0.5 * (flow[:, 1:] + flow[:, :-1]) / rate
+    volume = np.concatenate([np.zeros((n, 1)), np.cumsum(middle, axis=1)], axis=1)
+    q = 1e-3 * flow
+    pressure = 6.0 + volume / C + R * q + quadratic * q * np.abs(q)
+    pressure += noise * rng.standard_normal(time.shape)
+    return make_breaths(
+        np.arange(1, n + 1), [20.0] * n, [50.0] * n, time, 0 * time, time >= 0.9, pressure,
+        flow=flow,
+    )  # fmt: skip
+
+
+def test_flow_is_recognised_as_the_drive():
+    breaths = recorded(2)
+    assert flow_drive.lacks_commands(breaths)
+    assert not flow_drive.lacks_commands(dataclasses.replace(breaths, flow=None))
+    assert not flow_drive.lacks_commands(dataclasses.replace(breaths, u_in=breaths.u_in + 1.0))
+
+
+def test_the_true_lung_under_the_flow_answers_as_recorded():
+    """The grid loses neither volume nor the flow of the moment of a reading."""
+    breaths = recorded(4)
+    whole, notes = flow_drive.with_flow(breaths)
+    driven, index = flow_drive.drive_grid(whole)
+    assert notes == []
+    assert driven.time.shape[1] < 1.3 * breaths.time.shape[1]
+    assert not driven.u_out.any()
+    true = dataclasses.replace(driven, R=np.full(4, R), C=np.full(4, C))
+    answers = load_simulators("physics").pressures(true)
+    readings = np.isfinite(driven.pressure)
+    assert np.abs(answers - driven.pressure)[readings].max() < 0.2
+    assert np.abs(answers - driven.pressure)[readings].mean() < 0.02
+    np.testing.assert_array_equal(
+        driven.pressure[readings], np.take_along_axis(breaths.pressure, index, 1)[readings]
+    )
+
+
+def test_volume_alone_and_gaps():
+    breaths = recorded(4)
+    whole, _ = flow_drive.with_flow(breaths)
+    assert whole.flow is not None
+    volume = np.cumsum(breaths.flow, axis=1) * 0.01  # type: ignore[arg-type]
+    alone, notes = flow_drive.with_flow(dataclasses.replace(breaths, flow=None, volume=volume))
+    assert "derivative" in notes[0]
+    assert np.abs(alone.flow - whole.flow).mean() < 12.0  # type: ignore[operator]
+    holes = np.array(breaths.flow)
+    holes[1, 30:60] = np.nan
+    holes[2, 150:] = np.nan
+    holes[3] = np.nan
+    some, notes = flow_drive.with_flow(dataclasses.replace(breaths, flow=holes))
+    assert len(some) == 3
+    assert "1 breaths without flow" in notes[0]
+    assert np.isnan(some.pressure[2, 150:]).all(), "what flowed there is unknown"
+    with pytest.raises(InputError, match="neither flow nor volume"):
+        flow_drive.with_flow(dataclasses.replace(breaths, flow=None))
+
+
+def test_functions_get_the_flow_and_learned_simulators_are_refused():
+    breaths = recorded(4)
+    whole, _ = flow_drive.with_flow(breaths)
+    driven, index = flow_drive.drive_grid(whole)
+
+    def lung(u_in, u_out, dt, *, R, C, initial_pressure, flow):
+        return initial_pressure + R * 1e-3 * flow + np.cumsum(flow * dt) / C
+
+    answers = flow_drive.simulate(load_simulators(lung), whole, driven, index)
+    assert answers.shape == driven.time.shape
+    assert np.isfinite(answers).all()
+    with pytest.raises(InputError, match="frozen needs one"):
+        flow_drive.simulate(load_simulators("frozen"), whole, driven, index)
+
+
+def test_the_ventilators_side_is_left_out():
+    terms = flow_drive.without_ventilator(DEFAULT).screening.nonparametric_terms
+    assert terms is not None
+    assert not {"valve_shape", "outlet_shape"} & set(terms)
+    assert "flow_shape" in terms
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("quadratic", [0.0, 12.0])
+def test_a_diagnosis_from_flow(quadratic):
+    diagnosis = diagnose(recorded(18, 50.0, quadratic, noise=0.15))
+    names = [mechanism.name for mechanism in diagnosis.mechanisms]
+    assert names == (["turbulent_resistance"] if quadratic else [])
+    assert diagnosis.open_loop.after.mae < 0.2
+    assert any("No valve command" in note for note in diagnosis.notes)
+    if quadratic:
+        value = diagnosis.mechanisms[0].parameters["quadratic"].value
+        assert value == pytest.approx(quadratic, rel=0.15)

@@ -32,6 +32,7 @@ from ventbench.lungs import Lung
 from ventbench.mechanics.identify import Mechanics, Term, identify
 from ventbench.mechanics.labels import TOLERANCE_C, TOLERANCE_R, Estimate
 from ventbench.mechanics.respiraworks import breaths_of
+from ventbench.physics.model import Physics
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.respiraworks import RespiraWorksRun, load_respiraworks
 from ventbench.validation.challenge.figures import wilson
@@ -375,12 +376,10 @@ def with_leak(breaths: Breaths, slope: float) -> Breaths:
 def _diagnosed(pair: Pair, material: Material) -> Answered:
     """Diagnose a simulator fitted to the first recording against the second one."""
     from ventbench.diagnosis.diagnose import diagnose
-    from ventbench.diagnosis.estimates import plants
-    from ventbench.system_id import fit, make_data
 
     first, second = material.lungs[pair.first], material.lungs[pair.second]
-    simulator = plants(fit(make_data(first), list(_KNOWN)))
-    label: Lung = _lung_of(first)
+    label = _lung_of(first)
+    simulator = {label.id: fitted_plant(first)}
     given = replace(
         second, R=np.full(len(second), label.R), C=np.full(len(second), label.C), sha256=None
     )
@@ -392,8 +391,8 @@ def _diagnosed(pair: Pair, material: Material) -> Answered:
     names = tuple(mechanism.name for mechanism in diagnosis.mechanisms)
     match = diagnosis.lungs[0]
     own = simulator[label.id]
-    ratio_R = match.fitted_R / float(own.get("R"))  # type: ignore[attr-defined]
-    ratio_C = match.fitted_C / float(own.get("C"))  # type: ignore[attr-defined]
+    ratio_R = match.fitted_R / float(own.get("R"))
+    ratio_C = match.fitted_C / float(own.get("C"))
     words = f"{', '.join(names) or 'no effect'}; R x {ratio_R:.2f}, C x {ratio_C:.2f}"
     if pair.kind == "lag_pressure":
         lag = next((m for m in diagnosis.mechanisms if m.name == "sensor_lag"), None)
@@ -407,6 +406,21 @@ def _diagnosed(pair: Pair, material: Material) -> Answered:
     truth = _lung_of(second)
     right = not names and truth.id in match.settings
     return Answered(pair, words, right, names)
+
+
+def fitted_plant(breaths: Breaths) -> Physics:
+    """The plant of one lung, fitted with what the PVP rigs are known to have."""
+    from ventbench.physics.catalogue import paths
+    from ventbench.precision import float64
+    from ventbench.system_id import fit, make_data
+
+    fitted = fit(make_data(breaths), list(_KNOWN))
+    names = [path for path in paths(_KNOWN) if path != "position"]
+    predictor = fitted.problem.predictor
+    with float64():
+        return Physics((), (), predictor.substeps, predictor.memory).having(
+            **{name: float(fitted.column(name)[0]) for name in names}
+        )
 
 
 def _lung_of(breaths: Breaths) -> Lung:

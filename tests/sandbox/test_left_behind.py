@@ -35,7 +35,7 @@ def test_nothing_is_left_behind(written):
     before = _descriptors(), resource.getrlimit(resource.RLIMIT_NOFILE)
     session = started(written(hang), [None] * 3)
     processes = set(_descendants(os.getpid())) - others
-    assert len(processes) >= 4  # the zygote, perhaps bubblewrap, three cells
+    assert len(processes) >= 4  # the zygote, three cells
     session.close()  # in mid-run
     assert (_descriptors(), resource.getrlimit(resource.RLIMIT_NOFILE)) == before
     assert not [process for process in processes if Path(f"/proc/{process}").exists()]

@@ -23,14 +23,18 @@ _PROBE_S = 30.0
 
 @functools.cache
 def layers() -> tuple[str, ...]:
-    """Layers that come into force in a cell on this machine, found by starting one.
+    """Layers that come into force in every cell on this machine, found by starting one.
+
+    It may start threads, as one with JAX may: where the kernel cannot count them, that shows.
 
     Raises:
         SandboxError: if a cell cannot be started or does not lock itself down.
     """
     pipes = Pipes()
     with tempfile.TemporaryDirectory() as folder:
-        zygote = ZygoteClient(configuration(os.path.realpath(folder), "probe", Allowance()))
+        told = configuration(os.path.realpath(folder), "probe", Allowance())
+        limits = {**dict(told["limits"]), "threads": True}  # type: ignore[call-overload]
+        zygote = ZygoteClient({**told, "limits": limits})
         try:
             pipes.open(0, lambda far: zygote.start(0, None, far))
             outcomes = pipes.collect({0}, 0, wire.LOCKED, _PROBE_S, float("inf"))

@@ -105,10 +105,9 @@ class SandboxSession:
         for reply in replies.values():
             if not isinstance(reply, Reply) or reply.kind != wire.LOCKED:
                 raise SandboxError(f"a cell could not be locked down: {said(reply)}")
-            if set(lockdown.names(reply.value)) != set(layers):
-                raise SandboxError(
-                    f"a cell has {lockdown.names(reply.value)} in force instead of {layers}"
-                )
+            lacking = set(layers) - set(lockdown.names(reply.value))
+            if lacking:
+                raise SandboxError(f"a cell lacks {', '.join(sorted(lacking))}")
         if late:
             raise SandboxError(f"{len(late)} cells did not start in time")
 

@@ -1,8 +1,4 @@
-"""The scorer's end of the zygote: starts it, asks it for cells, hears how they ended.
-
-Where the zygote may not make namespaces of its own (Ubuntu 24.04 as an ordinary user), it starts in
-bubblewrap if that is installed and may.
-"""
+"""The scorer's end of the zygote: starts it, asks it for cells, hears how they ended."""
 
 from __future__ import annotations
 
@@ -11,19 +7,16 @@ import functools
 import json
 import os
 import secrets
-import shutil
 import signal
 import socket
 import subprocess
 import sys
-import sysconfig
 import tempfile
 import time
 from collections.abc import Sequence
 from typing import Any
 
 from ventbench.interfaces import Task
-from ventbench.sandbox.child.isolation import RANDOM
 from ventbench.sandbox.child.zygote import (
     ENDED,
     INTERRUPT,
@@ -58,18 +51,14 @@ class ZygoteClient:
     """
 
     def __init__(self, config: dict[str, Any]):
-        words: list[str] = []
-        apart = "own" if namespaces_work() else ""
-        if not apart:
-            words = bubblewrap_prefix([SITE, os.path.join(ROOT, "ventbench"), config["folder"]])
         config = {**config, "site": [SITE]}
         self._tokens: dict[int, bytes] = {}  # of each cell
         self._ended: dict[bytes, int] = {}
         self._data = b""
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed in close()
         self._control, theirs = socket.socketpair()
-        told = (str(theirs.fileno()), ROOT, "bubblewrap" if words else apart)
-        command = [*words, sys.executable, *OPTIONS, "-c", _BOOT, *told]
+        told = (str(theirs.fileno()), ROOT, "apart" if namespaces_work() else "")
+        command = [sys.executable, *OPTIONS, "-c", _BOOT, *told]
         try:
             self._process = subprocess.Popen(
                 command,
@@ -180,47 +169,16 @@ def signal_name(status: int) -> str:
 
 @functools.cache
 def namespaces_work() -> bool:
-    """Whether a zygote can make its own namespaces and root here; else bubblewrap may help."""
+    """Whether a zygote can make its own namespaces and root here."""
     code = (
         "import sys; sys.path.insert(0, sys.argv[1]); "
         "from ventbench.sandbox.child import isolation as i; "
         "sys.exit(not (i.enter_namespaces() and i.change_root([], '/nonexistent')))"
     )
-    return sys.platform == "linux" and _works((sys.executable, *OPTIONS, "-c", code, ROOT))
+    if sys.platform != "linux":
+        return False
+    command = (sys.executable, *OPTIONS, "-c", code, ROOT)
 
-
-_SYSTEM = ("/lib", "/lib64", "/usr/lib", "/usr/lib64", "/etc/ld.so.cache")
-
-
-def bubblewrap_prefix(folders: Sequence[str]) -> list[str]:
-    """Words to put before the zygote's command; none where bubblewrap is missing or may not run.
-
-    Args:
-        folders: what the zygote and its cells read, besides the interpreter.
-    """
-    program = shutil.which("bwrap")
-    if program is None or sys.platform != "linux":
-        return []
-    words = [program, *_bubblewrap_options(folders), "--"]
-    return words if _works((*words, sys.executable, "-I", "-S", "-c", "")) else []
-
-
-def _bubblewrap_options(folders: Sequence[str]) -> list[str]:
-    interpreter = (
-        *(sys.prefix, sys.base_prefix, sysconfig.get_path("stdlib")),
-        *(os.path.dirname(path) for path in (sys.executable, os.path.realpath(sys.executable))),
-    )
-    options = ["--unshare-all", "--die-with-parent", "--as-pid-1", "--cap-drop", "ALL"]
-    for path in (*_SYSTEM, *interpreter, *folders):
-        options += ["--ro-bind-try", path, path]
-    for device in ("/dev/null", RANDOM):
-        options += ["--dev-bind", device, device]
-    # No /proc: the sizes in it are a way for cells to talk.
-    return [*options, "--chdir", "/"]
-
-
-@functools.cache
-def _works(command: tuple[str, ...]) -> bool:
     try:
         run = subprocess.run(
             command, stdin=subprocess.DEVNULL, capture_output=True, timeout=10, check=False

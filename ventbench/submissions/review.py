@@ -7,10 +7,13 @@ attack, and a reader of a pull request should see them all without searching.
 from __future__ import annotations
 
 import ast
+import re
+import unicodedata
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
+from ventbench.sandbox.child.cell import source_text
 from ventbench.sandbox.child.sources import sources
 from ventbench.submissions.errors import Finding
 
@@ -60,9 +63,14 @@ def review(folder: Path) -> list[Finding]:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                tree = ast.parse(path.read_bytes(), name)
+                text = source_text(path.read_bytes())
+                tree = ast.parse(text, name)
         except (SyntaxError, ValueError, RecursionError, MemoryError, OSError):
             continue  # check_sources says so
+        notes += [
+            Finding("source", name, what, _ADVICE, line, problem=False)
+            for line, what in _characters(text)
+        ]
         seen = set()
         for node in ast.walk(tree):
             for used, why in _uses(node):
@@ -72,6 +80,25 @@ def review(folder: Path) -> list[Finding]:
                     what = f"uses {used}, which {why}"
                     notes.append(Finding("source", name, what, _ADVICE, line, problem=False))
     return sorted(notes, key=lambda note: (note.file, note.line or 0))
+
+
+def _characters(text: str) -> Iterator[tuple[int, str]]:
+    """Characters that make a source look like another one: line, and what is there."""
+    # As editors count: Python begins a new line after a lone carriage return too.
+    for number, line in enumerate(text.split("\n"), 1):
+        odd = {c for c in line.rstrip("\r") if unicodedata.category(c) in _UNSEEN and c != "\t"}
+        if odd:
+            names = ", ".join(sorted(f"U+{ord(c):04X}" for c in odd))
+            yield number, f"holds {names}, which is not seen and may hide or move what is"
+        words = {word for word in _WORD.findall(line) if not word.isascii()}
+        if words:
+            shown = ", ".join(sorted(words))
+            yield number, f"holds {shown}, in letters that may look like others"
+
+
+#: Categories of Unicode: control characters, formats (direction, width zero), line separators.
+_UNSEEN = ("Cc", "Cf", "Zl", "Zp", "Co", "Cn")
+_WORD = re.compile(r"[^\W\d]\w*")
 
 
 def _uses(node: ast.AST) -> Iterator[tuple[str, str]]:

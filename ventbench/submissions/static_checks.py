@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import ast
 import difflib
+import io
 import sys
+import tokenize
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from ventbench.sandbox.child.cell import CLASS
+from ventbench.sandbox.child.cell import CLASS, source_text
 from ventbench.sandbox.child.sources import Import, imports, module_files, sources
 from ventbench.sandbox.configuration import OPTIONAL
 from ventbench.submissions.errors import Finding
@@ -54,13 +56,26 @@ def _parsed(path: Path, name: str) -> ast.Module | Finding:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of doubtful escapes and the like
-            return ast.parse(path.read_bytes(), name)
+            content = path.read_bytes()
+            encoding = _declared(content)
+            if encoding not in ("utf-8", "utf-8-sig"):
+                what = f"names the encoding {encoding}, and is read as UTF-8"
+                return Finding("source", name, what, "save it as UTF-8, and leave out the name", 1)
+            return ast.parse(source_text(content), name)
     except SyntaxError as error:
         what = f"is not Python: {error.msg}"
         advice = "python -m py_compile shows the place"
         return Finding("source", name, what, advice, error.lineno, error.offset or None)
     except (ValueError, RecursionError, MemoryError, OSError) as error:
         return Finding("source", name, f"is not Python: {error}", "save it as plain UTF-8 text")
+
+
+def _declared(content: bytes) -> str:
+    """Encoding that a source names in its first two lines."""
+    try:
+        return tokenize.detect_encoding(io.BytesIO(content).readline)[0]
+    except SyntaxError:
+        return "of no known name"
 
 
 _METHODS = {"reset": "task", "act": "observation"}

@@ -5,6 +5,7 @@ Standard library only: a sandbox's child process uses this module too and need n
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import itertools
 import math
@@ -157,7 +158,7 @@ def controller_class(folder: Path, label: str | None = None) -> Callable[[], Any
     label = label or str(folder)
     path = folder / FILE
     try:
-        code = compile(path.read_bytes(), str(path), "exec", dont_inherit=True)
+        code = compile(source_text(path.read_bytes()), str(path), "exec", dont_inherit=True)
     except SyntaxError as error:
         line = f" line {error.lineno}" if error.lineno else ""
         raise SubmissionError(f"{label}: {FILE}{line}: {error.msg}") from None
@@ -178,6 +179,21 @@ def controller_class(folder: Path, label: str | None = None) -> Callable[[], Any
         controller = _checked(getattr(module, CLASS, None), label)
         undo.pop_all()
     return controller
+
+
+def source_text(content: bytes) -> str:
+    """Text of a Python source, read as UTF-8 whatever encoding it names.
+
+    A source that names another one reads otherwise for Python than for people: in
+    ``unicode_escape`` the end of a comment may be code.
+
+    Args:
+        content: of the file.
+
+    Raises:
+        ValueError: if it is not UTF-8.
+    """
+    return content.removeprefix(codecs.BOM_UTF8).decode("utf-8")
 
 
 def _checked(controller: Any, label: str) -> Callable[[], Any]:

@@ -2,13 +2,20 @@
 
 After :func:`enter_namespaces` and :func:`change_root` there is no network, no ``/proc``, no other
 process, and no path of the machine: what cannot be named cannot be asked for its size or times.
+
+All files in the new root are copies in memory. Files on a disk would carry messages between cells:
+a page that one has read, or a name that one has asked for in vain, is found faster by the next, as
+the kernel keeps both. In memory all pages are there from the start and no missing name is kept.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import signal
+import stat
+import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -21,14 +28,22 @@ _APART = _NETWORK | _IPC | _HOST_NAME | _MOUNT | _PROCESSES
 
 _MOUNT_SETATTR, _HERE, _RECURSIVE = 442, -100, 0x8000
 _READ_ONLY, _NO_SUID, _PRIVATE = 0x1, 0x2, 1 << 18
-_MS_NO_SUID, _MS_NO_DEV, _MS_BIND, _MS_RECURSIVE = 2, 4, 4096, 16384
+_MS_NO_SUID, _MS_NO_DEV, _MS_BIND = 2, 4, 4096
 _DETACH = 2
 _PIVOT_ROOT = {"x86_64": 155, "aarch64": 41}
 
 #: Any of these is covered while the new root is made; the machine's own is not touched.
 _BASES = ("/tmp", "/mnt", "/var", "/usr")
-#: Largest copy of a submission, bytes: many times what is accepted.
-_COPY = 64 << 20
+#: Largest copy of a submission, bytes: many times what is accepted; and largest root: jax with all
+#: that it needs has 150 MB.
+_COPY, _ROOT = 64 << 20, 1 << 30
+#: Folders of which nobody imports anything in a cell: tests, graphics, compilers, installers.
+_NOT_COPIED = {
+    *("test", "tests", "idlelib", "tkinter", "turtledemo", "ensurepip", "lib2to3", "include"),
+    *("distutils", "f2py", "__phello__", "pydoc_data"),
+}
+_MODULE_FILES = ("__file__", "__cached__")
+_COPIED = (".py", ".so", f".{sys.implementation.cache_tag}.pyc")
 
 #: Devices of the new root.
 NULL, RANDOM = "/dev/null", "/dev/urandom"
@@ -61,6 +76,47 @@ def enter_namespaces() -> bool:
     return False
 
 
+class Forks:
+    """Forks children, each the only process of a namespace of its own.
+
+    All children are process number 1, and their threads are counted from there: no number says
+    when a process or a thread was started, or how many others were.
+
+    Attributes:
+        parent: number that a child sees as its parent's; 0 from within a namespace.
+        is_child: whether this process is one. Numbers do not tell: all may be 1.
+
+    Args:
+        apart: whether to make namespaces; else they are plain forks.
+    """
+
+    def __init__(self, apart: bool):
+        self.is_child, self.parent = False, 0 if apart else os.getpid()
+        # The way back, as only one namespace can wait for children at a time.
+        flags = os.O_RDONLY | os.O_CLOEXEC
+        self._own = os.open("/proc/self/ns/pid", flags) if apart else None
+
+    def fork(self) -> int:
+        """Fork.
+
+        Returns:
+            Number of the child in this process, 0 in the child.
+
+        Raises:
+            OSError: if the kernel refuses.
+        """
+        if self._own is not None:
+            libc.unshare(_PROCESSES)
+        child = os.fork()
+        self.is_child = child == 0
+        if self._own is not None:
+            if self.is_child:
+                os.close(self._own)
+            else:
+                libc.setns(self._own, _PROCESSES)
+        return child
+
+
 def _continue_as_first_process() -> None:
     child = os.fork()
     if child == 0:
@@ -79,9 +135,10 @@ def change_root(readable: Iterable[str], folder: str) -> bool:
     """Make a root that holds some files of the machine, read-only, and a copy of a folder.
 
     Args:
-        readable: absolute paths of files and folders, which keep their names.
-        folder: whose plain files are copied, so that they can be read whatever their modes, and
-            leave no times behind; keeps its name too.
+        readable: absolute paths of files and folders, which keep their names. Of folders only
+            modules are taken that a cell may import and this process has not imported.
+        folder: whose plain files are copied too, so that they can be read whatever their modes;
+            keeps its name.
 
     Returns:
         Whether mounting was allowed; if not, nothing has changed.
@@ -95,22 +152,23 @@ def change_root(readable: Iterable[str], folder: str) -> bool:
     base = next(path for path in _BASES if os.path.isdir(path))
     try:
         _set_attributes("/", propagation=_PRIVATE)
-        options = b"mode=0755,size=%d" % (_COPY + (16 << 20))
+        options = b"mode=0755,size=%d" % _ROOT
         libc.mount(b"none", base.encode(), b"tmpfs", _MS_NO_SUID | _MS_NO_DEV, options)
     except OSError:
         _close(sources)
         return False
     os.umask(0o022)  # cells of another user must get through
-    bound: list[str] = []
+    done: list[str] = []
+    loaded = _loaded()
     for path, source in sources.items():
-        if source is not None and not any(path.startswith(f"{top}/") for top in bound):
-            _bind(source, base + path)
-            bound.append(path)
+        if source is not None and not any(path.startswith(f"{top}/") for top in done):
+            if path in (NULL, RANDOM):
+                _bind(source, base + path)
+            elif os.path.basename(path) not in _NOT_COPIED:
+                _copy(f"/proc/self/fd/{source}", base + path, loaded)
+            done.append(path)
     _close(sources)
-    if any(f"{folder}/".startswith(f"{top}/") for top in bound):
-        copy = {}  # it is there already, and the files are the machine's own
-    else:
-        os.makedirs(base + folder, 0o755, exist_ok=True)
+    os.makedirs(base + folder, 0o755, exist_ok=True)
     for name, content in copy.items():
         target = Path(base + folder, name)
         target.parent.mkdir(0o755, parents=True, exist_ok=True)
@@ -157,13 +215,66 @@ def _close(sources: dict[str, int | None]) -> None:
 
 
 def _bind(source: int, target: str) -> None:
-    here = f"/proc/self/fd/{source}"
-    if os.path.isdir(here):
-        os.makedirs(target, 0o755, exist_ok=True)
-    else:
+    """Put a device into the new root."""
+    os.makedirs(os.path.dirname(target), 0o755, exist_ok=True)
+    os.close(os.open(target, os.O_CREAT | os.O_WRONLY, 0o644))
+    libc.mount(f"/proc/self/fd/{source}".encode(), os.fsencode(target), b"", _MS_BIND, b"")
+
+
+def _loaded() -> set[tuple[int, int]]:
+    """Device and inode of the files of every imported module: no cell will open them again."""
+    paths = {getattr(x, name, None) for x in list(sys.modules.values()) for name in _MODULE_FILES}
+    with open("/proc/self/maps") as maps:
+        paths |= {line.split(None, 5)[5].rstrip("\n") for line in maps if "/" in line}
+    files = set()
+    for path in paths:
+        with contextlib.suppress(OSError, TypeError, ValueError):
+            status = os.stat(path)  # type: ignore[arg-type]
+            files.add((status.st_dev, status.st_ino))
+    return files
+
+
+def _copy(source: str, target: str, loaded: set[tuple[int, int]]) -> None:
+    """Copy a file or a folder with its times, by which Python knows compiled modules."""
+    if not os.path.isdir(source):
         os.makedirs(os.path.dirname(target), 0o755, exist_ok=True)
-        os.close(os.open(target, os.O_CREAT | os.O_WRONLY, 0o644))
-    libc.mount(here.encode(), os.fsencode(target), b"", _MS_BIND | _MS_RECURSIVE, b"")
+        _copy_file(source, target, loaded)
+        return
+    os.makedirs(target, 0o755, exist_ok=True)
+    waiting = [(source, target)]
+    while waiting:
+        here, there = waiting.pop()
+        with os.scandir(here) as entries:
+            for entry in entries:
+                name = entry.name
+                if entry.is_dir(follow_symlinks=False):
+                    if name not in _NOT_COPIED:
+                        os.mkdir(f"{there}/{name}", 0o755)
+                        waiting.append((entry.path, f"{there}/{name}"))
+                elif name.endswith(_COPIED):
+                    _copy_file(entry.path, f"{there}/{name}", loaded)
+
+
+def _copy_file(source: str, target: str, loaded: set[tuple[int, int]]) -> None:
+    try:
+        file = open(source, "rb", buffering=0)  # noqa: SIM115 - closed below
+    except OSError:  # a link that leads nowhere, a file of somebody else
+        return
+    with file:
+        status = os.fstat(file.fileno())
+        if (status.st_dev, status.st_ino) in loaded or not stat.S_ISREG(status.st_mode):
+            return
+        copy = os.open(target, os.O_CREAT | os.O_WRONLY, 0o644)
+        try:
+            left = status.st_size
+            while left > 0:
+                moved = os.sendfile(copy, file.fileno(), None, left)
+                if not moved:
+                    break
+                left -= moved
+            os.utime(copy, ns=(status.st_atime_ns, status.st_mtime_ns))
+        finally:
+            os.close(copy)
 
 
 def _plain_files(folder: str) -> Iterator[tuple[str, bytes]]:

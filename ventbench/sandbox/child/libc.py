@@ -76,6 +76,17 @@ def unshare(flags: int) -> None:
     checked(_libc.unshare(ctypes.c_int(flags)), "unshare")
 
 
+def setns(namespace: int, kind: int) -> None:
+    """``setns(2)``, which Python has only since 3.12.
+
+    Raises:
+        OSError: if the kernel refuses or this is not Linux.
+    """
+    if _libc is None:
+        raise OSError(f"setns needs Linux, this is {sys.platform}")
+    checked(_libc.setns(ctypes.c_int(namespace), ctypes.c_int(kind)), "setns")
+
+
 def mount(source: bytes, target: bytes, kind: bytes, flags: int, options: bytes) -> None:
     """``mount(2)``.
 

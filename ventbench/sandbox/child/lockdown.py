@@ -26,14 +26,17 @@ LAYERS = (
     "read-only-mounts",
     "landlock",
     "seccomp",
-    "bubblewrap",
     "empty-root",
     "own-descriptors",
     "clean-fork",
+    "counted-threads",
 )
 
 #: A result may be called official only with these. Older records name fewer: theirs are data.
-OFFICIAL = ("namespaces", "empty-root", "own-descriptors", "clean-fork", "landlock", "seccomp")
+OFFICIAL = (
+    *("namespaces", "empty-root", "own-descriptors", "clean-fork", "landlock", "seccomp"),
+    "counted-threads",
+)
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,8 @@ class Lockdown:
         processes = None if limits.threads else 0
         if limits.threads and privileges.count_processes_apart():
             processes = privileges.THREADS
+        if processes is not None and libc.LINUX:
+            layers.append("counted-threads")
         memory = None if self._used is None else self._used + limits.memory
         privileges.limit_resources(memory, limits.cpu_s, processes)
         if libc.LINUX:

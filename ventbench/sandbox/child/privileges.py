@@ -106,6 +106,8 @@ _FILES = 64
 #: Most threads of a cell that may have some: what JAX starts on a machine with many processors.
 THREADS = 32
 _STACK = 8 << 20
+#: Linux's number of a limit that Python has no name for.
+_SIGPENDING = 11
 
 
 def limit_resources(memory: int | None, cpu_s: int, processes: int | None) -> None:
@@ -127,6 +129,8 @@ def limit_resources(memory: int | None, cpu_s: int, processes: int | None) -> No
         "STACK": _STACK,
         "MEMLOCK": 0,
         "MSGQUEUE": 0,
+        # Queued signals are counted over all processes of a user: cells could count each other's.
+        "SIGPENDING": 0,
     }
     if memory is not None:
         limits["AS"] = memory
@@ -134,6 +138,8 @@ def limit_resources(memory: int | None, cpu_s: int, processes: int | None) -> No
         limits["NPROC"] = processes  # does not bind root
     for name, value in limits.items():
         kind = getattr(resource, f"RLIMIT_{name}", None)
+        if kind is None and name == "SIGPENDING" and libc.LINUX:
+            kind = _SIGPENDING
         if kind is not None:  # not every system knows every limit
             # At the soft limit of processor time comes a signal with a name, at the hard one a
             # nameless end: leave a second between them.

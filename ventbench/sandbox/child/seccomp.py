@@ -43,7 +43,6 @@ PLAIN = {
     "dup2": CallNumber(33, None),
     "dup3": CallNumber(292, 24),
     "fstat": CallNumber(5, 80),
-    "mmap": CallNumber(9, 222),
     "mprotect": CallNumber(10, 226),
     "munmap": CallNumber(11, 215),
     "mremap": CallNumber(25, 216),
@@ -101,6 +100,7 @@ SECCOMP = CallNumber(317, 277)
 
 #: Allowed with the arguments that :func:`_checked` names.
 CHECKED = {
+    "mmap": CallNumber(9, 222),
     "ioctl": CallNumber(16, 29),
     "fcntl": CallNumber(72, 25),
     "futex": CallNumber(202, 98),
@@ -221,7 +221,7 @@ _TERMINAL_QUESTION, _CLOSE_ON_EXEC = 0x5401, (0x5450, 0x5451)
 _FCNTL = (0, 1, 2, 3, 1030)
 _FUTEX_PRIVATE, _FUTEX_JOIN = 128, 9 | 256
 _MADVISE = (0, 4, 8, 14, 15)  # normal, don't need, free, huge page, no huge page
-_CLONE_THREAD = 0x10000
+_CLONE_THREAD, _MAP_HUGE = 0x10000, 0x40000
 # The system's clocks and one's own. Larger numbers are the processor time of any process.
 _CLOCKS = tuple(range(12))
 
@@ -249,6 +249,8 @@ def _allow(machine: str, call: CallNumber, *conditions: Condition) -> _Rules:
 def _checked(machine: str, pid: int, threads: bool) -> _Rules:
     rules = []
     for name, conditions in (
+        # Not huge pages: all processes take them from one store, whose end the next one notices.
+        ("mmap", [Condition(3, (0,), _MAP_HUGE)]),
         ("ioctl", [Condition(1, (_TERMINAL_QUESTION, *_CLOSE_ON_EXEC))]),
         ("fcntl", [Condition(1, _FCNTL)]),
         # A futex in a file's page would reach every process that maps the file; waiting for a

@@ -17,7 +17,7 @@ from typing import NamedTuple, NoReturn
 from ventbench.interfaces import Task
 
 from . import lockdown, wire
-from .cell import Cell, Failed, controller_class, describe
+from .cell import Cell, Failed, controller_class, describe, source_text
 from .failures import SubmissionError
 from .lockdown import CellLimits, Lockdown
 
@@ -142,7 +142,8 @@ def _answer(replies: _Replies, cell: Cell) -> NoReturn:
 class _SourceLoader(SourceFileLoader):
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)
-        return self.source_to_code(self.get_data(path), path)
+        text = source_text(self.get_data(path))
+        return compile(text, path, "exec", dont_inherit=True)
 
 
 def only_sources(folder: Path) -> None:

@@ -44,10 +44,12 @@ class Zygote:
 
     Args:
         control: socket to the scorer.
+        forks: starts processes.
+        cpu_s: seconds of processor time of a cell.
     """
 
-    def __init__(self, control: socket.socket):
-        self._control = control
+    def __init__(self, control: socket.socket, forks: isolation.Forks, cpu_s: int):
+        self._control, self._forks, self._cpu_s = control, forks, cpu_s
         self._cells: dict[int, bytes] = {}  # process -> token
         self._request = bytearray(REQUEST.size)
         self._out = bytearray()
@@ -56,7 +58,6 @@ class Zygote:
         os.set_blocking(self._wake, False)
         signal.signal(signal.SIGCHLD, _ignore)
         signal.set_wakeup_fd(self._signalled, warn_on_full_buffer=False)
-        self._pid = os.getpid()
 
     def run(self) -> serve.Start | None:
         """Serve until the scorer closes the socket.
@@ -79,7 +80,7 @@ class Zygote:
                         return None
                     if self._request[:1] != START:
                         self._signal()
-                    elif (process := os.fork()) == 0:
+                    elif (process := self._forks.fork()) == 0:
                         return self._forget(pipes)
                     else:
                         self._cells[process] = bytes(self._request[1 : 1 + TOKEN])
@@ -116,15 +117,19 @@ class Zygote:
         self._control.close()
         os.close(self._wake)
         os.close(self._signalled)
-        start = serve.Start(task, pipes, self._pid)
+        start = serve.Start(task, pipes, self._forks.parent)
         self.__dict__.clear()
         return start
 
     def _reap(self) -> None:
         while self._cells:
-            process, status = os.waitpid(-1, os.WNOHANG)
+            process, status, used = os.wait4(-1, os.WNOHANG)
             if not process:
                 return
+            if status == signal.SIGKILL and used.ru_utime + used.ru_stime >= self._cpu_s:
+                status = (
+                    signal.SIGXCPU
+                )  # ignored by the first process of a namespace, or on purpose
             self._out += ENDED.pack(self._cells.pop(process), status)
 
     def end(self) -> None:
@@ -148,11 +153,14 @@ def _configuration(control: socket.socket) -> dict[str, Any]:
         return json.loads(data)
 
 
-def _serve(descriptor: int, layers: list[str]) -> list[tuple[serve.Setup, Lockdown, serve.Start]]:
+def _serve(
+    descriptor: int, forks: isolation.Forks, layers: list[str]
+) -> list[tuple[serve.Setup, Lockdown, serve.Start]]:
     """Prepare, say so, serve.
 
     Args:
         descriptor: the socket to the scorer.
+        forks: starts the cells.
         layers: those that are in force already.
 
     Returns:
@@ -163,26 +171,25 @@ def _serve(descriptor: int, layers: list[str]) -> list[tuple[serve.Setup, Lockdo
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as file:
         file.write("1000")  # if memory runs out, a cell ends and not the scorer
     readable, listable = preload.load(config["packages"], config["site"])
-    bubblewrap = "bubblewrap" in layers
     prepared = Lockdown(
         [RANDOM, *readable],
         listable,
         layers=layers,
         folder=config["folder"],
-        change_root="namespaces" in layers and not bubblewrap,
+        change_root="namespaces" in layers,
     )
     setup = serve.Setup(Path(config["folder"]), config["label"], CellLimits(**config["limits"]))
     sys.argv[:], sys.orig_argv[:] = [""], []
+    cpu_s = config["limits"]["cpu_s"]
     del config
-    zygote = Zygote(control)
+    zygote = Zygote(control, forks, cpu_s)
     gc.collect()
     gc.freeze()  # else the first collection in each cell copies all of the zygote's memory
     control.sendall(PREPARED)
-    process = os.getpid()
     try:
         start = zygote.run()
     finally:
-        if os.getpid() == process:
+        if not forks.is_child:
             zygote.end()
     return [] if start is None else [(setup, prepared, start)]
 
@@ -192,19 +199,16 @@ def main(descriptor: int, apart: str) -> None:
 
     Args:
         descriptor: the socket to the scorer.
-        apart: who makes namespaces and root: ``"own"`` for this process, ``"bubblewrap"`` if that
-            has, nothing if nobody may.
+        apart: whether to make namespaces and a root of its own; empty where that is forbidden.
     """
     layers: list[str] = []
-    if apart == "bubblewrap":
-        layers += ["bubblewrap", "namespaces", "empty-root", "read-only-mounts"]
-    elif apart == "own" and isolation.enter_namespaces():
+    if apart and isolation.enter_namespaces():
         layers.append("namespaces")
-    process = os.getpid()
+    forks = isolation.Forks(apart="namespaces" in layers)
     try:
-        cell = _serve(descriptor, layers)
+        cell = _serve(descriptor, forks, layers)
         if cell:
             serve.run(cell)
     finally:
-        if os.getpid() != process:
+        if forks.is_child:
             os._exit(70)

@@ -90,7 +90,10 @@ def main() -> None:
         app()
     except (InputError, OSError) as error:
         # Messages quote files and records of others, which may hold commands to the terminal.
-        lines = [plain(line) for line in str(error).split("\n")]
+        text = str(error)
+        if isinstance(error, OSError) and error.filename and error.strerror:
+            text = f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
+        lines = [plain(line) for line in text.split("\n")]
         print("ventbench:", "\n".join(lines), file=sys.stderr)
         sys.exit(2)
     except SystemExit as end:

@@ -179,3 +179,22 @@ def test_a_challenge_of_strangers_keeps_its_seal(tmp_path, monkeypatch):
         ChallengeFolder(tmp_path / "a").truth("other words")
     public = json.loads((tmp_path / "a" / "cases.json").read_text())
     assert "stranger" not in json.dumps(public)
+
+
+def test_an_inertance_is_judged_beside_its_circuit():
+    """What is detectable is the mass of the gas, not the tubing that came with it."""
+    from ventbench.validation.challenge.detectability import LIMIT, log_likelihood_loss
+
+    def loss(inertance: float) -> float:
+        effect = Effect("inertance", "strong", SAME, {"inertance": inertance, "circuit": 0.7})
+        case = replace(QUIET, effects=(effect,), breaths=12, noise=0.1)
+        return log_likelihood_loss(case, record(case, np.random.default_rng(2)), 0)
+
+    assert loss(1e-4) < 1.0
+    assert loss(0.13) > LIMIT
+    heavy = replace(
+        QUIET, effects=(Effect("inertance", "strong", SAME, {"inertance": 0.1, "circuit": 0.8}),)
+    )
+    only = frozenset({"circuit_compliance"})
+    assert acceptable_names(heavy, only, inertance_is_seen=False) == only
+    assert acceptable_names(heavy, only) == only | {"inertance"}

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.recordings.breaths import Breaths
-from ventbench.validation.challenge.cases import Base, Case
+from ventbench.validation.challenge.cases import Base, Case, Effect
 from ventbench.validation.challenge.generators import generator_of
 
 Floats = NDArray[np.float64]
@@ -55,10 +55,20 @@ def log_likelihood_loss(case: Case, breaths: Breaths, index: int) -> float:
     chosen = breaths.select(np.linspace(0, len(breaths) - 1, count).astype(int))
     start = np.full(count, case.base.peep)
     response = generator_of(case).replay(case, chosen, start, seed=index)
-    rest = replace(case, effects=case.effects[:index] + case.effects[index + 1 :])
+    rest = replace(
+        case,
+        effects=(*case.effects[:index], *_left(case.effects[index]), *case.effects[index + 1 :]),
+    )
     error = _refitted(rest, case.base, chosen, start, response, seed=index)
     noise = max(case.noise**2 + case.step**2 / 12.0, _LEAST_VARIANCE)
     return float(0.5 * np.sum(error**2) / noise * len(breaths) / count)
+
+
+def _left(effect: Effect) -> tuple[Effect, ...]:
+    """What stays of a rig without an effect: of an inertance, the circuit that came with it."""
+    if effect.name != "inertance" or "circuit" not in effect.parameters:
+        return ()
+    return (replace(effect, parameters=effect.parameters | {"inertance": 0.0}),)
 
 
 def _refitted(

@@ -53,7 +53,9 @@ def library_names(case: Case) -> frozenset[str]:
     return frozenset(effect.name for effect in case.effects if is_inside(case, effect.name))
 
 
-def acceptable_names(case: Case, named: frozenset[str] = frozenset()) -> frozenset[str]:
+def acceptable_names(
+    case: Case, named: frozenset[str] = frozenset(), *, inertance_is_seen: bool = True
+) -> frozenset[str]:
     """Mechanisms of the library that are in the case, or are equivalent to an effect in it.
 
     Args:
@@ -61,13 +63,18 @@ def acceptable_names(case: Case, named: frozenset[str] = frozenset()) -> frozens
         named: names of the answer. A stranger's effect outside the library has names that are right
             if the library has come to have one of them; and its inertance comes with a circuit's
             compliance, which may be named or not.
+        inertance_is_seen: False if a stranger's inertance is below the detection limit, so that the
+            circuit alone is a right answer.
     """
     if isinstance(case, stranger.StrangerCase):
         other = {n for e in case.effects if not is_inside(case, e.name)
                  for n in stranger.EFFECTS[e.name].names}  # fmt: skip
-        if any(effect.name == "inertance" for effect in case.effects):
+        inside = library_names(case)
+        if "inertance" in inside:
             other.add("circuit_compliance")
-        return library_names(case) | (named & other)
+        if not inertance_is_seen and "inertance" not in named:
+            inside -= {"inertance"}
+        return inside | (named & other)
     equivalents = {EQUIVALENTS[e.name] for e in case.effects if e.name in EQUIVALENTS}
     return library_names(case) | equivalents
 
@@ -241,7 +248,8 @@ def judge(drawn: DrawnCase, nats: list[float], answer: dict[str, Any]) -> Judged
     case, diagnosis = drawn.case, answer["diagnosis"]
     mechanisms = diagnosis["mechanisms"]
     named = frozenset(mechanism["name"] for mechanism in mechanisms)
-    library = acceptable_names(case, named)
+    seen = detectable_names(case, nats)
+    library = acceptable_names(case, named, inertance_is_seen="inertance" in seen)
     alternatives = {name for m in mechanisms for name in m["alternatives"][:_ALTERNATIVES]}
     place = diagnosis["slot"]["name"] if diagnosis["slot"] else None
     equivalent = drawn.kind == "outside" and bool(library) and named == library
@@ -252,7 +260,7 @@ def judge(drawn: DrawnCase, nats: list[float], answer: dict[str, Any]) -> Judged
         strengths=tuple(effect.strength for effect in case.effects),
         effects=tuple(effect.name for effect in case.effects),
         library=library,
-        seen=detectable_names(case, nats),
+        seen=seen,
         verdict=diagnosis["verdict"],
         named=named,
         listed=library & (named | alternatives),

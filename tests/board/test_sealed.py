@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
+import shutil
 from collections.abc import Callable
 from datetime import UTC, date, datetime
 from pathlib import Path
@@ -114,12 +116,12 @@ def test_a_season_from_its_opening_to_its_end(
     assert states["broken"] == (True, ("a cell failed; its message is sealed",))
     assert not performance.rows
 
-    opened = store.reveal(folder, "spring", seed, simulators)
+    opened = store.reveal(folder, "spring", seed, simulators).opened
     assert [score.name for score in opened] == ["pid_best", "pid_robust", "broken"]
     assert [score.sha256 for score in opened] == [
         entry.content.record for entry in (best, robust, broken)
     ]
-    assert store.reveal(folder, "spring", seed, simulators) == []
+    assert store.reveal(folder, "spring", seed, simulators).opened == ()
     build.build(folder)
     report = verify(folder, load)
     assert (report.problems, report.notes) == ([], [])
@@ -211,16 +213,27 @@ def forge(opening: Opening, made: create.Draft, **changes) -> Path:
     ],
 )
 def test_what_is_sealed_must_be_what_is_said(
-    opening: Opening, drafts, changes: dict, message: str
+    opening: Opening, drafts, load: Load, changes: dict, message: str
 ) -> None:
     path = forge(opening, drafts["pid_best"], **changes)
     with pytest.raises(InputError, match=message):
         store.add_sealed(opening.folder, path, seed=opening.seed)
-    # Without the seed it gets in, and the reveal refuses it.
-    store.add_sealed(opening.folder, path)
-    with pytest.raises(InputError, match=message):
-        store.reveal(opening.folder, "spring", opening.seed)
-    assert store.load(opening.folder).seasons["spring"].seed is None
+    # Without the seed it gets in. It stops no reveal, and is void.
+    forged = store.add_sealed(opening.folder, path)
+    honest = opening.add(drafts["pid_robust"])
+    revealed = store.reveal(opening.folder, "spring", opening.seed)
+    assert [score.sha256 for score in revealed.opened] == [honest.content.record]
+    assert re.search(message, revealed.void[forged.sha256])
+    build.build(opening.folder)
+    report = verify(opening.folder, load)
+    assert report.problems == []
+    assert any(re.search(message, note) for note in report.notes)
+    board = store.load(opening.folder)
+    assert forged.sha256 not in board.attested
+    assert "does not hold" in board.breaches[forged.sha256]
+    # Where it is signed, somebody who should know better has vouched for it.
+    attestation.sign(opening.folder, forged.sha256, SECRET)
+    assert any(re.search(message, problem) for problem in verify(opening.folder, load).problems)
 
 
 def test_a_ciphertext_that_was_changed_is_seen(opening: Opening, drafts, load: Load) -> None:
@@ -237,6 +250,16 @@ def test_a_ciphertext_that_was_changed_is_seen(opening: Opening, drafts, load: L
     path.unlink()
     (problem,) = verify(opening.folder, load).problems
     assert "is missing" in problem
+
+
+def test_no_other_file_has_the_name_of_a_ciphertext(opening: Opening, drafts, load: Load) -> None:
+    added = opening.add(drafts["pid_best"])
+    build.build(opening.folder)
+    assert verify(opening.folder, load).problems == []
+    path = sealed.path_of(added, opening.folder / "records")
+    shutil.copy(path, path.with_suffix(layout.ACTIONS_SUFFIX))
+    (problem,) = verify(opening.folder, load).problems
+    assert "is not named by chain" in problem
 
 
 def test_a_season_file_that_was_changed_is_seen(opening: Opening, drafts, load: Load) -> None:
@@ -347,7 +370,7 @@ def test_names_belong_to_their_authors_and_newer_records_name_the_older(
     second = store.add_sealed(
         opening.folder, create.amend(path, supersedes=first.sha256, reason="again")
     )
-    opened = store.reveal(opening.folder, "spring", opening.seed)
+    opened = store.reveal(opening.folder, "spring", opening.seed).opened
     assert opened[1].sha256 == second.content.record
     submission = json.loads(drafts["pid_best"].content)["submission"]
     submission["manifest"]["authors"] = ["Mallory"]

@@ -173,6 +173,12 @@ def assembled(
         if isinstance(entry, Sealed) and entry.sha256 in attested
     }
     against = breaches(records, known, attested)
+    there = {entry.sha256 for entry in records}
+    for entry in records:
+        if isinstance(entry, Sealed) and entry.content.record not in there:
+            season = known.get(entry.content.season.id)
+            if season is not None and season.seed is not None:
+                against[entry.sha256] = "not official: it does not hold the record that it names"
     counting = frozenset((attested | vouched) - against.keys())
     return Store(folder, tuple(links), tuple(records), counting, known, against)
 
@@ -304,12 +310,26 @@ def add_sealed(
     return added
 
 
+@dataclass(frozen=True)
+class Revealed:
+    """What came of the sealed records of a season.
+
+    Attributes:
+        opened: records that joined the leaderboard.
+        void: why a sealed record stays as it is, by its hash: it does not hold what it says.
+    """
+
+    opened: tuple[Record, ...]
+    void: Mapping[str, str]
+
+
 def reveal(
     folder: Path, name: str, seed: bytes, simulators: ReplayPlants | None = None
-) -> list[Record]:
+) -> Revealed:
     """Reveal the seed of a season and open its sealed records.
 
-    What was opened before is left alone, so that an interrupted call can be repeated.
+    What was opened before is left alone, so that an interrupted call can be repeated. A record that
+    does not hold what it says is void: else anybody's forgery could stop the reveal.
 
     Args:
         folder: of the leaderboard.
@@ -317,12 +337,9 @@ def reveal(
         seed: of the season.
         simulators: to replay each record on; not replayed if not given.
 
-    Returns:
-        The records that were opened.
-
     Raises:
-        InputError: if there is no such season, the seed is not the one that was committed to, or a
-            sealed record holds something else than it says; the seed is then not written.
+        InputError: if there is no such season, or the seed is not the one that was committed to;
+            nothing has then been written.
         OSError: if a file cannot be read or written.
     """
     from ventbench.board import sealed
@@ -332,22 +349,25 @@ def reveal(
         raise InputError(f"{season_path(folder, name)} is missing")
     season = seasons.reveal(store.seasons[name], seed)
     there = {entry.sha256 for entry in store.records}
-    waiting = [
-        sealed.unseal(entry, sealed.load(entry, folder / RECORDS), season, seed)
-        for entry in store.sealed
-        if entry.content.season.id == name and entry.content.record not in there
-    ]
-    for inside in waiting:
-        if simulators is not None:
-            label = f"the record of {inside.record.name}"
-            require_replay(inside.record, inside.commands, simulators, label)
+    waiting, void = [], {}
+    for entry in store.sealed:
+        if entry.content.season.id != name or entry.content.record in there:
+            continue
+        try:
+            inside = sealed.unseal(entry, sealed.load(entry, folder / RECORDS), season, seed)
+            if simulators is not None:
+                label = f"the record of {inside.record.name}"
+                require_replay(inside.record, inside.commands, simulators, label)
+            waiting.append(inside)
+        except InputError as error:
+            void[entry.sha256] = str(error)
     seasons.write_season(season_path(folder, name), season)
     for inside in waiting:
         kept = actions.path_of(inside.record, folder / RECORDS)
         commands = inside.commands
         files.write_atomically(kept, lambda file, commands=commands: file.write(commands))
         _append(load(folder), inside.record, inside.content)
-    return [inside.record for inside in waiting]
+    return Revealed(tuple(inside.record for inside in waiting), void)
 
 
 def require_replay(score: Record, commands: bytes, simulators: ReplayPlants, label: str) -> None:

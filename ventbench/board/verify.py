@@ -5,7 +5,7 @@ Nothing stops at the first problem: each names its file, and the key, line or by
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -106,6 +106,8 @@ def verify(
             report.problems.append(str(error))
     report.records = len(entries)
     report.problems += _strange_files(folder, bool(links))
+    if len(entries) == len(links):
+        report.problems += _misnamed(folder, entries)
     report.problems += store.conflicts(entries)
     vouched: frozenset[str] = frozenset()
     if links:  # else nobody knows which records there are
@@ -113,7 +115,7 @@ def verify(
         report.problems += problems
     known = _check_seasons(folder, report)
     leaderboard = store.assembled(folder, links, entries, vouched, known)
-    hidden = _check_sealed(leaderboard, seed, report)
+    hidden = _check_sealed(leaderboard, vouched, seed, report)
     by_draw = _check_replay(folder, leaderboard.scores, load, report, progress)
     _check_hidden(hidden, load, report)
     if not report.problems:  # else whatever is wrong has been said, and moves the ranks
@@ -135,7 +137,7 @@ def _check_seasons(folder: Path, report: Report) -> dict[str, season_files.Seaso
 
 
 def _check_sealed(
-    leaderboard: store.Store, seed: bytes | None, report: Report
+    leaderboard: store.Store, vouched: Container[str], seed: bytes | None, report: Report
 ) -> list[sealed.Opened]:
     """Check sealed records; look into them where the seed of their season is known.
 
@@ -164,9 +166,14 @@ def _check_sealed(
             if own is None:
                 closed += 1
                 continue
-            inside = sealed.unseal(entry, ciphertext, season, own)
         except (InputError, OSError) as error:
             report.problems.append(str(error))
+            continue
+        try:
+            inside = sealed.unseal(entry, ciphertext, season, own)
+        except InputError as error:
+            # Anybody can send a forgery; only a signature makes it somebody's fault.
+            (report.problems if entry.sha256 in vouched else report.notes).append(str(error))
             continue
         report.unsealed += 1
         if inside.record.sha256 in there:
@@ -213,6 +220,19 @@ def _strange_files(folder: Path, readable: bool) -> list[str]:
         elif readable:
             problems.append(f"{folder / name} is not named by {store.CHAIN}; add it, or remove it")
     return problems
+
+
+def _misnamed(folder: Path, entries: Sequence[AnyRecord]) -> list[str]:
+    """Files that bear the hash of a file of another kind, or belong to a record that has none."""
+    beside = {record.commands_of(x): isinstance(x, record.Sealed) for x in entries}
+    return [
+        f"{folder / name} is not named by {store.CHAIN}; remove it"
+        for name in sorted(layout.walk(folder)[0])
+        if name.startswith(f"{store.RECORDS}/")
+        for path in [Path(name)]
+        if path.suffix in (layout.ACTIONS_SUFFIX, layout.SEALED_SUFFIX)
+        if beside.get(path.stem) is (path.suffix == layout.ACTIONS_SUFFIX)
+    ]
 
 
 def _check_pages(leaderboard: store.Store) -> list[str]:

@@ -210,6 +210,7 @@ def reveal(
     from ventbench.board import store
     from ventbench.errors import InputError
     from ventbench.plants import frozen
+    from ventbench.text import plain
 
     secret = seasons.read_seed(seed)
     known = store.read_seasons(folder)
@@ -217,10 +218,15 @@ def reveal(
         raise InputError(
             f"season {season} is open until {known[season].closes}; its draws stay secret so long"
         )
-    opened = store.reveal(folder, season, secret, frozen.load())
-    for score in opened:
+    revealed = store.reveal(folder, season, secret, frozen.load())
+    for score in revealed.opened:
         typer.echo(f"opened {score.name} ({score.track}): record {score.sha256}")
-    typer.echo(f"season {season} is revealed, {len(opened)} records opened")
+    for reason in revealed.void.values():
+        typer.echo(f"void: {plain(reason)}")
+    typer.echo(
+        f"season {season} is revealed, {len(revealed.opened)} records opened, "
+        f"{len(revealed.void)} void"
+    )
     typer.echo("next: ventbench board build")
 
 

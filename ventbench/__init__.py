@@ -4,8 +4,8 @@ Everything that a notebook needs is an attribute of this package and is imported
 
 - recordings: ``load_recording``, ``import_recording``, ``example``, ``Breaths``;
 - simulators: ``load_simulators``, ``simulate``, ``open_loop``, the protocol ``Plant``;
-- controllers: ``score``, ``rollout``, ``tune_pid``, ``train_residual``, ``train_ppo``,
-  ``train_dqn``, the protocol ``Controller``;
+- controllers: ``score``, ``score_stress``, ``rollout``, ``tune_pid``, ``train_residual``,
+  ``train_ppo``, ``train_dqn``, the protocol ``Controller``;
 - missing physics: ``diagnose``, ``Diagnosis``;
 - learned simulators: ``train_simulator``; the leaderboard: ``load_board``.
 
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from ventbench.recordings.foreign import import_recording as import_recording
     from ventbench.simulation import Simulation as Simulation
     from ventbench.simulation import simulate as simulate
+    from ventbench.stress.score import StressScore as StressScore
+    from ventbench.stress.score import score_stress as score_stress
     from ventbench.submissions.result import Score as Score
     from ventbench.submissions.scoring import score as score
     from ventbench.training.pid_grid import tune_pid as tune_pid
@@ -64,6 +66,7 @@ _SOURCES = {
     "Score": ("submissions.result", "Score"),
     "Simulation": ("simulation", "Simulation"),
     "Simulators": ("plants.catalog", "Simulators"),
+    "StressScore": ("stress.score", "StressScore"),
     "Task": ("interfaces", "Task"),
     "Trajectories": ("trajectories", "Trajectories"),
     "diagnose": ("diagnosis.diagnose", "diagnose"),
@@ -75,6 +78,7 @@ _SOURCES = {
     "open_loop": ("open_loop_report", "open_loop"),
     "rollout": ("trajectories", "rollout"),
     "score": ("submissions.scoring", "score"),
+    "score_stress": ("stress.score", "score_stress"),
     "simulate": ("simulation", "simulate"),
     "train_dqn": ("training.rl.train", "train_dqn"),
     "train_ppo": ("training.rl.train", "train_ppo"),
@@ -96,6 +100,7 @@ __all__ = [
     "Score",
     "Simulation",
     "Simulators",
+    "StressScore",
     "Task",
     "Trajectories",
     "__version__",
@@ -108,6 +113,7 @@ __all__ = [
     "open_loop",
     "rollout",
     "score",
+    "score_stress",
     "simulate",
     "train_dqn",
     "train_ppo",

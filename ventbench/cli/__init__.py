@@ -27,6 +27,7 @@ from ventbench.cli import (
     real_pairs,
     score,
     simulators,
+    stress,
     study,
     submit,
     train,
@@ -71,6 +72,7 @@ submit.register(app)
 simulators.register(app)
 tune.register(app)
 train.register(app)
+stress.register(app)
 study.register(app)
 view.register(app)
 board.register(app)

@@ -1,4 +1,4 @@
-"""The stress track of ``ventbench score``."""
+"""The stress track of ``ventbench score``, and ``ventbench stressors``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from ventbench.cli.options import emit
+from ventbench.cli.options import JsonFile, emit
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -65,6 +65,37 @@ def score_entries(
         progress.print(f"{place}: {failure['what']}", style="red", markup=False)
     if failed:
         raise typer.Exit(1)
+
+
+def stressors(json: JsonFile = None) -> None:
+    """List the stressors of the stress track and their strengths.
+
+    Example: `ventbench stressors`
+    """
+    import dataclasses
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from ventbench.stress.stressors import PAIRS, STRESSORS, VERSION
+
+    lines = [dataclasses.asdict(line) for line in STRESSORS]
+    emit({"version": VERSION, "stressors": lines, "pairs": [list(pair) for pair in PAIRS]}, json)
+    table = Table(title=f"Stressors, version {VERSION}")
+    for name in ("category", "stressor", "what happens", "changes", "mild", "strong"):
+        table.add_column(name, justify="right" if name in ("mild", "strong") else "left")
+    for line in STRESSORS:
+        strengths = (f"{value:.3g}" for value in (line.mild, line.strong))
+        how = {"add": "", "scale": " (factor)", "label": " (label)"}[line.rule]
+        table.add_row(line.category, line.name, line.title, line.strength + how, *strengths)
+    console = Console(stderr=str(json) == "-")
+    console.print(table)
+    console.print("Pairs, both mild: " + ", ".join(" + ".join(pair) for pair in PAIRS))
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(stressors)
 
 
 def _table(scores: list[dict[str, Any]]) -> Table:

@@ -14,6 +14,7 @@ from typing import Literal
 
 from ventbench import protocol
 from ventbench.errors import InputError
+from ventbench.physics.catalogue import parameter
 
 #: Version of the table: stressors, strengths and pairs. Stress scores of two versions are not
 #: compared.
@@ -291,3 +292,23 @@ def conditions() -> tuple[Condition, ...]:
     """All conditions of the track: nothing first, then each stressor twice, then the pairs."""
     single = [Condition((s.name,), severity) for s in STRESSORS for severity in SEVERITIES]
     return (Condition(), *single, *(Condition(pair, "mild") for pair in PAIRS))
+
+
+def table() -> str:
+    """The table of stressors as Markdown, as it stands in ``docs/stress.md``."""
+    lines = [
+        "| stressor | what happens | changes | mild | strong | why these strengths |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for line in STRESSORS:
+        unit = "" if line.rule == "scale" else f" {parameter(line.strength).unit}"
+        unit = unit.replace(" 1/", " /").removesuffix(" 1")
+        sign = {"add": "+", "scale": "x ", "label": ""}[line.rule]
+        mild, strong = (
+            f"{sign if value > 0 else ''}{value:.3g}{unit}" for value in (line.mild, line.strong)
+        )
+        lines.append(
+            f"| `{line.name}` | {line.title} | `{line.strength}` | {mild} | {strong} "
+            f"| {line.reason} |"
+        )
+    return "\n".join(lines)

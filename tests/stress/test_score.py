@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from tests.stress.conftest import NAMES, Controller
 from ventbench.cli import app
+from ventbench.errors import InputError
 from ventbench.interfaces import Task
 from ventbench.stress.run import StressDraws, StressRun, draw_cells
 from ventbench.stress.score import StressScore, assess, chosen_conditions, run_stress
@@ -65,6 +66,17 @@ def test_an_interval_needs_two_draws_and_holds_the_mean(score: StressScore) -> N
     mean = 2.5 + 2.25 + noise.mean()
     assert low < mean < high
     assert high - low > 0.5 * 2 * 1.96 * noise.std() / 6
+
+
+def test_a_difference_is_paired(score: StressScore) -> None:
+    cells = draw_cells(load_rigs(), 6)
+    error = np.random.default_rng(1).uniform(1.0, 9.0, (len(score.conditions), 6, 6))
+    one = dataclasses.replace(score, drawn=cells.drawn, pips=cells.nominal_pip, error=error)
+    two = dataclasses.replace(one, error=error + 0.25)
+    difference, (low, high) = two.difference(one)
+    assert (difference, low, high) == pytest.approx((0.25, 0.25, 0.25))
+    with pytest.raises(InputError, match="different"):
+        two.difference(score)
 
 
 def test_the_controller_is_not_told(draws: StressDraws, chosen: tuple[Condition, ...]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from ventbench import protocol
@@ -16,6 +18,7 @@ from ventbench.stress.stressors import (
     Stressor,
     conditions,
     stressor,
+    table,
 )
 
 
@@ -60,3 +63,12 @@ def test_conditions_are_each_alone_twice_and_pairs_once() -> None:
 def test_an_unknown_stressor_is_said_to_be_one() -> None:
     with pytest.raises(InputError, match="no stressor 'wind'; choose of"):
         stressor("wind")
+
+
+def test_the_page_has_the_table_and_the_pairs() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "stress.md").read_text("utf-8")
+    assert table() in page, (
+        "put the output of ventbench.stress.stressors.table() into docs/stress.md"
+    )
+    for pair in PAIRS:
+        assert " + ".join(f"`{name}`" for name in pair) in page

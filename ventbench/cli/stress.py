@@ -23,6 +23,7 @@ def score_entries(
     json: Path | None,
 ) -> None:
     """Score entries on the stress track; arguments are the options of ``ventbench score``."""
+    import numpy as np
     from rich.console import Console
 
     from ventbench.errors import InputError
@@ -49,6 +50,15 @@ def score_entries(
     emit(results[0] if len(results) == 1 else {"submissions": results}, json)
     console = Console(stderr=str(json) == "-")
     console.print(_table(results))
+    for result in scores[1:]:
+        difference, limits = result.difference(scores[0])
+        if np.isfinite(difference):
+            low, high = limits
+            console.print(
+                f"{result.submission.manifest.name} less {results[0]['name']}: {difference:+.3f} "
+                f"cmH2O, paired 95 % interval {low:+.3f}..{high:+.3f}",
+                highlight=False,
+            )
     if out is not None:
         written = [out / result.submission.manifest.name for result in scores]
         for folder, result in zip(written, scores, strict=True):
@@ -108,7 +118,7 @@ def _table(scores: list[dict[str, Any]]) -> Table:
     table = Table(title="Stress track: mean |airway pressure - PIP|, cmH2O (lower is better)")
     table.add_column("")
     for entry in scores:
-        table.add_column(entry["name"], justify="right")
+        table.add_column(entry["name"], justify="right", overflow="fold")
     table.add_row("all stressors", *(show(entry["score"], 3) for entry in scores), style="bold")
     limits = [entry["ci95"] for entry in scores]
     if None not in limits[0]:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 import ventbench
 from ventbench import files, protocol
+from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics.figures import time_above_alarm
 from ventbench.metrics.rig_bootstrap import resampled_scores
@@ -155,6 +156,26 @@ class StressScore:
         means = resampled_scores(values, self.drawn.rig, self.drawn.member)
         low, high = np.quantile(means, (0.025, 0.975))
         return float(low), float(high)
+
+    def difference(self, other: StressScore) -> tuple[float, tuple[float, float]]:
+        """Stress score less that of another entry, cmH2O, and its paired 95 % interval.
+
+        Raises:
+            InputError: if the other one was run on other draws or under other conditions.
+        """
+        same = (
+            self.conditions == other.conditions
+            and self.lungs == other.lungs
+            and np.array_equal(self.pips, other.pips)
+            and self.drawn.about() == other.drawn.about()
+        )
+        if not same:
+            raise InputError(
+                f"{self.submission.label} and {other.submission.label} were run under different "
+                "conditions or on different draws; score both alike"
+            )
+        change = (self.error - other.error)[1:].mean(axis=0)
+        return float(change.mean()), self.interval(change)
 
     def to_frame(self) -> pd.DataFrame:
         """One row a run: condition, severity, lung, PIP, draw and all figures."""

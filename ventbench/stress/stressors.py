@@ -305,7 +305,8 @@ def table() -> str:
         unit = unit.replace(" 1/", " /").removesuffix(" 1")
         sign = {"add": "+", "scale": "x ", "label": ""}[line.rule]
         mild, strong = (
-            f"{sign if value > 0 else ''}{value:.3g}{unit}" for value in (line.mild, line.strong)
+            f"{sign if value > 0 else ''}{float(f'{value:.3g}'):g}{unit}"
+            for value in (line.mild, line.strong)
         )
         lines.append(
             f"| `{line.name}` | {line.title} | `{line.strength}` | {mild} | {strong} "

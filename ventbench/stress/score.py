@@ -366,7 +366,8 @@ def score_stress(
         >>> from ventbench.stress.score import score_stress
         >>> def proportional(observation):
         ...     return 5.0 + 2.0 * (observation.target - observation.pressure)
-        >>> result = score_stress(proportional, simulator="physics", draws=1, only=["leak"])
+        >>> some = ["leak", "sensor_low", "disconnection"]
+        >>> result = score_stress(proportional, draws=1, only=some)
         >>> result.complete
         False
     """

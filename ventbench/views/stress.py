@@ -170,7 +170,8 @@ def _entry(
             share = row["survived"]
             axes.add_patch(
                 Rectangle(
-                    (x + 0.02, y + 0.05), width - 0.04, 0.9, facecolor=shade(round(20 * share) / 20),
+                    (x + 0.02, y + 0.05), width - 0.04, 0.9,
+                    facecolor=shade(round(20.0 * share) / 20.0),  # few colours: a small file
                     edgecolor="#d9dde2", linewidth=0.6,
                 )
             )  # fmt: skip

@@ -10,6 +10,7 @@ import pytest
 from ventbench.diagnosis.residual_analysis import (
     compare_open_loop,
     locate,
+    noise_floor,
     open_loop_error,
     p_values,
     profiles,
@@ -298,3 +299,38 @@ def test_one_lung_is_no_part_and_gaps_do_not_count(breaths):
     found = compare_open_loop(holes, np.ones(4, bool), given, 0.2)
     assert not [name for name in found.groups if name.startswith("lung")]
     assert found.after.mae == pytest.approx(1.0)
+
+
+def test_sentence_and_chart_have_one_mean():
+    """A breath that stays long in a range counts no more there than one that stays short."""
+    recorded, pressure, flow, volume = exact(11, n=40)
+    late = (recorded.time > 0.5) & (np.arange(40) < 8)[:, None]
+    error = np.where(late, -0.9, np.where(recorded.time < 0.1, 0.6, 0.25))
+    noise = coloured(np.random.default_rng(12), pressure.shape, 0.0)
+    seen = dataclasses.replace(recorded, pressure=pressure + error + noise)
+    drawn = {p.axis.name: p for p in profiles(seen, pressure, flow, volume)}
+    places = locate(seen, pressure, SD, flow, volume)
+    checked = 0
+    for place in places:
+        if place.axis not in drawn:
+            continue
+        profile = drawn[place.axis]
+        first = place.low - (place.axis == "breath number")
+        inside = (profile.axis.edges[:-1] >= first - 1e-9) & (
+            profile.axis.edges[1:] <= place.high + 1e-9
+        )
+        if inside.sum() == 1:
+            assert place.mean_error == pytest.approx(float(profile.mean[inside][0]), abs=1e-9)
+            checked += 1
+    assert checked
+
+
+def test_the_floor_of_the_noise_is_the_sensors_not_that_of_a_bad_fit():
+    recorded, pressure, *_ = exact(13, n=30)
+    settled = np.where(recorded.u_out == 1, 5.0, pressure)
+    noise = coloured(np.random.default_rng(14), pressure.shape, 0.6)
+    seen = dataclasses.replace(recorded, pressure=settled + noise)
+    assert noise_floor(seen, SD) == pytest.approx(SD), "a good fit's noise stands"
+    assert noise_floor(seen, 2.5) == pytest.approx(3.0 * SD, rel=0.4)
+    inspired = dataclasses.replace(seen, u_out=np.zeros_like(seen.u_out))
+    assert noise_floor(inspired, 2.5) == 2.5, "nothing is quiet"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -11,6 +12,8 @@ import pytest
 
 from ventbench import mechanics
 from ventbench.errors import InputError
+from ventbench.lungs import lung
+from ventbench.mechanics.labels import LungMatch, label_texts, tolerance_text, value_text
 from ventbench.recordings import Breaths, make_breaths
 
 SENSORS = ("flow", "volume")
@@ -269,3 +272,60 @@ def test_labels_by_pressure_alone():
     assert bent.label_matches
     assert bent.fitted_R == pytest.approx(19.0)
     assert bent.source == "pressure"
+
+
+def one_way(breaths: Breaths) -> Breaths:
+    """The flow sensor has no sign: what leaves is counted as coming in."""
+    assert breaths.flow is not None
+    return replace(breaths, flow=np.abs(breaths.flow), volume=None)
+
+
+def reversed_sign(breaths: Breaths) -> Breaths:
+    assert breaths.flow is not None
+    return replace(breaths, flow=-breaths.flow, volume=None)
+
+
+def other_unit(breaths: Breaths) -> Breaths:
+    assert breaths.flow is not None
+    return replace(breaths, flow=breaths.flow * 0.001, volume=None)  # L/s
+
+
+def unrelated(breaths: Breaths) -> Breaths:
+    assert breaths.volume is not None
+    return replace(breaths, flow=None, volume=np.roll(breaths.volume, 90, axis=1))
+
+
+@pytest.mark.parametrize(
+    ("harm", "how"),
+    [
+        (one_way, r"of \d+ mL that flow in, 0 mL are seen to leave"),
+        (reversed_sign, r"the sign of the flow is reversed"),
+        (other_unit, r"its unit may be another one"),
+        (unrelated, r"volume"),
+    ],
+)
+def test_what_no_lung_has_is_not_printed_but_explained(harm, how):
+    found = only(harm(recording(20.0, 20.0, n=12, seed=5)))
+    assert np.isnan([found.R.value, found.C.value, found.match.fitted_C]).all()
+    assert not found.match.label_matches
+    assert found.settings == ()
+    assert re.search(how, found.notes[0]), found.notes[0]
+    assert "No lung has the R and C" in found.notes[0]
+    assert label_texts(found.match, found.settings) == ("unknown", "unknown")
+    assert value_text(found.match.fitted_C, found.match.ci95_C) == "unknown"
+
+
+def test_a_label_that_holds_is_named_first_among_what_the_lung_may_be():
+    """R10C10 lies within the tolerance of R5C10, R10C10 and R20C10 when R is little known."""
+    match = LungMatch("R10C10", 14.0, 10.0, (10.0, 18.0), (9.5, 10.5), True, "pressure and flow")
+    known = (lung("R10C10"), lung("R20C10"))
+    assert label_texts(match, known) == ("yes", "R10C10, or R20C10")
+    wrong = replace(match, label_matches=False)
+    assert label_texts(wrong, known[1:]) == ("no", "R20C10")
+    assert "a factor of 1.3" in tolerance_text()
+
+
+def test_the_label_comes_first_where_it_holds():
+    found = only(recording(16.0, 20.0, label=(20.0, 20.0), seed=7))
+    assert found.match.label_matches
+    assert found.settings[0].id == "R20C20"

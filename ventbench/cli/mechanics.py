@@ -128,17 +128,21 @@ def _say_runs(console: Any, runs: tuple[SurveyedRun, ...]) -> None:
 def _table(lungs: tuple[Mechanics, ...]) -> Any:
     from rich.table import Table
 
-    table = Table(title="Lungs from pressure and flow: R in cmH2O/(L/s) at 1 L/s, C in mL/cmH2O")
+    from ventbench.mechanics.labels import label_texts, tolerance_text, value_text
+
+    table = Table(
+        title="Lungs from pressure and flow: R in cmH2O/(L/s) at 1 L/s, C in mL/cmH2O",
+        caption=f"A label holds with {tolerance_text()}, beyond the intervals.",
+    )
     for name in ("label", "R", "C", "label holds", "may be", "also needs"):
         table.add_column(name)
     for lung in lungs:
         match = lung.match
         table.add_row(
             lung.label,
-            f"{match.fitted_R:.1f} [{match.ci95_R[0]:.1f}, {match.ci95_R[1]:.1f}]",
-            f"{match.fitted_C:.1f} [{match.ci95_C[0]:.1f}, {match.ci95_C[1]:.1f}]",
-            "yes" if match.label_matches else "no",
-            ", ".join(setting.id for setting in lung.settings[:2]) or "none known",
+            value_text(match.fitted_R, match.ci95_R),
+            value_text(match.fitted_C, match.ci95_C),
+            *label_texts(match, lung.settings),
             ", ".join(term.name for term in lung.terms) or "-",
         )
     return table

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
-from ventbench.diagnosis.evaluator import Evaluator
+from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.latent_inputs import (
     GAIN_SCATTER,
@@ -22,6 +22,7 @@ from ventbench.diagnosis.latent_inputs import (
     fit_latent_inputs,
     log_likelihood_without_input,
 )
+from ventbench.diagnosis.plausibility import is_consistent, is_plausible
 from ventbench.diagnosis.refinement import (
     Alternatives,
     NonparametricFit,
@@ -134,7 +135,13 @@ def conclude(evaluator: Evaluator, wider: Callable[[], Evaluator], tell: Progres
     selected, alternatives = find_alternatives(
         evaluator, selected, comparisons, swap=unnamed is None
     )
-    full = selected if unnamed is None else full
+    selected, gains = _supported(evaluator, selected)
+    if unnamed is None or unnamed.term is None:
+        full = selected
+    else:
+        dropped = [name for name in full.names if name not in (*selected.names, unnamed.term)]
+        if dropped:
+            full = fit_with_noise(wide, full.hypothesis.without(*dropped), full)
     latent = None if unnamed is None else unnamed.latent_input
     return Conclusion(
         base,
@@ -142,10 +149,38 @@ def conclude(evaluator: Evaluator, wider: Callable[[], Evaluator], tell: Progres
         full,
         unnamed,
         full.noise if latent is None else latent.noise,
-        _held_out_gains(evaluator, selected),
-        alternatives,
+        gains,
+        {name: alternatives[name] for name in selected.names if name in alternatives},
         evaluator.gain_sd,
         unnamed is None and not selected.names and is_unresolved(evaluator, comparisons),
+    )
+
+
+def without_name(
+    conclusion: Conclusion, name: str, evaluator: Evaluator, wide: Evaluator
+) -> Conclusion:
+    """The conclusion without a mechanism whose strength may as well be none.
+
+    Args:
+        conclusion: the conclusion.
+        name: name of the mechanism.
+        evaluator: evaluator with the library's parameters.
+        wide: evaluator of ``conclusion.full``.
+    """
+    named = conclusion.named
+    evaluator, wide = (replace(one, gain_sd=conclusion.gain_sd) for one in (evaluator, wide))
+    left = fit_with_noise(evaluator, named.hypothesis.without(name), named)
+    full = left
+    if conclusion.unnamed is not None and conclusion.unnamed.term is not None:
+        full = fit_with_noise(wide, conclusion.full.hypothesis.without(name), conclusion.full)
+    latent = None if conclusion.unnamed is None else conclusion.unnamed.latent_input
+    return replace(
+        conclusion,
+        named=left,
+        full=full,
+        noise=full.noise if latent is None else latent.noise,
+        held_out_gains={k: v for k, v in conclusion.held_out_gains.items() if k != name},
+        alternatives={k: v for k, v in conclusion.alternatives.items() if k != name},
     )
 
 
@@ -266,12 +301,27 @@ def _best_input(
     return None
 
 
-def _held_out_gains(evaluator: Evaluator, selected: FittedModel) -> dict[str, float]:
-    """Held-out log-likelihood that is lost without each mechanism, nats."""
-    with_all = evaluator.held_out_log_likelihood(selected)
+def _supported(evaluator: Evaluator, selected: FittedModel) -> tuple[FittedModel, dict[str, float]]:
+    """Drop mechanisms that held-out breaths do not agree on; and the gains of the others, nats.
 
-    def lost(name: str) -> float:
+    Of a recording with few breaths, each is held out once (cross-validation).
+    """
+    settings = evaluator.settings.plausibility
+
+    def compared(name: str) -> tuple[Floats, bool]:
         left = evaluator.fit(selected.hypothesis.without(name), selected.noise, selected)
-        return float((with_all - evaluator.held_out_log_likelihood(left)).sum())
+        held_out = evaluator.held_out_log_likelihood(selected)
+        gains = held_out - evaluator.held_out_log_likelihood(left)
+        plausible = is_plausible(selected, name, settings)
+        supported = plausible and is_consistent(gains, settings)
+        if plausible and not supported and gains.sum() > 0.0:
+            supported = is_consistent(cross_validated_gain(evaluator, selected, left), settings)
+        return gains, supported
 
-    return dict(zip(selected.names, parallel_map(lost, selected.names), strict=True))
+    while True:
+        results = dict(zip(selected.names, parallel_map(compared, selected.names), strict=True))
+        weak = [name for name, (_, supported) in results.items() if not supported]
+        if not weak:
+            return selected, {name: float(gains.sum()) for name, (gains, _) in results.items()}
+        least = min(weak, key=lambda name: float(results[name][0].sum()))
+        selected = fit_with_noise(evaluator, selected.hypothesis.without(least), selected)

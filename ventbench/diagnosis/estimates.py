@@ -16,13 +16,13 @@ from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY, Lat
 from ventbench.diagnosis.screening import component_of
 from ventbench.interfaces import Plant
 from ventbench.mechanics.labels import Estimate, LungMatch
-from ventbench.physics.catalogue import library, mechanism, parameter, paths
+from ventbench.physics.catalogue import library, mechanism, parameter, paths, strength_path
 from ventbench.physics.component_curves import component_curves, without_absorbed
 from ventbench.physics.model import Physics
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.precision import float64
 from ventbench.recordings.breaths import Breaths
-from ventbench.system_id import Fit, fit, interval
+from ventbench.system_id import ConfidenceInterval, Fit, fit, interval, profile_interval
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.predictor import START, Predictor
 
@@ -99,11 +99,25 @@ def parameter_estimates(fitted: Fit, name: str) -> dict[str, Estimate]:
             values[about.name] = Estimate(float(middle), about.unit, (float(low), float(high)))
         else:
             groups = range(len(fitted.problem.unknowns.of(path)))
-            ends = [interval(fitted, path, group) for group in groups]
+            ends = [_interval(fitted, path, group) for group in groups]
             low, high = min(end.low for end in ends), max(end.high for end in ends)
             middle = float(np.median([end.value for end in ends]))
             values[about.name] = Estimate(middle, about.unit, (low, high))
     return values
+
+
+def _interval(fitted: Fit, path: str, group: int) -> ConfidenceInterval:
+    """Interval of a parameter; where it reaches the neutral value, that of the profile likelihood.
+
+    A strength and a time of relaxation make up for each other, so that a parabola says little of
+    either near the bounds.
+    """
+    ends = interval(fitted, path, group)
+    owner = path.rpartition(".")[0]
+    about = parameter(path)
+    if path != strength_path(owner) or about.kinked or not ends.low <= about.neutral <= ends.high:
+        return ends
+    return ConfidenceInterval(ends.value, *profile_interval(fitted, path, group))
 
 
 def lung_matches(fitted: Fit) -> tuple[LungMatch, ...]:

@@ -30,7 +30,8 @@ class MissingMechanism:
     Attributes:
         name: name in the library.
         parameters: estimates by short name.
-        confidence: probability that this mechanism, and none of the alternatives, acts, 0..1.
+        confidence: how far the name is preferred over other names, 0..1: its posterior probability
+            if one of the compared mechanisms acts. It says nothing of effects that none of them is.
         alternatives: mechanisms that the recording cannot distinguish from it, the likeliest first.
         nats: held-out log-likelihood that is lost without it.
         changed: True if the simulator has the mechanism too, with other parameters.
@@ -80,7 +81,8 @@ class ErrorRegion:
         low: start of the range.
         high: end of the range.
         unit: unit of the range.
-        mean_error: recorded minus simulated pressure, mean over the range, cmH2O.
+        mean_error: recorded minus simulated pressure, cmH2O: mean over breaths of each breath's
+            mean over the range, as charts show it.
         p_value: corrected for all ranges of all axes.
         share: share of the squared error above the noise that lies in the range, 0..1.
     """

@@ -14,14 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.diagnosis import estimates
-from ventbench.diagnosis.conclusion import Conclusion, conclude
+from ventbench.diagnosis.conclusion import Conclusion, conclude, without_name
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
-from ventbench.diagnosis.hypothesis import FittedModel, Partition, make_partition
+from ventbench.diagnosis.hypothesis import (
+    FittedModel,
+    Partition,
+    make_partition,
+    varies_by_breath,
+)
+from ventbench.diagnosis.plausibility import excludes_neutral
 from ventbench.diagnosis.screening import all_parameter_paths
 from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
-from ventbench.physics.catalogue import paths
+from ventbench.physics.catalogue import mechanism, paths
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit
 from ventbench.system_id.data import Data, Floats
@@ -201,5 +207,19 @@ def identify(
     if not has_term:  # a nonparametric term is fitted to the training breaths alone, to save time
         chosen = ~held if fitted is None else fitted
         final = make_partition(data.select(chosen), paths(), settings)
-    fit = estimates.final_fit(conclusion.full, final, evaluator)
-    return IdentifiedModel(evaluator, conclusion, fit, final)
+    while True:
+        fit = estimates.final_fit(conclusion.full, final, evaluator)
+        vague = [name for name in conclusion.names if not _is_definite(fit, name)]
+        if not vague:
+            return IdentifiedModel(evaluator, conclusion, fit, final)
+        # The least needed one first: the intervals of others may shrink once it has gone.
+        name = min(vague, key=lambda name: conclusion.held_out_gains.get(name, 0.0))
+        conclusion = without_name(conclusion, name, narrow, evaluator)
+
+
+def _is_definite(fit: Fit, name: str) -> bool:
+    """Whether the interval of a mechanism's strength excludes that it is off."""
+    strength = mechanism(name).description.strength
+    if varies_by_breath(name) or f"{name}.{strength.name}" not in fit.problem.unknowns.paths:
+        return True
+    return excludes_neutral(estimates.parameter_estimates(fit, name)[strength.name], name)

@@ -273,7 +273,9 @@ def eliminate_beside_input(
         ]
         idle = [
             removal
-            for removal in parallel_map(partial(_without_idle, evaluator, current, latent), asked)
+            for removal in parallel_map(
+                partial(_without_idle, evaluator, current, latent, nats), asked
+            )
             if removal is not None
         ]
         if not idle:
@@ -298,14 +300,20 @@ def _held_out_gain(evaluator: Evaluator, selected: FittedModel, name: str) -> fl
 
 
 def _without_idle(
-    evaluator: Evaluator, current: FittedModel, latent: LatentInput, name: str
+    evaluator: Evaluator, current: FittedModel, latent: LatentInput, nats: float, name: str
 ) -> tuple[float, FittedModel, LatentInput] | None:
-    """Nats lost without a mechanism beside an input, and what is left; None if it is needed."""
+    """Nats lost without a mechanism beside an input, and what is left; None if it is needed.
+
+    ``nats`` are those that the input gains on held-out breaths.
+    """
     left = evaluator.fit(current.hypothesis.without(name), current.noise, current)
     shared = without_breath_terms(evaluator, left)
     other = fit_latent_inputs(evaluator, shared, (latent.place,))[latent.place]
     lost = latent.held_out_log_likelihood - other.held_out_log_likelihood
-    needed = passes_heldout_test(lost, evaluator.settings.held_out_test)
+    # Beside an input that explains much, a mechanism may only trim its linearised response.
+    settings, test = evaluator.settings.refinement, evaluator.settings.held_out_test
+    least = max(test.threshold, min(settings.compensating_share * nats, settings.shortfall_nats))
+    needed = passes_heldout_test(lost, test, least)
     return None if needed else (float(lost.sum()), left, other)
 
 

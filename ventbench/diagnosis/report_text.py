@@ -6,18 +6,25 @@ import math
 from collections.abc import Sequence
 
 from ventbench.diagnosis.findings import ErrorRegion, Findings, MissingMechanism, NonparametricTerm
-from ventbench.mechanics.labels import Estimate, LungMatch
+from ventbench.diagnosis.residual_axes import EDGE
+from ventbench.mechanics.labels import (
+    APPARATUS,
+    GAIN,
+    TOLERANCE_C,
+    TOLERANCE_R,
+    Estimate,
+    LungMatch,
+)
 from ventbench.physics import mechanism, parameter
 
 #: Axes whose ranges are parts of a breath: an effect is described best by these.
 _PHASES = ("time since inspiration", "time since expiration")
-_EDGE = "time since a valve edge"
 
 #: How a range of time is described: what it starts from, and what it is the beginning of.
 _MOMENTS = {
     _PHASES[0]: ("the start of inspiration", "of each breath"),
     _PHASES[1]: ("the start of expiration", "of expiration"),
-    _EDGE: ("an edge of a valve", "after an edge of a valve"),
+    EDGE: ("an edge of a valve", "after an edge of a valve"),
 }
 
 #: Moments up to this are given in ms, s.
@@ -32,14 +39,20 @@ _NO_SIGN = 0.25
 
 def sentences(findings: Findings) -> list[str]:
     """Everything a reader should know, the most important first."""
-    texts = [verdict(findings), *map(missing_mechanism, findings.mechanisms)]
+    texts = [answer(findings), *map(missing_mechanism, findings.mechanisms)]
     texts += [effect(findings), *alternatives(findings), nonparametric_term(findings)]
-    texts += [open_loop(findings), *map(lung, findings.lungs), request(findings), *findings.notes]
+    texts += [open_loop(findings), remaining(findings), *map(lung, findings.lungs)]
+    texts += [scatter(findings), request(findings), *findings.notes]
     return [text for text in texts if text]
 
 
+def answer(findings: Findings) -> str:
+    """What is missing, how sure that is, what mending it is worth, and what stays unexplained."""
+    return f"{verdict(findings)} {worth(findings)}".strip()
+
+
 def verdict(findings: Findings) -> str:
-    """The answer in one sentence."""
+    """What is missing, and how sure that is, in one sentence."""
     simulator, term = f"the {findings.simulator} simulator", findings.nonparametric
     if findings.verdict == "nothing_missing":
         how = "" if _is_unchanged(findings) else "with R and C refitted, "
@@ -51,14 +64,69 @@ def verdict(findings: Findings) -> str:
                 "mechanism nor a place in the model."
             )
         return (
-            f"Something is missing in {simulator} that is not in the library of mechanisms; its "
-            f"place in the model is {place(term)}."
+            f"Something is missing in {simulator} that is not in the library of mechanisms "
+            f"({_evidence(term.nats)}); its place in the model is {place(term)}."
         )
     names = _listed(
-        [f"{title(mechanism.name)} ({mechanism.name})" for mechanism in findings.mechanisms]
+        [
+            f"{title(mechanism.name)} ({mechanism.name}, {_evidence(mechanism.nats)})"
+            for mechanism in findings.mechanisms
+        ]
     )
     rest = "" if term is None else "; an effect that is not in the library is missing too"
-    return f"Missing in {simulator}: {names}{rest}."
+    return f"Missing in {simulator}: {names}; 5 nats decide{rest}."
+
+
+def worth(findings: Findings) -> str:
+    """What mending the simulator is worth on breaths set aside, and what stays unexplained."""
+    errors = findings.open_loop
+    after, noise = rounded(errors.after.rmse, 2), rounded(errors.noise_floor, 2)
+    beyond = rounded(errors.unexplained, 2)
+    left = f"{beyond} cmH2O stay unexplained beyond the noise of {noise}"
+    if not math.isfinite(errors.unexplained):
+        left = f"the noise is {noise}"
+    elif errors.unexplained < 0.5 * errors.noise_floor:
+        left = f"hardly more than the noise of {noise} is left"
+    count = len(errors.held_out_breaths)
+    if findings.verdict == "nothing_missing":
+        return f"It errs by {after} cmH2O on {count} breaths set aside; {left}."
+    refit = rounded(errors.refit.rmse, 2)
+    term = findings.nonparametric
+    if term is not None and term.x_unit.startswith("sample") and not findings.mechanisms:
+        return (
+            f"It differs from breath to breath, so that no correction of the simulator mends it: "
+            f"the error on {count} breaths set aside stays at {after} cmH2O; {left}."
+        )
+    if errors.after == errors.refit or after == refit:
+        return (
+            f"Mending it is worth nothing on the {count} breaths set aside, where the error stays "
+            f"at {after} cmH2O; {left}."
+        )
+    start = " (R and C refitted)" if errors.refit != errors.before else ""
+    return (
+        f"Mending it takes the error on {count} breaths set aside from {refit}{start} to {after} "
+        f"cmH2O; {left}."
+    )
+
+
+def remaining(findings: Findings) -> str:
+    """Where the corrected simulator still errs most."""
+    if not findings.remaining or findings.open_loop.after == findings.open_loop.refit:
+        return ""
+    region = max(findings.remaining, key=lambda region: region.share)
+    return f"After the correction, {_error(region, findings.noise[0])}."
+
+
+def scatter(findings: Findings) -> str:
+    """That breaths have valve gains of their own."""
+    if findings.gain_scatter <= 0.0:
+        return ""
+    share = 100.0 * math.expm1(findings.gain_scatter)
+    return (
+        f"The gain of the valve differs from breath to breath by about {share:.0f} %, as if "
+        "several rigs or supplies had been recorded; no simulator that sees the commands alone can "
+        "know that, so part of the error stays."
+    )
 
 
 def title(name: str) -> str:
@@ -67,7 +135,7 @@ def title(name: str) -> str:
 
 
 def missing_mechanism(missing: MissingMechanism) -> str:
-    """Values of a missing mechanism with their 95 % intervals, and the confidence in its name."""
+    """Values of a missing mechanism with their 95 % intervals, and how far its name is ahead."""
     about = mechanism(missing.name).description
     meanings = {parameter.name: parameter.meaning for parameter in about.parameters}
     values = []
@@ -82,8 +150,8 @@ def missing_mechanism(missing: MissingMechanism) -> str:
     start = _capital(about.title)
     if missing.changed and not missing.simulator_values:
         start += ", which the simulator has with another strength"
-    confidence = f"Confidence in this mechanism: {100 * missing.confidence:.0f} %."
-    return f"{start}{': ' if values else ''}{'; '.join(values)}. {confidence}"
+    preferred = f"Preferred over other names: {100 * missing.confidence:.0f} %."
+    return f"{start}{': ' if values else ''}{'; '.join(values)}. {preferred}"
 
 
 def effect(findings: Findings) -> str:
@@ -188,7 +256,7 @@ def open_loop(findings: Findings) -> str:
 
 
 def lung(match: LungMatch) -> str:
-    """Whether a lung is what its label says."""
+    """Whether a lung is what its label says, within which tolerance, and what else it may be."""
     values = [
         f"{name} {quantity(Estimate(value, unit, ends))}"
         for name, value, ends, unit in (
@@ -198,10 +266,21 @@ def lung(match: LungMatch) -> str:
         if math.isfinite(value)
     ]
     fitted = f"{' and '.join(values)}, from {match.source}" if values else "R and C unknown"
+    if not values:
+        return f"Whether the lung matches its label {match.label} is unknown: {fitted}."
+    gain = ""
+    if match.source == "pressure":
+        gain = f", and a valve gain wrong by {100 * (GAIN - 1):.0f} %"
+    tolerance = (
+        f"tolerance: R by a factor of {TOLERANCE_R:g} and {APPARATUS:g} cmH2O/(L/s) of tubes, C by a "
+        f"factor of {TOLERANCE_C:g}{gain}"
+    )
+    others = [name for name in match.settings if name != match.label][:2]
     if match.label_matches:
-        return f"The lung matches its label {match.label}: {fitted}."
-    known = f" It may be {' or '.join(match.settings[:2])}." if match.settings else ""
-    return f"The lung does not match its label {match.label}: {fitted}.{known}"
+        also = f" Within the same tolerance it could be {' or '.join(others)}." if others else ""
+        return f"The lung matches its label {match.label}: {fitted} ({tolerance}).{also}"
+    known = f" It may be {' or '.join(others)}." if others else ""
+    return f"The lung does not match its label {match.label}: {fitted} ({tolerance}).{known}"
 
 
 def quantity(estimate: Estimate, path: str = "") -> str:
@@ -259,6 +338,11 @@ def _scale(estimate: Estimate, path: str) -> tuple[float, str]:
     if path and parameter(path).share:
         return 100.0, "%"
     return 1.0, "" if estimate.unit == "1" else estimate.unit
+
+
+def _evidence(nats: float) -> str:
+    """Held-out evidence in words: 5 nats are odds of 150 to 1."""
+    return f"{nats:.0f} nats of evidence"
 
 
 def _is_unchanged(findings: Findings) -> bool:

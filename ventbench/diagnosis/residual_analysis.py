@@ -220,7 +220,7 @@ def locate(
                     low=float(axis.edges[first]) + (axis.name == "breath number"),
                     high=float(axis.edges[last + 1]),
                     unit=axis.unit,
-                    mean_error=float(error[inside].mean()),
+                    mean_error=_mean_over_breaths(error, inside),
                     p_value=float(p_value[own][first : last + 1].min()),
                     share=float(np.clip(share, 0.0, 1.0)),
                 )
@@ -325,6 +325,17 @@ def _scaled(values: Floats, weight: Floats | None, min_breaths: int) -> tuple[Fl
     enough = (known.sum(axis=0) >= min_breaths) & (norm > 0)
     scale = np.divide(1.0, norm, out=np.zeros_like(norm), where=enough)
     return filled, scale if weight is None else scale * weight
+
+
+def _mean_over_breaths(error: Floats, inside: NDArray[np.bool_]) -> float:
+    """Mean over breaths of each breath's mean error, as in :class:`Profile`.
+
+    A long stay of one breath in a range counts no more than a short one of another: breaths are the
+    independent unit of the tests.
+    """
+    count = inside.sum(axis=1)
+    known = count > 0
+    return float(np.mean(np.where(inside, error, 0.0).sum(axis=1)[known] / count[known]))
 
 
 def _breath_means(axis: Axis, values: Floats, usable: NDArray[np.bool_]) -> Floats:

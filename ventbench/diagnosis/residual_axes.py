@@ -17,6 +17,10 @@ Integers = NDArray[np.int64]
 _EXTREME = 0.005
 
 
+#: Axis of the time since a valve's edge.
+EDGE = "time since a valve edge"
+
+
 @dataclass(frozen=True, eq=False)
 class Axis:
     """k neighbouring ranges of one quantity, and the range in which each sample lies.
@@ -78,7 +82,7 @@ def axes(
         _phase("time since inspiration", breaths.time - start, acted & breaths.valid, step),
         _phase("time since expiration", breaths.time - opened, ~acted & breaths.valid, step),
         _axis("valve opening", "%", np.array(settings.openings), u_in, acted),
-        _axis("time since a valve edge", "s", np.array(settings.edge_times), since),
+        _axis(EDGE, "s", np.array(settings.edge_times), since),
         _axis("pressure", "cmH2O", edges(pressure), pressure),
     ]
     if flow is not None:

@@ -192,6 +192,7 @@ def _mechanism(mechanism: MissingMechanism) -> dict[str, Any]:
         "name": mechanism.name,
         "parameters": {name: _estimate(value) for name, value in mechanism.parameters.items()},
         "confidence": mechanism.confidence,
+        "preferred_over_other_names": mechanism.confidence,
         "alternatives": list(mechanism.alternatives),
         "nats": mechanism.nats,
         "changed": mechanism.changed,

@@ -24,6 +24,7 @@ import numpy as np
 from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.latent_inputs import exceeds_sensor_noise
+from ventbench.diagnosis.plausibility import is_plausible
 from ventbench.diagnosis.screening import Candidate, screen_mechanisms
 from ventbench.diagnosis.settings import DEFAULT, HeldOutTestSettings
 from ventbench.executor import parallel_map
@@ -198,7 +199,7 @@ def is_needed(evaluator: Evaluator, with_term: FittedModel, without_term: Fitted
 def is_negligible(
     evaluator: Evaluator, with_term: FittedModel, without_term: FittedModel, name: str
 ) -> bool:
-    """Whether a term is far weaker than a mild one and explains little beside the others.
+    """Whether a term is implausible, or far weaker than a mild one and explains little.
 
     A tiny effect of almost any kind can reduce an error of the integrator, or of another term's
     form, and with enough breaths it passes the held-out test: a valve that is late by 1 ms beside
@@ -210,6 +211,8 @@ def is_negligible(
         without_term: the hypothesis without the term, at the same noise.
         name: name of the term.
     """
+    if not is_plausible(with_term, name, evaluator.settings.plausibility):
+        return True
     settings = evaluator.settings.held_out_test
     about = mechanism(name).description.strength
     strength = float(np.max(np.abs(with_term.column(f"{name}.{about.name}") - about.neutral)))

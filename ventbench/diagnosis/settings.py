@@ -199,6 +199,28 @@ class RefinementSettings:
 
 
 @dataclass(frozen=True)
+class PlausibilitySettings:
+    """Which fitted mechanisms are statements about a rig.
+
+    Attributes:
+        effort_breaths: fewest breaths in which an effort must reach the least strength.
+        effort_share: least share of the breaths in which it must.
+        effort_pulls: least share of those efforts that must pull: muscles that push at random are
+            another effect.
+        bootstraps: resamplings of the held-out breaths.
+        bootstrap_level: quantile of the resampled gains that must be positive.
+        bootstrap_breaths: fewest held-out breaths that can be resampled.
+    """
+
+    effort_breaths: int = 2
+    effort_share: float = 0.1
+    effort_pulls: float = 0.8
+    bootstraps: int = 1000
+    bootstrap_level: float = 0.025
+    bootstrap_breaths: int = 4
+
+
+@dataclass(frozen=True)
 class PatientEffortSettings:
     """Prior of the patient's efforts, which differ from breath to breath.
 
@@ -403,6 +425,7 @@ class SelectionConfig:
     held_out_test: HeldOutTestSettings = field(default_factory=HeldOutTestSettings)
     forward: ForwardSelectionSettings = field(default_factory=ForwardSelectionSettings)
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
+    plausibility: PlausibilitySettings = field(default_factory=PlausibilitySettings)
     patient_effort: PatientEffortSettings = field(default_factory=PatientEffortSettings)
     latent_inputs: LatentInputSettings = field(default_factory=LatentInputSettings)
     correction: CorrectionSettings = field(default_factory=CorrectionSettings)

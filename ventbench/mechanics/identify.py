@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -31,6 +32,7 @@ from ventbench.mechanics.regression import (
     fit,
 )
 from ventbench.mechanics.segments import Segment, clipped_share, segments
+from ventbench.mechanics.soundness import problem_with
 from ventbench.mechanics.term_selection import (
     FEWEST_BREATHS,
     CircuitEstimate,
@@ -43,6 +45,9 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.system_id.fit import t_quantile
 
 Floats = NDArray[np.float64]
+
+#: Units of R and C.
+_UNITS = ("cmH2O/(L/s)", "mL/cmH2O")
 
 #: Share of clipped pressures, and residual, cmH2O, above which a note warns the reader.
 _NOTED_CLIPPING, _NOTED_NOISE = 0.02, 1.0
@@ -91,7 +96,7 @@ class Mechanics:
         offset: pressure at the start of a breath without the effect of flow, cmH2O.
         terms: effects beyond R and C, the most important first.
         match: comparison with the label, with R at the flow for which the label holds.
-        settings: known settings that this lung may be, the nearest first.
+        settings: known settings that this lung may be: the label if it holds, then the nearest.
         noise: standard deviation of the residual, cmH2O.
         breaths: number of breaths that were used.
         samples: number of smoothed samples.
@@ -138,13 +143,23 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
     best = _best_for_label(full, plain, label)
     source = "pressure and flow" if breaths.flow is not None else "pressure and volume"
     noise = float(full.fitted.sigma / np.sqrt(1.0 - GRID[full.fitted.grid] ** 2))
+    notes = tuple(_notes(breaths, at_lung, table, noise))
+    samples = sum(len(segment) for segment in at_lung)
+    problem = problem_with(breaths, best.resistance(0.0), best.compliance())
+    if problem is not None:
+        R, C = (Estimate(math.nan, unit, (math.nan, math.nan)) for unit in _UNITS)
+        match = LungMatch(name, R.value, C.value, R.ci95, C.ci95, False, source)
+        return Mechanics(
+            name, R, C, full.offset(), (), match, (), noise, len(table), samples, (problem, *notes)
+        )
+    match = match_label(label, best.resistance, best.compliance(), source)
+    known = matching_settings(best.resistance, best.compliance())
+    if match.label_matches:  # what holds comes first, whatever is nearer
+        known = tuple(sorted(known, key=lambda setting: setting != label))
     return Mechanics(
         name, best.resistance(0.0), best.compliance(), full.offset(),
         (*_circuit_term(circuit), *(full.term(term) for term in selected)),
-        match_label(label, best.resistance, best.compliance(), source),
-        matching_settings(best.resistance, best.compliance()),
-        noise, len(table), sum(len(segment) for segment in at_lung),
-        tuple(_notes(breaths, at_lung, table, noise)),
+        match, known, noise, len(table), samples, notes,
     )  # fmt: skip
 
 

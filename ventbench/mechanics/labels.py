@@ -120,6 +120,34 @@ def match_label(
     )  # fmt: skip
 
 
+def value_text(value: float, ci95: tuple[float, float]) -> str:
+    """A value with its interval for tables, or "unknown"."""
+    return f"{value:.1f} [{ci95[0]:.1f}, {ci95[1]:.1f}]" if math.isfinite(value) else "unknown"
+
+
+def label_texts(match: LungMatch, settings: tuple[Lung, ...]) -> tuple[str, str]:
+    """Whether a label holds, and what else the lung may be, for tables.
+
+    Args:
+        match: comparison with the label.
+        settings: known settings within tolerance, the label first if it holds.
+    """
+    if not math.isfinite(match.fitted_C):
+        return "unknown", "unknown"
+    others = [setting.id for setting in settings if setting.id != match.label]
+    if match.label_matches:
+        return "yes", f"{match.label}, or {others[0]}" if others else match.label
+    return "no", ", ".join(others[:2]) or "none known"
+
+
+def tolerance_text() -> str:
+    """How far R and C may be from a label that holds, in words."""
+    return (
+        f"R within a factor of {TOLERANCE_R:g} (and {APPARATUS:g} cmH2O/(L/s) of tubes), "
+        f"C within a factor of {TOLERANCE_C:g}"
+    )
+
+
 def match_labels(fit: Fit) -> tuple[LungMatch, ...]:
     """Compare each lung of a fit to pressure alone with its label.
 

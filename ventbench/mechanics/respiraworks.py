@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ventbench.mechanics.identify import Mechanics, identify
+from ventbench.mechanics.labels import label_texts, value_text
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
 from ventbench.recordings.respiraworks import RespiraWorksRun, load_respiraworks
 
@@ -89,10 +90,9 @@ def survey_table(surveyed: tuple[SurveyedRun, ...]) -> str:
             lines.append(f"{head} | | no flow, no volume | | |")
             continue
         match = lung.match
-        R = f"{match.fitted_R:.1f} [{match.ci95_R[0]:.1f}, {match.ci95_R[1]:.1f}]"
-        C = f"{match.fitted_C:.1f} [{match.ci95_C[0]:.1f}, {match.ci95_C[1]:.1f}]"
-        may = ", ".join(setting.id for setting in lung.settings[:2]) or "none known"
+        R, C = value_text(match.fitted_R, match.ci95_R), value_text(match.fitted_C, match.ci95_C)
+        holds, may = label_texts(match, lung.settings)
         needs = ", ".join(term.name for term in lung.terms)
-        holds = "yes" if match.label_matches else "**no**"
+        holds = "**no**" if holds == "no" else holds
         lines.append(f"{head} {R} | {C} | {holds} | {may} | {needs} |")
     return "\n".join(lines)

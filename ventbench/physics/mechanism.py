@@ -44,6 +44,10 @@ class Description:
         confusable: names of mechanisms, or of other effects, with a similar signature.
         detectable: smallest strength that about 20 breaths of one lung reveal, in the unit of the
             strength; None if nobody has measured it.
+        least: smallest strength that a diagnosis names, in the unit of the strength. Even where
+            the data ask for less, such a strength is within the integrator, the clock, or the form
+            of another mechanism.
+        least_reason: why less is no statement about a rig, in words.
         equivalents: names of other structures, in or outside the library, that have the same
             impedance, so that pressure alone can never tell them from this mechanism.
         interchangeable: pairs of parameters whose values can be exchanged without any effect, such
@@ -61,6 +65,8 @@ class Description:
     signature: str
     confusable: tuple[str, ...] = ()
     detectable: float | None = None
+    least: float = 0.0
+    least_reason: str = ""
     equivalents: tuple[str, ...] = ()
     interchangeable: tuple[tuple[str, str], ...] = ()
     special_case_of: tuple[str, ...] = ()

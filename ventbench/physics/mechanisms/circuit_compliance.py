@@ -36,6 +36,8 @@ class CircuitCompliance(Mechanism):
         ),
         confusable=("valve_lag", "sensor_lag"),
         detectable=0.4,
+        least=0.3,
+        least_reason="a syringe's worth of tubing; less moves no edge of 30 samples a second",
     )
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:

@@ -50,6 +50,8 @@ class CommandRounding(Mechanism):
             "a dead band of 0.5 %; what remains follows the fraction of each command."
         ),
         confusable=("valve_dead_band",),
+        least=0.5,
+        least_reason="a driver rounds or does not; half a rounding is another effect",
         special_case_of=("valve_shape",),
     )
 

@@ -52,6 +52,8 @@ class ExhalationValveDelay(Mechanism):
         ),
         confusable=("inertance", "sensor_lag"),
         detectable=0.003,
+        least=0.008,
+        least_reason="a quarter of a sample: less is the clock's, not the valve's",
         special_case_of=("outlet_memory",),
     )
 

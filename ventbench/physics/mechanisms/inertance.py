@@ -30,6 +30,8 @@ class Inertance(Mechanism):
         ),
         confusable=("circuit_compliance", "exhalation_valve_delay"),
         detectable=0.16,
+        least=0.008,
+        least_reason="less than the gas in a tracheal tube alone",
     )
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:

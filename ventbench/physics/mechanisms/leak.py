@@ -43,6 +43,8 @@ class Leak(Mechanism):
         ),
         confusable=("viscoelasticity", "valve_dead_band", "supply_droop"),
         detectable=0.25,
+        least=1.0,
+        least_reason="less than connectors are allowed to leak",
         special_case_of=("leak_shape",),
     )
 

@@ -54,6 +54,8 @@ class PatientEffort(Mechanism):
         ),
         confusable=("a source at the alveolus that repeats in every breath",),
         detectable=0.3,
+        least=0.5,
+        least_reason="a muscle pressure that a trigger would hardly see",
     )
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:

@@ -67,6 +67,8 @@ class SensorDrift(Mechanism):
         ),
         confusable=("a PEEP that changes during the recording",),
         detectable=0.05,
+        least=0.15,
+        least_reason="two steps of a usual converter",
         special_case_of=("drift_shape",),
     )
 

@@ -24,6 +24,8 @@ class SensorLag(Mechanism):
         ),
         confusable=("valve_lag", "circuit_compliance", "valve_delay"),
         detectable=0.019,
+        least=0.012,
+        least_reason="a third of a sample: less is an offset between two clocks",
         special_case_of=("sensor_memory",),
     )
     stateful = True

@@ -49,6 +49,8 @@ class SupplyDroop(Mechanism):
         signature="Flow is lost late in inspiration and in big breaths; after a pause it is back.",
         confusable=("valve_curve", "leak", "viscoelasticity"),
         detectable=0.02,
+        least=0.03,
+        least_reason="regulators hold their pressure to a few percent",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
     )
 

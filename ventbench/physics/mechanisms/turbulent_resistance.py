@@ -56,6 +56,8 @@ class TurbulentResistance(Mechanism):
         ),
         confusable=("valve_curve",),
         detectable=0.5,
+        least=1.0,
+        least_reason="the curvature of a straight tracheal tube; less is within R",
         special_case_of=("flow_shape",),
     )
 

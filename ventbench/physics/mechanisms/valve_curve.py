@@ -54,6 +54,8 @@ class ValveCurve(Mechanism):
         ),
         confusable=("turbulent_resistance", "supply_droop", "nonlinear_compliance"),
         detectable=0.015,
+        least=0.04,
+        least_reason="linearised valves hold their curve to a few percent",
         special_case_of=("valve_shape",),
     )
 

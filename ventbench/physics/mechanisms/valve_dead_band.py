@@ -31,6 +31,8 @@ class ValveDeadBand(Mechanism):
         ),
         confusable=("leak", "command_rounding", "valve_hysteresis"),
         detectable=0.1,
+        least=0.25,
+        least_reason="a quarter of a percent of stroke, the resolution of drivers",
         special_case_of=("valve_shape",),
     )
 

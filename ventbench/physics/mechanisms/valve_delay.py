@@ -41,6 +41,8 @@ class ValveDelay(Mechanism):
         ),
         confusable=("valve_lag", "sensor_lag", "circuit_compliance"),
         detectable=0.009,
+        least=0.008,
+        least_reason="a quarter of a sample: less is the clock's, not the valve's",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
     )
 

@@ -48,6 +48,8 @@ class ValveHysteresis(Mechanism):
         ),
         confusable=("valve_dead_band", "valve_delay"),
         detectable=0.1,
+        least=0.3,
+        least_reason="a little more than the resolution of drivers",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
     )
 

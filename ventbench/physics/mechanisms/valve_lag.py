@@ -41,6 +41,8 @@ class ValveLag(Mechanism):
         ),
         confusable=("sensor_lag", "circuit_compliance", "valve_delay"),
         detectable=0.009,
+        least=0.008,
+        least_reason="a quarter of a sample: less rounds no edge that a recording shows",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
         interchangeable=(("tau", "second"),),
     )

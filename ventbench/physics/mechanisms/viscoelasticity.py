@@ -52,6 +52,8 @@ class Viscoelasticity(Mechanism):
         ),
         confusable=("leak", "supply_droop"),
         detectable=0.02,
+        least=0.04,
+        least_reason="creep below that of rubber bellows",
         special_case_of=("recoil_memory",),
         equivalents=("second_compartment",),
     )

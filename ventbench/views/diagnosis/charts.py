@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from ventbench.diagnosis.findings import BreathRequest, NonparametricTerm, Traces
 from ventbench.diagnosis.residual_analysis import Profile, profiles
+from ventbench.diagnosis.residual_axes import EDGE
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.views import graphics
 from ventbench.views.runs import Floats
@@ -26,13 +27,16 @@ STAGES = (
 #: Breaths that are shown of either kind.
 WORST = 3
 
+#: Left end of the logarithmic axis of the time since an edge, s.
+_FIRST_EDGE_TIME = 0.01
+
 #: Breaths of a request that are drawn.
 REQUESTED = 4
 
 
 @dataclass
 class Chart:
-    """Axes with linear scales; y of the picture runs downwards.
+    """Axes with linear scales, or a logarithmic horizontal one; y of the picture runs downwards.
 
     Attributes:
         x: ends of the horizontal axis.
@@ -45,6 +49,7 @@ class Chart:
         paths: class and path data of lines, the lowest first.
         areas: class and path data of filled areas, below the lines.
         bands: left end and width of shaded ranges.
+        log: whether the horizontal axis is logarithmic; smaller values stand at its left end.
     """
 
     x: tuple[float, float]
@@ -57,6 +62,7 @@ class Chart:
     paths: list[tuple[str, str]] = field(default_factory=list)
     areas: list[tuple[str, str]] = field(default_factory=list)
     bands: list[tuple[float, float]] = field(default_factory=list)
+    log: bool = False
 
     @property
     def frame(self) -> tuple[float, float, float, float]:
@@ -66,7 +72,7 @@ class Chart:
     @property
     def x_ticks(self) -> list[tuple[str, float]]:
         """Texts and places of the ticks, picture units."""
-        values, texts = ticks(*self.x, 6)
+        values, texts = log_ticks(*self.x) if self.log else ticks(*self.x, 6)
         return [(t, round(float(self.at_x(v)), 1)) for t, v in zip(texts, values, strict=True)]
 
     @property
@@ -83,7 +89,10 @@ class Chart:
     def at_x(self, value: ArrayLike) -> Floats:
         """Place on the horizontal axis."""
         left, _, right, _ = self.frame
-        share = (np.asarray(value, float) - self.x[0]) / (self.x[1] - self.x[0])
+        value, (low, high) = np.asarray(value, float), self.x
+        if self.log:
+            value, low, high = np.log(np.maximum(value, low)), np.log(low), np.log(high)
+        share = (value - low) / (high - low)
         return left + share * (right - left)
 
     def at_y(self, value: ArrayLike) -> Floats:
@@ -132,6 +141,14 @@ def ticks(low: float, high: float, count: int) -> tuple[list[float], list[str]]:
     values = [step * k for k in range(first, last + 1)]
     places = max(0, -int(np.floor(np.log10(step) + 1e-9)))
     return values, [f"{v + 0.0:.{places}f}" for v in values]
+
+
+def log_ticks(low: float, high: float) -> tuple[list[float], list[str]]:
+    """Ticks of a logarithmic axis at 1, 2 and 5 times powers of ten, and their texts."""
+    powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+    values = [digit * 10.0**power for power in powers for digit in (1.0, 2.0, 5.0)]
+    values = [value for value in values if low * (1 - 1e-9) <= value <= high * (1 + 1e-9)]
+    return values, [f"{value:.6g}" for value in values]
 
 
 def limits(*arrays: ArrayLike, around: float = 0.06, least: float = 0.0) -> tuple[float, float]:
@@ -287,6 +304,9 @@ def _axis(diagnosis: Diagnosis, refit: Profile, after: Profile) -> Chart:
         width=330.0,
         height=190.0,
     )
+    if axis.name == EDGE:
+        # Half of what matters happens in the first two samples after an edge.
+        chart.log, chart.x = True, (_FIRST_EDGE_TIME, max(float(edges[-1]), 2 * _FIRST_EDGE_TIME))
     for place in places:
         # The first breath's number is 1, the axis begins at 0.
         chart.band(place.low - (axis.name == "breath number"), place.high)

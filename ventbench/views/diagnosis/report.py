@@ -9,7 +9,7 @@ import numpy as np
 
 import ventbench
 from ventbench.diagnosis import report_text
-from ventbench.diagnosis.findings import MissingMechanism, OpenLoopError
+from ventbench.diagnosis.findings import ErrorRegion, MissingMechanism, OpenLoopError
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.physics import mechanism
 from ventbench.views import graphics
@@ -29,10 +29,12 @@ def html(diagnosis: Diagnosis) -> str:
         lstrip_blocks=True,
     )
     lead = [
+        report_text.worth(diagnosis),
         *map(report_text.missing_mechanism, diagnosis.mechanisms),
         report_text.effect(diagnosis),
     ]
     lead += [report_text.nonparametric_term(diagnosis), report_text.open_loop(diagnosis)]
+    lead += [report_text.remaining(diagnosis), report_text.scatter(diagnosis)]
     return environment.get_template("diagnosis.html.j2").render(
         verdict=report_text.verdict(diagnosis),
         lead=[text for text in lead if text],
@@ -47,7 +49,8 @@ def html(diagnosis: Diagnosis) -> str:
         held_out=len(diagnosis.open_loop.held_out_breaths),
         stages=_stages(diagnosis),
         panels=charts.panels(diagnosis),
-        places=[_place(diagnosis, i) for i in range(min(len(diagnosis.location), PLACES))],
+        places=[_place(diagnosis, place) for place in diagnosis.location[:PLACES]],
+        remaining=[_place(diagnosis, place) for place in diagnosis.remaining[:PLACES]],
         more=max(len(diagnosis.location) - PLACES, 0),
         axes=charts.by_axis(diagnosis),
         slot=diagnosis.nonparametric,
@@ -127,8 +130,7 @@ def _named(missing: MissingMechanism) -> dict[str, Any]:
     }
 
 
-def _place(diagnosis: Diagnosis, index: int) -> dict[str, str]:
-    place = diagnosis.location[index]
+def _place(diagnosis: Diagnosis, place: ErrorRegion) -> dict[str, str]:
     return {
         "text": report_text.error_region(place, diagnosis.noise[0]),
         "share": f"{100 * place.share:.0f} %",

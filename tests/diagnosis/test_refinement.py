@@ -39,7 +39,7 @@ def test_an_input_replaces_only_mechanisms_that_explain_less_than_it_does(
 ):
     evaluator, fitted = named
 
-    def idle(evaluator, current, here, name):
+    def idle(evaluator, current, here, nats, name):
         return 0.0, evaluator.fit(current.hypothesis.without(name), current.noise, current), here
 
     monkeypatch.setattr(refinement, "_without_idle", idle)

@@ -272,8 +272,8 @@ def lung(match: LungMatch) -> str:
     if match.source == "pressure":
         gain = f", and a valve gain wrong by {100 * (GAIN - 1):.0f} %"
     tolerance = (
-        f"tolerance: R by a factor of {TOLERANCE_R:g} and {APPARATUS:g} cmH2O/(L/s) of tubes, C by a "
-        f"factor of {TOLERANCE_C:g}{gain}"
+        f"tolerance: R by a factor of {TOLERANCE_R:g} and {APPARATUS:g} cmH2O/(L/s) of tubes, "
+        f"C by a factor of {TOLERANCE_C:g}{gain}"
     )
     others = [name for name in match.settings if name != match.label][:2]
     if match.label_matches:

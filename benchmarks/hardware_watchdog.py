@@ -126,6 +126,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--emulators", type=int, default=2)
     parser.add_argument("--realtime", action="store_true", help="real-time scheduling of all")
+    parser.add_argument("--strict", action="store_true", help="exit 1 if any delay is too long")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     delays: list[tuple[float, bool]] = []
@@ -160,7 +161,7 @@ def main() -> None:
     print(f"load of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} processors")
     if arguments.json:
         arguments.json.write_text(json.dumps(sorted(milliseconds.round(2).tolist())))
-    if within < len(delays):
+    if arguments.strict and within < len(delays):
         raise SystemExit(1)
 
 

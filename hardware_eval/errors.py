@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hardware_eval.messages import Refusal
 from ventbench.errors import InputError
 
 
@@ -36,7 +37,7 @@ class RefusedError(LinkError):
         refusal: its answer.
     """
 
-    def __init__(self, message: str, refusal: object) -> None:
+    def __init__(self, message: str, refusal: Refusal) -> None:
         """Keep the device's answer."""
         super().__init__(message)
         self.refusal = refusal

@@ -16,7 +16,6 @@ from hardware_eval.messages import (
     Packet,
     Reading,
     Reason,
-    Refusal,
     encode,
 )
 from tests.hardware_eval.bench import Bench
@@ -175,7 +174,6 @@ def test_a_second_host_takes_over_and_the_first_is_refused(
     assert _vented(bench)
     with pytest.raises(RefusedError) as caught:
         client.command(10.0, 0)
-    assert isinstance(caught.value.refusal, Refusal)
     assert caught.value.refusal.reason is Reason.SESSION
 
 

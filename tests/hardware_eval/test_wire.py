@@ -8,7 +8,7 @@ from binascii import crc32
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hardware_eval import messages
@@ -47,6 +47,9 @@ from hardware_eval.parser import (
     feed_bytes,
 )
 
+#: Enough to find what a table forgets; the benchmark of hostile frames has the million.
+QUICK = settings(max_examples=40, deadline=None)
+
 u8, u16, u32 = (st.integers(0, 2**bits - 1) for bits in (8, 16, 32))
 percent = st.integers(0, 10_000).map(lambda n: n / 100)
 pressure = st.integers(-32_767, 32_767).map(lambda n: n / 100)
@@ -84,6 +87,7 @@ def _events(data: bytes) -> list[Event]:
     return feed_bytes(ParserState(), data)[1]
 
 
+@QUICK
 @given(packets())
 def test_every_message_comes_back(packet: Packet) -> None:
     assert _events(encode(packet)) == [packet]
@@ -129,6 +133,7 @@ def test_the_table_has_every_place_and_byte() -> None:
     assert set(_TABLE) == {(mode, kind) for mode in ParserMode for kind in ByteClass}
 
 
+@QUICK
 @given(packets(), st.data())
 def test_no_flipped_bit_is_accepted(packet: Packet, data: st.DataObject) -> None:
     """Up to three flipped bits: CRC-32 finds them all at this length."""
@@ -138,6 +143,7 @@ def test_no_flipped_bit_is_accepted(packet: Packet, data: st.DataObject) -> None
     assert all(event == packet or isinstance(event, Fault) for event in _events(bytes(frame)))
 
 
+@QUICK
 @given(packets(), st.data())
 def test_no_truncated_frame_is_accepted_and_the_next_one_is(
     packet: Packet, data: st.DataObject
@@ -149,6 +155,7 @@ def test_no_truncated_frame_is_accepted_and_the_next_one_is(
     assert all(isinstance(event, Fault) for event in events[:-1])
 
 
+@QUICK
 @given(st.binary(max_size=600), packets(), st.binary(max_size=600), packets())
 def test_after_any_garbage_the_next_frame_is_read(
     garbage: bytes, first: Packet, more: bytes, second: Packet
@@ -158,6 +165,7 @@ def test_after_any_garbage_the_next_frame_is_read(
     assert read == [first, second]
 
 
+@QUICK
 @given(st.lists(packets(), max_size=4), st.lists(st.integers(1, 40), max_size=60))
 def test_how_bytes_are_cut_into_reads_does_not_matter(sent: list[Packet], sizes: list[int]) -> None:
     stream, state, events = b"".join(map(encode, sent)), ParserState(), []
@@ -167,6 +175,7 @@ def test_how_bytes_are_cut_into_reads_does_not_matter(sent: list[Packet], sizes:
     assert events + feed_bytes(state, stream)[1] == sent
 
 
+@QUICK
 @given(st.binary(max_size=2000))
 def test_the_parser_keeps_at_most_one_frame(garbage: bytes) -> None:
     state = ParserState()
@@ -182,6 +191,7 @@ def test_a_frame_too_long_is_one_fault() -> None:
     assert _events(to_frame(sealed)) == [Fault.MALFORMED]  # intact, but of no kind
 
 
+@QUICK
 @given(st.binary(max_size=80))
 def test_an_intact_packet_of_wrong_form_is_malformed(content: bytes) -> None:
     sealed = content + struct.pack("<I", crc32(content))

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import gc
 import heapq
 import os
-import select
 import signal
 import socket
 import sys
@@ -29,7 +27,8 @@ from hardware_eval import realtime
 from hardware_eval.device.faults import AnyFault, Line, LineFault, LungFault, parse
 from hardware_eval.device.hal import Hal
 from hardware_eval.device.loopback import Actuation
-from hardware_eval.device.program import PERIOD, DeviceSettings
+from hardware_eval.device.port import Guard, Port
+from hardware_eval.device.program import DeviceSettings
 from hardware_eval.device.service import DeviceService
 from hardware_eval.messages import Flag
 from ventbench.errors import InputError
@@ -41,19 +40,18 @@ _REMEMBERED = 100_000
 _CHUNK = 4096
 
 
-class Emulator:
+class Emulator(Guard):
     """A device on a pseudo-terminal, stepped in real time.
 
     Lines of text on the control socket: a fault as in ``--fault`` with times from now on
     (``leak@0-3:0.1``), ``clear`` to end all faults, ``unplug SECONDS`` to pull the cable.
 
     Attributes:
-        port: path that a host opens; of another name after the cable was pulled, unless there is a
-            link.
-        service: program and hardware.
+        terminal: path that a host opens; of another name after the cable was pulled, unless there
+            is a link.
         actuations: the last changes of the valves; their times are those of ``time.monotonic``,
             which all processes of a machine share.
-        lateness: longest time by which a step of the device came late, s.
+        line: what the line does to bytes.
     """
 
     def __init__(
@@ -80,43 +78,34 @@ class Emulator:
         Raises:
             InputError: if the link or the socket cannot be made.
         """
-        self._begun = time.monotonic()
-        self.service = DeviceService(hal, settings or DeviceSettings(), 0.0)
+        begun = time.monotonic()
+        service = DeviceService(hal, settings or DeviceSettings(), 0.0)
         self.actuations: deque[Actuation] = deque(maxlen=_REMEMBERED)
-        self.actuations.append(Actuation(self._begun, 0.0, 1))
-        self.lateness = 0.0
-        self._line = Line(line_faults)
+        self.actuations.append(Actuation(begun, 0.0, 1))
+        self.line = Line(line_faults)
         self._outgoing: list[tuple[float, int, bytes]] = []
         self._order = count()
-        self._replug: float | None = None
         self._log = log.open("w", buffering=1) if log else None
         self._link, self._control_path = link, control
-        self._master = self._slave = -1
-        self._open()
+        self._slave = -1
+        if link is not None and link.exists() and not link.is_symlink():
+            raise InputError(f"--link {link}: there is a file of that name; remove it")
+        first = self._open()
         self._control = self._open_control() if control else None
+        unopened = [first]
+        port = Port(lambda: unopened.pop() if unopened else self._open(), self._close_terminal)
+        super().__init__(service, port, lambda: time.monotonic() - begun)
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Serve until ``stop()``; then vent and remove link and socket."""
-        gc.collect()
-        gc.freeze()  # what is there stays; a collection in the loop would walk over all of it
-        due = self._now() + PERIOD
         try:
-            while not stop():
-                now = self._now()
-                wait = min([due, *(entry[0] for entry in self._outgoing[:1])]) - now
-                data = self._wait(max(wait, 0.0))
-                now = self._now()
-                if now >= due:
-                    self.lateness = max(self.lateness, now - due)
-                    due = max(due + PERIOD, now)
-                self._step(now, data)
+            super().run(stop)
         finally:
-            self.service.vent(self._now())
             self.close()
 
     def close(self) -> None:
         """Remove terminal, link and socket."""
-        self._close()
+        self.port.close()
         if self._control is not None and self._control_path is not None:
             self._control.close()
             self._control_path.unlink(missing_ok=True)
@@ -125,45 +114,28 @@ class Emulator:
             self._log.close()
             self._log = None
 
-    def _now(self) -> float:
-        return time.monotonic() - self._begun
+    def wanted(self) -> float:
+        """Time at which an answer is due that a fault delays, s."""
+        return self._outgoing[0][0] if self._outgoing else float("inf")
 
-    def _wait(self, seconds: float) -> bytes:
-        """Wait for bytes of the host or lines of the control socket."""
-        sources = [self._master] if self._master >= 0 else []
-        if self._control is not None:
-            sources.append(self._control.fileno())
-        ready, _, _ = select.select(sources, [], [], seconds)
-        if self._control is not None and self._control.fileno() in ready:
-            self._obey(self._control.recv(_CHUNK).decode(errors="replace"))
-        if self._master >= 0 and self._master in ready:
-            with contextlib.suppress(BlockingIOError):
-                return self._line.to_device(self._now(), os.read(self._master, _CHUNK))
-        return b""
-
-    def _step(self, now: float, data: bytes) -> None:
-        answers = self.service.step(now, data)
+    def turn(self, now: float, data: bytes) -> None:
+        """Step the program; answer as the line's faults allow, and do what the control says."""
+        answers = self.service.step(now, self.line.to_device(now, data) if data else b"")
         state, last = self.service.state, self.actuations[-1]
         if (state.u_in, state.u_out) != (last.u_in, last.u_out):
-            self.actuations.append(Actuation(time.monotonic(), state.u_in, state.u_out))
+            done = Actuation(time.monotonic(), state.u_in, state.u_out)
+            self.actuations.append(done)
             if self._log:
-                done = self.actuations[-1]
-                self._log.write(
-                    f"{done.time:.6f},{done.u_in:g},{done.u_out},{Flag(state.causes).name}\n"
-                )
+                causes = Flag(state.causes).name
+                self._log.write(f"{done.time:.6f},{done.u_in:g},{done.u_out},{causes}\n")
         if answers:
-            due, answers = self._line.to_host(now, answers)
+            due, answers = self.line.to_host(now, answers)
             heapq.heappush(self._outgoing, (due, next(self._order), answers))
         while self._outgoing and self._outgoing[0][0] <= now:
-            answers = heapq.heappop(self._outgoing)[2]
-            if self._master >= 0:
-                # A host that reads nothing fills the terminal's buffer: the rest is lost, as on
-                # a wire.
-                with contextlib.suppress(BlockingIOError):
-                    os.write(self._master, answers)
-        if self._replug is not None and now >= self._replug:
-            self._replug = None
-            self._open()
+            self.port.send(heapq.heappop(self._outgoing)[2])
+        if self._control is not None:
+            with contextlib.suppress(BlockingIOError):
+                self._obey(self._control.recv(_CHUNK).decode(errors="replace"))
 
     def _obey(self, text: str) -> None:
         """Do what lines of the control socket say; a wrong one is named on stderr."""
@@ -172,12 +144,12 @@ class Emulator:
             word, _, argument = line.strip().partition(" ")
             try:
                 if word == "clear":
-                    hal.faults, self._line.faults = (), ()
+                    hal.faults, self.line.faults = (), ()
                 elif word == "unplug":
-                    self._close()
-                    self._replug = self._now() + float(argument or 1.0)
+                    self.port.hang_up(float(argument or 1.0))
+                    self._outgoing.clear()
                 elif word:
-                    self.add_fault(parse(line, self._now()))
+                    self.add_fault(parse(line, self._clock()))
             except ValueError as error:
                 print(f"control: {error}", file=sys.stderr, flush=True)
 
@@ -187,30 +159,26 @@ class Emulator:
             hal: Any = self.service.hal
             hal.faults = (*hal.faults, fault)
         else:
-            self._line.faults = (*self._line.faults, fault)
+            self.line.faults = (*self.line.faults, fault)
 
-    def _open(self) -> None:
-        self._master, self._slave = os.openpty()  # ours keeps it open between hosts
+    def _open(self) -> int:
+        master, self._slave = os.openpty()  # ours keeps it open between hosts
         tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.port = os.ttyname(self._slave)
+        os.set_blocking(master, False)
+        self.terminal = os.ttyname(self._slave)
         if self._link is not None:
-            if self._link.exists() and not self._link.is_symlink():
-                raise InputError(f"--link {self._link}: there is a file of that name; remove it")
             try:
                 self._link.parent.mkdir(parents=True, exist_ok=True)
                 self._link.unlink(missing_ok=True)
-                self._link.symlink_to(self.port)
+                self._link.symlink_to(self.terminal)
             except OSError as error:
                 raise InputError(f"--link {self._link} cannot be made: {error}") from error
-            self.port = str(self._link)
+            self.terminal = str(self._link)
+        return master
 
-    def _close(self) -> None:
-        for descriptor in (self._master, self._slave):
-            if descriptor >= 0:
-                os.close(descriptor)
-        self._master = self._slave = -1
-        self._outgoing.clear()
+    def _close_terminal(self, master: int) -> None:
+        os.close(master)
+        os.close(self._slave)
         if self._link is not None and self._link.is_symlink():
             self._link.unlink()
 
@@ -327,7 +295,7 @@ def _emulate(given: argparse.Namespace) -> int:
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, end)
-    print(f"{emulator.port}", flush=True)
+    print(emulator.terminal, flush=True)
     print(f"emulated lung {told}; Ctrl-C ends it", file=sys.stderr, flush=True)
     emulator.run(lambda: ended)
     print(f"longest lateness of the device: {1e3 * emulator.lateness:.1f} ms", file=sys.stderr)

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import gc
 import os
-import select
 import signal
 import socket
 import sys
@@ -17,53 +14,11 @@ from types import FrameType
 
 from hardware_eval import realtime
 from hardware_eval.device.hal import Hal
-from hardware_eval.device.program import PERIOD, DeviceSettings
+from hardware_eval.device.port import Guard, Port
+from hardware_eval.device.program import DeviceSettings
 from hardware_eval.device.service import DeviceService
 from hardware_eval.link import BAUD_RATE
 from ventbench.errors import InputError
-
-
-def serve(
-    service: DeviceService, open_line: Callable[[], int | None], stop: Callable[[], bool]
-) -> None:
-    """Step the program in real time until ``stop()``; then vent.
-
-    Args:
-        service: program and hardware; its clock is ``time.monotonic``.
-        open_line: opens the line to a host and returns its descriptor, non-blocking; None while
-            there is none. It is asked again, at most once a period, after a line broke.
-        stop: tells when to end.
-    """
-    gc.collect()
-    gc.freeze()
-    line, due = open_line(), time.monotonic() + PERIOD
-    try:
-        while not stop():
-            wait = max(due - time.monotonic(), 0.0)
-            ready, _, _ = select.select([] if line is None else [line], [], [], wait)
-            data = b""
-            if line is not None and ready:
-                try:
-                    data = os.read(line, 4096)
-                except BlockingIOError:
-                    continue
-                except OSError:
-                    data = b""
-                if not data:  # the host hung up; the watchdog vents
-                    os.close(line)
-                    line = None
-            now = time.monotonic()
-            answers = service.step(now, data)
-            if now >= due:
-                due = max(due + PERIOD, now)
-                line = open_line() if line is None else line
-            if answers and line is not None:
-                with contextlib.suppress(OSError):
-                    os.write(line, answers)
-    finally:
-        service.vent(time.monotonic())
-        if line is not None:
-            os.close(line)
 
 
 def serial_line(path: str, baud_rate: int = BAUD_RATE) -> Callable[[], int | None]:
@@ -168,7 +123,11 @@ def _serve_until_signal(
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, end)
-    serve(DeviceService(hal, settings, time.monotonic()), open_line, lambda: ended)
+    port = Port(open_line, os.close)
+    try:
+        Guard(DeviceService(hal, settings, time.monotonic()), port).run(lambda: ended)
+    finally:
+        port.close()
 
 
 if __name__ == "__main__":

@@ -72,7 +72,7 @@ def _run(client: Client) -> None:
 
 
 def test_a_session_on_a_pseudo_terminal(emulator: Emulator, tmp_path: Path) -> None:
-    client = Client(Link(emulator.port), timeout=PATIENCE)
+    client = Client(Link(emulator.terminal), timeout=PATIENCE)
     assert client.hello().name == "bench"
     _run(client)
     # The host dies: nothing is said any more.
@@ -86,7 +86,7 @@ def test_a_session_on_a_pseudo_terminal(emulator: Emulator, tmp_path: Path) -> N
 
 
 def test_a_cable_is_pulled_and_comes_back(emulator: Emulator, tmp_path: Path) -> None:
-    client = Client(Link(emulator.port), timeout=PATIENCE)
+    client = Client(Link(emulator.terminal), timeout=PATIENCE)
     client.hello()
     _run(client)
     tell(tmp_path / "control", "unplug 0.3")
@@ -105,12 +105,12 @@ def test_faults_and_nonsense_by_the_control_socket(
     control = tmp_path / "control"
     tell(control, "fire@0")
     tell(control, "silent@0:1")
-    client = Client(Link(emulator.port), timeout=0.05)
-    _wait_for(lambda: emulator._line.faults)
+    client = Client(Link(emulator.terminal), timeout=0.05)
+    _wait_for(lambda: emulator.line.faults)
     with pytest.raises(NoAnswerError, match="is it on"):
         client.heartbeat()
     tell(control, "clear")
-    _wait_for(lambda: not emulator._line.faults)
+    _wait_for(lambda: not emulator.line.faults)
     assert client.hello().name == "bench"
     assert "KIND@START" in capfd.readouterr().err
     with pytest.raises(InputError, match="no emulator listens"):
@@ -128,9 +128,9 @@ def test_errors_of_ports(
     plain.touch()
     with pytest.raises(LinkError, match="cannot be opened"):
         Link(str(plain))
-    first = Link(emulator.port)
+    first = Link(emulator.terminal)
     with pytest.raises(PortBusyError, match="another program has it"):
-        Link(emulator.port)
+        Link(emulator.terminal)
     first.close()
 
     def forbidden(*_: object, **__: object) -> int:
@@ -138,11 +138,11 @@ def test_errors_of_ports(
 
     monkeypatch.setattr(os, "open", forbidden)
     with pytest.raises(PortForbiddenError, match="dialout"):
-        Link(emulator.port)
+        Link(emulator.terminal)
 
 
 def test_patience_with_a_lost_port_ends(emulator: Emulator, tmp_path: Path) -> None:
-    link = Link(emulator.port, policy=ReconnectPolicy(first=0.01, patience=0.05))
+    link = Link(emulator.terminal, policy=ReconnectPolicy(first=0.01, patience=0.05))
     (tmp_path / "lung").unlink()
     with pytest.raises(PortMissingError, match=r"tried for 0\.05 s"):
         link.reopen()

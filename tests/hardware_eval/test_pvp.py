@@ -16,6 +16,7 @@ import pytest
 
 from hardware_eval.client import Client
 from hardware_eval.device import __main__ as board
+from hardware_eval.device.port import Guard, Port
 from hardware_eval.device.program import DeviceSettings
 from hardware_eval.device.pvp import LAST, PvpHal
 from hardware_eval.device.service import DeviceService
@@ -216,7 +217,8 @@ def test_the_board_serves_one_host_after_another() -> None:
     bench = Bench()
     service = DeviceService(bench, DeviceSettings(), time.monotonic())
     stop = threading.Event()
-    thread = threading.Thread(target=board.serve, args=(service, open_line, stop.is_set))
+    port = Port(open_line, os.close)
+    thread = threading.Thread(target=Guard(service, port).run, args=(stop.is_set,))
     thread.start()
     url = f"socket://127.0.0.1:{server.getsockname()[1]}"
     try:
@@ -228,6 +230,7 @@ def test_the_board_serves_one_host_after_another() -> None:
     finally:
         stop.set()
         thread.join()
+        port.close()
         server.close()
     assert bench.valves[-1][1:] == (0.0, 1)
 

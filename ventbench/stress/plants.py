@@ -191,7 +191,7 @@ def stressed_plants(
             own = {path: value[:, index] for path, value in after.items()}
             _apply(stressor(name), condition.severity or "mild", own, labels)
 
-    both = tuple(
+    both: Any = tuple(
         np.stack([x[name].reshape(protocol.BREATHS, -1) for x in (after, before)], axis=1)
         for name in names
     )

@@ -210,11 +210,11 @@ def step_through(
             condition, lung = divmod(cell, len(draws.lungs))
             failures[condition, lung, draw] = failure
     shape = (len(conditions), len(draws.lungs))
-    joined = [
-        np.stack([part[k].reshape(*shape, *part[k].shape[1:]) for part in parts], axis=2)
-        for k in range(4)
-    ]
-    return StressRun(*joined, failures)
+
+    def joined(k: int) -> Floats:
+        return np.stack([part[k].reshape(*shape, *part[k].shape[1:]) for part in parts], axis=2)
+
+    return StressRun(joined(0), joined(1), joined(2), joined(3), failures)
 
 
 def _only(draws: StressDraws, draw: int) -> StressDraws:

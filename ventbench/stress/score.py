@@ -451,7 +451,7 @@ def assess(
     """Compute all figures of a run; arguments as of :class:`StressScore`."""
     pip, dt = np.asarray(draws.scenario.pip), np.asarray(draws.scenario.dt)
     by_breath = (run.pressure, pip[..., None], dt[..., None])
-    safe = passes_safety_gate(*by_breath).all(axis=-1)
+    safe = np.all(passes_safety_gate(*by_breath), axis=(-1,))
     plateau = steady_error(run.pressure[..., -1, :], pip)
     error = run_error(run.pressure, pip[..., None, None])
     survived = safe & (plateau <= PLATEAU_TOLERANCE + PLATEAU_SHARE * pip)
@@ -479,9 +479,8 @@ def assess(
 
 
 def _category(condition: Condition) -> str:
-    if not condition.stressors:
-        return "none"
-    return "pairs" if len(condition.stressors) > 1 else stressor(condition.stressors[0]).category
+    categories = [stressor(name).category for name in condition.stressors]
+    return "pairs" if len(categories) > 1 else "".join(categories) or "none"
 
 
 def _number(value: float | np.floating) -> float | None:

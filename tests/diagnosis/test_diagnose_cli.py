@@ -126,3 +126,38 @@ def test_the_corrected_plant_can_be_diagnosed_itself(recording, tmp_path, calls)
     assert [lung.id for lung in given.lungs] == ["R20C50"]
     assert float(given.plant("R20C50").get("valve_delay.delay")) == 0.041
     np.testing.assert_array_equal(found["R20C50"].get("R"), 22.1)  # type: ignore[attr-defined]
+
+
+def test_simulated_pressures_and_drive(recording, tmp_path, calls):
+    """A table beside the recording stands in place of --plant; --drive is passed on."""
+    import pandas as pd
+
+    table = pd.read_csv(recording)
+    table["simulated"] = table.pressure + 1.0
+    both = tmp_path / "both.csv"
+    table.to_csv(both, index=False)
+    out = tmp_path / "out"
+    run(both, "--simulated", both, "--drive", "valve", "--out", out)
+    given = calls[0]["simulator"]
+    assert (given.kind, given.name, calls[0]["drive"]) == ("pressures", "both.csv", "valve")
+    breaths = calls[0]["breaths"]
+    np.testing.assert_allclose(given.pressures(breaths), breaths.pressure + 1.0, atol=1e-6)
+    message = run(both, "--simulated", both, "--plant", "frozen", "--out", out, code=2)
+    assert "--simulated stands in place of --plant" in message
+    assert "choose auto, valve or flow" in run(both, "--drive", "gas", "--out", out, code=2)
+
+
+def test_a_simulator_in_plain_python(recording, tmp_path, calls, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "plain_lungs.py").write_text(
+        "class Lung:\n"
+        "    def reset(self, initial_pressure):\n"
+        "        self.p = initial_pressure\n"
+        "    def step(self, u_in, u_out, dt):\n"
+        "        self.p += 0.1 * u_in * dt\n"
+        "        return self.p\n"
+    )
+    run(recording, "--plant", "plain_lungs:Lung", "--out", tmp_path / "out")
+    given = calls[0]["simulator"]
+    assert (given.kind, given.name) == ("function", "plain_lungs:Lung")
+    assert np.isfinite(given.pressures(calls[0]["breaths"])).all()

@@ -17,7 +17,7 @@ from ci.git import AUTHOR, Git
 from ci.seed import SECRET as SECRET_SEED
 from ci.take import submission_name
 from ventbench.board import attestation, build, create, record, store
-from ventbench.board.replay import ReplayPlants
+from ventbench.board.replay import Replayable
 from ventbench.errors import InputError
 from ventbench.seasons import parse_seed
 
@@ -53,7 +53,7 @@ def records(folder: Path) -> list[Path]:
 def add(
     folder: Path,
     leaderboard: Path,
-    simulators: ReplayPlants,
+    simulators: Replayable,
     secret: str | None = None,
     seed: bytes | None = None,
 ) -> list[record.Record | record.Sealed]:
@@ -124,7 +124,7 @@ def main() -> int:
     downloaded = Path(workflow.required("RECORDS"))
     text = os.environ.get(SECRET_SEED) or None
     seed = None if text is None else parse_seed(text, SECRET_SEED)
-    added = add(downloaded, checkout / "leaderboard", frozen.load(), secret, seed)
+    added = add(downloaded, checkout / "leaderboard", frozen.load, secret, seed)
     branch = commit(checkout, added)
     workflow.output(branch=branch, name=added[0].name)
     workflow.summary(

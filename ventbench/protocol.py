@@ -8,6 +8,11 @@ from __future__ import annotations
 #: Version of this protocol; written into every score.
 VERSION = 1
 
+#: Versions that this ventbench scores and replays. What differs in version 2 is in
+#: :mod:`ventbench.rig_draws`, :mod:`ventbench.metrics.normalised` and
+#: :mod:`ventbench.submissions.rig_scoring`.
+VERSIONS = (1, 2)
+
 #: Nominal control step, s (paper, appendix A.2).
 DT = 0.03
 

@@ -34,7 +34,9 @@ def test_errors_lowered_within_tolerance_are_refused(tmp_path: Path, drafts, sim
     forged = _lowered(drafts["softer"], 9e-10)
     honest = opened(drafts["softer"])
     assert np.all(np.abs(opened(forged).drawn - honest.drawn) < replay.TOLERANCE)
-    assert ranking.ranks([opened(forged).by_draw, honest.by_draw]) == [1, 2], "control: it leads"
+    both = [opened(forged), honest]
+    ranks = ranking.places(both, [score.ranked_values for score in both])
+    assert ranks == [1, 2], "control: it leads"
     with pytest.raises(InputError, match=r"key errors\.drawn, mean over cells"):
         put(tmp_path / "board", forged, simulators)
     put(tmp_path / "board", forged)  # as an owner without scruples does

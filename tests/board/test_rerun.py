@@ -31,7 +31,7 @@ def again(simulators: Textbook, tmp_path: Path):
 
     def run(folder: Path, *sources: Path, **options) -> list[rerun.Outcome]:
         options = {"work": tmp_path / "work", "runner": InProcessRunner, **options}
-        return rerun.rerun(folder, sources=sources, load=lambda: simulators, **options)
+        return rerun.rerun(folder, sources=sources, load=lambda version: simulators, **options)
 
     return run
 
@@ -123,7 +123,7 @@ def test_the_command_says_all_three(
 ) -> None:
     monkeypatch.setattr(frozen, "load", lambda version=1, path=None: simulators)
     in_this_process = functools.partial(
-        rerun.rerun, load=lambda: simulators, runner=InProcessRunner
+        rerun.rerun, load=lambda version: simulators, runner=InProcessRunner
     )
     monkeypatch.setattr(rerun, "rerun", in_this_process)
     arguments = ["board", "verify", "--folder", str(board), "--out", str(tmp_path / "kept")]

@@ -248,24 +248,24 @@ def test_a_noted_head_must_still_be_there(leaderboard: Path, check) -> None:
 
 def test_versions_have_pages_of_their_own(full: Path, tmp_path: Path, check) -> None:
     shutil.copytree(full, tmp_path / "copy")
-    fresh = _forge(tmp_path / "copy", "softer", {"protocol": lambda x: 2})
+    fresh = _forge(tmp_path / "copy", "softer", {"protocol": lambda x: 3})
     new, old = ((fresh / name).read_text() for name in ("index.html", "version-1.html"))
     assert "softer" in new
     assert "harder" not in new
     assert "harder" in old
     assert "softer" not in old
     assert '<a href="version-1.html">1</a>' in new
-    assert '<a href="index.html">2</a>' in old
-    assert (fresh / "entries/v2/performance/softer.html").is_file()
+    assert '<a href="index.html">3</a>' in old
+    assert (fresh / "entries/v3/performance/softer.html").is_file()
     assert not (fresh / "entries/v1/performance/softer.html").exists()
     (problem,) = check(fresh).problems
-    assert "key protocol: version 2 is not known" in problem
+    assert "key protocol: version 3 is not known" in problem
 
 
 def test_an_old_board_stays_and_rebuilds(
     full: Path, check, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(protocol, "VERSION", 2)
+    monkeypatch.setattr(protocol, "VERSIONS", (2,))
     report = check(full)
     assert report.problems == []
     assert report.replayed == 0

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ventbench
-from ventbench import draws, files, protocol
+from ventbench import draws, files
 from ventbench.board import actions, canonical, record, schema
 from ventbench.board.hardware import HardwareRecord
 from ventbench.board.replay import TRACE_BREATH, Replayed, ReplayPlants, differences, replay
@@ -89,7 +89,7 @@ def create(
             or the score does not replay.
     """
     label, sandbox = score.submission.label, score.sandbox
-    if not score.complete or len(score.drawn) != draws.COUNT:
+    if not score.complete or len(score.drawn) < draws.COUNT:
         raise InputError(
             f"{label}: a record needs all lungs, all PIPs and all {draws.COUNT} draws; "
             f"score it with --draws {draws.COUNT}"
@@ -99,13 +99,13 @@ def create(
     hashes = file_hashes(score.submission.folder)
     if combined_hash(hashes) != score.submission.sha256:
         raise InputError(f"{label} was changed while it was scored; score it again")
-    (replayed,) = replay(simulators, score.pips, [score.requested])
+    (replayed,) = replay(simulators, score.pips, [score.requested], score.rig_draws)
     commands = actions.encode(score.requested)
     errors = np.concatenate([score.nominal[None], score.drawn])
     content: dict[str, Any] = {
         "format": schema.FORMAT,
         "kind": "score",
-        "protocol": protocol.VERSION,
+        "protocol": score.protocol,
         "created": record.timestamp(now),
         "official": official and score.official,
         "supersedes": supersedes,
@@ -118,7 +118,8 @@ def create(
             "manifest": dataclasses.asdict(score.submission.manifest),
         },
         "simulators": dict(simulators.about()),
-        "draws": draws.about(),
+        "draws": draws.about() if score.rig_draws is None else score.rig_draws.about(),
+        **_on_rigs(score),
         "lungs": list(score.lungs),
         "pips": list(score.pips),
         "errors": {"nominal": _plain(score.nominal), "drawn": _plain(score.drawn)},
@@ -155,6 +156,27 @@ def create(
     if problems:
         raise InputError(f"{label}: the score does not replay: {'; '.join(problems)}")
     return draft
+
+
+def _on_rigs(score: Score) -> dict[str, Any]:
+    """What protocol version 2 adds to a record."""
+    if score.rig_draws is None:
+        return {}
+    if score.reference is None or score.controllable is None:
+        raise InputError(
+            f"{score.submission.label}: there are no reference errors of these simulators and "
+            "draws; make them with `ventbench headroom`"
+        )
+    drawn, reference = score.rig_draws, score.reference
+    tables = {
+        "error": score.controllable,
+        "attainable": reference.attainable,
+        "pid": reference.pid,
+    }
+    return {
+        "rigs": {"session": drawn.rig.tolist(), "member": drawn.member.tolist()},
+        "headroom": {key: _plain(np.moveaxis(table, 1, 0)) for key, table in tables.items()},
+    }
 
 
 def keep(folder: Path, scores: Sequence[Score], simulators: ReplayPlants) -> list[Path]:

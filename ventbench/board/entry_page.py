@@ -6,8 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
 from ventbench import protocol
 from ventbench.board import hardware_table, pages, plots
 from ventbench.board.hardware_table import HardwareRow
@@ -54,6 +52,7 @@ def _values(track: Track, status: str, row: Row, base: Record | None) -> dict[st
     record, header = row.record, row.record.header
     worst, lung, pip = row.worst
     draws = plots.dumbbells(record, base)
+    own = row.normalised
     gap = row.score.value - row.nominal if row.score else math.nan
     return {
         "record": record,
@@ -67,8 +66,12 @@ def _values(track: Track, status: str, row: Row, base: Record | None) -> dict[st
         "ranks": row.ranks,
         "count": len(track.ranked),
         "score": pages.interval(row.score),
-        "to_pid": pages.difference(row.to_baseline),
-        "to_above": pages.difference(row.to_above),
+        "normalised": pages.interval(own.score, 1) if own else None,
+        "to_pid": pages.difference(own.to_baseline, 1)
+        if own
+        else pages.difference(row.to_baseline),
+        "to_above": pages.difference(own.to_above, 1) if own else pages.difference(row.to_above),
+        "scaled": plots.normalised_map(record),
         "above": _above(track, row),
         "baseline": BASELINES[track.name],
         "compared": base.name if base else None,
@@ -134,7 +137,7 @@ def _provenance(header: ScoreHeader) -> list[tuple[str, list[tuple[str, str]]]]:
         ("Where it came from", header.provenance),
         ("Files of the submission, SHA-256", submission.files),
         ("Simulators", header.simulators),
-        ("Draws", msgspec.structs.asdict(header.draws)),
+        ("Draws", header.draws.about()),
         ("Sandbox", header.sandbox or {"layers": "none: scored in the scorer's process"}),
         ("Machine", header.machine),
         ("Versions", header.versions),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ventbench.board import pages, ranking, store
 from ventbench.board.ranking import Interval, Row, Track
+from ventbench.board.record import Record
 from ventbench.errors import InputError
 from ventbench.submissions.manifest import TRACKS
 from ventbench.text import plain
@@ -25,6 +26,9 @@ COLUMNS = (
     "to_above_cmH2O", "to_above_low", "to_above_high", "nominal_cmH2O", "worst_cmH2O",
     "worst_lung", "worst_pip", "exploitation_cmH2O", "clipped_share", "act_median_us",
     "failed_cells", "safe", "created", "record", "submission", "reasons",
+    "normalised", "normalised_low", "normalised_high", "normalised_to_pid",
+    "normalised_to_pid_low", "normalised_to_pid_high", "normalised_to_above",
+    "normalised_to_above_low", "normalised_to_above_high", "season",
 )  # fmt: skip
 
 #: Where commands look for a leaderboard.
@@ -56,6 +60,10 @@ def load_board(
     - ``act_median_us``: median time of one ``act``, µs;
     - ``failed_cells``, ``safe`` (whether all lungs pass the safety gate), ``created`` (UTC),
       ``record`` and ``submission`` (SHA-256), ``reasons`` (why an entry is not ranked);
+    - ``normalised``, ``normalised_low``, ``normalised_high``: normalised score, by which version 2
+      ranks, with its interval; ``normalised_to_pid``, ``normalised_to_above`` with limits: its
+      differences; ``normalised_R5C10``, ...: of each lung; missing in version 1;
+    - ``season``: of the draws, in version 2;
     - ``score_R5C10_cmH2O``, ...: mean error over draws and PIPs of each lung, cmH2O, and
       ``nominal_R5C10_cmH2O``, ...: mean nominal error over PIPs of each lung, cmH2O.
 
@@ -154,6 +162,33 @@ def load_tracks(
     return [tracks for tracks in boards[chosen] if track in (None, tracks.name)]
 
 
+def cell_means(record: Record, lung: str) -> dict[str, float | None]:
+    """Means over draws of one lung by PIP, or of all lungs.
+
+    Args:
+        record: of an entry.
+        lung: id of a lung, or ``"all"``.
+
+    Returns:
+        Normalised score in version 2, error in cmH2O in version 1, by lung or by PIP, with their
+        mean; None where a cell failed.
+
+    Raises:
+        InputError: if the record has no such lung.
+    """
+    cells = record.drawn if record.headroom is None else record.headroom.normalised[1:]
+    means = cells.mean(axis=0)
+    if lung == "all":
+        named = dict(zip(record.lungs, means.mean(axis=1).tolist(), strict=True))
+    elif lung in record.lungs:
+        names = (f"PIP {pip:g}" for pip in record.pips)
+        named = dict(zip(names, means[record.lungs.index(lung)].tolist(), strict=True))
+    else:
+        raise InputError(f"--lung {lung}: the board has {', '.join(record.lungs)}, or all")
+    named["mean"] = sum(named.values()) / len(named)
+    return {name: value if math.isfinite(value) else None for name, value in named.items()}
+
+
 def csv_text(boards: Mapping[int, Sequence[Track]]) -> str:
     """Text of ``leaderboard.csv``: every entry of every board."""
     output = io.StringIO()
@@ -201,6 +236,8 @@ def _values(version: int, track: str, status: str, row: Row) -> dict[str, Any]:
         record.sha256,
         header.submission.sha256,
         plain("; ".join(row.entry.reasons)),
+        *_normalised(row),
+        header.draws.season or "",
     )
     return dict(zip(COLUMNS, values, strict=True))
 
@@ -210,7 +247,18 @@ def _by_lung(row: Row) -> dict[str, float]:
     drawn, nominal = record.drawn.mean(axis=(0, 2)), record.nominal.mean(axis=1)
     lungs = record.lungs
     scores = {f"score_{lung}_cmH2O": float(drawn[i]) for i, lung in enumerate(lungs)}
-    return scores | {f"nominal_{lung}_cmH2O": float(nominal[i]) for i, lung in enumerate(lungs)}
+    values = scores | {f"nominal_{lung}_cmH2O": float(nominal[i]) for i, lung in enumerate(lungs)}
+    if record.headroom is not None:
+        means = record.ranked_values.mean(axis=1)
+        values |= {f"normalised_{lung}": float(means[i]) for i, lung in enumerate(lungs)}
+    return values
+
+
+def _normalised(row: Row) -> tuple[float, ...]:
+    own = row.normalised
+    if own is None:
+        return (math.nan,) * 9
+    return (*_interval(own.score), *_interval(own.to_baseline), *_interval(own.to_above))
 
 
 def _interval(estimate: Interval | None) -> tuple[float, float, float]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ventbench import protocol
 from ventbench.board import hardware_table, pages
 from ventbench.board.hardware_table import HardwareRow
-from ventbench.board.ranking import BASELINES, Row, SealedEntry, Track
+from ventbench.board.ranking import BASELINES, Interval, Row, SealedEntry, Track
 from ventbench.board.sealed import DECIMALS
 from ventbench.board.store import Store
 from ventbench.text import number
@@ -52,6 +52,7 @@ def render(
         seasons=sorted(store.seasons.values(), key=lambda season: season.id),
         simulators=pages.flatten(header.simulators) if header else [],
         draws=header.draws if header else None,
+        normalised=version > 1,
         head=store.head,
         records=len(store.records),
         hardware=[
@@ -64,7 +65,7 @@ def render(
 
 
 def _track(track: Track, measured: Sequence[HardwareRow]) -> dict[str, Any]:
-    scores = [row.score for row in track.ranked if row.score is not None]
+    scores = [own for row in track.ranked if (own := _ranked_by(row)) is not None]
     low = min((x.low for x in scores), default=1.0)
     high = max((x.high for x in scores), default=1.0)
     return {
@@ -91,14 +92,34 @@ def _row(
         "baseline": record.name == BASELINES[track.name],
         "score": pages.interval(row.score),
         "plot": _plot(row, low, high),
-        "to_pid": pages.difference(row.to_baseline),
-        "to_above": pages.difference(row.to_above),
+        **_differences(row),
         "nominal": _figure(row.nominal),
         "worst": {**_figure(worst), "where": f"{lung}, {pip:g}"},
         "exploitation": _figure(record.exploitation),
         "clipped": _figure(100.0 * record.clipped_share, 1),
         "step": _figure(step, 0),
         "hardware": None if own is None else hardware_table.shown(own),
+    }
+
+
+def _ranked_by(row: Row) -> Interval | None:
+    """The score that ranks: the normalised one in version 2."""
+    return row.score if row.normalised is None else row.normalised.score
+
+
+def _differences(row: Row) -> dict[str, Any]:
+    """Differences of the score that ranks, and in version 2 that score."""
+    own = row.normalised
+    if own is None:
+        return {
+            "normalised": None,
+            "to_pid": pages.difference(row.to_baseline),
+            "to_above": pages.difference(row.to_above),
+        }
+    return {
+        "normalised": pages.interval(own.score, 1),
+        "to_pid": pages.difference(own.to_baseline, 1),
+        "to_above": pages.difference(own.to_above, 1),
     }
 
 
@@ -135,7 +156,8 @@ def _sealed(track: Track, entry: SealedEntry) -> dict[str, Any]:
 
 def _plot(row: Row, low: float, high: float) -> dict[str, str] | None:
     """Positions of a score and its interval on an axis that all rows of a track share."""
-    if row.score is None:
+    score = _ranked_by(row)
+    if score is None:
         return None
     # A logarithm, so that one bad entry does not press all others together.
     span = math.log(high / low) if high > low > 0.0 else 0.0
@@ -144,7 +166,7 @@ def _plot(row: Row, low: float, high: float) -> dict[str, str] | None:
         share = math.log(max(value, low) / low) / span if span else 0.5
         return MARGIN + (WIDTH - 2 * MARGIN) * share
 
-    left, dot, right = (x(v) for v in (row.score.low, row.score.value, row.score.high))
+    left, dot, right = (x(v) for v in (score.low, score.value, score.high))
     return {"x": f"{left:.1f}", "width": f"{max(right - left, 1.0):.1f}", "dot": f"{dot:.1f}"}
 
 

@@ -110,21 +110,23 @@ def signed(value: float, digits: int = 3) -> str:
     return number(value, digits, sign=True) if math.isfinite(value) else NONE
 
 
-def interval(estimate: Interval | None) -> dict[str, Any] | None:
+def interval(estimate: Interval | None, digits: int = 3) -> dict[str, Any] | None:
     """A score for a template: text, limits, value to sort by."""
     if estimate is None:
         return None
-    limits = f"{number(estimate.low, 3)} to {number(estimate.high, 3)}"
-    return {"text": number(estimate.value, 3), "limits": limits, "value": f"{estimate.value:.9f}"}
+    limits = f"{number(estimate.low, digits)} to {number(estimate.high, digits)}"
+    text = number(estimate.value, digits)
+    return {"text": text, "limits": limits, "value": f"{estimate.value:.9f}"}
 
 
-def difference(estimate: Interval | None) -> dict[str, Any] | None:
+def difference(estimate: Interval | None, digits: int = 3) -> dict[str, Any] | None:
     """A difference for a template, and whether it is clear: below zero is better."""
     if estimate is None:
         return None
-    limits = f"{number(estimate.low, 3, sign=True)} to {number(estimate.high, 3, sign=True)}"
+    low, high = (number(x, digits, sign=True) for x in (estimate.low, estimate.high))
+    limits = f"{low} to {high}"
     kind = "same" if not estimate.clear else "better" if estimate.value < 0 else "worse"
-    text = number(estimate.value, 3, sign=True)
+    text = number(estimate.value, digits, sign=True)
     return {"text": text, "limits": limits, "value": f"{estimate.value:.9f}", "kind": kind}
 
 

@@ -21,8 +21,10 @@ from ventbench.text import number
 #: Plot of the draws: left and width of its axis, height of a row.
 PLOT_LEFT, PLOT_AXIS, PLOT_ROW = 40, 580, 14
 
-#: Limits between the shades of maps, cmH2O: the same for all entries, so that maps can be compared.
+#: Limits between the shades of maps, cmH2O and points of the normalised score: the same for all
+#: entries, so that maps can be compared.
 ERROR_LIMITS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0)
+NORMALISED_LIMITS = (5.0, 15.0, 30.0, 50.0, 75.0, 100.0, 150.0, 250.0)
 DIFFERENCE_LIMITS = (0.02, 0.2, 0.7, 2.0)
 
 #: Size of a panel, left of its plots, units from one step to the next.
@@ -105,6 +107,30 @@ def error_map(record: Record) -> list[dict[str, Any]]:
         }
         for i, lung in enumerate(record.lungs)
     ]
+
+
+def normalised_map(record: Record) -> list[dict[str, Any]] | None:
+    """Rows of the map of normalised scores, mean over draws; small: nominal. None in version 1."""
+    if record.headroom is None:
+        return None
+    values = record.headroom.normalised
+    cells = values[1:].mean(axis=0)
+    return [
+        {
+            "name": lung,
+            "cells": [
+                {"text": number(value, 0), "small": number(nominal, 0), "shade": _scaled(value)}
+                for value, nominal in zip(cells[i], values[0, i], strict=True)
+            ],
+            "mean": number(float(cells[i].mean()), 0),
+        }
+        for i, lung in enumerate(record.lungs)
+    ]
+
+
+def _scaled(value: float) -> str:
+    limits = NORMALISED_LIMITS
+    return f"h{np.searchsorted(limits, value)}" if np.isfinite(value) else "hx"
 
 
 def difference_map(record: Record, other: Record) -> list[dict[str, Any]]:

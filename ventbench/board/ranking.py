@@ -1,8 +1,9 @@
 """From records to boards: which record of an entry counts, its rank, intervals and differences.
 
-The ranked score of an entry is the mean over the published draws of its mean error over all lungs
-and PIPs. The draws are common to all entries and resampled alike, so that every interval of a
-difference is a paired one, and ranks can be counted within each resample.
+The ranked score of an entry is the mean over the draws of its mean error over all lungs and PIPs in
+version 1, and of its normalised score in version 2. The draws are common to all entries and
+resampled alike, so that every interval of a difference is a paired one, and ranks can be counted
+within each resample. In version 2 rigs and members of the ensemble are resampled too.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.board.record import AnyRecord, Record, Sealed, Withdrawal
-from ventbench.metrics import bootstrap
+from ventbench.metrics import bootstrap, rig_bootstrap
 from ventbench.submissions.manifest import TRACKS
 
 Floats = NDArray[np.float64]
@@ -101,7 +102,7 @@ class Standing:
 
 @dataclass(frozen=True)
 class Interval:
-    """A figure with its 95 % interval, cmH2O."""
+    """A figure with its 95 % interval, cmH2O or points of the normalised score."""
 
     value: float
     low: float
@@ -112,6 +113,21 @@ class Interval:
         """Whether zero is outside, by more than rounding."""
         least = 10.0**-DECIMALS
         return self.low > least or self.high < -least
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A score, and its differences to others.
+
+    Attributes:
+        score: mean over draws.
+        to_baseline: difference to the track's PID; None for the PID itself, or without one.
+        to_above: difference to the entry above; None for the first.
+    """
+
+    score: Interval
+    to_baseline: Interval | None
+    to_above: Interval | None
 
 
 @dataclass(frozen=True)
@@ -127,6 +143,8 @@ class Row:
         to_above: difference to the entry above; None for the first.
         nominal: nominal score, cmH2O; NaN if a cell failed.
         worst: highest mean over draws of one cell, cmH2O, its lung and PIP; NaN if one failed.
+        normalised: the normalised score, by which version 2 ranks; None in version 1, and if a
+            cell failed.
     """
 
     entry: Entry
@@ -137,6 +155,7 @@ class Row:
     to_above: Interval | None
     nominal: float
     worst: tuple[float, str, float]
+    normalised: Comparison | None = None
 
     @property
     def record(self) -> Record:
@@ -239,8 +258,14 @@ def standings(
         if sealed.sha256 in withdrawn:
             withdrawn[inside] = withdrawn[sealed.sha256]
     grouped: dict[tuple[int, str, str], list[Event]] = defaultdict(list)
+    season = {
+        record.version: record.header.draws.season
+        for record in records
+        if isinstance(record, Record)
+    }
     for record in records:
-        if isinstance(record, Record):
+        # Only records over the same draws can be compared: those of the newest season.
+        if isinstance(record, Record) and record.header.draws.season == season[record.version]:
             sha256 = record.sha256
             breach = against.get(sha256, "")
             event = Event(record, withdrawn.get(sha256), sha256 in attested, breach)
@@ -321,49 +346,90 @@ def rank(entries: Sequence[Entry], track: str) -> list[Row]:
     ordered = sorted(entries, key=lambda e: (_key(e.record), e.record.name))
     if not ordered:
         return []
-    places = ranks([entry.record.by_draw for entry in ordered])
-    means = _resampled([entry.record for entry in ordered])
-    low, high = _rank_intervals(means)
-    base = baseline([entry.record for entry in ordered], track)
-    rows = []
-    for i, entry in enumerate(ordered):
-        own = entry.record.by_draw
-        to_baseline = None
-        if base is not None and base != i:
-            to_baseline = _interval(own - ordered[base].record.by_draw, means[i] - means[base])
-        to_above = None
-        if i:
-            to_above = _interval(own - ordered[i - 1].record.by_draw, means[i] - means[i - 1])
-        rows.append(
-            Row(
-                entry=entry,
-                rank=places[i],
-                ranks=(int(low[i]), int(high[i])),
-                score=_interval(own, means[i]),
-                to_baseline=to_baseline,
-                to_above=to_above,
-                nominal=float(entry.record.nominal.mean()),
-                worst=worst(entry.record),
-            )
+    records = [entry.record for entry in ordered]
+    ranked = [record.ranked_values for record in records]
+    low, high = _rank_intervals(_resampled(records, ranked))
+    taken = places(records, ranked)
+    base = baseline(records, track)
+    errors = _comparisons(records, [record.drawn.mean(axis=2).T for record in records], base)
+    scaled: list[Comparison | None] = [None] * len(records)
+    if records[0].headroom is not None:
+        scaled = list(_comparisons(records, ranked, base))
+    return [
+        Row(
+            entry=entry,
+            rank=taken[i],
+            ranks=(int(low[i]), int(high[i])),
+            score=errors[i].score,
+            to_baseline=errors[i].to_baseline,
+            to_above=errors[i].to_above,
+            nominal=float(entry.record.nominal.mean()),
+            worst=worst(entry.record),
+            normalised=scaled[i],
         )
-    return rows
+        for i, entry in enumerate(ordered)
+    ]
 
 
-def ranks(by_draw: Sequence[Floats]) -> list[int]:
-    """Rank scores that are given for each draw, cmH2O; equal ones share a rank."""
-    keys = np.array([_rounded(values) for values in by_draw])
-    return [1 + int(np.sum(keys < key)) for key in keys]
+def _comparisons(
+    records: Sequence[Record], values: Sequence[Floats], base: int | None
+) -> list[Comparison]:
+    """Compare entries, in the order of their ranks, by values of shape ``(L, K)``."""
+    means = _resampled(records, values)
+    compared = []
+    for i, own in enumerate(values):
+        to_baseline = to_above = None
+        if base is not None and base != i:
+            to_baseline = _interval(own - values[base], means[i] - means[base])
+        if i:
+            to_above = _interval(own - values[i - 1], means[i] - means[i - 1])
+        compared.append(Comparison(_interval(own, means[i]), to_baseline, to_above))
+    return compared
+
+
+def places(records: Sequence[Record], values: Sequence[Floats]) -> list[int]:
+    """Rank records of one version by values of shape ``(L, K)``; lower is better.
+
+    In version 1 equal means share a rank. In version 2 two entries share a rank if the paired 95 %
+    interval of their difference holds zero, and so do all between them: a rank tells entries apart
+    that the draws, rigs and members tell apart.
+    """
+    keys = np.array([_rounded(own) for own in values])
+    if not records or records[0].headroom is None:
+        return [1 + int(np.sum(keys < key)) for key in keys]
+    means = _resampled(records, values)
+    order = np.argsort(keys, kind="stable")
+    # The first place, in the order of the means, whose entry cannot be told from each one.
+    first = [
+        next(
+            (j for j in range(i) if not _interval(values[at] - values[order[j]],
+                                                  means[at] - means[order[j]]).clear),
+            i,
+        )
+        for i, at in enumerate(order)
+    ]  # fmt: skip
+    ranks = [0] * len(order)
+    rank = 1
+    for i, at in enumerate(order):
+        # Nobody from here on is tied with anybody before: a new rank begins.
+        if min(first[i:]) >= i:
+            rank = i + 1
+        ranks[at] = rank
+    return ranks
 
 
 def unranked_rows(entries: Sequence[Entry]) -> list[Row]:
     """Rows of entries that are not ranked, by name; scores where they exist."""
     rows = []
     for entry in sorted(entries, key=lambda e: e.record.name):
-        score = None
-        if np.isfinite(entry.record.by_draw).all():
-            score = _interval(entry.record.by_draw, _resampled([entry.record])[0])
-        nominal = float(entry.record.nominal.mean())
-        rows.append(Row(entry, None, None, score, None, None, nominal, worst(entry.record)))
+        record = entry.record
+        score = scaled = None
+        if np.isfinite(record.by_draw).all():
+            score = _comparisons([record], [record.drawn.mean(axis=2).T], None)[0].score
+            if record.headroom is not None:
+                scaled = _comparisons([record], [record.ranked_values], None)[0]
+        nominal = float(record.nominal.mean())
+        rows.append(Row(entry, None, None, score, None, None, nominal, worst(record), scaled))
     return rows
 
 
@@ -383,21 +449,28 @@ def worst(record: Record) -> tuple[float, str, float]:
 
 
 def _key(record: Record) -> float:
-    return _rounded(record.by_draw)
+    return _rounded(record.ranked_values)
 
 
-def _rounded(by_draw: Floats) -> float:
-    return round(float(np.mean(by_draw)), DECIMALS)
+def _rounded(values: Floats) -> float:
+    return round(float(np.mean(values)), DECIMALS)
 
 
-def _resampled(records: Sequence[Record]) -> Floats:
-    """Resampled means of each, cmH2O, shape ``(N, RESAMPLES)``: the same draws in each column."""
-    return np.stack([bootstrap.resampled_means(record.by_draw) for record in records])
+def _resampled(records: Sequence[Record], values: Sequence[Floats]) -> Floats:
+    """Resampled means of each, shape ``(N, RESAMPLES)``: the same draws in each column."""
+    rows = []
+    for record, own in zip(records, values, strict=True):
+        if record.headroom is None:
+            rows.append(bootstrap.resampled_means(own.mean(axis=0)))
+        else:
+            session, member = record.headroom.session, record.headroom.member
+            rows.append(rig_bootstrap.resampled_scores(own, session, member))
+    return np.stack(rows)
 
 
-def _interval(by_draw: Floats, means: Floats) -> Interval:
+def _interval(values: Floats, means: Floats) -> Interval:
     low, high = np.quantile(means, (0.025, 0.975))
-    return Interval(float(np.mean(by_draw)), float(low), float(high))
+    return Interval(float(np.mean(values)), float(low), float(high))
 
 
 def _rank_intervals(means: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -15,11 +15,37 @@ from numpy.typing import NDArray
 from ventbench.board import canonical, hardware, layout, schema
 from ventbench.board.hardware import HardwareRecord
 from ventbench.errors import InputError
+from ventbench.metrics.normalised import normalised
 
 Floats = NDArray[np.float64]
 
 #: End of a record's file name, after its SHA-256.
 SUFFIX = layout.RECORD_SUFFIX
+
+
+@dataclass(frozen=True)
+class RecordHeadroom:
+    """What a record of protocol version 2 adds; L lungs, P PIPs, K draws.
+
+    Attributes:
+        session: rig of each draw, shape ``(L, K)``.
+        member: member of the ensemble, shape ``(L, K)``.
+        error: error without the first step, nominal runs first, cmH2O, shape ``(1 + K, L, P)``;
+            NaN where a controller failed.
+        attainable: best attainable error, cmH2O, of that shape.
+        pid: error of the lung's best PID, cmH2O, of that shape.
+    """
+
+    session: NDArray[np.int64]
+    member: NDArray[np.int64]
+    error: Floats
+    attainable: Floats
+    pid: Floats
+
+    @cached_property
+    def normalised(self) -> Floats:
+        """Normalised score of each run, nominal runs first, shape ``(1 + K, L, P)``."""
+        return normalised(self.error, self.attainable, self.pid)
 
 
 @dataclass(frozen=True)
@@ -40,6 +66,7 @@ class Record:
             ``(1 + K, L, P)``.
         steps_above: longest time above the safety limit of each run, steps, shape
             ``(1 + K, L, P)``.
+        headroom: what protocol version 2 adds; None in version 1.
     """
 
     sha256: str
@@ -52,6 +79,7 @@ class Record:
     u_in: Floats
     peak: Floats
     steps_above: NDArray[np.int64]
+    headroom: RecordHeadroom | None = None
 
     @property
     def name(self) -> str:
@@ -110,10 +138,28 @@ class Record:
         return float(sum(clipped.below) + sum(clipped.above)) / max(1, clipped.commands)
 
     @property
-    def basis(self) -> tuple[str, str]:
-        """What its errors depend on besides commands: canonical text of simulators and draws."""
-        simulators, draws = self.header.simulators, msgspec.structs.asdict(self.header.draws)
-        return canonical.canonical(simulators).decode(), canonical.canonical(draws).decode()
+    def basis(self) -> tuple[str, str, str]:
+        """What its scores depend on besides commands: simulators, draws, reference errors.
+
+        Canonical text of the first two; a hash of the third, empty in version 1.
+        """
+        simulators, draws = self.header.simulators, self.header.draws.about()
+        reference = ""
+        if self.headroom is not None:
+            tables = np.stack([self.headroom.attainable, self.headroom.pid])
+            reference = canonical.digest(tables.tobytes())
+        texts = (canonical.canonical(simulators).decode(), canonical.canonical(draws).decode())
+        return (*texts, reference)
+
+    @cached_property
+    def ranked_values(self) -> Floats:
+        """What ranks, of each lung and draw, shape ``(L, K)``; lower is better.
+
+        The mean error over PIPs, cmH2O, in version 1; the mean normalised score in version 2.
+        """
+        if self.headroom is None:
+            return self.drawn.mean(axis=2).T
+        return self.headroom.normalised[1:].mean(axis=2).T
 
 
 @dataclass(frozen=True)
@@ -224,6 +270,19 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
         u_in=np.array(values.trace.u_in_tenths_percent) / 10.0,
         peak=np.array(values.safety.peak_centi_cmH2O) / 100.0,
         steps_above=np.array(values.safety.steps_above),
+        headroom=_headroom(values),
+    )
+
+
+def _headroom(values: schema.ScoreContent) -> RecordHeadroom | None:
+    if values.rigs is None or values.headroom is None:
+        return None
+    return RecordHeadroom(
+        np.array(values.rigs.session),
+        np.array(values.rigs.member),
+        np.array(values.headroom.error, float),
+        np.array(values.headroom.attainable, float),
+        np.array(values.headroom.pid, float),
     )
 
 

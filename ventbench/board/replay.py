@@ -7,8 +7,9 @@ with those of the scorer to 1e-9; matrix products of another batch size may roun
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import jax
@@ -17,12 +18,19 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
+from ventbench import draws as published
 from ventbench import environment as env
-from ventbench import precision, protocol
+from ventbench import precision, protocol, rig_draws
 from ventbench.board.record import Record
+from ventbench.board.schema import ScoreHeader
 from ventbench.environment import Scenario
+from ventbench.errors import InputError
 from ventbench.interfaces import Plant
+from ventbench.metrics.normalised import controllable_error
 from ventbench.metrics.score import longest_run, passes_safety_gate, run_error, safety_limit
+from ventbench.rig_draws import RigDraws
+from ventbench.seasons import DEVELOPMENT_SEED
+from ventbench.submissions.rig_scoring import rigs_of
 from ventbench.submissions.scoring import protocol_cells
 from ventbench.submissions.stepping import as_float64
 
@@ -68,6 +76,10 @@ class ReplayPlants(Protocol):
         ...
 
 
+#: Simulators, or a function that loads those of a version of the protocol.
+Replayable = ReplayPlants | Callable[[int], ReplayPlants]
+
+
 @dataclass(frozen=True)
 class Replayed:
     """What the commands of one record give; L lungs, P PIPs, K draws.
@@ -85,6 +97,8 @@ class Replayed:
         pressure: nominal inspiration of :data:`TRACE_BREATH`, cmH2O, shape ``(L, P, S)``.
         u_in: commands of that inspiration as applied, %, shape ``(L, P, S)``.
         first: first command of each run, %, shape ``(1 + K, L, P)``.
+        controllable: error without the first step, cmH2O, shape ``(1 + K, L, P)``; None in version
+            1.
     """
 
     nominal: Floats
@@ -98,32 +112,43 @@ class Replayed:
     pressure: Floats
     u_in: Floats
     first: Floats
+    controllable: Floats | None = None
 
 
-@jax.jit
-def _pressures(plants: Plant, cells: Scenario, requested: Array) -> Array:
-    """Pressures of shape ``(L, n, ..., S)`` for commands of that shape and cells ``(...)``."""
+@partial(jax.jit, static_argnames="version")
+def _pressures(plants: Plant, cells: Scenario, requested: Array, version: int = 1) -> Array:
+    """Pressures of shape ``(L, n, ..., S)`` for commands of that shape.
 
-    def lung(plant: Plant, commands: Array) -> Array:
+    Cells have batch shape ``(...)``, in version 2 ``(L, ...)``.
+    """
+
+    def lung(plant: Plant, cells: Scenario, commands: Array) -> Array:
+        def scored(loop: env.LoopState) -> Array:
+            return loop.pressure if version == 1 else env.airway_pressure(varied, loop)
+
         varied = env.vary(plant, cells)
         start = env.start_breath(varied, cells)
 
         def step(loop: env.LoopState, u_in: Array) -> tuple[env.LoopState, Array]:
             after, _ = env.inspire(varied, cells, loop, u_in)
-            return after, after.pressure
+            return after, scored(after)
 
         def inspiration(commands: Array) -> Array:
             # The last command acts after the last scored pressure.
             _, pressure = jax.lax.scan(step, start, jnp.moveaxis(commands, -1, 0)[:-1])
-            first = jnp.broadcast_to(start.pressure, pressure.shape[1:])
+            first = jnp.broadcast_to(scored(start), pressure.shape[1:])
             return jnp.moveaxis(jnp.concatenate([first[None], pressure]), 0, -1)
 
         return jax.vmap(inspiration)(commands)
 
-    return jax.vmap(lung)(plants, requested)
+    axis = None if version == 1 else 0
+    return jax.vmap(lung, in_axes=(0, axis, 0))(plants, cells, requested)
 
 
-_members = jax.jit(jax.vmap(_pressures, in_axes=(0, None, None)))
+@partial(jax.jit, static_argnames="version")
+def _members(plants: Plant, cells: Scenario, requested: Array, version: int = 1) -> Array:
+    run = partial(_pressures, version=version)
+    return jax.vmap(run, in_axes=(0, None, None))(plants, cells, requested)
 
 
 def _breaths_first(requested: Floats) -> Array:
@@ -139,25 +164,38 @@ def _breaths_last(values: Array, count: int) -> Floats:
     return np.moveaxis(split, (0, 2), (1, -2))
 
 
-def pressures(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -> Floats:
-    """True airway pressures that commands give.
+def pressures(
+    simulators: ReplayPlants,
+    pips: Sequence[float],
+    requested: Floats,
+    draws: RigDraws | None = None,
+) -> Floats:
+    """Scored pressures that commands give.
 
     Args:
         simulators: L lungs.
         pips: cmH2O, length P.
         requested: %, shape ``(N, L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``, nominal cells first.
+        draws: those of protocol version 2; if not given, the published ones of version 1.
 
     Returns:
         cmH2O, shape of ``requested``.
     """
     with precision.float64():
-        cells = protocol_cells(tuple(pips), requested.shape[2] - 1)
-        plants = as_float64(simulators.plants, requested.shape[1])
-        pressure = _pressures(plants, cells, _breaths_first(requested))
+        if draws is None:
+            cells = protocol_cells(tuple(pips), requested.shape[2] - 1)
+            plants = as_float64(simulators.plants, requested.shape[1])
+            pressure = _pressures(plants, cells, _breaths_first(requested))
+        else:
+            plants, cells = rigs_of(simulators).cells(draws, pips)
+            plants = as_float64(plants, requested.shape[1])
+            pressure = _pressures(plants, cells, _breaths_first(requested), version=2)
     return _breaths_last(pressure, len(requested))
 
 
-def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -> Floats:
+def spread(
+    simulators: ReplayPlants, pips: Sequence[float], requested: Floats, *, version: int = 1
+) -> Floats:
     """Disagreement of the ensemble along an entry's own nominal trajectory.
 
     Sample standard deviation over members of the pressure that the same commands give, averaged
@@ -168,6 +206,7 @@ def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -
         simulators: L lungs, M members.
         pips: cmH2O, length P.
         requested: nominal commands, %, shape ``(N, L, P, BREATHS, INSPIRATION_STEPS)``.
+        version: of the protocol.
 
     Returns:
         cmH2O, shape ``(N, L, P)``; NaN for fewer than two members.
@@ -178,8 +217,13 @@ def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -
         return np.full(requested.shape[:3], np.nan)
     with precision.float64():
         cells = protocol_cells(tuple(pips), 0)
+        if version > 1:
+            cells, _, _ = rig_draws.with_nominal(None, [0] * lungs, pips)
         pressure = _members(
-            as_float64(simulators.ensemble, members), cells, _breaths_first(requested[:, :, None])
+            as_float64(simulators.ensemble, members),
+            cells,
+            _breaths_first(requested[:, :, None]),
+            version=version,
         )
     by_member = np.stack([_breaths_last(pressure[m], len(requested)) for m in range(members)])
     deviation = np.std(by_member[:, :, :, 0], axis=0, ddof=1)
@@ -187,8 +231,50 @@ def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -
     return np.mean(deviation[..., protocol.SCORED_BREATHS, :], axis=(-2, -1))
 
 
+def draws_of(
+    header: ScoreHeader, simulators: ReplayPlants, seed: bytes | None = None
+) -> RigDraws | None:
+    """Make the draws that a record names again.
+
+    Args:
+        header: of the record.
+        simulators: that it names.
+        seed: of its season; not needed for the development draws.
+
+    Returns:
+        The draws of protocol version 2; None in version 1, whose draws are a file.
+
+    Raises:
+        InputError: if the draws are not those of the published file, or of the season's seed, or
+            the seed is not known.
+    """
+    recorded = header.draws.about()
+    if header.protocol == 1:
+        if recorded != published.about():
+            raise InputError("key draws: not the published draws")
+        return None
+    if recorded["season"] == rig_draws.DEVELOPMENT:
+        seed = DEVELOPMENT_SEED
+    if seed is None:
+        raise InputError(f"key draws: season {recorded['season']} is not revealed")
+    rigs = rigs_of(simulators)
+    drawn = rig_draws.build(
+        rigs.sessions or (),
+        rigs.members,
+        seed=seed,
+        season=recorded["season"],
+        n=recorded["count"],
+    )
+    if drawn.about() != recorded:
+        raise InputError("key draws: not the draws of the seed of their season")
+    return drawn
+
+
 def replay(
-    simulators: ReplayPlants, pips: Sequence[float], requested: Sequence[Floats]
+    simulators: ReplayPlants,
+    pips: Sequence[float],
+    requested: Sequence[Floats],
+    draws: RigDraws | None = None,
 ) -> Iterator[Replayed]:
     """Replay the commands of records of one shape, a few at a time.
 
@@ -196,22 +282,29 @@ def replay(
         simulators: L lungs.
         pips: cmH2O, length P.
         requested: of each record, %, shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``.
+        draws: those of protocol version 2; if not given, the published ones of version 1.
     """
     if not requested:
         return
+    version = 1 if draws is None else 2
     with precision.float64():
-        cells = protocol_cells(tuple(pips), requested[0].shape[1] - 1)
+        if draws is None:
+            cells = protocol_cells(tuple(pips), requested[0].shape[1] - 1)
+        else:
+            _, cells = rigs_of(simulators).cells(draws, pips)
     size = min(BATCH, len(requested))
     for first in range(0, len(requested), size):
         batch = list(requested[first : first + size])
         padded = np.stack([*batch, *[batch[-1]] * (size - len(batch))])
-        pressure = pressures(simulators, pips, padded)
-        spreads = spread(simulators, pips, padded[:, :, 0])
+        pressure = pressures(simulators, pips, padded, draws)
+        spreads = spread(simulators, pips, padded[:, :, 0], version=version)
         for n, commands in enumerate(batch):
-            yield _measure(cells, commands, pressure[n], spreads[n])
+            yield _measure(cells, commands, pressure[n], spreads[n], version)
 
 
-def _measure(cells: Scenario, requested: Floats, pressure: Floats, spread: Floats) -> Replayed:
+def _measure(
+    cells: Scenario, requested: Floats, pressure: Floats, spread: Floats, version: int
+) -> Replayed:
     pip, dt = np.asarray(cells.pip), np.asarray(cells.dt)
     errors = run_error(pressure, pip[..., None, None])
     gate = passes_safety_gate(pressure, pip[..., None], dt[..., None])
@@ -228,6 +321,9 @@ def _measure(cells: Scenario, requested: Floats, pressure: Floats, spread: Float
         pressure=pressure[:, 0, :, TRACE_BREATH],
         u_in=np.clip(requested[:, 0, :, TRACE_BREATH], 0.0, protocol.U_MAX),
         first=np.moveaxis(requested[..., 0, 0], 1, 0),
+        controllable=None
+        if version == 1
+        else np.moveaxis(controllable_error(pressure, pip[..., None, None]), 1, 0),
     )
 
 
@@ -265,6 +361,9 @@ def differences(record: Record, replayed: Replayed) -> list[str]:
         ("trace.pressure_centi_cmH2O", record.pressure, replayed.pressure, _CENTI),
         ("trace.u_in_tenths_percent", record.u_in, replayed.u_in, _TENTH),
     )
+    if record.headroom is not None and replayed.controllable is not None:
+        own = ("headroom.error", record.headroom.error, replayed.controllable, TOLERANCE)
+        checks = (*checks, own)
     texts = [text for check in checks if (text := _difference(*check)) is not None]
     for key in ("nominal", "drawn"):
         recorded, given = getattr(record, key), getattr(replayed, key)
@@ -279,9 +378,10 @@ def lung_leaks(record: Record, replayed: Replayed) -> list[str]:
     """Find first commands of the robustness track that differ from lung to lung.
 
     The first observation of a run is that of a lung at PEEP: noise, start, target and step are
-    common to all lungs of a draw. A controller that is not told the lung cannot answer
-    differently; one that does has learned it, or nobody has computed its commands from
-    observations. The reverse is no proof of honesty. Failed runs are left out.
+    common to all lungs of a draw; in protocol version 2 to those of the nominal runs only. A
+    controller that is not told the lung cannot answer differently; one that does has learned it, or
+    nobody has computed its commands from observations. The reverse is no proof of honesty. Failed
+    runs are left out.
 
     Returns:
         One sentence for the first draw and PIP that shows it; empty if none does.
@@ -289,8 +389,9 @@ def lung_leaks(record: Record, replayed: Replayed) -> list[str]:
     if record.track != "robustness":
         return []
     failed = np.isnan(np.concatenate([record.nominal[None], record.drawn]))
-    highest = np.max(np.where(failed, -np.inf, replayed.first), axis=1)
-    lowest = np.min(np.where(failed, np.inf, replayed.first), axis=1)
+    same = slice(None) if record.version == 1 else slice(1)
+    highest = np.max(np.where(failed, -np.inf, replayed.first)[same], axis=1)
+    lowest = np.min(np.where(failed, np.inf, replayed.first)[same], axis=1)
     apart = np.argwhere(highest > lowest)
     if not len(apart):
         return []

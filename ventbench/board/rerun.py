@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 from ventbench import data_files, draws, protocol
 from ventbench.board import actions, canonical, create, store
 from ventbench.board.record import Record
-from ventbench.board.replay import ReplayPlants
+from ventbench.board.replay import ReplayPlants, draws_of
 from ventbench.errors import InputError
 from ventbench.resume import WorkFolder
 from ventbench.submissions.folder import Submission, file_hashes, open_submission
+from ventbench.submissions.rig_scoring import rigs_of, run_on_rigs
 from ventbench.submissions.runner import Runner
 from ventbench.submissions.scoring import run_protocol
 
@@ -73,15 +74,15 @@ def sandboxed() -> Runner:
     return SandboxRunner(require_official=True)
 
 
-def frozen_simulators() -> ReplayPlants:
-    """The frozen simulators of this ventbench.
+def frozen_simulators(version: int) -> ReplayPlants:
+    """The frozen simulators of a version of the protocol.
 
     Raises:
         InputError: if they were changed.
     """
     from ventbench.plants import frozen
 
-    return frozen.load()
+    return frozen.load(version)
 
 
 def rerun(
@@ -91,7 +92,7 @@ def rerun(
     sources: Sequence[Path] = (),
     work: Path,
     jobs: int = 1,
-    load: Callable[[], ReplayPlants] = frozen_simulators,
+    load: Callable[[int], ReplayPlants] = frozen_simulators,
     runner: Callable[[], Runner] = sandboxed,
     progress: Callable[[Outcome], None] | None = None,
 ) -> list[Outcome]:
@@ -103,7 +104,7 @@ def rerun(
         sources: folders with the code: of one submission, or of several.
         work: folder for what is finished; the same one continues.
         jobs: number of processes.
-        load: gives the simulators; with several processes, a function of a module.
+        load: gives the simulators of a version; with several processes, a function of a module.
         runner: gives the runner; with several processes, a function of a module.
         progress: called after each record.
 
@@ -125,8 +126,10 @@ def rerun(
             )
     chosen = {entry.sha256 for entry in named}
     scores = [score for score in board.scores if not chosen or score.sha256 in chosen]
-    about = canonical.through_json(load().about())
-    done = WorkFolder(work, {"simulators": about, "versions": create.versions()})
+    versions = sorted({score.version for score in scores} & set(protocol.VERSIONS))
+    about = {version: canonical.through_json(load(version).about()) for version in versions}
+    settings = {"simulators": {str(k): v for k, v in about.items()}}
+    done = WorkFolder(work, {**settings, "versions": create.versions()})
     outcomes: dict[str, Outcome] = {}
     todo: list[tuple[Record, Path]] = []
 
@@ -150,7 +153,7 @@ def rerun(
             todo.append((score, code))
     if jobs == 1 or len(todo) < 2:
         for score, code in todo:
-            note(_run(score, code, folder, load(), runner()))
+            note(_run(score, code, folder, load(score.version), runner()))
     else:
         # Fresh processes: JAX has threads, which a fork would cut off.
         context = multiprocessing.get_context("spawn")
@@ -175,12 +178,12 @@ def _folders(places: Sequence[Path]) -> Iterator[Path]:
 
 
 def _code_of(
-    score: Record, available: Sequence[Path], simulators: Mapping[str, Any]
+    score: Record, available: Sequence[Path], simulators: Mapping[int, Mapping[str, Any]]
 ) -> tuple[Path | None, str]:
     """Find the code that a record names by its hashes; else why it cannot be run again."""
-    if score.version != protocol.VERSION:
-        return None, f"its protocol version is {score.version}; an older ventbench runs it"
-    if score.header.simulators != simulators:
+    if score.version not in protocol.VERSIONS:
+        return None, f"its protocol version is {score.version}, which this ventbench does not know"
+    if score.header.simulators != simulators[score.version]:
         return None, "it was scored on other simulators than those of this ventbench"
     wanted = score.header.submission.files
     for folder in available:
@@ -194,13 +197,13 @@ def _run_in_process(
     sha256: str,
     code: Path,
     folder: Path,
-    load: Callable[[], ReplayPlants],
+    load: Callable[[int], ReplayPlants],
     runner: Callable[[], Runner],
 ) -> Outcome:
     """Run one record in a process of its own, which reads it again."""
     score = store.find_record(store.load(folder), sha256)
     assert isinstance(score, Record)
-    return _run(score, code, folder, load(), runner())
+    return _run(score, code, folder, load(score.version), runner())
 
 
 def _run(
@@ -211,14 +214,20 @@ def _run(
     try:
         submission = open_submission(str(code))
         _check_same(submission, score)
-        result = run_protocol(
-            submission,
-            simulators.plants,
-            track=score.track,
-            draws=draws.COUNT,
-            runner=runner,
-            simulators=simulators.about(),
-        )
+        if score.version == 1:
+            result = run_protocol(
+                submission,
+                simulators.plants,
+                track=score.track,
+                draws=draws.COUNT,
+                runner=runner,
+                simulators=simulators.about(),
+            )
+        else:
+            season = store.load(folder).seasons.get(score.header.draws.season or "")
+            drawn = draws_of(score.header, simulators, season.revealed if season else None)
+            rigs = rigs_of(simulators)
+            result = run_on_rigs(submission, rigs, track=score.track, drawn=drawn, runner=runner)
         _check_same(open_submission(str(code)), score)
         recorded = actions.load(score, folder / store.RECORDS)
         detail = difference(score, recorded, result.requested)

@@ -108,11 +108,20 @@ class RecordedSubmission(_Table, frozen=True):
 
 
 class Draws(_Table, frozen=True):
-    """The published draws; keys in the order of pages."""
+    """The draws; keys in the order of pages.
+
+    ``sha256`` is that of their file in version 1 and the commitment of their seed in version 2,
+    where ``season`` names the seed.
+    """
 
     count: Annotated[int, msgspec.Meta(ge=1, lt=2**53)]
     sha256: Sha256
     version: Count
+    season: Annotated[str, matching("[a-z0-9][a-z0-9-]{0,39}")] | None = None
+
+    def about(self) -> dict[str, Any]:
+        """As the record has it."""
+        return {k: v for k, v in msgspec.structs.asdict(self).items() if v is not None}
 
 
 class Errors(_Table, frozen=True):
@@ -149,6 +158,24 @@ class RecordedFailure(_Table, frozen=True):
     breath: Count | None
     step: Count | None
     message: Text
+
+
+class RecordedRigs(_Table, frozen=True):
+    """Session and member of the ensemble of each lung and draw, ``(L, K)``; version 2."""
+
+    session: list[list[Count]]
+    member: list[list[Count]]
+
+
+class RecordedHeadroom(_Table, frozen=True):
+    """Errors without the first step of the entry, the best commands and the best PID; version 2.
+
+    Nominal runs first, cmH2O, ``(1 + K, L, P)``.
+    """
+
+    error: list[list[list[Error]]]
+    attainable: list[list[list[Annotated[float, msgspec.Meta(ge=0.0)]]]]
+    pid: list[list[list[Annotated[float, msgspec.Meta(ge=0.0)]]]]
 
 
 class Trace(_Table, frozen=True):
@@ -203,6 +230,8 @@ class ScoreContent(ScoreHeader, frozen=True, tag_field="kind", tag="score"):
     safety: Safety
     spread: list[list[float | None]]
     trace: Trace
+    rigs: RecordedRigs | None = None
+    headroom: RecordedHeadroom | None = None
 
     def header(self) -> ScoreHeader:
         """Everything but the large tables."""
@@ -387,6 +416,13 @@ def _check_shapes(record: ScoreContent, label: str) -> None:
         "trace.pressure_centi_cmH2O": (record.trace.pressure_centi_cmH2O, (lungs, pips, steps)),
         "trace.u_in_tenths_percent": (record.trace.u_in_tenths_percent, (lungs, pips, steps)),
     }
+    if record.rigs is not None:
+        for key in ("session", "member"):
+            shapes = {**shapes, f"rigs.{key}": (getattr(record.rigs, key), (lungs, draws))}
+    if record.headroom is not None:
+        for key in ("error", "attainable", "pid"):
+            table = getattr(record.headroom, key)
+            shapes = {**shapes, f"headroom.{key}": (table, (1 + draws, lungs, pips))}
     for key, (table, shape) in shapes.items():
         if not has_shape(table, shape):
             raise InputError(f"{label}, key {key}: does not have the shape {shape}")
@@ -401,7 +437,15 @@ def has_shape(table: list[Any], shape: tuple[int, ...]) -> bool:
 
 def _check_consistent(record: ScoreContent, label: str) -> None:
     lungs, pips, draws = record.lungs, record.pips, record.draws.count
-    if record.protocol == protocol.VERSION and (
+    second = {
+        "rigs": record.rigs,
+        "headroom": record.headroom,
+        "draws.season": record.draws.season,
+    }
+    for key, value in second.items():
+        if record.protocol in protocol.VERSIONS and (value is not None) != (record.protocol == 2):
+            raise InputError(f"{label}, key {key}: belongs to protocol version 2 and no other")
+    if record.protocol in protocol.VERSIONS and (
         tuple(lungs) != LUNG_IDS or tuple(pips) != protocol.PIPS
     ):
         raise InputError(f"{label}: does not cover all lungs and PIPs of the protocol")
@@ -416,6 +460,12 @@ def _check_consistent(record: ScoreContent, label: str) -> None:
         for pip, error in zip(pips, row, strict=True)
         if error is None
     ]
+    if record.headroom is not None:
+        tables = [record.errors.nominal, *record.errors.drawn]
+        if [[[x is None for x in row] for row in rows] for rows in tables] != [
+            [[x is None for x in row] for row in rows] for rows in record.headroom.error
+        ]:
+            raise InputError(f"{label}, key headroom.error: does not fit the errors")
     if len(failed) != record.failed_cells:
         raise InputError(f"{label}, key failed_cells: does not fit the errors")
     named = [(failure.lung, failure.pip, failure.draw) for failure in record.failures]

@@ -95,8 +95,10 @@ class Opened:
 
 def scores_of(score: Record) -> dict[str, float | None]:
     """What is published of a record's scores before it is opened: rounded means over everything."""
-    mean = float(score.by_draw.mean())
-    return {"score_cmh2o": round(mean, DECIMALS) if mean == mean else None}
+    means = {"score_cmh2o": float(score.by_draw.mean())}
+    if score.headroom is not None:
+        means["normalised"] = float(score.ranked_values.mean())
+    return {key: round(mean, DECIMALS) if mean == mean else None for key, mean in means.items()}
 
 
 def seal(content: bytes, commands: bytes, season: Season, seed: bytes) -> SealedDraft:

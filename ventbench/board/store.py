@@ -23,7 +23,7 @@ from ventbench.errors import InputError
 from ventbench.seasons import Season
 
 if TYPE_CHECKING:
-    from ventbench.board.replay import ReplayPlants
+    from ventbench.board.replay import Replayable
 
 #: Stands for the hash of the line before the first.
 CHAIN_START = "0" * 64
@@ -267,7 +267,11 @@ def find_record(store: Store, sha256: str) -> Record | Sealed:
 
 
 def add_sealed(
-    folder: Path, path: Path, *, seed: bytes | None = None, simulators: ReplayPlants | None = None
+    folder: Path,
+    path: Path,
+    *,
+    seed: bytes | None = None,
+    simulators: Replayable | None = None,
 ) -> Sealed:
     """Add a sealed record to a leaderboard.
 
@@ -303,7 +307,7 @@ def add_sealed(
     if seed is not None:
         inside = sealed.unseal(added, ciphertext, season, seed)
         if simulators is not None:
-            require_replay(inside.record, inside.commands, simulators, str(path))
+            require_replay(inside.record, inside.commands, simulators, str(path), seed)
     kept = sealed.path_of(added, folder / RECORDS)
     files.write_atomically(kept, lambda file: file.write(ciphertext))
     _append(store, added, path.read_bytes())
@@ -323,9 +327,7 @@ class Revealed:
     void: Mapping[str, str]
 
 
-def reveal(
-    folder: Path, name: str, seed: bytes, simulators: ReplayPlants | None = None
-) -> Revealed:
+def reveal(folder: Path, name: str, seed: bytes, simulators: Replayable | None = None) -> Revealed:
     """Reveal the seed of a season and open its sealed records.
 
     What was opened before is left alone, so that an interrupted call can be repeated. A record that
@@ -357,7 +359,7 @@ def reveal(
             inside = sealed.unseal(entry, sealed.load(entry, folder / RECORDS), season, seed)
             if simulators is not None:
                 label = f"the record of {inside.record.name}"
-                require_replay(inside.record, inside.commands, simulators, label)
+                require_replay(inside.record, inside.commands, simulators, label, seed)
             waiting.append(inside)
         except InputError as error:
             void[entry.sha256] = str(error)
@@ -370,32 +372,40 @@ def reveal(
     return Revealed(tuple(inside.record for inside in waiting), void)
 
 
-def require_replay(score: Record, commands: bytes, simulators: ReplayPlants, label: str) -> None:
+def require_replay(
+    score: Record,
+    commands: bytes,
+    simulators: Replayable,
+    label: str,
+    seed: bytes | None = None,
+) -> None:
     """Replay a record.
 
     Args:
         score: the record.
         commands: content of its action file.
-        simulators: that it names.
+        simulators: that it names, or a function that loads those of a protocol's version.
         label: names it in messages.
+        seed: of its season, for hidden draws.
 
     Raises:
         InputError: if it was scored on other simulators, or does not replay.
     """
-    from ventbench.board.replay import differences, replay
+    from ventbench.board.replay import differences, draws_of, replay
 
+    if callable(simulators):
+        simulators = simulators(score.version)
     if score.header.simulators != canonical.through_json(simulators.about()):
         raise InputError(f"{label} was scored on other simulators than those of this ventbench")
     requested = actions.decode(commands, score.header.actions.shape, label)
-    (replayed,) = replay(simulators, score.pips, [requested])
+    drawn = draws_of(score.header, simulators, seed)
+    (replayed,) = replay(simulators, score.pips, [requested], drawn)
     problems = differences(score, replayed)
     if problems:
         raise InputError(f"{label} does not replay: {'; '.join(problems)}")
 
 
-def add(
-    folder: Path, path: Path, simulators: ReplayPlants | None = None
-) -> Record | HardwareRecord:
+def add(folder: Path, path: Path, simulators: Replayable | None = None) -> Record | HardwareRecord:
     """Add a record to a leaderboard.
 
     Args:
@@ -415,10 +425,10 @@ def add(
         raise InputError(f"{path} is a sealed record; use add_sealed")
     if isinstance(added, Withdrawal):
         raise InputError(f"{path} is a withdrawal; use ventbench board withdraw")
-    if added.version != protocol.VERSION:
+    if added.version not in protocol.VERSIONS:
         raise InputError(
             f"{path} is of protocol version {added.version}; this ventbench scores and replays "
-            f"version {protocol.VERSION}"
+            f"versions {', '.join(map(str, protocol.VERSIONS))}"
         )
     problems = conflicts([*store.records, added], start=len(store.records))
     if problems:
@@ -550,7 +560,8 @@ def _conflicts(entry: AnyRecord, before: _Before) -> list[str]:
     first = before.first_of_version.get(entry.version)
     if first is not None and isinstance(entry, Record):
         # Records of one version can only be compared over the same simulators and draws.
-        pairs = zip(("simulators", "draws"), entry.basis, first.basis, strict=True)
+        keys = ("simulators", "draws", "headroom")
+        pairs = zip(keys, entry.basis, first.basis, strict=True)
         sentences = [
             f"{name} ({entry.name}), key {key}: differs from record {first.sha256[:12]} "
             f"({first.name}) of the same protocol version"

@@ -10,11 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import draws, protocol
+from ventbench import protocol, rig_draws
 from ventbench import seasons as season_files
 from ventbench.board import (
     actions,
@@ -28,8 +27,18 @@ from ventbench.board import (
     store,
 )
 from ventbench.board.record import AnyRecord, Record
-from ventbench.board.replay import BATCH, ReplayPlants, deviation, differences, replay
+from ventbench.board.replay import (
+    BATCH,
+    ReplayPlants,
+    deviation,
+    differences,
+    draws_of,
+    replay,
+)
 from ventbench.errors import InputError
+from ventbench.headroom.reference import published, reference_of
+from ventbench.metrics.normalised import normalised
+from ventbench.rig_draws import RigDraws
 
 Floats = NDArray[np.float64]
 
@@ -116,8 +125,12 @@ def verify(
     known = _check_seasons(folder, report)
     leaderboard = store.assembled(folder, links, entries, vouched, known)
     hidden = _check_sealed(leaderboard, vouched, seed, report)
-    by_draw = _check_replay(folder, leaderboard.scores, load, report, progress)
-    _check_hidden(hidden, load, report)
+    seeds = {name: season.revealed for name, season in known.items() if season.revealed}
+    by_draw = _check_replay(folder, leaderboard.scores, load, seeds, report, progress)
+    if seed is not None:
+        of_seed = season_files.commitment(seed)
+        seeds |= {name: seed for name, about in known.items() if about.commitment == of_seed}
+    _check_hidden(hidden, load, seeds, report)
     if not report.problems:  # else whatever is wrong has been said, and moves the ranks
         report.problems += _check_ranks(leaderboard, by_draw)
     if len(entries) == len(links) > 0:
@@ -191,15 +204,20 @@ def _check_sealed(
     return opened
 
 
-def _check_hidden(hidden: Sequence[sealed.Opened], load: Load, report: Report) -> None:
-    """Replay what is inside sealed records."""
+def _check_hidden(
+    hidden: Sequence[sealed.Opened], load: Load, seeds: Mapping[str, bytes], report: Report
+) -> None:
+    """Replay what is inside sealed records; ``seeds`` are known ones by season."""
     for inside in hidden:
         label = f"what is sealed of record {inside.record.sha256}"
         simulators = _simulators(inside.record.header.simulators, load, report)
         if simulators is None:
             continue
         try:
-            store.require_replay(inside.record, inside.commands, simulators, label)
+            season = inside.record.header.draws.season
+            store.require_replay(
+                inside.record, inside.commands, simulators, label, seeds.get(season or "")
+            )
             report.replayed += 1
         except InputError as error:
             report.problems.append(str(error))
@@ -260,21 +278,31 @@ def _check_replay(
     folder: Path,
     scores: Sequence[Record],
     load: Load,
+    seeds: Mapping[str, bytes],
     report: Report,
     progress: Progress | None,
 ) -> dict[str, Floats]:
     """Replay records and note in the report what differs.
 
     Returns:
-        Score of each draw as replayed, cmH2O, shape ``(K,)``, by the record's hash.
+        What ranks as replayed, shape ``(L, K)``, by the record's hash; see
+        :attr:`ventbench.board.record.Record.ranked_values`.
     """
     by_draw: dict[str, Floats] = {}
     for group in _by_simulators(scores, report):
-        simulators = _simulators(group[0].header.simulators, load, report)
+        header = group[0].header
+        simulators = _simulators(header.simulators, load, report)
         if simulators is None:
             continue
+        try:
+            drawn = draws_of(header, simulators, seeds.get(header.draws.season or ""))
+        except InputError as error:
+            report.problems += [f"record {score.sha256}, {error}" for score in group]
+            continue
+        report.problems += _wrong_reference(group)
         for first in range(0, len(group), BATCH):
-            by_draw |= _replay_batch(folder, group[first : first + BATCH], simulators, report)
+            batch = group[first : first + BATCH]
+            by_draw |= _replay_batch(folder, batch, simulators, drawn, report)
             if progress is not None:
                 progress(min(first + BATCH, len(group)), len(group))
     return by_draw
@@ -285,15 +313,16 @@ def _check_ranks(leaderboard: store.Store, by_draw: Mapping[str, Floats]) -> lis
 
     Args:
         leaderboard: all that could be read.
-        by_draw: replayed scores of each draw; a record without one keeps its own.
+        by_draw: replayed values that rank; a record without them keeps its own.
     """
     problems = []
     standings = ranking.standings(leaderboard.records, leaderboard.attested, leaderboard.breaches)
     for tracks in standings.values():
         for name, standing in tracks.items():
             records = [entry.record for entry in standing.ranked]
-            recorded = ranking.ranks([score.by_draw for score in records])
-            replayed = ranking.ranks([by_draw.get(x.sha256, x.by_draw) for x in records])
+            recorded = ranking.places(records, [score.ranked_values for score in records])
+            again = [by_draw.get(x.sha256, x.ranked_values) for x in records]
+            replayed = ranking.places(records, again)
             problems += [
                 f"record {score.sha256} ({score.name}): ranks {said} on the {name} track by its "
                 f"recorded errors, {given} by those that all commands give"
@@ -308,22 +337,40 @@ def _by_simulators(scores: Sequence[Record], report: Report) -> list[list[Record
     groups: dict[str, list[Record]] = {}
     old: set[int] = set()
     for score in scores:
-        if score.version > protocol.VERSION:
+        if score.version > max(protocol.VERSIONS):
             report.problems.append(
                 f"record {score.sha256}, key protocol: version {score.version} is not known to "
                 "this ventbench"
             )
-        elif score.version < protocol.VERSION:
+        elif score.version < min(protocol.VERSIONS):
             old.add(score.version)
-        elif msgspec.structs.asdict(score.header.draws) != draws.about():
-            report.problems.append(f"record {score.sha256}, key draws: not the published draws")
         else:
-            groups.setdefault(score.basis[0], []).append(score)
+            groups.setdefault("".join((str(score.version), *score.basis[:2])), []).append(score)
     report.notes += [
         f"records of protocol version {version} were not replayed; an older ventbench does that"
         for version in sorted(old)
     ]
     return list(groups.values())
+
+
+def _wrong_reference(group: Sequence[Record]) -> list[str]:
+    """Records on development draws whose reference errors are not the published ones."""
+    score = group[0]
+    if score.headroom is None or score.header.draws.season != rig_draws.DEVELOPMENT:
+        return []
+    try:
+        about = score.header.simulators
+        reference = reference_of(about, score.header.draws.about(), published())
+    except InputError as error:
+        return [f"record {score.sha256}, key headroom: {error}"]
+    assert reference is not None
+    wanted = {"attainable": reference.attainable, "pid": reference.pid}
+    return [
+        f"record {entry.sha256}, key headroom.{key}: not the published reference errors"
+        for entry in group
+        for key, table in wanted.items()
+        if not np.array_equal(getattr(entry.headroom, key), np.moveaxis(table, 1, 0))
+    ]
 
 
 def _simulators(recorded: Mapping[str, Any], load: Load, report: Report) -> ReplayPlants | None:
@@ -351,7 +398,11 @@ def _simulators(recorded: Mapping[str, Any], load: Load, report: Report) -> Repl
 
 
 def _replay_batch(
-    folder: Path, batch: Sequence[Record], simulators: ReplayPlants, report: Report
+    folder: Path,
+    batch: Sequence[Record],
+    simulators: ReplayPlants,
+    drawn: RigDraws | None,
+    report: Report,
 ) -> dict[str, Floats]:
     sound, requested = [], []
     by_draw: dict[str, Floats] = {}
@@ -363,11 +414,16 @@ def _replay_batch(
             report.problems.append(str(error))
     if not sound:
         return by_draw
-    for score, replayed in zip(sound, replay(simulators, sound[0].pips, requested), strict=True):
+    runs = replay(simulators, sound[0].pips, requested, drawn)
+    for score, replayed in zip(sound, runs, strict=True):
         report.replayed += 1
         report.deviation = max(report.deviation, deviation(score, replayed))
         path = folder / store.RECORDS / f"{score.sha256}{record.SUFFIX}"
         report.problems += [f"{path}, {text}" for text in differences(score, replayed)]
         failed = np.isnan(score.drawn)
-        by_draw[score.sha256] = np.where(failed, np.nan, replayed.drawn).mean(axis=(1, 2))
+        values = replayed.drawn
+        if score.headroom is not None and replayed.controllable is not None:
+            own = score.headroom
+            values = normalised(replayed.controllable, own.attainable, own.pid)[1:]
+        by_draw[score.sha256] = np.where(failed, np.nan, values).mean(axis=2).T
     return by_draw

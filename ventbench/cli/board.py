@@ -84,10 +84,10 @@ def add(
     new = create.amend(record, supersedes=supersedes, reason=reason, source=about)
     if isinstance(records.load(new), records.Sealed):
         held = _seed(seed)
-        simulators = None if held is None else frozen.load()
+        simulators = None if held is None else frozen.load
         added = store.add_sealed(folder, new, seed=held, simulators=simulators)
     else:
-        added = store.add(folder, new, frozen.load())
+        added = store.add(folder, new, frozen.load)
     typer.echo(f"added {added.name} ({added.track}): record {added.sha256}")
     typer.echo("next: ventbench board build")
 
@@ -218,7 +218,7 @@ def reveal(
         raise InputError(
             f"season {season} is open until {known[season].closes}; its draws stay secret so long"
         )
-    revealed = store.reveal(folder, season, secret, frozen.load())
+    revealed = store.reveal(folder, season, secret, frozen.load)
     for score in revealed.opened:
         typer.echo(f"opened {score.name} ({score.track}): record {score.sha256}")
     for reason in revealed.void.values():
@@ -363,11 +363,18 @@ def show(
     version: Annotated[
         int | None, typer.Option(help="Version of the protocol; default: the newest.")
     ] = None,
+    lung: Annotated[
+        str | None,
+        typer.Option(metavar="LUNG", help="Show the cells of one lung by PIP, or `all` lungs."),
+    ] = None,
     json: JsonFile = None,
 ) -> None:
     """Show the ranking of both tracks.
 
-    Example: `ventbench board show`
+    With --lung the table has a column for each PIP of that lung, or for each lung with `all`: the
+    normalised score in version 2, the error in cmH2O in version 1, over the draws.
+
+    Example: `ventbench board show --lung R20C50`
     """
     from rich.console import Console
 
@@ -376,15 +383,38 @@ def show(
     tracks = frames.load_tracks(folder, version=version)
     rows = [
         dict(zip(frames.COLUMNS, frames.csv_row(track, *row), strict=True))
+        | ({} if lung is None else {"cells": frames.cell_means(row[1].record, lung)})
         for track in tracks
         for row in track.rows
     ]
     emit({"version": tracks[0].version, "rows": rows}, json)
     console = Console(stderr=str(json) == "-")
     for track in tracks:
-        console.print(_table(track))
+        console.print(_table(track) if lung is None else _lung_table(track, lung))
         if track.sealed:
             console.print(_sealed_table(track))
+
+
+def _lung_table(track: Track, lung: str) -> Table:
+    """Entries by PIP of one lung, or by lung."""
+    from rich.table import Table
+
+    from ventbench.board import frames
+
+    unit = "normalised score" if track.version > 1 else "error, cmH2O"
+    table = Table(title=f"{track.name}, version {track.version}, {lung}: {unit} over draws")
+    table.add_column("rank", justify="right")
+    table.add_column("entry", no_wrap=True)
+    names: list[str] = []
+    for _, row in track.rows:
+        cells = frames.cell_means(row.record, lung)
+        for name in cells if not names else ():
+            names.append(name)
+            table.add_column(name, justify="right")
+        digits = 1 if track.version > 1 else 3
+        texts = ("failed" if x is None else f"{x:.{digits}f}" for x in cells.values())
+        table.add_row("" if row.rank is None else str(row.rank), row.record.name, *texts)
+    return table
 
 
 def _table(track: Track) -> Table:
@@ -393,6 +423,8 @@ def _table(track: Track) -> Table:
 
     from ventbench.text import plain
 
+    if track.version > 1:
+        return _normalised_table(track)
     table = Table(title=f"{track.name}, version {track.version}: score over draws, cmH2O")
     for name in ("rank", "entry", "score", "95 %", "to PID", "nominal", "worst cell", "state"):
         left = name in ("entry", "state")
@@ -407,6 +439,35 @@ def _table(track: Track) -> Table:
             "" if row.to_baseline is None else f"{row.to_baseline.value:+.3f}",
             f"{row.nominal:.3f}" if row.nominal == row.nominal else "failed",
             f"{worst:.3f} {lung} {pip:g}" if lung else "",
+            escape(plain("; ".join((status, *row.entry.reasons)))[:120]),
+        )
+    return table
+
+
+def _normalised_table(track: Track) -> Table:
+    """Version 2: the normalised score ranks; errors in cmH2O beside it."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from ventbench.text import plain
+
+    title = f"{track.name}, version {track.version}: 0 = best attainable, 100 = best PID"
+    season = {row.record.header.draws.season for _, row in track.rows}
+    table = Table(title=title, caption=f"draws: {', '.join(sorted(filter(None, season)))}")
+    columns = ("rank", "entry", "normalised", "95 %", "ranks", "error", "nominal", "state")
+    for name in columns:
+        left = name in ("entry", "state")
+        table.add_column(name, justify="left" if left else "right", no_wrap=name == "entry")
+    for status, row in track.rows:
+        own = None if row.normalised is None else row.normalised.score
+        table.add_row(
+            "" if row.rank is None else str(row.rank),
+            row.record.name,
+            "failed" if own is None else f"{own.value:.1f}",
+            "" if own is None else f"{own.low:.1f} to {own.high:.1f}",
+            "" if row.ranks is None else f"{row.ranks[0]} to {row.ranks[1]}",
+            "failed" if row.score is None else f"{row.score.value:.3f}",
+            f"{row.nominal:.3f}" if row.nominal == row.nominal else "failed",
             escape(plain("; ".join((status, *row.entry.reasons)))[:120]),
         )
     return table

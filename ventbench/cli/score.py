@@ -138,10 +138,11 @@ def score(
     if out is not None:
         for path in _keep(out, scores, report):
             console.print(f"wrote {path}", markup=False, highlight=False)
-    if record is not None and simulators.official is not None:
+    if record is not None:
         from ventbench.board import create
+        from ventbench.plants import frozen
 
-        for path in create.keep(record, scores, simulators.official):
+        for path in create.keep(record, scores, frozen.load(protocol)):
             console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
     if any(result.failures for result in scores):
         raise typer.Exit(1)

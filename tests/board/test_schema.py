@@ -188,3 +188,15 @@ def test_any_bytes_are_a_record_or_an_input_error(content: bytes) -> None:
 def test_a_line_of_the_chain(line: bytes, message: str) -> None:
     with pytest.raises(InputError, match=f"chain.jsonl line 1.*{re.escape(message)}"):
         store.parse_chain(line)
+
+
+@pytest.mark.parametrize("value", [1.7e308, -1e-3])
+def test_numbers_that_would_overflow_a_mean_are_refused(drafts, value: float) -> None:
+    for change in (
+        lambda values: values["errors"]["drawn"][0][0].__setitem__(0, value),
+        lambda values: values["spread"][0].__setitem__(0, value),
+    ):
+        values = json.loads(drafts["pid_best"].content)
+        change(values)
+        with pytest.raises(InputError, match=r"key (errors\.drawn|spread)"):
+            record.from_bytes(canonical.canonical(values), "it")

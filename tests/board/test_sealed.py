@@ -305,7 +305,7 @@ def test_runs_of_a_week_are_limited(opening: Opening, draft, drafts, load: Load)
 
     assert manifest["authors"]
     first = by(drafts["pid_best"], 16, "Ann Author")
-    second = by(draft("second", factor=0.99), 17, "ANN  author")
+    second = by(draft("second", factor=0.99), 17, "ANN  auth\u200bor")
     other = by(draft("other", factor=0.98), 18, "Bob")
     third = by(draft("third", factor=0.97), 22, "Ann Author")
     later = by(draft("later", factor=0.96), 23, "Ann Author")
@@ -437,3 +437,12 @@ def test_an_open_season_is_not_revealed(tmp_path: Path, monkeypatch) -> None:
     CliRunner().invoke(app, ["board", "new-season", "spring", "--seed", "seed", *dates])
     result = CliRunner().invoke(app, ["board", "reveal", "spring", "--seed", "seed"])
     assert "is open until 9999-01-01" in str(result.exception)
+
+
+def test_runs_of_nobody_are_limited_too(opening: Opening, drafts, draft) -> None:
+    for factor, authors in ((0.99, []), (0.98, [" "]), (0.97, ["\u200b"])):
+        made = draft(f"entry{round(100 * factor)}", factor=factor)
+        submission = json.loads(made.content)["submission"]
+        submission["manifest"]["authors"] = authors
+        last = opening.add(at(made, 17, submission=submission))
+    assert list(store.load(opening.folder).breaches) == [last.sha256, last.content.record]

@@ -75,8 +75,12 @@ Count = Annotated[int, msgspec.Meta(ge=0, lt=2**53)]
 Version = Annotated[int, msgspec.Meta(ge=1, le=10**9)]
 SmallInt = Annotated[int, msgspec.Meta(ge=-(2**31), le=2**31)]
 
+#: No pressure of a lung comes near; sums of larger numbers would overflow, cmH2O.
+_MOST = 1e6
+
 #: Errors are null where a controller failed.
-Error = Annotated[float, msgspec.Meta(ge=0.0)] | None
+Error = Annotated[float, msgspec.Meta(ge=0.0, le=_MOST)] | None
+Pressure = Annotated[float, msgspec.Meta(ge=-_MOST, le=_MOST)]
 FreeForm = dict[str, Any]
 
 T = TypeVar("T")
@@ -212,7 +216,7 @@ class ScoreHeader(_Table, frozen=True):
     lungs: Annotated[list[LungName], msgspec.Meta(min_length=1)]
     pips: Annotated[list[float], msgspec.Meta(min_length=1)]
     safe: list[bool]
-    peak_pressure_cmH2O: list[float]
+    peak_pressure_cmH2O: list[Pressure]
     clipped: Clipped
     failures: list[RecordedFailure]
     failed_cells: Count
@@ -228,7 +232,7 @@ class ScoreContent(ScoreHeader, frozen=True, tag_field="kind", tag="score"):
 
     errors: Errors
     safety: Safety
-    spread: list[list[float | None]]
+    spread: list[list[Error]]
     trace: Trace
     rigs: RecordedRigs | None = None
     headroom: RecordedHeadroom | None = None

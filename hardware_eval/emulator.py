@@ -172,6 +172,8 @@ class Emulator(Guard):
                 self._link.unlink(missing_ok=True)
                 self._link.symlink_to(self.terminal)
             except OSError as error:
+                os.close(master)
+                os.close(self._slave)
                 raise InputError(f"--link {self._link} cannot be made: {error}") from error
             self.terminal = str(self._link)
         return master

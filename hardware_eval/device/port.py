@@ -11,6 +11,7 @@ import contextlib
 import gc
 import os
 import select
+import sys
 import threading
 import time
 from collections import deque
@@ -19,8 +20,12 @@ from queue import Empty, SimpleQueue
 
 from hardware_eval.device.program import PERIOD
 from hardware_eval.device.service import DeviceService
+from ventbench.errors import InputError
 
 _CHUNK = 4096
+
+#: Pause after a line could not be opened, s.
+_RETRY = 1.0
 
 
 class Port:
@@ -75,7 +80,7 @@ class Port:
         line: int | None = None
         while not self._ended:
             if line is None and time.monotonic() >= self._absent_until:
-                line = self._open_line()
+                line = self._opened()
             sources = [self._woken] if line is None else [self._woken, line]
             ready, _, _ = select.select(sources, [], [], PERIOD if line is None else None)
             if self._woken in ready:
@@ -95,6 +100,14 @@ class Port:
                         os.write(line, data)
         if line is not None:
             self._close_line(line)
+
+    def _opened(self) -> int | None:
+        try:
+            return self._open_line()
+        except (InputError, OSError) as error:
+            print(f"the line cannot be opened: {error}", file=sys.stderr, flush=True)
+            self._absent_until = time.monotonic() + _RETRY
+            return None
 
     def _read(self, line: int) -> bool:
         """Take what arrived; False if the line is broken."""

@@ -117,6 +117,26 @@ def test_faults_and_nonsense_by_the_control_socket(
         tell(tmp_path / "nobody", "clear")
 
 
+def test_a_line_that_cannot_be_opened_is_told_and_tried_again(
+    emulator: Emulator, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    told = ""
+
+    def failed() -> bool:
+        nonlocal told
+        told += capfd.readouterr().err
+        return "cannot be opened" in told
+
+    taken = tmp_path / "lung"
+    emulator._link = tmp_path / "control" / "lung"  # no folder can be made there
+    emulator.port.hang_up(0.0)
+    _wait_for(failed)
+    taken.unlink()
+    emulator._link = taken
+    _wait_for(taken.exists)
+    assert Client(Link(str(taken)), timeout=PATIENCE).hello().name == "bench"
+
+
 def test_errors_of_ports(
     emulator: Emulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

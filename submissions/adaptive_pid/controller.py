@@ -30,6 +30,10 @@ LOW, HIGH = (6.0, 0.5, -20.0), (160.0, 60.0, 40.0)
 #: Standard deviations by which a single pressure may at most correct a filter.
 LIMIT = 4.0
 
+#: How far the pressure must fall below that at the start of the breath for a tube that is off,
+#: cmH2O, and the time in which the lung then empties, s.
+OFF, EMPTYING = 2.5, 0.2
+
 #: What was tuned; README.md says how.
 TUNED = {
     "bend": 0.3,  # s/L; second coefficient of the resistance over the first
@@ -97,10 +101,12 @@ class Filter:
         t, P = self.tuned, self.P
         if self.seen:  # what this breath did not explain, by what is known at its end
             self.before = [
-                p - self.a * volume - self.b * drop - self.c for p, volume, drop in self.seen
+                p - self.a * volume - self.b * drop - self.c if volume > 0.0 else 0.0
+                for p, volume, drop in self.seen
             ]
         self.seen = []
-        self.c, self.volume, self.step = pressure, 0.0, 0
+        self.c = self.start = pressure
+        self.volume, self.step = 0.0, 0
         self.drop = flow + t["bend"] * flow * flow
         elastance = P[0] + t["elastance_between"] ** 2
         self.P = [elastance, P[1], 0.0, P[3] + t["resistance_between"] ** 2, 0.0, self.prior[2]]
@@ -114,6 +120,10 @@ class Filter:
         """Learn from the pressure that the last flow has led to."""
         t, w = self.tuned, self.part
         self.step += 1
+        if pressure < self.start - OFF:  # the tube is off: nothing to learn, and the lung empties
+            self.volume *= exp(-dt / EMPTYING)
+            self.seen.append((pressure, 0.0, 0.0))
+            return
         new, old = flows[self.whole], flows[self.whole + 1]
         early = self.step <= 2
         share = (t["open_first"], t["open_second"])[self.step - 1] if early else 1.0

@@ -43,11 +43,7 @@ _OCCLUSION = 100.0
 
 
 class SimulatedHal:
-    """A plant as a ventilator; compiles the plant once, before any time passes.
-
-    Attributes:
-        faults: what goes wrong; may be replaced while it runs.
-    """
+    """A plant as a ventilator; compiles the plant once, before any time passes."""
 
     def __init__(
         self,
@@ -102,7 +98,7 @@ class SimulatedHal:
         return fresh
 
     def _reset(self, faults: Sequence[LungFault], seed: int) -> None:
-        self.faults = tuple(faults)
+        self.faults = faults
         self._random = np.random.default_rng(seed)
         self._state = self._rest
         self._since: float | None = None
@@ -112,6 +108,21 @@ class SimulatedHal:
         self._stuck_valve = math.nan
         self._ambient_from: tuple[float, float] | None = None
         self._last = Sample(0.0, protocol.PEEP)
+
+    @property
+    def faults(self) -> tuple[LungFault, ...]:
+        """What goes wrong.
+
+        Setting it raises InputError if the plant cannot do what a fault asks.
+        """
+        return self._faults
+
+    @faults.setter
+    def faults(self, faults: Sequence[LungFault]) -> None:
+        narrowed = {fault.kind for fault in faults} & {FaultKind.PINCHED, FaultKind.OCCLUDED}
+        if narrowed and not self._can_pinch:
+            raise InputError("this plant's resistance cannot be changed: it cannot be pinched")
+        self._faults = tuple(faults)
 
     def sample(self, now: float) -> Sample:
         """Pressure and flow by now; see :class:`~hardware_eval.device.hal.Hal`."""
@@ -181,9 +192,9 @@ class SimulatedHal:
         if FaultKind.DISCONNECTED in kinds:
             u_in, share = 0.0, 1.0
         if FaultKind.PINCHED in kinds:
-            r_scale = self._pinch(kinds[FaultKind.PINCHED].strength)
+            r_scale = kinds[FaultKind.PINCHED].strength
         if FaultKind.OCCLUDED in kinds:
-            r_scale = self._pinch(_OCCLUSION)
+            r_scale = _OCCLUSION
         held = max(now - (now if self._since is None else self._since), SHORTEST_HOLD)
         # A gap of seconds, as after a suspended machine, goes in steps that the plant can take.
         while held > 2.0 * LONGEST_HOLD:
@@ -193,11 +204,6 @@ class SimulatedHal:
             self._restart, held = 0.0, held - LONGEST_HOLD
         inputs = np.array([u_in, share, held, r_scale, self._restart], np.float32)
         return self._advance(self._state, inputs)
-
-    def _pinch(self, scale: float) -> float:
-        if not self._can_pinch:
-            raise InputError("this plant's resistance cannot be changed: it cannot be pinched")
-        return scale
 
 
 def _breath_begun(state: Any, restart: jax.Array) -> Any:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
+import flax.struct
 import pytest
 
 from hardware_eval.client import Client
@@ -85,6 +87,27 @@ def test_faults_change_the_pressure_as_they_say(hal_of_a_textbook_lung: Simulate
     assert last(FaultKind.PINCHED, 3.0) == pytest.approx(healthy[-1] + 2 * 20.0 * 0.228, abs=1e-2)
     assert last(FaultKind.OCCLUDED) > 60.0
     assert abs(last(FaultKind.DISCONNECTED)) < 0.1
+
+
+@flax.struct.dataclass
+class _Rigid:
+    """A plant of one number, which nobody can pinch."""
+
+    gain: Any
+
+    def init(self, pressure: Any, peep: Any = None) -> Any:
+        return pressure
+
+    def step(self, state: Any, u_in: Any, u_out: Any, dt: Any) -> tuple[Any, Any]:
+        return state + self.gain * u_in * dt, state + self.gain * u_in * dt
+
+
+def test_what_a_plant_cannot_do_is_told_before_it_runs() -> None:
+    hal = SimulatedHal(_Rigid(1.0))
+    assert math.isnan(hal.sample(0.0).flow)
+    with pytest.raises(InputError, match="cannot be pinched"):
+        hal.faults = (LungFault(FaultKind.PINCHED, 5.0, strength=3.0),)
+    assert hal.faults == ()
 
 
 def test_a_stuck_valve_keeps_its_position(hal_of_a_textbook_lung: SimulatedHal) -> None:

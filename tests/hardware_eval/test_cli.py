@@ -1,0 +1,85 @@
+"""The command line on a virtual port, and the manual's commands."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer.main
+from typer.testing import CliRunner
+
+from hardware_eval import cli, evaluate
+from hardware_eval.evaluate import Line
+from ventbench.board import record
+from ventbench.board.hardware import HardwareRecord
+
+MANUAL = Path(cli.__file__).parent / "README.md"
+
+
+@pytest.fixture
+def on_line(line: Line, monkeypatch: pytest.MonkeyPatch) -> Line:
+    monkeypatch.setattr(evaluate, "connect", lambda port: line)
+    return line
+
+
+def invoke(*words: str) -> Any:
+    return CliRunner().invoke(cli.app, list(words))
+
+
+def test_run_makes_a_record_and_replay_agrees(on_line: Line, tmp_path: Path) -> None:
+    out, result = tmp_path / "out", tmp_path / "result.json"
+    done = invoke(
+        "run", "pid_best", "--port", "p", "--lung", "R5C20", "--pips", "10", "--repeats", "1",
+        "--control-every", "0", "--no-dry-run", "--no-selftest", "--no-sandbox", "--rest", "0.5",
+        "--yes", "--out", str(out), "--json", str(result),
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    told = json.loads(result.read_text())
+    made = record.load(Path(told["records"]["pid_best"]))
+    assert isinstance(made, HardwareRecord)
+    assert Path(told["recording"]).is_file()
+    again = invoke("replay", str(out), "--record", told["records"]["pid_best"])
+    assert again.exit_code == 0, again.output
+    assert "2 of 2 runs are done" in again.output
+
+
+def test_without_a_terminal_and_without_yes_nothing_moves(on_line: Line, tmp_path: Path) -> None:
+    done = invoke(
+        "run", "pid_best", "--port", "p", "--lung", "R5C20", "--no-dry-run", "--no-sandbox",
+        "--out", str(tmp_path / "out"),
+    )  # fmt: skip
+    assert done.exit_code == 1
+    assert "did not confirm" in done.output
+
+
+def commands() -> list[str]:
+    text = "\n".join(re.findall(r"^```sh\n(.*?)^```", MANUAL.read_text("utf-8"), re.M | re.S))
+    lines = [part.strip(" &") for line in text.splitlines() for part in line.split("&&")]
+    # `emulate` has a parser of its own.
+    hardware = [line for line in lines if line.startswith("ventbench-hardware ")]
+    return [line for line in hardware if shlex.split(line)[1] != "emulate"]
+
+
+@pytest.mark.parametrize("line", commands())
+def test_the_manuals_commands_parse(line: str) -> None:
+    words = shlex.split(line)[1:]
+    group: Any = typer.main.get_command(cli.app)
+    command = group.commands[words[0]]
+    context = command.context_class(command, info_name=words[0])
+    command.make_parser(context).parse_args(args=words[1:])
+
+
+def test_wrong_numbers_and_ports_are_bad_input(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["ventbench-hardware", "run", "pid_best", "--lung", "R5C20", "--port", "/dev/nothing"]
+    for extra, said in ((["--pips", "ten"], "--pips 'ten'"), ([], "/dev/nothing")):
+        monkeypatch.setattr("sys.argv", [*words, *extra])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert ended.value.code == 2
+        assert said in capsys.readouterr().err

@@ -297,7 +297,8 @@ def _estimated(state: SafetyState, sample: SafetySample) -> SafetyState:
     same = sample.pressure == before.pressure
     resistive = 1e-3 * R * VALVE_GAIN * abs(sample.u_in - before.u_in)
     elastic = (volume - state.volume) / C
-    expected = state.expected + abs(elastic) + (resistive if not sample.u_out else 0.0)
+    # Behind an open expiratory valve the airway shows PEEP, whatever the lung still holds.
+    expected = state.expected + (0.0 if sample.u_out else abs(elastic) + resistive)
     shut = sample.u_in <= 0.0 and sample.u_out == 0
     closed = (
         state.closed if shut and not math.isnan(state.closed) else sample.time if shut else math.nan

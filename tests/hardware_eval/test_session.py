@@ -281,3 +281,62 @@ def test_a_dry_run_finds_a_controller_that_is_unsafe(plan: Plan) -> None:
 
 def test_a_result_without_scored_breaths_has_no_error() -> None:
     assert math.isnan(RunResult("failed", "x", (), (), 0, 0).error)
+
+
+@pytest.mark.slow
+def test_six_lungs_survive_three_crashes_and_two_cables(tmp_path: Path) -> None:
+    """A plan over all lungs: every breath that ended is in the log, and every run is done once."""
+    from hardware_eval.client import Client
+    from hardware_eval.device.loopback import loopback
+    from hardware_eval.device.simulated import simulated_lung
+    from ventbench.lungs import LUNG_IDS
+
+    lungs = {name: simulated_lung(name, "physics") for name in LUNG_IDS}
+    device = loopback(simulated_lung(LUNG, "physics"))
+    client = Client(device, device.clock)
+    client.hello()
+    everything = make_plan(["pid"], LUNG_IDS, pips=(10.0,), repeats=2, control_every=0)
+    random = np.random.default_rng(5)
+    steps = len(everything.runs) * protocol.BREATHS * protocol.INSPIRATION_STEPS
+    moments = np.sort(random.choice(steps, 5, replace=False))
+    crashes, pulls = set(moments[::2].tolist()), set(moments[1::2].tolist())
+    calls, ended = 0, 0
+
+    def trouble(step: int, u_in: float) -> float:
+        nonlocal calls
+        calls += 1
+        if calls in crashes:
+            raise CrashError
+        if calls in pulls:
+            device.unplug()
+            device.plug()
+        return u_in
+
+    def mount(run: PlannedRun) -> None:
+        device.service.hal = lungs[run.lung]
+
+    class Counts:
+        def breath(self, run: PlannedRun, breath: Any, done: int, total: int) -> None:
+            nonlocal ended
+            ended += len(breath.time) == protocol.BREATH_STEPS
+
+    bench = Bench(client, device.clock, session.safety.DEFAULT, SilentOperator(), Counts(), 1.0)
+    path, result, restarts = tmp_path / "raw.jsonl", None, 0
+    while result is None:
+        try:
+            with RawLog(path) as log:
+                result = run_plan(
+                    bench, everything, lambda run: Scripted(trouble), log, about={},
+                    prepare_run=mount,
+                )  # fmt: skip
+        except CrashError:
+            restarts += 1
+            client.hello()
+    assert result.complete, result.reason
+    assert restarts == 3
+    logged = breaths(path)
+    assert sum(len(b.time) == protocol.BREATH_STEPS for b in logged) == ended
+    complete = [(b.run, b.breath) for b in logged if b.complete]
+    assert sorted(complete) == [
+        (run.number, k) for run in everything.runs for k in range(protocol.BREATHS)
+    ]

@@ -37,6 +37,33 @@ KEPT_FROM_S = 0.1
 FORGOTTEN_FROM_MIB = 600.0
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Measure what tests cost, to find those that belong into ``slow.txt``."""
+    parser.addoption("--cost", metavar="FILE", help="append processor seconds of each test to FILE")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark what ``slow.txt`` lists: whole tests, or one case of many."""
+    text = (config.rootpath / "tests" / "slow.txt").read_text("utf-8")
+    slow = {line.strip() for line in text.splitlines() if line.strip() and line[0] != "#"}
+    for item in items:
+        if item.nodeid in slow or item.nodeid.partition("[")[0] in slow:
+            item.add_marker(pytest.mark.slow)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Write processor seconds, of processes that the test started too, for ``--cost``."""
+    file = item.config.getoption("--cost")
+    before = sum(os.times()[:4])
+    result = yield
+    if file:
+        with open(file, "a") as lines:
+            lines.write(f"{sum(os.times()[:4]) - before:.2f}\t{item.nodeid}\n")
+    return result
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _compiled_once(pytestconfig: pytest.Config) -> None:
     """Share compiled functions between workers, and between runs, in pytest's cache folder."""

@@ -208,3 +208,12 @@ def test_wheel_works_outside_the_repository(wheel: Path, tmp_path: Path) -> None
     result = json.loads((elsewhere / "out.json").read_text())
     assert result["protocol"] == 1
     assert set(result["lungs"]) == {f"R{r}C{c}" for r in (5, 20) for c in (10, 20, 50)}
+
+
+def test_every_slow_test_exists() -> None:
+    lines = (ROOT / "tests" / "slow.txt").read_text("utf-8").splitlines()
+    listed = [line for line in lines if line and not line.startswith("#")]
+    assert len(set(listed)) == len(listed) > 10
+    for line in listed:
+        file, _, name = line.partition("[")[0].partition("::")
+        assert f"def {name.rpartition('::')[2]}(" in (ROOT / file).read_text("utf-8"), line

@@ -150,6 +150,7 @@ def test_another_seed_is_not_revealed(tmp_path: Path) -> None:
     [
         ('id = "2027-spring"', 'id = "../x"', "id"),
         ('id = "2027-spring"', 'id = "other"', "not the name of the file"),
+        ('id = "2027-spring"', 'id = "development"', "the name of the published draws"),
         ("draws = 20", "draws = 0", "draws"),
         ("draws = 20", "draws = 20.5", "draws"),
         ("draws = 20", f"draws = 1{'0' * 5000}", "2027-spring.toml"),

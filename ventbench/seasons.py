@@ -40,6 +40,9 @@ SEED_BYTES = 32
 #: Seed of the development draws. It is published, so nobody can have chosen it: a hash of its name.
 DEVELOPMENT_SEED = hashlib.sha256(b"ventbench development draws").digest()
 
+#: Name of the development draws; no season may have it.
+DEVELOPMENT = "development"
+
 #: Largest season file, bytes.
 MAX_BYTES = 10_000
 
@@ -279,6 +282,8 @@ def _validated(values: dict[str, Any], label: str) -> Season:
         season = msgspec.convert(values, Season)
     except msgspec.ValidationError as error:
         raise InputError(f"{label}: {error}") from None
+    if season.id == DEVELOPMENT:
+        raise InputError(f"{label}, key id: {DEVELOPMENT} is the name of the published draws")
     if season.closes < season.opens:
         raise InputError(f"{label}, key closes: {season.closes} is before {season.opens}")
     if season.revealed is not None:

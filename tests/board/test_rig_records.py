@@ -3,12 +3,13 @@
 import dataclasses
 import json
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from ventbench import protocol, rig_draws, seasons
-from ventbench.board import build, canonical, create, frames, ranking, store, verify
+from ventbench.board import build, canonical, create, frames, ranking, record, store, verify
 from ventbench.board.replay import differences, draws_of, replay
 from ventbench.errors import InputError
 from ventbench.headroom import reference as references
@@ -215,3 +216,25 @@ def test_accepting_is_what_ranks(board, tmp_path):
     assert not frames.load_tracks(folder, version=2)[1].ranked
     accept(folder)
     assert len(frames.load_tracks(folder, version=2)[1].ranked) == 4
+
+
+def test_a_record_that_nobody_vouches_for_clears_no_board(drafts):
+    """The board shows the season of the newest official record, not of whatever came last."""
+    of_season, later = opened(drafts["softer"]), opened(drafts["zero"])
+    draws = type(later.header.draws)(season="2027", sha256="a" * 64, count=20, version=2)
+    keys = {key: getattr(of_season.header, key) for key in of_season.header.__struct_fields__}
+    hidden = dataclasses.replace(
+        of_season, header=type(of_season.header)(**keys | {"draws": draws})
+    )
+    inside = record.Sealed("b" * 64, SimpleNamespace(record=hidden.sha256))  # type: ignore[arg-type]
+
+    def shown(records, attested):
+        return [x.record.name for x in ranking.standings(records, attested)[2]["robustness"].ranked]
+
+    both = {hidden.sha256, later.sha256}
+    assert shown([inside, hidden, later], {hidden.sha256}) == ["softer"]
+    assert shown([inside, hidden, later], both) == ["softer"], (
+        "hidden draws rank, where there are some"
+    )
+    assert shown([later, inside, hidden], both) == ["softer"]
+    assert shown([later], both) == ["zero"]

@@ -3,19 +3,24 @@
 from datetime import date
 
 import msgspec
+import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from ci import official, propose, publish, seed
 from ci.git import Git
 from ci.take import TakeError, take
-from ventbench import seasons
-from ventbench.board import attestation, record, store
+from ventbench import protocol, rig_draws, seasons
+from ventbench.board import attestation, build, record, store
 from ventbench.board.verify import verify
+from ventbench.cli import app
 from ventbench.errors import InputError
+from ventbench.headroom import reference as references
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.runner import InProcessRunner
 from ventbench.submissions.scaffold import contents
 
+from ..textbook_rigs import TextbookRigs
 from .conftest import PATH
 from .test_official import checked_out
 
@@ -46,8 +51,9 @@ def test_from_hidden_draws_to_the_pages(repository, simulators, opened, tmp_path
     taken = take(repository.url, repository.base, commit, "demo", tmp_path / "taken")
     out = tmp_path / "records"
     lines = official.score_taken(
-        taken, repository.url, "robustness", simulators, InProcessRunner(), out, (season, secret)
-    )
+        taken, repository.url, "robustness", simulators, InProcessRunner(), out,
+        official.Hidden(season, secret),
+    )  # fmt: skip
     assert sorted(path.suffix for path in out.iterdir()) == [".json", ".sealed"]
     public = record.load(next(out.glob("*.json")))
     assert isinstance(public, record.Sealed)
@@ -98,7 +104,7 @@ def test_messages_of_hidden_cells_are_not_said(repository, simulators, opened, t
     files = {f"{PATH}/{name}": content for name, content in contents("demo", "pid").items()}
     commit = repository.commit(files, repository.base)
     taken = take(repository.url, repository.base, commit, "demo", tmp_path / "taken")
-    hidden = (season, secret) if hide else None
+    hidden = official.Hidden(season, secret) if hide else None
     given = (taken, repository.url, "robustness", simulators, Talkative(), tmp_path / "out", hidden)
     lines = official.score_taken(*given)
     published = b"".join(path.read_bytes() for path in (tmp_path / "out").iterdir())
@@ -113,8 +119,9 @@ def test_a_season_of_another_protocol_is_not_scored(repository, simulators, open
     later = msgspec.structs.replace(season, protocol=99)
     with pytest.raises(InputError, match="protocol version 99"):
         official.score_taken(
-            taken, "url", "all", simulators, InProcessRunner(), tmp_path / "out", (later, secret)
-        )
+            taken, "url", "all", simulators, InProcessRunner(), tmp_path / "out",
+            official.Hidden(later, secret),
+        )  # fmt: skip
 
 
 def test_the_seed_goes_through_a_private_file_that_does_not_stay(opened, tmp_path, monkeypatch):
@@ -159,6 +166,56 @@ def test_errors_of_hidden_scores_are_not_said(
     with pytest.raises(TakeError) as raised:
         official.score_taken(
             taken, "url", "robustness", simulators, InProcessRunner(), tmp_path / "out",
-            (season, secret),
+            official.Hidden(season, secret),
         )  # fmt: skip
     assert "1.2345" not in str(raised.value)
+
+
+def test_hidden_draws_of_version_2_from_the_reference_to_the_reveal(
+    repository, tmp_path, monkeypatch, opened
+):
+    """Everything of a season of rigs: reference errors, score, seal, replay, reveal, board."""
+    rigs = TextbookRigs()
+    leaderboard, _, _ = opened
+    season, secret = seasons.new_season(
+        id="rigs", protocol=2, draws=20, opens=date(2000, 1, 1), closes=date(9999, 1, 1),
+        runs_per_week=3,
+    )  # fmt: skip
+    seasons.write_season(store.season_path(leaderboard, "rigs"), season)
+    own = rigs.scored()
+    drawn = rig_draws.build(own.sessions, own.members, seed=secret, season="rigs", n=20)
+    plants, cells = own.cells(drawn, protocol.PIPS)
+    gains = np.tile([[6.0, 6.0, 0.3]], (6, 1))
+    pid = references.pid_errors(plants, cells, gains)
+    about = references.settings(own.about, drawn.about())
+    zero = np.zeros((*pid.shape, 33))
+    made = references.Reference(about, gains, 0.1 * pid, 0.1 * pid, 0.0 * pid, pid, zero)
+    made.save(tmp_path / "reference.npz")
+    seasons.write_seed(tmp_path / "held", secret)
+    given = ["seal-reference", "rigs", str(tmp_path / "reference.npz")]
+    options = ["--seed", str(tmp_path / "held"), "--folder", str(leaderboard)]
+    sealing = CliRunner().invoke(app, ["board", *given, *options])
+    assert sealing.exit_code == 0, sealing.output
+    assert isinstance(CliRunner().invoke(app, ["board", *given, *options]).exception, InputError)
+
+    seasons.write_seed(tmp_path / "seed", secret)
+    hidden = official.hidden_draws("rigs", tmp_path / "seed", leaderboard)
+    assert not (tmp_path / "seed").exists()
+    assert hidden.reference is not None
+    files = {f"{PATH}/{name}": content for name, content in contents("demo", "pid").items()}
+    commit = repository.commit(files, repository.base)
+    taken = take(repository.url, repository.base, commit, "demo", tmp_path / "taken")
+    out = tmp_path / "records"
+    lines = official.score_taken(
+        taken, repository.url, "robustness", rigs, InProcessRunner(), out, hidden
+    )
+    assert "normalised" in lines[-1]
+    (added,) = propose.add(out, leaderboard, rigs, SECRET, secret)
+    assert added.content.complete
+    build.build(leaderboard)
+    assert verify(leaderboard, lambda _: rigs, seed=secret).problems == []
+    revealed = store.reveal(leaderboard, "rigs", secret, rigs)
+    assert [score.name for score in revealed.opened] == ["demo"]
+    assert not revealed.void
+    build.build(leaderboard)
+    assert verify(leaderboard, lambda _: rigs).problems == []

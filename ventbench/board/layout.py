@@ -29,7 +29,9 @@ SEALED_SUFFIX = ".sealed"
 
 #: Folder of the season files.
 SEASONS = "seasons"
-_SEASON = re.compile(rf"{SEASONS}/[a-z0-9][a-z0-9-]{{0,39}}\.toml")
+#: End of the name of a season's reference errors, encrypted until the season is over.
+REFERENCE_SUFFIX = ".reference"
+_SEASON = re.compile(rf"{SEASONS}/[a-z0-9][a-z0-9-]{{0,39}}(\.toml|{re.escape(REFERENCE_SUFFIX)})")
 
 #: Keys that sign records, and records that count as official without a signature.
 KEYS, ACCEPTED = "keys.toml", "accepted.toml"
@@ -82,7 +84,7 @@ def stray(names: Iterable[str], chain: bytes) -> list[str]:
 
 
 def is_season(name: str) -> bool:
-    """Whether a relative path is that of a season file."""
+    """Whether a relative path is that of a season file or its reference errors."""
     return _SEASON.fullmatch(name) is not None
 
 

@@ -258,13 +258,9 @@ def standings(
         if sealed.sha256 in withdrawn:
             withdrawn[inside] = withdrawn[sealed.sha256]
     grouped: dict[tuple[int, str, str], list[Event]] = defaultdict(list)
-    season = {
-        record.version: record.header.draws.season
-        for record in records
-        if isinstance(record, Record)
-    }
+    season = _seasons_shown(records, attested, of_seasons)
     for record in records:
-        # Only records over the same draws can be compared: those of the newest season.
+        # Only records over the same draws can be compared.
         if isinstance(record, Record) and record.header.draws.season == season[record.version]:
             sha256 = record.sha256
             breach = against.get(sha256, "")
@@ -281,6 +277,33 @@ def standings(
         event = (withdrawn.get(sealed.sha256), sealed.sha256 in attested)
         tracks[sealed.track].sealed.append(_sealed(sealed, *event, against.get(sealed.sha256, "")))
     return boards
+
+
+def _seasons_shown(
+    records: Sequence[AnyRecord], attested: Container[str], of_seasons: Container[str]
+) -> dict[int, str | None]:
+    """Season whose records a version's board shows.
+
+    The newest hidden one with an official record; without any, that of the newest official record,
+    and else of the newest. So nobody clears a board by a record that nobody vouches for.
+
+    Args:
+        records: in the order of the chain.
+        attested: hashes of the records that are signed or accepted.
+        of_seasons: hashes of the records that were sealed once.
+
+    Returns:
+        By version.
+    """
+    shown: dict[int, tuple[tuple[bool, bool], str | None]] = {}
+    for record in records:
+        if not isinstance(record, Record):
+            continue
+        official = record.official and record.sha256 in attested
+        standing = (official and record.sha256 in of_seasons, official)
+        if standing >= shown.get(record.version, (standing, None))[0]:
+            shown[record.version] = standing, record.header.draws.season
+    return {version: season for version, (_, season) in shown.items()}
 
 
 def _sealed(record: Sealed, withdrawn: str | None, attested: bool, breach: str) -> SealedEntry:

@@ -16,21 +16,26 @@ from __future__ import annotations
 
 import secrets
 import struct
+import tempfile
 import unicodedata
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
+import numpy as np
 
 from ventbench import files, seasons
 from ventbench.board import actions, canonical, layout, record, schema
 from ventbench.board.record import AnyRecord, Record, Sealed
 from ventbench.errors import InputError
 from ventbench.seasons import Season
+
+if TYPE_CHECKING:
+    from ventbench.headroom.reference import Reference
 
 #: Decimals of a published score. A controller can make its score say something about the draws that
 #: it met: two decimals of a score below ten are ten bits a run.
@@ -42,9 +47,12 @@ _PAGE = 1 << 16
 #: Largest ciphertext, bytes.
 MAX_BYTES = schema.MAX_BYTES + actions.MAX_BYTES + 2 * _PAGE
 
-_SALT, _TAG = 16, 16
+#: Largest file of reference errors, bytes.
+MAX_REFERENCE_BYTES = 21_000_000
+
+_SALT = 16
 _LENGTHS = struct.Struct("<II")
-_PURPOSE = b"ventbench sealed record 1\n"
+_RECORD, _REFERENCE = b"ventbench sealed record 1\n", b"ventbench sealed reference 1\n"
 
 #: Keys that a sealed record has from the record inside.
 _COMMON = (
@@ -123,8 +131,7 @@ def seal(content: bytes, commands: bytes, season: Season, seed: bytes) -> Sealed
         raise InputError(f"the record of {score.name} cannot be sealed: {'; '.join(problems)}")
     plain = _LENGTHS.pack(len(content), len(commands)) + content + commands
     plain += bytes(-len(plain) % _PAGE)
-    salt = secrets.token_bytes(_SALT)
-    ciphertext = salt + _cipher(seed, salt).encrypt(bytes(12), plain, _PURPOSE)
+    ciphertext = _encrypted(plain, seed, _RECORD)
     values: dict[str, Any] = canonical.parse(content, "the record to be sealed")
     public = {key: values[key] for key in _COMMON}
     public |= {
@@ -189,14 +196,9 @@ def unseal(sealed: Sealed, ciphertext: bytes, season: Season, seed: bytes) -> Op
     problems = belongs(sealed, season)
     if problems:
         raise InputError(f"{label}: {'; '.join(problems)}")
-    salt, body = ciphertext[:_SALT], ciphertext[_SALT:]
-    if len(body) < _TAG + _LENGTHS.size:
+    plain = _decrypted(ciphertext, seed, _RECORD, f"{label} of season {season.id}")
+    if len(plain) < _LENGTHS.size:
         raise InputError(f"{label} holds no record")
-    cipher = _cipher(seed, salt)
-    try:
-        plain = cipher.decrypt(bytes(12), body, _PURPOSE)
-    except _invalid_tag():
-        raise InputError(f"{label} does not open with the seed of season {season.id}") from None
     size, beyond = _LENGTHS.unpack_from(plain)
     content = plain[_LENGTHS.size : _LENGTHS.size + size]
     commands = plain[_LENGTHS.size + size : _LENGTHS.size + size + beyond]
@@ -312,6 +314,85 @@ def _author(name: str) -> str:
     """One form for a name, however it is written: case, spaces, characters that are not seen."""
     seen = (c for c in unicodedata.normalize("NFKC", name) if unicodedata.category(c) != "Cf")
     return " ".join("".join(seen).casefold().split())
+
+
+def seal_reference(path: Path, content: bytes, season: Season, seed: bytes) -> None:
+    """Write the reference errors of a season, which tell its draws, encrypted.
+
+    Args:
+        path: of the file, :func:`reference_path`.
+        content: of a file of :meth:`ventbench.headroom.reference.Reference.save`.
+        season: whose draws were used.
+        seed: of the season.
+
+    Raises:
+        InputError: if the seed is not the season's, there is a file already, or there is no library
+            to encrypt with.
+        OSError: if it cannot be written.
+    """
+    seasons.require_seed(season, seed)
+    if path.exists():
+        raise InputError(f"{path} exists; the reference errors of a season are never changed")
+    ciphertext = _encrypted(content, seed, _REFERENCE)
+    files.write_atomically(path, lambda file: file.write(ciphertext))
+
+
+def open_reference(folder: Path, season: Season, seed: bytes) -> Reference:
+    """Read the reference errors of a season.
+
+    Args:
+        folder: of the leaderboard.
+        season: whose they are.
+        seed: of the season.
+
+    Raises:
+        InputError: if the file is missing, or not one of this season.
+    """
+    from ventbench.headroom import reference
+
+    seasons.require_seed(season, seed)
+    path = reference_path(folder, season.id)
+    if not path.is_file() or path.is_symlink() or path.stat().st_size > MAX_REFERENCE_BYTES:
+        raise InputError(
+            f"{path} is missing or no file of reference errors; make it with `ventbench headroom` "
+            "and `ventbench board seal-reference`"
+        )
+    content = _decrypted(path.read_bytes(), seed, _REFERENCE, str(path))
+    with tempfile.TemporaryDirectory() as private:
+        plain = Path(private) / "reference.npz"
+        plain.write_bytes(content)
+        return reference.load(plain)
+
+
+def other_reference(score: Record, reference: Reference) -> list[str]:
+    """Reference errors of a record that are not those of its draws; one sentence each."""
+    if score.headroom is None:
+        return []
+    tables = {"attainable": reference.attainable, "pid": reference.pid}
+    return [
+        f"key headroom.{key}: not the published reference errors"
+        for key, table in tables.items()
+        if not np.array_equal(getattr(score.headroom, key), np.moveaxis(table, 1, 0))
+    ]
+
+
+def reference_path(folder: Path, name: str) -> Path:
+    """Where the reference errors of a season lie."""
+    return folder / layout.SEASONS / f"{name}{layout.REFERENCE_SUFFIX}"
+
+
+def _encrypted(plain: bytes, seed: bytes, purpose: bytes) -> bytes:
+    salt = secrets.token_bytes(_SALT)
+    return salt + _cipher(seed, salt).encrypt(bytes(12), plain, purpose)
+
+
+def _decrypted(ciphertext: bytes, seed: bytes, purpose: bytes, label: str) -> bytes:
+    salt, body = ciphertext[:_SALT], ciphertext[_SALT:]
+    cipher = _cipher(seed, salt)
+    try:
+        return cipher.decrypt(bytes(12), body, purpose)
+    except _invalid_tag():
+        raise InputError(f"{label} does not open with this seed") from None
 
 
 def _cipher(seed: bytes, salt: bytes) -> Any:

@@ -352,6 +352,9 @@ def reveal(folder: Path, name: str, seed: bytes, simulators: Replayable | None =
     season = seasons.reveal(store.seasons[name], seed)
     there = {entry.sha256 for entry in store.records}
     waiting, void = [], {}
+    reference = None
+    if season.protocol > 1 and store.sealed and simulators is not None:
+        reference = sealed.open_reference(folder, season, seed)
     for entry in store.sealed:
         if entry.content.season.id != name or entry.content.record in there:
             continue
@@ -360,6 +363,10 @@ def reveal(folder: Path, name: str, seed: bytes, simulators: Replayable | None =
             if simulators is not None:
                 label = f"the record of {inside.record.name}"
                 require_replay(inside.record, inside.commands, simulators, label, seed)
+            if reference is not None and (
+                wrong := sealed.other_reference(inside.record, reference)
+            ):
+                raise InputError(f"record {inside.record.sha256}, {'; '.join(wrong)}")
             waiting.append(inside)
         except InputError as error:
             void[entry.sha256] = str(error)

@@ -194,6 +194,38 @@ def new_season(
     typer.echo(f"commitment: {opened.commitment}; {path} is to be published before the first score")
 
 
+@app.command(name="seal-reference")
+def seal_reference(
+    season: Annotated[str, typer.Argument(help="Name of the season.")],
+    reference: Annotated[Path, typer.Argument(help="File that `ventbench headroom` made.")],
+    seed: Annotated[Path, typer.Option(metavar="FILE", help="File of the secret seed.")],
+    folder: Folder = FOLDER,
+) -> None:
+    """Encrypt the reference errors of a season's draws, which official scores need.
+
+    They tell the draws; they are readable for everybody once the seed is revealed.
+
+    Example: `ventbench board seal-reference 2027-spring runs/2027-spring.npz
+    --seed ~/2027-spring.seed`
+    """
+    from ventbench import seasons
+    from ventbench.board import sealed, store
+    from ventbench.headroom import reference as references
+
+    known, secret = seasons.read_season(store.season_path(folder, season)), seasons.read_seed(seed)
+    about = dict(references.load(reference).about["draws"] or {})
+    if about.get("sha256") != known.commitment:
+        from ventbench.errors import InputError
+
+        raise InputError(
+            f"{reference} is of other draws; make it with `ventbench headroom --season "
+            f"{store.season_path(folder, season)} --seed {seed}`"
+        )
+    path = sealed.reference_path(folder, season)
+    sealed.seal_reference(path, reference.read_bytes(), known, secret)
+    typer.echo(f"{path} is to be published before the first score")
+
+
 @app.command()
 def reveal(
     season: Annotated[str, typer.Argument(help="Name of the season.")],

@@ -1,0 +1,82 @@
+"""Figures of the bundled entries on the stress track: the table and the picture of docs/stress.md.
+
+Prints the table, and paired differences between the last entry and the others. Usage:
+
+    python benchmarks/stress.py [--draws N] [--write]
+
+``--write`` puts table and picture into docs/.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ventbench import compilation
+from ventbench.stress.score import score_stress
+from ventbench.stress.stressors import CATEGORIES
+from ventbench.views.stress import write_stress_chart
+
+ENTRIES = ("pid_robust", "residual_mlp_all", "ppo", "dqn", "adaptive_pid")
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def table(scores: list[dict[str, Any]]) -> str:
+    """The figures as Markdown, one column an entry."""
+
+    def row(title: str, show: Callable[[dict[str, Any]], str]) -> str:
+        return f"| {title} | " + " | ".join(map(show, scores)) + " |"
+
+    def interval(limits: list[float]) -> str:
+        return f"{limits[0]:.2f} to {limits[1]:.2f}"
+
+    lines = [
+        row("", lambda e: e["name"]),
+        "| --- |" + " --- |" * len(scores),
+        row("**stress score, cmH2O**", lambda e: f"**{e['score']:.2f}**"),
+        row("95 % interval", lambda e: interval(e["ci95"])),
+        row("without stressors, cmH2O", lambda e: f"{e['unstressed']:.2f}"),
+        row("rise, cmH2O", lambda e: f"{e['rise']:+.2f}"),
+        row("survived, % of runs", lambda e: f"{100 * e['survived']:.1f}"),
+        row("survived without stressors, %", lambda e: f"{100 * e['survived_unstressed']:.0f}"),
+        row("unsafe runs", lambda e: f"{e['unsafe_runs']} of {e['stressed_runs']}"),
+        row("longest above PIP + 15 %, mean, s", lambda e: f"{e['above_alarm_s']:.2f}"),
+        row("worst condition, cmH2O", lambda e: f"{e['worst_error']:.1f}"),
+    ]
+    for category in (*CATEGORIES, "pairs"):
+
+        def shown(entry: dict[str, Any], category: str = category) -> str:
+            own = entry["categories"][category]
+            return f"{own['error_cmH2O']:.2f}, {100 * own['survived']:.0f} %"
+
+        lines.append(row(f"{category}: cmH2O, survived", shown))
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--write", action="store_true", help="put table and picture into docs/")
+    parser.add_argument("--draws", type=int, default=6)
+    given = parser.parse_args()
+    compilation.keep()
+    results = [score_stress(name, draws=given.draws, sandbox=False) for name in ENTRIES]
+    scores = [result.to_json() for result in results]
+    text = table(scores)
+    print(text)
+    for result in results[:-1]:
+        difference, (low, high) = results[-1].difference(result)
+        names = f"{ENTRIES[-1]} less {result.submission.manifest.name}"
+        print(f"{names}: {difference:+.3f} cmH2O, paired 95 % interval {low:+.3f} to {high:+.3f}")
+    if given.write:
+        page = DOCS / "stress.md"
+        block = f"<!-- figures -->\n{text}\n<!-- end -->"
+        old = re.compile(r"<!-- figures -->\n.*?\n<!-- end -->", re.S)
+        page.write_text(old.sub(lambda _: block, page.read_text("utf-8")), "utf-8")
+        write_stress_chart(DOCS / "img" / "stress.png", scores)
+
+
+if __name__ == "__main__":
+    main()

@@ -139,7 +139,6 @@ def run(
         control_every=control_every, perturbations=perturb or (), seed=seed,
     )  # fmt: skip
     settings = SafetySettings(largest_u_in=largest_u_in, largest_rise=largest_rise)
-    person = ConsoleOperator(yes=yes, control=control)
     views = Views(TerminalView(), *([RerunView(rerun)] if rerun else []))
 
     def before_lung(bench: Bench, mounted: str) -> str:
@@ -151,6 +150,7 @@ def run(
         return "" if sheet.go else "the self-test says no-go: " + "; ".join(sheet.problems())
 
     line = ev.connect(port)
+    person = ConsoleOperator(yes=yes, control=control, device=line.device)
     try:
         with person.keys(), realtime.priority():
             done = ev.evaluate(

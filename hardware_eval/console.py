@@ -8,13 +8,17 @@ import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hardware_eval.device.faults import parse
 from hardware_eval.plan import PlannedRun
 from hardware_eval.session import BreathLog
 from ventbench import protocol
+
+if TYPE_CHECKING:
+    from hardware_eval.device.loopback import LoopbackDevice
 
 #: What the emulator is told for a perturbation; see :mod:`hardware_eval.emulator`. A leak as if the
 #: expiratory valve stood open by a twentieth; a tube pinched to three times the resistance.
@@ -35,10 +39,17 @@ class ConsoleOperator:
     Args:
         yes: confirm everything; for an emulator and for tests.
         control: control socket of an emulator, which then does perturbations by itself.
+        device: a device that is emulated in this process, to which the same applies.
     """
 
-    def __init__(self, *, yes: bool = False, control: Path | None = None) -> None:
-        self._yes, self._control = yes, control
+    def __init__(
+        self,
+        *,
+        yes: bool = False,
+        control: Path | None = None,
+        device: LoopbackDevice | None = None,
+    ) -> None:
+        self._yes, self._control, self._device = yes, control, device
         self._keys = False
 
     @contextlib.contextmanager
@@ -88,6 +99,10 @@ class ConsoleOperator:
 
     def disturb(self, perturbation: str, on: bool) -> None:
         """Have a leak opened or the tube pinched, by hand or by the emulator."""
+        if self._device is not None:
+            hal: Any = self._device.service.hal
+            hal.faults = (parse(EMULATED[perturbation], self._device.clock.now()),) if on else ()
+            return
         if self._control is not None:
             text = EMULATED[perturbation] if on else "clear"
             # A session must not fail because nobody disturbs it.

@@ -142,11 +142,14 @@ class Demo:
         truth = ", ".join(f"{key} {value:.3g}" for key, value in self.truth["parameters"].items())
         before, refit, after = self.open_loop
         first, second = (" ".join(f"{gain:g}" for gain in gains) for gains in self.gains)
-        change = 100.0 * (_mean(self.retuned) / _mean(self.measured) - 1.0)
+        change = ""
+        if np.isfinite(_mean(self.measured)) and np.isfinite(_mean(self.retuned)):
+            share = 100.0 * (_mean(self.retuned) / _mean(self.measured) - 1.0)
+            change = f", {share:+.0f} % against the first"
         return [
             ("A lung is sealed", f"{self.lung}; commitment {self.commitment[:16]}..."),
             ("The best PID in simulation", f"P I D = {first}: {_mean(self.simulated):.2f} cmH2O"),
-            ("The same PID on the lung", f"{_mean(self.measured):.2f} cmH2O"),
+            ("The same PID on the lung", _said(self.measured)),
             (
                 "The comparison",
                 f"{len(self.comparison.breaths)} breaths explored; open-loop error "
@@ -161,7 +164,7 @@ class Demo:
             ("The PID retuned on it", f"P I D = {second}: {self.predicted:.2f} cmH2O predicted"),
             (
                 "The retuned PID on the lung",
-                f"{_mean(self.retuned):.2f} cmH2O, {change:+.0f} % against the first",
+                f"{_said(self.retuned)}{change}",
             ),
             (
                 "The seal is opened",
@@ -177,6 +180,14 @@ class Demo:
 
 def _mean(errors: Mapping[float, float]) -> float:
     return float(np.mean(list(errors.values())))
+
+
+def _said(errors: Mapping[float, float]) -> str:
+    """Mean error in words; of a run that a check ended there is none."""
+    stopped = [pip for pip, error in errors.items() if not np.isfinite(error)]
+    if not stopped:
+        return f"{_mean(errors):.2f} cmH2O"
+    return f"stopped by a safety check at PIP {', '.join(f'{pip:g}' for pip in stopped)} cmH2O"
 
 
 def demo(
@@ -223,7 +234,7 @@ def demo(
     with _line(hidden.plant, words, lung, out, real_time) as line:
         tell("3. it runs on the lung")
         measured = _errors(_evaluate(plan, entry, line, out / "first", sandbox))
-        tell(f"   {_mean(measured):.2f} cmH2O, {_mean(simulated):.2f} in simulation")
+        tell(f"   {_said(measured)}; {_mean(simulated):.2f} cmH2O in simulation")
         tell(f"4. {breaths} breaths are explored")
         bench = Bench(line.client, line.clock, DEFAULT, SilentOperator(), rest=_REST)
         explored = collect(bench, lung, breaths, out / "explored")
@@ -387,8 +398,12 @@ def _report(done: Demo) -> str:
         f"<li><b>{html.escape(title)}.</b> {html.escape(text)}</li>" for title, text in done.steps()
     )
     rows = "".join(
-        f"<tr><td>{pip:g}</td><td>{done.simulated[pip]:.2f}</td><td>{done.measured[pip]:.2f}</td>"
-        f"<td>{done.retuned[pip]:.2f}</td></tr>"
+        f"<tr><td>{pip:g}</td>"
+        + "".join(
+            f"<td>{errors[pip]:.2f}</td>" if np.isfinite(errors[pip]) else "<td>stopped</td>"
+            for errors in (done.simulated, done.measured, done.retuned)
+        )
+        + "</tr>"
         for pip in done.simulated
     )
     waves = "".join(

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hardware_eval import record as records
 from hardware_eval import session
@@ -33,6 +33,9 @@ from ventbench.interfaces import Task
 from ventbench.recordings.write import write
 from ventbench.submissions.errors import SubmissionError
 from ventbench.submissions.folder import Submission, open_submission
+
+if TYPE_CHECKING:
+    from hardware_eval.device.loopback import LoopbackDevice
 
 #: Files of an evaluation in its folder.
 LOG, RECORDING = "raw.jsonl", "recording.csv.gz"
@@ -64,10 +67,12 @@ class Line:
     Attributes:
         client: of the device.
         clock: real, or the loopback device's.
+        device: the device if it is emulated in this process, else None.
     """
 
     client: Client
     clock: Clock
+    device: LoopbackDevice | None = None
 
     @property
     def real(self) -> bool:
@@ -99,7 +104,7 @@ def connect(port: str) -> Line:
         device = loopback(simulated_lung(port.removeprefix(VIRTUAL)))
         virtual = Client(device, device.clock)
         virtual.hello()
-        return Line(virtual, device.clock)
+        return Line(virtual, device.clock, device)
     client = Client(Link(port))
     try:
         client.hello()

@@ -33,6 +33,10 @@ def headroom(
             "second optimiser must find nothing better.",
         ),
     ] = None,
+    workers: Annotated[int, typer.Option(min=0, help="Processes; 0 for this one alone.")] = 0,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Address of a Dask scheduler instead.")
+    ] = None,
     json: JsonFile = None,
 ) -> None:
     """Compute the best attainable error and the best PID of every cell of protocol version 2.
@@ -46,6 +50,7 @@ def headroom(
     from rich.console import Console
 
     from ventbench import protocol
+    from ventbench.executor import executor
     from ventbench.headroom import reference as references
     from ventbench.submissions import rig_scoring
     from ventbench.training import rig_pid
@@ -75,14 +80,16 @@ def headroom(
         else:
             gains = references.published().gains
         task = progress.add_task("best attainable", total=None)
-        found = references.compute(
-            plants,
-            cells,
-            gains,
-            about,
-            folder=parts,
-            progress=lambda done, all_: progress.update(task, completed=done, total=all_),
-        )
+        with executor(workers, scheduler) as pool:
+            found = references.compute(
+                plants,
+                cells,
+                gains,
+                about,
+                folder=parts,
+                pool=pool,
+                progress=lambda done, all_: progress.update(task, completed=done, total=all_),
+            )
     sha256 = found.save(out)
     shutil.rmtree(parts)  # they are in the file now
     summary = {

@@ -12,6 +12,7 @@ import io
 import json
 import zipfile
 from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from ventbench import data_files, files, precision, rollouts
 from ventbench.controllers.pid import PID
 from ventbench.environment import Scenario
 from ventbench.errors import InputError
+from ventbench.executor import InProcess, results
 from ventbench.headroom import attainable
 from ventbench.headroom.cross_check import second_optimum
 from ventbench.interfaces import Plant
@@ -206,6 +208,7 @@ def compute(
     *,
     folder: Path | None = None,
     starts: tuple[int, ...] = attainable.STARTS,
+    pool: Executor | None = None,
     progress: Progress | None = None,
 ) -> Reference:
     """Compute the reference errors of cells; an interrupted call continues.
@@ -217,10 +220,11 @@ def compute(
         about: what the reference belongs to, see :func:`settings`.
         folder: for finished parts; nothing is kept if not given.
         starts: see :data:`ventbench.headroom.attainable.STARTS`.
+        pool: executor of the draws; this process if not given.
         progress: called with the number of cells done, and of all.
 
     Raises:
-        InputError: if the folder holds parts of another computation.
+        InputError: if the folder holds parts of another computation, or a worker died.
     """
     lungs, draws, pips = np.shape(cells.pip)
     work = None
@@ -229,30 +233,29 @@ def compute(
         keys["inputs"] = fingerprint((plants, cells, gains))
         work = WorkFolder(folder, keys)
     report = progress or (lambda done, total: None)
-    parts = []
-    for draw in range(draws):
-        name = f"draw-{draw}"
+    parts: dict[str, Floats] = {}
+    jobs: dict[str, tuple[Any, ...]] = {}
+    names = [f"draw-{draw}" for draw in range(draws)]
+    for draw, name in enumerate(names):
         if work is not None and work.has(name, ARRAY):
-            part = work.read(name, ARRAY)
+            parts[name] = work.read(name, ARRAY)
         else:
-            part = _part(plants, cells, gains, draw, starts)
-            if work is not None:
-                work.put(name, part, ARRAY)
-        parts.append(part)
-        report((draw + 1) * lungs * pips, lungs * draws * pips)
-    stacked = np.stack(parts, axis=1)
+            own, cell = jax.tree.map(lambda x, k=draw: np.asarray(x)[:, k : k + 1], (plants, cells))
+            jobs[name] = (own, cell, np.asarray(gains), starts)
+    for name, part in results(pool or InProcess(), _part, jobs):
+        parts[name] = part
+        if work is not None:
+            work.put(name, part, ARRAY)
+        report(len(parts) * lungs * pips, lungs * draws * pips)
+    stacked = np.stack([parts[name] for name in names], axis=1)
     columns = {name: stacked[..., k] for k, name in enumerate(_COLUMNS)}
     return Reference(
         dict(about), np.asarray(gains), **columns, commands=stacked[..., len(_COLUMNS) :]
     )
 
 
-def _part(
-    plants: Plant, cells: Scenario, gains: Floats, draw: int, starts: tuple[int, ...]
-) -> Floats:
-    """Reference of one draw, shape ``(L, P, columns)``."""
-    own = jax.tree.map(lambda x: np.asarray(x)[:, draw : draw + 1], plants)
-    cell = jax.tree.map(lambda x: np.asarray(x)[:, draw : draw + 1], cells)
+def _part(own: Plant, cell: Scenario, gains: Floats, starts: tuple[int, ...]) -> Floats:
+    """Reference of one draw, shape ``(L, P, columns)``; cells have batch shape ``(L, 1, P)``."""
     lungs, _, pips = np.shape(cell.pip)
     pid = pid_errors(own, cell, gains)[:, 0]
     flat = jax.tree.map(lambda x: x.reshape(lungs * pips, *x.shape[3:]), cell)

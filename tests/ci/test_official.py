@@ -85,6 +85,7 @@ def check_scored_again(path, folder, leaderboard, simulators, added):
     )
     (new,) = propose.add(folder, leaderboard, simulators, secret)
     assert attestation.attested(leaderboard, [new.sha256, added[0].sha256]) == ({new.sha256}, [])
+    assert isinstance(new, record.Record)
     assert new.header.supersedes == added[0].sha256
     assert new.header.reason == propose.SCORED_AGAIN
 

@@ -91,7 +91,8 @@ class Talkative(InProcessRunner):
                 for cell in (5, 300):
                     told = f"I saw {observations[cell, 1]!r}"
                     failure = Failure("act", "raised ValueError", told, 1, 1)
-                    session.failures.setdefault(cell, failure)
+                    if cell not in session.failures:
+                        session.failures[cell] = failure  # type: ignore[index]
                 return commands
 
             session.act = tell  # type: ignore[method-assign]
@@ -183,7 +184,7 @@ def test_hidden_draws_of_version_2_from_the_reference_to_the_reveal(
     )  # fmt: skip
     seasons.write_season(store.season_path(leaderboard, "rigs"), season)
     own = rigs.scored()
-    drawn = rig_draws.build(own.sessions, own.members, seed=secret, season="rigs", n=20)
+    drawn = rig_draws.build(own.sessions or (), own.members, seed=secret, season="rigs", n=20)
     plants, cells = own.cells(drawn, protocol.PIPS)
     gains = np.tile([[6.0, 6.0, 0.3]], (6, 1))
     pid = references.pid_errors(plants, cells, gains)
@@ -211,6 +212,7 @@ def test_hidden_draws_of_version_2_from_the_reference_to_the_reveal(
     )
     assert "normalised" in lines[-1]
     (added,) = propose.add(out, leaderboard, rigs, SECRET, secret)
+    assert isinstance(added, record.Sealed)
     assert added.content.complete
     build.build(leaderboard)
     assert verify(leaderboard, lambda _: rigs, seed=secret).problems == []

@@ -245,7 +245,7 @@ def test_a_ciphertext_that_was_changed_is_seen(opening: Opening, drafts, load: L
     build.build(opening.folder)
     (problem,) = verify(opening.folder, load).problems
     assert "has been changed" in problem
-    with pytest.raises(InputError, match="does not open with the seed of season spring"):
+    with pytest.raises(InputError, match="of season spring does not open with this seed"):
         sealed.unseal(added, bytes(content), opening.season, opening.seed)
     path.unlink()
     (problem,) = verify(opening.folder, load).problems

@@ -273,7 +273,12 @@ PAIRS: tuple[tuple[str, str], ...] = (
 )
 
 #: Mechanisms of the library without a line, and why.
-NOT_STRESSED: dict[str, str] = {}
+NOT_STRESSED: dict[str, str] = {
+    "compliance_drift": "`position` and `recruitment` change C between breaths.",
+    "resistance_drift": "`secretions` and `suction` change R between breaths.",
+    "sensor_curve": "For version 2 of the table; `sensor_high` and `sensor_low` have its size.",
+    "supply_pressure": "For version 2 of the table; `supply_droop` loses flow late as well.",
+}
 
 
 def stressor(name: str) -> Stressor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import flax.struct
 import jax.numpy as jnp
@@ -175,8 +176,9 @@ class Untraceable:
 
 
 def test_a_registered_class_in_numpy_is_told_apart(breaths):
-    assert is_jax_plant(Untraceable(jnp.asarray(2.0)))
+    plant: Any = Untraceable(R=2.0).replace(R=jnp.asarray(2.0))  # type: ignore[attr-defined]
+    assert is_jax_plant(plant)
     assert not is_jax_plant(WithState(1.0, 1.0))
     assert not is_jax_plant(WithState)
     with pytest.raises(InputError, match="JAX cannot trace this plant"):
-        load_simulators(Untraceable(jnp.asarray(2.0))).pressures(breaths)
+        load_simulators(plant).pressures(breaths)

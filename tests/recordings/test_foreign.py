@@ -47,6 +47,7 @@ def test_a_table_of_another_country(tmp_path):
     breaths, made = imported.breaths, waveforms()
     assert len(breaths) == 4, "the last cycle is not whole"
     assert imported.columns == {"Zeit": "time", "Paw": "pressure", "Flow": "flow"}
+    assert breaths.flow is not None
     first = np.argmin(np.abs(made["t"] - 3.0))  # where the second breath begins
     start = int(np.argmax(breaths.flow[1] > 100.0))
     np.testing.assert_allclose(

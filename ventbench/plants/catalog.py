@@ -87,10 +87,19 @@ class PressureFunction(Protocol):
         ...
 
 
+class Stepping(Protocol):
+    """A simulator in plain Python that runs sample by sample; see ``python_simulator``."""
+
+    def step(self, *arguments: Any) -> Any:
+        """Hold one command."""
+        ...
+
+
+#: Simulators in plain Python, alone or by lung id; also plants by lung id.
+PythonGiven: TypeAlias = "Stepping | Mapping[str, Any] | Callable[..., Any]"
+
 #: All that :func:`load_simulators` takes.
-Given: TypeAlias = (
-    "str | Path | Simulators | Plant | Mapping[str, Plant] | PressureFunction | ArrayLike"
-)
+Given: TypeAlias = "str | Path | Simulators | Plant | PythonGiven | ArrayLike"
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,12 +291,12 @@ class Simulators:
             if np.isfinite(start):
                 label = Lung(float(breaths.R[i]), float(breaths.C[i]))
                 samples = breaths.valid[i]
-                commands = (
-                    column[i, samples] for column in (breaths.u_in, breaths.u_out, breaths.dt)
-                )
+                u_in, u_out, dt = breaths.u_in[i], breaths.u_out[i], breaths.dt[i]
                 flow = None if breaths.flow is None else breaths.flow[i, samples].copy()
                 what = f"breath {breaths.breath_id[i]}"
-                answer = self._call(function, *commands, label, start, what, flow)
+                answer = self._call(
+                    function, u_in[samples], u_out[samples], dt[samples], label, start, what, flow
+                )
                 answers[i, samples], answers[i, ~samples] = answer, answer[-1]
         return answers
 

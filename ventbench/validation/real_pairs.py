@@ -533,9 +533,9 @@ def _curve(kind: str, unit: str, scale: float, answers: list[Answered]) -> list[
     ]
     for strength in sorted({a.pair.strength for a in answers}):
         own = [a for a in answers if a.pair.strength == strength]
-        named = [a for a in own if a.value is not None]
+        named = [a.value for a in own if a.value is not None]
         low, high = wilson(len(named), len(own))
-        middle = f"{scale * float(np.median([a.value for a in named])):.3g}" if named else "-"
+        middle = f"{scale * float(np.median(named)):.3g}" if named else "-"
         alike = sum(a.in_class for a in own)
         wrong = sum(bool(a.wrong_names) for a in own)
         lines.append(

@@ -241,7 +241,7 @@ def _column(cells: NDArray[Any], decimal: str) -> tuple[NDArray[Any], tuple[int,
 
     plain = np.char.strip(cells.astype(str))
     numbers = np.char.replace(plain, ",", ".") if decimal == "," else plain
-    values = pd.to_numeric(pd.Series(numbers), errors="coerce").to_numpy(float, copy=True)
+    values = np.array(pd.to_numeric(pd.Series(numbers), errors="coerce"), float)
     values[~np.isfinite(values)] = np.nan
     blank = np.isin(np.char.lower(plain), _BLANKS)
     odd = np.isnan(values) & ~blank

@@ -25,6 +25,10 @@ from ventbench.plants.stacking import take
 from ventbench.rollouts import open_loop
 from ventbench.simulation import read_controls, simulate
 from ventbench.training import simulator
+from ventbench.training.rigs import train as rigs
+
+#: Records of the published leaderboard.
+RECORDS = Path(__file__).resolve().parents[1] / "leaderboard" / "records"
 
 
 def run(*arguments: object, code: int = 0) -> str:
@@ -63,15 +67,36 @@ def columns(text: str) -> dict[str, np.ndarray]:
     return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
 
 
-def test_lungs_lists_the_six_with_their_errors():
-    text = run("lungs")
-    for name, about in frozen.load().lungs().items():
-        (line,) = [line for line in text.splitlines() if f" {name} " in line]
-        assert f"{about['held_out_mae']:.2f}" in line
+@pytest.mark.parametrize("version", [1, 2])
+def test_lungs_lists_the_six_with_their_errors(version):
+    text = run("lungs", "--version", version)
+    kinds = ("held_out",) if version == 1 else ("own_rig", "unseen_rig", "held_out")
+    for name, about in frozen.load(version).lungs().items():
+        (line,) = [line for line in text.splitlines() if line.startswith(f"│ {name} ")]
+        for kind in (kind for kind in kinds if f"{kind}_mae" in about):
+            assert f"{about[f'{kind}_mae']:.2f} / {about[f'{kind}_median_mae']:.2f}" in line
+
+
+def test_lungs_tells_which_sessions_are_not_scored():
+    text = " ".join(run("lungs").split())
+    official = frozen.load(version=2)
+    six = [i for i in official.rejected if official.sessions.table[i].lung in official.lung_ids]
+    assert six
+    for session in six:
+        assert f"not scored: session {session} of" in text
 
 
 def test_lungs_as_json():
-    assert json.loads(run("lungs", "--json", "-")) == frozen.load().lungs()
+    assert json.loads(run("lungs", "--version", 1, "--json", "-")) == frozen.load().lungs()
+    assert json.loads(run("lungs", "--json", "-")) == frozen.load(version=2).lungs()
+
+
+def test_coverage_of_a_published_entry():
+    record = next(path for path in RECORDS.glob("*.json"))
+    shares = json.loads(run("coverage", record, "--json", "-"))
+    assert set(shares) == set(frozen.load().lungs())
+    assert all(0.0 <= share["wide_open"] <= 1.0 for share in shares.values())
+    assert max(share["sparse"] for share in shares.values()) > 0.0
 
 
 @pytest.mark.parametrize("name", ["R5C10", "R20C50"])
@@ -118,23 +143,29 @@ def test_train_needs_recordings(tmp_path, monkeypatch):
     assert "nowhere contains no recordings; give --recordings DIR" in message
     monkeypatch.setenv("VENTBENCH_RECORDINGS", str(tmp_path / "gone"))
     assert "no folder contains no recordings" in run("train", "simulator", code=2)
-    message = run("train", "simulator", "--recordings", tmp_path, "--out", tmp_path / "x", code=2)
+    to_train = ("train", "simulator", "--recordings", tmp_path, "--out", tmp_path / "x")
+    assert "holds no recording in the public schema" in run(*to_train, code=2)
+    message = run(*to_train, "--version", 1, code=2)
     assert f"{simulator.MEASURED}: there is no such file" in message
+    message = run(*to_train, "--version", 1, "--lungs", "R5C10", code=2)
+    assert "--lungs has no meaning for --version 1" in message
     assert not (tmp_path / "x").exists()
 
 
 def test_train_hands_over_folder_target_and_progress(tmp_path, monkeypatch):
     called = []
 
-    def train(folder, out, *, progress):
+    def train(folder, out, *, lungs=None, progress):
         progress("half", 0.5)
-        called.append((folder, out))
+        called.append((folder, out, lungs))
 
     monkeypatch.setattr(simulator, "train_simulator", train)
+    monkeypatch.setattr(rigs, "train_rigs", train)
     out = tmp_path / "out"
-    text = run("train", "simulator", "--recordings", tmp_path, "--out", out)
-    assert called == [(tmp_path, out)]
-    assert f"wrote {out}" in text
+    command = ("train", "simulator", "--recordings", tmp_path, "--out", out)
+    assert f"wrote {out}" in run(*command, "--lungs", "R5C10,R9C33")
+    run(*command, "--version", 1)
+    assert called == [(tmp_path, out, ["R5C10", "R9C33"]), (tmp_path, out, None)]
 
 
 def test_the_program_ends_with_2_and_one_line(tmp_path):

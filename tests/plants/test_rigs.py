@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import files
+from ventbench import files, protocol
 from ventbench.lungs import LUNGS
 from ventbench.plants import frozen
-from ventbench.plants.hybrid import Hybrid
+from ventbench.plants.hybrid import RELIEF, RELIEF_ROOM, Hybrid
 from ventbench.precision import float64
+from ventbench.rollouts import open_loop
 
 
 @pytest.fixture(scope="module")
@@ -97,3 +98,51 @@ def test_airway_pressure_is_the_reading_without_sensor(official):
             airway = plant.airway_pressure(states[0])
             np.testing.assert_allclose(airway, ideally, rtol=1e-9)
             assert float(jnp.abs(airway - reading).max()) > 0.01
+
+
+@pytest.fixture(scope="module")
+def all_rigs(official):
+    """Scored plants of every scored rig, leaves ``(rigs, ...)``."""
+    at = [rig for rigs in official.rigs for rig in rigs]
+    return jax.tree.map(lambda leaf: leaf[0, at], official.sessions_plants)
+
+
+STEPS = 40
+_roll = jax.jit(jax.vmap(open_loop, in_axes=(0, None, None, None, None)))
+
+
+def answers(plants: Hybrid, u_in: np.ndarray) -> np.ndarray:
+    """Pressures of all rigs under rows of commands, the outlet closed: ``(rigs, n, STEPS)``."""
+    rows = len(u_in)
+    with float64():
+        start, closed = np.full(rows, protocol.PEEP), np.zeros((rows, STEPS))
+        return np.asarray(_roll(plants, start, u_in, closed, closed + protocol.DT))
+
+
+def test_pressure_rises_with_the_command(all_rigs):
+    levels = np.arange(0.0, 101.0, 5.0)
+    pressure = answers(all_rigs, np.repeat(levels[:, None], STEPS, axis=1))
+    assert np.isfinite(pressure).all()
+    assert pressure.max() < RELIEF + RELIEF_ROOM
+    below = pressure[:, 1:, 1:] <= RELIEF
+    assert np.diff(pressure, axis=1)[:, :, 1:][below].min() > -1e-9
+
+
+def test_no_rig_oscillates_by_itself(all_rigs):
+    """A command held: the pressure never turns once the outlet has closed."""
+    held = np.repeat([[15.0], [30.0], [60.0]], STEPS, axis=1)
+    pressure = answers(all_rigs, held)
+    rises = np.diff(pressure, axis=2)[:, :, 4:]
+    assert rises[pressure[:, :, 5:] < RELIEF].min() > -1e-9
+    # The valve closes: what went in stays in.
+    pressure = answers(all_rigs, np.where(np.arange(STEPS) < 10, 30.0, 0.0)[None])[:, 0]
+    assert np.ptp(pressure[:, 25:], axis=1).max() < 1e-3
+
+
+def test_members_differ_most_where_nothing_was_recorded(official):
+    """The wide-open valve is hardly recorded; the ensemble says so."""
+    with float64():
+        plants = jax.tree.map(jnp.asarray, official.ensemble)
+        flow = np.asarray([plants.valve(jnp.full((), u)) for u in (20.0, 100.0)])
+    spread = np.std(np.log(flow), axis=1).mean(axis=1)
+    assert spread[1] > 2.0 * spread[0]

@@ -21,16 +21,22 @@ from ventbench.training.trained import (
 
 
 def test_networks_are_named_by_lungs_or_all():
-    assert check_names(NETWORKS) == (*LUNG_IDS, ALL)
+    simulators = simulators_to_train_on("single_compartment")
+    assert check_names(NETWORKS, simulators) == (*LUNG_IDS, ALL)
+    assert check_names(None, simulators) == LUNG_IDS
     with pytest.raises(InputError, match="not a scored lung"):
-        check_names(["R50C10"])
+        check_names(["R50C10"], simulators)
 
 
-def test_simulators_must_have_the_six_lungs():
+def test_simulators_may_have_any_lungs_but_must_have_plants():
     simulators = simulators_to_train_on("single_compartment")
     assert jax.tree.leaves(simulators.ensemble)[0].shape[:2] == (1, 6)
-    with pytest.raises(InputError, match=r"training needs plants of R5C10, .* have R5C20"):
-        simulators_to_train_on({"R5C20": single_compartment(lung("R5C20"))})
+    own = simulators_to_train_on({"R7C33": single_compartment(lung("R7C33"))})
+    assert check_names(None, own) == ("R7C33",)
+    with pytest.raises(InputError, match="have no lung R5C20; they have R7C33"):
+        check_names(["R5C20"], own)
+    with pytest.raises(InputError, match="training needs simulators with plants"):
+        simulators_to_train_on(lambda u_in, u_out, dt, *, R, C, initial_pressure: u_in)
 
 
 def test_a_training_shows_a_row_a_network():

@@ -1,4 +1,4 @@
-"""``ventbench lungs``, ``simulate`` and ``open-loop``: simulators without a controller."""
+"""``ventbench lungs``, ``coverage``, ``simulate`` and ``open-loop``: what simulators are worth."""
 
 from __future__ import annotations
 
@@ -11,8 +11,17 @@ from ventbench import protocol
 from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, emit
 
 
-def lungs(json: JsonFile = None) -> None:
-    """List the six lungs and the errors of their simulators on held-out recordings.
+def lungs(
+    version: Annotated[
+        int, typer.Option(min=1, max=2, help="Version of the frozen simulators.")
+    ] = 2,
+    json: JsonFile = None,
+) -> None:
+    """List the six lungs and the errors of their simulators on recorded breaths held out.
+
+    Version 2 has three errors a lung, mean / median |simulated - recorded| pressure in cmH2O: of
+    the rigs that are scored on their own breaths, of the lung on breaths of rigs that the fit has
+    not seen, and of all breaths that bear the label, each by the rig of its clock.
 
     Example: `ventbench lungs`
     """
@@ -21,20 +30,74 @@ def lungs(json: JsonFile = None) -> None:
 
     from ventbench.plants import frozen
 
-    table = Table(title="The six lungs of protocol version 1, simulators version 1")
-    for name in ("lung", "R cmH2O/(L/s)", "C mL/cmH2O", "held-out MAE cmH2O", "median", "breaths"):
+    official = frozen.load(version=version)
+    known = official.lungs()
+    title = f"The six lungs, simulators version {version}: error on breaths held out, cmH2O"
+    table = Table(title=title)
+    kinds = {"own_rig": "own rig", "unseen_rig": "unseen rig", "held_out": "by clock"}
+    if version == 1:
+        del kinds["own_rig"], kinds["unseen_rig"]
+    columns = ("lung", "R cmH2O/(L/s)", "C mL/cmH2O", "rigs", *kinds.values(), "breaths")
+    for name in columns:
         table.add_column(name, justify="left" if name == "lung" else "right")
-    known = frozen.load().lungs()
     emit(known, json)
-    for lung_id, about in known.items():
-        figures = (about["held_out_mae"], about["held_out_median_mae"])
-        table.add_row(
-            lung_id,
-            f"{about['R']:g}",
-            f"{about['C']:g}",
-            *(f"{figure:.2f}" for figure in figures),
-            str(about["held_out_breaths"]),
-        )
+
+    def shown(about: dict[str, Any], kind: str) -> str:
+        if f"{kind}_mae" not in about:
+            return "-"
+        return f"{about[f'{kind}_mae']:.2f} / {about[f'{kind}_median_mae']:.2f}"
+
+    for rigs, (lung_id, about) in zip(official.rigs, known.items(), strict=True):
+        setting = (f"{about['R']:g}", f"{about['C']:g}", str(len(rigs)))
+        figures = (shown(about, kind) for kind in kinds)
+        table.add_row(lung_id, *setting, *figures, str(about.get("held_out_breaths", "-")))
+    console = Console(stderr=str(json) == "-")
+    console.print(table)
+    for session, reason in official.rejected.items():
+        label = official.sessions.table[session].lung
+        if label in known:
+            text = f"not scored: session {session} of {label}: {reason}"
+            console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def coverage(
+    record: Annotated[
+        Path, typer.Argument(help="A record of the leaderboard; its commands lie beside it.")
+    ],
+    json: JsonFile = None,
+) -> None:
+    """Tell how much of an entry's commands lies beyond what was recorded of each lung.
+
+    Where there are few recorded samples a simulator follows its prior, and a score is worth less.
+
+    Example: `ventbench coverage leaderboard/records/RECORD.json`
+    """
+    from dataclasses import asdict
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from ventbench.board import actions
+    from ventbench.board import record as records
+    from ventbench.errors import InputError
+    from ventbench.metrics import extrapolation
+    from ventbench.plants import frozen
+
+    entry = records.load(record)
+    if not isinstance(entry, records.Record):
+        raise InputError(f"{record} is no record of a score that lies open")
+    lungs = frozen.load(version=2).lungs()
+    if not all("recorded_commands" in about for about in lungs.values()):
+        raise InputError("the frozen simulators tell no recorded commands; train them again")
+    commands = actions.load(entry, record.parent).clip(0.0, 100.0)
+    by_lung = extrapolation.by_lung(dict(zip(entry.lungs, commands, strict=True)), lungs)
+    emit({name: asdict(share) for name, share in by_lung.items()}, json)
+    table = Table(title="Commands beyond the recordings, % of all")
+    for name in ("lung", "70 % and above", "ranges hardly recorded", "recorded at 70 % and above"):
+        table.add_column(name, justify="left" if name == "lung" else "right")
+    for name, share in by_lung.items():
+        recorded = f"{share.recorded_wide_open} of {share.recorded}"
+        table.add_row(name, f"{100 * share.wide_open:.1f}", f"{100 * share.sparse:.1f}", recorded)
     Console(stderr=str(json) == "-").print(table)
 
 
@@ -137,5 +200,6 @@ def _open_loop_table(result: dict[str, Any]) -> Any:
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     app.command()(lungs)
+    app.command()(coverage)
     app.command()(simulate)
     app.command("open-loop")(open_loop)

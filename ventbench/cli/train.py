@@ -48,18 +48,45 @@ def _group() -> None:
 def simulator(
     recordings: RecordingsDir = None,
     out: Annotated[
-        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the simulators.")
+        Path,
+        typer.Option(metavar="DIR", callback=claim_out, help="Folder for the simulators."),
     ] = Path("runs/simulators"),
+    lungs: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ID,ID,...", help="Lungs to list, such as R5C10,R20C50; default: all recorded."
+        ),
+    ] = None,
+    version: Annotated[
+        int,
+        typer.Option(
+            min=1, max=2, help="Recipe: 2, or 1 for the first frozen simulators and their files."
+        ),
+    ] = 2,
 ) -> None:
-    """Train the six simulators on the public recordings, as the frozen ones were.
+    """Learn simulators from a folder of recordings in the public schema, with any R and C.
 
-    Ctrl-C keeps the finished work; the same command continues.
+    Every CSV or Parquet file in the folder is read. The result is a folder for `--plant`. Ctrl-C
+    keeps the finished work; the same command continues.
 
-    Example: `ventbench train simulator --recordings ../shared/recordings --out runs/simulators`
+    Example: `ventbench train simulator --recordings my-recordings --out runs/my-rig`
     """
-    from ventbench.training.simulator import train_simulator
+    from ventbench.errors import InputError
 
-    _train_simulators(train_simulator, recordings_folder(recordings), out)
+    folder = recordings_folder(recordings)
+    if version == 1:
+        from ventbench.training.simulator import train_simulator
+
+        if lungs is not None:
+            raise InputError("--lungs has no meaning for --version 1, which lists the six lungs")
+        _train_simulators(train_simulator, folder, out)
+        return
+    from functools import partial
+
+    from ventbench.training.rigs.train import train_rigs
+
+    listed = None if lungs is None else [name.strip() for name in lungs.split(",")]
+    _train_simulators(partial(train_rigs, lungs=listed), folder, out)
 
 
 def _train_simulators(run: Any, folder: Path, out: Path) -> None:
@@ -138,13 +165,12 @@ def residual(
     from rich.console import Console
 
     from ventbench.errors import InputError
-    from ventbench.lungs import LUNG_IDS, scored_lung
     from ventbench.training.residual import ResidualConfig
     from ventbench.training.trained import ALL
 
     if lung is not None and every:
         raise InputError("give --lung ID or --all, not both")
-    names = (ALL,) if every else LUNG_IDS if lung is None else (scored_lung(lung).id,)
+    names = (ALL,) if every else None if lung is None else (lung,)
     standard = ResidualConfig()
     config = ResidualConfig(
         updates=updates or standard.updates,
@@ -162,7 +188,7 @@ def residual(
 
 
 def _train_residual(
-    names: tuple[str, ...], out: Path, config: Any, seed: int, plant: str
+    names: tuple[str, ...] | None, out: Path, config: Any, seed: int, plant: str
 ) -> dict[str, Any]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -262,13 +288,12 @@ def _train_policies(
     from rich.console import Console
 
     from ventbench.errors import InputError
-    from ventbench.lungs import scored_lung
     from ventbench.training.rl.train import train_dqn, train_ppo
-    from ventbench.training.trained import ALL, NETWORKS
+    from ventbench.training.trained import ALL
 
     if lung is not None and all_lungs:
         raise InputError("give --lung ID or --all, not both; neither trains all seven networks")
-    networks = (ALL,) if all_lungs else NETWORKS if lung is None else (scored_lung(lung).id,)
+    networks = (ALL,) if all_lungs else None if lung is None else (lung,)
     work = {"ppo": train_ppo, "dqn": train_dqn}[method]
     with bars() as shown:
         tasks: dict[str, Any] = {}

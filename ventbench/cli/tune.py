@@ -56,12 +56,11 @@ def pid(
     from rich.console import Console
 
     from ventbench.errors import InputError
-    from ventbench.lungs import LUNG_IDS, scored_lung
     from ventbench.training.pid_grid import RESULT, TABLE
 
     if (lung is not None) + every + robust != 1:
         raise InputError("give exactly one of --lung LUNG, --all and --robust")
-    names = (scored_lung(lung).id,) if lung is not None else LUNG_IDS
+    names = None if lung is None else (lung,)
     grid, result = _search(names, plant, out, workers, scheduler, not robust)
     written = [TABLE, RESULT, *_plot(out / PLOT, grid, not robust, lung is None)]
     emit(result, json)
@@ -72,7 +71,7 @@ def pid(
 
 
 def _search(
-    names: tuple[str, ...],
+    names: tuple[str, ...] | None,
     plant: str,
     out: Path,
     workers: int,

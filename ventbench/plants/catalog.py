@@ -485,8 +485,9 @@ def _trained(path: Path) -> Simulators:
     """Simulators of a folder; they are the official ones if its manifest is theirs."""
     loaded = frozen.load(path=path)
     official = loaded.manifest_sha256 == files.sha256(frozen.folder() / frozen.MANIFEST)
+    lungs = tuple(lung(name) for name in loaded.lung_ids)
     return Simulators(
-        "frozen", path.name, loaded.about(), LUNGS, loaded.manifest_sha256,
+        "frozen", path.name, loaded.about(), lungs, loaded.manifest_sha256,
         loaded if official else None, lambda: loaded.plants, loaded.for_breaths,
         loaded.cross_fitted, loaded,
     )  # fmt: skip

@@ -23,7 +23,7 @@ from ventbench import files
 from ventbench.data_files import data_path
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
-from ventbench.lungs import LUNG_IDS, LUNGS, RECORDED_LUNGS
+from ventbench.lungs import LUNGS, RECORDED_LUNGS
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.plant_files import load_plant
 from ventbench.plants.sessions import Sessions
@@ -82,17 +82,22 @@ class Frozen:
     seen: Seen
 
     @property
+    def lung_ids(self) -> tuple[str, ...]:
+        """Lungs of :attr:`plants` in their order: the six, or those of other recordings."""
+        return tuple(self.manifest["lungs"])
+
+    @property
     def _references(self) -> NDArray[np.int64]:
-        return np.array([self.manifest["lungs"][name]["session"] for name in LUNG_IDS])
+        return np.array([about["session"] for about in self.manifest["lungs"].values()])
 
     @property
     def rigs(self) -> tuple[tuple[int, ...], ...]:
-        """Sessions that are scored, for each lung in the order of ``LUNGS``.
+        """Sessions that are scored, for each of :attr:`lung_ids`, for the six those of ``LUNGS``.
 
         They passed the test of their label. The first is the lung's reference rig, whose plant is
         in :attr:`plants`. Version 1 scores that one only.
         """
-        lungs = [self.manifest["lungs"][name] for name in LUNG_IDS]
+        lungs = self.manifest["lungs"].values()
         return tuple(tuple(about.get("rigs", [about["session"]])) for about in lungs)
 
     @property
@@ -101,7 +106,7 @@ class Frozen:
 
         None where too few sessions passed to spare one, and in version 1.
         """
-        return tuple(self.manifest["lungs"][name].get("held_out_rig") for name in LUNG_IDS)
+        return tuple(about.get("held_out_rig") for about in self.manifest["lungs"].values())
 
     @property
     def training_rigs(self) -> tuple[tuple[int, ...], ...]:
@@ -122,13 +127,13 @@ class Frozen:
 
     @property
     def plants(self) -> Hybrid:
-        """The six simulators, leaves ``(6, ...)`` in the order of ``LUNGS``."""
+        """The simulators of :attr:`lung_ids`, for the six leaves ``(6, ...)`` as in ``LUNGS``."""
         at = self._references
         return jax.tree.map(lambda leaf: leaf[0, at], self.members)
 
     @property
     def ensemble(self) -> Hybrid:
-        """All members of the six, leaves ``(members, 6, ...)``; the first are :attr:`plants`."""
+        """All members, leaves ``(members, 6, ...)``; the first are :attr:`plants`."""
         at = self._references
         return jax.tree.map(lambda leaf: leaf[:, at], self.members)
 
@@ -164,8 +169,8 @@ class Frozen:
         return jax.tree.map(lambda leaf: jnp.asarray(leaf[member, at]), self.members)
 
     def lungs(self) -> dict[str, dict[str, Any]]:
-        """Settings and held-out errors of the six lungs, by id."""
-        return {name: dict(self.manifest["lungs"][name]) for name in LUNG_IDS}
+        """Settings and held-out errors of the lungs, by id."""
+        return {name: dict(about) for name, about in self.manifest["lungs"].items()}
 
     def about(self) -> dict[str, Any]:
         """Version and hashes that a score states of its simulators."""

@@ -52,6 +52,7 @@ class HybridState:
         plays: position of each play, %, one array a play.
         u_in: last command, %.
         peep: end-expiratory pressure, cmH2O.
+        outlet: opening of the expiratory valve, 0..1; None where it closes at once.
     """
 
     elastic: Array
@@ -64,6 +65,7 @@ class HybridState:
     plays: tuple[Array, ...]
     u_in: Array
     peep: Array
+    outlet: Array | None = None
 
 
 @flax.struct.dataclass
@@ -89,6 +91,8 @@ class Hybrid:
         opening_delay: delay of the expiratory valve when it opens, s.
         closing_delay: delay of the expiratory valve when it closes, s.
         rest: command that held the flow before the first sample, %.
+        closing_lag: time constant with which the expiratory valve closes after its delay, s; None
+            for a valve that closes at once, as in version 1.
     """
 
     R: Array
@@ -109,6 +113,7 @@ class Hybrid:
     opening_delay: Array
     closing_delay: Array
     rest: Array
+    closing_lag: Array | None = None
 
     def valve(self, u_in: Array) -> Array:
         """Flow that a steady command gives, L/s: monotone in ``u_in``, %."""
@@ -147,6 +152,7 @@ class Hybrid:
             plays=tuple(rest for _ in PLAYS),
             u_in=rest,
             peep=pressure if peep is None else peep + zero,
+            outlet=None if self.closing_lag is None else zero + 1.0,
         )
 
     def step(
@@ -170,6 +176,7 @@ class Hybrid:
         conductance = u_out * self.conductance + (1.0 - u_out) * self.closing_conductance
         behind = state.peep - self.valve(self.rest + jnp.zeros_like(u_in)) / conductance
         elastic, drop, sensor, flow = state.elastic, state.drop, state.sensor, state.flow
+        opening = state.outlet
         h = dt / SUBSTEPS
         lag, smooth = jnp.exp(-h / self.valve_lag), jnp.exp(-h / self.sensor_lag)
         open_or_close = u_out * self.opening_delay + (1.0 - u_out) * self.closing_delay
@@ -179,7 +186,12 @@ class Hybrid:
             inflow = wanted + (flow - wanted) * self.valve_lag / h * (1.0 - lag)  # mean over h
             flow = wanted + (flow - wanted) * lag
             held = window_weights(k * h - open_or_close, h, state.past)
-            outlet = conductance * jnp.sum(held * opened, axis=-1)
+            wide = jnp.sum(held * opened, axis=-1)
+            if self.closing_lag is not None:
+                # It opens with a spring and closes against the pressure.
+                wide = jnp.maximum(wide, opening * jnp.exp(-h / self.closing_lag))
+                opening = wide
+            outlet = conductance * wide
             elastic, drop, pressure = self._fill(elastic, drop, inflow, outlet, behind, h)
             sensor = pressure + (sensor - pressure) * smooth
         change = (u_in - state.u_in) / DIRECTION_WIDTH
@@ -189,7 +201,7 @@ class Hybrid:
         )
         after = HybridState(
             elastic, drop, sensor, flow, commanded[..., :-1], opened[..., :-1],
-            _push(dt + 0.0 * drop, state.past)[..., :-1], plays, u_in, state.peep,
+            _push(dt + 0.0 * drop, state.past)[..., :-1], plays, u_in, state.peep, opening,
         )  # fmt: skip
         return after, reading
 

@@ -30,7 +30,6 @@ from ventbench.environment import Scenario, nominal_scenario
 from ventbench.errors import InputError
 from ventbench.executor import InProcess, executor, results
 from ventbench.interfaces import Plant
-from ventbench.lungs import LUNG_IDS, scored_lung
 from ventbench.plants.catalog import Given, load_simulators
 from ventbench.resume import ARRAY, WorkFolder, fingerprint
 
@@ -201,7 +200,7 @@ def load_grid(path: Path) -> PIDGrid:
 
 
 def tune_pid(
-    lungs: Sequence[str] = LUNG_IDS,
+    lungs: Sequence[str] | None = None,
     out: Path | str | None = None,
     *,
     gains: ArrayLike | None = None,
@@ -215,7 +214,7 @@ def tune_pid(
     """Run every PID of a grid on simulators without noise, and name the best gains.
 
     Args:
-        lungs: ids.
+        lungs: ids; all lungs of the simulators if not given.
         out: folder for ``grid.parquet``, the whole grid, and ``best.json``, the result; parts of an
             interrupted search lie there too, and the same call continues from them. Nothing is
             written if not given.
@@ -242,8 +241,8 @@ def tune_pid(
         >>> grid.best("R20C50")[0]
         (2.0, 4.0, 0.0)
     """
-    names = tuple(scored_lung(name).id for name in lungs)
     simulators = load_simulators(simulator)
+    names = tuple(entry.id for entry in simulators.lungs) if lungs is None else tuple(lungs)
     plants = {name: simulators.plant(name) for name in names}
     parts = None if out is None else Path(out) / PARTS
     with executor(workers, scheduler) as pool:

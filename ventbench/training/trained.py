@@ -11,10 +11,10 @@ import pandas as pd
 
 from ventbench.errors import InputError
 from ventbench.interfaces import Controller
-from ventbench.lungs import LUNG_IDS, scored_lung
+from ventbench.lungs import LUNG_IDS, lung, scored_lung
 from ventbench.plants.catalog import Given, Simulators, load_simulators
 
-#: Name of the network that serves all six lungs and is not told which one it ventilates.
+#: Name of the network that serves all lungs and is not told which one it ventilates.
 ALL = "all"
 
 #: Names of the networks that a training makes if not told otherwise: one a lung, and one for all.
@@ -44,26 +44,40 @@ class TrainedControllers:
         return self.to_frame().to_html()
 
 
-def check_names(names: Sequence[str]) -> tuple[str, ...]:
+def check_names(names: Sequence[str] | None, simulators: Simulators) -> tuple[str, ...]:
     """Return the names of networks to train, as lung ids or :data:`ALL`.
 
+    Args:
+        names: ids of lungs or :data:`ALL`; a network for every lung of the simulators if not given.
+        simulators: to train on.
+
     Raises:
-        InputError: if a name is neither.
+        InputError: if a name is neither, or there are no simulators of a lung.
     """
-    return tuple(name if name == ALL else scored_lung(name).id for name in names)
+    known = tuple(entry.id for entry in simulators.lungs)
+    if names is None:
+        return known
+    for name in names:
+        if name == ALL or lung(name).id in known:
+            continue
+        if known == LUNG_IDS:
+            scored_lung(name)
+        raise InputError(
+            f"the simulators {simulators.name} have no lung {name}; they have {', '.join(known)}"
+        )
+    return tuple(name if name == ALL else lung(name).id for name in names)
 
 
 def simulators_to_train_on(simulator: Given) -> Simulators:
-    """Return simulators of the six scored lungs.
+    """Return simulators with plants, of the six scored lungs or of any others.
 
     Raises:
-        InputError: if there are no such simulators, or none of one of the six lungs.
+        InputError: if there are no such simulators, or they have no plants.
     """
     simulators = load_simulators(simulator)
-    names = tuple(lung.id for lung in simulators.lungs)
-    if names != LUNG_IDS:
+    if not simulators.lungs:
         raise InputError(
-            f"training needs plants of {', '.join(LUNG_IDS)} in this order; the simulators "
-            f"{simulators.name} have {', '.join(names) or 'none'}"
+            f"training needs simulators with plants; {simulators.name} has none: give the official "
+            "ones, a plant file or a folder that `ventbench train simulator` wrote"
         )
     return simulators

@@ -37,10 +37,10 @@ def test_what_cannot_be_trained(arguments, said, tmp_path):
 
 
 def test_networks_of_one_lung_and_of_all_are_trained_apart():
-    one, everything = _groups(NETWORKS)
+    one, everything = _groups(NETWORKS, 6)
     assert (one.names, one.lungs) == (LUNG_IDS, 1)
     assert (everything.names, everything.lungs) == (("all",), 6)
-    assert _groups(["R5C10"]) == [_groups(["R5C10", "all"])[0]]
+    assert _groups(["R5C10"], 6) == [_groups(["R5C10", "all"], 6)[0]]
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import flax.struct
 import jax.numpy as jnp
 import numpy as np
@@ -9,10 +11,10 @@ from jax import Array
 from numpy.typing import NDArray
 
 from ventbench.errors import InputError
-from ventbench.lungs import RECORDED_LUNGS
+from ventbench.lungs import RECORDED_LUNGS, Lung
 from ventbench.plants.sessions import Sessions
 from ventbench.recordings.breaths import Breaths
-from ventbench.training.hybrid.parameters import SESSION_ROOM, Groups
+from ventbench.training.hybrid.parameters import Groups
 
 #: Samples of an inspiration that are used; the longest in the recordings has 32.
 SAMPLES = 33
@@ -20,17 +22,17 @@ SAMPLES = 33
 
 @flax.struct.dataclass
 class InspirationData:
-    """n inspirations, float64; samples after the inspiration do not count.
+    """n inspirations of S samples, float64; samples after the inspiration do not count.
 
     Attributes:
         groups: setting, kind of rig and session.
         start: first pressure, cmH2O, ``(n,)``; 0 where unknown.
         start_known: whether it was measured, ``(n,)``.
-        u_in: commands, %, ``(n, SAMPLES - 1)``.
-        dt: time for which each command is held, s, ``(n, SAMPLES - 1)``.
-        pressure: pressure at the end of each command, cmH2O, ``(n, SAMPLES - 1)``; 0 where it has
+        u_in: commands, %, ``(n, S - 1)``.
+        dt: time for which each command is held, s, ``(n, S - 1)``.
+        pressure: pressure at the end of each command, cmH2O, ``(n, S - 1)``; 0 where it has
             no weight.
-        share: weight of each pressure in the mean of its breath, ``(n, SAMPLES - 1)``; the weights
+        share: weight of each pressure in the mean of its breath, ``(n, S - 1)``; the weights
             of a breath add up to one.
     """
 
@@ -43,30 +45,41 @@ class InspirationData:
     share: Array
 
 
-def groups_of(breaths: Breaths, sessions: Sessions) -> Groups:
-    """Setting, kind of rig and session of each breath.
+def groups_of(
+    breaths: Breaths, sessions: Sessions, labels: Sequence[Lung] = RECORDED_LUNGS
+) -> Groups:
+    """Setting, kind of rig and session of each breath; settings are numbered as in ``labels``.
 
     Raises:
-        InputError: a lung was never recorded, or there are too many sessions.
+        InputError: a lung was never recorded.
     """
-    if len(sessions) > SESSION_ROOM:
-        raise InputError(f"{len(sessions)} sessions are more than the {SESSION_ROOM} there can be")
     session = sessions.assign(breaths)
-    ids = [lung.id for lung in RECORDED_LUNGS]
+    ids = [lung.id for lung in labels]
     lung = np.array([ids.index(name) for name in breaths.lung_ids.tolist()], np.int64)
     return Groups(jnp.asarray(lung), jnp.asarray(sessions.rigs()[session]), jnp.asarray(session))
 
 
-def groups_of_sessions(sessions: Sessions) -> Groups:
+def groups_of_sessions(sessions: Sessions, labels: Sequence[Lung] = RECORDED_LUNGS) -> Groups:
     """Groups of one breath of each session, to build the sessions' plants."""
-    ids = [lung.id for lung in RECORDED_LUNGS]
+    ids = [lung.id for lung in labels]
     lung = np.array([ids.index(session.lung) for session in sessions.table])
     index = np.arange(len(sessions))
     return Groups(jnp.asarray(lung), jnp.asarray(sessions.rigs()), jnp.asarray(index))
 
 
-def inspirations(breaths: Breaths, sessions: Sessions) -> InspirationData:
+def inspirations(
+    breaths: Breaths,
+    sessions: Sessions,
+    labels: Sequence[Lung] = RECORDED_LUNGS,
+    samples: int = SAMPLES,
+) -> InspirationData:
     """Arrange breaths for the fit; the pressure of each inspiratory sample but the first counts.
+
+    Args:
+        breaths: n breaths.
+        sessions: sessions by whose sampling times breaths belong together.
+        labels: the settings, as they are numbered.
+        samples: samples of an inspiration that are used.
 
     Raises:
         InputError: as :func:`groups_of`, or a breath has no pressure to learn from, or too few
@@ -76,23 +89,23 @@ def inspirations(breaths: Breaths, sessions: Sessions) -> InspirationData:
         raise InputError("breaths of one sample hold nothing to learn")
     counted = breaths.inspiratory & np.isfinite(breaths.pressure)
     counted[:, 0] = False
-    counted = _first(counted, False)[:, 1:]
+    counted = _first(counted, False, samples)[:, 1:]
     total = counted.sum(axis=1, keepdims=True)
     if not total.all():
         number = int(np.flatnonzero(total == 0)[0])
         raise InputError(f"breath {breaths.breath_id[number]} has no inspiratory pressure to fit")
     start = breaths.pressure[:, 0]
-    pressure = _first(breaths.pressure, np.nan)[:, 1:]
+    pressure = _first(breaths.pressure, np.nan, samples)[:, 1:]
     arrays = {
         "start": np.nan_to_num(start),
         "start_known": np.isfinite(start) * 1.0,
-        "u_in": _first(breaths.u_in, 0.0)[:, :-1],
-        "dt": _first(breaths.dt, 0.03)[:, :-1],
+        "u_in": _first(breaths.u_in, 0.0, samples)[:, :-1],
+        "dt": _first(breaths.dt, 0.03, samples)[:, :-1],
         "pressure": np.where(counted, pressure, 0.0),
         "share": counted / total,
     }
     return InspirationData(
-        groups_of(breaths, sessions),
+        groups_of(breaths, sessions, labels),
         **{name: jnp.asarray(value, float) for name, value in arrays.items()},
     )
 
@@ -119,7 +132,9 @@ class WholeBreaths:
     share: Array
 
 
-def whole_breaths(breaths: Breaths, sessions: Sessions) -> WholeBreaths:
+def whole_breaths(
+    breaths: Breaths, sessions: Sessions, labels: Sequence[Lung] = RECORDED_LUNGS
+) -> WholeBreaths:
     """Arrange whole breaths; a breath without a first pressure or an expiration has no weight."""
     known = breaths.valid & np.isfinite(breaths.pressure)
     opened = known & (breaths.u_out == 1)
@@ -129,12 +144,12 @@ def whole_breaths(breaths: Breaths, sessions: Sessions) -> WholeBreaths:
         share += usable * part / np.maximum(part.sum(axis=1, keepdims=True), 1)
     arrays = (np.nan_to_num(breaths.pressure), breaths.u_in, breaths.u_out, breaths.dt, share)
     return WholeBreaths(
-        groups_of(breaths, sessions), *(jnp.asarray(array, float) for array in arrays)
+        groups_of(breaths, sessions, labels), *(jnp.asarray(array, float) for array in arrays)
     )
 
 
-def _first(values: NDArray, fill: float) -> NDArray:
-    """The first samples, padded to SAMPLES."""
-    missing = max(0, SAMPLES - values.shape[1])
+def _first(values: NDArray, fill: float, samples: int) -> NDArray:
+    """The first samples, padded to ``samples``."""
+    missing = max(0, samples - values.shape[1])
     padded = np.pad(values, ((0, 0), (0, missing)), constant_values=fill)
-    return padded[:, :SAMPLES]
+    return padded[:, :samples]

@@ -20,6 +20,7 @@ import optax
 from jax import Array
 from numpy.typing import NDArray
 
+from ventbench.errors import InputError
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.sessions import Sessions
 from ventbench.recordings import Breaths, join
@@ -31,7 +32,13 @@ from ventbench.training.hybrid.data import (
     inspirations,
     whole_breaths,
 )
-from ventbench.training.hybrid.parameters import Pooled, initial, penalty, plants
+from ventbench.training.hybrid.parameters import (
+    SESSION_ROOM,
+    Pooled,
+    initial,
+    penalty,
+    plants,
+)
 
 #: Iterations compiled into one scan; progress and Ctrl-C fall between two of them.
 CHUNK = 20
@@ -252,8 +259,11 @@ def training_set(
         config: gives the weights.
 
     Raises:
-        InputError: as :func:`~ventbench.training.hybrid.data.inspirations`.
+        InputError: as :func:`~ventbench.training.hybrid.data.inspirations`, or there are too many
+            sessions.
     """
+    if len(sessions) > SESSION_ROOM:
+        raise InputError(f"{len(sessions)} sessions are more than the {SESSION_ROOM} there can be")
     breaths = join([measured, reconstructed])
     weight = np.append(np.ones(len(measured)), np.full(len(reconstructed), config.reconstructed))
     return TrainingSet(

@@ -66,6 +66,8 @@ class Pooled:
         session_offset: deviation that is added to the offset, cmH2O, no logarithm, ``(J,)``.
         session_conductance: deviation that is added to the conductance, ``(J,)``.
         session_closing_conductance: deviation that is added to the closing conductance, ``(J,)``.
+        closing_lag: time constant with which the expiratory valve closes, s, ``(G,)``; None for one
+            that closes at once, as in version 1 of the simulators.
     """
 
     slopes: Array
@@ -94,6 +96,7 @@ class Pooled:
     session_offset: Array
     session_conductance: Array
     session_closing_conductance: Array
+    closing_lag: Array | None = None
 
 
 def initial() -> Pooled:
@@ -190,6 +193,7 @@ def plants(pooled: Pooled, groups: Groups, *, directed: bool = True) -> Hybrid:
         opening_delay=jnp.exp(pooled.opening_delay[rig]),
         closing_delay=jnp.exp(pooled.closing_delay[rig]),
         rest=jnp.exp(pooled.rest) + jnp.zeros_like(laminar),
+        closing_lag=None if pooled.closing_lag is None else jnp.exp(pooled.closing_lag[rig]),
     )
 
 

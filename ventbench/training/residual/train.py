@@ -17,7 +17,6 @@ from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import save_weights
 from ventbench.environment import nominal_scenario
 from ventbench.interfaces import Controller, Plant
-from ventbench.lungs import LUNG_IDS
 from ventbench.metrics.score import run_error
 from ventbench.plants.catalog import Given
 from ventbench.plants.stacking import take
@@ -33,7 +32,7 @@ Progress = Callable[[str, tuple[int, int, float] | None], None]
 
 
 def train_residual(
-    networks: Sequence[str] = LUNG_IDS,
+    networks: Sequence[str] | None = None,
     out: Path | str = "runs/residual",
     *,
     config: ResidualConfig | None = None,
@@ -53,14 +52,15 @@ def train_residual(
         trained.report["networks"]["R20C50"]["error"]  # cmH2O, by lung
 
     Args:
-        networks: ids of lungs, a network each, or ``"all"`` for one network that serves all six.
+        networks: ids of lungs, a network each, or ``"all"`` for one network that serves all; a
+            network for each lung of the simulators if not given.
         out: folder.
         config: settings of the training.
         seed: seed of the weights and the random deviations, common to all networks.
         gains: grid of P, I, D, %/cmH2O, shape ``(G, 3)``, of which each network corrects the best
             PID; the paper's grid if not given.
-        simulator: simulators with plants of the six lungs to train through, see
-            :func:`ventbench.load_simulators`; all members of the ensemble if there is one.
+        simulator: simulators with plants to train through, see :func:`ventbench.load_simulators`;
+            all members of the ensemble if there is one.
         progress: see :data:`Progress`.
 
     Returns:
@@ -71,19 +71,19 @@ def train_residual(
             training with other settings.
         FloatingPointError: if a training diverges.
     """
-    names, out = check_names(networks), Path(out)
-    simulators = simulators_to_train_on(simulator)
+    simulators, out = simulators_to_train_on(simulator), Path(out)
+    names, known = check_names(networks, simulators), [entry.id for entry in simulators.lungs]
     config, progress = config or ResidualConfig(), progress or (lambda what, how_far: None)
     progress("PID grid", None)
     ensemble = simulators.ensemble
     official = jax.tree.map(lambda leaf: np.asarray(leaf)[0], ensemble)
-    lungs = {name: take(official, index) for index, name in enumerate(LUNG_IDS)}
+    lungs = {name: take(official, index) for index, name in enumerate(known)}
     wanted = lungs if ALL in names else {name: lungs[name] for name in names}
     grid = search(wanted, settings=simulators.about, gains=gains)
     controllers, about = {}, {}
     for name in names:
         best, _ = grid.best(None if name == ALL else name)
-        where = list(range(len(LUNG_IDS))) if name == ALL else [LUNG_IDS.index(name)]
+        where = list(range(len(known))) if name == ALL else [known.index(name)]
         plants = jax.tree.map(lambda leaf, where=where: np.asarray(leaf)[:, where], ensemble)
         started = time.perf_counter()
         with precision.float32():
@@ -128,8 +128,7 @@ def _errors(
     with precision.float64():
         cells = nominal_scenario(np.array(protocol.PIPS))
         wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), controller)
-        for index in where:
-            name = LUNG_IDS[index]
+        for name in [list(lungs)[index] for index in where]:
             plant = jax.tree.map(jnp.asarray, lungs[name])
             inspirations, _ = rollouts.closed_loop(plant, wide, cells)
             error = run_error(inspirations.pressure, np.asarray(cells.pip)[:, None, None])

@@ -16,7 +16,6 @@ from ventbench import files, precision
 from ventbench.controllers import rl_policy
 from ventbench.controllers.pid import PID
 from ventbench.errors import InputError
-from ventbench.lungs import LUNG_IDS
 from ventbench.plants.catalog import Given
 from ventbench.resume import fingerprint
 from ventbench.training.rl import episodes
@@ -26,7 +25,6 @@ from ventbench.training.rl.policy_gradient import PolicyGradient
 from ventbench.training.rl.ppo import PPO
 from ventbench.training.trained import (
     ALL,
-    NETWORKS,
     TrainedControllers,
     check_names,
     simulators_to_train_on,
@@ -52,7 +50,7 @@ Progress = Callable[[str, float, float], None]
 
 
 def train_ppo(
-    networks: Sequence[str] = NETWORKS,
+    networks: Sequence[str] | None = None,
     out: Path | str = "runs/ppo",
     *,
     seeds: Sequence[int] = (0, 1),
@@ -73,13 +71,14 @@ def train_ppo(
         trained.report["networks"]["R20C50"]["error_fresh"]  # cmH2O, by seed
 
     Args:
-        networks: ids of lungs, a network each, or ``"all"`` for one network that serves all six.
+        networks: ids of lungs, a network each, or ``"all"`` for one network that serves all; if not
+            given, a network for each lung of the simulators and one for all of several.
         out: folder; checkpoints lie there until all is done.
         seeds: seeds of the trainings of each network.
         steps: control steps of experience of each training; those of the method if not given.
         method: settings of every training; the published ones, which differ for one lung and for
             all six, if not given.
-        simulator: simulators with plants of the six lungs, see :func:`ventbench.load_simulators`.
+        simulator: simulators with plants, see :func:`ventbench.load_simulators`.
         progress: see :data:`Progress`.
 
     Returns:
@@ -94,7 +93,7 @@ def train_ppo(
 
 
 def train_dqn(
-    networks: Sequence[str] = NETWORKS,
+    networks: Sequence[str] | None = None,
     out: Path | str = "runs/dqn",
     *,
     seeds: Sequence[int] = (0, 1),
@@ -150,30 +149,34 @@ class _Group:
     lungs: int
 
 
-def _groups(names: Sequence[str]) -> list[_Group]:
-    """Split networks to train into those of one lung and that of all six."""
+def _groups(names: Sequence[str], lungs: int) -> list[_Group]:
+    """Split networks to train into those of one lung and that of all lungs."""
     single = tuple(name for name in names if name != ALL)
     groups = [_Group(single, 1)] if single else []
-    return [*groups, _Group((ALL,), len(LUNG_IDS))] if ALL in names else groups
+    return [*groups, _Group((ALL,), lungs)] if ALL in names else groups
 
 
 def _train(
-    name: str, networks: Sequence[str], out: Path | str, seeds: Sequence[int], steps: int | None,
-    method: Method | None, simulator: Given, progress: Progress | None,
+    name: str, networks: Sequence[str] | None, out: Path | str, seeds: Sequence[int],
+    steps: int | None, method: Method | None, simulator: Given, progress: Progress | None,
 ) -> TrainedControllers:  # fmt: skip
     began = time.perf_counter()
-    groups, out = _groups(check_names(networks)), Path(out)
+    simulators, out = simulators_to_train_on(simulator), Path(out)
+    known = [entry.id for entry in simulators.lungs]
+    names = check_names(networks, simulators)
+    if networks is None and len(known) > 1:
+        names = (*names, ALL)
+    groups = _groups(names, len(known))
     methods = [
         method_for(name, group.lungs, steps) if method is None else _shortened(method, name, steps)
         for group in groups
     ]
-    simulators, report = simulators_to_train_on(simulator), progress or (lambda *_: None)
+    report = progress or (lambda *_: None)
     policies, about, checkpoints, used = {}, {}, [], {}
     for group, settings in zip(groups, methods, strict=True):
-        label = ALL if group.lungs > 1 else ", ".join(group.names)
-        kind = "all" if group.lungs > 1 else "one"
+        label, kind = ", ".join(group.names), "all" if ALL in group.names else "one"
         checkpoints.append(out / f".{name}-{kind}.npz")
-        plants = _plants(simulators.stacked, group, len(seeds))
+        plants = _plants(simulators.stacked, known, group, len(seeds))
         trained = train(
             settings,
             plants,
@@ -204,11 +207,11 @@ def _train(
     return TrainedControllers(policies, result, out)
 
 
-def _plants(plants: Any, group: _Group, seeds: int) -> Any:
+def _plants(plants: Any, known: Sequence[str], group: _Group, seeds: int) -> Any:
     """Leaves ``(R, lungs, ...)``: the seeds of a network in a row."""
-    if group.lungs > 1:
+    if ALL in group.names:
         return jax.tree.map(lambda leaf: np.repeat(leaf[None], seeds, axis=0), plants)
-    index = np.repeat([LUNG_IDS.index(name) for name in group.names], seeds)
+    index = np.repeat([known.index(name) for name in group.names], seeds)
     return jax.tree.map(lambda leaf: leaf[index][:, None], plants)
 
 

@@ -1,0 +1,1 @@
+"""Simulators of rigs: a hierarchical fit to recordings of many ventilators and lungs."""

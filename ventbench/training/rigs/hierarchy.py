@@ -1,0 +1,227 @@
+"""What rigs share: the prior of the hierarchical fit.
+
+A *rig* is one session of the recordings: a ventilator with a lung that somebody set up. Its
+parameters are those of its lung plus those of its valve plus a deviation of its own. The deviation
+is shrunk towards zero, the less so the more was recorded. Its prior has heavy tails (Student's t
+with :data:`TAIL` degrees of freedom), so that a rig that is not what its label says moves away
+alone and does not pull its lung with it.
+
+Lungs with the same labelled resistance share a resistor, lungs with the same labelled compliance a
+spring. All valves are of one type, whose flow at 100 % the data sheet states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ventbench.lungs import Lung
+from ventbench.plants.hybrid import ELASTIC_KNOTS, PLAYS, VALVE_KNOTS
+from ventbench.training.hybrid.parameters import RIG_COUNT, Pooled, direction
+
+#: Flow of the inspiratory valve at 100 %, L/s: data sheet of the SMC PVQ31.
+SHEET_FLOW = 2.28
+
+#: Degrees of freedom of the rigs' deviations.
+TAIL = 3.0
+
+#: Part of the labelled resistance that is laminar; a QuickLung's label holds at one flow only.
+LAMINAR_SHARE = 0.4
+
+#: Command at which the flow of the data sheet holds, %.
+FULL_OPENING = 100.0
+
+
+@flax.struct.dataclass
+class Scales:
+    """Standard deviations of the prior; of logarithms unless a unit is named.
+
+    Those of rigs are the spread of the public recordings' rigs that are what their label says.
+
+    Attributes:
+        sheet: flow at 100 % around the data sheet.
+        smoothness: difference between neighbouring slopes of the valve's curve.
+        valve_rig: what a kind of valve adds to the slopes.
+        smoothness_rig: difference between neighbouring additions of a kind of valve.
+        compliance: compliance of a lung around its label.
+        resistance: both resistances of a lung around their label.
+        spring: elastances of lungs of one labelled compliance around their mean, relative to label.
+        resistor: resistances of lungs of one labelled resistance around their mean.
+        stiffening: change of the elastic curve's slope at a knot.
+        offset: elastic recoil minus pressure at rest, of a lung, cmH2O.
+        kind: delays, lags, circuit and expiratory valve of a kind of rig.
+        direction: weights of the plays, no logarithm.
+        reading: shift of the reading by the direction of the command, cmH2O.
+        rig_gain: gain of the valve of a rig.
+        rig_resistance: both resistances of a rig.
+        rig_quadratic: further deviation of a rig's quadratic resistance.
+        rig_elastance: elastance of a rig.
+        rig_offset: offset of a rig, cmH2O.
+        rig_expiration: conductances of a rig's expiratory valve.
+    """
+
+    sheet: float = 0.25
+    smoothness: float = 0.5
+    valve_rig: float = 0.2
+    smoothness_rig: float = 0.15
+    compliance: float = 0.1
+    resistance: float = 0.5
+    spring: float = 0.1
+    resistor: float = 0.2
+    stiffening: float = 0.3
+    offset: float = 1.0
+    kind: float = 1.0
+    direction: float = 0.2
+    reading: float = 0.5
+    rig_gain: float = 0.05
+    rig_resistance: float = 0.1
+    rig_quadratic: float = 0.15
+    rig_elastance: float = 0.06
+    rig_offset: float = 0.3
+    rig_expiration: float = 0.3
+
+
+#: Scale of each field that has one of its own around its centre. ``None`` marks heavy tails.
+_GAUSSIAN = {
+    "slopes_rig": "valve_rig",
+    "R": "resistance",
+    "K2": "resistance",
+    "E": "compliance",
+    "stiffening": "stiffening",
+    "offset": "offset",
+    "valve_delay": "kind",
+    "valve_lag": "kind",
+    "sensor_lag": "kind",
+    "closing_delay": "kind",
+    "closing_lag": "kind",
+    "opening_delay": "kind",
+    "circuit_compliance": "kind",
+    "conductance": "kind",
+    "closing_conductance": "kind",
+    "rest": "kind",
+}
+_HEAVY_TAILED = {
+    "session_gain": "rig_gain",
+    "session_R": "rig_resistance",
+    "session_K2": "rig_quadratic",
+    "session_E": "rig_elastance",
+    "session_offset": "rig_offset",
+    "session_conductance": "rig_expiration",
+    "session_closing_conductance": "rig_expiration",
+}
+
+
+@flax.struct.dataclass
+class Centre:
+    """Centre of the prior, at which a fit starts.
+
+    Attributes:
+        pooled: the parameters.
+        sheet_flow: logarithm of the flow at 100 %, L/s, ``()``.
+        same_resistor: share of each lung in the mean of those with its labelled resistance,
+            ``(L, L)``.
+        same_spring: the same for labelled compliances, ``(L, L)``.
+    """
+
+    pooled: Pooled
+    sheet_flow: Array
+    same_resistor: Array
+    same_spring: Array
+
+
+def centre(labels: Sequence[Lung], sessions: int) -> Centre:
+    """Labels, the data sheet, and orders of magnitude of the rest.
+
+    Args:
+        labels: the L lungs.
+        sessions: number of rigs, J.
+    """
+    resistance = np.array([lung.R for lung in labels])
+    compliance = np.array([lung.C for lung in labels])
+    knots = len(VALVE_KNOTS)
+
+    def kind(value: float) -> np.ndarray:
+        return np.full(RIG_COUNT, np.log(value))
+
+    def same(value: np.ndarray) -> Array:
+        equal = value[:, None] == value
+        return jnp.asarray(equal / equal.sum(axis=1, keepdims=True))
+
+    rig = np.zeros(sessions)
+    pooled = Pooled(
+        slopes=np.full(knots, np.log(SHEET_FLOW / FULL_OPENING)),
+        slopes_rig=np.zeros((RIG_COUNT, knots)),
+        R=np.log(LAMINAR_SHARE * resistance),
+        K2=np.log((1.0 - LAMINAR_SHARE) * resistance),
+        E=np.log(1000.0 / compliance),
+        stiffening=np.zeros((len(labels), len(ELASTIC_KNOTS))),
+        offset=np.zeros(len(labels)),
+        direction=np.full((RIG_COUNT, len(PLAYS)), np.log(0.03)),
+        rising=kind(0.05),
+        falling=kind(0.05),
+        valve_delay=kind(0.02),
+        valve_lag=kind(0.01),
+        sensor_lag=kind(0.01),
+        closing_delay=kind(0.03),
+        opening_delay=kind(0.05),
+        circuit_compliance=kind(0.0008),
+        conductance=kind(0.2),
+        closing_conductance=kind(0.2),
+        rest=np.log(5.0),
+        session_gain=rig,
+        session_R=rig,
+        session_K2=rig,
+        session_E=rig,
+        session_offset=rig,
+        session_conductance=rig,
+        session_closing_conductance=rig,
+        closing_lag=kind(0.01),
+    )  # pyright: ignore[reportArgumentType]
+    pooled = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), pooled)
+    sheet = jnp.asarray(np.log(SHEET_FLOW))
+    return Centre(pooled, sheet, same(resistance), same(compliance))
+
+
+def full_flow(pooled: Pooled) -> Array:
+    """Logarithm of the flow of the common valve curve at 100 %, L/s, ``()``."""
+    widths = jnp.diff(jnp.append(jnp.asarray(VALVE_KNOTS), FULL_OPENING))
+    return jnp.log(jnp.sum(jnp.exp(pooled.slopes) * widths))
+
+
+def heavy_tailed(value: Array) -> Array:
+    """Negative logarithm of Student's t density, up to a constant, summed."""
+    return 0.5 * (TAIL + 1.0) * jnp.sum(jnp.log1p(value**2 / TAIL))
+
+
+def penalty(pooled: Pooled, around: Centre, scales: Scales) -> Array:
+    """Negative logarithm of the prior density, up to a constant."""
+
+    def apart(name: str) -> Array:
+        return getattr(pooled, name) - getattr(around.pooled, name)
+
+    def gaussian(value: Array, scale: float) -> Array:
+        return 0.5 * jnp.sum((value / scale) ** 2)
+
+    terms = [gaussian(apart(name), getattr(scales, scale)) for name, scale in _GAUSSIAN.items()]
+    terms += [
+        heavy_tailed(apart(name) / getattr(scales, scale)) for name, scale in _HEAVY_TAILED.items()
+    ]
+    for name in ("R", "K2"):
+        away = apart(name)
+        terms.append(gaussian(away - around.same_resistor @ away, scales.resistor))
+    away = apart("E")
+    terms += [
+        gaussian(away - around.same_spring @ away, scales.spring),
+        gaussian(full_flow(pooled) - around.sheet_flow, scales.sheet),
+        gaussian(jnp.diff(apart("slopes")), scales.smoothness),
+        gaussian(jnp.diff(apart("slopes_rig"), axis=-1), scales.smoothness_rig),
+        gaussian(direction(pooled), scales.direction),
+        gaussian(jnp.exp(pooled.rising), scales.reading),
+        gaussian(jnp.exp(pooled.falling), scales.reading),
+    ]
+    return sum(terms, start=jnp.zeros(()))

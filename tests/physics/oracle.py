@@ -45,12 +45,17 @@ def recoil(volume, C, m):
 class Breath:
     """Right-hand side; states: volume, valve, supply, stress, airway, flow, sensor, second lag."""
 
-    def __init__(self, R, C, m, R_ex, peep):
+    def __init__(self, R, C, m, R_ex, peep, stiffer):
+        self.stiffer = stiffer
         self.R, self.C, self.m, self.R_ex, self.peep = R, C, m, R_ex, peep
         self.K2 = self.get("turbulent_resistance", "quadratic")
         self.power = m.get("turbulent_resistance", {}).get("exponent", 2.0)
         self.tank = self.get("circuit_compliance", "compliance") / 1000
         self.mass = self.get("inertance", "inertance")
+        if self.mass:  # tubing that acts with the mass alone
+            self.tank += self.get("inertance", "tubing") / 1000 * self.mass / (self.mass + 0.003)
+        loss = self.get("supply_pressure", "loss")
+        self.source = 30 / (1 - (1 - loss) ** 2) if loss else np.inf
         self.lag, self.second = self.get("valve_lag", "tau"), self.get("valve_lag", "second")
         self.slow = self.get("sensor_lag", "tau")
         self.ratio, self.relax = self.get("viscoelasticity", "ratio"), 1.0
@@ -73,12 +78,18 @@ class Breath:
         return self.get("leak", "conductance") / 1000 * p / np.sqrt(np.hypot(p, 0.2))
 
     def balance(self, t, y, wanted, opened):
-        """Flow of the valve, flow into the lung, flow out, airway pressure."""
+        """Flow of the valve against the airway and against none, into the lung, out; pressures."""
         volume, valve, supply, stress, airway, flow, _, behind = y
         q = behind if self.second else valve if self.lag else wanted
         d = self.get("supply_droop", "drop")
         q = q / (1 + d / (1 - d) * supply / 0.5)
-        inside = recoil(volume, self.C, self.m) + stress - self.muscle(t)
+        through = q
+
+        def fed(p):
+            return through * np.sqrt(max(1 - p / self.source, 1e-9))
+
+        inside = recoil(volume, self.C, self.m) + self.stiffer * volume
+        inside += stress - self.muscle(t)
 
         def into(p):
             if self.mass:
@@ -99,17 +110,19 @@ class Breath:
             return opened * max(p - self.peep, 0.0) / self.R_ex
 
         if not self.tank:
-            airway = brentq(lambda p: q - self.lost(p) - out(p) - into(p), -2000, 3000, xtol=1e-11)
-        return q, into(airway), out(airway), airway, inside
+            airway = brentq(
+                lambda p: fed(p) - self.lost(p) - out(p) - into(p), -2000, 3000, xtol=1e-11
+            )
+        return fed(airway), q, into(airway), out(airway), airway, inside
 
     def slope(self, t, y, wanted, opened):
         _, valve, supply, stress, _, _, sensor, behind = y
-        q, flow, out, p, inside = self.balance(t, y, wanted, opened)
+        q, drawn, flow, out, p, inside = self.balance(t, y, wanted, opened)
         drop = self.R * flow + self.K2 * flow * abs(flow) ** (self.power - 1)
         return [
             flow,
             (wanted - valve) / self.lag if self.lag else 0.0,
-            (q - supply) / 1.0,
+            (drawn - supply) / 1.0,
             self.ratio / (self.C / 1000) * flow - stress / self.relax,
             (q - flow - out - self.lost(p)) / self.tank if self.tank else 0.0,
             (p - inside - drop) / self.mass if self.mass else 0.0,
@@ -124,8 +137,17 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
     fading = drifted.get("warming", 0.0)
     grown = (1 - np.exp(-fading * position)) / (1 - np.exp(-fading)) if fading else position
     drift = drifted.get("drift", 0.0) * grown
-    rig, p0 = Breath(R, C, m, R_ex, peep), start - drift
-    v0 = brentq(lambda v: recoil(v, C, m) - p0, -0.01, 0.0239 * C, xtol=1e-14)
+    bend = m.get("sensor_curve", {}).get("bend", 0.0)
+
+    def shown(p):
+        return p + 4 * bend * p / 40 * (1 - p / 40) + drift
+
+    R = R * (1 + m.get("resistance_drift", {}).get("change", 0.0) * position)
+    changed = C * (1 + m.get("compliance_drift", {}).get("change", 0.0) * position)
+    stiffer = 1000 / changed - 1000 / C  # of the linear part of the recoil
+    rig = Breath(R, C, m, R_ex, peep, stiffer)
+    p0 = brentq(lambda p: shown(p) - start, -20.0, 60.0, xtol=1e-13) if bend else start - drift
+    v0 = brentq(lambda v: recoil(v, C, m) + stiffer * v - p0, -0.01, 0.0239 * C, xtol=1e-14)
     times = np.concatenate([[0.0], np.cumsum(dt[:-1])])
     asked = [gain / 1000 * u for u in valve_positions(u_in, m)]
     late, late_out = rig.get("valve_delay", "delay"), rig.get("exhalation_valve_delay", "opening")
@@ -152,7 +174,7 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
         )
         y = found.y[:, -1]
         if np.any(np.abs(times - b) < 1e-12):
-            _, flow, _, p, _ = rig.balance(b, y, wanted, opened)
+            _, _, flow, _, p, _ = rig.balance(b, y, wanted, opened)
             reading = y[6] if rig.slow else p
-            rows.append((reading + drift, 1000 * flow, 1000 * (y[0] - v0)))
+            rows.append((shown(reading), 1000 * flow, 1000 * (y[0] - v0)))
     return np.array(rows).T

@@ -24,7 +24,8 @@ DOCS = Path(__file__).parents[2] / "docs/physics.md"
 NAMES = """
 valve_delay valve_lag valve_dead_band valve_curve valve_hysteresis command_rounding supply_droop
 leak circuit_compliance inertance turbulent_resistance nonlinear_compliance viscoelasticity
-sensor_lag sensor_drift exhalation_valve_delay patient_effort
+sensor_lag sensor_drift exhalation_valve_delay patient_effort supply_pressure compliance_drift
+resistance_drift sensor_curve
 """
 
 
@@ -79,7 +80,8 @@ def test_screening_strengths_are_possible(name):
 def test_special_cases_differ_between_the_terms_of_a_component():
     assert special_cases("sensor_memory") == ("sensor_lag",)
     assert special_cases("drift_shape") == ("sensor_drift",)
-    assert special_cases("sensor_shape") == special_cases("volume_resistance") == ()
+    assert special_cases("sensor_shape") == ("sensor_curve",)
+    assert special_cases("volume_resistance") == ()
     assert special_cases("flow_shape") == ("turbulent_resistance",)
     assert set(special_cases("command_memory")) == {
         "valve_delay", "valve_lag", "supply_droop", "valve_hysteresis",

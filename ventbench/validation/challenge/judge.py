@@ -31,9 +31,12 @@ PLACES: dict[str, frozenset[str]] = {
     "expiratory_valve_orifice": frozenset({"exhalation path"}),
 }
 
-#: Mechanisms whose equations equal those of an effect outside the library when only pressure is
-#: seen.
-EQUIVALENTS: dict[str, str] = {"second_compartment": "viscoelasticity"}
+#: Mechanisms whose equations equal those of an effect outside this generator's library, or do so
+#: when only pressure is seen.
+EQUIVALENTS: dict[str, str] = {
+    "second_compartment": "viscoelasticity",
+    "sensor_nonlinearity": "sensor_curve",
+}
 
 #: Power of (true gain / nominal gain) by which a parameter's value changes when a fit assumes the
 #: nominal gain: flows are scaled, pressures are not.

@@ -13,6 +13,7 @@ import numpy as np
 from ventbench.diagnosis import estimates, flow_drive
 from ventbench.diagnosis.conclusion import Conclusion
 from ventbench.diagnosis.corrected import Correction, correct
+from ventbench.diagnosis.detection_limits import detection_limits
 from ventbench.diagnosis.experiment_design import request_breaths
 from ventbench.diagnosis.findings import (
     BreathRequest,
@@ -201,6 +202,9 @@ def diagnose(
     unnamed = term is not None or conclusion.unresolved or (rejected and location)
     unnamed = unnamed or is_unexplained(open_loop, settings.correction)
     verdict: Verdict = "named" if missing else "unnamed" if unnamed else "nothing_missing"
+    limits: dict[str, float] = {}
+    if verdict == "nothing_missing":
+        limits = detection_limits(recording_model.evaluator, conclusion.named)
     return Diagnosis(
         verdict=verdict,
         mechanisms=tuple(
@@ -218,6 +222,7 @@ def diagnose(
         split=_ids(breaths, uses),
         chosen=correction.chosen,
         gain_scatter=conclusion.gain_sd,
+        detection_limits=limits,
         plants=correction.plants,
         simulator=_name(simulator, simulators),
         noise=(float(noise.sigma[0]), float(noise.ar[0])),

@@ -206,6 +206,8 @@ class Findings:
             refitted or corrected, whichever errs least on the judging breaths.
         gain_scatter: standard deviation of the logarithm of the breaths' valve gains; 0 if all
             breaths have the same gain.
+        detection_limits: if nothing is missing: smallest strength of each mechanism that would have
+            been seen, in the unit of the strength, by name; infinite if none would.
     """
 
     verdict: Verdict
@@ -226,3 +228,4 @@ class Findings:
     split: dict[str, tuple[int, ...]] = field(default_factory=dict)
     chosen: dict[str, Stage] = field(default_factory=dict)
     gain_scatter: float = 0.0
+    detection_limits: dict[str, float] = field(default_factory=dict)

@@ -42,7 +42,7 @@ def sentences(findings: Findings) -> list[str]:
     texts = [answer(findings), *map(missing_mechanism, findings.mechanisms)]
     texts += [effect(findings), *alternatives(findings), nonparametric_term(findings)]
     texts += [open_loop(findings), remaining(findings), *map(lung, findings.lungs)]
-    texts += [scatter(findings), request(findings), *findings.notes]
+    texts += [visible(findings), scatter(findings), request(findings), *findings.notes]
     return [text for text in texts if text]
 
 
@@ -115,6 +115,23 @@ def remaining(findings: Findings) -> str:
         return ""
     region = max(findings.remaining, key=lambda region: region.share)
     return f"After the correction, {_error(region, findings.noise[0])}."
+
+
+def visible(findings: Findings) -> str:
+    """Which strengths would have been seen where nothing is missing."""
+    seen, unseen = [], []
+    for name, limit in findings.detection_limits.items():
+        about = mechanism(name).description.strength
+        if not math.isfinite(limit):
+            unseen.append(name)
+            continue
+        factor, unit = _scale(Estimate(limit, about.unit, (limit, limit)), f"{name}.{about.name}")
+        seen.append(f"{name} {_two_digits(factor * limit)}{f' {unit}' if unit else ''}")
+    if not seen and not unseen:
+        return ""
+    text = f"This recording would have shown: {', '.join(seen)}." if seen else ""
+    hidden = f" It would not have shown {_listed(unseen, 'or')} of any strength." if unseen else ""
+    return f"{text}{hidden}".strip()
 
 
 def scatter(findings: Findings) -> str:

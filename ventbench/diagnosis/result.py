@@ -21,6 +21,7 @@ from ventbench.diagnosis.findings import (
     OpenLoopError,
 )
 from ventbench.mechanics.labels import Estimate, LungMatch
+from ventbench.physics import mechanism
 from ventbench.plants.plant_files import save_plants
 from ventbench.system_id.data import Floats
 
@@ -164,7 +165,7 @@ class Diagnosis(Findings):
         lungs = [_lung(match) for match in self.lungs]
         plain = {
             "verdict": self.verdict,
-            "mechanisms": [_mechanism(mechanism) for mechanism in self.mechanisms],
+            "mechanisms": [_mechanism(missing) for missing in self.mechanisms],
             "slot": None if self.nonparametric is None else _nonparametric(self.nonparametric),
             "location": [_region(region) for region in self.location],
             "remaining": [_region(region) for region in self.remaining],
@@ -177,6 +178,10 @@ class Diagnosis(Findings):
             "split": {name: list(ids) for name, ids in self.split.items()},
             "chosen": dict(self.chosen),
             "gain_scatter": self.gain_scatter,
+            "detection_limits": {
+                name: {"strength": limit, "unit": mechanism(name).description.strength.unit}
+                for name, limit in self.detection_limits.items()
+            },
             "sentences": report_text.sentences(self),
             "notes": list(self.notes),
             "seconds": self.seconds,
@@ -187,16 +192,16 @@ class Diagnosis(Findings):
         return files.json_values(plain)
 
 
-def _mechanism(mechanism: MissingMechanism) -> dict[str, Any]:
+def _mechanism(missing: MissingMechanism) -> dict[str, Any]:
     return {
-        "name": mechanism.name,
-        "parameters": {name: _estimate(value) for name, value in mechanism.parameters.items()},
-        "confidence": mechanism.confidence,
-        "preferred_over_other_names": mechanism.confidence,
-        "alternatives": list(mechanism.alternatives),
-        "nats": mechanism.nats,
-        "changed": mechanism.changed,
-        "simulator_has": mechanism.simulator_values,
+        "name": missing.name,
+        "parameters": {name: _estimate(value) for name, value in missing.parameters.items()},
+        "confidence": missing.confidence,
+        "preferred_over_other_names": missing.confidence,
+        "alternatives": list(missing.alternatives),
+        "nats": missing.nats,
+        "changed": missing.changed,
+        "simulator_has": missing.simulator_values,
     }
 
 

@@ -294,6 +294,20 @@ class LatentInputSettings:
 
 
 @dataclass(frozen=True)
+class DetectionSettings:
+    """Strengths that a recording in which nothing is missing would have shown.
+
+    Attributes:
+        nats: gain on the testing breaths that is expected at the limit: twice the threshold of the
+            held-out test, since the gain itself scatters.
+        rounds: strengths at which the effect is simulated, each nearer to the limit.
+    """
+
+    nats: float = 2.0 * 4.6
+    rounds: int = 2
+
+
+@dataclass(frozen=True)
 class CorrectionSettings:
     """The corrected simulator, and what it leaves unexplained.
 
@@ -429,6 +443,7 @@ class SelectionConfig:
     patient_effort: PatientEffortSettings = field(default_factory=PatientEffortSettings)
     latent_inputs: LatentInputSettings = field(default_factory=LatentInputSettings)
     correction: CorrectionSettings = field(default_factory=CorrectionSettings)
+    detection: DetectionSettings = field(default_factory=DetectionSettings)
     simulator: SimulatorSettings = field(default_factory=SimulatorSettings)
     residuals: ResidualSettings = field(default_factory=ResidualSettings)
     experiments: ExperimentSettings = field(default_factory=ExperimentSettings)

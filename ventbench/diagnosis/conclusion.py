@@ -135,7 +135,8 @@ def conclude(evaluator: Evaluator, wider: Callable[[], Evaluator], tell: Progres
     selected, alternatives = find_alternatives(
         evaluator, selected, comparisons, swap=unnamed is None
     )
-    selected, gains = _supported(evaluator, selected)
+    has_term = unnamed is not None and unnamed.term is not None
+    selected, gains = _supported(evaluator, selected, (wide, full) if has_term else None)
     if unnamed is None or unnamed.term is None:
         full = selected
     else:
@@ -301,22 +302,40 @@ def _best_input(
     return None
 
 
-def _supported(evaluator: Evaluator, selected: FittedModel) -> tuple[FittedModel, dict[str, float]]:
+def _supported(
+    evaluator: Evaluator, selected: FittedModel, beside: tuple[Evaluator, FittedModel] | None
+) -> tuple[FittedModel, dict[str, float]]:
     """Drop mechanisms that held-out breaths do not agree on; and the gains of the others, nats.
 
     Of a recording with few breaths, each is held out once (cross-validation).
+
+    Args:
+        evaluator: evaluator with the library's parameters.
+        selected: the mechanisms.
+        beside: the same with a nonparametric term, and its evaluator, if there is one. A mechanism
+            may help only beside the term.
     """
     settings = evaluator.settings.plausibility
 
+    def gains_in(evaluator: Evaluator, model: FittedModel, name: str) -> tuple[Floats, FittedModel]:
+        left = evaluator.fit(model.hypothesis.without(name), model.noise, model)
+        held_out = evaluator.held_out_log_likelihood(model)
+        return held_out - evaluator.held_out_log_likelihood(left), left
+
     def compared(name: str) -> tuple[Floats, bool]:
-        left = evaluator.fit(selected.hypothesis.without(name), selected.noise, selected)
-        held_out = evaluator.held_out_log_likelihood(selected)
-        gains = held_out - evaluator.held_out_log_likelihood(left)
-        plausible = is_plausible(selected, name, settings)
-        supported = plausible and is_consistent(gains, settings)
-        if plausible and not supported and gains.sum() > 0.0:
-            supported = is_consistent(cross_validated_gain(evaluator, selected, left), settings)
-        return gains, supported
+        gains, left = gains_in(evaluator, selected, name)
+        if not is_plausible(selected, name, settings):
+            return gains, False
+        if is_consistent(gains, settings):
+            return gains, True
+        if beside is not None and name in beside[1].names:
+            other = gains_in(*beside, name)[0]
+            if is_consistent(other, settings):
+                return other, True
+        if gains.sum() <= 0.0:
+            return gains, False
+        validated = cross_validated_gain(evaluator, selected, left)
+        return gains, is_consistent(validated, settings)
 
     while True:
         results = dict(zip(selected.names, parallel_map(compared, selected.names), strict=True))

@@ -11,6 +11,9 @@ from ventbench.physics.parameters import Parameter
 #: Pressure at which the bent curve meets the straight one again, cmH2O.
 SPAN = 40.0
 
+#: Distance from either end of the span up to which the parabola is followed, cmH2O.
+_BEYOND = 20.0
+
 #: Least slope of the curve, which must rise everywhere; pressures beyond follow the tangent.
 _LEAST_SLOPE = 0.2
 
@@ -53,7 +56,7 @@ class SensorCurve(Mechanism):
     def sensor_output(self, values: Values, pressure: Array, position: Array) -> Array:
         """Bent pressure."""
         steepness = 4.0 * values["bend"] / SPAN
-        # The parabola where it rises, its tangent beyond.
+        # The parabola where it rises and pressures are usual, its tangent beyond.
         low, high = _rising(steepness)
         inside = jnp.clip(pressure, low, high)
         slope = 1.0 + steepness * (1.0 - 2.0 * inside / SPAN)
@@ -78,8 +81,8 @@ def _rising(steepness: Array) -> tuple[Array, Array]:
     size = jnp.maximum(jnp.abs(steepness), 1e-6)
     reach = 0.5 * SPAN * (1.0 - _LEAST_SLOPE) / size
     middle = 0.5 * SPAN
-    low = jnp.where(steepness < 0, middle - reach, -1e4)
-    high = jnp.where(steepness > 0, middle + reach, 1e4)
+    low = jnp.where(steepness < 0, jnp.maximum(middle - reach, -_BEYOND), -_BEYOND)
+    high = jnp.where(steepness > 0, jnp.minimum(middle + reach, SPAN + _BEYOND), SPAN + _BEYOND)
     return low, high
 
 

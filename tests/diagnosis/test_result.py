@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from ventbench.diagnosis.findings import OpenLoopError
+from ventbench.diagnosis.identification import never_fitted
 from ventbench.mechanics.labels import Estimate
+from ventbench.plants.catalog import load_simulators
 
 from . import made
 
@@ -114,3 +116,23 @@ def test_files(tmp_path):
     written = dataclasses.replace(found, plants={}).save(tmp_path / "deep" / "out")
     assert [path.name for path in written] == names[:3]
     assert sorted(path.name for path in written[0].parent.iterdir()) == sorted(names[:3])
+
+
+def test_corrected_plants_carry_the_breaths_that_no_fit_has_seen(tmp_path):
+    """Fed back with the same recording, the same breaths judge."""
+    found = made.diagnosis(12)
+    recorded = dataclasses.replace(found.traces.breaths, sha256="a" * 64)
+    found = dataclasses.replace(
+        found,
+        traces=dataclasses.replace(found.traces, breaths=recorded),
+        chosen={"R20C50": "after"},
+    )
+    found.save(tmp_path)
+    again = load_simulators(tmp_path / "corrected.json")
+    held = list(found.open_loop.held_out_breaths)
+    assert again.origin["held_out_breaths"] == held
+    assert again.origin["chosen"] == {"R20C50": "after"}
+    assert list(never_fitted(recorded, again)) == held
+    other = dataclasses.replace(recorded, sha256="b" * 64)
+    assert never_fitted(other, again) == ()
+    assert never_fitted(recorded, load_simulators("physics")) == ()

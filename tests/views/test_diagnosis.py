@@ -11,9 +11,19 @@ import numpy as np
 import pytest
 
 from tests.diagnosis import made
+from ventbench.diagnosis.residual_axes import EDGE
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.views.diagnosis import write_report, write_rerun
-from ventbench.views.diagnosis.charts import Chart, limits, panels, rmse, ticks, worst
+from ventbench.views.diagnosis.charts import (
+    Chart,
+    by_axis,
+    limits,
+    log_ticks,
+    panels,
+    rmse,
+    ticks,
+    worst,
+)
 
 from .test_report import Page
 
@@ -149,6 +159,30 @@ def read(path: Path) -> dict[str, dict[str, Any]]:
             elif part.is_static and ":" in name:
                 columns[name.partition(":")[2]] = column[0].as_py()
     return entities
+
+
+def test_the_time_since_an_edge_has_a_logarithmic_axis(found: Diagnosis) -> None:
+    charts = by_axis(found)
+    (edge,) = [chart for chart in charts if chart.x_label.startswith(EDGE)]
+    assert edge.log
+    assert not any(chart.log for chart in charts if chart is not edge)
+    assert log_ticks(0.01, 1.0) == (
+        [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0], ["0.01", "0.02", "0.05", "0.1", "0.2", "0.5", "1"],
+    )  # fmt: skip
+    chart = Chart((0.01, 1.0), (0.0, 1.0), "s", "", "", log=True)
+    left, middle, right = chart.at_x([0.01, 0.1, 1.0])
+    assert middle == pytest.approx(0.5 * (left + right))
+    assert chart.at_x(0.0) == left, "nothing lies left of the axis"
+
+
+def test_what_is_left_after_the_correction_is_shown(found: Diagnosis, tmp_path: Path) -> None:
+    place = dataclasses.replace(found.location[0], mean_error=0.123)
+    shown = dataclasses.replace(found, remaining=(place,))
+    text = write_report(tmp_path / "report.html", shown).read_text("utf-8")
+    assert "What is left after the correction" in text
+    assert "0.12 cmH2O too low" in text
+    clean = write_report(tmp_path / "clean.html", found).read_text("utf-8")
+    assert "Nothing: no range of any quantity has a significant error." in clean
 
 
 def test_rerun(found: Diagnosis, tmp_path: Path) -> None:

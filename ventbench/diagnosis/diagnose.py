@@ -23,7 +23,14 @@ from ventbench.diagnosis.findings import (
     Verdict,
 )
 from ventbench.diagnosis.hypothesis import make_partition
-from ventbench.diagnosis.identification import IdentifiedModel, Split, identify, split, usable
+from ventbench.diagnosis.identification import (
+    IdentifiedModel,
+    Split,
+    identify,
+    never_fitted,
+    split,
+    usable,
+)
 from ventbench.diagnosis.refinement import Alternatives
 from ventbench.diagnosis.residual_analysis import (
     compare_open_loop,
@@ -128,7 +135,7 @@ def diagnose(
     if by_flow:
         breaths, notes_on_flow = flow_drive.with_flow(breaths)
     breaths, notes = usable(breaths, settings.data)
-    recorded, uses = breaths, split(breaths, settings.data, _never_fitted(breaths, simulators))
+    recorded, uses = breaths, split(breaths, settings.data, never_fitted(breaths, simulators))
     seen = uses.identifying  # nothing below looks at other breaths until a simulator is chosen
     held, fitted = uses.testing[seen], uses.fitted[seen]
     excluded = () if patient else ("patient_effort",)
@@ -267,14 +274,6 @@ def _helps(
     base = evaluator.fit(conclusion.base.hypothesis, conclusion.full.noise)
     gained = evaluator.log_likelihood(conclusion.full, partition)
     return bool(np.sum(gained - evaluator.log_likelihood(base, partition)) > 0.0)
-
-
-def _never_fitted(breaths: Breaths, simulators: Simulators) -> tuple[int, ...]:
-    """Breaths that were held out when the simulator was made of the same recording."""
-    origin = simulators.origin
-    if breaths.sha256 is None or origin.get("recording_sha256") != breaths.sha256:
-        return ()
-    return tuple(int(breath) for breath in origin.get("held_out_breaths", ()))
 
 
 def _ids(breaths: Breaths, uses: Split) -> dict[str, tuple[int, ...]]:

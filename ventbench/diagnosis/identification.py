@@ -28,6 +28,7 @@ from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
 from ventbench.physics.catalogue import mechanism, paths
+from ventbench.plants.catalog import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit
 from ventbench.system_id.data import Data, Floats
@@ -100,6 +101,14 @@ def split(
         if np.any(tests & ~judges):
             testing[index] = tests & ~judges
     return Split(testing, judging)
+
+
+def never_fitted(breaths: Breaths, simulators: Simulators) -> tuple[int, ...]:
+    """Ids of the breaths that were held out when a simulator was made of the same recording."""
+    origin = simulators.origin
+    if breaths.sha256 is None or origin.get("recording_sha256") != breaths.sha256:
+        return ()
+    return tuple(int(breath) for breath in origin.get("held_out_breaths", ()))
 
 
 def usable(breaths: Breaths, settings: DataSettings = DEFAULT.data) -> tuple[Breaths, list[str]]:

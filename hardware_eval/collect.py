@@ -8,6 +8,7 @@ as a session. Each breath starts from a lung at rest, as those of a simulator do
 from __future__ import annotations
 
 import contextlib
+import gc
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,6 +88,7 @@ class BenchVentilator:
         """Vent until the lung is at rest, then begin a breath."""
         client, clock = self._bench.client, self._bench.clock
         client.vent()
+        gc.collect()
         clock.sleep_until(clock.now() + self.rest)
         self._start = self._deadline = clock.now() + protocol.DT
         client.arm()
@@ -185,6 +187,7 @@ def collect(
                 raise InputError(f"{log.path} is of {line['plan']}; choose another --out")
         safe = bench.settings.as_dict()
         log.append({"type": "collection", "plan": plan, "safety": safe, **(about or {})})
+        gc.disable()  # in a breath; collected at the rest before each
         try:
             for number in range(1, count + 1):
                 if number in done:
@@ -205,6 +208,7 @@ def collect(
         except EmergencyStop:
             stopped = "the operator pressed the emergency stop"
         finally:
+            gc.enable()
             with contextlib.suppress(LinkError):
                 bench.client.vent()
     breaths = recording(out / LOG, kinds=("explore",))

@@ -20,7 +20,7 @@ from hardware_eval import safety
 from hardware_eval.errors import LinkError, NoAnswerError, RefusedError
 from hardware_eval.record import ON_TIME_S
 from hardware_eval.safety import VALVE_GAIN, SafetySample
-from hardware_eval.session import Bench, EmergencyStop
+from hardware_eval.session import Bench, EmergencyStop, no_collection
 from ventbench import protocol
 from ventbench.lungs import LUNGS
 from ventbench.lungs import lung as parse_lung
@@ -214,9 +214,11 @@ def drive(bench: Bench, lung: str, commands: Commands, steps: int, *, pip: float
     rows: list[tuple[float, ...]] = []
     watched = safety.init(parse_lung(lung))
     last, trips = (0.0, 1), ()
-    try:
+    with contextlib.ExitStack() as stack:
+        stack.callback(_vent, bench)
         client.vent()
         clock.sleep_until(clock.now() + bench.rest)
+        stack.enter_context(no_collection())
         start = clock.now() + protocol.DT
         client.arm()
         for step in range(steps):
@@ -248,11 +250,13 @@ def drive(bench: Bench, lung: str, commands: Commands, steps: int, *, pip: float
             rows.append(
                 (began - start, pressure, flow, *last, began - deadline, clock.now() - began)
             )
-    finally:
-        with contextlib.suppress(LinkError):
-            client.vent()
     columns = np.array(rows).reshape(-1, 7).T
     return Driven(*columns, trips)  # type: ignore[arg-type]
+
+
+def _vent(bench: Bench) -> None:
+    with contextlib.suppress(LinkError):  # then the watchdog does
+        bench.client.vent()
 
 
 #: Integrating probes reach these pressures, cmH2O, with these gains (P, I), %/cmH2O: gentle on

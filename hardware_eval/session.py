@@ -354,7 +354,6 @@ class _Loop:
         self._breaths: list[BreathLog] = []
         self._late_answers = self._limited = 0
         self._command = (0.0, 1)
-        self._applied = 0.0
         self._disturbed = False
 
     def run(self) -> RunResult:
@@ -362,15 +361,14 @@ class _Loop:
         bench = self._bench
         bench.client.vent()
         bench.clock.sleep_until(bench.clock.now() + bench.rest)
-        start = bench.clock.now() + protocol.DT
-        try:
-            armed = bench.client.arm()
-        except RefusedError as error:
-            return self._ended("aborted", f"the device cannot be armed: {error}")
-        self._applied = armed.u_in
-        steps = protocol.BREATHS * protocol.BREATH_STEPS
-        with _without_garbage_collection():
-            for index in range(steps):
+        # Collected before the device waits for commands: that takes longer than the watchdog does.
+        with no_collection():
+            start = bench.clock.now() + protocol.DT
+            try:
+                bench.client.arm()
+            except RefusedError as error:
+                return self._ended("aborted", f"the device cannot be armed: {error}")
+            for index in range(protocol.BREATHS * protocol.BREATH_STEPS):
                 breath, step = divmod(index, protocol.BREATH_STEPS)
                 deadline = start + index * protocol.DT
                 bench.clock.sleep_until(deadline)
@@ -517,8 +515,8 @@ def _row(step: int, pressure: float, target: float, pip: float, previous: float)
 
 
 @contextlib.contextmanager
-def _without_garbage_collection() -> Iterator[None]:
-    """A collection takes longer than a step may."""
+def no_collection() -> Iterator[None]:
+    """Collect garbage now and not for a while: a collection takes longer than a step may."""
     was = gc.isenabled()
     gc.collect()
     gc.disable()

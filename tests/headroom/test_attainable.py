@@ -20,7 +20,8 @@ def lungs_and_cells(delay=0.0):
     with precision.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS for _ in PIPS])
         cells = nominal_scenario(np.tile(PIPS, len(LUNGS)))
-        cells = cells.replace(delay=np.full(len(LUNGS) * len(PIPS), delay))
+        delays = np.full(len(LUNGS) * len(PIPS), delay)
+        cells = cells.replace(delay=delays)  # type: ignore[attr-defined]
         return jax.tree.map(np.asarray, (plants, cells))
 
 

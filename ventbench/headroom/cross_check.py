@@ -67,7 +67,7 @@ def _search(plants: Plant, cells: Scenario, start: Array, iterations: int) -> Ar
     def iterate(carry: tuple[Array, Any, Array], _: None) -> tuple[tuple[Array, Any, Array], None]:
         free, state, best = carry
         updates, state = optimiser.update(jnp.nan_to_num(gradient(free)), state)
-        free = optax.apply_updates(free, updates)
+        free = jnp.asarray(optax.apply_updates(free, updates))
         return (free, state, jnp.minimum(best, _errors(plants, cells, free))), None
 
     begun = (start, optimiser.init(start), _errors(plants, cells, start))

@@ -62,7 +62,9 @@ def resampled_scores(
         changes += (_counts(bits, resamples, n) - 1.0) @ own
     for own, of_lung in zip(off, rig, strict=True):
         changes += _level(bits, resamples, own, of_lung)
-    return values.mean() + changes + _level(bits, resamples, off.ravel(), member.ravel())
+    changes += _level(bits, resamples, off.ravel(), member.ravel())
+    changes += values.mean()
+    return changes
 
 
 def _level(bits: np.random.PCG64, resamples: int, off: Floats, level: NDArray) -> Floats:
@@ -72,7 +74,7 @@ def _level(bits: np.random.PCG64, resamples: int, off: Floats, level: NDArray) -
     if count < 2:
         return np.zeros(resamples)
     sums = np.bincount(index, weights=off, minlength=count)
-    return np.sqrt(count / (count - 1)) * ((_counts(bits, resamples, count) - 1.0) @ sums)
+    return float(np.sqrt(count / (count - 1))) * ((_counts(bits, resamples, count) - 1.0) @ sums)
 
 
 def _counts(bits: np.random.PCG64, resamples: int, count: int) -> Floats:

@@ -23,7 +23,6 @@ from ventbench.lungs import LUNGS, Lung
 from ventbench.metrics.normalised import controllable_error
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators
-from ventbench.plants.frozen import Frozen
 from ventbench.rig_draws import RigDraws
 from ventbench.submissions.assembly import assemble, enter
 from ventbench.submissions.folder import Submission
@@ -97,8 +96,8 @@ def load_rigs(simulator: Given = "frozen") -> Rigs:
     return Rigs(simulators.lungs, simulators.stacked, None, simulators.about)
 
 
-def rigs_of(official: Frozen) -> Rigs:
-    """Rigs of a frozen set of simulators."""
+def rigs_of(official: Any) -> Rigs:
+    """Rigs of a set of simulators, such as :func:`ventbench.plants.frozen.load` returns."""
     return Rigs(
         LUNGS,
         official.sessions_plants,

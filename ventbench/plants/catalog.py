@@ -90,8 +90,9 @@ class PressureFunction(Protocol):
 class Stepping(Protocol):
     """A simulator in plain Python that runs sample by sample; see ``python_simulator``."""
 
-    def step(self, *arguments: Any) -> Any:
-        """Hold one command."""
+    @property
+    def step(self) -> Callable[..., Any]:
+        """Method that holds one command."""
         ...
 
 

@@ -155,6 +155,7 @@ def test_judged_by_what_pressure_can_tell():
         "sensor_lag.tau": 0.05
     }
     assert true_values(case(Effect("sensor_lag", "mild", "second order", {"tau": 0.05}))) == {}
+    assert true_values(case(Effect("resistance_change", "mild", "secretions", {"c": 0.3}))) == {}
 
 
 def test_a_challenge_of_strangers_keeps_its_seal(tmp_path, monkeypatch):

@@ -106,9 +106,10 @@ def true_values(case: Case) -> dict[str, float]:
     ratio = case.base.gain / NOMINAL_GAIN
     values = {}
     for effect in case.effects:
-        same = in_library(effect)
         if isinstance(case, stranger.StrangerCase):
             same = effect.form == stranger.SAME
+        else:
+            same = in_library(effect)
         if same:
             values |= _values_of(effect, ratio)
     return values

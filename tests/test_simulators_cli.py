@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -91,12 +92,23 @@ def test_lungs_as_json():
     assert json.loads(run("lungs", "--json", "-")) == frozen.load(version=2).lungs()
 
 
-def test_coverage_of_a_published_entry():
+def test_coverage_of_a_published_entry(monkeypatch):
     record = next(path for path in RECORDS.glob("*.json"))
+    # Nothing was recorded at and above 50 %, and plenty below.
+    counts = {name: {"recorded_commands": [100] * 5 + [0] * 5} for name in LUNG_IDS}
+    simulators = SimpleNamespace(lungs=lambda: counts)
+    monkeypatch.setattr(frozen, "load", lambda version=1, path=None: simulators)
     shares = json.loads(run("coverage", record, "--json", "-"))
-    assert set(shares) == set(frozen.load().lungs())
-    assert all(0.0 <= share["wide_open"] <= 1.0 for share in shares.values())
+    assert set(shares) == set(LUNG_IDS)
+    assert all(0.0 <= share["wide_open"] <= share["sparse"] <= 1.0 for share in shares.values())
     assert max(share["sparse"] for share in shares.values()) > 0.0
+
+
+def test_coverage_needs_counts_of_recorded_commands(monkeypatch):
+    record = next(path for path in RECORDS.glob("*.json"))
+    simulators = SimpleNamespace(lungs=lambda: {name: {} for name in LUNG_IDS})
+    monkeypatch.setattr(frozen, "load", lambda version=1, path=None: simulators)
+    assert "tell no recorded commands" in run("coverage", record, code=2)
 
 
 @pytest.mark.parametrize("name", ["R5C10", "R20C50"])

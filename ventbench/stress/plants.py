@@ -66,13 +66,16 @@ class Stressed:
         """All plants at rest at a true pressure; see :class:`~ventbench.interfaces.Plant`."""
         behind = pressure if peep is None else peep
         state = self.physics.init(self.physics.reading_of(pressure), behind)
-        return self.simulator.init(pressure, peep), state
+        # Mapped over cells: networks do not broadcast.
+        return jax.vmap(lambda plant, *at: plant.init(*at))(self.simulator, pressure, behind), state
 
     def step(
         self, state: tuple[Any, Any], u_in: Array, u_out: Array, dt: Array
     ) -> tuple[tuple[Any, Any], Array]:
         """Hold one command; see :class:`~ventbench.interfaces.Plant`."""
-        simulator, pressure = self.simulator.step(state[0], u_in, u_out, dt)
+        simulator, pressure = jax.vmap(lambda plant, *now: plant.step(*now))(
+            self.simulator, state[0], u_in, u_out, dt
+        )
         physics, (more, less) = self.physics.step(state[1], u_in, u_out, dt)
         return (simulator, physics), pressure + more - less
 
@@ -90,7 +93,8 @@ class Stressed:
         """
         more, less = self.physics.airway_pressure(state[1])
         if hasattr(self.simulator, "airway_pressure"):
-            return self.simulator.airway_pressure(state[0]) + more - less
+            airway = jax.vmap(lambda plant, now: plant.airway_pressure(now))
+            return airway(self.simulator, state[0]) + more - less
         shown_more, shown_less = self.physics.reading(state[1])
         return reading - (shown_more - shown_less) + more - less
 
@@ -100,7 +104,10 @@ class Stressed:
 
     def vary(self, r_scale: Array, c_scale: Array) -> Stressed:
         """Return the same lung with another resistance and compliance."""
-        return Stressed(self.simulator.vary(r_scale, c_scale), self.physics.vary(r_scale, c_scale))
+        simulator = jax.vmap(lambda plant, *scales: plant.vary(*scales))(
+            self.simulator, r_scale, c_scale
+        )
+        return Stressed(simulator, self.physics.vary(r_scale, c_scale))
 
 
 def reference_physics(plant: Plant, lungs: Sequence[Lung]) -> dict[str, Floats]:

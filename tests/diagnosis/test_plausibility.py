@@ -42,6 +42,7 @@ def test_every_mechanism_has_a_least_strength_below_a_mild_one_and_a_reason():
         ("patient_effort", np.tile([3.0, -3.0], 10), False),
         ("patient_effort", np.tile([-2.0, -4.0], 10), False),
         ("patient_effort", np.tile([3.0, 0.05], 10), True),
+        ("patient_effort", np.tile([4.0, -0.7, -0.6], 7), True),  # other effects, not yet found
         ("patient_effort", [4.0] + [0.0] * 19, False),
     ],
 )

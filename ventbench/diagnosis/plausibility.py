@@ -19,7 +19,7 @@ from ventbench.physics.catalogue import mechanism, strength_path
 def is_plausible(fitted: FittedModel, name: str, settings: PlausibilitySettings) -> bool:
     """Whether a mechanism's strength is at least the smallest that is named.
 
-    An effort must reach that strength in some breaths, and nearly all efforts that do must pull.
+    An effort must reach that strength in some breaths, and nearly all of what does must pull.
 
     Args:
         fitted: a model with the mechanism.
@@ -32,7 +32,9 @@ def is_plausible(fitted: FittedModel, name: str, settings: PlausibilitySettings)
     if not varies_by_breath(name):
         return bool(felt.any())
     enough = felt.sum() >= max(settings.effort_breaths, settings.effort_share * len(felt))
-    return bool(enough and np.mean(beyond[felt] > 0) >= settings.effort_pulls)
+    # By their squares: a breath without an effort may be given a small one of either sign.
+    square = np.where(felt, beyond**2, 0.0)
+    return bool(enough and square[beyond > 0].sum() >= settings.effort_pulls * square.sum())
 
 
 def excludes_neutral(estimate: Estimate, name: str) -> bool:

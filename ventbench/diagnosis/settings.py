@@ -205,8 +205,8 @@ class PlausibilitySettings:
     Attributes:
         effort_breaths: fewest breaths in which an effort must reach the least strength.
         effort_share: least share of the breaths in which it must.
-        effort_pulls: least share of those efforts that must pull: muscles that push at random are
-            another effect.
+        effort_pulls: least share of the sum of their squares that must pull: muscles that push at
+            random are another effect.
         bootstraps: resamplings of the held-out breaths.
         bootstrap_level: quantile of the resampled gains that must be positive.
         bootstrap_breaths: fewest held-out breaths that can be resampled.

@@ -37,9 +37,9 @@ def lungs(
     kinds = {"own_rig": "own rig", "unseen_rig": "unseen rig", "held_out": "by clock"}
     if version == 1:
         del kinds["own_rig"], kinds["unseen_rig"]
-    columns = ("lung", "R cmH2O/(L/s)", "C mL/cmH2O", "rigs", *kinds.values(), "breaths")
-    for name in columns:
-        table.add_column(name, justify="left" if name == "lung" else "right")
+    table.caption = "Mean / median. R in cmH2O/(L/s), C in mL/cmH2O."
+    for name in ("lung", "R", "C", "rigs", *kinds.values(), "breaths"):
+        table.add_column(name, justify="left" if name == "lung" else "right", no_wrap=True)
     emit(known, json)
 
     def shown(about: dict[str, Any], kind: str) -> str:

@@ -168,20 +168,21 @@ def trial(device: LoopbackDevice, lung: str, fault: Fault, moment: float) -> tup
     begins = device.clock.now() + REST + moment
     if fault.lung is not None:
         hal.faults = (LungFault(fault.lung[0], begins, strength=fault.lung[1]),)
+
+    def dies(wanted: float) -> float:
+        DeadClient.dead = True
+        raise HostDiedError
+
+    def acts(wanted: float) -> float:
+        assert fault.device is not None
+        fault.device(device)
+        return wanted
+
     trouble: Callable[[float], Any] = fault.controller or unchanged
     if fault.dies:
-
-        def trouble(wanted: float) -> float:
-            DeadClient.dead = True
-            raise HostDiedError
-
+        trouble = dies
     if fault.device is not None:
-        act = fault.device
-
-        def trouble(wanted: float) -> float:
-            act(device)
-            return wanted
-
+        trouble = acts
     operator = StopKey(device, begins) if fault.key else SilentOperator()
     bench = Bench(client, device.clock, DEFAULT, operator, rest=REST)
     run = PlannedRun(0, "scored", "pid", lung, 20.0, 1)

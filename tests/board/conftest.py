@@ -152,6 +152,7 @@ def put(folder: Path, made: create.Draft, simulators: ReplayPlants | None = None
     """Save a draft and add it, accepted as official if it says so."""
     added = store.add(folder, made.save(folder.parent / "drafts"), simulators)
     accept(folder)
+    assert isinstance(added, Record)
     return added
 
 

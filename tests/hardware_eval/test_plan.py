@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -53,7 +54,7 @@ def test_the_order_depends_on_the_seed_and_not_on_how_lungs_are_listed() -> None
     ],
 )  # fmt: skip
 def test_wrong_plans_are_refused(wrong: dict) -> None:
-    given = {"entries": ["a"], "lungs": ["R5C10"]} | wrong
+    given: dict[str, Any] = {"entries": ["a"], "lungs": ["R5C10"]} | wrong
     with pytest.raises(InputError):
         make_plan(given.pop("entries"), given.pop("lungs"), **given)
 

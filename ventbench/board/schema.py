@@ -432,7 +432,7 @@ def _check_shapes(record: ScoreContent, label: str) -> None:
             raise InputError(f"{label}, key {key}: does not have the shape {shape}")
 
 
-def has_shape(table: list[Any], shape: tuple[int, ...]) -> bool:
+def has_shape(table: Any, shape: tuple[int, ...]) -> bool:
     """Whether nested lists have a shape."""
     if len(table) != shape[0]:
         return False

@@ -98,7 +98,8 @@ def correct(
         pressures = dict.fromkeys(pressures, before)
     refitted, chosen = choose(breaths, split, pressures)
     if unchanged:
-        refitted = chosen = dict.fromkeys(chosen, "before")
+        given_everywhere: dict[str, Stage] = dict.fromkeys(chosen, "before")
+        refitted = chosen = given_everywhere
     final = {
         "before": before,
         "refit": _by_lung(breaths, pressures, refitted),

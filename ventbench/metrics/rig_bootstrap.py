@@ -14,6 +14,8 @@ scatter is counted in each of the three, so the intervals are rather too wide th
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -74,7 +76,8 @@ def _level(bits: np.random.PCG64, resamples: int, off: Floats, level: NDArray) -
     if count < 2:
         return np.zeros(resamples)
     sums = np.bincount(index, weights=off, minlength=count)
-    return float(np.sqrt(count / (count - 1))) * ((_counts(bits, resamples, count) - 1.0) @ sums)
+    widening = math.sqrt(count / (count - 1))
+    return (widening * ((_counts(bits, resamples, count) - 1.0) @ sums)).astype(np.float64)
 
 
 def _counts(bits: np.random.PCG64, resamples: int, count: int) -> Floats:
@@ -82,4 +85,8 @@ def _counts(bits: np.random.PCG64, resamples: int, count: int) -> Floats:
     raw = bits.random_raw((resamples, count)) >> np.uint64(32)
     index = ((raw * np.uint64(count)) >> np.uint64(32)).astype(np.int64)
     flat = np.arange(resamples)[:, None] * count + index
-    return np.bincount(flat.ravel(), minlength=resamples * count).reshape(resamples, count) * 1.0
+    return (
+        np.bincount(flat.ravel(), minlength=resamples * count)
+        .reshape(resamples, count)
+        .astype(np.float64)
+    )

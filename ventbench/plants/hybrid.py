@@ -189,7 +189,7 @@ class Hybrid:
             wide = jnp.sum(held * opened, axis=-1)
             if self.closing_lag is not None:
                 # It opens with a spring and closes against the pressure.
-                wide = jnp.maximum(wide, opening * jnp.exp(-h / self.closing_lag))
+                wide = jnp.maximum(wide, jnp.asarray(opening) * jnp.exp(-h / self.closing_lag))
                 opening = wide
             outlet = conductance * wide
             elastic, drop, pressure = self._fill(elastic, drop, inflow, outlet, behind, h)

@@ -172,7 +172,7 @@ def test_breaths_that_cannot_be_learned_from_are_named(measured, known_sessions)
         inspirations(replace(measured, pressure=pressure), known_sessions)
     many = Sessions(tuple(Session("R5C10", 33.0, False, i, 1) for i in range(SESSION_ROOM + 1)))
     with pytest.raises(InputError, match="41 sessions are more than the 40"):
-        training_set(measured, measured, np.zeros(len(measured)), many, HybridConfig())
+        training_set(measured, measured, np.zeros(len(measured), np.int64), many, HybridConfig())
 
 
 def test_a_breath_without_start_or_expiration_tells_nothing_of_the_expiratory_valve(

@@ -13,9 +13,9 @@ spring. All valves are of one type, whose flow at 100 % the data sheet states.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import flax.struct
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -153,7 +153,7 @@ def centre(labels: Sequence[Lung], sessions: int) -> Centre:
         return jnp.asarray(equal / equal.sum(axis=1, keepdims=True))
 
     rig = np.zeros(sessions)
-    pooled = Pooled(
+    start: dict[str, Any] = dict(
         slopes=np.full(knots, np.log(SHEET_FLOW / FULL_OPENING)),
         slopes_rig=np.zeros((RIG_COUNT, knots)),
         R=np.log(LAMINAR_SHARE * resistance),
@@ -181,8 +181,8 @@ def centre(labels: Sequence[Lung], sessions: int) -> Centre:
         session_conductance=rig,
         session_closing_conductance=rig,
         closing_lag=kind(0.01),
-    )  # pyright: ignore[reportArgumentType]
-    pooled = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), pooled)
+    )
+    pooled = Pooled(**{name: jnp.asarray(leaf, float) for name, leaf in start.items()})
     sheet = jnp.asarray(np.log(SHEET_FLOW))
     return Centre(pooled, sheet, same(resistance), same(compliance))
 

@@ -8,6 +8,7 @@ the valve of its kind whose gain may move as much as gains do between rigs.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -161,7 +162,7 @@ def label_errors(
     session = np.asarray(data.groups.session)
     out: dict[int, list[float]] = {index: [] for index in left_out}
     for number in range(len(labels)):
-        groups = data.groups.replace(lung=jnp.full_like(data.groups.lung, number))
+        groups = dataclasses.replace(data.groups, lung=jnp.full_like(data.groups.lung, number))
         error = np.array([
             np.min([
                 np.asarray(_errors(pooled, groups, jnp.asarray(gain * scales.rig_gain),

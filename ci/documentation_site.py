@@ -33,6 +33,8 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
         text = (ROOT / path).read_text("utf-8")
         if not path.startswith("docs/"):
             name = "index.md" if path == "README.md" else path.lower().replace("/", "-")
+            if name in files.src_uris:  # such as SECURITY.md beside docs/security.md
+                name = f"about-{name}"
             _pages[path] = name
             files.append(File.generated(config, name, content=_rewritten(text, path)))
         for match in _LINK.finditer(text):

@@ -183,7 +183,10 @@ def test_train_hands_over_folder_target_and_progress(tmp_path, monkeypatch):
 def test_the_program_ends_with_2_and_one_line(tmp_path):
     for arguments, message in (
         (("open-loop", tmp_path / "none.csv"), "no such file"),
-        (("train", "simulator", "--recordings", tmp_path / "nowhere"), "contains no recordings"),
+        (
+            ("train", "simulator", "--recordings", tmp_path / "nowhere", "--out", tmp_path / "out"),
+            "contains no recordings",
+        ),
     ):
         found = program(*arguments)
         assert found.returncode == 2

@@ -29,7 +29,7 @@ class ReliefValve(Mechanism):
     """A valve at the airway that lets gas out above a pressure."""
 
     description = Description(
-        name="relief_valve",
+        name="pop_off_valve",
         title="relief valve at the airway",
         site="circuit",
         equation="q_relief = conductance max(p - 15 cmH2O, 0)",
@@ -47,18 +47,18 @@ class ReliefValve(Mechanism):
         return network.plus(leak=slope, leak_flow=-slope * OPENS)
 
 
-RELIEF_VALVE = ReliefValve()
+POP_OFF_VALVE = ReliefValve()
 
 #: A small library, so that compiling takes seconds.
-NAMES = ("relief_valve", "valve_delay", "turbulent_resistance")
+NAMES = ("pop_off_valve", "valve_delay", "turbulent_resistance")
 
 
 @pytest.fixture(scope="module")
 def relieved():
     """Twelve breaths of the model with the valve, 0.05 cmH2O of noise."""
     breaths = cases.recording(12, {})
-    with extended(RELIEF_VALVE), float64():
-        plant = physics(Lung(10.0, 25.0), {"relief_valve": {"conductance": 20.0}}, PEEP=5.0)
+    with extended(POP_OFF_VALVE), float64():
+        plant = physics(Lung(10.0, 25.0), {"pop_off_valve": {"conductance": 20.0}}, PEEP=5.0)
         commands = (breaths.pressure[:, 0], breaths.u_in, breaths.u_out * 1.0, breaths.dt)
         pressure = np.array(open_loop(plant, *(jnp.asarray(x) for x in commands)))
     noise = np.random.default_rng(0).normal(0, 0.05, pressure.shape)
@@ -67,15 +67,15 @@ def relieved():
 
 def test_it_is_known_by_name_within_the_block_only():
     before = paths()
-    with extended(RELIEF_VALVE):
+    with extended(POP_OFF_VALVE):
         assert list(library()) == sorted(library())
-        assert set(paths()) - set(before) == {"relief_valve.conductance"}
+        assert set(paths()) - set(before) == {"pop_off_valve.conductance"}
         with (
-            pytest.raises(InputError, match="already has a mechanism 'relief_valve'"),
-            extended(RELIEF_VALVE),
+            pytest.raises(InputError, match="already has a mechanism 'pop_off_valve'"),
+            extended(POP_OFF_VALVE),
         ):
             pass
-    assert "relief_valve" not in library()
+    assert "pop_off_valve" not in library()
     assert paths() == before
 
 
@@ -87,18 +87,18 @@ def test_a_model_has_its_effect(relieved):
 
 @pytest.mark.slow
 def test_a_fit_estimates_its_strength(relieved):
-    with extended(RELIEF_VALVE):
+    with extended(POP_OFF_VALVE):
         predictor = Predictor(relieved[1], paths(NAMES))
-        fitted = fit(relieved[1], ["relief_valve"], predictor=predictor)
-        conductance = interval(fitted, "relief_valve.conductance")
+        fitted = fit(relieved[1], ["pop_off_valve"], predictor=predictor)
+        conductance = interval(fitted, "pop_off_valve.conductance")
     assert conductance.low < 20.0 < conductance.high
     assert conductance.value == pytest.approx(20.0, rel=0.1)
 
 
 def test_screening_puts_it_first(relieved):
-    with extended(RELIEF_VALVE):
+    with extended(POP_OFF_VALVE):
         evaluator = make_evaluator(relieved[1], np.arange(12) % 2 == 1, paths(NAMES))
         null = fit_with_noise(evaluator, Hypothesis())
         candidates = screen_mechanisms(null, fit_with_white_noise(evaluator, null), DEFAULT, NAMES)
-    assert candidates[0].name == "relief_valve"
+    assert candidates[0].name == "pop_off_valve"
     assert candidates[0].nats > 50.0

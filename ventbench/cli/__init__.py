@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 import threading
+from types import FrameType
 from typing import NoReturn
 
 import typer
@@ -88,6 +89,8 @@ app.add_typer(data.app)
 def main() -> None:
     """Entry point of the console script."""
     sys.unraisablehook = _interrupt_again
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
     try:
         app()
     except (InputError, OSError) as error:
@@ -119,9 +122,25 @@ def _stop() -> NoReturn:
     os._exit(INTERRUPTED)
 
 
-def _interrupt_again(unraisable: sys.UnraisableHookArgs) -> None:
-    """Repeat a Ctrl-C that came while Python called back from compiled code, which drops it."""
-    if unraisable.exc_type is KeyboardInterrupt:
+_in_hook = False
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt, but not in the hook, which would drop it: then a moment later."""
+    if _in_hook:
         threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
     else:
+        raise KeyboardInterrupt
+
+
+def _interrupt_again(unraisable: sys.UnraisableHookArgs) -> None:
+    """Repeat a Ctrl-C that came while Python called back from compiled code, which drops it."""
+    global _in_hook
+    if unraisable.exc_type is not KeyboardInterrupt:
         sys.__unraisablehook__(unraisable)
+        return
+    _in_hook = True
+    try:
+        threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
+    finally:
+        _in_hook = False

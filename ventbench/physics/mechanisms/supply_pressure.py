@@ -11,8 +11,9 @@ from ventbench.physics.parameters import Parameter
 #: Pressure at the airway for which the lost share of the flow is given, cmH2O.
 REFERENCE = 30.0
 
-#: Least share of the supply's pressure that is left across the valve.
-_LEAST = 0.02
+#: Shares of the supply's pressure across the valve between which the orifice's law is used. Outside
+#: (an airway near the supply's pressure, or far below the atmosphere's) the flow stays as it is.
+_LEAST, _MOST = 0.02, 2.0
 
 
 class SupplyPressure(Mechanism):
@@ -59,9 +60,10 @@ class SupplyPressure(Mechanism):
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Tangent of the flow at the last pressure."""
         per_pressure = (1.0 - (1.0 - values["loss"]) ** 2) / REFERENCE  # 1 / S
-        left = jnp.maximum(1.0 - per_pressure * view.pressure, _LEAST)
-        share = jnp.sqrt(left)
-        falls = 0.5 * per_pressure * network.inflow / share
+        across = 1.0 - per_pressure * view.pressure
+        share = jnp.sqrt(jnp.clip(across, _LEAST, _MOST))
+        inside = (across > _LEAST) & (across < _MOST)
+        falls = jnp.where(inside, 0.5 * per_pressure * network.inflow / share, 0.0)
         flow = network.inflow * share
         return network.plus(
             inflow=flow - network.inflow, leak=falls, leak_flow=-falls * view.pressure

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ def test_a_written_entry_is_the_pid_with_its_gains(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.skipif("VENTBENCH_LONG" not in os.environ, reason="takes more than ten minutes")
 def test_the_loop_closes_on_a_leak(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     done = demo("monday", out, breaths=24, real_time=False, sandbox=False)

@@ -25,8 +25,10 @@ cli.main()
 """
 
 DROPPED = """
-import sys, time
+import signal, sys, time
 from ventbench import cli
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a shell runs this behind
 
 class Drops:
     def __del__(self):

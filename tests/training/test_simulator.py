@@ -252,6 +252,9 @@ def test_leads_to_the_frozen_simulators(public_recordings, tmp_path):
         # Some of these are near zero; all others are far from it.
         near_zero = name in ("stiffening", "offset", "direction")
         wanted = getattr(official.members, name)
+        if wanted is None:  # physics that version 2 alone has
+            assert leaf is None, name
+            continue
         np.testing.assert_allclose(leaf, wanted, rtol=1e-3, atol=1e-3 * near_zero, err_msg=name)
     for name in LUNG_IDS:
         new, old = found.lungs()[name], official.lungs()[name]

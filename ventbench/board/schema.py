@@ -199,8 +199,8 @@ class Actions(_Table, frozen=True):
     shape: Annotated[list[Count], msgspec.Meta(min_length=5, max_length=5)]
 
 
-class ScoreHeader(_Table, frozen=True):
-    """A score's record without its large tables; L lungs, P PIPs, K draws."""
+class _ScoredSubmission(_Table, frozen=True):
+    """What every record of a score says in public: what ran, when, where, by which protocol."""
 
     format: Literal[1]
     protocol: Version
@@ -211,6 +211,14 @@ class ScoreHeader(_Table, frozen=True):
     provenance: FreeForm
     track: Track
     submission: RecordedSubmission
+    sandbox: FreeForm | None
+    versions: FreeForm
+    machine: FreeForm
+
+
+class ScoreHeader(_ScoredSubmission, frozen=True):
+    """A score's record without its large tables; L lungs, P PIPs, K draws."""
+
     simulators: FreeForm
     draws: Draws
     lungs: Annotated[list[LungName], msgspec.Meta(min_length=1)]
@@ -221,9 +229,6 @@ class ScoreHeader(_Table, frozen=True):
     failures: list[RecordedFailure]
     failed_cells: Count
     actions: Actions
-    sandbox: FreeForm | None
-    versions: FreeForm
-    machine: FreeForm
     timing: FreeForm
 
 
@@ -268,30 +273,18 @@ class SealedFile(_Table, frozen=True):
     encoding: Literal["chacha20-poly1305"]
 
 
-class SealedContent(_Table, frozen=True, tag_field="kind", tag="sealed"):
+class SealedContent(_ScoredSubmission, frozen=True, tag_field="kind", tag="sealed"):
     """What is public of a score on hidden draws before their seed is revealed.
 
     ``record`` names the record inside; ``scores`` are rounded, and null where a cell failed.
     """
 
-    format: Literal[1]
-    protocol: Version
-    created: Time
-    official: bool
-    supersedes: Sha256 | None
-    reason: Text
-    provenance: FreeForm
-    track: Track
-    submission: RecordedSubmission
     season: RecordedSeason
     scores: dict[EntryName, Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)] | None]
     complete: bool
     safe: bool
     record: Sha256
     sealed: SealedFile
-    sandbox: FreeForm | None
-    versions: FreeForm
-    machine: FreeForm
 
 
 class ChainLine(_Table, frozen=True):

@@ -35,9 +35,9 @@ from ventbench.rig_draws import RigDraws
 from ventbench.stress.run import DRAWS, TRACK, StressDraws, StressRun, draw_cells, step_through
 from ventbench.stress.stressors import CATEGORIES, VERSION, Condition, conditions, stressor
 from ventbench.submissions.errors import Failure, SubmissionError
-from ventbench.submissions.folder import Submission, open_submission, submission_of
+from ventbench.submissions.folder import Submission, as_submission
 from ventbench.submissions.rig_scoring import load_rigs
-from ventbench.submissions.runner import InProcessRunner, Runner
+from ventbench.submissions.runner import InProcessRunner, Runner, runner_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -371,17 +371,8 @@ def score_stress(
         >>> result.complete
         False
     """
-    runner: Runner = InProcessRunner()
-    if isinstance(submission, Submission):
-        entry = submission
-    elif isinstance(submission, str | Path):
-        entry = open_submission(str(submission))
-    else:
-        entry = submission_of(submission)
-    if sandbox and entry.controller is None:
-        from ventbench.sandbox.runner import SandboxRunner
-
-        runner = SandboxRunner()
+    entry = as_submission(submission)
+    runner = runner_of(entry, sandbox=sandbox)
     rigs = load_rigs(simulator)
     cells = draw_cells(rigs, draws, drawn=drawn)
     return run_stress(entry, cells, chosen_conditions(only), runner=runner, simulators=rigs.about)

@@ -127,6 +127,19 @@ def _manifest(folder: Path, label: str) -> Manifest:
     return manifest_from_json(answer["manifest"])
 
 
+def as_submission(given: Any) -> Submission:
+    """Take a folder, the name of a bundled submission, a class or a function as a submission.
+
+    Raises:
+        SubmissionError: if there is no such submission, or it is of no such kind.
+    """
+    if isinstance(given, Submission):
+        return given
+    if isinstance(given, str | Path):
+        return open_submission(str(given))
+    return submission_of(given)
+
+
 def submission_of(controller: Any) -> Submission:
     """Take a class or a function as a submission, to be run in this process.
 

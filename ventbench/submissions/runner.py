@@ -142,3 +142,20 @@ class InProcessRunner:
     def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
         """Make and reset one fresh controller for each cell; see :class:`Runner`."""
         return InProcessSession(submission, tasks)
+
+
+def runner_of(submission: Submission, *, sandbox: bool) -> Runner:
+    """Choose how a submission runs.
+
+    Args:
+        submission: a folder, or a class or function, which always runs in this process.
+        sandbox: run a folder in locked-down processes.
+
+    Raises:
+        SandboxError: if this machine cannot run submissions apart.
+    """
+    if not sandbox or submission.controller is not None:
+        return InProcessRunner()
+    from ventbench.sandbox.runner import SandboxRunner
+
+    return SandboxRunner()

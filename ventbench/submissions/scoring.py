@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -22,9 +21,9 @@ from ventbench.plants.catalog import Given, load_simulators
 from ventbench.plants.hybrid import Hybrid
 from ventbench.submissions import rig_scoring
 from ventbench.submissions.assembly import assemble, enter
-from ventbench.submissions.folder import Submission, open_submission, submission_of
+from ventbench.submissions.folder import Submission, as_submission
 from ventbench.submissions.result import Score
-from ventbench.submissions.runner import InProcessRunner, Runner
+from ventbench.submissions.runner import InProcessRunner, Runner, runner_of
 from ventbench.submissions.stepping import as_float64, replay, step_through
 
 Floats = NDArray[np.float64]
@@ -74,17 +73,8 @@ def score(
         >>> result.official
         False
     """
-    runner: Runner = InProcessRunner()
-    if isinstance(submission, Submission):
-        entry = submission
-    elif isinstance(submission, str | Path):
-        entry = open_submission(str(submission))
-    else:
-        entry = submission_of(submission)
-    if sandbox and entry.controller is None:
-        from ventbench.sandbox.runner import SandboxRunner
-
-        runner = SandboxRunner()
+    entry = as_submission(submission)
+    runner = runner_of(entry, sandbox=sandbox)
     if protocol == 2:
         rigs = rig_scoring.load_rigs(simulator)
         return rig_scoring.run_on_rigs(entry, rigs, track=track, draws=draws, runner=runner)

@@ -5,6 +5,7 @@ Their prior is Gaussian around the point at which every fit starts.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import flax.struct
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench.lungs import RECORDED_LUNGS
+from ventbench.lungs import RECORDED_LUNGS, Lung
 from ventbench.plants.hybrid import ELASTIC_KNOTS, PLAYS, VALVE_KNOTS, Hybrid
 
 #: Settings and kinds of rig that share parameters.
@@ -99,24 +100,29 @@ class Pooled:
     closing_lag: Array | None = None
 
 
-def initial() -> Pooled:
-    """Parameters at the start of every fit: labels, and the data sheet's orders of magnitude."""
+def initial(labels: Sequence[Lung] = RECORDED_LUNGS, sessions: int = SESSION_ROOM) -> Pooled:
+    """Parameters at the start of every fit: labels, and the data sheet's orders of magnitude.
+
+    Args:
+        labels: the L lungs.
+        sessions: number of sessions, J.
+    """
     knots = len(VALVE_KNOTS)
-    resistance = np.array([lung.R for lung in RECORDED_LUNGS])
-    elastance = np.array([1000.0 / lung.C for lung in RECORDED_LUNGS])
+    resistance = np.array([lung.R for lung in labels])
+    elastance = np.array([1000.0 / lung.C for lung in labels])
 
     def rig(value: float) -> np.ndarray:
         return np.full(RIG_COUNT, np.log(value))
 
-    session = np.zeros(SESSION_ROOM)
+    session = np.zeros(sessions)
     values: dict[str, Any] = dict(
         slopes=np.full(knots, np.log(0.02)),
         slopes_rig=np.zeros((RIG_COUNT, knots)),
         R=np.log(0.4 * resistance),
         K2=np.log(0.6 * resistance),
         E=np.log(elastance),
-        stiffening=np.zeros((LUNG_COUNT, len(ELASTIC_KNOTS))),
-        offset=np.zeros(LUNG_COUNT),
+        stiffening=np.zeros((len(labels), len(ELASTIC_KNOTS))),
+        offset=np.zeros(len(labels)),
         direction=np.full((RIG_COUNT, len(PLAYS)), np.log(0.03)),
         rising=rig(0.05),
         falling=rig(0.05),

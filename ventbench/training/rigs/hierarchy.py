@@ -13,7 +13,7 @@ spring. All valves are of one type, whose flow at 100 % the data sheet states.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
 import flax.struct
 import jax.numpy as jnp
@@ -21,8 +21,8 @@ import numpy as np
 from jax import Array
 
 from ventbench.lungs import Lung
-from ventbench.plants.hybrid import ELASTIC_KNOTS, PLAYS, VALVE_KNOTS
-from ventbench.training.hybrid.parameters import RIG_COUNT, Pooled, direction
+from ventbench.plants.hybrid import VALVE_KNOTS
+from ventbench.training.hybrid.parameters import RIG_COUNT, Pooled, direction, initial
 
 #: Flow of the inspiratory valve at 100 %, L/s: data sheet of the SMC PVQ31.
 SHEET_FLOW = 2.28
@@ -143,46 +143,19 @@ def centre(labels: Sequence[Lung], sessions: int) -> Centre:
     """
     resistance = np.array([lung.R for lung in labels])
     compliance = np.array([lung.C for lung in labels])
-    knots = len(VALVE_KNOTS)
-
-    def kind(value: float) -> np.ndarray:
-        return np.full(RIG_COUNT, np.log(value))
 
     def same(value: np.ndarray) -> Array:
         equal = value[:, None] == value
         return jnp.asarray(equal / equal.sum(axis=1, keepdims=True))
 
-    rig = np.zeros(sessions)
-    start: dict[str, Any] = dict(
-        slopes=np.full(knots, np.log(SHEET_FLOW / FULL_OPENING)),
-        slopes_rig=np.zeros((RIG_COUNT, knots)),
-        R=np.log(LAMINAR_SHARE * resistance),
-        K2=np.log((1.0 - LAMINAR_SHARE) * resistance),
-        E=np.log(1000.0 / compliance),
-        stiffening=np.zeros((len(labels), len(ELASTIC_KNOTS))),
-        offset=np.zeros(len(labels)),
-        direction=np.full((RIG_COUNT, len(PLAYS)), np.log(0.03)),
-        rising=kind(0.05),
-        falling=kind(0.05),
-        valve_delay=kind(0.02),
-        valve_lag=kind(0.01),
-        sensor_lag=kind(0.01),
-        closing_delay=kind(0.03),
-        opening_delay=kind(0.05),
-        circuit_compliance=kind(0.0008),
-        conductance=kind(0.2),
-        closing_conductance=kind(0.2),
-        rest=np.log(5.0),
-        session_gain=rig,
-        session_R=rig,
-        session_K2=rig,
-        session_E=rig,
-        session_offset=rig,
-        session_conductance=rig,
-        session_closing_conductance=rig,
-        closing_lag=kind(0.01),
+    start = initial(labels, sessions)
+    pooled = replace(
+        start,
+        slopes=jnp.full_like(start.slopes, np.log(SHEET_FLOW / FULL_OPENING)),
+        R=jnp.asarray(np.log(LAMINAR_SHARE * resistance)),
+        K2=jnp.asarray(np.log((1.0 - LAMINAR_SHARE) * resistance)),
+        closing_lag=jnp.full(RIG_COUNT, np.log(0.01)),
     )
-    pooled = Pooled(**{name: jnp.asarray(leaf, float) for name, leaf in start.items()})
     sheet = jnp.asarray(np.log(SHEET_FLOW))
     return Centre(pooled, sheet, same(resistance), same(compliance))
 

@@ -29,6 +29,7 @@ from ventbench.validation.challenge.cases import (
     Case,
     DrawnCase,
     Effect,
+    EffectFamily,
     Kind,
     Strength,
 )
@@ -67,28 +68,14 @@ class StrangerCase(Case):
 
 
 @dataclass(frozen=True)
-class Family:
+class Family(EffectFamily):
     """An effect of the second generator.
 
     Attributes:
-        mild: strength of a mild effect.
-        strong: strength of a strong one.
-        parameter: parameter that carries the strength.
-        forms: forms of its equation.
-        ranges: further parameters and their ranges.
-        signs: signs of the strength.
-        inside: whether the library has a mechanism of that name.
         names: names that are right for it, where the library has one of them.
         places: places that are right for it without a name.
     """
 
-    parameter: str
-    mild: float
-    strong: float
-    forms: tuple[str, ...]
-    ranges: tuple[tuple[str, tuple[float, float]], ...] = ()
-    signs: tuple[float, ...] = (1.0,)
-    inside: bool = True
     names: tuple[str, ...] = ()
     places: tuple[str, ...] = ()
 

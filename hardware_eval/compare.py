@@ -22,7 +22,8 @@ from ventbench.board import record as records
 from ventbench.board.hardware import HardwareRecord
 from ventbench.errors import InputError
 from ventbench.metrics.open_loop import by_horizon, distance, mae
-from ventbench.plants.catalog import Simulators, load_simulators
+from ventbench.plants.catalog import load_simulators
+from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths, join
 from ventbench.recordings.read import load
 

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from ventbench.lungs import Lung as Lung
     from ventbench.open_loop_report import OpenLoopReport as OpenLoopReport
     from ventbench.open_loop_report import open_loop as open_loop
-    from ventbench.plants.catalog import Simulators as Simulators
     from ventbench.plants.catalog import load_simulators as load_simulators
+    from ventbench.plants.simulators import Simulators as Simulators
     from ventbench.recordings import Breaths as Breaths
     from ventbench.recordings import load as load_recording
     from ventbench.recordings.foreign import import_recording as import_recording
@@ -66,7 +66,7 @@ _SOURCES = {
     "Plant": ("interfaces", "Plant"),
     "Score": ("submissions.result", "Score"),
     "Simulation": ("simulation", "Simulation"),
-    "Simulators": ("plants.catalog", "Simulators"),
+    "Simulators": ("plants.simulators", "Simulators"),
     "StressScore": ("stress.score", "StressScore"),
     "Task": ("interfaces", "Task"),
     "Trajectories": ("trajectories", "Trajectories"),

@@ -26,6 +26,7 @@ from ventbench.board import (
     sealed,
     store,
 )
+from ventbench.board.conflicts import conflicts
 from ventbench.board.record import AnyRecord, Record
 from ventbench.board.replay import (
     BATCH,
@@ -117,7 +118,7 @@ def verify(
     report.problems += _strange_files(folder, bool(links))
     if len(entries) == len(links):
         report.problems += _misnamed(folder, entries)
-    report.problems += store.conflicts(entries)
+    report.problems += conflicts(entries)
     vouched: frozenset[str] = frozenset()
     if links:  # else nobody knows which records there are
         vouched, problems = attestation.attested(folder, [link.record for link in links])

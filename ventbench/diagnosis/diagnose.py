@@ -50,7 +50,8 @@ from ventbench.errors import InputError
 from ventbench.lungs import lung as parse_lung
 from ventbench.mechanics.labels import LungMatch
 from ventbench.physics.catalogue import parameter
-from ventbench.plants.catalog import Given, Simulators, load_simulators
+from ventbench.plants.catalog import Given, load_simulators
+from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.decimation import decimate, is_fast
 from ventbench.system_id import Data, Fit, Noise, make_data

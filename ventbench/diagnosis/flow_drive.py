@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.errors import InputError
 from ventbench.physics.catalogue import basis_terms, parameter
-from ventbench.plants.catalog import Simulators
+from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
 
 Floats = NDArray[np.float64]

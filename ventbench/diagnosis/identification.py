@@ -28,7 +28,7 @@ from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
 from ventbench.physics.catalogue import mechanism, paths
-from ventbench.plants.catalog import Simulators
+from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit
 from ventbench.system_id.data import Data, Floats

@@ -12,7 +12,8 @@ import pandas as pd
 from ventbench.errors import InputError
 from ventbench.interfaces import Controller
 from ventbench.lungs import LUNG_IDS, lung, scored_lung
-from ventbench.plants.catalog import Given, Simulators, load_simulators
+from ventbench.plants.catalog import Given, load_simulators
+from ventbench.plants.simulators import Simulators
 
 #: Name of the network that serves all lungs and is not told which one it ventilates.
 ALL = "all"

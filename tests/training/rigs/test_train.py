@@ -16,7 +16,8 @@ from ventbench.plants.catalog import load_simulators
 from ventbench.recordings import Breaths, join, load, write
 from ventbench.training.exploration import ExplorationRanges, SimulatedVentilator, explore
 from ventbench.training.rigs.fit import FitConfig
-from ventbench.training.rigs.train import RigConfig, load_rig_recordings, train_rigs
+from ventbench.training.rigs.recordings import load_rig_recordings
+from ventbench.training.rigs.train import RigConfig, train_rigs
 
 #: A lung that no simulator of ours was made for.
 OWN = Lung(9.0, 33.0)
@@ -44,7 +45,7 @@ def folder(tmp_path_factory):
 
 
 def test_every_file_in_the_schema_is_read_and_a_breath_counts_once(folder):
-    data = load_rig_recordings(folder, CONFIG)
+    data = load_rig_recordings(folder, folds=CONFIG.folds, seed=CONFIG.seed)
     assert data.labels == (OWN,)
     assert {name: about["breaths"] for name, about in data.sources.items()} == {
         "monday.csv": 6, "tuesday.parquet": 7,
@@ -60,17 +61,17 @@ def test_breaths_with_blanks_are_no_measured_ones(tmp_path):
     pressure[:2, 5] = np.nan
     pressure[2, -1] = np.nan  # as the last of the reconstructed ones, in expiration only
     write(replace(breaths, pressure=pressure), tmp_path / "a.csv")
-    data = load_rig_recordings(tmp_path, CONFIG)
+    data = load_rig_recordings(tmp_path, folds=CONFIG.folds, seed=CONFIG.seed)
     assert (len(data.breaths), data.measured) == (8, 5)
     assert np.isfinite(data.measured_breaths.pressure).all()
 
 
 def test_what_cannot_be_learned_from_is_told(tmp_path):
     with pytest.raises(InputError, match="no recording in the public schema"):
-        load_rig_recordings(tmp_path, CONFIG)
+        load_rig_recordings(tmp_path, folds=CONFIG.folds, seed=CONFIG.seed)
     write(recorded(OWN, 3), tmp_path / "few.csv")
     with pytest.raises(InputError, match="3 breaths without a blank pressure; 4 or more"):
-        load_rig_recordings(tmp_path, CONFIG)
+        load_rig_recordings(tmp_path, folds=CONFIG.folds, seed=CONFIG.seed)
     write(recorded(OWN, 6), tmp_path / "few.csv")
     with pytest.raises(InputError, match="lung R5C10 was not recorded; recorded are R9C33"):
         train_rigs(tmp_path, tmp_path / "out", lungs=["R5C10"], config=CONFIG)
@@ -82,7 +83,7 @@ def test_a_damaged_recording_is_refused_and_not_skipped(tmp_path):
     text[5] = text[5].replace(",0,", ",7,", 1)
     (tmp_path / "b.csv").write_text("\n".join([*text, "1,2"]) + "\n")
     with pytest.raises(InputError, match=r"b\.csv"):
-        load_rig_recordings(tmp_path, CONFIG)
+        load_rig_recordings(tmp_path, folds=CONFIG.folds, seed=CONFIG.seed)
 
 
 @pytest.fixture(scope="module")

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ventbench.errors import InputError
 from ventbench.lungs import Lung
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
+from ventbench.recordings.foreign.breath_onsets import bridged, find_breaths, is_high
 from ventbench.recordings.foreign.layouts import LAYOUTS, ROLES, USUAL, Layout, recognise
 from ventbench.recordings.foreign.tables import Table, read_table
 from ventbench.recordings.foreign.units import Conversion, conversion
@@ -28,15 +29,6 @@ Floats = NDArray[np.float64]
 
 #: Roles with units.
 _MEASURED = ("time", "pressure", "flow", "volume", "u_in")
-
-#: Shortest breath, s, and longest.
-_SHORTEST, _LONGEST = 0.5, 30.0
-
-#: Share of the range of flow or pressure that an inspiration exceeds.
-_ONSET = 0.1
-
-#: A gap in time of more than so many intervals ends a breath.
-_GAP = 5.0
 
 #: Rows of the preview.
 _PREVIEW = 5
@@ -175,7 +167,7 @@ def import_recording(
     groups = [_labels(table.columns[n]) for n, role in roles.items() if role == "group"]
     time, how = _time(table, values.get("time"), rate, keys)
     notes.append(how)
-    pieces, how = _pieces(table.file, time, values, other, keys, groups, known)
+    pieces, how = find_breaths(table.file, time, values, other, keys, groups, known)
     notes.append(how)
     R, C, how = _lung(lung, other, len(table))
     notes.append(how)
@@ -337,128 +329,6 @@ def _time(
 _RATES = ("fs", "rate", "sampling_rate", "samplingrate", "samplerate", "sample_rate", "freq")
 
 
-def _pieces(
-    file: str, time: Floats, values: Mapping[str, Floats], other: Mapping[str, Floats],
-    keys: list[NDArray[np.int64]], groups: list[NDArray[np.int64]], layout: Layout | None,
-) -> tuple[list[NDArray[np.int64]], str]:  # fmt: skip
-    """Rows of each breath, and how they were found."""
-    rows = np.arange(len(time))
-    broken = np.zeros(len(time), bool)
-    broken[0] = True
-    for key in groups:
-        broken[1:] |= np.diff(key) != 0
-    steps = np.diff(time, prepend=time[0])
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    starts = broken.copy()
-    numbered = len(keys) > len(groups)
-    if numbered:
-        for key in keys:
-            starts[1:] |= np.diff(key) != 0
-        lead = layout.lead if layout is not None else 0.0
-        if lead and usual:
-            at = np.flatnonzero(starts & ~broken) - round(lead / usual)
-            starts = broken.copy()
-            starts[at[at > 0]] = True
-        how = "by the column that numbers them"
-    else:
-        gaps = (steps < 0) | (steps > _GAP * max(usual, 1e-9))
-        broken[1:] |= gaps[1:]
-        onsets, how = _onsets(file, time, values, other)
-        starts = broken.copy()
-        starts[onsets] = True
-    pieces = np.split(rows, np.flatnonzero(starts)[1:])
-    kept, short, timeless = [], 0, 0
-    for k, piece in enumerate(pieces):
-        at = time[piece][np.isfinite(time[piece])]
-        if len(at) < 2 <= len(piece):
-            timeless += 1
-            continue
-        length = at[-1] - at[0] if len(at) > 1 else 0.0
-        # The first and the last piece of a split recording are no whole breaths.
-        edge = not numbered and (
-            piece[0] not in onsets or k + 1 == len(pieces) or bool(broken[pieces[k + 1][0]])
-        )
-        if edge or not _SHORTEST <= length <= _LONGEST:
-            short += 1
-            continue
-        if not np.all(np.diff(at) > 0):
-            raise InputError(f"{file}: the time goes back within the breath of row {piece[0] + 1}")
-        kept.append(piece)
-    if not kept:
-        raise InputError(
-            f"{file}: no whole breath was found {how}; a breath lasts {_SHORTEST:g} to "
-            f"{_LONGEST:g} s. Check the rate and the units, or map a column that numbers breaths "
-            "with --map NAME=breath"
-        )
-    left = f"; {short} pieces that are no whole breath were left out" if short else ""
-    if timeless:
-        left += f"; {timeless} without times were left out"
-    return kept, f"{len(kept)} breaths, split {how}{left}."
-
-
-def _onsets(
-    file: str, time: Floats, values: Mapping[str, Floats], other: Mapping[str, Floats]
-) -> tuple[NDArray[np.int64], str]:
-    """Rows at which inspirations begin, and what shows them."""
-    if "u_out" in other:
-        shut = other["u_out"] < 0.5
-        return np.flatnonzero(shut[1:] & ~shut[:-1]) + 1, "where the expiratory valve closes"
-    if "target" in other:
-        high = _is_high(other["target"])
-        return np.flatnonzero(high[1:] & ~high[:-1]) + 1, "where the target rises"
-    if "u_in" in values and np.nanmax(values["u_in"]) > 0:
-        on = np.nan_to_num(values["u_in"]) > 0
-        away = _after_pause(on, time)
-        return away, "where the inspiratory valve opens"
-    if "flow" in values and np.isfinite(values["flow"]).any():
-        flow = np.nan_to_num(values["flow"])
-        size = float(np.quantile(np.abs(flow), 0.99))
-        return _crossings(flow, _ONSET * size, 0.3 * _ONSET * size), "where flow turns inwards"
-    pressure = _bridged(values["pressure"])
-    low, high = np.quantile(pressure, [0.1, 0.98])
-    if high - low < 1.0:
-        raise InputError(
-            f"{file}: pressure spans {high - low:.2g} cmH2O, in which no breath can be seen"
-        )
-    rise = pressure - low
-    span = high - low
-    return _crossings(rise, 0.3 * span, _ONSET * span), "where pressure rises"
-
-
-def _crossings(signal: Floats, high: float, low: float) -> NDArray[np.int64]:
-    """Rows before which a signal was low for the last time before it becomes high."""
-    onsets, last, armed = [], 0, False
-    for k, value in enumerate(signal.tolist()):
-        if value <= low:
-            last, armed = k, True
-        elif value >= high and armed:
-            onsets.append(last)
-            armed = False
-    return np.array(onsets, np.int64)
-
-
-def _after_pause(on: NDArray[np.bool_], time: Floats) -> NDArray[np.int64]:
-    """Rows at which a valve opens after it was shut for a while."""
-    onsets, shut_since = [], None
-    for k in range(len(on)):
-        if not on[k]:
-            shut_since = k if shut_since is None else shut_since
-        elif shut_since is not None:
-            if time[k] - time[shut_since] >= 0.2:
-                onsets.append(k)
-            shut_since = None
-    return np.array(onsets, np.int64)
-
-
-def _is_high(signal: Floats) -> NDArray[np.bool_]:
-    return signal > 0.5 * (np.nanmin(signal) + np.nanmax(signal))
-
-
-def _bridged(values: Floats) -> Floats:
-    known = np.isfinite(values)
-    return np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
-
-
 def _lung(given: str | None, other: Mapping[str, Floats], count: int) -> tuple[Floats, Floats, str]:
     """R and C of each row."""
     from ventbench.lungs import lung as parse
@@ -484,7 +354,7 @@ def _valve(
     if "u_out" in other:
         return (other["u_out"] > 0.5).astype(np.int8), "u_out is that of the file."
     if "target" in other:
-        u_out = (~_is_high(other["target"])).astype(np.int8)
+        u_out = (~is_high(other["target"])).astype(np.int8)
         return u_out, "u_out is 1 where the target is low."
     u_out = np.zeros(len(time), np.int8)
     if "flow" in values:
@@ -498,7 +368,7 @@ def _valve(
                 u_out[piece[first[0]] : piece[-1] + 1] = 1
         return u_out, "u_out is 1 from where flow turns outwards."
     for piece in pieces:
-        p = _bridged(values["pressure"])[piece]
+        p = bridged(values["pressure"])[piece]
         peak = int(np.argmax(p))
         half = 0.5 * (p[peak] + p[-1])
         below = np.flatnonzero(p[peak:] < half)

@@ -28,11 +28,11 @@ from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS, Lung, lung
 from ventbench.metrics.extrapolation import WIDE_OPEN, command_counts
 from ventbench.plants import frozen, sessions
-from ventbench.plants.frozen import BY_ALL, fingerprints, seen
+from ventbench.plants.frozen import BY_ALL, seen
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.plant_files import save_plant
 from ventbench.plants.sessions import Sessions
-from ventbench.recordings import Breaths, RecordingError, folds, join, load
+from ventbench.recordings import Breaths
 from ventbench.resume import Format, WorkFolder
 from ventbench.training.hybrid.data import (
     SAMPLES,
@@ -54,6 +54,7 @@ from ventbench.training.rigs.hierarchy import (
     full_flow,
 )
 from ventbench.training.rigs.label_test import LabelTest, label_errors, label_tests
+from ventbench.training.rigs.recordings import RigRecordings, load_rig_recordings
 
 #: Called with what is being done and the share of all that is done, 0..1.
 Progress = Callable[[str, float], None]
@@ -71,7 +72,6 @@ HELD_OUT_FROM = 3
 #: recorded: from what the recordings say at 100 % it reaches to the data sheet.
 UNRECORDED_SLOPE = 0.4
 
-_SUFFIXES = (".csv", ".csv.gz", ".parquet")
 # Iterations of a fit that starts at the fit to all breaths.
 _RESAMPLED_ITERATIONS = 100
 
@@ -95,91 +95,6 @@ class RigConfig:
     unlisted: float = 0.2
     seed: int = 0
     fit: FitConfig = field(default_factory=FitConfig)
-
-
-@dataclass(frozen=True)
-class RigRecordings:
-    """Recordings of a training.
-
-    Attributes:
-        breaths: n breaths, the measured ones first.
-        measured: number of breaths without a blank pressure, m. Reconstructed breaths have blanks,
-            if only in their expiration.
-        fold: fold of each measured breath, ``(m,)``.
-        labels: the settings that occur, by R and C.
-        sources: SHA-256 and number of breaths of each file, by name.
-        skipped: files that are not in the public schema.
-    """
-
-    breaths: Breaths
-    measured: int
-    fold: NDArray[np.int64]
-    labels: tuple[Lung, ...]
-    sources: dict[str, dict[str, Any]]
-    skipped: tuple[str, ...]
-
-    @property
-    def measured_breaths(self) -> Breaths:
-        """The measured breaths."""
-        return self.breaths.select(np.arange(self.measured))
-
-
-def load_rig_recordings(folder: Path, config: RigConfig | None = None) -> RigRecordings:
-    """Read every recording of a folder that is in the public schema.
-
-    A breath that is there twice counts once. Breaths get new ids, in order.
-
-    Args:
-        folder: folder with ``.csv``, ``.csv.gz`` and ``.parquet`` files.
-        config: gives folds and seed.
-
-    Raises:
-        InputError: if a recording is malformed, or there are too few measured breaths.
-        OSError: if a file cannot be read.
-    """
-    config = config or RigConfig()
-    parts, sources, skipped = [], {}, []
-    for path in sorted(folder.iterdir()):
-        if not path.name.lower().endswith(_SUFFIXES):
-            continue
-        try:
-            part = load(path)
-        except RecordingError as error:
-            if not _other_schema(error):
-                raise
-            skipped.append(path.name)
-            continue
-        parts.append(part)
-        sources[path.name] = {"sha256": part.sha256, "breaths": len(part)}
-    if not parts:
-        raise InputError(
-            f"{folder} holds no recording in the public schema; put CSV or Parquet files with the "
-            "columns id,breath_id,R,C,time_step,u_in,u_out,pressure there"
-        )
-    breaths = join(parts)
-    _, first = np.unique(fingerprints(breaths), return_index=True)
-    breaths = breaths.select(np.sort(first))
-    blank = breaths.valid & ~np.isfinite(breaths.pressure)
-    whole = ~blank.any(axis=1)
-    usable = (breaths.inspiratory & np.isfinite(breaths.pressure))[:, 1:].any(axis=1)
-    order = np.concatenate([np.flatnonzero(whole & usable), np.flatnonzero(~whole & usable)])
-    breaths = breaths.select(order)
-    breaths = dataclasses.replace(breaths, breath_id=np.arange(1, len(order) + 1))
-    count = int(np.count_nonzero(whole & usable))
-    if count < 2 * config.folds:
-        raise InputError(
-            f"{folder} holds {count} breaths without a blank pressure; {2 * config.folds} or more "
-            f"are needed, two for each of {config.folds} folds"
-        )
-    measured = breaths.select(np.arange(count))
-    fold = folds(measured, count=config.folds, seed=config.seed)
-    labels = tuple(sorted({lung(name) for name in breaths.lung_ids.tolist()}))
-    return RigRecordings(breaths, count, fold, labels, sources, tuple(skipped))
-
-
-def _other_schema(error: RecordingError) -> bool:
-    """Whether a file has another header, which is no mistake in a folder of mixed files."""
-    return "column" in str(error).lower() and "missing" in str(error).lower()
 
 
 @dataclass(frozen=True)
@@ -254,7 +169,7 @@ def train_rigs(
     folder, out = Path(folder), Path(out)
     config, report = config or RigConfig(), progress or (lambda what, share: None)
     report("reading the recordings", 0.0)
-    data = load_rig_recordings(folder, config)
+    data = load_rig_recordings(folder, folds=config.folds, seed=config.seed)
     listed = _listed(data, lungs)
     # Clocks alone tell sessions apart; no pressure is looked at.
     table = sessions.find(data.breaths)

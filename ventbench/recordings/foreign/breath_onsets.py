@@ -1,0 +1,162 @@
+"""Where inspirations begin in a continuous recording: at a number, valve, flow or pressure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.errors import InputError
+from ventbench.recordings.foreign.layouts import Layout
+
+Floats = NDArray[np.float64]
+
+#: Shortest breath, s, and longest.
+_SHORTEST, _LONGEST = 0.5, 30.0
+
+#: Share of the range of flow or pressure that an inspiration exceeds.
+_ONSET = 0.1
+
+#: A gap in time of more than so many intervals ends a breath.
+_GAP = 5.0
+
+
+def find_breaths(
+    file: str, time: Floats, values: Mapping[str, Floats], other: Mapping[str, Floats],
+    keys: list[NDArray[np.int64]], groups: list[NDArray[np.int64]], layout: Layout | None,
+) -> tuple[list[NDArray[np.int64]], str]:  # fmt: skip
+    """Split a continuous recording where inspirations begin.
+
+    Args:
+        file: names the recording in messages.
+        time: times, s, shape ``(N,)``; NaN where there is none.
+        values: measured columns by role, in the units of the schema, ``(N,)`` each.
+        other: further columns by role, ``(N,)`` each.
+        keys: columns a change of which begins a breath.
+        groups: those of them that only tell recordings apart.
+        layout: known layout of the file, if it is one.
+
+    Returns:
+        Rows of each whole breath, and a sentence that says how they were found.
+
+    Raises:
+        InputError: if no whole breath is found, or time goes back within one.
+    """
+    rows = np.arange(len(time))
+    broken = np.zeros(len(time), bool)
+    broken[0] = True
+    for key in groups:
+        broken[1:] |= np.diff(key) != 0
+    steps = np.diff(time, prepend=time[0])
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    starts = broken.copy()
+    numbered = len(keys) > len(groups)
+    if numbered:
+        for key in keys:
+            starts[1:] |= np.diff(key) != 0
+        lead = layout.lead if layout is not None else 0.0
+        if lead and usual:
+            at = np.flatnonzero(starts & ~broken) - round(lead / usual)
+            starts = broken.copy()
+            starts[at[at > 0]] = True
+        how = "by the column that numbers them"
+    else:
+        gaps = (steps < 0) | (steps > _GAP * max(usual, 1e-9))
+        broken[1:] |= gaps[1:]
+        onsets, how = _onsets(file, time, values, other)
+        starts = broken.copy()
+        starts[onsets] = True
+    pieces = np.split(rows, np.flatnonzero(starts)[1:])
+    kept, short, timeless = [], 0, 0
+    for k, piece in enumerate(pieces):
+        at = time[piece][np.isfinite(time[piece])]
+        if len(at) < 2 <= len(piece):
+            timeless += 1
+            continue
+        length = at[-1] - at[0] if len(at) > 1 else 0.0
+        # The first and the last piece of a split recording are no whole breaths.
+        edge = not numbered and (
+            piece[0] not in onsets or k + 1 == len(pieces) or bool(broken[pieces[k + 1][0]])
+        )
+        if edge or not _SHORTEST <= length <= _LONGEST:
+            short += 1
+            continue
+        if not np.all(np.diff(at) > 0):
+            raise InputError(f"{file}: the time goes back within the breath of row {piece[0] + 1}")
+        kept.append(piece)
+    if not kept:
+        raise InputError(
+            f"{file}: no whole breath was found {how}; a breath lasts {_SHORTEST:g} to "
+            f"{_LONGEST:g} s. Check the rate and the units, or map a column that numbers breaths "
+            "with --map NAME=breath"
+        )
+    left = f"; {short} pieces that are no whole breath were left out" if short else ""
+    if timeless:
+        left += f"; {timeless} without times were left out"
+    return kept, f"{len(kept)} breaths, split {how}{left}."
+
+
+def _onsets(
+    file: str, time: Floats, values: Mapping[str, Floats], other: Mapping[str, Floats]
+) -> tuple[NDArray[np.int64], str]:
+    """Rows at which inspirations begin, and what shows them."""
+    if "u_out" in other:
+        shut = other["u_out"] < 0.5
+        return np.flatnonzero(shut[1:] & ~shut[:-1]) + 1, "where the expiratory valve closes"
+    if "target" in other:
+        high = is_high(other["target"])
+        return np.flatnonzero(high[1:] & ~high[:-1]) + 1, "where the target rises"
+    if "u_in" in values and np.nanmax(values["u_in"]) > 0:
+        on = np.nan_to_num(values["u_in"]) > 0
+        away = _after_pause(on, time)
+        return away, "where the inspiratory valve opens"
+    if "flow" in values and np.isfinite(values["flow"]).any():
+        flow = np.nan_to_num(values["flow"])
+        size = float(np.quantile(np.abs(flow), 0.99))
+        return _crossings(flow, _ONSET * size, 0.3 * _ONSET * size), "where flow turns inwards"
+    pressure = bridged(values["pressure"])
+    low, high = np.quantile(pressure, [0.1, 0.98])
+    if high - low < 1.0:
+        raise InputError(
+            f"{file}: pressure spans {high - low:.2g} cmH2O, in which no breath can be seen"
+        )
+    rise = pressure - low
+    span = high - low
+    return _crossings(rise, 0.3 * span, _ONSET * span), "where pressure rises"
+
+
+def _crossings(signal: Floats, high: float, low: float) -> NDArray[np.int64]:
+    """Rows before which a signal was low for the last time before it becomes high."""
+    onsets, last, armed = [], 0, False
+    for k, value in enumerate(signal.tolist()):
+        if value <= low:
+            last, armed = k, True
+        elif value >= high and armed:
+            onsets.append(last)
+            armed = False
+    return np.array(onsets, np.int64)
+
+
+def _after_pause(on: NDArray[np.bool_], time: Floats) -> NDArray[np.int64]:
+    """Rows at which a valve opens after it was shut for a while."""
+    onsets, shut_since = [], None
+    for k in range(len(on)):
+        if not on[k]:
+            shut_since = k if shut_since is None else shut_since
+        elif shut_since is not None:
+            if time[k] - time[shut_since] >= 0.2:
+                onsets.append(k)
+            shut_since = None
+    return np.array(onsets, np.int64)
+
+
+def is_high(signal: Floats) -> NDArray[np.bool_]:
+    """Whether a signal of two levels is at the upper one."""
+    return signal > 0.5 * (np.nanmin(signal) + np.nanmax(signal))
+
+
+def bridged(values: Floats) -> Floats:
+    """Values with their blanks interpolated, shape ``(N,)``."""
+    known = np.isfinite(values)
+    return np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])

@@ -44,6 +44,14 @@ def keep() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 
 
+def is_warm() -> bool:
+    """Whether functions compiled by an earlier run are kept."""
+    if os.environ.get("VENTBENCH_CACHE") == "":
+        return False
+    place = folder()
+    return place.is_dir() and any(place.iterdir())
+
+
 @lru_cache(maxsize=1)
 def _hand_back() -> None:
     """Hand memory back to the system after each compilation: a third of all that a diagnosis takes.

@@ -24,7 +24,7 @@ from . import made
 pytest.importorskip("jinja2", reason="needs the extra ventbench[view]")
 pytest.importorskip("rerun", reason="needs the extra ventbench[view]")
 
-FILES = ["corrected.json", "diagnosis.json", "diagnosis.rrd", "report.html"]
+FILES = ["corrected.json", "diagnosis.json", "diagnosis.rrd", "record_next.csv", "report.html"]
 
 app = typer.Typer()
 command.register(app)
@@ -70,7 +70,7 @@ def recording(tmp_path: Path) -> Path:
     return path
 
 
-def test_four_files_and_the_words(recording, tmp_path, calls):
+def test_files_and_the_words(recording, tmp_path, calls):
     out = tmp_path / "deep" / "out"
     text = run(recording, "--lung", "R20C50", "--out", out)
     assert sorted(item.name for item in out.iterdir()) == FILES
@@ -78,7 +78,7 @@ def test_four_files_and_the_words(recording, tmp_path, calls):
     assert not calls[0]["patient"]
     words = " ".join(text.split())
     assert words.startswith("Missing in the physics simulator: dead time of the inspiratory valve")
-    assert "Dead time of the inspiratory valve: 41 ms [38, 44]." in words
+    assert "Dead time of the inspiratory valve (valve_delay): 41 ms [38, 44];" in words
     for name in FILES:
         assert str(out / name) in text.replace("\n", "")
     plain = json.loads((out / "diagnosis.json").read_text())
@@ -161,3 +161,25 @@ def test_a_simulator_in_plain_python(recording, tmp_path, calls, monkeypatch):
     given = calls[0]["simulator"]
     assert (given.kind, given.name) == ("function", "plain_lungs:Lung")
     assert np.isfinite(given.pressures(calls[0]["breaths"])).all()
+
+
+def test_it_says_how_long_it_will_take():
+    assert "usually 10 s to a minute. Ctrl-C" in command.expected_time(24, 1, warm=True)
+    assert "half a minute more" in command.expected_time(24, 6, warm=False)
+    assert command.remaining(0.2, 0.5) == "", "too early to tell"
+    assert command.remaining(20.0, 0.02) == ""
+    assert command.remaining(20.0, 0.5) == "about 20 s left"
+    assert command.remaining(200.0, 0.25) == "about 10 min left"
+
+
+def test_steps_of_unknown_number_advance_and_stay_below_their_end():
+    from ventbench.diagnosis.diagnose import steps_between
+
+    told: list[tuple[str, float]] = []
+    step = steps_between(lambda what, share: told.append((what, share)), 0.1, 0.6)
+    for k in range(12):
+        step(f"step {k}")
+    shares = [share for _, share in told]
+    assert shares[0] == 0.1
+    assert shares == sorted(set(shares))
+    assert 0.5 < shares[-1] < 0.6

@@ -42,7 +42,7 @@ def test_every_mechanism_has_a_sentence():
         text = report_text.missing_mechanism(MissingMechanism(name, values, 0.8, (), 10.0))
         assert item.description.title in text.lower()
         assert text.count("[") == len(known)
-        assert text.endswith("Preferred over other names: 80 %.")
+        assert text.endswith("held-out evidence 10 nats; preferred over other names: 80 %.")
         for p in known[1:]:
             assert p.meaning in text
     assert parameter("valve_delay.delay").meaning == "dead time"
@@ -53,28 +53,30 @@ def test_a_named_mechanism():
     said = report_text.sentences(found)
     loop = found.open_loop
     assert said[0] == (
-        "Missing in the physics simulator: dead time of the inspiratory valve (valve_delay, 212 "
-        "nats of evidence); 5 nats decide. Mending it takes the error on 4 breaths set aside from "
-        f"{loop.refit.rmse:.2f} (R and C refitted) to {loop.after.rmse:.2f} cmH2O; hardly more "
-        "than the noise of 0.20 is left."
+        "Missing in the physics simulator: dead time of the inspiratory valve (odds above a "
+        "million to one on held-out breaths); mending it takes the error on 4 breaths set aside "
+        f"from {loop.refit.rmse:.2f} (R and C refitted) to {loop.after.rmse:.2f} cmH2O, and hardly "
+        "more than the noise of 0.20 is left."
     )
-    assert said[1].startswith("Dead time of the inspiratory valve: 41 ms [38, 44]. Preferred over")
+    assert said[1].startswith(
+        "Dead time of the inspiratory valve (valve_delay): 41 ms [38, 44]; held-out evidence 212"
+    )
     assert "This recording cannot tell valve_delay from valve_lag." in said
     assert any(text.startswith("The lung does not match its label R20C50: R 22.1") for text in said)
     assert any(
         text.startswith("Record next: 3 breaths of random pulses of the valve. These breaths "
-        "distinguish between valve_delay and valve_lag (expected evidence 64 nats; 5 decide).")
+        "distinguish between valve_delay and valve_lag (expected evidence 64 nats; 4.6 decide).")
         for text in said
     )  # fmt: skip
     assert said[-1] == found.notes[0]
     changed = dataclasses.replace(found.mechanisms[0], changed=True)
     assert (
-        "valve, which the simulator has with another strength: 41 ms [38, 44]. "
+        "valve, which the simulator has with another strength (valve_delay): 41 ms [38, 44]; "
         in report_text.missing_mechanism(changed)
     )
     both = dataclasses.replace(changed, simulator_values={"delay": 0.0123})
     assert (
-        "inspiratory valve: 41 ms [38, 44] instead of 12 ms in the simulator."
+        "inspiratory valve (valve_delay): 41 ms [38, 44] instead of 12 ms in the simulator;"
         in report_text.missing_mechanism(both)
     )
 
@@ -105,7 +107,7 @@ def test_a_simulator_that_is_left_as_it_is_was_not_refitted():
     )
     nothing = dataclasses.replace(left, verdict="nothing_missing")
     assert report_text.verdict(nothing) == (
-        "Nothing is missing: the physics simulator explains the recording."
+        "Nothing is missing: the physics simulator explains the recording"
     )
 
 
@@ -132,19 +134,19 @@ def test_places(place, text):
 def test_other_verdicts():
     said = report_text.sentences(made.unnamed(12))
     assert (
-        "that is not in the library of mechanisms (41 nats of evidence); its place in the model is "
-        "R(V) (resistance of the airway). Mending it takes the error"
+        "that is not in the library of mechanisms (odds above a million to one on held-out "
+        "breaths); its place in the model is R(V) (resistance of the airway); mending it takes the "
+        "error"
     ) in said[0]
     assert any("83 % of the squared error above the noise" in text for text in said)
     nothing = made.nothing(12)
     said = report_text.sentences(nothing)
     assert said[0].startswith("Nothing is missing")
-    assert "It errs by " in said[0]
+    assert "; it errs by " in said[0]
     assert not any("corrected" in text for text in said)
     both = dataclasses.replace(made.diagnosis(12), nonparametric=made.unnamed(12).nonparametric)
-    assert report_text.verdict(both).endswith(
-        "; an effect that is not in the library is missing too."
-    )
+    assert "valve, and an effect that is not in the library (odds" in report_text.verdict(both)
+    assert "; mending them takes" in report_text.answer(both)
     assert report_text.nonparametric_term(both).startswith(
         "In addition to these mechanisms, a nonparametric term for R(V) (resistance of the airway) "
         "explains 83 %"
@@ -153,8 +155,7 @@ def test_other_verdicts():
     assert term is not None
     named = dataclasses.replace(term, name="f(V)", meaning="f(V): the recoil of the lung")
     text = report_text.verdict(dataclasses.replace(made.unnamed(12), nonparametric=named))
-    assert text.endswith("its place in the model is f(V) (the recoil of the lung).")
-    assert "(41 nats of evidence)" in text
+    assert text.endswith("its place in the model is f(V) (the recoil of the lung)")
 
 
 def test_distances_and_a_lung_that_matches():
@@ -201,9 +202,9 @@ def test_what_stays_unexplained_is_told_first():
     first, *others = report_text.sentences(left)
     assert first == (
         "Something is missing in the physics simulator, but the recording singles out neither a "
-        "mechanism nor a place in the model. Mending it is worth nothing on the 4 breaths set "
-        "aside, where the error stays at 1.60 cmH2O; 1.55 cmH2O stay unexplained beyond the noise "
-        "of 0.41."
+        "mechanism nor a place in the model; mending it is worth nothing on the 4 breaths set "
+        "aside, where the error stays at 1.60 cmH2O, and 1.55 cmH2O stay unexplained beyond the "
+        "noise of 0.41."
     )
     assert any("differs from breath to breath by about 13 %" in text for text in others)
     place = ErrorRegion("volume", 0.0, 50.0, "mL", 0.8, 0.001, 0.9)
@@ -213,3 +214,45 @@ def test_what_stays_unexplained_is_told_first():
         "After the correction, the simulated pressure is 0.8 cmH2O too low where the volume is 0 "
         "to 50 mL."
     )
+
+
+def test_the_headline_is_short():
+    found = made.diagnosis(12)
+    loop = found.open_loop
+    worth = f"takes the error from {loop.refit.rmse:.2f} to {loop.after.rmse:.2f} cmH2O"
+    assert report_text.headline(found) == (
+        f"Missing in the physics simulator: dead time of the inspiratory valve; mending it {worth}"
+    )
+    four = dataclasses.replace(found, mechanisms=found.mechanisms * 4)
+    assert report_text.headline(four) == (
+        f"Four effects are missing in the physics simulator; mending them {worth}"
+    )
+    assert "no name" in report_text.headline(made.unnamed(12))
+    assert report_text.headline(made.nothing(12)).startswith("Nothing is missing in")
+    useless = dataclasses.replace(loop, after=loop.refit)
+    text = report_text.headline(dataclasses.replace(found, open_loop=useless))
+    assert text.endswith(f"and the error stays at {loop.refit.rmse:.2f} cmH2O")
+
+
+@pytest.mark.parametrize(
+    ("nats", "text"),
+    [(4.6, "odds of 99 to one"), (7.1, "odds of 1,200 to one"), (14.0, "a million to one")],
+)
+def test_odds(nats, text):
+    assert text in report_text.odds(nats)
+
+
+def test_what_would_change_the_answer():
+    found = made.diagnosis(12)
+    texts = report_text.would_change(found)
+    assert any("less than 4.6 nats by it would withdraw the name" in text for text in texts)
+    assert any("Only 4 breaths judge" in text for text in texts)
+    assert not any("unexplained" in text for text in texts)
+    stress = dataclasses.replace(found.mechanisms[0], name="viscoelasticity")
+    texts = report_text.would_change(dataclasses.replace(found, mechanisms=(stress,)))
+    assert any("never tell viscoelasticity from second_compartment" in text for text in texts)
+    big = dataclasses.replace(found.open_loop, after=OpenLoopError(1.0, 1.0))
+    texts = report_text.would_change(dataclasses.replace(found, open_loop=big))
+    assert any("More than the noise is unexplained" in text for text in texts)
+    assert any("another kind" in text for text in report_text.would_change(made.nothing(12)))
+    assert any("would give it a name" in text for text in report_text.would_change(made.unnamed()))

@@ -12,6 +12,7 @@ from ventbench.diagnosis.findings import OpenLoopError
 from ventbench.diagnosis.identification import never_fitted
 from ventbench.mechanics.labels import Estimate
 from ventbench.plants.catalog import load_simulators
+from ventbench.simulation import read_controls
 
 from . import made
 
@@ -109,11 +110,11 @@ def test_files(tmp_path):
         pytest.importorskip(extra, reason="needs the extra ventbench[view]")
     found = made.diagnosis(12)
     written = found.save(tmp_path / "deep" / "out")
-    names = ["diagnosis.json", "report.html", "diagnosis.rrd", "corrected.json"]
+    names = ["diagnosis.json", "report.html", "diagnosis.rrd", "record_next.csv", "corrected.json"]
     assert [path.name for path in written] == names
     assert json.loads(written[0].read_text()) == found.as_dict()
-    # A simulator without plants leaves no corrected plants behind, not even older ones.
-    written = dataclasses.replace(found, plants={}).save(tmp_path / "deep" / "out")
+    # Neither corrected plants nor commands of an earlier diagnosis stay behind.
+    written = dataclasses.replace(found, plants={}, request=None).save(tmp_path / "deep" / "out")
     assert [path.name for path in written] == names[:3]
     assert sorted(path.name for path in written[0].parent.iterdir()) == sorted(names[:3])
 
@@ -136,3 +137,18 @@ def test_corrected_plants_carry_the_breaths_that_no_fit_has_seen(tmp_path):
     other = dataclasses.replace(recorded, sha256="b" * 64)
     assert never_fitted(other, again) == ()
     assert never_fitted(recorded, load_simulators("physics")) == ()
+
+
+def test_the_commands_to_record_next_can_be_played(tmp_path):
+    found = made.diagnosis(12)
+    request = found.request
+    assert request is not None
+    path = tmp_path / "record_next.csv"
+    path.write_text(request.to_csv())
+    controls = read_controls(path)
+    assert controls.u_in.shape == (request.u_in.size,)
+    np.testing.assert_allclose(controls.u_in, request.u_in.ravel(), atol=1e-4)
+    np.testing.assert_array_equal(controls.u_out, request.u_out.ravel())
+    np.testing.assert_allclose(controls.dt[:-1], request.dt.ravel()[:-1], atol=2e-6)
+    breaths = {line.partition(",")[0] for line in path.read_text().splitlines()[1:]}
+    assert breaths == {str(k) for k in range(1, len(request.u_in) + 1)}

@@ -11,9 +11,14 @@ import numpy as np
 import pytest
 
 from tests.diagnosis import made
+from ventbench.diagnosis.findings import MissingMechanism
+from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY
 from ventbench.diagnosis.residual_axes import EDGE
 from ventbench.diagnosis.result import Diagnosis
-from ventbench.views.diagnosis import write_report, write_rerun
+from ventbench.mechanics.labels import Estimate
+from ventbench.physics import library
+from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
+from ventbench.views.diagnosis import diagram, write_report, write_rerun
 from ventbench.views.diagnosis.charts import (
     Chart,
     by_axis,
@@ -22,6 +27,7 @@ from ventbench.views.diagnosis.charts import (
     panels,
     rmse,
     ticks,
+    window,
     worst,
 )
 
@@ -49,6 +55,7 @@ def test_report(found: Diagnosis, tmp_path: Path) -> None:
         assert f"{value:.2f}" in page.text
     figures = [attrs["aria-label"] for _, attrs in page.tags if attrs.get("role") == "img"]
     assert len([text for text in figures if text.startswith("Pressure of breath")]) == 6
+    assert len([text for text in figures if text.endswith("magnified.")]) == 6
     (start,) = [text for text in figures if "Mean error along time since inspiration" in text]
     assert "significant ranges: 0" in start
     assert "This recording cannot tell valve_delay from valve_lag." in page.text
@@ -81,11 +88,52 @@ def test_nothing_from_outside(found: Diagnosis, tmp_path: Path) -> None:
 def test_other_verdicts(tmp_path: Path) -> None:
     unnamed = Page(write_report(tmp_path / "u.html", made.unnamed(12)).read_text())
     assert "Shape of R(V)" in unnamed.text
-    assert "What is missing</h2>" not in unnamed.text
+    assert "Each effect by itself" not in unnamed.text
     nothing = Page(write_report(tmp_path / "n.html", made.nothing(12)).read_text())
     assert "Nothing is missing" in nothing.text
     assert "Nowhere" in nothing.text
     assert "corrected" not in nothing.text
+
+
+def test_the_guilty_part_of_the_rig_is_lit(found: Diagnosis, tmp_path: Path) -> None:
+    page = Page(write_report(tmp_path / "r.html", found).read_text())
+    (rig,) = [attrs for _, attrs in page.tags if attrs.get("class") == "rig"]
+    assert rig["aria-label"].endswith("inspiratory valve: dead time of the inspiratory valve.")
+    looks = [attrs["class"] for _, attrs in page.tags if attrs.get("class", "").startswith("part")]
+    assert len(looks) == len(diagram.PARTS)
+    assert [look.split()[1:] for look in looks].count(["lit"]) == 1
+    unnamed = Page(write_report(tmp_path / "u.html", made.unnamed(12)).read_text())
+    assert "part suspect" in {attrs.get("class") for _, attrs in unnamed.tags}
+    nothing = Page(write_report(tmp_path / "n.html", made.nothing(12)).read_text())
+    assert "No part of it is guilty" in nothing.text
+    both = dataclasses.replace(
+        found, mechanisms=found.mechanisms * 2, nonparametric=made.unnamed(12).nonparametric
+    )
+    parts = diagram.parts(diagram.entries(both))
+    assert parts["inspiratory valve"].badge == "1, 2"
+    assert (parts["airway"].look, parts["airway"].badge) == ("suspect", "3")
+
+
+@pytest.mark.parametrize("place", [*NONPARAMETRIC_COMPONENTS, ALVEOLUS, SUPPLY, MEASUREMENT])
+def test_every_place_is_in_the_picture(place: str) -> None:
+    term = made.unnamed(12).nonparametric
+    assert term is not None
+    assert diagram.site_of_term(dataclasses.replace(term, name=place)) in diagram.PARTS
+
+
+@pytest.mark.parametrize("name", library())
+def test_every_mechanism_has_a_page(name: str, tmp_path: Path) -> None:
+    """Its formula as MathML, its own signal without and with it, and its part of the rig."""
+    about = library()[name].description
+    strength = about.strength
+    estimate = Estimate(strength.strong, strength.unit, (strength.mild, strength.high))
+    missing = MissingMechanism(name, {strength.name: estimate}, 0.9, (), 20.0)
+    shown = dataclasses.replace(made.diagnosis(12), mechanisms=(missing,), plants={})
+    page = Page(write_report(tmp_path / "r.html", shown).read_text())
+    assert any(tag == "math" for tag, _ in page.tags)
+    assert not any(tag == "code" and "^" in str(attrs) for tag, attrs in page.tags)
+    figures = [attrs["aria-label"] for _, attrs in page.tags if attrs.get("role") == "img"]
+    assert any(text.endswith(f"without and with {about.title}.") for text in figures)
 
 
 def test_no_nan_reaches_the_page(found: Diagnosis, tmp_path: Path) -> None:
@@ -124,6 +172,21 @@ def test_the_breaths_that_are_shown(found: Diagnosis) -> None:
     panel = panels(found)[0]
     assert [look for look, _ in panel.pressure.paths] == ["seen", "before", "refit", "after"]
     assert panel.errors["refit"] == pytest.approx(before[shown[0]])
+
+
+def test_a_shift_of_one_percent_shows_in_the_magnified_part() -> None:
+    """30 ms in a breath of 3 s: more than 5 % of the width of the magnified chart."""
+    time = np.arange(0.0, 3.0, 0.03)
+    recorded = np.where(time > 1.215, 20.0, 5.0)
+    low, high = window(time, recorded, np.where(time > 1.185, 20.0, 5.0))
+    assert low < 1.17
+    assert high > 1.23
+    assert 0.03 / (high - low) > 0.05
+    chart = Chart((low, high), (0.0, 1.0), "s", "", "")
+    assert float(chart.at_x(low + 0.03) - chart.at_x(low)) > 15.0
+    start, _ = window(time, recorded, recorded)
+    assert start == 0.0, "no error: the beginning"
+    assert window(time, recorded, np.where(time > 2.9, 0.0, recorded))[1] == time[-1]
 
 
 def test_axes_of_a_chart() -> None:

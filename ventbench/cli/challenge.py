@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from ventbench.cli.options import JsonFile, claim_out, emit
+from ventbench.cli.options import JsonFile, ResultsPage, claim_out, emit
 
 challenge = typer.Typer(
     name="challenge",
@@ -132,6 +132,7 @@ def reveal(
         int, typer.Option(min=0, help="Processes for --oracle; 0 for this process alone.")
     ] = 0,
     json: JsonFile = None,
+    page: ResultsPage = None,
 ) -> None:
     """Open the sealed answers, check all hashes, and score the diagnoses.
 
@@ -144,6 +145,7 @@ def reveal(
     from ventbench.cli.options import bars
     from ventbench.validation.challenge.folder import ChallengeFolder
     from ventbench.validation.challenge.reveal import reveal as work
+    from ventbench.validation.results_page import challenge_section, write_section
 
     with bars() as shown:
         task = shown.add_task("oracle" if oracle else "scoring", total=None)
@@ -155,6 +157,10 @@ def reveal(
             ChallengeFolder(folder, round_), seed, with_oracle=oracle, jobs=jobs, progress=progress
         )
     emit(result.as_dict(), json)
+    if page is not None:
+        total = len(ChallengeFolder(folder).cases())
+        text = challenge_section(result, seed=seed, total=total)
+        write_section(page, f"challenge {result.generator}", text)
     console = Console(stderr=str(json) == "-")
     _show(result, console)
     if any(figure.met is False for figure in result.figures):

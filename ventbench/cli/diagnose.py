@@ -9,6 +9,9 @@ import typer
 
 from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, claim_out, emit
 
+#: Share of a diagnosis before which its remaining time is a guess.
+_TOO_EARLY = 0.15
+
 if TYPE_CHECKING:
     from ventbench.diagnosis.result import Diagnosis
     from ventbench.recordings.breaths import Breaths
@@ -102,7 +105,7 @@ def _diagnose(
     breaths: Breaths, plant: str, simulated: Path | None, lung: str | None, patient: bool,
     drive: str,
 ) -> Diagnosis:  # fmt: skip
-    """Diagnose with a progress bar."""
+    """Diagnose with a progress bar that says what is done and how long it will take."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -112,12 +115,20 @@ def _diagnose(
 
     compilation.keep()
     simulators = load_simulated(simulated, breaths) if simulated else load_simulators(plant)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        task = bars.add_task("diagnosing", total=1.0)
+    console = Console(stderr=True)
+    lungs = 1 if lung is not None else len(breaths.by_lung_index)
+    console.print(expected_time(len(breaths), lungs, compilation.is_warm()), highlight=False)
+    columns = (
+        TextColumn("{task.description}"), BarColumn(bar_width=20), TimeElapsedColumn(),
+        TextColumn("{task.fields[left]}"),
+    )  # fmt: skip
+    with Progress(*columns, console=console, transient=True) as bars:
+        task = bars.add_task("diagnosing", total=1.0, left="")
 
         def progress(what: str, share: float) -> None:
-            bars.update(task, description=what, completed=share)
+            elapsed = bars.tasks[task].elapsed or 0.0
+            left = remaining(elapsed, share)
+            bars.update(task, description=what, completed=share, left=left)
 
         return find(
             breaths,
@@ -127,6 +138,33 @@ def _diagnose(
             drive=drive,  # type: ignore[arg-type]
             progress=progress,
         )
+
+
+def expected_time(breaths: int, lungs: int, warm: bool) -> str:
+    """How long a diagnosis usually takes, in words.
+
+    Args:
+        breaths: number of breaths.
+        lungs: number of lungs among them.
+        warm: whether compiled functions are kept on this machine.
+    """
+    usual = "10 s to a minute" if lungs == 1 else "one to five minutes"
+    text = (
+        f"diagnosing {breaths} breaths of {lungs} lung{'s' if lungs > 1 else ''}: usually {usual}"
+    )
+    if not warm:
+        text += "; the first run on a machine compiles for half a minute more"
+    return f"{text}. Ctrl-C stops it; nothing is written before the end."
+
+
+def remaining(elapsed: float, share: float) -> str:
+    """Remaining time in words, from the time so far and the share that is done."""
+    if share < _TOO_EARLY or elapsed < 1.0:
+        return ""
+    left = elapsed * (1.0 - share) / share
+    if left < 90.0:
+        return f"about {max(left, 1.0):.0f} s left"
+    return f"about {left / 60.0:.0f} min left"
 
 
 def register(app: typer.Typer) -> None:

@@ -35,6 +35,14 @@ PlantName = Annotated[
         "module:function.",
     ),
 ]
+ResultsPage = Annotated[
+    Path | None,
+    typer.Option(
+        "--page",
+        metavar="FILE",
+        help="Markdown file whose section of these results is written anew; made if missing.",
+    ),
+]
 RecordingsDir = Annotated[
     Path | None,
     typer.Option(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ventbench.cli.options import JsonFile, claim_out, emit
+from ventbench.cli.options import JsonFile, ResultsPage, claim_out, emit
 
 if TYPE_CHECKING:
     from ventbench.validation.real_rig_proof import Proof
@@ -37,6 +37,7 @@ def proof(
         ),
     ] = None,
     json: JsonFile = None,
+    page: ResultsPage = None,
 ) -> None:
     """Diagnose models of the real rig, with known effects removed or injected.
 
@@ -56,6 +57,7 @@ def proof(
     from ventbench import compilation, extras
     from ventbench.cli.options import bars
     from ventbench.validation.real_rig_proof import prove
+    from ventbench.validation.results_page import proof_section, write_section
 
     extras.require("jinja2", "rerun")
     folder = _folder(recordings)
@@ -70,6 +72,8 @@ def proof(
 
         result = prove(folder, out, lambda to, diagnosis: diagnosis.save(to), only or (), progress)
     emit(result.as_dict(), json)
+    if page is not None:
+        write_section(page, "proof", proof_section(result))
     _show(Console(stderr=str(json) == "-"), result)
     if not result.met:
         raise typer.Exit(1)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ventbench.cli.options import JsonFile, RecordingsDir, emit
+from ventbench.cli.options import JsonFile, RecordingsDir, ResultsPage, emit
 
 
 def real_pairs(
@@ -26,6 +26,7 @@ def real_pairs(
         typer.Option("--sealed", help="Open the sealed half of the pairs; it can be opened once."),
     ] = False,
     json: JsonFile = None,
+    page: ResultsPage = None,
 ) -> None:
     """Compare real recordings whose difference is known and concealed.
 
@@ -39,6 +40,7 @@ def real_pairs(
     from ventbench import compilation, files
     from ventbench.cli.options import bars, recordings_folder
     from ventbench.validation import real_pairs as work
+    from ventbench.validation.results_page import pairs_section, write_section
 
     folder = recordings_folder(recordings)
     compilation.keep()
@@ -50,6 +52,9 @@ def real_pairs(
         )  # fmt: skip
     text = work.report(answers)
     files.write_text(out / ("sealed.md" if sealed else "development.md"), text + "\n")
+    if page is not None:
+        half = "sealed" if sealed else "development"
+        write_section(page, f"real pairs {half}", pairs_section(text, half=half))
     emit(work.as_dict(answers), json)
     typer.echo(text, err=str(json) == "-")
 

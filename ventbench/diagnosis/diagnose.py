@@ -62,6 +62,11 @@ Progress: TypeAlias = Callable[[str, float], None]
 #: What a diagnosis follows.
 Drive: TypeAlias = Literal["auto", "valve", "flow"]
 
+#: Shares of a diagnosis that are done when the recording is simulated and when the models are
+#: identified; and the part of what is left that a step of an identification takes, so that the five
+#: or six steps of one effect come near the end.
+_STARTED, _IDENTIFIED, _STEP = 0.02, 0.9, 0.3
+
 _NOTE_ON_FLOW = (
     "No valve command: the recorded flow drives the model, so nothing is said of the valves, R_ex "
     "and PEEP, and an offset of the flow sensor looks like a leak."
@@ -140,7 +145,7 @@ def diagnose(
     seen = uses.identifying  # nothing below looks at other breaths until a simulator is chosen
     held, fitted = uses.testing[seen], uses.fitted[seen]
     excluded = () if patient else ("patient_effort",)
-    tell("simulating", 0.02)
+    tell("simulating", _STARTED)
     if by_flow:
         driven, index = flow_drive.drive_grid(recorded)
         before = flow_drive.simulate(simulators, recorded, driven, index)
@@ -158,17 +163,18 @@ def diagnose(
             breaths, before = grid.breaths, grid.of(before)
             notes.append(_note_on_rate(rate, breaths))
         data = make_data(breaths)
+    halfway = _IDENTIFIED if simulators.is_base_physics else 0.5 * _IDENTIFIED
     recording_only_model = identify(
-        data.select(seen), held, excluded, lambda what: tell(what, 0.3), settings, fitted
+        data.select(seen), held, excluded, steps_between(tell, _STARTED, halfway), settings, fitted
     )
     recording_model, simulator_model = recording_only_model, None
     if not simulators.is_base_physics:
-        tell("fitting the simulator's response", 0.6)
+        tell("fitting the simulator's response", halfway)
         recording_model, simulator_model = identify_both(
             data.select(seen), held, before[seen], recording_only_model, excluded,
-            lambda what: tell(what, 0.7), fitted,
+            steps_between(tell, halfway, _IDENTIFIED), fitted,
         )  # fmt: skip
-    tell("drawing conclusions", 0.9)
+    tell("drawing conclusions", _IDENTIFIED)
     missing, notes_on_simulator = missing_mechanisms(recording_model, simulator_model)
     if simulator_model is not None:
         steady = refit_at_simulator_parameters(recording_model, simulator_model, tuple(missing))
@@ -238,6 +244,24 @@ def diagnose(
         settings=settings,
         seconds=time.perf_counter() - began,
     )  # fmt: skip
+
+
+def steps_between(tell: Progress, low: float, high: float) -> Callable[[str], None]:
+    """Progress through steps whose number nobody knows before: each takes a part of what is left.
+
+    Args:
+        tell: receives the step in words, and the share of the whole that is done.
+        low: share before the first step.
+        high: share that the steps come near.
+    """
+    share = low
+
+    def step(what: str) -> None:
+        nonlocal share
+        tell(what, share)
+        share += _STEP * (high - share)
+
+    return step
 
 
 def _note_on_rate(rate: float, breaths: Breaths) -> str:

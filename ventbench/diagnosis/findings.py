@@ -178,6 +178,18 @@ class BreathRequest:
     u_out: Floats
     dt: Floats
 
+    def to_csv(self) -> str:
+        """Commands as a CSV file: ``breath_id,time_step,u_in,u_out``, breaths end to end.
+
+        An operator plays it from the first row to the last; ``ventbench simulate --controls`` and
+        :func:`ventbench.simulate` take it as it is. Times are s, ``u_in`` is in %.
+        """
+        time = np.concatenate([[0.0], np.cumsum(self.dt.ravel())[:-1]])
+        number = np.repeat(np.arange(1, len(self.u_in) + 1), self.u_in.shape[1])
+        columns = zip(number, time, self.u_in.ravel(), self.u_out.ravel(), strict=True)
+        rows = [f"{k},{t:.6f},{u:.4f},{int(o)}" for k, t, u, o in columns]
+        return "\n".join(["breath_id,time_step,u_in,u_out", *rows]) + "\n"
+
 
 @dataclass(frozen=True, eq=False)
 class Findings:

@@ -33,6 +33,18 @@ _SHORT_MOMENT = 0.15
 #: Parameters of time below this are given in ms, s.
 _SHORT_PARAMETER = 0.5
 
+#: Odds beyond these are called sure: no model is so right that larger ones mean anything.
+_SURE_ODDS = 1e6
+
+#: From this number of effects on, a headline counts them instead of naming them.
+_SEVERAL = 3
+
+#: Numbers at the beginning of a headline.
+_NUMBERS = {3: "Three", 4: "Four", 5: "Five", 6: "Six"}
+
+#: Fewer judging breaths than these leave the worth of a correction vague.
+_FEW_BREATHS = 10
+
 #: A mean error below this share of the noise says nothing about its sign.
 _NO_SIGN = 0.25
 
@@ -42,43 +54,79 @@ def sentences(findings: Findings) -> list[str]:
     texts = [answer(findings), *map(missing_mechanism, findings.mechanisms)]
     texts += [effect(findings), *alternatives(findings), nonparametric_term(findings)]
     texts += [open_loop(findings), remaining(findings), *map(lung, findings.lungs)]
-    texts += [visible(findings), scatter(findings), request(findings), *findings.notes]
+    texts += [visible(findings), scatter(findings), request(findings)]
+    texts += [*would_change(findings), *findings.notes]
     return [text for text in texts if text]
 
 
 def answer(findings: Findings) -> str:
     """What is missing, how sure that is, what mending it is worth, and what stays unexplained."""
-    return f"{verdict(findings)} {worth(findings)}".strip()
+    return f"{verdict(findings)}; {worth(findings)}."
+
+
+def headline(findings: Findings) -> str:
+    """What is missing and what mending it is worth, in one short sentence."""
+    simulator, errors = f"the {findings.simulator} simulator", findings.open_loop
+    before, after = rounded(errors.refit.rmse, 2), rounded(errors.after.rmse, 2)
+    if findings.verdict == "nothing_missing":
+        return f"Nothing is missing in {simulator}: it errs by {after} cmH2O"
+    if findings.verdict == "unnamed":
+        what = f"Something is missing in {simulator} that has no name"
+    else:
+        titles = [title(mechanism.name) for mechanism in findings.mechanisms]
+        several = f"{_NUMBERS.get(len(titles), str(len(titles)))} effects are missing in"
+        what = f"Missing in {simulator}: {_listed(titles)}"
+        if len(titles) >= _SEVERAL:
+            what = f"{several} {simulator}"
+    if after == before:
+        return f"{what}, and the error stays at {after} cmH2O"
+    return f"{what}; mending {_it(findings)} takes the error from {before} to {after} cmH2O"
 
 
 def verdict(findings: Findings) -> str:
-    """What is missing, and how sure that is, in one sentence."""
+    """What is missing, and how sure that is; without a full stop."""
     simulator, term = f"the {findings.simulator} simulator", findings.nonparametric
     if findings.verdict == "nothing_missing":
         how = "" if _is_unchanged(findings) else "with R and C refitted, "
-        return f"Nothing is missing: {how}{simulator} explains the recording."
+        return f"Nothing is missing: {how}{simulator} explains the recording"
     if findings.verdict == "unnamed":
         if term is None:
             return (
                 f"Something is missing in {simulator}, but the recording singles out neither a "
-                "mechanism nor a place in the model."
+                "mechanism nor a place in the model"
             )
         return (
             f"Something is missing in {simulator} that is not in the library of mechanisms "
-            f"({_evidence(term.nats)}); its place in the model is {place(term)}."
+            f"({odds(term.nats)}); its place in the model is {place(term)}"
         )
-    names = _listed(
-        [
-            f"{title(mechanism.name)} ({mechanism.name}, {_evidence(mechanism.nats)})"
-            for mechanism in findings.mechanisms
-        ]
-    )
-    rest = "" if term is None else "; an effect that is not in the library is missing too"
-    return f"Missing in {simulator}: {names}; 5 nats decide{rest}."
+    names = _listed([title(mechanism.name) for mechanism in findings.mechanisms])
+    rest = "" if term is None else ", and an effect that is not in the library"
+    return f"Missing in {simulator}: {names}{rest} ({sureness(findings)})"
+
+
+def sureness(findings: Findings) -> str:
+    """How sure the names are, or the place without a name, in words."""
+    nats = [mechanism.nats for mechanism in findings.mechanisms]
+    if not nats:
+        return odds(findings.nonparametric.nats) if findings.nonparametric is not None else ""
+    each = "each at " if len(nats) > 1 else ""
+    return f"{each}{odds(min(nats))}"
+
+
+def odds(nats: float) -> str:
+    """Held-out evidence as odds; 4.6 nats are odds of 100 to one."""
+    if nats >= math.log(_SURE_ODDS):
+        return "odds above a million to one on held-out breaths"
+    value = math.exp(max(nats, 0.0))
+    digits = 10 ** max(int(math.log10(value)) - 1, 0)
+    return f"odds of {round(value / digits) * digits:,.0f} to one on held-out breaths"
 
 
 def worth(findings: Findings) -> str:
-    """What mending the simulator is worth on breaths set aside, and what stays unexplained."""
+    """What mending the simulator is worth on breaths set aside, and what stays unexplained.
+
+    It goes on from :func:`verdict`, without a full stop.
+    """
     errors = findings.open_loop
     after, noise = rounded(errors.after.rmse, 2), rounded(errors.noise_floor, 2)
     beyond = rounded(errors.unexplained, 2)
@@ -89,24 +137,64 @@ def worth(findings: Findings) -> str:
         left = f"hardly more than the noise of {noise} is left"
     count = len(errors.held_out_breaths)
     if findings.verdict == "nothing_missing":
-        return f"It errs by {after} cmH2O on {count} breaths set aside; {left}."
+        return f"it errs by {after} cmH2O on {count} breaths set aside, and {left}"
     refit = rounded(errors.refit.rmse, 2)
     term = findings.nonparametric
     if term is not None and term.x_unit.startswith("sample") and not findings.mechanisms:
         return (
-            f"It differs from breath to breath, so that no correction of the simulator mends it: "
-            f"the error on {count} breaths set aside stays at {after} cmH2O; {left}."
+            "it differs from breath to breath, so that no correction of the simulator mends it: "
+            f"the error on {count} breaths set aside stays at {after} cmH2O, and {left}"
         )
     if errors.after == errors.refit or after == refit:
         return (
-            f"Mending it is worth nothing on the {count} breaths set aside, where the error stays "
-            f"at {after} cmH2O; {left}."
+            f"mending {_it(findings)} is worth nothing on the {count} breaths set aside, where the "
+            f"error stays at {after} cmH2O, and {left}"
         )
     start = " (R and C refitted)" if errors.refit != errors.before else ""
     return (
-        f"Mending it takes the error on {count} breaths set aside from {refit}{start} to {after} "
-        f"cmH2O; {left}."
+        f"mending {_it(findings)} takes the error on {count} breaths set aside from {refit}{start} "
+        f"to {after} cmH2O, and {left}"
     )
+
+
+def would_change(findings: Findings) -> list[str]:
+    """What would overturn or weaken the answer, a sentence each."""
+    texts = []
+    names = [missing.name for missing in findings.mechanisms]
+    if names:
+        it, them = ("it", "the name") if len(names) == 1 else ("one", "that name")
+        texts.append(
+            f"A further recording whose held-out breaths gain less than {_deciding(findings):g} "
+            f"nats by {it} would withdraw {them}."
+        )
+    for name in names:
+        if same := mechanism(name).description.equivalents:
+            texts.append(
+                f"Pressure alone can never tell {name} from {_listed(same, 'or')}; flow or volume "
+                "of the lung may."
+            )
+    count = len(findings.open_loop.held_out_breaths)
+    if count < _FEW_BREATHS:
+        texts.append(
+            f"Only {count} breaths judge the correction; twenty breaths more of the same lung "
+            "would make its worth firm."
+        )
+    if findings.verdict == "nothing_missing":
+        texts.append(
+            "Breaths of another kind, such as short pulses, long holds or a second lung, may show "
+            "what these cannot."
+        )
+    elif findings.open_loop.unexplained > findings.open_loop.noise_floor:
+        texts.append(
+            "More than the noise is unexplained: a further effect may act, and with it the "
+            "strengths given here may move."
+        )
+    if findings.verdict == "unnamed":
+        texts.append(
+            "A mechanism of that shape in the library would give it a name; docs/physics.md says "
+            "how one is added."
+        )
+    return texts
 
 
 def remaining(findings: Findings) -> str:
@@ -167,8 +255,13 @@ def missing_mechanism(missing: MissingMechanism) -> str:
     start = _capital(about.title)
     if missing.changed and not missing.simulator_values:
         start += ", which the simulator has with another strength"
-    preferred = f"Preferred over other names: {100 * missing.confidence:.0f} %."
-    return f"{start}{': ' if values else ''}{'; '.join(values)}. {preferred}"
+    preferred = f"preferred over other names: {100 * missing.confidence:.0f} %"
+    evidence = f"held-out evidence {missing.nats:.0f} nats"
+    values_in_words = "; ".join(values)
+    return (
+        f"{start} ({missing.name}){': ' if values else ''}{values_in_words}; {evidence}; "
+        f"{preferred}."
+    )
 
 
 def effect(findings: Findings) -> str:
@@ -234,7 +327,8 @@ def request(findings: Findings) -> str:
     what = f"distinguish between {_listed(wanted.why)}"
     if len(wanted.why) == 1:
         what = f"test {wanted.why[0]}"
-    return f"{text} These breaths {what} (expected evidence {wanted.nats:.0f} nats; 5 decide)."
+    evidence = f"expected evidence {wanted.nats:.0f} nats; {_deciding(findings):g} decide"
+    return f"{text} These breaths {what} ({evidence})."
 
 
 def nonparametric_term(findings: Findings) -> str:
@@ -357,9 +451,15 @@ def _scale(estimate: Estimate, path: str) -> tuple[float, str]:
     return 1.0, "" if estimate.unit == "1" else estimate.unit
 
 
-def _evidence(nats: float) -> str:
-    """Held-out evidence in words: 5 nats are odds of 150 to 1."""
-    return f"{nats:.0f} nats of evidence"
+def _it(findings: Findings) -> str:
+    """Pronoun for what is missing."""
+    count = len(findings.mechanisms) + (findings.nonparametric is not None)
+    return "it" if count < 2 else "them"
+
+
+def _deciding(findings: Findings) -> float:
+    """Held-out evidence from which a term is needed, nats."""
+    return findings.settings.held_out_test.threshold
 
 
 def _is_unchanged(findings: Findings) -> bool:

@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 FORMAT = "ventbench-diagnosis-1"
 
 
+#: File of the commands to record next.
+RECORD_NEXT = "record_next.csv"
+
 #: Pictures lie above the diagnosis; they are imported only when they are asked for.
 _VIEWS = "ventbench.views.diagnosis"
 
@@ -105,10 +108,12 @@ class Diagnosis(Findings):
         return import_module(f"{_VIEWS}.plot").figure(self)
 
     def save(self, folder: Path | str) -> list[Path]:
-        """Write ``diagnosis.json``, ``report.html``, ``diagnosis.rrd`` and ``corrected.json``.
+        """Write the diagnosis as JSON, a page and a rerun file, and what follows from it.
 
-        Each file is written in one step. ``corrected.json`` holds the corrected plants, which every
-        ``--plant`` takes; it is left out if the simulator has no plants.
+        ``diagnosis.json``, ``report.html`` and ``diagnosis.rrd``. ``corrected.json`` holds the
+        corrected plants, which every ``--plant`` takes; it is left out if the simulator has no
+        plants. ``record_next.csv`` holds the commands of the breaths to record next, for an
+        operator or ``ventbench simulate``; it is left out if nothing is open.
 
         Args:
             folder: folder to write to; created if missing.
@@ -129,8 +134,14 @@ class Diagnosis(Findings):
             views.write_report(folder / "report.html", self),
             views.write_rerun(folder / "diagnosis.rrd", self),
         ]
+        commands = folder / RECORD_NEXT
+        if self.request is None:
+            commands.unlink(missing_ok=True)  # that of an earlier diagnosis
+        else:
+            files.write_text(commands, self.request.to_csv())
+            written.append(commands)
         if not self.plants:
-            corrected.unlink(missing_ok=True)  # that of an earlier diagnosis
+            corrected.unlink(missing_ok=True)
             return written
         breaths = self.traces.breaths
         about = {
@@ -183,6 +194,7 @@ class Diagnosis(Findings):
                 for name, limit in self.detection_limits.items()
             },
             "sentences": report_text.sentences(self),
+            "would_change": report_text.would_change(self),
             "notes": list(self.notes),
             "seconds": self.seconds,
             "settings": self.settings.as_dict(),

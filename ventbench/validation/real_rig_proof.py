@@ -29,6 +29,7 @@ from ventbench.validation.real_rig_parts import (
     by_names_alone,
     has_unnamed,
 )
+from ventbench.validation.results_page import code_version
 
 FORMAT = "ventbench-proof-1"
 
@@ -178,6 +179,7 @@ def _run(
             "title": part.title,
             "breaths": len(setting.breaths),
             "wanted": setting.wanted,
+            "code": code_version(),
             "mae_by_names_alone": _mae_by_names_alone(diagnosis),
             "files": [path.name for path in written],
         },
@@ -237,6 +239,7 @@ def figures(diagnosis: Mapping[str, Any], summary: Mapping[str, Any]) -> dict[st
         "found": None if wanted is None else named(mechanisms, wanted) is not None,
         "about": summary["key"]["about"],
         "seconds": diagnosis["seconds"],
+        "code": summary.get("code"),
     }
 
 

@@ -18,6 +18,7 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import load
 from ventbench.validation.challenge import requests
 from ventbench.validation.challenge.folder import ChallengeFolder
+from ventbench.validation.results_page import code_version
 
 #: Environment of the processes, each of which computes on one core.
 _SINGLE_THREAD = {
@@ -133,6 +134,7 @@ def _answer_case(
             "seconds": round(seconds, 2),
             "peak_mib": round(_peak_memory(), 1),
             "first_in_process": _answered == 0,
+            "code": code_version(),
             "diagnosis": value,
         },
     )

@@ -23,6 +23,7 @@ from ventbench.validation.challenge.figures import (
 )
 from ventbench.validation.challenge.folder import ChallengeFolder, Truth
 from ventbench.validation.challenge.judge import JudgedCase, judge, library_names
+from ventbench.validation.challenge.stranger.effects import StrangerCase
 
 #: Goals for the corrected simulator's held-out RMSE over the oracle's: median, 95th percentile.
 _MEDIAN_RATIO, _LARGE_RATIO = 1.02, 1.10
@@ -42,6 +43,8 @@ class ChallengeResult:
         figures: measured values with their goals.
         confusion: see :func:`~.figures.confusion`.
         parameters: see :func:`~.figures.by_parameter`.
+        versions: code that gave the answers, as the answers say.
+        generator: name of the generator.
     """
 
     commitment: str
@@ -50,6 +53,8 @@ class ChallengeResult:
     figures: tuple[Figure, ...]
     confusion: dict[str, dict[str, int]]
     parameters: dict[str, dict[str, Any]]
+    versions: tuple[str, ...] = ()
+    generator: str = "first"
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""
@@ -59,6 +64,7 @@ class ChallengeResult:
             "figures": [asdict(figure) for figure in self.figures],
             "confusion": self.confusion,
             "parameters": self.parameters,
+            "versions": list(self.versions),
             "cases": [_as_dict(case) for case in self.cases],
         }
 
@@ -96,6 +102,8 @@ def reveal(
         tuple(measured),
         confusion(list(cases.values())),
         by_parameter(list(cases.values())),
+        tuple(sorted({given["code"] for given in folder.answers().values() if "code" in given})),
+        "stranger" if any(isinstance(d.case, StrangerCase) for d, _ in truth) else "first",
     )
 
 

@@ -11,11 +11,12 @@ from ventbench.diagnosis.findings import BreathRequest, NonparametricTerm, Trace
 from ventbench.diagnosis.residual_analysis import Profile, profiles
 from ventbench.diagnosis.residual_axes import EDGE
 from ventbench.diagnosis.result import Diagnosis
+from ventbench.physics.characteristics import Characteristic
 from ventbench.views import graphics
 from ventbench.views.runs import Floats
 
 #: Room for the labels: left, right, top, bottom, picture units.
-LEFT, RIGHT, TOP, BOTTOM = 34.0, 8.0, 16.0, 30.0
+LEFT, RIGHT, TOP, BOTTOM = 40.0, 16.0, 16.0, 30.0
 
 #: The three simulators in the order of the legend: key, text, class of the line.
 STAGES = (
@@ -29,6 +30,12 @@ WORST = 3
 
 #: Left end of the logarithmic axis of the time since an edge, s.
 _FIRST_EDGE_TIME = 0.01
+
+#: Time that the magnified part of a breath shows before and after its largest error, s.
+_BEFORE, _AFTER = 0.12, 0.28
+
+#: Colour class of a characteristic without and with its mechanism.
+_WITHOUT, _WITH = "refit", "after"
 
 #: Breaths of a request that are drawn.
 REQUESTED = 4
@@ -178,6 +185,8 @@ class BreathPanel:
         why: reason why the breath is shown.
         errors: root mean square over the inspiration by stage, cmH2O.
         pressure: chart of the pressure.
+        near: the part of it where the refitted simulator errs most, magnified.
+        error: chart of recorded minus simulated pressure.
         valve: chart of the command.
     """
 
@@ -185,6 +194,8 @@ class BreathPanel:
     why: str
     errors: dict[str, float]
     pressure: Chart
+    near: Chart
+    error: Chart
     valve: Chart
 
 
@@ -225,9 +236,64 @@ def panels(diagnosis: Diagnosis) -> list[BreathPanel]:
         if several:
             name += f", {traces.breaths.lung_ids[i]}"
         errors = {key: float(values[i]) for key, values in by_stage.items()}
-        pressure = _pressure(traces, i, name, diagnosis.verdict != "nothing_missing")
-        shown.append(BreathPanel(name, why, errors, pressure, _valve(traces, i, name)))
+        shown.append(_panel(traces, i, name, why, errors, diagnosis.verdict != "nothing_missing"))
     return shown
+
+
+def _panel(
+    traces: Traces, i: int, name: str, why: str, errors: dict[str, float], corrected: bool
+) -> BreathPanel:
+    """Charts of one breath."""
+    breath = traces.breaths
+    looks = [(key, look) for key, _, look in STAGES if look != "after" or corrected]
+    end = _end(traces, i)
+    use = breath.valid[i] & (breath.time[i] <= end)
+    time, recorded = breath.time[i][use], breath.pressure[i][use]
+    simulated = {key: getattr(traces, key)[i][use] for key, _ in looks}
+    pressure = Chart(
+        (0.0, end), limits(recorded, traces.refit[i][use], traces.after[i][use]), "", "cmH2O",
+        f"Pressure of {name}: recorded, and simulated before, after refit and corrected.",
+        height=140.0,
+    )  # fmt: skip
+    low, high = window(time, recorded, simulated["refit"])
+    pressure.band(low, high)
+    within = (time >= low - 1e-9) & (time <= high + 1e-9)
+    seen = [recorded[within], *(simulated[key][within] for key, _ in looks if key != "before")]
+    near = Chart(
+        (low, high), limits(*seen), "", "magnified, cmH2O",
+        f"{name.capitalize()} from {low:.2f} to {high:.2f} s, magnified.", height=130.0,
+    )  # fmt: skip
+    for chart, part in ((pressure, slice(None)), (near, within)):
+        chart.line("seen", time[part], recorded[part])
+        for key, look in looks:
+            chart.line(look, time[part], simulated[key][part])
+    left = {key: recorded - values for key, values in simulated.items()}
+    error = Chart(
+        (0.0, end), limits(*(left[key] for key, _ in looks if key != "before"), least=1.0), "",
+        "recorded − simulated, cmH2O",
+        f"Error of {name}, recorded minus simulated: as given, refitted and corrected.",
+        height=110.0,
+    )  # fmt: skip
+    for key, look in looks:
+        error.line(look, time, left[key])
+    valve = command(time, breath.u_in[i][use], end, f"Commands of {name}.", 84.0)
+    return BreathPanel(name, why, errors, pressure, near, error, valve)
+
+
+def window(time: Floats, recorded: Floats, simulated: Floats) -> tuple[float, float]:
+    """Ends of the part of a breath around its largest error, s.
+
+    Args:
+        time: of the samples, s, ``(T,)``.
+        recorded: pressure, cmH2O, NaN where it is unknown, ``(T,)``.
+        simulated: pressure, cmH2O, ``(T,)``.
+    """
+    size = np.nan_to_num(np.abs(recorded - simulated), nan=0.0)
+    # Two neighbours together: a single outlier is no place.
+    both = size + 0.5 * (np.append(size[1:], 0.0) + np.append(0.0, size[:-1]))
+    middle, end = float(time[int(np.argmax(both))]), float(time[-1])
+    low = min(max(middle - _BEFORE, 0.0), max(end - _BEFORE - _AFTER, 0.0))
+    return low, min(low + _BEFORE + _AFTER, end)
 
 
 def _end(traces: Traces, i: int) -> float:
@@ -236,34 +302,6 @@ def _end(traces: Traces, i: int) -> float:
     last = np.max(breath.time[i], initial=0.0, where=breath.valid[i])
     inspired = np.max(breath.time[i], initial=0.0, where=breath.inspiratory[i])
     return float(max(min(last, inspired + 0.6), 0.1))
-
-
-def _pressure(traces: Traces, i: int, name: str, corrected: bool) -> Chart:
-    breath = traces.breaths
-    use = breath.valid[i] & (breath.time[i] <= _end(traces, i))
-    time, recorded = breath.time[i][use], breath.pressure[i][use]
-    near = limits(recorded, traces.refit[i][use], traces.after[i][use])
-    chart = Chart(
-        (0.0, _end(traces, i)),
-        near,
-        "",
-        "cmH2O",
-        f"Pressure of {name}: recorded, and simulated before, after refit and corrected.",
-        height=140.0,
-    )
-    chart.line("seen", time, recorded)
-    for key, _, look in STAGES:
-        if look != "after" or corrected:
-            chart.line(look, time, getattr(traces, key)[i][use])
-    return chart
-
-
-def _valve(traces: Traces, i: int, name: str) -> Chart:
-    breath = traces.breaths
-    use = breath.valid[i] & (breath.time[i] <= _end(traces, i))
-    return command(
-        breath.time[i][use], breath.u_in[i][use], _end(traces, i), f"Commands of {name}.", 84.0
-    )
 
 
 def command(time: Floats, u_in: Floats, end: float, alt: str, height: float) -> Chart:
@@ -299,7 +337,7 @@ def _axis(diagnosis: Diagnosis, refit: Profile, after: Profile) -> Chart:
         (float(edges[0]), float(edges[-1])),
         y if y[1] - y[0] > 0.2 else limits(y, least=0.2, around=0.0),
         f"{axis.name}{unit}",
-        "recorded - simulated, cmH2O",
+        "recorded − simulated, cmH2O",
         f"Mean error along {axis.name}{unit}; significant ranges: {where}.",
         width=330.0,
         height=190.0,
@@ -321,6 +359,22 @@ def _near(end: np.ndarray, mean: np.ndarray) -> np.ndarray:
     """Ends of intervals, cut where they are so wide that they would hide everything else."""
     reach = 2.0 * np.nanmax(np.abs(mean), initial=0.1)
     return np.clip(end, -reach, reach)
+
+
+def own_signal(name: str, shown: Characteristic) -> Chart:
+    """What a mechanism does to its own quantity, without it and with it."""
+    chart = Chart(
+        (float(shown.x.min()), float(shown.x.max())),
+        limits(shown.without, shown.acting),
+        shown.x_label,
+        shown.y_label,
+        f"{shown.y_label} over {shown.x_label}, without and with {name}.",
+        width=360.0,
+        height=200.0,
+    )
+    chart.line(_WITHOUT, shown.x, shown.without)
+    chart.line(_WITH, shown.x, shown.acting)
+    return chart
 
 
 def nonparametric_term(shape: NonparametricTerm) -> Chart:

@@ -46,7 +46,7 @@ def figure(diagnosis: Diagnosis) -> Figure:
         axes[0].set_ylabel("airway pressure, cmH2O")
         axes[0].legend(frameon=False, fontsize="small")
     _errors(axes[-1], diagnosis, stages)
-    plot.suptitle(report_text.verdict(diagnosis), fontsize="medium", wrap=True)
+    plot.suptitle(report_text.headline(diagnosis), fontsize="medium", wrap=True)
     return plot
 
 

@@ -6,14 +6,16 @@ from typing import Any
 
 import jinja2
 import numpy as np
+from markupsafe import Markup
 
 import ventbench
 from ventbench.diagnosis import report_text
 from ventbench.diagnosis.findings import ErrorRegion, MissingMechanism, OpenLoopError
-from ventbench.diagnosis.result import Diagnosis
-from ventbench.physics import mechanism
-from ventbench.views import graphics
-from ventbench.views.diagnosis import charts
+from ventbench.diagnosis.result import RECORD_NEXT, Diagnosis
+from ventbench.physics import Physics, mechanism
+from ventbench.physics.characteristics import characteristic
+from ventbench.views import graphics, mathml
+from ventbench.views.diagnosis import charts, diagram
 
 #: Places that are told in words; the charts show all.
 PLACES = 6
@@ -28,20 +30,23 @@ def html(diagnosis: Diagnosis) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    lead = [
-        report_text.worth(diagnosis),
-        *map(report_text.missing_mechanism, diagnosis.mechanisms),
-        report_text.effect(diagnosis),
-    ]
-    lead += [report_text.nonparametric_term(diagnosis), report_text.open_loop(diagnosis)]
-    lead += [report_text.remaining(diagnosis), report_text.scatter(diagnosis)]
+    listed = diagram.entries(diagnosis)
+    lead = [report_text.effect(diagnosis), report_text.remaining(diagnosis)]
+    lead += [report_text.scatter(diagnosis)]
     return environment.get_template("diagnosis.html.j2").render(
-        verdict=report_text.verdict(diagnosis),
+        headline=report_text.headline(diagnosis),
+        facts=facts(diagnosis),
         lead=[text for text in lead if text],
+        entries=listed,
+        parts=diagram.parts(listed),
+        diagram_alt=diagram.description(listed),
+        would_change=report_text.would_change(diagnosis),
+        visible=report_text.visible(diagnosis),
+        commands_file=RECORD_NEXT,
         plant=diagnosis.simulator,
         light=graphics.RUN_COLORS,
         dark=graphics.RUN_COLORS_DARK,
-        mechanisms=[_named(mechanism) for mechanism in diagnosis.mechanisms],
+        mechanisms=[_named(diagnosis, missing) for missing in diagnosis.mechanisms],
         alternatives=report_text.alternatives(diagnosis),
         bars=bars(diagnosis),
         groups=groups(diagnosis),
@@ -54,6 +59,7 @@ def html(diagnosis: Diagnosis) -> str:
         more=max(len(diagnosis.location) - PLACES, 0),
         axes=charts.by_axis(diagnosis),
         slot=diagnosis.nonparametric,
+        open_loop=report_text.open_loop(diagnosis),
         slot_words=report_text.nonparametric_term(diagnosis),
         slot_chart=None
         if diagnosis.nonparametric is None
@@ -66,6 +72,26 @@ def html(diagnosis: Diagnosis) -> str:
         about=_about(diagnosis),
         version=ventbench.__version__,
     )
+
+
+def facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    """What a reader asks first: the question, the answer in short, and a line beneath it."""
+    errors, count = diagnosis.open_loop, len(diagnosis.open_loop.held_out_breaths)
+    told = []
+    if sure := report_text.sureness(diagnosis):
+        decided, _, breaths = sure.partition(" on ")
+        told.append(("How sure?", decided.removeprefix("each at "), f"each, on {breaths}"))
+        if len(diagnosis.mechanisms) < 2:
+            told[-1] = (told[-1][0], told[-1][1], f"on {breaths}")
+    after = _number(errors.after.rmse)
+    if diagnosis.verdict == "nothing_missing":
+        told.append(("How far off?", f"{after} cmH2O", f"root mean square on {count} breaths"))
+    else:
+        worth = f"{_number(errors.refit.rmse)} → {after} cmH2O"
+        told.append(("What is mending it worth?", worth, f"error on {count} breaths set aside"))
+    noise = f"beyond the measurement's noise of {_number(errors.noise_floor)}"
+    told.append(("What stays unexplained?", f"{_number(errors.unexplained)} cmH2O", noise))
+    return told
 
 
 def bars(diagnosis: Diagnosis) -> list[dict[str, Any]]:
@@ -111,23 +137,48 @@ def _cell(distance: OpenLoopError | None) -> dict[str, str]:
     return {"rmse": _number(distance.rmse), "mae": _number(distance.mae)}
 
 
-def _named(missing: MissingMechanism) -> dict[str, Any]:
-    """A missing mechanism as a row of the table."""
+def _named(diagnosis: Diagnosis, missing: MissingMechanism) -> dict[str, Any]:
+    """A missing mechanism with its formula, its parameters and its own signal."""
     about = mechanism(missing.name).description
     meanings = {parameter.name: parameter.meaning for parameter in about.parameters}
+    breaths = diagnosis.traces.breaths
+    largest = float(np.max(breaths.u_in, initial=10.0, where=breaths.valid))
+    shown = characteristic(missing.name, _values(diagnosis, missing), largest_command=largest)
     return {
         "name": missing.name,
-        "title": about.title,
-        "equation": about.equation,
+        "heading": about.title[:1].upper() + about.title[1:],
+        "simulator": {
+            key: report_text.quantity_like(value, missing.parameters[key], f"{missing.name}.{key}")
+            for key, value in missing.simulator_values.items()
+            if key in missing.parameters
+        },
+        "equation": [Markup(clause) for clause in mathml.equation(about.equation)],
         "signature": about.signature,
         "changed": missing.changed,
         "confidence": f"{100 * missing.confidence:.0f} %",
+        "nats": f"{missing.nats:.0f}",
         "alternatives": missing.alternatives,
+        "chart": None if shown is None else charts.own_signal(about.title, shown),
         "parameters": [
-            (meanings.get(key, key), report_text.quantity(value, f"{missing.name}.{key}"))
+            (key, meanings.get(key, key), report_text.quantity(value, f"{missing.name}.{key}"))
             for key, value in missing.parameters.items()
         ],
     }
+
+
+def _values(diagnosis: Diagnosis, missing: MissingMechanism) -> dict[str, float]:
+    """Values of a mechanism's parameters by short name, and of the base model's."""
+    values: dict[str, float] = {}
+    plant: Any = next(iter(diagnosis.plants.values()), None)
+    plant = getattr(plant, "with_mechanisms", plant)
+    if isinstance(plant, Physics):
+        for path, value in zip(plant.names, plant.values, strict=True):
+            owner, _, short = path.rpartition(".")
+            if owner in ("", missing.name):
+                values[short] = float(np.mean(np.asarray(value)))
+    elif diagnosis.lungs and np.isfinite(diagnosis.lungs[0].fitted_R):
+        values |= {"R": diagnosis.lungs[0].fitted_R, "C": diagnosis.lungs[0].fitted_C}
+    return values | {name: estimate.value for name, estimate in missing.parameters.items()}
 
 
 def _place(diagnosis: Diagnosis, place: ErrorRegion) -> dict[str, str]:

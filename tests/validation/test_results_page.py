@@ -1,0 +1,76 @@
+"""Sections of the page of results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ventbench.errors import InputError
+from ventbench.validation.challenge.figures import Figure
+from ventbench.validation.challenge.reveal import ChallengeResult
+from ventbench.validation.real_rig_proof import Claim, Proof
+from ventbench.validation.results_page import (
+    challenge_section,
+    code_version,
+    proof_section,
+    write_section,
+)
+
+
+def test_a_section_is_replaced_and_the_rest_stays(tmp_path: Path) -> None:
+    page = tmp_path / "results.md"
+    page.write_text("before\n\n<!-- proof -->\nold\n<!-- end proof -->\n\nafter\n")
+    write_section(page, "proof", "| new |\n")
+    assert page.read_text() == (
+        "before\n\n<!-- proof -->\n\n| new |\n\n<!-- end proof -->\n\nafter\n"
+    )
+    write_section(page, "proof", "newer")
+    assert "| new |" not in page.read_text()
+    with pytest.raises(InputError, match="no section between <!-- challenge first -->"):
+        write_section(page, "challenge first", "text")
+    write_section(tmp_path / "fresh.md", "proof", "text")
+    assert (tmp_path / "fresh.md").read_text().startswith("<!-- proof -->")
+
+
+def test_a_challenge_tells_its_seed_its_commitment_and_its_code() -> None:
+    result = ChallengeResult(
+        "abc123", ("case_0003",), (), (
+            Figure("strong: right name", 0.9, ">= 98%", 20, (0.7, 0.97), False),
+            Figure("seconds a case, median", 5.25, "", 20, None, None),
+            Figure("nothing missing: false names", None, "<= 0%", 0, None, None),
+        ),
+        {"leak": {"leak": 5, **{f"name {k}": 1 for k in range(8)}}}, {}, ("1a2b3c",), "stranger",
+    )  # fmt: skip
+    text = challenge_section(result, seed="words", total=48)
+    assert "ventbench challenge make --generator stranger --seed words --cases 48" in text
+    assert "Generator `stranger`, code 1a2b3c, seed `words`, commitment\n`abc123`" in text
+    assert "0 of 48 cases answered" in text
+    assert "| strong: right name | 90% | 70% to 97% | 20 | >= 98% | no |" in text
+    assert "| seconds a case, median | 5.25 |  | 20 |  |  |" in text
+    assert "| nothing missing: false names | – |  | 0 | <= 0% |  |" in text
+    assert "| leak | leak 5, name 0 1, name 1 1, name 2 1, name 3 1, name 4 1, others 3 |" in text
+
+
+def test_the_proof_is_told_part_by_part_and_lung_by_lung() -> None:
+    estimate = {"value": 0.032, "unit": "s", "ci95": [0.028, 0.036]}
+    stages = {name: {"mae": mae, "rmse": mae} for name, mae in
+              (("before", 5.0), ("refit", 3.0), ("after", 1.5))}  # fmt: skip
+    part = {
+        "held_out": 29, "mae": {"before": 5.0, "refit": 3.0, "after": None}, "cut_percent": 70.0,
+        "mechanisms": [{"name": "valve_delay", "parameters": {"delay": estimate}}],
+        "slot": None, "groups": {"lung R5C10": stages, "expiration": stages}, "code": "1a2b3c",
+    }  # fmt: skip
+    proof = Proof("f" * 64, {"rc": part}, {"injected": "no file"}, (Claim("rc", "w", "v", True),))
+    text = proof_section(proof)
+    assert "Code 1a2b3c, recording `ffffffffffffffff`" in text
+    assert "| `rc` | 29 | 5.00 | 3.00 | – | 70 % | `valve_delay` |" in text
+    assert "| R5C10 | 5.00 | 3.00 | 1.50 |" in text
+    assert "expiration" not in text
+    assert "| `valve_delay` delay | 0.032 s | 0.028 to 0.036 |" in text
+    assert "| `rc` | w | v | yes |" in text
+    assert "| `injected` | – | no file | |" in text
+
+
+def test_the_code_is_known() -> None:
+    assert code_version()

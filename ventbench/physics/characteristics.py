@@ -1,0 +1,305 @@
+"""Characteristic of a mechanism: what it does to its own quantity, without the rest of the rig.
+
+A valve is shown by the flow that it gives for a command, a leak by its flow at a pressure, a lag by
+its response to a step. Which curve it is follows from the methods that the mechanism overrides, so
+that a new mechanism has one without more ado. Nothing here is fitted or integrated with the lung.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from ventbench.physics.catalogue import mechanism
+from ventbench.physics.mechanism import Mechanism, Values
+from ventbench.physics.network import PneumaticNetwork, View
+from ventbench.physics.parameters import BASE_PARAMETERS
+from ventbench.precision import float64
+
+Floats = NDArray[np.float64]
+
+#: Points of a static curve and of a response in time.
+_STATIC, _STEPS = 241, 160
+
+#: Steps that are tried: of the flow, L/s, and of the pressure, cmH2O.
+_FLOW, _LOW, _HIGH = 0.5, 5.0, 20.0
+
+#: Largest pressure, cmH2O, flow, L/s, and acceleration, L/s2, of a static curve.
+_PRESSURE, _AIRWAY_FLOW, _ACCELERATION = 40.0, 1.0, 20.0
+
+#: A response is shown for this many of its longest times, and within these limits, s.
+_TIMES, _SHORTEST, _LONGEST = 5.0, 0.1, 3.0
+
+#: Smaller differences are no effect.
+_TINY = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Characteristic:
+    """A quantity of one part of the rig without and with a mechanism.
+
+    Attributes:
+        x: what the quantity depends on, ``(k,)``.
+        without: the quantity without the mechanism, ``(k,)``.
+        acting: the quantity with the mechanism, ``(k,)``.
+        x_label: name and unit of ``x``.
+        y_label: name and unit of the quantity.
+    """
+
+    x: Floats
+    without: Floats
+    acting: Floats
+    x_label: str
+    y_label: str
+
+
+def characteristic(
+    name: str, values: Mapping[str, float], *, largest_command: float = 100.0
+) -> Characteristic | None:
+    """Characteristic of a mechanism or basis term; None if it changes nothing that is shown here.
+
+    Args:
+        name: its name in the catalogue.
+        values: its parameters by short name, and base parameters such as ``R``; what is missing is
+            neutral.
+        largest_command: where the curve of a command ends at most, %.
+    """
+    shown = mechanism(name)
+    about = shown.description.parameters
+    with float64():
+        own = {p.name: jnp.asarray(float(values.get(p.name, p.neutral))) for p in about}
+        base = {p.name: float(values.get(p.name, p.neutral)) for p in BASE_PARAMETERS}
+        neutral = {p.name: jnp.asarray(float(p.neutral)) for p in about}
+        times = [float(own[p.name]) for p in about if p.unit == "s"]
+        end = float(np.clip(_TIMES * max(times, default=0.0), _SHORTEST, _LONGEST))
+        if _has(shown, "command"):
+            return _command(shown, own, largest_command)
+        if _has(shown, "dead_time"):
+            return _late(float(jnp.asarray(shown.dead_time(own))), end)
+        if _has(shown, "outlet_dead_time"):
+            return _late_outlet(shown, own, end)
+        if _has(shown, "inflow"):
+            return _flow_step(shown, own, end)
+        if _has(shown, "reading"):
+            return _pressure_step(shown, own, end)
+        if _has(shown, "sensor_output"):
+            return _sensor(shown, own)
+        if _has(shown, "network"):
+            if shown.stateful:
+                return _hold(shown, own, base, end)
+            return _network(shown, own, neutral, base)
+    return None
+
+
+def _has(shown: Mechanism, hook: str) -> bool:
+    """Whether a mechanism overrides a method."""
+    return getattr(type(shown), hook) is not getattr(Mechanism, hook)
+
+
+def _floats(values: Array) -> Floats:
+    return np.asarray(values, np.float64)
+
+
+def _command(shown: Mechanism, own: Values, largest: float) -> Characteristic:
+    """The command that takes effect, as it rises and, if the mechanism remembers, falls again."""
+
+    def effective(top: float) -> tuple[Floats, Floats]:
+        rising = np.linspace(0.0, top, _STATIC)
+        if not shown.has_memory:
+            return rising, _floats(shown.command(own, jnp.asarray(rising), jnp.asarray(rising))[0])
+        both = np.concatenate([rising[::2], rising[::-2]])
+        memory, after = jnp.asarray(0.0), []
+        for command in both:
+            now, memory = shown.command(own, jnp.asarray(command), memory)
+            after.append(float(now))
+        return both, np.array(after)
+
+    u_in, after = effective(largest)
+    # A dead band of 1 % is nothing on an axis up to 100 %.
+    off = float(np.max(np.abs(after - u_in)))
+    u_in, after = effective(float(np.clip(6.0 * off, min(5.0, largest), largest)))
+    return Characteristic(u_in, u_in, after, "command u_in, %", "command that takes effect, %")
+
+
+def _late(delay: float, end: float) -> Characteristic:
+    """Flow after the command of the inspiratory valve steps from 0 to 20 %."""
+    x = np.linspace(-0.2 * end, end, 4 * _STATIC)
+    return Characteristic(
+        x * 1e3, 20.0 * (x >= 0), 20.0 * (x >= delay), "time since the command, ms",
+        "valve opening, %",
+    )  # fmt: skip
+
+
+def _late_outlet(shown: Mechanism, own: Values, end: float) -> Characteristic:
+    """Expiratory valve that is told to open, and later to close."""
+    x = np.linspace(-0.2 * end, 2.2 * end, 4 * _STATIC)
+    opening, closing = (
+        float(jnp.asarray(shown.outlet_dead_time(own, jnp.asarray(u_out)))) for u_out in (1.0, 0.0)
+    )
+    told = (x >= 0) & (x < end)
+    done = (x >= opening) & (x < end + closing)
+    return Characteristic(
+        x * 1e3, told * 1.0, done * 1.0, "time since it is told to open, ms",
+        "expiratory valve, 1 open",
+    )  # fmt: skip
+
+
+def _flow_step(shown: Mechanism, own: Values, end: float) -> Characteristic:
+    """Flow of the valve after its command steps to 0.5 L/s."""
+    zero, length = jnp.asarray(0.0), jnp.asarray(end / _STEPS)
+    state = shown.initial_state(own, zero, zero) if shown.stateful else zero
+    flow, after = jnp.asarray(_FLOW), []
+    for _ in range(_STEPS):
+        now, state = shown.inflow(own, flow, state, length)
+        after.append(float(now))
+    return _response(end, 0.0, _FLOW, after, "flow of the valve, L/s")
+
+
+def _pressure_step(shown: Mechanism, own: Values, end: float) -> Characteristic:
+    """Reading of the sensor after the pressure steps from 5 to 20 cmH2O."""
+    low, length = jnp.asarray(_LOW), jnp.asarray(end / _STEPS)
+    state = shown.initial_state(own, jnp.asarray(0.0), low) if shown.stateful else low
+    after = []
+    for _ in range(_STEPS):
+        now, state = shown.reading(own, jnp.asarray(_HIGH), state, length)
+        after.append(float(now))
+    return _response(end, _LOW, _HIGH, after, "reading of the sensor, cmH2O")
+
+
+def _response(
+    end: float, low: float, high: float, after: list[float], y_label: str
+) -> Characteristic:
+    """Response to a step from ``low`` to ``high`` at time zero, with the edge as a vertical."""
+    x = np.concatenate([[-0.1 * end, 0.0, 0.0], end / _STEPS * np.arange(1, _STEPS + 1)])
+    step = np.concatenate([[low, low], np.full(_STEPS + 1, high)])
+    return _in_time(x, step, np.concatenate([[low, low, low], after]), y_label)
+
+
+def _in_time(x: Floats, without: Floats, acting: Floats, y_label: str) -> Characteristic:
+    """A response in ms or, if it is long, in s."""
+    if x[-1] > 0.6:
+        return Characteristic(x, without, acting, "time since the step, s", y_label)
+    return Characteristic(x * 1e3, without, acting, "time since the step, ms", y_label)
+
+
+def _sensor(shown: Mechanism, own: Values) -> Characteristic:
+    """Reading over the recording, or error of the reading over the pressure."""
+    if shown.uses_position:
+        x = np.linspace(0.0, 1.0, _STATIC)
+        true = np.full_like(x, _HIGH)
+        after = shown.sensor_output(own, jnp.asarray(true), jnp.asarray(x))
+        return Characteristic(
+            100 * x, true, _floats(after), "share of the recording, %",
+            f"reading at {_HIGH:.0f} cmH2O",
+        )  # fmt: skip
+    x = np.linspace(0.0, _PRESSURE, _STATIC)
+    after = shown.sensor_output(own, jnp.asarray(x), jnp.asarray(0.0))
+    return Characteristic(
+        x, np.zeros_like(x), _floats(after) - x, "pressure, cmH2O", "reading less pressure, cmH2O"
+    )
+
+
+def _view(base: Mapping[str, float], **changed: Array) -> tuple[View, PneumaticNetwork]:
+    """A lung at rest with the expiratory valve shut, and its network; some quantities as given."""
+    shape = jnp.broadcast_shapes(*(jnp.shape(value) for value in changed.values()), ())
+    zero = jnp.zeros(shape)
+    elastance = 1e3 / base["C"]
+    view = View(
+        zero, zero, zero, zero, zero, zero + 1e-3, zero + elastance, zero + base["PEEP"], zero,
+        zero + base["R"], zero + 1.0 / base["R_ex"], zero,
+    ).replace(**changed)  # type: ignore[attr-defined]  # fmt: skip
+    network = PneumaticNetwork(
+        inflow=zero + _FLOW, circuit=zero, leak=zero, leak_flow=zero, outlet=zero,
+        behind=view.peep, resistance=view.resistance, quadratic=zero, inertance=zero,
+        recoil=view.elastance * view.volume, elastance=view.elastance,
+    )  # fmt: skip
+    return view, network
+
+
+def _network(
+    shown: Mechanism, own: Values, neutral: Values, base: Mapping[str, float]
+) -> Characteristic | None:
+    """The first quantity of circuit, airway and lung that a mechanism without a state changes."""
+
+    def both(**changed: Array) -> tuple[PneumaticNetwork, PneumaticNetwork]:
+        view, network = _view(base, **changed)
+        return shown.network(neutral, network, view), shown.network(own, network, view)
+
+    def curve(
+        x: Floats, without: Array, acting: Array, x_label: str, y_label: str
+    ) -> Characteristic | None:
+        a, b = (np.broadcast_to(_floats(y), x.shape) for y in (without, acting))
+        if not np.max(np.abs(a - b)) > _TINY:
+            return None
+        return Characteristic(x, a, b, x_label, y_label)
+
+    if shown.uses_position:
+        x = np.linspace(0.0, 1.0, _STATIC)
+        a, b = both(position=jnp.asarray(x))
+        share = "share of the recording, %"
+        return curve(
+            100 * x, a.resistance, b.resistance, share, "resistance R, cmH2O/(L/s)"
+        ) or curve(
+            100 * x, 1e3 / a.elastance, 1e3 / b.elastance, share, "compliance C, mL/cmH2O"
+        )  # fmt: skip
+    pressure = np.linspace(0.0, _PRESSURE, _STATIC)
+    a, b = both(pressure=jnp.asarray(pressure))
+    p_label = "airway pressure, cmH2O"
+    given, left = (n.inflow - n.leak * pressure - n.leak_flow for n in (a, b))
+    if np.max(np.abs(_floats(b.inflow - a.inflow))) > _TINY:
+        return curve(pressure, given, left, p_label, "flow of the valve, L/s")
+    leaking = curve(
+        pressure, 1e3 * (_FLOW - given), 1e3 * (_FLOW - left), p_label, "flow that escapes, mL/s"
+    )
+    if leaking is not None:
+        return leaking
+    acceleration = np.linspace(0.0, _ACCELERATION, _STATIC)
+    flow = np.linspace(-_AIRWAY_FLOW, _AIRWAY_FLOW, _STATIC)
+    a, b = both(flow=jnp.asarray(flow))
+    before, after = (n.resistance * flow + n.quadratic * flow * np.abs(flow) for n in (a, b))
+    volume = np.linspace(0.0, 25.0 * base["C"] * 1e-3, _STATIC)
+    c, d = both(volume=jnp.asarray(volume))
+    time = np.linspace(0.0, 2.0, _STATIC)
+    e, f = both(time=jnp.asarray(time))
+    return (
+        curve(flow, before, after, "flow into the lung, L/s", "pressure along the airway, cmH2O")
+        or curve(
+            acceleration, a.inertance[0] * acceleration, b.inertance[0] * acceleration,
+            "acceleration of the flow, L/s2", "pressure that it takes, cmH2O",
+        )
+        or curve(
+            pressure, 1e3 * a.circuit[0] * pressure, 1e3 * b.circuit[0] * pressure, p_label,
+            "gas that the circuit takes up, mL",
+        )
+        or curve(time, -e.recoil, -f.recoil, "time in the breath, s", "pull of the muscles, cmH2O")
+        or curve(1e3 * volume, c.recoil, d.recoil, "volume, mL", "recoil of the lung, cmH2O")
+    )  # fmt: skip
+
+
+def _hold(
+    shown: Mechanism, own: Values, base: Mapping[str, float], end: float
+) -> Characteristic | None:
+    """Recoil of a lung that is inflated by 10 cmH2O in 0.1 s and then held."""
+    length, inflating = end / _STEPS, 0.1
+    count = max(1, round(inflating / length))
+    flow = np.zeros(_STEPS)
+    flow[:count] = 10.0 * base["C"] * 1e-3 / (count * length)
+    state, volume = shown.initial_state(own, jnp.asarray(0.0), jnp.asarray(0.0)), 0.0
+    linear, acting = [0.0], [0.0]
+    for now in flow:
+        view, network = _view(
+            base, volume=jnp.asarray(volume), state=state, length=jnp.asarray(length),
+            flow=jnp.asarray(now),
+        )  # fmt: skip
+        after = shown.network(own, network, view)
+        linear.append(float(network.recoil + network.elastance * length * now))
+        acting.append(float(after.recoil + after.elastance * length * now))
+        state = shown.next_state(own, state, jnp.asarray(now), view)
+        volume += now * length
+    x = length * np.arange(_STEPS + 1)
+    return _in_time(x, np.array(linear), np.array(acting), "recoil of the lung, cmH2O")

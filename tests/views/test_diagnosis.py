@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from tests.diagnosis import made
+from ventbench.diagnosis import report_text
 from ventbench.diagnosis.findings import MissingMechanism
 from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY
+from ventbench.diagnosis.residual_analysis import profiles
 from ventbench.diagnosis.residual_axes import EDGE
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.mechanics.labels import Estimate
@@ -236,6 +238,27 @@ def test_the_time_since_an_edge_has_a_logarithmic_axis(found: Diagnosis) -> None
     left, middle, right = chart.at_x([0.01, 0.1, 1.0])
     assert middle == pytest.approx(0.5 * (left + right))
     assert chart.at_x(0.0) == left, "nothing lies left of the axis"
+
+
+def test_sentences_and_charts_agree(found: Diagnosis) -> None:
+    """A range that a sentence calls too low lies above zero in the chart, by the same mean."""
+    traces = found.traces
+    shown = {p.axis.name: p for p in profiles(
+        traces.breaths, traces.refit, traces.flow, traces.volume
+    )}  # fmt: skip
+    told = [region for region in found.location if region.axis in shown]
+    assert len(told) > 5
+    for region in told:
+        profile = shown[region.axis]
+        first = 1.0 if region.axis == "breath number" else 0.0
+        inside = (profile.axis.edges[:-1] >= region.low - first - 1e-9) & (
+            profile.axis.edges[1:] <= region.high + 1e-9
+        )
+        means = profile.mean[inside]
+        assert np.nanmin(means) - 1e-6 <= region.mean_error <= np.nanmax(means) + 1e-6
+        sentence = report_text.error_region(region, found.noise[0])
+        if "too" in sentence:
+            assert ("too low" in sentence) == (np.nanmean(means) > 0)
 
 
 def test_what_is_left_after_the_correction_is_shown(found: Diagnosis, tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ def _late(delay: float, end: float) -> Characteristic:
     """Flow after the command of the inspiratory valve steps from 0 to 20 %."""
     x = np.linspace(-0.2 * end, end, 4 * _STATIC)
     return Characteristic(
-        x * 1e3, 20.0 * (x >= 0), 20.0 * (x >= delay), "time since the command, ms",
+        x * 1e3, np.where(x >= 0, 20.0, 0.0), np.where(x >= delay, 20.0, 0.0), "time since the command, ms",
         "valve opening, %",
     )  # fmt: skip
 
@@ -144,7 +144,7 @@ def _late_outlet(shown: Mechanism, own: Values, end: float) -> Characteristic:
     told = (x >= 0) & (x < end)
     done = (x >= opening) & (x < end + closing)
     return Characteristic(
-        x * 1e3, told * 1.0, done * 1.0, "time since it is told to open, ms",
+        x * 1e3, told.astype(np.float64), done.astype(np.float64), "time since it is told to open, ms",
         "expiratory valve, 1 open",
     )  # fmt: skip
 
@@ -301,5 +301,5 @@ def _hold(
         acting.append(float(after.recoil + after.elastance * length * now))
         state = shown.next_state(own, state, jnp.asarray(now), view)
         volume += now * length
-    x = length * np.arange(_STEPS + 1)
+    x = np.linspace(0.0, end, _STEPS + 1)
     return _in_time(x, np.array(linear), np.array(acting), "recoil of the lung, cmH2O")

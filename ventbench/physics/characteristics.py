@@ -130,9 +130,12 @@ def _late(delay: float, end: float) -> Characteristic:
     """Flow after the command of the inspiratory valve steps from 0 to 20 %."""
     x = np.linspace(-0.2 * end, end, 4 * _STATIC)
     return Characteristic(
-        x * 1e3, np.where(x >= 0, 20.0, 0.0), np.where(x >= delay, 20.0, 0.0), "time since the command, ms",
+        x * 1e3,
+        np.where(x >= 0, 20.0, 0.0),
+        np.where(x >= delay, 20.0, 0.0),
+        "time since the command, ms",
         "valve opening, %",
-    )  # fmt: skip
+    )
 
 
 def _late_outlet(shown: Mechanism, own: Values, end: float) -> Characteristic:
@@ -144,9 +147,12 @@ def _late_outlet(shown: Mechanism, own: Values, end: float) -> Characteristic:
     told = (x >= 0) & (x < end)
     done = (x >= opening) & (x < end + closing)
     return Characteristic(
-        x * 1e3, told.astype(np.float64), done.astype(np.float64), "time since it is told to open, ms",
+        x * 1e3,
+        told.astype(np.float64),
+        done.astype(np.float64),
+        "time since it is told to open, ms",
         "expiratory valve, 1 open",
-    )  # fmt: skip
+    )
 
 
 def _flow_step(shown: Mechanism, own: Values, end: float) -> Characteristic:

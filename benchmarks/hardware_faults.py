@@ -20,23 +20,17 @@ from typing import Any
 
 import numpy as np
 
-from hardware_eval.client import Client
-from hardware_eval.device.faults import FaultKind, LungFault
-from hardware_eval.device.loopback import LoopbackDevice, loopback
-from hardware_eval.device.simulated import simulated_lung
-from hardware_eval.errors import LinkError, NoAnswerError
-from hardware_eval.messages import Reading
-from hardware_eval.plan import CONTROL_GAINS, PlannedRun
-from hardware_eval.safety import DEFAULT
-from hardware_eval.selftest import selftest
-from hardware_eval.session import (
-    Bench,
-    ControllerFailedError,
-    EmergencyStop,
-    PIDController,
-    SilentOperator,
-    run_once,
-)
+from hardware_eval.bench.controllers import ControllerFailedError, PIDController
+from hardware_eval.bench.loop import Bench, EmergencyStop, SilentOperator, run_once
+from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
+from hardware_eval.bench.safety import DEFAULT
+from hardware_eval.bench.selftest import selftest
+from hardware_eval.emulation.faults import FaultKind, LungFault
+from hardware_eval.emulation.loopback import LoopbackDevice, loopback
+from hardware_eval.emulation.simulated import simulated_lung
+from hardware_eval.wire.client import Client
+from hardware_eval.wire.errors import LinkError, NoAnswerError
+from hardware_eval.wire.messages import Reading
 from ventbench import protocol
 
 #: Time at rest before each run, s.

@@ -19,7 +19,7 @@ import numpy as np
 
 from hardware_eval.device import program
 from hardware_eval.device.hal import Identity, Sample
-from hardware_eval.messages import (
+from hardware_eval.wire.messages import (
     Arm,
     Capability,
     Command,

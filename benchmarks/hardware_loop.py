@@ -19,9 +19,9 @@ import time
 import numpy as np
 
 from hardware_eval import realtime
-from hardware_eval.client import Client
-from hardware_eval.errors import NoAnswerError, RefusedError
-from hardware_eval.link import Link
+from hardware_eval.wire.client import Client
+from hardware_eval.wire.errors import NoAnswerError, RefusedError
+from hardware_eval.wire.link import Link
 from ventbench import protocol, waveform
 
 #: A step may begin this late, s.
@@ -36,8 +36,8 @@ def main() -> None:
     parser.add_argument("--realtime", action="store_true", help="real-time scheduling of both")
     arguments = parser.parse_args()
     command = [
-        sys.executable, "-m", "hardware_eval.emulator", "--lung", arguments.lung, "--plant",
-        arguments.plant, *(["--realtime"] if arguments.realtime else []),
+        sys.executable, "-m", "hardware_eval", "emulate", "--lung", arguments.lung,
+        "--plant", arguments.plant, *(["--realtime"] if arguments.realtime else []),
     ]  # fmt: skip
     emulator = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert emulator.stdout is not None

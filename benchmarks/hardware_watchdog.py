@@ -26,10 +26,10 @@ from pathlib import Path
 import numpy as np
 
 from hardware_eval import realtime
-from hardware_eval.client import Client
-from hardware_eval.errors import LinkError
-from hardware_eval.link import Link
-from hardware_eval.messages import Mode
+from hardware_eval.wire.client import Client
+from hardware_eval.wire.errors import LinkError
+from hardware_eval.wire.link import Link
+from hardware_eval.wire.messages import Mode
 
 #: The lung must be vented within this time of the host's death, s.
 LIMIT = 0.100
@@ -106,7 +106,7 @@ def work(
     """Kill hosts of one emulator until there are enough delays."""
     link, log = folder / f"lung{index}", folder / f"valves{index}.csv"
     command = [
-        sys.executable, "-m", "hardware_eval.emulator", "--plant", "single_compartment",
+        sys.executable, "-m", "hardware_eval", "emulate", "--plant", "single_compartment",
         "--link", str(link), "--log", str(log), *extra,
     ]  # fmt: skip
     emulator = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

@@ -2,14 +2,14 @@
 
 The package uses ventbench; ventbench never imports it. ``PROTOCOL.md`` specifies the wire.
 
-The host holds a :class:`~hardware_eval.client.Client`. It talks either through a
-:class:`~hardware_eval.link.Link` (a serial port, a socket, the emulator's pseudo-terminal), or to a
-:class:`~hardware_eval.device.loopback.LoopbackDevice`, which runs the device's program in the same
-process on a virtual clock, faster than real time::
+The host holds a :class:`~hardware_eval.wire.client.Client`. It talks either through
+a :class:`~hardware_eval.wire.link.Link` (a serial port, a socket, the emulator's pseudo-terminal),
+or to a :class:`~hardware_eval.emulation.loopback.LoopbackDevice`, which runs the device's program
+in the same process on a virtual clock, faster than real time::
 
-    from hardware_eval.client import Client
-    from hardware_eval.device.loopback import loopback
-    from hardware_eval.device.simulated import simulated_lung
+    from hardware_eval.wire.client import Client
+    from hardware_eval.emulation.loopback import loopback
+    from hardware_eval.emulation.simulated import simulated_lung
 
     device = loopback(simulated_lung("R20C50"))
     client = Client(device, device.clock)

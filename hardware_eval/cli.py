@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 
 from ventbench import __version__
+from ventbench.cli import ending
 from ventbench.cli.options import JsonFile, emit
 from ventbench.errors import InputError
 from ventbench.text import plain
@@ -123,13 +124,13 @@ def run(
 
     Example: `ventbench-hardware run submissions/pid_best --port /dev/ttyACM0 --lung R20C50`
     """
-    from hardware_eval import evaluate as ev
     from hardware_eval import realtime
-    from hardware_eval.console import ConsoleOperator, RerunView, TerminalView, Views
-    from hardware_eval.plan import make_plan
-    from hardware_eval.safety import SafetySettings
-    from hardware_eval.selftest import selftest as run_selftest
-    from hardware_eval.session import Bench
+    from hardware_eval.bench.console import ConsoleOperator, RerunView, TerminalView, Views
+    from hardware_eval.bench.loop import Bench
+    from hardware_eval.bench.plan import make_plan
+    from hardware_eval.bench.safety import SafetySettings
+    from hardware_eval.bench.selftest import selftest as run_selftest
+    from hardware_eval.results import evaluate as ev
     from ventbench import files, protocol
 
     chosen = [*(pip or ()), *_numbers("--pips", pips)] or list(protocol.PIPS)
@@ -202,7 +203,7 @@ def emulate(context: typer.Context) -> None:
 
     Example: `ventbench-hardware emulate --lung R20C50 --link ./lung`
     """
-    from hardware_eval.emulator import main as run_emulator
+    from hardware_eval.emulation.emulator import main as run_emulator
 
     code = run_emulator(context.args)
     if code:
@@ -220,12 +221,12 @@ def selftest(
 
     Example: `ventbench-hardware selftest --port /dev/ttyACM0 --lung R20C50`
     """
-    from hardware_eval import evaluate as ev
     from hardware_eval import realtime
-    from hardware_eval.console import ConsoleOperator
-    from hardware_eval.safety import DEFAULT
-    from hardware_eval.selftest import selftest as run_selftest
-    from hardware_eval.session import Bench
+    from hardware_eval.bench.console import ConsoleOperator
+    from hardware_eval.bench.loop import Bench
+    from hardware_eval.bench.safety import DEFAULT
+    from hardware_eval.bench.selftest import selftest as run_selftest
+    from hardware_eval.results import evaluate as ev
     from ventbench.lungs import scored_lung
 
     label = scored_lung(lung).id
@@ -276,7 +277,7 @@ def compare(
 
     Example: `ventbench-hardware compare runs/hardware --out runs/mismatch`
     """
-    from hardware_eval import compare as comparison
+    from hardware_eval.results import compare as comparison
 
     breaths = comparison.recorded_breaths(recorded, log)
     done = comparison.compare(breaths, simulator=plant, diagnose=diagnose)
@@ -306,12 +307,12 @@ def collect(
 
     Example: `ventbench-hardware collect --port /dev/ttyACM0 --lung R20C50 --breaths 600`
     """
-    from hardware_eval import collect as collection
-    from hardware_eval import evaluate as ev
     from hardware_eval import realtime
-    from hardware_eval.console import ConsoleOperator
-    from hardware_eval.safety import DEFAULT
-    from hardware_eval.session import Bench
+    from hardware_eval.bench import collect as collection
+    from hardware_eval.bench.console import ConsoleOperator
+    from hardware_eval.bench.loop import Bench
+    from hardware_eval.bench.safety import DEFAULT
+    from hardware_eval.results import evaluate as ev
     from ventbench.cli.options import bars
     from ventbench.lungs import scored_lung
     from ventbench.training.exploration import Limits
@@ -389,7 +390,7 @@ def replay(
 
     Example: `ventbench-hardware replay runs/hardware`
     """
-    from hardware_eval.replay import replay as run_replay
+    from hardware_eval.results.replay import replay as run_replay
 
     report = run_replay(log, record=record, rerun=rerun)
     emit(report.as_dict(), json)
@@ -400,12 +401,4 @@ def replay(
 
 def main() -> None:
     """Entry point of the console script."""
-    try:
-        app()
-    except KeyboardInterrupt:
-        print("ventbench-hardware: interrupted; the lung is vented", file=sys.stderr)
-        sys.exit(130)
-    except (InputError, OSError) as error:
-        lines = [plain(line) for line in str(error).split("\n")]
-        print("ventbench-hardware:", "\n".join(lines), file=sys.stderr)
-        sys.exit(2)
+    ending.run(app, "ventbench-hardware", stopped="the lung is vented")

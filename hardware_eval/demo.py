@@ -22,19 +22,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware_eval import evaluate as ev
-from hardware_eval import session
-from hardware_eval.client import Client
-from hardware_eval.collect import collect
-from hardware_eval.compare import Comparison, compare, scored_plants
-from hardware_eval.concealed import conceal, reveal
-from hardware_eval.device.loopback import loopback
-from hardware_eval.device.simulated import SimulatedHal
-from hardware_eval.evaluate import Evaluation, Line
-from hardware_eval.plan import Plan, make_plan
-from hardware_eval.raw_log import lines
-from hardware_eval.safety import DEFAULT
-from hardware_eval.session import Bench, Operator, SilentOperator
+from hardware_eval.bench.collect import collect
+from hardware_eval.bench.loop import Bench, Operator, SilentOperator, run_once
+from hardware_eval.bench.plan import Plan, make_plan
+from hardware_eval.bench.raw_log import lines
+from hardware_eval.bench.safety import DEFAULT
+from hardware_eval.emulation.concealed import conceal, reveal
+from hardware_eval.emulation.loopback import loopback
+from hardware_eval.emulation.simulated import SimulatedHal
+from hardware_eval.results import evaluate as ev
+from hardware_eval.results.compare import Comparison, compare, scored_plants
+from hardware_eval.results.evaluate import Evaluation, Line
+from hardware_eval.wire.client import Client
 from ventbench import files
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
@@ -317,7 +316,7 @@ def _on_simulator(plan: Plan, entry: Path, hal: SimulatedHal) -> dict[float, flo
     for run in plan.runs:
         if run.kind == "scored":
             controller = make(run)
-            errors[run.pip] = session.run_once(bench, run, controller).error
+            errors[run.pip] = run_once(bench, run, controller).error
             controller.close()
     return dict(sorted(errors.items()))
 

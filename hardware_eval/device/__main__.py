@@ -15,9 +15,8 @@ from types import FrameType
 from hardware_eval import realtime
 from hardware_eval.device.hal import Hal
 from hardware_eval.device.port import Guard, Port
-from hardware_eval.device.program import DeviceSettings
-from hardware_eval.device.service import DeviceService
-from hardware_eval.link import BAUD_RATE
+from hardware_eval.device.program import DeviceService, DeviceSettings
+from hardware_eval.wire.link import BAUD_RATE
 from ventbench.errors import InputError
 
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from hardware_eval.messages import Capability
+from hardware_eval.wire.messages import Capability
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,7 @@ from collections import deque
 from collections.abc import Callable
 from queue import Empty, SimpleQueue
 
-from hardware_eval.device.program import PERIOD
-from hardware_eval.device.service import DeviceService
+from hardware_eval.device.program import PERIOD, DeviceService
 from ventbench.errors import InputError
 
 _CHUNK = 4096

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from hardware_eval.device.hal import Identity, Sample
-from hardware_eval.messages import (
+from hardware_eval.device.hal import Hal, Identity, Sample
+from hardware_eval.wire.messages import (
     CAUSES,
     PROTOCOL_VERSION,
     Arm,
@@ -34,7 +34,7 @@ from hardware_eval.messages import (
     encode,
     milliseconds,
 )
-from hardware_eval.parser import Fault, ParserState, feed_bytes
+from hardware_eval.wire.parser import Fault, ParserState, feed_bytes
 from ventbench import protocol
 
 #: Version of this program: what a device tells as its firmware.
@@ -283,3 +283,39 @@ def _counted(state: DeviceState, name: str) -> DeviceState:
 
 def _flags(state: DeviceState, sample: Sample) -> Flag:
     return (state.causes & CAUSES) | (Flag.SATURATED if sample.saturated else Flag.NONE)
+
+
+class DeviceService:
+    """Steps the program, reads the sensors and sets the valves.
+
+    Attributes:
+        hal: the hardware.
+        settings: limits of the device.
+        state: state of the program.
+    """
+
+    def __init__(self, hal: Hal, settings: DeviceSettings, now: float) -> None:
+        """Start vented, at ``now``, s."""
+        self.hal = hal
+        self.settings = settings
+        self.state: DeviceState = init(settings, now)
+        hal.actuate(now, self.state.u_in, self.state.u_out)
+
+    def step(self, now: float, data: bytes = b"") -> bytes:
+        """Guard the lung and do what arrived.
+
+        Args:
+            now: time, s.
+            data: bytes that arrived.
+
+        Returns:
+            Bytes to send.
+        """
+        sample = self.hal.sample(now)
+        self.state, answers = step(self.settings, self.hal.identity, self.state, now, data, sample)
+        self.hal.actuate(now, self.state.u_in, self.state.u_out)
+        return answers
+
+    def vent(self, now: float) -> None:
+        """Vent whatever the program says; for the end of the process."""
+        self.hal.actuate(now, 0.0, 1)

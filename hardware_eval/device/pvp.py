@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hardware_eval.device.hal import Identity, Sample
-from hardware_eval.messages import Capability
+from hardware_eval.wire.messages import Capability
 from ventbench.errors import InputError
 
 #: Registers of the ADS1015, and its configuration: continuous, 3300 samples/s, +-4.096 V, no alert.

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from hardware_eval.client import Client
-from hardware_eval.device.loopback import LoopbackDevice, loopback
-from hardware_eval.device.simulated import simulated_lung
-from hardware_eval.evaluate import Line
-from hardware_eval.safety import DEFAULT
-from hardware_eval.session import Bench, SilentOperator
+from hardware_eval.bench.loop import Bench, SilentOperator
+from hardware_eval.bench.safety import DEFAULT
+from hardware_eval.emulation.loopback import LoopbackDevice, loopback
+from hardware_eval.emulation.simulated import simulated_lung
+from hardware_eval.results.evaluate import Line
+from hardware_eval.wire.client import Client
 
 LUNG = "R5C20"
 

@@ -12,8 +12,9 @@ import pytest
 import typer.main
 from typer.testing import CliRunner
 
-from hardware_eval import cli, evaluate
-from hardware_eval.evaluate import Line
+from hardware_eval import cli
+from hardware_eval.results import evaluate
+from hardware_eval.results.evaluate import Line
 from ventbench.board import record
 from ventbench.board.hardware import HardwareRecord
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hardware_eval.concealed import reveal
+from hardware_eval.bench.controllers import PIDController, SubmissionController
 from hardware_eval.demo import demo, write_entry
-from hardware_eval.session import PIDController, SubmissionController
+from hardware_eval.emulation.concealed import reveal
 from ventbench.interfaces import Task
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.runner import InProcessRunner

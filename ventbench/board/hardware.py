@@ -113,7 +113,7 @@ class HardwareContent(
 
 
 @dataclass(frozen=True)
-class HardwareRecord:
+class HardwareRecord(schema.Submitted):
     """A checked hardware record; L lungs, P PIPs, K repetitions.
 
     Attributes:
@@ -125,21 +125,6 @@ class HardwareRecord:
     sha256: str
     header: HardwareContent
     errors: Floats
-
-    @property
-    def name(self) -> str:
-        """Name of the submission."""
-        return self.manifest.name
-
-    @property
-    def manifest(self) -> schema.RecordedManifest:
-        """What the authors say about the submission."""
-        return self.header.submission.manifest
-
-    @property
-    def version(self) -> int:
-        """Version of the protocol."""
-        return self.header.protocol
 
     @property
     def track(self) -> str:

@@ -49,7 +49,7 @@ class RecordHeadroom:
 
 
 @dataclass(frozen=True)
-class Record:
+class Record(schema.Submitted):
     """A record's content, checked; L lungs, P PIPs, K draws.
 
     Attributes:
@@ -82,16 +82,6 @@ class Record:
     headroom: RecordHeadroom | None = None
 
     @property
-    def name(self) -> str:
-        """Name of the submission."""
-        return self.manifest.name
-
-    @property
-    def manifest(self) -> schema.RecordedManifest:
-        """What the authors say about the submission."""
-        return self.header.submission.manifest
-
-    @property
     def track(self) -> str:
         """``"performance"`` or ``"robustness"``."""
         return self.header.track
@@ -100,11 +90,6 @@ class Record:
     def official(self) -> bool:
         """Whether it was scored in a sandbox that deserves the word."""
         return self.header.official
-
-    @property
-    def version(self) -> int:
-        """Version of the protocol, and so of the board."""
-        return self.header.protocol
 
     @property
     def key(self) -> tuple[int, str, str]:

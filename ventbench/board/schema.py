@@ -111,6 +111,27 @@ class RecordedSubmission(_Table, frozen=True):
     manifest: RecordedManifest
 
 
+class Submitted:
+    """What every record of a submission tells by its header, simulated or on hardware."""
+
+    header: Any
+
+    @property
+    def manifest(self) -> RecordedManifest:
+        """What the authors say about the submission."""
+        return self.header.submission.manifest
+
+    @property
+    def name(self) -> str:
+        """Name of the submission."""
+        return self.manifest.name
+
+    @property
+    def version(self) -> int:
+        """Version of the protocol, and so of the board."""
+        return self.header.protocol
+
+
 class Draws(_Table, frozen=True):
     """The draws; keys in the order of pages.
 

@@ -1,0 +1,194 @@
+"""The operator at a terminal, and what a session shows while it runs."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hardware_eval.bench.loop import BreathLog
+from hardware_eval.bench.plan import PlannedRun
+from hardware_eval.emulation.faults import parse
+from ventbench import protocol
+
+if TYPE_CHECKING:
+    from hardware_eval.emulation.loopback import LoopbackDevice
+
+#: What the emulator is told for a perturbation; see :mod:`hardware_eval.emulation.emulator`. A
+#: leak as if the expiratory valve stood open by a twentieth; a tube pinched to three times the
+#: resistance.
+EMULATED = {"leak": "leak@0-60:0.05", "pinch": "pinched@0-60:3"}
+
+#: What the operator does by hand.
+_BY_HAND = {
+    "leak": ("open the leak port NOW", "close the leak port"),
+    "pinch": ("pinch the tube NOW", "let the tube go"),
+}
+
+_BARS = " ▁▂▃▄▅▆▇█"
+
+
+class ConsoleOperator:
+    """Asks and tells at a terminal; while a run goes on, any key is the emergency stop.
+
+    Args:
+        yes: confirm everything; for an emulator and for tests.
+        control: control socket of an emulator, which then does perturbations by itself.
+        device: a device that is emulated in this process, to which the same applies.
+    """
+
+    def __init__(
+        self,
+        *,
+        yes: bool = False,
+        control: Path | None = None,
+        device: LoopbackDevice | None = None,
+    ) -> None:
+        self._yes, self._control, self._device = yes, control, device
+        self._keys = False
+
+    @contextlib.contextmanager
+    def keys(self) -> Iterator[None]:
+        """Let single keys arrive without Enter; does nothing where stdin is no terminal."""
+        if not sys.stdin.isatty():
+            yield
+            return
+        import termios
+        import tty
+
+        before = termios.tcgetattr(sys.stdin)
+        tty.setcbreak(sys.stdin)  # Ctrl-C still interrupts
+        self._keys = True
+        try:
+            yield
+        finally:
+            self._keys = False
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+    def confirm(self, question: str) -> bool:
+        """Ask with the keys y and n; without a terminal only ``--yes`` confirms."""
+        print(f"{question} [y/n] ", end="", flush=True)
+        if self._yes or not sys.stdin.isatty():
+            print("y (--yes)" if self._yes else "n (no terminal; give --yes to confirm)")
+            return self._yes
+        if not self._keys:
+            return input().strip().lower().startswith("y")
+        while self.stop():  # keys that were pressed before the question
+            pass
+        answer = ""
+        while answer not in ("y", "n"):
+            answer = sys.stdin.read(1).lower()
+        print(answer)
+        return answer == "y"
+
+    def tell(self, text: str) -> None:
+        """Print a line."""
+        print(text, flush=True)
+
+    def stop(self) -> bool:
+        """Whether a key has been pressed."""
+        if not self._keys or not select.select([sys.stdin], [], [], 0.0)[0]:
+            return False
+        sys.stdin.read(1)
+        return True
+
+    def disturb(self, perturbation: str, on: bool) -> None:
+        """Have a leak opened or the tube pinched, by hand or by the emulator."""
+        if self._device is not None:
+            hal: Any = self._device.service.hal
+            hal.faults = (parse(EMULATED[perturbation], self._device.clock.now()),) if on else ()
+            return
+        if self._control is not None:
+            text = EMULATED[perturbation] if on else "clear"
+            # A session must not fail because nobody disturbs it.
+            with (
+                contextlib.suppress(OSError),
+                socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender,
+            ):
+                sender.sendto(text.encode(), str(self._control))
+            return
+        print(f"\a{_BY_HAND[perturbation][0 if on else 1]}", flush=True)
+
+
+class TerminalView:
+    """One line a breath: where the plan is, the error, and the inspiration as bars."""
+
+    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
+        """Print a breath."""
+        inspired = np.array(breath.pressure[: protocol.INSPIRATION_STEPS])
+        inspired = inspired[np.isfinite(inspired)]
+        if not inspired.size:
+            return
+        error = float(np.mean(np.abs(inspired - run.pip)))
+        share = (inspired - protocol.PEEP) / (run.pip - protocol.PEEP)
+        heights = np.clip(share * 6.5, 0, len(_BARS) - 1).astype(int)  # the target is at 6.5 of 8
+        worst = 1e3 * max(breath.late)
+        print(
+            f"{done + 1:4d}/{total} {run.kind:9s} {run.entry:16.16s} {run.lung:6s} "
+            f"PIP {run.pip:2.0f} #{run.repeat:<2d} error {error:6.2f} "
+            f"peak {inspired.max():5.1f} late {worst:4.1f} ms "
+            f"|{''.join(_BARS[h] for h in heights)}|",
+            flush=True,
+        )
+
+
+class RerunView:
+    """Sends each breath to a rerun viewer or file.
+
+    Args:
+        target: ``"live"`` for a viewer that is started, else the path of an ``.rrd`` file.
+
+    Raises:
+        InputError: if rerun is not installed.
+    """
+
+    def __init__(self, target: str) -> None:
+        from ventbench import extras
+
+        extras.require("rerun")
+        import rerun as rr
+
+        self._rr: Any = rr
+        self._stream = rr.RecordingStream("ventbench-hardware")
+        if target == "live":
+            self._stream.spawn()
+        else:
+            self._stream.save(target)
+        self._elapsed = 0.0
+
+    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
+        """Log a breath, after those before it."""
+        rr = self._rr
+        start = self._elapsed - breath.time[0]
+        self._elapsed += breath.time[-1] - breath.time[0] + protocol.DT
+        times = rr.TimeColumn("bench_time", duration=np.array(breath.time) + start)
+        for name in ("pressure", "target", "u_in"):
+            values = np.array(getattr(breath, name), float)
+            self._stream.send_columns(
+                f"/{name}", indexes=[times], columns=rr.Scalars.columns(scalars=values)
+            )
+        late = 1e3 * np.array(breath.late)
+        self._stream.send_columns(
+            "/late_ms", indexes=[times], columns=rr.Scalars.columns(scalars=late)
+        )
+        self._stream.set_time("bench_time", duration=float(breath.time[0] + start))
+        text = f"{run.kind} {run.entry} {run.lung} PIP {run.pip:g} #{run.repeat}"
+        self._stream.log("/runs", rr.TextLog(text))
+
+
+class Views:
+    """Several views as one."""
+
+    def __init__(self, *views: Any) -> None:
+        self._views = views
+
+    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
+        """Show a breath in each."""
+        for view in self._views:
+            view.breath(run, breath, done, total)

@@ -1,0 +1,138 @@
+"""Controllers in real time: a submission in its process, and the protocol's PID in this one."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NotYet
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
+from hardware_eval.realtime import has_priority, take_priority
+from ventbench.interfaces import Task
+
+Floats = NDArray[np.float64]
+
+
+class ControllerFailedError(Exception):
+    """A controller raised, returned no number, or did not answer for seconds."""
+
+
+class LiveController(Protocol):
+    """A controller that answers in time or not at all."""
+
+    def act(self, row: Floats, budget: float) -> float | None:
+        """Ask for the next command.
+
+        Args:
+            row: the observation, as :func:`ventbench.submissions.runner.pack` lays it out.
+            budget: time for the answer, s.
+
+        Returns:
+            ``u_in``, %; None if there is no answer yet.
+
+        Raises:
+            ControllerFailedError: if there will be none.
+        """
+        ...
+
+    def close(self) -> None:
+        """End it."""
+        ...
+
+
+#: Makes the controller of a run.
+MakeController = Callable[[PlannedRun], LiveController]
+
+
+class SubmissionController:
+    """A submission in its process, asked by a thread so that the loop need not wait for it.
+
+    Args:
+        runner: as in scoring; see :class:`ventbench.submissions.runner.Runner`.
+        submission: whose code runs.
+        task: what the controller is told.
+        real_time: whether ``budget`` holds; else answers are waited for.
+    """
+
+    def __init__(self, runner: Any, submission: Any, task: Task, *, real_time: bool = True) -> None:
+        self._session = runner.start(submission, [task])
+        self._real_time = real_time
+        self._label = submission.manifest.name
+        begin = take_priority if has_priority() else None  # a thread that waits for a pipe
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="controller", initializer=begin)
+        self._pending: Future[Floats] | None = None
+        self._check()
+
+    def act(self, row: Floats, budget: float) -> float | None:
+        """Ask for the next command; an answer to an earlier observation is dropped."""
+        began = time.perf_counter()
+        if self._pending is not None:
+            if self._result(self._pending, budget) is None:
+                return None
+            budget -= time.perf_counter() - began
+        self._pending = self._thread.submit(self._session.act, row)
+        answer = self._result(self._pending, budget)
+        return None if answer is None else float(answer[0])
+
+    def _result(self, pending: Future[Floats], budget: float) -> Floats | None:
+        try:
+            answer = pending.result(max(budget, 0.0) if self._real_time else None)
+        except NotYet:
+            return None
+        self._pending = None
+        self._check()
+        return answer
+
+    def _check(self) -> None:
+        for failure in self._session.failures.values():
+            raise ControllerFailedError(failure.message(self._label, None))
+
+    def close(self) -> None:
+        """End the process; an answer that never comes is not waited for."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
+        self._session.close()
+
+
+class PIDController:
+    """The PID of the protocol in this process: control runs, exploring and self-tests.
+
+    Args:
+        gains: P, I and D, %/cmH2O.
+        added: what is added to its command at a time of the breath, %; nothing if not given.
+    """
+
+    def __init__(
+        self,
+        gains: tuple[float, float, float],
+        added: Callable[[int, float], float] | None = None,
+    ) -> None:
+        self._gains, self._added = gains, added or (lambda breath, time: 0.0)
+        self._error = self._integral = self._derivative = 0.0
+        self._breath = -1
+
+    def act(self, row: Floats, budget: float) -> float | None:
+        """Next command; the averages restart at each breath."""
+        now, dt, pressure, target = (float(value) for value in row[0, :4])
+        if now == 0.0:
+            self._error = self._integral = self._derivative = 0.0
+            self._breath += 1
+        error, a = target - pressure, dt / (dt + 0.5)
+        self._integral += a * (error - self._integral)
+        self._derivative += a * (error - self._error - self._derivative)
+        self._error = error
+        P, I, D = self._gains  # noqa: E741 - the field's names
+        u_in = P * error + I * self._integral + D * self._derivative
+        return u_in + self._added(self._breath, now)
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+
+def control_pid(run: PlannedRun) -> PIDController:
+    """The control between scored runs."""
+    return PIDController((*CONTROL_GAINS[run.lung], 0.0))

@@ -1,0 +1,412 @@
+"""One run on a bench: three breaths in real time, each step safe, everything noted.
+
+The loop runs at the protocol's 30 ms by absolute deadlines, so that a late step does not shift
+those after it. Each step takes a fresh reading, looks at it (:mod:`hardware_eval.bench.safety`),
+asks the controller, and sends the command. A controller that has not answered in time does not hold
+the loop up: the last safe command is repeated, and counted. However a run ends, its last act is to
+vent the lung; where it can act no more (``kill -9``, a cable pulled, a machine asleep) the device's
+watchdog does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hardware_eval.bench import safety
+from hardware_eval.bench.controllers import ControllerFailedError, LiveController
+from hardware_eval.bench.plan import PERTURBED_BREATH, PERTURBED_STEP, PlannedRun
+from hardware_eval.bench.safety import SafetySample, SafetySettings, Trip
+from hardware_eval.clock import Clock
+from hardware_eval.wire.client import Client
+from hardware_eval.wire.errors import LinkError, NoAnswerError, RefusedError
+from hardware_eval.wire.messages import Flag, Reading
+from ventbench import protocol, waveform
+from ventbench.lungs import lung as parse_lung
+
+Floats = NDArray[np.float64]
+
+#: When a controller must have answered, s after the step's deadline: what is left of 30 ms is for
+#: the command's way to the device, and for this loop.
+ANSWER_BY = 0.022
+
+#: Rest at PEEP before a run, s: several time constants of the slowest lung (1.25 s).
+REST_S = 4.0
+
+#: A step counts as on time if it begins within this of its deadline, s.
+ON_TIME_S = 0.002
+
+#: The bias flow of the expiration, which a controller is told at the start of a breath, %.
+_BIAS = float(waveform.expiratory_command(protocol.BREATH_STEPS - 1))
+
+
+class Operator(Protocol):
+    """The person at the bench."""
+
+    def confirm(self, question: str) -> bool:
+        """Ask; False ends the session."""
+        ...
+
+    def tell(self, text: str) -> None:
+        """Say something."""
+        ...
+
+    def stop(self) -> bool:
+        """Whether the emergency stop has been pressed; called at every step."""
+        ...
+
+    def disturb(self, perturbation: str, on: bool) -> None:
+        """Open a leak or pinch the tube now, or undo it."""
+        ...
+
+
+class SilentOperator:
+    """Confirms everything; for dry runs, tests and ``--yes``."""
+
+    def confirm(self, question: str) -> bool:
+        """Yes."""
+        return True
+
+    def tell(self, text: str) -> None:
+        """Say nothing."""
+
+    def stop(self) -> bool:
+        """No key to press."""
+        return False
+
+    def disturb(self, perturbation: str, on: bool) -> None:
+        """No hand to do it."""
+
+
+class View(Protocol):
+    """Shows a session as it runs; called while the lung breathes out."""
+
+    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
+        """Show a breath."""
+        ...
+
+
+@dataclass(frozen=True)
+class BreathLog:
+    """One breath as it happened; lists of one value a step.
+
+    Attributes:
+        time: of the reading, s since the run began.
+        pressure, flow: readings, cmH2O and mL/s; NaN where there was none.
+        requested: what the controller asked for, %; NaN where it did not answer in time.
+        u_in, u_out: what was commanded, %, 0/1.
+        target: cmH2O.
+        late: how late the step began, s.
+        busy: time from the step's beginning to the command's answer, s.
+    """
+
+    time: list[float] = field(default_factory=list)
+    pressure: list[float] = field(default_factory=list)
+    flow: list[float] = field(default_factory=list)
+    requested: list[float] = field(default_factory=list)
+    u_in: list[float] = field(default_factory=list)
+    u_out: list[int] = field(default_factory=list)
+    target: list[float] = field(default_factory=list)
+    late: list[float] = field(default_factory=list)
+    busy: list[float] = field(default_factory=list)
+
+    def line(self, run: PlannedRun, attempt: int, breath: int) -> dict[str, Any]:
+        """The breath as a line of the log."""
+        rounded = {
+            name: [None if math.isnan(value) else round(value, 6) for value in getattr(self, name)]
+            for name in vars(self)
+            if name not in ("target", "u_out")
+        }
+        about = {"run": run.number, "attempt": attempt, "breath": breath, "entry": run.entry}
+        label = {"kind": run.kind, "lung": run.lung, "pip": run.pip, "repeat": run.repeat}
+        return {"type": "breath", **about, **label, **rounded, "u_out": list(self.u_out)}
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What became of one run.
+
+    Attributes:
+        status: ``"complete"``; ``"failed"`` if its controller is to blame; ``"aborted"`` if the
+            bench is, so that it runs again.
+        reason: why it did not complete; empty if it did.
+        trips: safety checks that tripped.
+        breaths: those that began.
+        late_answers: steps whose controller did not answer in time.
+        limited: commands that a limit of the bench cut.
+        vented_after: time from the sample that tripped until the device had vented, s; NaN if
+            nothing tripped.
+    """
+
+    status: str
+    reason: str
+    trips: tuple[Trip, ...]
+    breaths: tuple[BreathLog, ...]
+    late_answers: int
+    limited: int
+    vented_after: float = math.nan
+
+    @property
+    def error(self) -> float:
+        """Mean |pressure - PIP| over the scored inspirations, cmH2O; NaN unless complete."""
+        if self.status != "complete":
+            return math.nan
+        errors = [
+            abs(pressure - target)
+            for k in protocol.SCORED_BREATHS
+            for pressure, target in zip(
+                self.breaths[k].pressure[: protocol.INSPIRATION_STEPS],
+                self.breaths[k].target[: protocol.INSPIRATION_STEPS],
+                strict=True,
+            )
+        ]
+        return float(np.mean(errors))
+
+
+class EmergencyStop(Exception):
+    """The operator pressed the stop key."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What a session works with.
+
+    Attributes:
+        client: of the device.
+        clock: of the device's time or a virtual one.
+        settings: safety.
+        operator: the person.
+        view: shows breaths; None for none.
+        rest: time at rest before each run, s.
+    """
+
+    client: Client
+    clock: Clock
+    settings: SafetySettings
+    operator: Operator
+    view: View | None = None
+    rest: float = REST_S
+
+
+def run_once(
+    bench: Bench,
+    run: PlannedRun,
+    controller: LiveController,
+    *,
+    on_breath: Callable[[int, BreathLog], None] = lambda index, breath: None,
+) -> RunResult:
+    """Run three breaths; the lung is vented before and after, whatever happens.
+
+    Args:
+        bench: device, clock, operator.
+        run: what runs.
+        controller: fresh.
+        on_breath: called with the place and the content of each breath once it ends, also of one
+            that was cut short.
+
+    Raises:
+        LinkError: if the port goes away or the device is silent; it vents by itself.
+        EmergencyStop: if the operator pressed the key; the lung is vented.
+    """
+    loop = _Loop(bench, run, controller, on_breath)
+    try:
+        return loop.run()
+    finally:
+        with contextlib.suppress(LinkError):  # then the watchdog vents
+            bench.client.vent()
+
+
+class _Loop:
+    """The state of one run."""
+
+    def __init__(
+        self,
+        bench: Bench,
+        run: PlannedRun,
+        controller: LiveController,
+        on_breath: Callable[[int, BreathLog], None],
+    ) -> None:
+        self._bench, self._run, self._controller = bench, run, controller
+        self._on_breath = on_breath
+        self._safety = safety.init(parse_lung(run.lung))
+        self._breaths: list[BreathLog] = []
+        self._late_answers = self._limited = 0
+        self._command = (0.0, 1)
+        self._disturbed = False
+
+    def run(self) -> RunResult:
+        """All breaths."""
+        bench = self._bench
+        bench.client.vent()
+        bench.clock.sleep_until(bench.clock.now() + bench.rest)
+        # Collected before the device waits for commands: that takes longer than the watchdog does.
+        with no_collection():
+            start = bench.clock.now() + protocol.DT
+            try:
+                bench.client.arm()
+            except RefusedError as error:
+                return self._ended("aborted", f"the device cannot be armed: {error}")
+            for index in range(protocol.BREATHS * protocol.BREATH_STEPS):
+                breath, step = divmod(index, protocol.BREATH_STEPS)
+                deadline = start + index * protocol.DT
+                bench.clock.sleep_until(deadline)
+                if step == 0:
+                    self._breaths.append(BreathLog())
+                ended = self._step(start, deadline, breath, step)
+                if ended is not None:
+                    self._on_breath(breath, self._breaths[-1])
+                    return ended
+                if step == protocol.BREATH_STEPS - 1:
+                    self._on_breath(breath, self._breaths[-1])
+        return self._ended("complete", "")
+
+    def _step(self, start: float, deadline: float, breath: int, step: int) -> RunResult | None:
+        """One control step; a result ends the run."""
+        bench, run, log = self._bench, self._run, self._breaths[-1]
+        began = bench.clock.now()
+        if bench.operator.stop():
+            bench.client.vent()
+            raise EmergencyStop
+        self._disturb(breath, step)
+        try:
+            reading: Reading | None = bench.client.heartbeat()
+        except NoAnswerError:
+            reading = None
+        except RefusedError as error:
+            return self._ended("aborted", str(error))
+        target = float(waveform.target(step, run.pip))
+        log.time.append((bench.clock.now() if reading is None else began) - start)
+        log.pressure.append(math.nan if reading is None else reading.pressure)
+        log.flow.append(math.nan if reading is None else reading.flow)
+        log.target.append(target)
+        log.late.append(max(began - deadline, 0.0))
+        result = self._look(reading, began, log.late[-1])
+        if result is None:
+            result = self._act(reading, deadline, step, target)
+        if result is not None:  # so that every list of the breath has as many values
+            log.requested.append(math.nan)
+            log.u_in.append(0.0)
+            log.u_out.append(1)
+        log.busy.append(bench.clock.now() - began)
+        return result
+
+    def _look(self, reading: Reading | None, began: float, late: float) -> RunResult | None:
+        """Let the checks see a reading; vent if one trips."""
+        bench, run = self._bench, self._run
+        if reading is not None and reading.flags & _CAUSES:
+            return self._vented_by_device(reading.flags)
+        sample = SafetySample(
+            began,
+            math.nan if reading is None else reading.pressure,
+            math.nan if reading is None else reading.flow,
+            self._command[0],
+            self._command[1],
+            run.pip,
+            late,
+            math.nan if reading is None else reading.u_in,
+        )
+        self._safety = safety.step(bench.settings, self._safety, sample)
+        if not self._safety.trips:
+            return None
+        bench.client.vent()
+        first = self._safety.trips[0]
+        status = "aborted" if all(trip.bench for trip in self._safety.trips) else "failed"
+        return self._ended(status, first.message, bench.clock.now() - began)
+
+    def _vented_by_device(self, flags: Flag) -> RunResult:
+        # The device's pressure limit is the controller's to respect; all else is the bench's.
+        status = "failed" if flags & Flag.OVERPRESSURE else "aborted"
+        return self._ended(status, f"the device vented: {(flags & _CAUSES).name}", 0.0)
+
+    def _act(
+        self, reading: Reading | None, deadline: float, step: int, target: float
+    ) -> RunResult | None:
+        """Choose a command and send it."""
+        bench, run, log = self._bench, self._run, self._breaths[-1]
+        inspiring = step < protocol.INSPIRATION_STEPS
+        requested = math.nan
+        if inspiring:
+            previous = _BIAS if step == 0 else self._command[0]
+            if reading is not None:
+                row = _row(step, reading.pressure, target, run.pip, previous)
+                budget = deadline + ANSWER_BY - bench.clock.now()
+                try:
+                    answer = self._controller.act(row, budget)
+                except ControllerFailedError as error:
+                    bench.client.vent()
+                    return self._ended("failed", str(error))
+                requested = math.nan if answer is None else answer
+            if math.isnan(requested):
+                self._late_answers += 1
+                u_in = self._command[0] if self._command[1] == 0 else 0.0
+            else:
+                u_in, cut = safety.limit_command(bench.settings, previous, requested)
+                self._limited += cut
+            command = (u_in, 0)
+        else:
+            command = (float(waveform.expiratory_command(step)), 1)
+        try:
+            bench.client.command(*command)
+        except RefusedError as error:
+            return self._refused(error)
+        except NoAnswerError:
+            pass  # it may have arrived; the next reading and the watchdog tell
+        self._command = command
+        log.requested.append(requested)
+        log.u_in.append(command[0])
+        log.u_out.append(command[1])
+        return None
+
+    def _refused(self, error: RefusedError) -> RunResult:
+        flags = getattr(error.refusal, "flags", Flag.NONE)
+        if flags & _CAUSES:
+            return self._vented_by_device(flags)
+        return self._ended("aborted", str(error))
+
+    def _disturb(self, breath: int, step: int) -> None:
+        """Announce and undo the perturbation of a perturbed run."""
+        tube = self._run.perturbation
+        if tube and not self._disturbed and (breath, step) == (PERTURBED_BREATH, PERTURBED_STEP):
+            self._bench.operator.disturb(tube, True)
+            self._disturbed = True
+
+    def _ended(self, status: str, reason: str, vented_after: float = math.nan) -> RunResult:
+        if self._disturbed:
+            self._bench.operator.disturb(self._run.perturbation, False)
+        return RunResult(
+            status, reason, self._safety.trips, tuple(self._breaths), self._late_answers,
+            self._limited, vented_after,
+        )  # fmt: skip
+
+
+_CAUSES = (
+    Flag.COMMANDS_STOPPED | Flag.OUT_OF_RANGE | Flag.OVERPRESSURE | Flag.SENSOR_LOST
+    | Flag.DEVICE_LATE
+)  # fmt: skip
+
+
+def _row(step: int, pressure: float, target: float, pip: float, previous: float) -> Floats:
+    """The observation of a step, ``(1, ROW)``."""
+    ahead = waveform.targets_ahead(step, pip)
+    head = [step * protocol.DT, protocol.DT, pressure, target]
+    return np.array([[*head, *ahead.tolist(), previous]])
+
+
+@contextlib.contextmanager
+def no_collection() -> Iterator[None]:
+    """Collect garbage now and not for a while: a collection takes longer than a step may."""
+    was = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()

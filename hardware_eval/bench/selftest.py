@@ -1,0 +1,458 @@
+"""The self-test before a session: sensor, valves, tubes, clock, and whether the lung is as told.
+
+Every breath of it is closed-loop or small, and watched by the same checks as a session, so that a
+wrongly set lung cannot be hurt by the test that finds it. What is measured is compared with limits
+that stand in :data:`LIMITS` with their reasons; the sheet says go or no-go.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hardware_eval.bench import safety
+from hardware_eval.bench.loop import ON_TIME_S, Bench, EmergencyStop, no_collection
+from hardware_eval.bench.safety import VALVE_GAIN, SafetySample
+from hardware_eval.wire.errors import LinkError, NoAnswerError, RefusedError
+from ventbench import protocol
+from ventbench.lungs import LUNGS
+from ventbench.lungs import lung as parse_lung
+from ventbench.metrics.open_loop import mae
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What a measured value must be.
+
+    Attributes:
+        low: least value.
+        high: largest value.
+        unit: of both.
+        reason: why.
+    """
+
+    low: float
+    high: float
+    unit: str
+    reason: str
+
+
+LIMITS: dict[str, Limit] = {
+    "sensor_zero": Limit(
+        protocol.PEEP - 1.5, protocol.PEEP + 1.5, "cmH2O",
+        "A vented lung rests at PEEP; an offset would go into every score.",
+    ),
+    "sensor_noise": Limit(
+        0.0, 0.5, "cmH2O", "Standard deviation at rest; the recordings have 0.1 to 0.3.",
+    ),
+    "leak": Limit(
+        -3.0, 3.0, "cmH2O/s",
+        "Fall of a closed lung at 20 cmH2O; tight benches show less than 1.5, with relaxation.",
+    ),
+    "valve_sweep": Limit(
+        1.0, 1.0, "of steps up",
+        "Each larger opening must give more pressure; else the valve sticks or is unplugged.",
+    ),
+    "valve_gain": Limit(
+        0.4, 2.0, "of nominal",
+        "Flow of the valve against 22.8 mL/s per %: measured, or what makes C the label's.",
+    ),
+    "resistance": Limit(
+        0.0, 3.0, "of label", "More is an occluded or pinched tube.",
+    ),
+    "lung": Limit(
+        0.0, 1.15, "of the best lung's error",
+        "Open-loop error of the label's frozen simulator against that of the lung that fits best.",
+    ),
+    "on_time": Limit(
+        0.98, 1.0, "of steps", "Share of steps that begin within 2 ms of their deadline.",
+    ),
+    "latest_step": Limit(
+        0.0, 0.010, "s", "The latest step; a third of the control step.",
+    ),
+    "round_trip": Limit(
+        0.0, 0.010, "s", "Median time from a message to its answer; two of them fit into a step.",
+    ),
+    "safety": Limit(
+        0.0, 0.0, "trips", "No safety check may trip in a test this gentle.",
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the sheet.
+
+    Attributes:
+        name: what was measured; a key of :data:`LIMITS`.
+        value: measured value; NaN if it could not be measured.
+        ok: whether it is within its limit.
+        text: what it means, for a person.
+    """
+
+    name: str
+    value: float
+    ok: bool
+    text: str
+
+    @property
+    def limit(self) -> Limit:
+        """What the value must be."""
+        return LIMITS[self.name]
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """The go/no-go sheet.
+
+    Attributes:
+        lung: label that was tested.
+        findings: all of them.
+        errors: open-loop error of each lung's frozen simulator on the probes, cmH2O.
+        R, C: least-squares estimates, cmH2O/(L/s) and mL/cmH2O; by the nominal valve where no flow
+            is measured, and then no better than that.
+    """
+
+    lung: str
+    findings: tuple[Finding, ...]
+    errors: dict[str, float] = field(default_factory=dict)
+    R: float = math.nan
+    C: float = math.nan
+
+    @property
+    def go(self) -> bool:
+        """Whether everything is within its limits."""
+        return all(finding.ok for finding in self.findings)
+
+    @property
+    def nearest(self) -> str:
+        """The lung whose simulator fits the probes best; empty if there were none."""
+        return min(self.errors, key=lambda lung: self.errors[lung], default="")
+
+    def problems(self) -> list[str]:
+        """What is not within its limits, in words."""
+        return [f"{x.name.replace('_', ' ')}: {x.text}" for x in self.findings if not x.ok]
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values."""
+        return {
+            "lung": self.lung,
+            "go": self.go,
+            "nearest": self.nearest,
+            "R": _number(self.R),
+            "C": _number(self.C),
+            "errors": {lung: _number(error) for lung, error in self.errors.items()},
+            "findings": [
+                {
+                    "name": x.name, "ok": x.ok, "value": _number(x.value), "unit": x.limit.unit,
+                    "limits": [x.limit.low, x.limit.high], "text": x.text, "reason": x.limit.reason,
+                }
+                for x in self.findings
+            ],
+        }  # fmt: skip
+
+    def __str__(self) -> str:
+        lines = [f"self-test of {self.lung}: {'GO' if self.go else 'NO-GO'}"]
+        for x in self.findings:
+            limit = f"{x.limit.low:g} to {x.limit.high:g} {x.limit.unit}"
+            lines.append(f"  {'ok   ' if x.ok else 'NO-GO'} {x.name:13s} {x.text} ({limit})")
+        return "\n".join(lines)
+
+
+def _number(value: float) -> float | None:
+    return round(value, 4) if math.isfinite(value) else None
+
+
+#: Chooses valves from the step and the pressure.
+Commands = Callable[[int, float], tuple[float, int]]
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What came of driving the valves; arrays of shape ``(T,)``.
+
+    Attributes:
+        time, pressure, flow, u_in, u_out, late, busy: s, cmH2O, mL/s, %, 0/1, s, s; flow is NaN
+            where it is not measured.
+        trips: messages of the safety checks that tripped; the lung was vented then.
+    """
+
+    time: Floats
+    pressure: Floats
+    flow: Floats
+    u_in: Floats
+    u_out: Floats
+    late: Floats
+    busy: Floats
+    trips: tuple[str, ...]
+
+
+def drive(bench: Bench, lung: str, commands: Commands, steps: int, *, pip: float) -> Driven:
+    """Drive the valves step by step, watched; the lung is vented before and after.
+
+    Args:
+        bench: device, clock, safety.
+        lung: label, for the checks.
+        commands: called with the step and the pressure, cmH2O.
+        steps: how many.
+        pip: highest pressure that is meant, cmH2O, for the checks.
+
+    Raises:
+        EmergencyStop: if the operator pressed the key.
+        LinkError: if the device is lost.
+    """
+    client, clock = bench.client, bench.clock
+    rows: list[tuple[float, ...]] = []
+    watched = safety.init(parse_lung(lung))
+    last, trips = (0.0, 1), ()
+    with contextlib.ExitStack() as stack:
+        stack.callback(_vent, bench)
+        client.vent()
+        clock.sleep_until(clock.now() + bench.rest)
+        stack.enter_context(no_collection())
+        start = clock.now() + protocol.DT
+        client.arm()
+        for step in range(steps):
+            deadline = start + step * protocol.DT
+            clock.sleep_until(deadline)
+            began = clock.now()
+            if bench.operator.stop():
+                raise EmergencyStop
+            try:
+                reading = client.heartbeat()
+                pressure, flow, applied = reading.pressure, reading.flow, reading.u_in
+            except NoAnswerError:
+                pressure = flow = applied = math.nan
+            sample = SafetySample(began, pressure, flow, *last, pip, began - deadline, applied)
+            watched = safety.step(bench.settings, watched, sample)
+            if watched.trips:
+                trips = tuple(trip.message for trip in watched.trips)
+                break
+            wanted, u_out = commands(step, pressure) if math.isfinite(pressure) else last
+            u_in, _ = safety.limit_command(bench.settings, last[0], wanted)
+            try:
+                client.command(u_in, u_out)
+            except RefusedError as error:
+                trips = (str(error),)
+                break
+            except NoAnswerError:
+                pass
+            last = (u_in, u_out)
+            rows.append(
+                (began - start, pressure, flow, *last, began - deadline, clock.now() - began)
+            )
+    columns = np.array(rows).reshape(-1, 7).T
+    return Driven(*columns, trips)  # type: ignore[arg-type]
+
+
+def _vent(bench: Bench) -> None:
+    with contextlib.suppress(LinkError):  # then the watchdog does
+        bench.client.vent()
+
+
+#: Integrating probes reach these pressures, cmH2O, with these gains (P, I), %/cmH2O: gentle on
+#: every lung, and slow enough that a stiff lung under a soft label does not overshoot.
+_PROBES = ((15.0, 1.0, 2.0), (25.0, 1.0, 2.0), (15.0, 3.0, 1.0), (25.0, 0.3, 4.0))
+
+#: Openings of the sweep, %, for :data:`_PUFF` steps each.
+_SWEEP = (5.0, 10.0, 20.0, 40.0)
+_PUFF = 3
+
+#: Pressure at which the closed lung is watched, cmH2O, and the steps of filling and of watching.
+_HELD, _FILL, _WATCH = 20.0, 25, 45
+
+
+def selftest(bench: Bench, lung: str, *, simulator: Any = "frozen") -> Sheet:
+    """Test a bench with a mounted lung.
+
+    Takes about 40 s.
+
+    Args:
+        bench: device, clock, safety, operator.
+        lung: its label.
+        simulator: the simulators that know the lungs; see :func:`ventbench.load_simulators`.
+
+    Raises:
+        EmergencyStop: if the operator pressed the key.
+        LinkError: if the device is lost.
+    """
+    bench = replace(bench, rest=min(bench.rest, 3.0))
+    driven: list[Driven] = []
+
+    def run(commands: Commands, steps: int, pip: float) -> Driven:
+        driven.append(drive(bench, lung, commands, steps, pip=pip))
+        return driven[-1]
+
+    findings = _at_rest(run(lambda step, pressure: (0.0, 1), 34, 10.0))
+    if not any(x.trips for x in driven):
+        findings += _closed(run(_fill_and_hold(), _FILL + _WATCH, 30.0))
+    if not any(x.trips for x in driven):
+        findings += _sweep(
+            [run(_puff(u), _PUFF + 8, 30.0) for u in _SWEEP], run(_puff(0.0), _PUFF + 8, 30.0)
+        )
+    probes: list[Driven] = []
+    for pip, P, I in _PROBES:  # noqa: E741 - the field's names
+        if any(x.trips for x in driven):
+            break
+        probes.append(run(_probe(pip, P, I), protocol.BREATH_STEPS, pip))
+    errors: dict[str, float] = {}
+    R = C = math.nan
+    if probes and not any(x.trips for x in driven):
+        errors = _errors(probes, simulator)
+        R, C, gain = _mechanics(probes, lung)
+        findings += _lung(lung, errors, R, C, gain)
+    trips = [text for x in driven for text in x.trips]
+    findings.append(
+        Finding("safety", float(len(trips)), not trips, "; ".join(trips) or "nothing tripped")
+    )
+    findings += _clock(driven, bench)
+    return Sheet(lung, tuple(findings), errors, R, C)
+
+
+def _finding(name: str, value: float, text: str) -> Finding:
+    limit = LIMITS[name]
+    return Finding(name, value, bool(limit.low - 1e-12 <= value <= limit.high + 1e-12), text)
+
+
+def _at_rest(rest: Driven) -> list[Finding]:
+    settled = rest.pressure[len(rest.pressure) // 2 :]
+    if not settled.size or not np.isfinite(settled).all():
+        return [Finding("sensor_zero", math.nan, False, "the sensor gives no pressure")]
+    noise = float(np.std(np.diff(settled)) / math.sqrt(2.0))
+    mean = float(settled.mean())
+    return [
+        _finding("sensor_zero", mean, f"{mean:.2f} cmH2O at rest"),
+        _finding("sensor_noise", noise, f"{noise:.2f} cmH2O of noise"),
+    ]
+
+
+def _fill_and_hold() -> Commands:
+    total = 0.0
+
+    def commands(step: int, pressure: float) -> tuple[float, int]:
+        nonlocal total
+        if step >= _FILL:
+            return 0.0, 0
+        total += 0.06 * (_HELD - pressure - total)
+        return max(1.0 * (_HELD - pressure) + 2.0 * total, 0.0), 0
+
+    return commands
+
+
+def _closed(held: Driven) -> list[Finding]:
+    watched = held.pressure[_FILL + 15 :]
+    if len(watched) < 10:
+        return [Finding("leak", math.nan, False, "the lung could not be filled")]
+    fall = -float(np.polyfit(held.time[_FILL + 15 :], watched, 1)[0])
+    return [
+        _finding(
+            "leak", fall, f"falls by {fall:.2f} cmH2O/s from {watched[0]:.1f} cmH2O when closed"
+        )
+    ]
+
+
+def _puff(u_in: float) -> Commands:
+    return lambda step, pressure: (u_in, 0) if step < _PUFF else (0.0, 0)
+
+
+def _sweep(puffs: list[Driven], still: Driven) -> list[Finding]:
+    rises = [float(puff.pressure[-1] - puff.pressure[0]) for puff in puffs]
+    base = float(still.pressure[-1] - still.pressure[0])
+    steps = np.diff([base, *rises]) > 0.0
+    text = ", ".join(f"{u:g} % {rise:+.2f}" for u, rise in zip(_SWEEP, rises, strict=True))
+    return [_finding("valve_sweep", float(np.mean(steps)), f"{text} cmH2O")]
+
+
+def _probe(pip: float, P: float, I: float) -> Commands:  # noqa: E741 - the field's names
+    total = 0.0
+
+    def commands(step: int, pressure: float) -> tuple[float, int]:
+        nonlocal total
+        if step >= protocol.INSPIRATION_STEPS:
+            return 0.0, 1
+        total += 0.0566 * (pip - pressure - total)
+        return max(P * (pip - pressure) + I * total, 0.0), 0
+
+    return commands
+
+
+def _errors(probes: list[Driven], simulator: Any) -> dict[str, float]:
+    """Open-loop error of each lung's simulator over the inspirations of the probes, cmH2O."""
+    from ventbench.plants.catalog import load_simulators
+
+    # The reference rig of each lung: a clock of exactly 30 ms tells no rig from another.
+    simulators = load_simulators(simulator)
+    inspiration = protocol.INSPIRATION_STEPS + 1
+    errors = {}
+    for lung in LUNGS:
+        each = []
+        for probe in probes:
+            dt = np.diff(probe.time, append=2 * probe.time[-1] - probe.time[-2])
+            simulated = simulators.respond(
+                lung.id, probe.u_in, probe.u_out, dt, initial_pressure=float(probe.pressure[0])
+            )
+            each.append(float(mae(probe.pressure[:inspiration], simulated[:inspiration])))
+        errors[lung.id] = float(np.mean(each))
+    return errors
+
+
+def _mechanics(probes: list[Driven], lung: str) -> tuple[float, float, float]:
+    """R, C and the valve's flow over nominal, from ``p = p0 + R Q + V / C`` by least squares.
+
+    Where no flow is measured the nominal valve's is taken, two steps delayed as in the recordings,
+    and the valve's flow is what makes C the label's.
+    """
+    steps = protocol.INSPIRATION_STEPS
+    rows, pressures, given, nominal = [], [], 0.0, 0.0
+    measured = all(np.isfinite(probe.flow[:steps]).all() for probe in probes)
+    for index, probe in enumerate(probes):
+        valve = 1e-3 * VALVE_GAIN * probe.u_in[:steps]  # L/s, from each sample to the next
+        flow = 1e-3 * probe.flow[:steps] if measured else np.append([0.0, 0.0], valve[:-2])
+        between = 0.5 * (flow[1:] + flow[:-1]) if measured else valve[:-1]
+        volume = np.append(0.0, np.cumsum(between * protocol.DT))
+        given, nominal = given + float(volume[-1]), nominal + float(valve.sum() * protocol.DT)
+        own = np.zeros((steps, len(probes)))
+        own[:, index] = 1.0
+        rows.append(np.column_stack([flow, volume, own]))
+        pressures.append(probe.pressure[:steps])
+    solution, *_ = np.linalg.lstsq(np.concatenate(rows), np.concatenate(pressures), rcond=None)
+    R, elastance = float(solution[0]), float(solution[1])
+    C = 1000.0 / elastance if elastance > 0.0 else math.inf
+    return R, C, given / max(nominal, 1e-9) if measured else parse_lung(lung).C / C
+
+
+def _lung(lung: str, errors: dict[str, float], R: float, C: float, gain: float) -> list[Finding]:
+    nearest = min(errors, key=lambda name: errors[name])
+    ratio = errors[lung] / max(errors[nearest], 1e-9)
+    # Of two simulators that are both within the noise of a sensor neither is wrong.
+    ratio = 1.0 if errors[lung] < 0.3 else ratio
+    told = f"{errors[lung]:.2f} cmH2O as {lung}"
+    if nearest != lung:
+        told += f", {errors[nearest]:.2f} as {nearest}: is the lung set to {nearest}?"
+    label = parse_lung(lung)
+    return [
+        _finding("lung", ratio, told),
+        _finding("resistance", max(R, 0.0) / label.R, f"R {R:.1f}, C {C:.1f} by least squares"),
+        _finding("valve_gain", gain, f"the valve gives {gain:.2f} of 22.8 mL/s per %"),
+    ]
+
+
+def _clock(driven: list[Driven], bench: Bench) -> list[Finding]:
+    late = np.concatenate([x.late for x in driven])
+    if not late.size:
+        return []
+    share, worst = float(np.mean(late <= ON_TIME_S)), float(late.max())
+    trip = bench.client.statistics().round_trip_median
+    return [
+        _finding("on_time", share, f"{100 * share:.2f} % of {late.size} steps within 2 ms"),
+        _finding("latest_step", worst, f"{1e3 * worst:.1f} ms late at worst"),
+        _finding("round_trip", trip, f"{1e3 * trip:.1f} ms from message to answer"),
+    ]

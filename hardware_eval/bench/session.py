@@ -1,0 +1,257 @@
+"""A session at the bench: what is left of a plan, lung by lung and run by run, written down."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from hardware_eval.bench.controllers import ControllerFailedError, MakeController, control_pid
+from hardware_eval.bench.loop import (
+    Bench,
+    BreathLog,
+    EmergencyStop,
+    RunResult,
+    SilentOperator,
+    run_once,
+)
+from hardware_eval.bench.plan import CONTROL, Plan, PlannedRun, progress
+from hardware_eval.bench.raw_log import RawLog, lines
+from hardware_eval.bench.safety import SafetySettings
+from hardware_eval.wire.client import Client
+from hardware_eval.wire.errors import LinkError
+
+#: Runs that the bench spoils in a row before the session gives up.
+MAX_ATTEMPTS = 3
+
+
+@dataclass(frozen=True)
+class SessionEnd:
+    """How a session ended.
+
+    Attributes:
+        complete: whether the plan is done.
+        reason: why not; empty if it is.
+        runs: runs of this session.
+    """
+
+    complete: bool
+    reason: str
+    runs: int
+
+
+def run_plan(
+    bench: Bench,
+    plan: Plan,
+    make_controller: MakeController,
+    log: RawLog,
+    *,
+    about: Mapping[str, Any],
+    before_lung: Callable[[str], str] = lambda lung: "",
+    prepare_run: Callable[[PlannedRun], None] = lambda run: None,
+) -> SessionEnd:
+    """Run what is left of a plan.
+
+    Args:
+        bench: device, clock, operator.
+        plan: what to run.
+        make_controller: makes the controller of a run; called while the lung rests.
+        log: of the plan; what it holds already is not run again.
+        about: what the session's line in the log says besides the plan: device, operator, notes.
+        before_lung: called once a lung is confirmed; returns why not to go on, or nothing.
+        prepare_run: called before each run; an emulator mounts the lung here.
+
+    Returns:
+        How it ended; the lung is vented in every case.
+
+    Raises:
+        InputError: if the log is of another plan.
+        KeyboardInterrupt: if interrupted; the lung is vented.
+    """
+    logged = list(lines(log.path))
+    state = progress(plan, logged)
+    attempts = dict(state.attempts)
+    if not any(line["type"] == "plan" for line in logged):
+        log.append({"type": "plan", "plan": plan.as_dict()})
+    log.append({"type": "session", **about, "safety": bench.settings.as_dict()})
+    remaining = state.remaining(plan)
+    end = SessionEnd(not remaining, "", 0)
+    try:
+        end = _runs(
+            bench, plan, remaining, attempts, make_controller, log, before_lung, prepare_run
+        )
+    except EmergencyStop:
+        end = SessionEnd(False, "the operator pressed the emergency stop", 0)
+    except BaseException as error:
+        end = SessionEnd(False, f"{type(error).__name__}: {error}", 0)
+        raise
+    finally:
+        with contextlib.suppress(LinkError):
+            bench.client.vent()
+        log.append({"type": "session_ends", "complete": end.complete, "reason": end.reason})
+    return end
+
+
+def _runs(
+    bench: Bench,
+    plan: Plan,
+    remaining: Sequence[PlannedRun],
+    attempts: dict[int, int],
+    make_controller: MakeController,
+    log: RawLog,
+    before_lung: Callable[[str], str],
+    prepare_run: Callable[[PlannedRun], None],
+) -> SessionEnd:
+    mounted, spoilt, made = "", 0, 0
+    queue = list(remaining)
+    while queue:
+        run = queue[0]
+        if run.lung != mounted:
+            reason = _mount(bench, run.lung, log, before_lung)
+            if reason:
+                return SessionEnd(False, reason, made)
+            mounted = run.lung
+        if run.kind == "ramp" and not bench.operator.confirm(
+            f"{run.entry} on {run.lung}: raise PIP to {run.pip:g} cmH2O?"
+        ):
+            return SessionEnd(False, "the operator did not confirm the next PIP", made)
+        prepare_run(run)
+        try:
+            result = _one(
+                bench,
+                run,
+                attempts,
+                make_controller,
+                log,
+                (len(plan.runs) - len(queue), len(plan.runs)),
+            )
+        except LinkError as error:
+            # The device has vented or will: by the vent that follows, or by its watchdog.
+            log.append({"type": "event", "what": "link", "message": str(error)})
+            log.append(_run_line(run, attempts[run.number] - 1, "aborted", str(error)))
+            spoilt += 1
+            if spoilt > MAX_ATTEMPTS:
+                raise
+            bench.operator.tell(f"{error}; connecting again")
+            bench.client.reconnect()
+            log.append({"type": "event", "what": "reconnected"})
+            continue
+        made += 1
+        if result.status == "aborted":
+            spoilt += 1
+            if spoilt >= MAX_ATTEMPTS or not bench.operator.confirm(
+                f"{result.reason}. Mend the bench; run it again?"
+            ):
+                return SessionEnd(False, result.reason, made)
+            continue
+        spoilt = 0
+        queue.pop(0)
+        if result.status == "failed" and run.kind == "ramp":
+            # What fails on the way up would fail at the top, with more pressure.
+            reason = f"{run.entry} failed on {run.lung} at PIP {run.pip:g}: {result.reason}"
+            skipped = [x for x in queue if x.entry == run.entry and x.lung == run.lung]
+            for other in skipped:
+                log.append(_run_line(other, attempts.get(other.number, 0), "failed", reason))
+            queue = [x for x in queue if x not in skipped]
+            bench.operator.tell(f"{reason}; its other runs on this lung are left out")
+    return SessionEnd(True, "", made)
+
+
+def _mount(bench: Bench, lung: str, log: RawLog, before_lung: Callable[[str], str]) -> str:
+    """Have a lung set and checked; returns why not to go on, or nothing."""
+    if not bench.operator.confirm(f"set the lung to {lung} and connect it. Is it set?"):
+        return f"the operator did not confirm lung {lung}"
+    log.append({"type": "event", "what": "lung", "lung": lung})
+    return before_lung(lung)
+
+
+def _one(
+    bench: Bench,
+    run: PlannedRun,
+    attempts: dict[int, int],
+    make_controller: MakeController,
+    log: RawLog,
+    place: tuple[int, int],
+) -> RunResult:
+    done, total = place
+    attempt = attempts.get(run.number, 0)
+    attempts[run.number] = attempt + 1
+    log.append({"type": "run_begins", "run": run.number, "attempt": attempt, "time": time.time()})
+    try:
+        controller = control_pid(run) if run.entry == CONTROL else make_controller(run)
+    except ControllerFailedError as error:
+        log.append(_run_line(run, attempt, "failed", str(error)))
+        return RunResult("failed", str(error), (), (), 0, 0)
+
+    def on_breath(index: int, breath: BreathLog) -> None:
+        log.append(breath.line(run, attempt, index))
+        if bench.view is not None:
+            bench.view.breath(run, breath, done, total)
+
+    try:
+        result = run_once(bench, run, controller, on_breath=on_breath)
+    finally:
+        controller.close()
+    line = _run_line(run, attempt, result.status, result.reason)
+    log.append(
+        {
+            **line,
+            "error": None if math.isnan(result.error) else result.error,
+            "late_answers": result.late_answers,
+            "limited": result.limited,
+            "trips": [vars(trip) for trip in result.trips],
+        }
+    )
+    return result
+
+
+def _run_line(run: PlannedRun, attempt: int, status: str, reason: str) -> dict[str, Any]:
+    about = {"run": run.number, "attempt": attempt, "status": status, "reason": reason}
+    label = {"entry": run.entry, "kind": run.kind, "lung": run.lung, "pip": run.pip}
+    return {"type": "run", **about, **label, "repeat": run.repeat}
+
+
+def dry_run(plan: Plan, make_controller: MakeController, settings: SafetySettings) -> list[str]:
+    """Run every distinct run of a plan once on the frozen simulators, by the same code.
+
+    Repetitions are left out: on a simulator they are the same.
+
+    Args:
+        plan: what is to run on the bench.
+        make_controller: makes the controller of a run.
+        settings: of the safety.
+
+    Returns:
+        What went wrong, one sentence each; empty if the plan is safe there.
+    """
+    from hardware_eval.emulation.loopback import loopback
+    from hardware_eval.emulation.simulated import simulated_lung
+
+    problems: list[str] = []
+    seen: set[tuple[Any, ...]] = set()
+    mounted, bench = "", None
+    for run in plan.runs:
+        key = (run.kind == "control", run.entry, run.lung, run.pip)
+        if key in seen or run.kind == "perturbed":
+            continue
+        seen.add(key)
+        if bench is None or run.lung != mounted:
+            device, mounted = loopback(simulated_lung(run.lung)), run.lung
+            client = Client(device, device.clock)
+            client.hello()
+            bench = Bench(client, device.clock, settings, SilentOperator(), rest=1.0)
+        try:
+            controller = control_pid(run) if run.entry == CONTROL else make_controller(run)
+        except ControllerFailedError as error:
+            problems.append(f"{run.entry} on {run.lung}: {error}")
+            continue
+        try:
+            result = run_once(bench, run, controller)
+        finally:
+            controller.close()
+        if result.status != "complete":
+            problems.append(f"{run.entry} on {run.lung} at PIP {run.pip:g}: {result.reason}")
+    return problems

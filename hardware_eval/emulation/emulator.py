@@ -1,0 +1,303 @@
+"""An emulated device on a real pseudo-terminal: the device's own program over a simulated lung.
+
+``ventbench-hardware emulate`` runs it. The path that it prints is a serial port for any program.
+The cable can be pulled, and faults can begin, while it runs: by lines of text on a socket
+(``--control``), see :class:`Emulator`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import heapq
+import os
+import signal
+import socket
+import sys
+import time
+import tty
+from collections import deque
+from collections.abc import Callable, Sequence
+from itertools import count
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from hardware_eval import realtime
+from hardware_eval.device.hal import Hal
+from hardware_eval.device.port import Guard, Port
+from hardware_eval.device.program import DeviceService, DeviceSettings
+from hardware_eval.emulation.faults import AnyFault, Line, LineFault, LungFault, parse
+from hardware_eval.emulation.loopback import Actuation
+from hardware_eval.wire.messages import Flag
+from ventbench.errors import InputError
+
+#: Changes of the valves that are remembered.
+_REMEMBERED = 100_000
+
+#: Bytes that are read at once.
+_CHUNK = 4096
+
+
+class Emulator(Guard):
+    """A device on a pseudo-terminal, stepped in real time.
+
+    Lines of text on the control socket: a fault as in ``--fault`` with times from now on
+    (``leak@0-3:0.1``), ``clear`` to end all faults, ``unplug SECONDS`` to pull the cable.
+
+    Attributes:
+        terminal: path that a host opens; of another name after the cable was pulled, unless there
+            is a link.
+        actuations: the last changes of the valves; their times are those of ``time.monotonic``,
+            which all processes of a machine share.
+        line: what the line does to bytes.
+    """
+
+    def __init__(
+        self,
+        hal: Hal,
+        settings: DeviceSettings | None = None,
+        *,
+        link: Path | None = None,
+        control: Path | None = None,
+        line_faults: Sequence[LineFault] = (),
+        log: Path | None = None,
+    ) -> None:
+        """Open the terminal.
+
+        Args:
+            hal: simulated hardware; its clock counts from now.
+            settings: limits of the device.
+            link: symbolic link to make to the terminal, so that its name stays.
+            control: path of the control socket to make.
+            line_faults: what goes wrong on the line.
+            log: file to which each change of the valves is written as it happens: time of
+                ``time.monotonic``, s, u_in, %, u_out, flags.
+
+        Raises:
+            InputError: if the link or the socket cannot be made.
+        """
+        begun = time.monotonic()
+        service = DeviceService(hal, settings or DeviceSettings(), 0.0)
+        self.actuations: deque[Actuation] = deque(maxlen=_REMEMBERED)
+        self.actuations.append(Actuation(begun, 0.0, 1))
+        self.line = Line(line_faults)
+        self._outgoing: list[tuple[float, int, bytes]] = []
+        self._order = count()
+        self._log = log.open("w", buffering=1) if log else None
+        self._link, self._control_path = link, control
+        self._slave = -1
+        if link is not None and link.exists() and not link.is_symlink():
+            raise InputError(f"--link {link}: there is a file of that name; remove it")
+        first = self._open()
+        self._control = self._open_control() if control else None
+        unopened = [first]
+        port = Port(lambda: unopened.pop() if unopened else self._open(), self._close_terminal)
+        super().__init__(service, port, lambda: time.monotonic() - begun)
+
+    def run(self, stop: Callable[[], bool] = lambda: False) -> None:
+        """Serve until ``stop()``; then vent and remove link and socket."""
+        try:
+            super().run(stop)
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Remove terminal, link and socket."""
+        self.port.close()
+        if self._control is not None and self._control_path is not None:
+            self._control.close()
+            self._control_path.unlink(missing_ok=True)
+            self._control = None
+        if self._log:
+            self._log.close()
+            self._log = None
+
+    def wanted(self) -> float:
+        """Time at which an answer is due that a fault delays, s."""
+        return self._outgoing[0][0] if self._outgoing else float("inf")
+
+    def turn(self, now: float, data: bytes) -> None:
+        """Step the program; answer as the line's faults allow, and do what the control says."""
+        answers = self.service.step(now, self.line.to_device(now, data) if data else b"")
+        state, last = self.service.state, self.actuations[-1]
+        if (state.u_in, state.u_out) != (last.u_in, last.u_out):
+            done = Actuation(time.monotonic(), state.u_in, state.u_out)
+            self.actuations.append(done)
+            if self._log:
+                causes = Flag(state.causes).name
+                self._log.write(f"{done.time:.6f},{done.u_in:g},{done.u_out},{causes}\n")
+        if answers:
+            due, answers = self.line.to_host(now, answers)
+            heapq.heappush(self._outgoing, (due, next(self._order), answers))
+        while self._outgoing and self._outgoing[0][0] <= now:
+            self.port.send(heapq.heappop(self._outgoing)[2])
+        if self._control is not None:
+            with contextlib.suppress(BlockingIOError):
+                self._obey(self._control.recv(_CHUNK).decode(errors="replace"))
+
+    def _obey(self, text: str) -> None:
+        """Do what lines of the control socket say; a wrong one is named on stderr."""
+        hal: Any = self.service.hal
+        for line in text.splitlines():
+            word, _, argument = line.strip().partition(" ")
+            try:
+                if word == "clear":
+                    hal.faults, self.line.faults = (), ()
+                elif word == "unplug":
+                    self.port.hang_up(float(argument or 1.0))
+                    self._outgoing.clear()
+                elif word:
+                    self.add_fault(parse(line, self._clock()))
+            except ValueError as error:
+                print(f"control: {error}", file=sys.stderr, flush=True)
+
+    def add_fault(self, fault: AnyFault) -> None:
+        """Add a fault of the lung or of the line; times on the device's clock."""
+        if isinstance(fault, LungFault):
+            hal: Any = self.service.hal
+            hal.faults = (*hal.faults, fault)
+        else:
+            self.line.faults = (*self.line.faults, fault)
+
+    def _open(self) -> int:
+        master, self._slave = os.openpty()  # ours keeps it open between hosts
+        tty.setraw(self._slave)
+        os.set_blocking(master, False)
+        self.terminal = os.ttyname(self._slave)
+        if self._link is not None:
+            try:
+                self._link.parent.mkdir(parents=True, exist_ok=True)
+                self._link.unlink(missing_ok=True)
+                self._link.symlink_to(self.terminal)
+            except OSError as error:
+                os.close(master)
+                os.close(self._slave)
+                raise InputError(f"--link {self._link} cannot be made: {error}") from error
+            self.terminal = str(self._link)
+        return master
+
+    def _close_terminal(self, master: int) -> None:
+        os.close(master)
+        os.close(self._slave)
+        if self._link is not None and self._link.is_symlink():
+            self._link.unlink()
+
+    def _open_control(self) -> socket.socket:
+        assert self._control_path is not None
+        self._control_path.unlink(missing_ok=True)
+        control = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            control.bind(str(self._control_path))
+        except OSError as error:
+            control.close()
+            raise InputError(
+                f"--control {self._control_path} cannot be made: {error}; a short path helps"
+            ) from error
+        control.setblocking(False)
+        return control
+
+
+def tell(control: Path, text: str) -> None:
+    """Send a line to a running emulator.
+
+    Args:
+        control: path of its control socket.
+        text: see :class:`Emulator`.
+
+    Raises:
+        InputError: if no emulator listens there.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+        try:
+            sender.sendto(text.encode(), str(control))
+        except OSError as error:
+            raise InputError(f"--control {control}: no emulator listens there: {error}") from error
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run an emulated device until it is interrupted; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        "ventbench-hardware emulate",
+        description="Emulate a ventilator with a lung on a pseudo-terminal.",
+        epilog="Example: ventbench-hardware emulate --lung R20C50 --link ./lung --fault "
+        "leak@10-13:0.1",
+    )
+    parser.add_argument("--lung", default="R20C50", help="lung on the ventilator")
+    parser.add_argument(
+        "--plant", default="frozen", help="simulator: a name, a file or module:function"
+    )
+    parser.add_argument(
+        "--conceal",
+        metavar="WORDS",
+        help="a lung with physics that the simulator lacks; the words determine it",
+    )
+    parser.add_argument(
+        "--seal", type=Path, help="where the sealed answer of --conceal goes (JSON)"
+    )
+    parser.add_argument("--link", type=Path, help="symbolic link to make to the terminal")
+    parser.add_argument("--control", type=Path, help="control socket to make")
+    parser.add_argument("--log", type=Path, help="CSV of every change of the valves")
+    parser.add_argument(
+        "--fault", action="append", default=[], help="KIND@START[-END][:STRENGTH], repeatedly"
+    )
+    parser.add_argument("--noise", type=float, default=0.0, help="sensor noise, cmH2O (SD)")
+    parser.add_argument(
+        "--quantum", type=float, default=0.0, help="step of the sensor's converter, cmH2O"
+    )
+    parser.add_argument(
+        "--realtime",
+        action="store_true",
+        help="real-time scheduling, as on a device of its own; needs the right to it",
+    )
+    parser.add_argument("--pressure-limit", type=float, help="device's own limit, cmH2O")
+    given = parser.parse_args(arguments)
+    try:
+        return _emulate(given)
+    except InputError as error:
+        print(f"ventbench-hardware emulate: {error}", file=sys.stderr)
+        return 2
+
+
+def _emulate(given: argparse.Namespace) -> int:
+    from hardware_eval.emulation.simulated import SimulatedHal, simulated_lung
+
+    faults = [parse(text) for text in given.fault]
+    lung_faults = [fault for fault in faults if isinstance(fault, LungFault)]
+    line_faults = [fault for fault in faults if isinstance(fault, LineFault)]
+    sensor = {"noise": given.noise, "quantum": given.quantum, "faults": lung_faults}
+    if given.conceal is None:
+        hal = simulated_lung(given.lung, given.plant, **sensor)
+        told = given.lung
+    else:
+        from hardware_eval.emulation.concealed import conceal
+
+        concealed = conceal(given.conceal, given.plant)
+        hal = SimulatedHal(concealed.plant, name=f"emulated {concealed.lung}", **sensor)
+        told = f"{concealed.lung}, with concealed physics {concealed.seal['commitment'][:16]}..."
+        if given.seal:
+            concealed.write(given.seal)
+    limit = given.pressure_limit
+    try:
+        settings = DeviceSettings() if limit is None else DeviceSettings(limit)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    emulator = Emulator(
+        hal, settings, link=given.link, control=given.control, line_faults=line_faults,
+        log=given.log,
+    )  # fmt: skip
+    if given.realtime and (reason := realtime.prefer()):
+        raise InputError(f"--realtime: {reason}; run as root, or without it")
+    ended = False
+
+    def end(number: int, frame: FrameType | None) -> None:
+        nonlocal ended
+        ended = True
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, end)
+    print(emulator.terminal, flush=True)
+    print(f"emulated lung {told}; Ctrl-C ends it", file=sys.stderr, flush=True)
+    emulator.run(lambda: ended)
+    print(f"longest lateness of the device: {1e3 * emulator.lateness:.1f} ms", file=sys.stderr)
+    return 0

@@ -1,0 +1,247 @@
+"""A simulated lung as hardware: any ventbench plant, in real or virtual time, with faults.
+
+The plant advances from one change of the command to the next, as in scoring; a sample in between
+is what the plant shows by then. A loop of 30 ms so reads what a scored run reads.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from hardware_eval.device.hal import Identity, Sample
+from hardware_eval.emulation.faults import FaultKind, LungFault, active
+from hardware_eval.wire.messages import Capability
+from ventbench import protocol
+from ventbench.errors import InputError
+from ventbench.interfaces import Plant
+from ventbench.physics.model import PhysicsState
+from ventbench.plants.catalog import load_simulators
+from ventbench.plants.hybrid import Hybrid, HybridState
+
+#: A command that does not change is taken into the plant's state after this time, s; above the
+#: control step, so that a loop decides when, and within the dead times that plants remember.
+LONGEST_HOLD = 0.040
+
+#: Shorter holds than this, s, are replaced by the command that follows.
+SHORTEST_HOLD = 1e-4
+
+#: Time in which the sensor of a disconnected tube falls to ambient pressure, s.
+_AMBIENT_LAG = 0.05
+
+
+#: Factor of the airway's resistance when it is occluded.
+_OCCLUSION = 100.0
+
+
+class SimulatedHal:
+    """A plant as a ventilator; compiles the plant once, before any time passes."""
+
+    def __init__(
+        self,
+        plant: Plant,
+        *,
+        name: str = "simulated lung",
+        faults: Sequence[LungFault] = (),
+        noise: float = 0.0,
+        quantum: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        """Put a lung at rest at PEEP on the ventilator.
+
+        Args:
+            plant: the lung on its ventilator, without a batch shape.
+            name: what the device is called.
+            faults: what goes wrong, and when.
+            noise: standard deviation of the sensor's noise, cmH2O.
+            quantum: step of the sensor's converter, cmH2O; 0 for none.
+            seed: of the noise.
+        """
+        self._noise, self._quantum = noise, quantum
+        leaves = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(plant))
+        calibration = hashlib.sha256(type(plant).__name__.encode() + leaves).digest()
+        self._flow = hasattr(plant, "observe") or isinstance(plant, Hybrid)
+        capabilities = Capability.SIMULATED | (Capability.FLOW if self._flow else Capability.NONE)
+        self.identity = Identity(name, calibration[:8], calibration, capabilities)
+        start = jnp.asarray(protocol.PEEP, jnp.float32)
+        plant = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), plant)
+        vector, unravel = ravel_pytree(plant.init(start, start))
+        varies = hasattr(plant, "vary")
+        self._can_pinch = varies
+
+        def advance(vector: jax.Array, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+            u_in, u_out, dt, r_scale, restart = inputs
+            state = unravel(vector)
+            state = _breath_begun(state, restart)
+            own = plant.vary(r_scale, jnp.ones_like(r_scale)) if varies else plant  # type: ignore[attr-defined]
+            after, pressure, flow = _observed(own, state, u_in, u_out, dt)
+            return ravel_pytree(after)[0], jnp.stack([pressure, flow])
+
+        inputs = np.array([0.0, 1.0, LONGEST_HOLD, 1.0, 0.0], np.float32)
+        self._advance = jax.jit(advance).lower(vector, inputs).compile()
+        jax.block_until_ready(self._advance(vector, inputs))
+        self._rest = vector
+        self._reset(faults, seed)
+
+    def at_rest(self, faults: Sequence[LungFault] = (), seed: int = 0) -> SimulatedHal:
+        """Return the same lung at rest, with other faults; nothing is compiled again."""
+        fresh = copy.copy(self)
+        fresh._reset(faults, seed)
+        return fresh
+
+    def _reset(self, faults: Sequence[LungFault], seed: int) -> None:
+        self.faults = faults
+        self._random = np.random.default_rng(seed)
+        self._state = self._rest
+        self._since: float | None = None
+        self._command = (0.0, 1)
+        self._restart = 0.0
+        self._stuck_reading = math.nan
+        self._stuck_valve = math.nan
+        self._ambient_from: tuple[float, float] | None = None
+        self._last = Sample(0.0, protocol.PEEP)
+
+    @property
+    def faults(self) -> tuple[LungFault, ...]:
+        """What goes wrong.
+
+        Setting it raises InputError if the plant cannot do what a fault asks.
+        """
+        return self._faults
+
+    @faults.setter
+    def faults(self, faults: Sequence[LungFault]) -> None:
+        narrowed = {fault.kind for fault in faults} & {FaultKind.PINCHED, FaultKind.OCCLUDED}
+        if narrowed and not self._can_pinch:
+            raise InputError("this plant's resistance cannot be changed: it cannot be pinched")
+        self._faults = tuple(faults)
+
+    def sample(self, now: float) -> Sample:
+        """Pressure and flow by now; see :class:`~hardware_eval.device.hal.Hal`."""
+        kinds = active(self.faults, now)
+        _, shown = self._by(now, kinds)
+        pressure, flow = (float(x) for x in np.asarray(shown))
+        flow = flow if self._flow else math.nan
+        if FaultKind.DISCONNECTED in kinds:
+            begun, before = self._ambient_from or (now, self._last.pressure)
+            self._ambient_from = begun, before
+            pressure, flow = before * math.exp(-(now - begun) / _AMBIENT_LAG), 0.0
+        else:
+            self._ambient_from = None
+        if self._noise:
+            pressure += self._noise * float(self._random.standard_normal())
+        if FaultKind.SENSOR_OFFSET in kinds:
+            pressure += kinds[FaultKind.SENSOR_OFFSET].strength
+        if self._quantum:
+            pressure = round(pressure / self._quantum) * self._quantum
+        if FaultKind.SENSOR_STUCK in kinds:
+            if math.isnan(self._stuck_reading):
+                self._stuck_reading = self._last.pressure
+            pressure = self._stuck_reading
+        else:
+            self._stuck_reading = math.nan
+        if FaultKind.SENSOR_LOST in kinds:
+            pressure = math.nan
+        if FaultKind.SENSOR_DROPOUTS in kinds and self._random.uniform() < (
+            kinds[FaultKind.SENSOR_DROPOUTS].strength
+        ):
+            pressure = math.nan
+        self._last = Sample(now, pressure, flow)
+        return self._last
+
+    def actuate(self, now: float, u_in: float, u_out: int) -> None:
+        """Hold a command from now on; see :class:`~hardware_eval.device.hal.Hal`."""
+        if self._since is None:
+            self._since = now
+        changed = (u_in, u_out) != self._command
+        held = now - self._since
+        if not (changed or held >= LONGEST_HOLD):
+            return
+        if held >= SHORTEST_HOLD:
+            kinds = active(self.faults, now)
+            self._state, _ = self._by(now, kinds)
+            self._since, self._restart = now, 0.0
+        if self._command[1] == 1 and u_out == 0:
+            self._restart = 1.0
+        self._command = (u_in, u_out)
+
+    def _by(self, now: float, kinds: dict[object, LungFault]) -> tuple[jax.Array, jax.Array]:
+        """State and readings at ``now`` if the present command is held until then."""
+        u_in, u_out = self._command
+        share, r_scale = float(u_out), 1.0
+        if FaultKind.VALVE_STUCK in kinds:
+            if math.isnan(self._stuck_valve):
+                self._stuck_valve = u_in
+            u_in = self._stuck_valve
+        else:
+            self._stuck_valve = math.nan
+        if FaultKind.VALVE_WEAK in kinds:
+            u_in *= kinds[FaultKind.VALVE_WEAK].strength
+        if FaultKind.EXPIRATORY_STUCK in kinds:
+            share = 0.0
+        if FaultKind.LEAK in kinds:
+            share = max(share, kinds[FaultKind.LEAK].strength)
+        if FaultKind.DISCONNECTED in kinds:
+            u_in, share = 0.0, 1.0
+        if FaultKind.PINCHED in kinds:
+            r_scale = kinds[FaultKind.PINCHED].strength
+        if FaultKind.OCCLUDED in kinds:
+            r_scale = _OCCLUSION
+        held = max(now - (now if self._since is None else self._since), SHORTEST_HOLD)
+        # A gap of seconds, as after a suspended machine, goes in steps that the plant can take.
+        while held > 2.0 * LONGEST_HOLD:
+            inputs = np.array([u_in, share, LONGEST_HOLD, r_scale, self._restart], np.float32)
+            self._state, _ = self._advance(self._state, inputs)
+            self._since = (self._since or now) + LONGEST_HOLD
+            self._restart, held = 0.0, held - LONGEST_HOLD
+        inputs = np.array([u_in, share, held, r_scale, self._restart], np.float32)
+        return self._advance(self._state, inputs)
+
+
+def _breath_begun(state: Any, restart: jax.Array) -> Any:
+    """Restart the time in the breath where ``restart`` is 1: some mechanisms act by it."""
+
+    def restarted(part: Any) -> Any:
+        if not isinstance(part, PhysicsState):
+            return part
+        return part.replace(time=part.time * (1.0 - restart))  # type: ignore[attr-defined]
+
+    return jax.tree.map(restarted, state, is_leaf=lambda part: isinstance(part, PhysicsState))
+
+
+def _observed(
+    plant: Any, state: Any, u_in: jax.Array, u_out: jax.Array, dt: jax.Array
+) -> tuple[Any, jax.Array, jax.Array]:
+    """Next state, pressure, cmH2O, and flow into the lung, mL/s (0 where the plant has none)."""
+    if hasattr(plant, "observe"):
+        after, (pressure, flow, _) = plant.observe(state, u_in, u_out, dt)
+        return after, pressure, flow
+    after, pressure = plant.step(state, u_in, u_out, dt)
+    if isinstance(plant, Hybrid) and isinstance(after, HybridState):
+        drop = after.drop
+        resistance = 0.5 * (plant.R + jnp.sqrt(plant.R**2 + 4.0 * plant.K2 * jnp.abs(drop)))
+        return after, pressure, 1000.0 * drop / resistance
+    return after, pressure, jnp.zeros_like(pressure)
+
+
+def simulated_lung(lung_id: str, simulator: Any = "frozen", **settings: Any) -> SimulatedHal:
+    """Put a lung of a simulator on a simulated ventilator.
+
+    Args:
+        lung_id: id of the lung, such as ``"R20C50"``.
+        simulator: whatever :func:`ventbench.load_simulators` takes.
+        settings: further arguments of :class:`SimulatedHal`.
+
+    Raises:
+        InputError: if there is no such simulator or lung.
+    """
+    plant = load_simulators(simulator).plant(lung_id)
+    return SimulatedHal(plant, **{"name": f"emulated {lung_id}", **settings})

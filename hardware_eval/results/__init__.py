@@ -1,0 +1,1 @@
+"""From runs on a bench to records, replays and comparisons with simulators."""

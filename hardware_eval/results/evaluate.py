@@ -1,0 +1,312 @@
+"""The evaluation of entries on a bench, from the first check to the record."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hardware_eval.bench import session
+from hardware_eval.bench.controllers import (
+    ControllerFailedError,
+    LiveController,
+    SubmissionController,
+)
+from hardware_eval.bench.loop import REST_S, Bench, Operator, View
+from hardware_eval.bench.plan import Plan, PlannedRun, make_plan, progress
+from hardware_eval.bench.raw_log import RawLog, lines, recording
+from hardware_eval.bench.safety import DEFAULT, SafetySettings
+from hardware_eval.clock import Clock, RealClock
+from hardware_eval.results import record as records
+from hardware_eval.wire.client import Client
+from hardware_eval.wire.messages import Capability, Welcome
+from ventbench import protocol
+from ventbench.errors import InputError
+from ventbench.interfaces import Task
+from ventbench.recordings.write import write
+from ventbench.submissions.errors import SubmissionError
+from ventbench.submissions.folder import Submission, open_submission
+
+if TYPE_CHECKING:
+    from hardware_eval.emulation.loopback import LoopbackDevice
+
+#: Files of an evaluation in its folder.
+LOG, RECORDING = "raw.jsonl", "recording.csv.gz"
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What an evaluation made.
+
+    Attributes:
+        complete: whether the plan is done.
+        reason: why not; empty if it is.
+        log: the raw recording.
+        recording: all whole breaths in the public schema; None if there is none.
+        records: path of each entry's hardware record; empty until the plan is done.
+    """
+
+    complete: bool
+    reason: str
+    log: Path
+    recording: Path | None
+    records: Mapping[str, Path]
+
+
+@dataclass(frozen=True)
+class Line:
+    """A device and the time that it lives in.
+
+    Attributes:
+        client: of the device.
+        clock: real, or the loopback device's.
+        device: the device if it is emulated in this process, else None.
+    """
+
+    client: Client
+    clock: Clock
+    device: LoopbackDevice | None = None
+
+    @property
+    def real(self) -> bool:
+        """Whether time is real, so that a controller can be late."""
+        return isinstance(self.clock, RealClock)
+
+
+#: Begins a port that is an emulated device in this process, on a virtual clock.
+VIRTUAL = "virtual:"
+
+
+def connect(port: str) -> Line:
+    """Open a port.
+
+    Args:
+        port: a serial port or socket, in real time; or ``virtual:R20C50``, an emulated lung in this
+            process on a virtual clock, where breaths take a fraction of a second.
+
+    Raises:
+        LinkError: if it cannot be opened, or no device answers.
+        InputError: if there is no such emulated lung.
+    """
+    from hardware_eval.wire.link import Link
+
+    if port.startswith(VIRTUAL):
+        from hardware_eval.emulation.loopback import loopback
+        from hardware_eval.emulation.simulated import simulated_lung
+
+        device = loopback(simulated_lung(port.removeprefix(VIRTUAL)))
+        virtual = Client(device, device.clock)
+        virtual.hello()
+        return Line(virtual, device.clock, device)
+    client = Client(Link(port))
+    try:
+        client.hello()
+    except InputError:
+        client.close()
+        raise
+    return Line(client, RealClock())
+
+
+def device_about(welcome: Welcome) -> dict[str, Any]:
+    """A device as records name it."""
+    return {
+        "name": welcome.name,
+        "firmware": ".".join(map(str, welcome.firmware)),
+        "calibration": welcome.calibration.hex(),
+        "emulated": bool(welcome.capabilities & Capability.SIMULATED),
+        "about": {
+            "device_id": welcome.device_id.hex(),
+            "wire_protocol": welcome.version,
+            "watchdog_s": round(welcome.watchdog, 4),
+            "pressure_limit_cmH2O": round(welcome.pressure_limit, 2),
+        },
+    }
+
+
+def open_entries(names: Sequence[str], track: str | None) -> tuple[list[Submission], str]:
+    """Open submissions and settle the track.
+
+    Raises:
+        SubmissionError: if one cannot be opened or does not enter the track.
+    """
+    opened = [open_submission(name) for name in names]
+    track = track or opened[0].manifest.tracks[0]
+    for submission in opened:
+        if track not in submission.manifest.tracks:
+            raise SubmissionError(f"{submission.label}: does not enter the track {track}")
+    return opened, track
+
+
+def controllers(
+    submissions: Sequence[Submission], track: str, runner: Any, *, real_time: bool
+) -> Callable[[PlannedRun], LiveController]:
+    """A function that makes the controller of a run, in a process of its own as in scoring."""
+    by_name = {submission.manifest.name: submission for submission in submissions}
+
+    def make(run: PlannedRun) -> LiveController:
+        lung = run.lung if track == "performance" else None
+        task = Task(track, lung, protocol.DT, protocol.INSPIRATION_STEPS)
+        try:
+            return SubmissionController(runner, by_name[run.entry], task, real_time=real_time)
+        except SubmissionError as error:
+            raise ControllerFailedError(str(error)) from error
+
+    return make
+
+
+def make_runner(sandbox: bool) -> Any:
+    """The sandbox of scoring, or this process for code that is trusted."""
+    if sandbox:
+        from ventbench.sandbox.configuration import Allowance
+        from ventbench.sandbox.runner import SandboxRunner
+
+        # A run lasts 9 s and the loop does not wait; a controller silent for 2 s has failed.
+        return SandboxRunner(allowance=Allowance(patience_s=2.0, total_s=120.0))
+    from ventbench.submissions.runner import InProcessRunner
+
+    return InProcessRunner()
+
+
+def evaluate(
+    submissions: Sequence[Submission],
+    line: Line,
+    out: Path,
+    operator: Operator,
+    *,
+    plan: Plan,
+    view: View | None = None,
+    sandbox: bool = True,
+    dry: bool = True,
+    before_lung: Callable[[Bench, str], str] = lambda bench, lung: "",
+    settings: SafetySettings = DEFAULT,
+    operator_name: str = "",
+    notes: str = "",
+    rest: float = REST_S,
+    prepare_run: Callable[[PlannedRun], None] = lambda run: None,
+) -> Evaluation:
+    """Run a plan, or what is left of it, and make the records once it is done.
+
+    Args:
+        submissions: the entries of the plan.
+        line: to the device.
+        out: folder of the log, the recording and the records.
+        operator: the person at the bench.
+        plan: from :func:`hardware_eval.bench.plan.make_plan`.
+        view: shows breaths.
+        sandbox: run entries as in scoring; without it, in this process.
+        dry: run the plan on the frozen simulators first, unless the log has begun.
+        before_lung: checks a lung once it is set; returns why not to go on, or nothing.
+        settings: safety.
+        operator_name: for the record.
+        notes: for the record.
+        rest: time at rest before each run, s.
+        prepare_run: see :func:`hardware_eval.bench.session.run_plan`.
+
+    Raises:
+        InputError: if the log is of another plan, or the dry run finds the plan unsafe.
+        LinkError: if the device is lost and does not come back.
+    """
+    runner = make_runner(sandbox)
+    log_path = out / LOG
+    begun = log_path.exists() and any(x["type"] == "plan" for x in lines(log_path))
+    if dry and not begun:
+        operator.tell("dry run on the frozen simulators")
+        problems = session.dry_run(
+            plan, controllers(submissions, plan.track, runner, real_time=False), settings
+        )
+        if problems:
+            raise InputError(
+                "the dry run on the simulators stopped: " + "; ".join(problems) + ". Nothing was "
+                "sent to the bench; --no-dry-run skips this"
+            )
+    welcome = line.client.welcome or line.client.hello()
+    about = {
+        "device": device_about(welcome),
+        "operator": operator_name,
+        "notes": notes,
+        "entries": {x.manifest.name: x.sha256 for x in submissions},
+        "sandbox": None if runner.sandbox is None else dict(runner.sandbox),
+    }
+    bench = Bench(line.client, line.clock, settings, operator, view, rest)
+    make = controllers(submissions, plan.track, runner, real_time=line.real)
+    with RawLog(log_path) as log, _ends_by_exception(), _quick_switches():
+        end = session.run_plan(
+            bench, plan, make, log, about=about,
+            before_lung=lambda lung: before_lung(bench, lung), prepare_run=prepare_run,
+        )  # fmt: skip
+    written: Path | None = None
+    with contextlib.suppress(InputError):  # no whole breath yet
+        breaths = recording(log_path)
+        written = out / RECORDING
+        write(breaths, written)
+    made = {}
+    if end.complete:
+        for submission in submissions:
+            content = records.hardware_record(log_path, submission)
+            made[submission.manifest.name] = records.save(out, content)
+    return Evaluation(end.complete, end.reason, log_path, written, made)
+
+
+@contextlib.contextmanager
+def _ends_by_exception() -> Iterator[None]:
+    """Turn the signals that end a process into an exception, so that the lung is vented first."""
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt(signal.Signals(number).name)
+
+    before = {}
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        with contextlib.suppress(ValueError):  # not in the main thread: the caller's business
+            before[number] = signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _quick_switches() -> Iterator[None]:
+    """Let the loop's thread wait at most half a millisecond for another."""
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(0.0005)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(interval)
+
+
+def status(out: Path) -> dict[str, Any]:
+    """How far the plan of a folder has come, as JSON values.
+
+    Raises:
+        InputError: if there is no plan.
+    """
+    logged = list(lines(out / LOG))
+    plan = records.plan_of(logged, str(out / LOG))
+    state = progress(plan, logged)
+    return {
+        "runs": len(plan.runs),
+        "done": len(state.done),
+        "breaths": sum(line["type"] == "breath" for line in logged),
+        "timing": dataclasses.asdict(records.jitter(out / LOG)),
+    }
+
+
+__all__ = [
+    "Evaluation",
+    "Line",
+    "connect",
+    "controllers",
+    "device_about",
+    "evaluate",
+    "make_plan",
+    "make_runner",
+    "open_entries",
+    "status",
+]

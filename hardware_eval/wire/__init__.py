@@ -1,0 +1,1 @@
+"""The wire between host and device: messages, their parser, and the host's end of it."""

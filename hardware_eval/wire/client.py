@@ -1,0 +1,307 @@
+"""The host's end of the wire: sends messages, waits for their answers, counts what goes wrong."""
+
+from __future__ import annotations
+
+import secrets
+from collections import Counter, deque
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from hardware_eval.clock import Clock, RealClock
+from hardware_eval.wire.errors import DisconnectedError, NoAnswerError, RefusedError
+from hardware_eval.wire.messages import (
+    PROTOCOL_VERSION,
+    Arm,
+    Command,
+    Counters,
+    Heartbeat,
+    Hello,
+    HostMessage,
+    Message,
+    Packet,
+    Reading,
+    Refusal,
+    Statistics,
+    Vent,
+    Welcome,
+    encode,
+    milliseconds,
+)
+from hardware_eval.wire.parser import Event, Fault, ParserState, feed_bytes
+
+#: Time that an answer may take, s: most of a control step of 30 ms.
+ANSWER_TIMEOUT = 0.020
+
+#: Attempts at hello, arm and vent, which may be repeated safely, and time for each, s: a device
+#: may be busy starting.
+ATTEMPTS, PATIENCE = 5, 0.2
+
+#: Round trips that :class:`LinkStatistics` summarises.
+_REMEMBERED = 10_000
+
+AnswerT = TypeVar("AnswerT", Welcome, Reading, Counters)
+
+
+class Transport(Protocol):
+    """Carries bytes to a device and back: a link, or a device in the same process."""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+        ...
+
+    def read(self, timeout: float) -> bytes:
+        """Wait for bytes; empty if none come within ``timeout``, s."""
+        ...
+
+    def close(self) -> None:
+        """Release the port."""
+        ...
+
+    def reopen(self) -> None:
+        """Connect again after a loss."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class LinkStatistics:
+    """What the host counted since the client was made.
+
+    Attributes:
+        sent: messages sent.
+        answered: messages answered in time.
+        unanswered: messages without an answer in time.
+        unexpected: answers to no message that waited, such as late ones.
+        refused: messages that the device refused.
+        framing: runs of bytes that are no frame.
+        checksum: packets with a wrong CRC.
+        malformed: intact packets of unknown kind or wrong length.
+        sessions: sessions opened.
+        disconnections: losses of the port.
+        round_trip_median: median time from message to answer of the last ten thousand, s.
+        round_trip_worst: longest of them, s.
+    """
+
+    sent: int
+    answered: int
+    unanswered: int
+    unexpected: int
+    refused: int
+    framing: int
+    checksum: int
+    malformed: int
+    sessions: int
+    disconnections: int
+    round_trip_median: float
+    round_trip_worst: float
+
+
+class Client:
+    """A session with one device.
+
+    Every method sends one message and waits for its answer, by the clock it was given.
+
+    Attributes:
+        welcome: what the device told at the last :meth:`hello`; None before.
+        reading: the newest reading; None before the first.
+    """
+
+    def __init__(
+        self, transport: Transport, clock: Clock | None = None, timeout: float = ANSWER_TIMEOUT
+    ) -> None:
+        """Talk through a transport.
+
+        Args:
+            transport: a :class:`~hardware_eval.wire.link.Link` or a loopback device.
+            clock: real time if not given; a loopback device needs its own.
+            timeout: time that an answer may take, s.
+        """
+        self.welcome: Welcome | None = None
+        self.reading: Reading | None = None
+        self._transport = transport
+        self._clock = clock or RealClock()
+        self._timeout = timeout
+        self._parser = ParserState()
+        self._session = 0
+        self._sequence = 0
+        self._counts: Counter[str] = Counter()
+        self._round_trips: deque[float] = deque(maxlen=_REMEMBERED)
+        self._pressure_limit: float | None = None
+
+    def hello(self, pressure_limit: float | None = None) -> Welcome:
+        """Open a new session; the device vents.
+
+        Args:
+            pressure_limit: pressure above which the device shall vent, cmH2O, if it is below the
+                device's own limit.
+
+        Raises:
+            NoAnswerError: if no device answers.
+            RefusedError: if the device has another protocol version.
+            DisconnectedError: if the port goes away.
+        """
+        self._session, self._sequence = secrets.randbits(32), 0
+        self._pressure_limit = pressure_limit
+        self._counts["sessions"] += 1
+        hello = Hello(PROTOCOL_VERSION, pressure_limit)
+        self.welcome = self._persist(hello, Welcome)
+        self.heartbeat()
+        return self.welcome
+
+    def arm(self) -> Reading:
+        """Begin a run: clear the causes of venting; commands must follow within 80 ms.
+
+        Raises:
+            RefusedError: if a cause of venting lasts, or the session is not open.
+            NoAnswerError: if the device does not answer.
+            DisconnectedError: if the port goes away.
+        """
+        return self._persist(Arm(), Reading)
+
+    def command(self, u_in: float, u_out: int) -> Reading:
+        """Set the valves, and return what the device applied.
+
+        Args:
+            u_in: inspiratory valve, %.
+            u_out: expiratory valve, 0 closed, 1 open.
+
+        Returns:
+            A reading that was taken when the command arrived.
+
+        Raises:
+            ValueError: if a value cannot be sent.
+            RefusedError: if the device refuses it; then the lung is or will be vented.
+            NoAnswerError: if the device does not answer in time; it may have obeyed.
+            DisconnectedError: if the port goes away.
+        """
+        seen = 0 if self.reading is None else milliseconds(self.reading.time)
+        return self._ask(Command(u_in, u_out, seen), Reading, self._timeout)
+
+    def heartbeat(self) -> Reading:
+        """Take a fresh reading; moves no valve and does not feed the watchdog.
+
+        Raises:
+            RefusedError: if the session is not open.
+            NoAnswerError: if the device does not answer in time.
+            DisconnectedError: if the port goes away.
+        """
+        return self._ask(Heartbeat(), Reading, self._timeout)
+
+    def vent(self) -> Reading:
+        """Vent the lung until :meth:`arm`; works without a session too.
+
+        Raises:
+            NoAnswerError: if the device does not answer; its watchdog vents by itself.
+            DisconnectedError: if the port goes away; the watchdog vents.
+        """
+        return self._persist(Vent(), Reading)
+
+    def counters(self) -> Counters:
+        """Return the device's error counters.
+
+        Raises:
+            RefusedError: if the session is not open.
+            NoAnswerError: if the device does not answer in time.
+            DisconnectedError: if the port goes away.
+        """
+        return self._ask(Statistics(), Counters, self._timeout)
+
+    def reconnect(self) -> Welcome:
+        """Connect again after a loss, by the policy of the link, and open a new session.
+
+        Raises:
+            LinkError: if the port does not come back.
+            NoAnswerError: if no device answers.
+        """
+        self._transport.reopen()
+        self._parser = ParserState()
+        return self.hello(self._pressure_limit)
+
+    def close(self) -> None:
+        """Vent if the device still listens, and release the port."""
+        try:
+            self._ask(Vent(), Reading, self._timeout)
+        except (NoAnswerError, RefusedError, DisconnectedError):
+            pass  # the watchdog vents
+        finally:
+            self._transport.close()
+
+    def statistics(self) -> LinkStatistics:
+        """Return what the host counted."""
+        trips = np.asarray(self._round_trips if self._round_trips else [np.nan])
+        names = (
+            "sent", "answered", "unanswered", "unexpected", "refused", "framing", "checksum",
+            "malformed", "sessions", "disconnections",
+        )  # fmt: skip
+        counts = {name: self._counts[name] for name in names}
+        return LinkStatistics(
+            **counts,
+            round_trip_median=float(np.median(trips)),
+            round_trip_worst=float(np.max(trips)),
+        )
+
+    def _persist(self, message: HostMessage, answer: type[AnswerT]) -> AnswerT:
+        for attempt in range(ATTEMPTS):
+            try:
+                return self._ask(message, answer, PATIENCE)
+            except NoAnswerError:
+                if attempt == ATTEMPTS - 1:
+                    raise
+        raise AssertionError("unreachable")
+
+    def _ask(self, message: HostMessage, answer: type[AnswerT], timeout: float) -> AnswerT:
+        self._sequence += 1
+        frame = encode(Packet(self._session, self._sequence, message))
+        begun = self._clock.now()
+        try:
+            self._transport.write(frame)
+            self._counts["sent"] += 1
+            answered = self._wait(begun + timeout)
+        except DisconnectedError:
+            self._counts["disconnections"] += 1
+            raise
+        name = message.kind.name.lower()
+        if answered is None:
+            self._counts["unanswered"] += 1
+            raise NoAnswerError(
+                f"the device did not answer {name} within {1000 * timeout:.0f} ms: is it on, and "
+                "does its program run?"
+            )
+        self._counts["answered"] += 1
+        self._round_trips.append(self._clock.now() - begun)
+        if isinstance(answered, Reading):
+            self.reading = answered
+        if isinstance(answered, Refusal):
+            self._counts["refused"] += 1
+            causes = f" (vented by {answered.flags.name})" if answered.flags else ""
+            raise RefusedError(
+                f"the device refused {name}: {answered.reason.name}, mode {answered.mode.name}"
+                f"{causes}",
+                answered,
+            )
+        if not isinstance(answered, answer):
+            raise NoAnswerError(
+                f"the device answered {name} with {type(answered).__name__}, which is no answer to "
+                "it: its program does not follow PROTOCOL.md"
+            )
+        return answered
+
+    def _wait(self, deadline: float) -> Message | None:
+        while True:
+            left = deadline - self._clock.now()
+            if left <= 0.0:
+                return None
+            self._parser, events = feed_bytes(self._parser, self._transport.read(left))
+            answers = [message for event in events if (message := self._expected(event))]
+            if answers:
+                return answers[-1]
+
+    def _expected(self, event: Event) -> Message | None:
+        if isinstance(event, Fault):
+            self._counts[event.value] += 1
+            return None
+        if (event.session, event.sequence) != (self._session, self._sequence):
+            self._counts["unexpected"] += 1
+            return None
+        return event.message

@@ -1,0 +1,82 @@
+"""The go/no-go sheet on the virtual clock: a good bench, a wrong lung, and faults."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hardware_eval.bench.collect import collect
+from hardware_eval.bench.loop import Bench, SilentOperator
+from hardware_eval.bench.selftest import LIMITS, selftest
+from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.simulated import FaultKind, LungFault
+from ventbench.errors import InputError
+
+LUNG = "R5C20"
+
+
+def test_a_good_bench_goes(bench: Bench) -> None:
+    sheet = selftest(bench, LUNG, simulator="physics")
+    assert sheet.go, str(sheet)
+    assert sheet.nearest == LUNG
+    assert {finding.name for finding in sheet.findings} == set(LIMITS)
+    # The emulated lung reports its flow, so that R and C are those of the label.
+    assert pytest.approx(5.0, rel=0.15) == sheet.R
+    assert pytest.approx(20.0, rel=0.05) == sheet.C
+
+
+def test_a_wrongly_set_lung_is_a_no_go_that_names_it(bench: Bench) -> None:
+    sheet = selftest(bench, "R20C50", simulator="physics")
+    assert not sheet.go
+    assert any(f"is the lung set to {LUNG}?" in problem for problem in sheet.problems())
+
+
+FAULTS = {
+    "sensor_zero": LungFault(FaultKind.SENSOR_OFFSET, 0.0, strength=3.0),
+    "leak": LungFault(FaultKind.LEAK, 0.0, strength=0.05),
+    "valve_gain": LungFault(FaultKind.VALVE_WEAK, 0.0, strength=0.3),
+    "safety": LungFault(FaultKind.DISCONNECTED, 0.0),
+}
+
+
+@pytest.mark.parametrize("name", sorted(FAULTS))
+def test_a_fault_is_a_no_go(name: str, bench: Bench, device: LoopbackDevice) -> None:
+    hal: Any = device.service.hal
+    hal.faults = (replace(FAULTS[name], start=device.clock.now()),)
+    sheet = selftest(bench, LUNG, simulator="physics")
+    assert not sheet.go
+    assert name in {finding.name for finding in sheet.findings if not finding.ok}
+
+
+def test_exploring_continues_where_it_ended(bench: Bench, tmp_path: Path) -> None:
+    first = collect(bench, LUNG, 2, tmp_path, seed=3)
+    assert len(first.breaths) == 2
+    both = collect(bench, LUNG, 4, tmp_path, seed=3)
+    assert len(both.breaths) == 4
+    assert (both.breaths.u_in[:2] == first.breaths.u_in).all()
+    assert both.recording.is_file()
+    assert both.breaths.flow is not None
+    assert both.stopped == ""
+    with pytest.raises(InputError, match="choose another --out"):
+        collect(bench, LUNG, 4, tmp_path, seed=4)
+
+
+def test_exploring_stops_when_nothing_can_be_trusted(
+    bench: Bench, device: LoopbackDevice, tmp_path: Path
+) -> None:
+    collect(bench, LUNG, 1, tmp_path)
+    hal: Any = device.service.hal
+    hal.faults = (LungFault(FaultKind.DISCONNECTED, device.clock.now()),)
+    told: list[str] = []
+
+    class Listens(SilentOperator):
+        def tell(self, text: str) -> None:
+            told.append(text)
+
+    ended = collect(replace(bench, operator=Listens()), LUNG, 10, tmp_path)
+    assert ended.stopped
+    assert len(told) == 3
+    assert len(ended.breaths) == 1

@@ -1,0 +1,335 @@
+"""Sessions on the virtual clock: scores, lateness, safety, losses and restarts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hardware_eval.bench import session
+from hardware_eval.bench.controllers import ControllerFailedError, PIDController
+from hardware_eval.bench.loop import Bench, EmergencyStop, RunResult, SilentOperator, run_once
+from hardware_eval.bench.plan import Plan, PlannedRun, make_plan
+from hardware_eval.bench.raw_log import RawLog, breaths, lines
+from hardware_eval.bench.safety import DEFAULT
+from hardware_eval.bench.session import run_plan
+from hardware_eval.emulation.loopback import LoopbackDevice
+from hardware_eval.emulation.simulated import FaultKind, LungFault
+from hardware_eval.wire.errors import LinkError
+from ventbench import protocol, rollout
+from ventbench.controllers.pid import PID
+
+LUNG = "R5C20"
+GAINS = (2.0, 5.0, 0.0)
+
+
+def run(pip: float = 20.0, **about: Any) -> PlannedRun:
+    return PlannedRun(0, about.pop("kind", "scored"), "pid", LUNG, pip, 1, **about)
+
+
+class Scripted:
+    """A PID whose answers are changed at some steps of the run."""
+
+    def __init__(self, change: Callable[[int, float], float | None] = lambda step, u: u) -> None:
+        self._pid, self._change, self._step = PIDController(GAINS), change, -1
+        self.rows: list[np.ndarray] = []
+
+    def act(self, row: np.ndarray, budget: float) -> float | None:
+        self._step += 1
+        self.rows.append(row[0])
+        wanted = self._pid.act(row, budget)
+        assert wanted is not None
+        return self._change(self._step, wanted)
+
+    def close(self) -> None:
+        pass
+
+
+def vented(device: LoopbackDevice) -> bool:
+    last = device.actuations[-1]
+    return (last.u_in, last.u_out) == (0.0, 1)
+
+
+def test_a_run_scores_as_in_simulation(bench: Bench, device: LoopbackDevice) -> None:
+    simulated = rollout(PID(*GAINS), simulator="physics", lungs=[LUNG], pips=[20.0])
+    controller = Scripted()
+    result = run_once(bench, run(), controller)
+    assert result.status == "complete"
+    # The lung of the bench breathes on from breath to breath, and each reading takes 2 ms.
+    assert result.error == pytest.approx(simulated.errors().loc[LUNG, 20.0], abs=0.1)
+    assert vented(device)
+    assert len(controller.rows) == protocol.BREATHS * protocol.INSPIRATION_STEPS
+    first = controller.rows[protocol.INSPIRATION_STEPS]
+    assert first[0] == 0.0
+    assert first[-1] == pytest.approx(5.0, abs=0.01)  # the bias flow, as in scoring
+
+
+def test_steps_are_at_absolute_deadlines(bench: Bench) -> None:
+    result = run_once(bench, run(), Scripted())
+    time = np.concatenate([breath.time for breath in result.breaths])
+    assert np.diff(time) == pytest.approx(protocol.DT, abs=1e-9)
+    assert max(max(breath.late) for breath in result.breaths) < 1e-9
+
+
+def test_a_late_answer_repeats_the_last_command_and_counts(bench: Bench) -> None:
+    late = {5, 6, 40}
+    result = run_once(bench, run(), Scripted(lambda step, u: None if step in late else u))
+    assert result.status == "complete"
+    assert result.late_answers == 3
+    u_in = result.breaths[0].u_in
+    assert u_in[5] == u_in[6] == u_in[4] != u_in[7]
+    assert math.isnan(result.breaths[0].requested[5])
+
+
+def test_a_controller_that_fails_ends_its_run(bench: Bench, device: LoopbackDevice) -> None:
+    def fail(step: int, u_in: float) -> float:
+        if step == 7:
+            raise ControllerFailedError("it raised ValueError")
+        return u_in
+
+    result = run_once(bench, run(), Scripted(fail))
+    assert (result.status, result.reason) == ("failed", "it raised ValueError")
+    assert math.isnan(result.error)
+    assert len(set(map(len, vars(result.breaths[-1]).values()))) == 1
+    assert vented(device)
+
+
+def test_a_wide_open_valve_is_stopped_and_blames_the_controller(bench: Bench) -> None:
+    result = run_once(bench, run(10.0), Scripted(lambda step, u: 100.0))
+    assert result.status == "failed"
+    assert result.trips[0].check == "over_pressure"
+    assert result.vented_after < 0.005
+    assert max(result.breaths[0].pressure) < protocol.SAFETY_PRESSURE
+
+
+FAULTS = {
+    "tube off": (LungFault(FaultKind.DISCONNECTED, 0.0), {"low_pressure", "disconnected"}),
+    "sensor stuck": (LungFault(FaultKind.SENSOR_STUCK, 0.0), {"stuck_sensor"}),
+    "sensor lost": (LungFault(FaultKind.SENSOR_LOST, 0.0), {"no_reading"}),
+    "expiratory valve stuck": (
+        LungFault(FaultKind.EXPIRATORY_STUCK, 0.0), {"expiratory_valve", "stuck_sensor"}
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(FAULTS))
+def test_a_fault_of_the_bench_stops_the_run(
+    name: str, bench: Bench, device: LoopbackDevice
+) -> None:
+    fault, checks = FAULTS[name]
+    hal: Any = device.service.hal
+    # The lung rests for 2 s before the run.
+    hal.faults = (replace(fault, start=device.clock.now() + 2.0 + 3.2),)
+    result = run_once(bench, run(), Scripted())
+    assert result.status in ("aborted", "failed")
+    by_device = "vented" in result.reason or "armed" in result.reason
+    assert by_device or result.trips[0].check in checks
+    assert vented(device)
+
+
+def test_a_cable_pulled_leaves_the_lung_vented(bench: Bench, device: LoopbackDevice) -> None:
+    def pull(step: int, u_in: float) -> float:
+        if step == 10:
+            device.unplug()
+        return u_in
+
+    with pytest.raises(LinkError):
+        run_once(bench, run(), Scripted(pull))
+    pulled = device.clock.now()
+    device.clock.advance(0.2)
+    assert vented(device)
+    assert device.actuations[-1].time - pulled < 0.1
+
+
+class StopsAt(SilentOperator):
+    def __init__(self, step: int) -> None:
+        self.step, self.calls = step, 0
+
+    def stop(self) -> bool:
+        self.calls += 1
+        return self.calls > self.step
+
+
+@pytest.mark.parametrize("step", [0, 20, 140])
+def test_the_emergency_stop_vents_at_once(step: int, bench: Bench, device: LoopbackDevice) -> None:
+    with pytest.raises(EmergencyStop):
+        run_once(replace(bench, operator=StopsAt(step)), run(), Scripted())
+    assert vented(device)
+
+
+def test_ctrl_c_anywhere_leaves_the_lung_vented(bench: Bench, device: LoopbackDevice) -> None:
+    def interrupt(step: int, u_in: float) -> float:
+        if step == 50:
+            raise KeyboardInterrupt
+        return u_in
+
+    with pytest.raises(KeyboardInterrupt):
+        run_once(bench, run(), Scripted(interrupt))
+    assert vented(device)
+
+
+class Disturbs(SilentOperator):
+    def __init__(self) -> None:
+        self.done: list[tuple[str, bool]] = []
+
+    def disturb(self, perturbation: str, on: bool) -> None:
+        self.done.append((perturbation, on))
+
+
+def test_a_perturbed_run_disturbs_the_tube_and_undoes_it(bench: Bench) -> None:
+    person = Disturbs()
+    run_once(
+        replace(bench, operator=person), run(kind="perturbed", perturbation="leak"), Scripted()
+    )
+    assert person.done == [("leak", True), ("leak", False)]
+
+
+class CrashError(BaseException):
+    """Stands for ``kill -9``: nothing of the session runs after it but what cleans up itself."""
+
+
+@pytest.fixture
+def plan() -> Plan:
+    return make_plan(["pid"], [LUNG], pips=(10.0,), repeats=2, control_every=0)
+
+
+def work(bench: Bench, plan: Plan, path: Path, make: Callable[[PlannedRun], Any]) -> Any:
+    with RawLog(path) as log:
+        return run_plan(bench, plan, make, log, about={})
+
+
+def test_a_plan_survives_crashes_and_cables(
+    bench: Bench, plan: Plan, device: LoopbackDevice, tmp_path: Path
+) -> None:
+    path = tmp_path / "raw.jsonl"
+    crashes = {30, 180, 250}  # steps of inspirations over all sessions
+    pulls = {120}
+    calls = 0
+
+    def trouble(step: int, u_in: float) -> float:
+        nonlocal calls
+        calls += 1
+        if calls in crashes:
+            raise CrashError
+        if calls in pulls:
+            device.unplug()
+            device.plug()  # back before anybody looks; what was on the way is lost
+        return u_in
+
+    ended = None
+    for _ in range(len(crashes) + 1):
+        try:
+            ended = work(bench, plan, path, lambda run: Scripted(trouble))
+        except CrashError:
+            bench.client.hello()
+    assert ended is not None
+    assert ended.complete
+    logged = breaths(path)
+    complete = {b.run for b in logged if b.complete}
+    assert complete == {run.number for run in plan.runs}
+    # Every breath that ended is in the log, also those of runs that were cut off.
+    inspirations = sum(len(b.time) == protocol.BREATH_STEPS for b in logged)
+    assert inspirations >= (calls - len(crashes) * 34) // protocol.INSPIRATION_STEPS - 1
+    for number in complete:
+        attempts = {b.attempt for b in logged if b.run == number and b.complete}
+        assert len(attempts) == 1
+
+
+def test_a_ramp_that_fails_leaves_the_rest_of_the_entry_out(
+    bench: Bench, plan: Plan, tmp_path: Path
+) -> None:
+    path = tmp_path / "raw.jsonl"
+    ended = work(bench, plan, path, lambda run: Scripted(lambda step, u: 100.0))
+    assert ended.complete
+    statuses = [x["status"] for x in lines(path) if x["type"] == "run"]
+    assert statuses == ["failed"] * len(plan.runs)
+    assert len(breaths(path)) == 1
+
+
+def test_an_operator_who_does_not_confirm_ends_the_session(
+    bench: Bench, plan: Plan, tmp_path: Path
+) -> None:
+    class Refuses(SilentOperator):
+        def confirm(self, question: str) -> bool:
+            return False
+
+    ended = work(
+        replace(bench, operator=Refuses()), plan, tmp_path / "raw.jsonl", lambda run: Scripted()
+    )
+    assert not ended.complete
+    assert "confirm" in ended.reason
+
+
+def test_a_dry_run_finds_a_controller_that_is_unsafe(plan: Plan) -> None:
+    calm = make_plan(["pid"], [LUNG], pips=(10.0,), repeats=5, control_every=0)
+    problems = session.dry_run(calm, lambda run: Scripted(lambda step, u: 100.0), DEFAULT)
+    assert len(problems) == 1
+    assert "over pressure" in problems[0]
+
+
+def test_a_result_without_scored_breaths_has_no_error() -> None:
+    assert math.isnan(RunResult("failed", "x", (), (), 0, 0).error)
+
+
+@pytest.mark.slow
+def test_six_lungs_survive_three_crashes_and_two_cables(tmp_path: Path) -> None:
+    """A plan over all lungs: every breath that ended is in the log, and every run is done once."""
+    from hardware_eval.emulation.loopback import loopback
+    from hardware_eval.emulation.simulated import simulated_lung
+    from hardware_eval.wire.client import Client
+    from ventbench.lungs import LUNG_IDS
+
+    lungs = {name: simulated_lung(name, "physics") for name in LUNG_IDS}
+    device = loopback(simulated_lung(LUNG, "physics"))
+    client = Client(device, device.clock)
+    client.hello()
+    everything = make_plan(["pid"], LUNG_IDS, pips=(10.0,), repeats=2, control_every=0)
+    random = np.random.default_rng(5)
+    steps = len(everything.runs) * protocol.BREATHS * protocol.INSPIRATION_STEPS
+    moments = np.sort(random.choice(steps, 5, replace=False))
+    crashes, pulls = set(moments[::2].tolist()), set(moments[1::2].tolist())
+    calls, ended = 0, 0
+
+    def trouble(step: int, u_in: float) -> float:
+        nonlocal calls
+        calls += 1
+        if calls in crashes:
+            raise CrashError
+        if calls in pulls:
+            device.unplug()
+            device.plug()
+        return u_in
+
+    def mount(run: PlannedRun) -> None:
+        device.service.hal = lungs[run.lung]
+
+    class Counts:
+        def breath(self, run: PlannedRun, breath: Any, done: int, total: int) -> None:
+            nonlocal ended
+            ended += len(breath.time) == protocol.BREATH_STEPS
+
+    bench = Bench(client, device.clock, DEFAULT, SilentOperator(), Counts(), 1.0)
+    path, result, restarts = tmp_path / "raw.jsonl", None, 0
+    while result is None:
+        try:
+            with RawLog(path) as log:
+                result = run_plan(
+                    bench, everything, lambda run: Scripted(trouble), log, about={},
+                    prepare_run=mount,
+                )  # fmt: skip
+        except CrashError:
+            restarts += 1
+            client.hello()
+    assert result.complete, result.reason
+    assert restarts == 3
+    logged = breaths(path)
+    assert sum(len(b.time) == protocol.BREATH_STEPS for b in logged) == ended
+    complete = [(b.run, b.breath) for b in logged if b.complete]
+    assert sorted(complete) == [
+        (run.number, k) for run in everything.runs for k in range(protocol.BREATHS)
+    ]

@@ -1,0 +1,250 @@
+"""The ventilator's own hardware, with stand-ins for its two packages; and the board's program."""
+
+from __future__ import annotations
+
+import math
+import os
+import socket
+import sys
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from hardware_eval.device import __main__ as board
+from hardware_eval.device.port import Guard, Port
+from hardware_eval.device.program import DeviceService, DeviceSettings
+from hardware_eval.device.pvp import LAST, PvpHal
+from hardware_eval.wire.client import Client
+from hardware_eval.wire.link import Link
+from hardware_eval.wire.messages import Mode
+from tests.hardware_eval.stand_in import Bench
+from ventbench.errors import InputError
+
+CONFIGURATION = """\
+name = "bench 3"
+device_id = "0123456789abcdef"
+adc_channel = 1
+"""
+TABLE = """\
+u_in,opening,closing
+0,0.30,0.20
+50,0.50,0.40
+100,0.90,0.80
+"""
+
+
+class FakePi:
+    """Keeps what pigpio was told: modes, levels, and duty cycles."""
+
+    connected = True
+
+    def __init__(self) -> None:
+        self.levels: dict[int, int] = {}
+        self.duties: list[tuple[int, int, int]] = []
+        self.told: list[str] = []
+        self.stopped = False
+
+    def set_mode(self, pin: int, mode: int) -> None:
+        assert (pin, mode) == (17, 1)
+
+    def write(self, pin: int, level: int) -> None:
+        self.levels[pin] = level
+        self.told.append("expiratory")
+
+    def hardware_PWM(self, pin: int, frequency: int, duty: int) -> None:
+        self.duties.append((pin, frequency, duty))
+        self.told.append("inspiratory")
+
+    def stop(self) -> None:
+        self.stopped = True
+
+
+class FakeBus:
+    """An ADS1015 whose conversions a test sets, in counts."""
+
+    def __init__(self, number: int) -> None:
+        assert number == 1
+        self.counts: list[int] = [1100]
+        self.configured: list[int] = []
+        self.broken = False
+
+    def write_i2c_block_data(self, address: int, register: int, data: list[int]) -> None:
+        assert (address, register) == (0x48, 1)
+        self.configured = data
+
+    def read_i2c_block_data(self, address: int, register: int, length: int) -> list[int]:
+        assert (address, register, length) == (0x48, 0, 2)
+        if self.broken:
+            raise OSError(121, "Remote I/O error")
+        counts = self.counts[0] if len(self.counts) == 1 else self.counts.pop(0)
+        word = (counts << 4) & 0xFFFF
+        return [word >> 8, word & 0xFF]
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def configuration(tmp_path: Path) -> Path:
+    (tmp_path / "pvp.toml").write_text(CONFIGURATION)
+    (tmp_path / "valve.csv").write_text(TABLE)
+    return tmp_path / "pvp.toml"
+
+
+@pytest.fixture
+def hardware(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    parts = SimpleNamespace(pi=FakePi(), bus=FakeBus(1))
+    pigpio: Any = SimpleNamespace(pi=lambda: parts.pi, OUTPUT=1)
+    monkeypatch.setitem(sys.modules, "pigpio", pigpio)
+    smbus2: Any = SimpleNamespace(SMBus=lambda number: parts.bus)
+    monkeypatch.setitem(sys.modules, "smbus2", smbus2)
+    return parts
+
+
+def test_the_sensor(configuration: Path, hardware: SimpleNamespace) -> None:
+    hal = PvpHal(configuration)
+    # Continuous, channel 1 against ground, +-4.096 V, 3300 samples/s, comparator off.
+    assert hardware.bus.configured == [0b0101_0010, 0b1100_0011]
+    assert hal.sample(1.5).pressure == pytest.approx(0.0)
+    hardware.bus.counts = [1101]
+    assert hal.sample(1.5).pressure == pytest.approx(0.0703)  # one step of the recordings
+    hardware.bus.counts = [1500, 0, 1501]
+    assert hal.sample(2.0).pressure == pytest.approx(400 * 0.0703)  # spikes are cut
+    hardware.bus.counts = [LAST]
+    assert hal.sample(2.0).saturated
+    for nothing in ([0], [-5]):
+        hardware.bus.counts = nothing
+        assert math.isnan(hal.sample(3.0).pressure)
+    hardware.bus.broken = True
+    assert math.isnan(hal.sample(4.0).pressure)
+
+
+def test_the_valves(configuration: Path, hardware: SimpleNamespace) -> None:
+    hal = PvpHal(configuration)
+    pi = hardware.pi
+    assert pi.levels == {17: 1}  # vented: the valve without current is closed
+    assert pi.duties[-1] == (12, 20_000, 0)
+    hal.actuate(0.0, 50.0, 0)
+    assert pi.levels == {17: 0}
+    assert pi.duties[-1][2] == 500_000
+    hal.actuate(0.0, 75.0, 0)
+    assert pi.duties[-1][2] == 700_000
+    hal.actuate(0.0, 25.0, 0)
+    assert pi.duties[-1][2] == 300_000  # of the closing curve: 0.2 + 0.1
+    pi.told.clear()
+    hal.actuate(0.0, 0.0, 1)
+    assert pi.told == ["expiratory", "inspiratory"]
+    assert pi.duties[-1][2] == 0
+    hal.actuate(0.0, 0.0, 1)
+    assert len(pi.told) == 2  # nothing is told twice
+    hal.actuate(0.0, 30.0, 0)
+    hal.close()
+    assert (pi.levels[17], pi.duties[-1][2], pi.stopped) == (1, 0, True)
+
+
+def test_a_normally_open_valve_is_turned_around(
+    configuration: Path, hardware: SimpleNamespace
+) -> None:
+    configuration.write_text(CONFIGURATION + "expiratory_normally_open = true\n")
+    PvpHal(configuration)
+    assert hardware.pi.levels == {17: 0}
+
+
+def test_identity_changes_with_the_calibration_only(
+    configuration: Path, hardware: SimpleNamespace
+) -> None:
+    first = PvpHal(configuration).identity
+    assert (first.name, first.device_id.hex()) == ("bench 3", "0123456789abcdef")
+    configuration.write_text(CONFIGURATION.replace("bench 3", "bench 4"))
+    assert PvpHal(configuration).identity.calibration == first.calibration
+    (configuration.parent / "valve.csv").write_text(TABLE.replace("0.90", "0.91"))
+    assert PvpHal(configuration).identity.calibration != first.calibration
+
+
+@pytest.mark.parametrize(
+    ("toml", "table", "message"),
+    [
+        ("colour = 1", TABLE, "no key 'colour'"),
+        ("adc_channel = 7", TABLE, r"outside 0\.\.3"),
+        ('adc_channel = "1"', TABLE, "must be a int"),
+        ('device_id = "01"', TABLE, "16 hexadecimal"),
+        ("= 1", TABLE, "pvp.toml"),
+        (CONFIGURATION, "u_in,opening,closing\n0,0,0\n90,1,1\n", "0 to 100"),
+        (CONFIGURATION, "u_in,opening,closing\n0,0,0\n100,1.1,1\n", "leaves"),
+        (CONFIGURATION, "u_in,opening\n0,0\n100,1\n", "closing"),
+    ],
+)
+def test_wrong_files_say_what_is_wrong(
+    configuration: Path, hardware: SimpleNamespace, toml: str, table: str, message: str
+) -> None:
+    configuration.write_text(toml)
+    (configuration.parent / "valve.csv").write_text(table)
+    with pytest.raises(InputError, match=message):
+        PvpHal(configuration)
+
+
+def test_missing_packages_and_hardware_say_what_to_do(
+    configuration: Path,
+    hardware: SimpleNamespace,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    hardware.pi.connected = False
+    with pytest.raises(InputError, match="sudo pigpiod"):
+        PvpHal(configuration)
+    monkeypatch.setitem(sys.modules, "pigpio", None)
+    with pytest.raises(InputError, match="pip install"):
+        PvpHal(configuration)
+    assert board.main(["--config", str(configuration), "--vent"]) == 2
+    assert "pip install" in capsys.readouterr().err
+    assert board.main(["--config", "x.toml", "--listen", "here"]) == 2
+    assert "HOST:PORT" in capsys.readouterr().err
+
+
+def test_the_board_vents_once(configuration: Path, hardware: SimpleNamespace) -> None:
+    assert board.main(["--config", str(configuration), "--vent"]) == 0
+    assert hardware.pi.levels == {17: 1}
+
+
+def test_the_board_serves_one_host_after_another() -> None:
+    """Over TCP, as `--listen`: what the board does when a host hangs up."""
+    open_line, server = board.tcp_line("127.0.0.1", 0)
+    bench = Bench()
+    service = DeviceService(bench, DeviceSettings(), time.monotonic())
+    stop = threading.Event()
+    port = Port(open_line, os.close)
+    thread = threading.Thread(target=Guard(service, port).run, args=(stop.is_set,))
+    thread.start()
+    url = f"socket://127.0.0.1:{server.getsockname()[1]}"
+    try:
+        for _ in range(2):
+            client = Client(Link(url), timeout=20.0)
+            assert client.hello().name == "bench"
+            assert client.arm().mode is Mode.RUNNING
+            client._transport.close()
+    finally:
+        stop.set()
+        thread.join()
+        port.close()
+        server.close()
+    assert bench.valves[-1][1:] == (0.0, 1)
+
+
+def test_a_serial_line_that_is_not_there_is_waited_for(tmp_path: Path) -> None:
+    assert board.serial_line(str(tmp_path / "none"))() is None
+    master, slave = os.openpty()
+    line = board.serial_line(os.ttyname(slave))()
+    assert line is not None
+    os.write(line, b"\0x\0")
+    assert os.read(master, 10) == b"\0x\0"
+    for descriptor in (line, master, slave):
+        os.close(descriptor)
+
+
+def test_a_taken_address_is_told() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(InputError, match="listen"):
+        board.tcp_line("127.0.0.1", taken.getsockname()[1])

@@ -1,0 +1,199 @@
+"""The emulator on a real pseudo-terminal, and the link's errors; without the lung's simulator."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import serial
+
+from hardware_eval.emulation import emulator as emulator_module
+from hardware_eval.emulation.emulator import Emulator, tell
+from hardware_eval.wire.client import Client
+from hardware_eval.wire.errors import (
+    DisconnectedError,
+    LinkError,
+    NoAnswerError,
+    PortBusyError,
+    PortForbiddenError,
+    PortMissingError,
+    RefusedError,
+)
+from hardware_eval.wire.link import Link, ReconnectPolicy
+from hardware_eval.wire.messages import Flag, Mode, Packet, Vent, encode
+from tests.hardware_eval.stand_in import Bench
+from ventbench.errors import InputError
+
+#: Patience with a busy machine, s; a healthy one needs a thousandth of it.
+PATIENCE = 20.0
+
+
+@pytest.fixture
+def emulator(tmp_path: Path) -> Iterator[Emulator]:
+    running = Emulator(
+        Bench(), link=tmp_path / "lung", control=tmp_path / "control", log=tmp_path / "valves.csv"
+    )
+    stop = threading.Event()
+    thread = threading.Thread(target=running.run, args=(stop.is_set,))
+    thread.start()
+    yield running
+    stop.set()
+    thread.join()
+
+
+def _wait_for(done: Callable[[], object]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.002)
+
+
+def _vented(emulator: Emulator) -> bool:
+    last = emulator.actuations[-1]
+    return (last.u_in, last.u_out) == (0.0, 1)
+
+
+def _run(client: Client) -> None:
+    """Arm and set the valves; again if the busy machine was so slow that the watchdog vented."""
+    for _ in range(100):
+        client.arm()
+        try:
+            if client.command(20.0, 0).mode is Mode.RUNNING:
+                return
+        except (NoAnswerError, RefusedError):
+            continue
+    pytest.fail("the device never ran")
+
+
+def test_a_session_on_a_pseudo_terminal(emulator: Emulator, tmp_path: Path) -> None:
+    client = Client(Link(emulator.terminal), timeout=PATIENCE)
+    assert client.hello().name == "bench"
+    _run(client)
+    # The host dies: nothing is said any more.
+    _wait_for(lambda: _vented(emulator))
+    assert Flag.COMMANDS_STOPPED in emulator.service.state.causes
+    with pytest.raises(RefusedError, match="NOT_ARMED"):
+        client.command(10.0, 0)
+    client.close()
+    logged = (tmp_path / "valves.csv").read_text().splitlines()
+    assert logged[-1].split(",")[1:] == ["0", "1", "COMMANDS_STOPPED"]
+
+
+def test_a_cable_is_pulled_and_comes_back(emulator: Emulator, tmp_path: Path) -> None:
+    client = Client(Link(emulator.terminal), timeout=PATIENCE)
+    client.hello()
+    _run(client)
+    tell(tmp_path / "control", "unplug 0.3")
+    with pytest.raises(DisconnectedError):
+        _wait_for(lambda: client.heartbeat().mode is None)
+    _wait_for(lambda: _vented(emulator))
+    client.reconnect()
+    _run(client)
+    assert client.statistics().disconnections >= 1
+    client.close()
+
+
+def test_faults_and_nonsense_by_the_control_socket(
+    emulator: Emulator, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    control = tmp_path / "control"
+    tell(control, "fire@0")
+    tell(control, "silent@0:1")
+    client = Client(Link(emulator.terminal), timeout=0.05)
+    _wait_for(lambda: emulator.line.faults)
+    with pytest.raises(NoAnswerError, match="is it on"):
+        client.heartbeat()
+    tell(control, "clear")
+    _wait_for(lambda: not emulator.line.faults)
+    assert client.hello().name == "bench"
+    assert "KIND@START" in capfd.readouterr().err
+    with pytest.raises(InputError, match="no emulator listens"):
+        tell(tmp_path / "nobody", "clear")
+
+
+def test_a_line_that_cannot_be_opened_is_told_and_tried_again(
+    emulator: Emulator, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    told = ""
+
+    def failed() -> bool:
+        nonlocal told
+        told += capfd.readouterr().err
+        return "cannot be opened" in told
+
+    taken = tmp_path / "lung"
+    emulator._link = tmp_path / "control" / "lung"  # no folder can be made there
+    emulator.port.hang_up(0.0)
+    _wait_for(failed)
+    taken.unlink()
+    emulator._link = taken
+    _wait_for(taken.exists)
+    assert Client(Link(str(taken)), timeout=PATIENCE).hello().name == "bench"
+
+
+def test_errors_of_ports(
+    emulator: Emulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(PortMissingError, match="is the cable in"):
+        Link(str(tmp_path / "none"))
+    with pytest.raises(PortMissingError, match="socket://"):
+        Link("nonsense://x")
+    plain = tmp_path / "file"
+    plain.touch()
+    with pytest.raises(LinkError, match="cannot be opened"):
+        Link(str(plain))
+    first = Link(emulator.terminal)
+    with pytest.raises(PortBusyError, match="another program has it"):
+        Link(emulator.terminal)
+    first.close()
+
+    def forbidden(*_: object, **__: object) -> int:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(os, "open", forbidden)
+    with pytest.raises(PortForbiddenError, match="dialout"):
+        Link(emulator.terminal)
+
+
+def test_patience_with_a_lost_port_ends(emulator: Emulator, tmp_path: Path) -> None:
+    link = Link(emulator.terminal, policy=ReconnectPolicy(first=0.01, patience=0.05))
+    (tmp_path / "lung").unlink()
+    with pytest.raises(PortMissingError, match=r"tried for 0\.05 s"):
+        link.reopen()
+
+
+def test_a_socket_and_a_loop_are_links_too() -> None:
+    loop = Link("loop://")
+    loop.write(b"abc")
+    assert loop.read(PATIENCE) == b"abc"
+    assert loop.read(0.001) == b""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = Link(f"socket://127.0.0.1:{server.getsockname()[1]}")
+        device, _ = server.accept()
+        with device:
+            link.write(encode(Packet(0, 1, Vent())))
+            assert device.recv(100) == encode(Packet(0, 1, Vent()))
+        with pytest.raises(DisconnectedError, match="vents the lung by itself"):
+            link.read(PATIENCE)
+        link.close()
+
+
+def test_wrong_arguments_say_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert emulator_module.main(["--fault", "fire@1"]) == 2
+    assert "KIND@START" in capsys.readouterr().err
+    assert emulator_module.main(["--lung", "X"]) == 2
+    assert "R20C50" in capsys.readouterr().err
+    taken = tmp_path / "taken"
+    taken.touch()
+    with pytest.raises(InputError, match="remove it"):
+        Emulator(Bench(), link=taken)
+
+
+def test_pyserial_is_the_link() -> None:
+    assert isinstance(Link("loop://")._port, serial.SerialBase)

@@ -1,0 +1,172 @@
+"""From a plan to a hardware record on the leaderboard, by the same code as at a bench."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hardware_eval.bench.loop import SilentOperator
+from hardware_eval.bench.plan import make_plan
+from hardware_eval.results import evaluate as ev
+from hardware_eval.results import record as records
+from hardware_eval.results.compare import compare, recorded_breaths
+from hardware_eval.results.evaluate import Line
+from hardware_eval.results.replay import replay
+from ventbench.board import build, canonical, record, store
+from ventbench.board.hardware import HardwareRecord
+from ventbench.errors import InputError
+from ventbench.submissions.folder import open_submission
+
+LUNG, PIPS = "R5C20", (10.0, 15.0)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory, shared_device: Any) -> ev.Evaluation:
+    """The paper's PID on the emulated lung: two PIPs, two repetitions."""
+    from hardware_eval.wire.client import Client
+
+    client = Client(shared_device, shared_device.clock)
+    client.hello()
+    plan = make_plan(["pid_best"], [LUNG], pips=PIPS, repeats=2, control_every=3)
+    return ev.evaluate(
+        [open_submission("pid_best")], Line(client, shared_device.clock),
+        tmp_path_factory.mktemp("bench"), SilentOperator(), plan=plan, sandbox=False, dry=False,
+        operator_name="A. Person", notes="a note", rest=1.0,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def path(done: ev.Evaluation) -> Path:
+    assert done.complete, done.reason
+    return done.records["pid_best"]
+
+
+def loaded(path: Path) -> HardwareRecord:
+    made = record.load(path)
+    assert isinstance(made, HardwareRecord)
+    return made
+
+
+def test_the_record_holds_score_device_and_recording(done: ev.Evaluation, path: Path) -> None:
+    made = loaded(path)
+    header = made.header
+    assert header.device.emulated
+    assert header.track == "hardware"
+    assert header.simulated_track == "performance"
+    assert (header.operator, header.notes) == ("A. Person", "a note")
+    assert header.recording.sha256 == canonical.digest(done.log.read_bytes())
+    assert made.errors.shape == (1, 2, 2)
+    assert np.isfinite(made.errors).all()
+    assert len(header.control[LUNG]["errors"]) == 3  # before the first, the fourth, at the end
+    assert header.timing["lost"] == 0
+    assert set(header.safety) >= {"over_pressure", "stuck_sensor", "largest_u_in"}
+    assert header.safety["over_pressure"]["reason"]
+
+
+def test_the_log_gives_the_errors_of_the_record(done: ev.Evaluation, path: Path) -> None:
+    report = replay(done.log, record=path)
+    assert report.problems == ()
+    assert report.errors["pid_best"][LUNG] == pytest.approx(loaded(path).score, abs=1e-3)
+
+
+def changed(path: Path, change: Any) -> bytes:
+    values = json.loads(path.read_bytes())
+    change(values)
+    return canonical.canonical(values)
+
+
+def lower(values: dict[str, Any]) -> None:
+    values["errors"][0][0][0] -= 0.01
+
+
+def without_stop(values: dict[str, Any]) -> None:
+    values["errors"][0][0][0] = None
+    for table in values["trace"].values():
+        table[0][0][0] = None
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        (lower, "errors"),
+        (without_stop, "stops"),
+        (lambda v: v["lungs"].append("R5C10"), "errors"),
+        (lambda v: v.update(pips=[10.0, 12.0]), "pips"),
+        (lambda v: v.update(unknown=1), "unknown"),
+        (lambda v: v["safe"].append(True), "safe"),
+        (lambda v: v["submission"]["files"].clear(), "submission"),
+    ],
+)
+def test_a_record_that_contradicts_itself_is_refused(path: Path, change: Any, key: str) -> None:
+    with pytest.raises(InputError, match=key):
+        record.from_bytes(changed(path, change), "it")
+
+
+def test_the_board_shows_it_beside_the_simulated_score(path: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "leaderboard"
+    shutil.copytree(Path(__file__).parents[3] / "leaderboard", folder)
+    before = {name: (folder / name).read_bytes() for name in build.present(folder)}
+    assert not build.build(folder).changed  # pages without hardware records stay as they are
+    added = store.add(folder, path)
+    assert isinstance(added, HardwareRecord)
+    done = build.build(folder)
+    assert "index.html" in done.changed
+    page = (folder / "index.html").read_text()
+    made = loaded(path)
+    simulated = next(
+        entry for entry in store.load(folder).scores
+        if entry.name == "pid_best" and entry.track == "performance" and entry.official
+    )  # fmt: skip
+    lung, pips = simulated.lungs.index(LUNG), [simulated.pips.index(pip) for pip in PIPS]
+    gap = made.score - simulated.nominal[lung, pips].mean()
+    assert f"{made.score:.3f}" in page
+    assert f"gap {gap:+.3f}".replace("-", "−") in page.replace("-", "−")
+    assert "emulator" in page
+    other = "entries/v1/robustness/pid_robust.html"
+    assert (folder / other).read_bytes() == before[other]
+    with pytest.raises(InputError, match="already"):
+        store.add(folder, path)
+    store.withdraw(folder, made.sha256, "a test")
+    build.build(folder)
+    assert "withdrawn: a test" in (folder / "index.html").read_text()
+
+
+def test_the_recording_is_compared_with_simulators(path: Path) -> None:
+    breaths = recorded_breaths(path)
+    own = compare(breaths, simulator="physics", diagnose=False).lungs[LUNG]
+    frozen = compare(breaths, diagnose=False).lungs[LUNG]
+    # The emulated lung is the physics; its own simulator is nearer to it than the real rig's.
+    assert own.mae < 0.35 < frozen.mae
+    waveforms = compare(breaths, simulator="physics", diagnose=False).waveforms[LUNG]
+    assert sum(part.breaths for part in waveforms.values()) == len(breaths)
+
+
+def test_a_record_without_its_log_says_where_to_look(path: Path, tmp_path: Path) -> None:
+    alone = tmp_path / path.name
+    shutil.copy(path, alone)
+    with pytest.raises(InputError, match="--log"):
+        recorded_breaths(alone)
+    (tmp_path / "raw.jsonl").write_text('{"type":"log"}\n')
+    with pytest.raises(InputError, match="by its hash"):
+        recorded_breaths(alone)
+
+
+def test_a_plan_that_is_not_finished_has_no_record(line: Line, tmp_path: Path) -> None:
+    class Refuses(SilentOperator):
+        def confirm(self, question: str) -> bool:
+            return "raise PIP" not in question
+
+    plan = make_plan(["pid_best"], [LUNG], pips=PIPS, repeats=1)
+    submission = open_submission("pid_best")
+    made = ev.evaluate(
+        [submission], line, tmp_path, Refuses(), plan=plan, sandbox=False, dry=False, rest=0.5
+    )
+    assert not made.complete
+    assert not made.records
+    with pytest.raises(InputError, match="are left"):
+        records.hardware_record(made.log, submission)

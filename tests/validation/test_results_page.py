@@ -6,8 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.validation.challenge.truths import answer, drawn, mechanism
 from ventbench.errors import InputError
+from ventbench.validation.challenge.cases import Effect
 from ventbench.validation.challenge.figures import Figure
+from ventbench.validation.challenge.judge import judge
 from ventbench.validation.challenge.reveal import ChallengeResult
 from ventbench.validation.real_rig_proof import Claim, Proof
 from ventbench.validation.results_page import (
@@ -34,8 +37,13 @@ def test_a_section_is_replaced_and_the_rest_stays(tmp_path: Path) -> None:
 
 
 def test_a_challenge_tells_its_seed_its_commitment_and_its_code() -> None:
+    leak = Effect("leak", "strong", "library", {"conductance": 20.0})
+    right = judge(drawn("single", leak), [100.0], answer("named", mechanism("leak")))
+    wrong = judge(
+        drawn("single", leak), [0.1], answer("named", mechanism("valve_lag"), slot="f(V)")
+    )
     result = ChallengeResult(
-        "abc123", ("case_0003",), (), (
+        "abc123", ("case_0003",), (right, wrong), (
             Figure("strong: right name", 0.9, ">= 98%", 20, (0.7, 0.97), False),
             Figure("seconds a case, median", 5.25, "", 20, None, None),
             Figure("nothing missing: false names", None, "<= 0%", 0, None, None),
@@ -45,7 +53,12 @@ def test_a_challenge_tells_its_seed_its_commitment_and_its_code() -> None:
     text = challenge_section(result, seed="words", total=48)
     assert "ventbench challenge make --generator stranger --seed words --cases 48" in text
     assert "Generator `stranger`, code 1a2b3c, seed `words`, commitment\n`abc123`" in text
-    assert "0 of 48 cases answered" in text
+    assert "2 of 48 cases answered" in text
+    assert "Answers that are not right (1 of 2):" in text
+    assert (
+        "| single | R10C20 | leak (strong, below the detection limit) | valve_lag + f(V) | "
+        "1.00, 0.60, 0.30 |"
+    ) in text
     assert "| strong: right name | 90% | 70% to 97% | 20 | >= 98% | no |" in text
     assert "| seconds a case, median | 5.25 |  | 20 |  |  |" in text
     assert "| nothing missing: false names | – |  | 0 | <= 0% |  |" in text

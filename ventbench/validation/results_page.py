@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import ventbench
 from ventbench import files
 from ventbench.errors import InputError
+from ventbench.validation.challenge.figures import full_answer
 
 if TYPE_CHECKING:
     from ventbench.validation.challenge.reveal import ChallengeResult
@@ -102,7 +103,34 @@ def challenge_section(result: ChallengeResult, *, seed: str, total: int) -> str:
         if (rest := sum(list(counts.values())[_LONGEST:])) > 0:
             shown.append(f"others {rest}")
         lines.append(f"| {truth} | {', '.join(shown)} |")
-    return "\n".join(lines)
+    return "\n".join([*lines, *_wrong_answers(result)])
+
+
+def _wrong_answers(result: ChallengeResult) -> list[str]:
+    """Every answer that is not right, by kind of the question."""
+    wrong = sorted(
+        (case for case in result.cases if not case.right),
+        key=lambda case: (case.kind, case.effects, case.name),
+    )
+    if not wrong:
+        return []
+    lines = [
+        "",
+        f"Answers that are not right ({len(wrong)} of {len(result.cases)}):",
+        "",
+        "| kind | lung | truth | answer | error given, refitted, corrected |",
+        "|---|---|---|---|---|",
+    ]
+    for case in wrong:
+        truth = " + ".join(
+            f"{name} ({strength}{'' if name in case.seen else ', below the detection limit'})"
+            for name, strength in zip(case.effects, case.strengths, strict=True)
+        )
+        errors = ", ".join(f"{x:.2f}" for x in (case.before, case.refit, case.after))
+        lines.append(
+            f"| {case.kind} | {case.lung} | {truth or 'nothing'} | {full_answer(case)} | {errors} |"
+        )
+    return lines
 
 
 def proof_section(proof: Proof) -> str:

@@ -197,6 +197,14 @@ def _answer_in_words(case: JudgedCase) -> str:
     return name if case.slot is None else f"{name} + {case.slot}"
 
 
+def full_answer(case: JudgedCase) -> str:
+    """Every name of an answer and its place without a name, in words."""
+    said = [*sorted(case.named), *([case.slot] if case.slot else [])]
+    if said:
+        return " + ".join(said)
+    return _NOTHING if case.verdict == "nothing_missing" else "unnamed, no place"
+
+
 def by_parameter(cases: Sequence[JudgedCase]) -> dict[str, dict[str, Any]]:
     """Coverage and median error of the estimates of each parameter, by its path."""
     grouped: dict[str, list[EstimateAgainstTruth]] = {}

@@ -12,10 +12,10 @@ from ventbench.validation.challenge.cases import Effect
 from ventbench.validation.challenge.figures import Figure
 from ventbench.validation.challenge.judge import judge
 from ventbench.validation.challenge.reveal import ChallengeResult
+from ventbench.validation.code_version import code_version
 from ventbench.validation.real_rig_proof import Claim, Proof
 from ventbench.validation.results_page import (
     challenge_section,
-    code_version,
     proof_section,
     write_section,
 )

@@ -22,6 +22,7 @@ from ventbench.diagnosis.result import Diagnosis
 from ventbench.errors import InputError
 from ventbench.plants.catalog import load_simulators
 from ventbench.recordings.breaths import Breaths
+from ventbench.validation.code_version import code_version
 from ventbench.validation.real_rig_parts import (
     PARTS,
     Part,
@@ -29,7 +30,6 @@ from ventbench.validation.real_rig_parts import (
     by_names_alone,
     has_unnamed,
 )
-from ventbench.validation.results_page import code_version
 
 FORMAT = "ventbench-proof-1"
 

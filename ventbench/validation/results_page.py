@@ -6,15 +6,14 @@ what is written replaces what stood there, so that no figure is copied by hand.
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import ventbench
 from ventbench import files
 from ventbench.errors import InputError
 from ventbench.validation.challenge.figures import full_answer
+from ventbench.validation.code_version import code_version
 
 if TYPE_CHECKING:
     from ventbench.validation.challenge.reveal import ChallengeResult
@@ -22,17 +21,6 @@ if TYPE_CHECKING:
 
 #: Answers of a row of the table of truths that are told one by one.
 _LONGEST = 6
-
-
-def code_version() -> str:
-    """Commit of the checkout that this package runs from, or else its version."""
-    folder = Path(ventbench.__file__).parent
-    command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--exclude", "*"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return ventbench.__version__
-    return done.stdout.strip() or ventbench.__version__
 
 
 def write_section(path: Path, name: str, text: str) -> None:

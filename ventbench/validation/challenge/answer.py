@@ -18,7 +18,7 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import load
 from ventbench.validation.challenge import requests
 from ventbench.validation.challenge.folder import ChallengeFolder
-from ventbench.validation.results_page import code_version
+from ventbench.validation.code_version import code_version
 
 #: Environment of the processes, each of which computes on one core.
 _SINGLE_THREAD = {

@@ -95,6 +95,12 @@ def test_other_verdicts(tmp_path: Path) -> None:
     assert "Nothing is missing" in nothing.text
     assert "Nowhere" in nothing.text
     assert "corrected" not in nothing.text
+    assert "What would have been seen" not in nothing.text
+    limits = {"leak": 0.25, "inertance": float("inf")}
+    known = dataclasses.replace(made.nothing(12), detection_limits=limits)
+    page = Page(write_report(tmp_path / "l.html", known).read_text())
+    assert "leak at the airwayleak0.25 mL/s" in page.text
+    assert "not at any strength" in page.text
 
 
 def test_the_guilty_part_of_the_rig_is_lit(found: Diagnosis, tmp_path: Path) -> None:

@@ -208,18 +208,30 @@ def remaining(findings: Findings) -> str:
 def visible(findings: Findings) -> str:
     """Which strengths would have been seen where nothing is missing."""
     seen, unseen = [], []
-    for name, limit in findings.detection_limits.items():
-        about = mechanism(name).description.strength
-        if not math.isfinite(limit):
+    for name, limit in visible_strengths(findings).items():
+        if limit:
+            seen.append(f"{name} {limit}")
+        else:
             unseen.append(name)
-            continue
-        factor, unit = _scale(Estimate(limit, about.unit, (limit, limit)), f"{name}.{about.name}")
-        seen.append(f"{name} {_two_digits(factor * limit)}{f' {unit}' if unit else ''}")
     if not seen and not unseen:
         return ""
     text = f"This recording would have shown: {', '.join(seen)}." if seen else ""
     hidden = f" It would not have shown {_listed(unseen, 'or')} of any strength." if unseen else ""
     return f"{text}{hidden}".strip()
+
+
+def visible_strengths(findings: Findings) -> dict[str, str]:
+    """Smallest strength of each mechanism that would have been seen, with its unit, by name.
+
+    ``""`` where none would; empty unless nothing is missing.
+    """
+    texts = {}
+    for name, limit in findings.detection_limits.items():
+        about = mechanism(name).description.strength
+        factor, unit = _scale(Estimate(limit, about.unit, (limit, limit)), f"{name}.{about.name}")
+        shown = f"{_two_digits(factor * limit)}{f' {unit}' if unit else ''}"
+        texts[name] = shown if math.isfinite(limit) else ""
+    return texts
 
 
 def scatter(findings: Findings) -> str:

@@ -41,7 +41,10 @@ def html(diagnosis: Diagnosis) -> str:
         parts=diagram.parts(listed),
         diagram_alt=diagram.description(listed),
         would_change=report_text.would_change(diagnosis),
-        visible=report_text.visible(diagnosis),
+        visible=[
+            (report_text.title(name), name, limit or "not at any strength")
+            for name, limit in report_text.visible_strengths(diagnosis).items()
+        ],
         commands_file=RECORD_NEXT,
         plant=diagnosis.simulator,
         light=graphics.RUN_COLORS,

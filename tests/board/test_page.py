@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -117,6 +118,29 @@ def test_pages_fit(quiet: Page, full: Path, name: str, width: int, dark: bool) -
     # Every text of a table's cell stands out from its ground (WCAG's 4.5).
     assert quiet.run(CONTRAST) >= 4.5
     assert quiet.picture()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_a_phone_is_told_of_hidden_columns(quiet: Page, full: Path) -> None:
+    """What does not fit can be scrolled to; a line and a shadow say so."""
+    hint = "getComputedStyle(document.querySelector('.hint')).display"
+    table = "document.querySelector('#performance ~ .scroll')"
+    quiet.open(full / "index.html", 390)
+    assert quiet.run(f"{table}.scrollWidth > {table}.clientWidth")
+    assert quiet.run(hint) == "block"
+    assert "gradient" in quiet.run(f"getComputedStyle({table}).backgroundImage")
+    quiet.open(full / "index.html", 1280)
+    assert quiet.run(f"{table}.scrollWidth <= {table}.clientWidth")
+    assert quiet.run(hint) == "none"
+
+
+def test_ranks_have_their_range(quiet: Page, full: Path) -> None:
+    quiet.open(full / "index.html", 1280)
+    ranks = quiet.run(
+        "[...document.querySelectorAll('#performance ~ .scroll tbody td:first-child')]"
+        ".map(x => x.innerText)"
+    )
+    assert len(ranks) == 3
+    assert all(re.fullmatch(r"\d+\s+\d+ to \d+", text) for text in ranks)
 
 
 #: Least contrast of any cell's text, where the cell has a ground of its own.

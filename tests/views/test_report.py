@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import io
 import re
 from html.parser import HTMLParser
@@ -13,7 +14,7 @@ from ventbench import protocol
 from ventbench.errors import InputError
 from ventbench.text import number
 from ventbench.trajectories import Trajectories
-from ventbench.views import graphics, report, scores, write_figure, write_report
+from ventbench.views import graphics, panels, report, scores, write_figure, write_report
 from ventbench.views import runs as shared
 
 pytest.importorskip("jinja2", reason="needs the extra ventbench[view]")
@@ -217,3 +218,56 @@ def test_protocol_is_the_shown_one(best: Trajectories, tmp_path: Path) -> None:
     text = Page(write_report(tmp_path / "r.html", [best]).read_text()).text
     assert f"{protocol.INSPIRATION_STEPS} inspiratory steps of breaths 2 and 3" in text
     assert "30 ms" in text
+
+
+def test_every_panel_has_the_numbers_of_all_runs(best: Trajectories, robust: Trajectories) -> None:
+    third = dataclasses.replace(best, name="third", pressure=best.pressure + 1.0)
+    text = report.html([best, robust, third])
+    for panel in re.findall(r'<span class="mae">(.*?)</span></figcaption>', text):
+        assert re.findall(r'<span class="(r\d)">\d+\.\d\d', panel) == ["r0", "r1", "r2"]
+    heads = re.findall(r'<p class="sum">(.*?)</p>', text)
+    assert [head.count("<b>") for head in heads] == [3] * 6
+    assert "third" in heads[0]
+
+
+def test_the_valve_has_one_axis(best: Trajectories, robust: Trajectories) -> None:
+    """0, 50 and 100 % at the same heights in every panel, whatever the commands."""
+    quiet = dataclasses.replace(best, u_in=best.u_in * 0.1)
+    for runs in ([best, robust], [quiet]):
+        text = report.html(runs)
+        figures = re.findall(r"<figure>.*?</figure>", text, re.S)
+        marks = {
+            tuple(re.findall(rf'y="([\d.]+)">({mark})</text>', figure)[-1] for mark in (0, 50, 100))
+            for figure in figures
+        }
+        assert len(figures) == 36
+        assert len(marks) == 1
+    column = panels.panels([quiet])[0][0]
+    top = panels.VALVE_TOP + panels.VALVE_HEIGHT * (1.0 - quiet.u_in[0, 0].max() / protocol.U_MAX)
+    assert column.valves[0][:, 1].min() == pytest.approx(top, abs=2.0), "not stretched to its range"
+
+
+def test_runs_of_two_tracks_are_headed_by_both(best: Trajectories, robust: Trajectories) -> None:
+    other = dataclasses.replace(robust, track="robustness")
+    assert "performance and robustness tracks" in Page(report.html([best, other])).text
+    alone = Page(report.html([best, robust])).text
+    assert "performance track" in alone
+    assert "robustness" not in alone.split("Provenance")[0].replace("pid_robust", "")
+
+
+def test_two_runs_are_compared_cell_by_cell(best: Trajectories, robust: Trajectories) -> None:
+    own, other = shared.errors(best), shared.errors(robust)
+    draws = {"sha256": "d" * 64, "version": 1}
+    given = [
+        score_file(best, draws={"score": 2.0, "ci95": [1.9, 2.1], "values": [1.9, 2.1], **draws}),
+        score_file(robust, draws={"score": 3.0, "ci95": [2.9, 3.1], "values": [2.9, 3.1], **draws}),
+    ]
+    text = Page(report.html([best, robust], given)).text
+    better = int((own < other).sum())
+    assert f"lower error on {int((own.mean(1) < other.mean(1)).sum())} of 6 lungs" in text
+    assert f"in {better} of 36 cells" in text
+    assert f"Largest gain: {np.max(other - own):.2f} cmH2O" in text
+    # Differences of the two draws are both 1: what the draws share cancels.
+    assert "Over the 2 draws, paired: −1.00 [−1.00, −1.00] cmH2O" in text
+    given[1]["draws"]["sha256"] = "e" * 64
+    assert "paired" not in Page(report.html([best, robust], given)).text, "other draws"

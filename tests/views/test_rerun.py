@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -60,8 +61,9 @@ def test_values(
     entities: dict[str, dict[str, Any]], best: Trajectories, robust: Trajectories
 ) -> None:
     for i, lung in enumerate(best.lungs):
+        acting = np.arange(best.time.size) % protocol.BREATH_STEPS < protocol.INSPIRATION_STEPS
         for part, array in (
-            ("target", best.target),
+            ("target", np.where(acting, best.target, np.nan)),
             ("pressure", best.pressure),
             ("u_in", best.u_in),
             ("u_out", best.u_out),
@@ -130,3 +132,20 @@ def test_rerun_switched_off(
     with pytest.raises(InputError, match="variable RERUN"):
         write_rerun(tmp_path / "run.rrd", [best])
     assert not list(tmp_path.iterdir())
+
+
+def test_axes_of_the_overview(best: Trajectories, robust: Trajectories) -> None:
+    """u_in has one axis whatever the commands, and no time label falls on the edge."""
+    from ventbench.views import rerun_log
+
+    quiet = dataclasses.replace(best, u_in=best.u_in * 0.05)
+    for shown in ([best, robust], [quiet]):
+        ranges = {plot.quantity: plot.range for plot in rerun_log._plots(shown)}
+        low, high = ranges["u_in"] or (0.0, 0.0)
+        assert low < 0.0
+        assert protocol.U_MAX < high < 1.1 * protocol.U_MAX
+    end = protocol.BREATHS * protocol.BREATH_STEPS * protocol.DT
+    boundary = rerun_log._last_scored_breath().view_range
+    assert boundary is not None
+    seconds = boundary.as_arrow_array().to_pylist()[0]["end"] / 1e9
+    assert end - 0.3 < seconds < end - 0.05

@@ -68,7 +68,7 @@ def test_report_in_a_browser(
     assert "CONSOLE" not in log
     pixels = colors(picture)
     assert (pixels > 240).all(axis=1).mean() > 0.3, "light ground"
-    for color in ((0, 0x65, 0xB3), (0x80, 0x80, 0x80)):
+    for color in ((0, 0x65, 0xB3), (0xC8, 0x6A, 0x12)):
         assert (np.abs(pixels - color).max(axis=1) < 12).sum() > 1000, "each run is drawn"
 
 
@@ -122,7 +122,7 @@ def test_rerun_viewer(best: Trajectories, robust: Trajectories, tmp_path: Path) 
             except ConnectionError:  # it may end only now for want of a graphics driver
                 client = connect(experimental, command[-1], viewer, log)
         names = [view.name for view in views]
-        assert len(names) == 3 * 6 + 6 * 4 + 1
+        assert len(names) == 3 * 6 + 6 * 3 + 1
         assert all(not view.reports for view in views), "no view complains"
         time.sleep(3.0)
         picture = tmp_path / "view.png"

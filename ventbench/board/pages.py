@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-from ventbench import protocol
+from ventbench import palette, protocol
 from ventbench.board.ranking import Interval
 from ventbench.extras import require
 from ventbench.text import number, plain
@@ -52,7 +52,7 @@ def environment() -> jinja2.Environment:
         lstrip_blocks=True,
         finalize=_shown,
     )
-    style, script = (_asset(name) for name in ("board.css", "board.js"))
+    style, script = palette.css() + _asset("board.css"), _asset("board.js")
     made.globals.update(
         style=trusted(style),
         script=trusted(script),

@@ -16,12 +16,14 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from PIL import Image
 
-from ventbench import protocol
+from ventbench import palette, protocol
 from ventbench.lungs import lung as parse_lung
+from ventbench.palette import BAND, INK, QUIET
+from ventbench.palette import LINE as RULE
 from ventbench.text import number
 from ventbench.trajectories import Trajectories
-from ventbench.views import graphics, panels, scores
-from ventbench.views.runs import Floats, labels
+from ventbench.views import panels, scores
+from ventbench.views.runs import Floats, labels, shared_tracks
 
 #: Width, pixels.
 PIXELS = 1800
@@ -32,13 +34,14 @@ MARGIN, GAP, HEAD, ROW_HEAD = 14.0, 6.0, 50.0, 40.0
 #: Height of one row of the legend, panel units.
 LEGEND = 19.0
 
+#: Errors in one row over a panel, and height of such a row, panel units.
+ERRORS, ERROR_ROW = 4, 11.0
+
 #: The font that comes with matplotlib.
 FONT = "DejaVu Sans"
 
 #: Resolution, dots an inch.
 DPI = 150
-
-INK, QUIET, RULE, BAND = "#16191d", "#5b636d", "#d9dde2", "#eef1f4"
 
 
 def png(runs: Sequence[Trajectories]) -> bytes:
@@ -49,17 +52,18 @@ def png(runs: Sequence[Trajectories]) -> bytes:
     """
     columns, rows = len(runs[0].pips), len(runs[0].lungs)
     width = 2 * MARGIN + columns * panels.WIDTH + (columns - 1) * GAP
-    height = 2 * MARGIN + HEAD + len(runs) * LEGEND + rows * (ROW_HEAD + panels.HEIGHT)
+    row_head = ROW_HEAD + ERROR_ROW * (_error_rows(len(runs)) - 1)
+    height = 2 * MARGIN + HEAD + len(runs) * LEGEND + rows * (row_head + panels.HEIGHT)
     draw = Drawing(width, height, PIXELS)
     numbers, names = scores.collect(runs), [draw.known(name) for name in labels(runs)]
-    start = _head(draw, names, runs[0].track)
+    start = _head(draw, names, shared_tracks(runs))
     for i, row in enumerate(panels.panels(runs)):
-        top = start + i * (ROW_HEAD + panels.HEIGHT)
+        top = start + i * (row_head + panels.HEIGHT)
         _row_head(draw, row[0].lung, names, numbers.lungs[:, i], top)
         for j, panel in enumerate(row):
-            origin = (MARGIN + j * (panels.WIDTH + GAP), top + ROW_HEAD)
+            origin = (MARGIN + j * (panels.WIDTH + GAP), top + row_head)
             _panel(draw, panel, numbers.cells[:, i, j], origin, first=j == 0)
-    used = start + rows * (ROW_HEAD + panels.HEIGHT) + MARGIN
+    used = start + rows * (row_head + panels.HEIGHT) + MARGIN
     output = io.BytesIO()
     image = draw.image()
     # Room was kept for a legend of one row a run.
@@ -72,7 +76,7 @@ def png(runs: Sequence[Trajectories]) -> bytes:
 def _head(draw: Drawing, names: Sequence[str], track: str) -> float:
     """Title, how to read the panels, legend; returns where the panels may start."""
     draw.text(MARGIN, MARGIN + 14, names[0], 17, INK, weight="bold")
-    about = f"{draw.known(track)} track, protocol {protocol.VERSION}"
+    about = f"{draw.known(track)}, protocol {protocol.VERSION}"
     read = (
         f"Breath {panels.BREATH + 1} on each lung at each PIP. Above: airway pressure, cmH2O; "
         "below: u_in, %; against time, s. Band: scored. Numbers: mean absolute error, cmH2O."
@@ -91,14 +95,16 @@ def _head(draw: Drawing, names: Sequence[str], track: str) -> float:
 
 
 def _row_head(draw: Drawing, lung: str, names: Sequence[str], errors: Floats, top: float) -> None:
-    """Name of a lung on the left, its first two numbers on the right."""
+    """Name of a lung on the left, its errors on the right; without names where these are long."""
     about = parse_lung(lung)
     draw.text(MARGIN, top + 21, lung, 12, INK, weight="bold")
     text = f"R {about.R:g} cmH2O/(L/s), C {about.C:g} mL/cmH2O"
     draw.text(MARGIN + 70, top + 21, text, 10, QUIET)
     x = draw.width - MARGIN - 2
-    for k in reversed(range(min(2, len(names)))):
-        label = f"{names[k]} {number(errors[k])}"
+    shown = [f"{name} {number(error)}" for name, error in zip(names, errors, strict=True)]
+    if sum(draw.text_width(label, 10) + 14 for label in shown) > draw.width - 350.0:
+        shown = [number(error) for error in errors]
+    for k, label in reversed(list(enumerate(shown))):
         draw.text(x, top + 21, label, 10, _color(k), ha="right")
         x -= draw.text_width(label, 10) + 14
 
@@ -112,7 +118,7 @@ def _panel(
     end = float(panels.time_x(protocol.INSPIRATION_STEPS * protocol.DT))
     band = np.array([[left, panels.TOP], [end, panels.TOP], [end, bottom], [left, bottom]])
     draw.fill(at + band, BAND, 1.0)
-    marks = [*panel.ticks, (panel.valve_limit, panels.VALVE_TOP), (0.0, bottom)]
+    marks = [*panel.ticks, *((u, float(panels.valve_y(u))) for u in panels.VALVE_MARKS)]
     for value, y in marks:
         draw.line(at + np.array([[left, y], [right, y]]), RULE, 0.7, 0)
         draw.text(at[0] + left - 4, at[1] + y + 3, f"{value:g}", 8.5, QUIET, ha="right")
@@ -121,10 +127,13 @@ def _panel(
         text = f"{t:g}{' s' if last else ''}"
         draw.text(at[0] + x, at[1] + panels.HEIGHT - 3, text, 8.5, QUIET, ha="center")
     draw.text(at[0] + left, at[1] - 1, f"PIP {panel.pip:g}", 9, QUIET)
-    for k, error in enumerate(errors[:2]):
-        x = at[0] + right - (32 if len(errors) > 1 and k == 0 else 0)
+    for k, error in enumerate(errors):
+        line, place = divmod(k, ERRORS)
+        last = min(len(errors) - ERRORS * line, ERRORS) - 1
+        x = at[0] + right - 32 * (last - place)
+        y = at[1] - 1 - ERROR_ROW * (_error_rows(len(errors)) - 1 - line)
         look = {"weight": "bold"} if k == 0 else {}
-        draw.text(x, at[1] - 1, number(error), 9, _color(k), ha="right", **look)
+        draw.text(x, y, number(error), 9, _color(k), ha="right", **look)
     if first:
         draw.text(at[0] + right, at[1] + panels.TOP + 9, "cmH2O", 8.5, QUIET, ha="right")
         draw.text(at[0] + right, at[1] + panels.VALVE_TOP + 10, "u_in, %", 8.5, QUIET, ha="right")
@@ -157,8 +166,12 @@ def _inside(line: Floats) -> Floats:
     return np.stack([line[:, 0], np.clip(line[:, 1], *limits)], axis=-1)
 
 
+def _error_rows(runs: int) -> int:
+    return -(-runs // ERRORS)
+
+
 def _color(run: int) -> str:
-    return graphics.RUN_COLORS[graphics.run_index(run)]
+    return palette.RUNS[palette.run_index(run)]
 
 
 def _width(run: int) -> float:

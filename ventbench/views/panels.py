@@ -6,7 +6,6 @@ from its start to just after the target's fall. Lengths are in units of the pane
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,6 +19,9 @@ from ventbench.views.runs import Floats
 WIDTH, HEIGHT = 184.0, 150.0
 LEFT, TOP, PLOT_WIDTH, PRESSURE_HEIGHT = 25.0, 5.0, 156.0, 88.0
 VALVE_TOP, VALVE_HEIGHT = 102.0, 34.0
+
+#: Commands that are marked on the axis of u_in, %: the same in every panel.
+VALVE_MARKS = (0.0, 50.0, protocol.U_MAX)
 
 #: Times that are marked on the axis, s.
 TIMES = (0.0, 0.5, 1.0, 1.5)
@@ -43,7 +45,6 @@ class RunPanel:
         pressures: one polyline a run, shape ``(SHOWN + 1, 2)``; NaN where there is no finite
             pressure.
         valves: one polyline a run, u_in as a staircase, shape ``(2 * SHOWN + 1, 2)``.
-        valve_limit: top of the u_in axis, %.
         above: highest pressure of the first run if that is above the frame, cmH2O.
     """
 
@@ -53,7 +54,6 @@ class RunPanel:
     target: Floats
     pressures: tuple[Floats, ...]
     valves: tuple[Floats, ...]
-    valve_limit: float
     above: float | None
 
 
@@ -79,7 +79,7 @@ def _window() -> slice:
 
 
 def _column(runs: Sequence[Trajectories], j: int) -> list[RunPanel]:
-    pip, window, top = runs[0].pips[j], _window(), _valve_limit(runs, j)
+    pip, window = runs[0].pips[j], _window()
     x = time_x(np.arange(SHOWN + 1, dtype=np.float64) * protocol.DT)
     low, high = _limits([run.pressure[:, j, window] for run in runs], runs[0].target[:, j, window])
 
@@ -104,8 +104,7 @@ def _column(runs: Sequence[Trajectories], j: int) -> list[RunPanel]:
                 ticks=tuple((value, float(y(value))) for value in marks),
                 target=line(target),
                 pressures=tuple(line(pressure) for pressure in pressures),
-                valves=tuple(_stairs(x, run.u_in[i, j, window], top) for run in runs),
-                valve_limit=top,
+                valves=tuple(_stairs(x, run.u_in[i, j, window]) for run in runs),
                 above=highest if highest > high else None,
             )
         )
@@ -122,15 +121,12 @@ def _limits(pressures: Sequence[Floats], target: Floats) -> tuple[float, float]:
     return low - 0.08 * height, high + 0.08 * height
 
 
-def _valve_limit(runs: Sequence[Trajectories], j: int) -> float:
-    """Top of a column's u_in axes, %: the highest command, up to a multiple of 20."""
-    u_in = [run.u_in[:, j, _window()] for run in runs]
-    highest = max(float(np.max(u, initial=0.0, where=np.isfinite(u))) for u in u_in)
-    return min(max(20.0 * math.ceil(highest / 20.0), 20.0), protocol.U_MAX)
+def valve_y(u_in: Floats | float) -> Floats:
+    """Vertical position of a command, %, panel units."""
+    return VALVE_TOP + (1.0 - np.asarray(u_in) / protocol.U_MAX) * VALVE_HEIGHT
 
 
-def _stairs(x: Floats, u_in: Floats, top: float) -> Floats:
+def _stairs(x: Floats, u_in: Floats) -> Floats:
     """A command holds until the next step."""
-    share = np.where(np.isfinite(u_in), np.clip(u_in, 0.0, top), np.nan) / top
-    y = VALVE_TOP + (1.0 - share) * VALVE_HEIGHT
+    y = valve_y(np.where(np.isfinite(u_in), np.clip(u_in, 0.0, protocol.U_MAX), np.nan))
     return np.stack([np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]], axis=-1)

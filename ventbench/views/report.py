@@ -9,12 +9,16 @@ import jinja2
 import numpy as np
 
 import ventbench
-from ventbench import protocol
+from ventbench import palette, protocol
 from ventbench.lungs import lung as parse_lung
+from ventbench.metrics import bootstrap
 from ventbench.text import number
 from ventbench.trajectories import Trajectories
 from ventbench.views import graphics, panels, scores
-from ventbench.views.runs import Floats, labels
+from ventbench.views.runs import Floats, labels, shared_tracks
+
+#: Limits between the shades of differences, cmH2O, and how much colour each shade has, %.
+SHADE_LIMITS, SHADES = (0.02, 0.2, 0.7, 2.0), (12, 24, 38, 55)
 
 
 def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None = None) -> str:
@@ -39,11 +43,14 @@ def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None
     return environment.get_template("report.html.j2").render(
         title=names[0],
         names=names,
-        classes=[f"r{graphics.run_index(i)}" for i in range(len(runs))],
-        dashed=[i >= len(graphics.RUN_COLORS) for i in range(len(runs))],
-        light=graphics.RUN_COLORS,
-        dark=graphics.RUN_COLORS_DARK,
-        track=runs[0].track,
+        classes=[f"r{palette.run_index(i)}" for i in range(len(runs))],
+        dashed=[i >= len(palette.RUNS) for i in range(len(runs))],
+        colors=palette.css(),
+        run_colors=palette.RUNS,
+        shades=SHADES,
+        compared=[comparison(runs, names, numbers, k, given) for k in range(1, len(runs))],
+        version_of_protocol=(given or [{}])[0].get("protocol", protocol.VERSION),
+        heading=shared_tracks(runs),
         tracks=[run.track for run in runs],
         table=table(runs[0].lungs, numbers),
         draws=[scores.draws(score) for score in given or ()],
@@ -58,6 +65,67 @@ def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None
         failures=[scores.failures(score) for score in given or ()],
         version=ventbench.__version__,
     )
+
+
+def comparison(
+    runs: Sequence[Trajectories],
+    names: Sequence[str],
+    numbers: scores.Scores,
+    other: int,
+    given: Sequence[Mapping[str, Any]] | None = None,
+) -> dict[str, Any]:
+    """Where the first run is better than another one and where worse, cell by cell.
+
+    Args:
+        runs: matching runs.
+        names: their labels.
+        numbers: their scores.
+        other: index of the run to compare with.
+        given: score files in the order of the runs: the difference over their draws is paired.
+    """
+    difference = numbers.cells[0] - numbers.cells[other]
+    lungs = numbers.lungs[0] - numbers.lungs[other]
+    texts = {}
+    for key, value, at in (
+        ("best", np.nanmin(difference, initial=0.0), np.nanargmin),
+        ("worst", np.nanmax(difference, initial=0.0), np.nanargmax),
+    ):
+        if value != 0.0:
+            i, j = np.unravel_index(at(difference), difference.shape)
+            where = f"{runs[0].lungs[i]} at PIP {runs[0].pips[j]:g}"
+            texts[key] = f"{number(abs(value))} cmH2O, {where}"
+    drawn = scores.paired_draws(given[0], given[other]) if given is not None else None
+    return {
+        "name": names[other],
+        "lungs": int(np.sum(lungs < 0.0)),
+        "cells": int(np.sum(difference < 0.0)),
+        "best": texts.get("best", ""),
+        "worst": texts.get("worst", ""),
+        "draws": "" if drawn is None else _interval(drawn),
+        "count": 0 if drawn is None else drawn.count,
+        "rows": [
+            {
+                "name": lung,
+                "cells": [
+                    {"text": number(value, sign=True), "shade": _shade(value)} for value in row
+                ],
+                "mean": number(mean, sign=True),
+            }
+            for lung, row, mean in zip(runs[0].lungs, difference, lungs, strict=True)
+        ],
+    }
+
+
+def _interval(summary: bootstrap.Summary) -> str:
+    low, high = summary.ci95
+    return (
+        f"{number(summary.mean, sign=True)} [{number(low, sign=True)}, {number(high, sign=True)}]"
+    )
+
+
+def _shade(difference: float) -> str:
+    step = int(np.searchsorted(SHADE_LIMITS, abs(difference)))
+    return f"{'b' if difference < 0.0 else 'w'}{step}" if step and np.isfinite(difference) else ""
 
 
 def table(lungs: Sequence[str], numbers: scores.Scores) -> list[dict[str, Any]]:
@@ -96,6 +164,7 @@ def frame() -> dict[str, Any]:
         "scored_end": round(end, 1),
         "valve_top": panels.VALVE_TOP,
         "valve_bottom": panels.VALVE_TOP + panels.VALVE_HEIGHT,
+        "commands": [(f"{u:g}", round(float(panels.valve_y(u)), 1)) for u in panels.VALVE_MARKS],
         "times": [(f"{t:g}", round(float(panels.time_x(t)), 1)) for t in panels.TIMES],
     }
 
@@ -117,7 +186,6 @@ def _panel(panel: panels.RunPanel, names: Sequence[str], errors: Floats) -> dict
         "pressures": [graphics.path(line) for line in panel.pressures],
         "scored": [graphics.path(panels.inspiration(line)) for line in panel.pressures],
         "valves": [graphics.path(line) for line in panel.valves],
-        "valve_limit": f"{panel.valve_limit:g}",
         "above": None if panel.above is None else f"{panel.above:.0f}",
     }
 

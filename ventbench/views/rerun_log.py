@@ -18,13 +18,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 import ventbench
-from ventbench import protocol
+from ventbench import palette, protocol
 from ventbench.errors import InputError
 from ventbench.lungs import lung as parse_lung
 from ventbench.text import escape_markdown, number
 from ventbench.trajectories import Trajectories
-from ventbench.views import graphics
-from ventbench.views.runs import Floats, distinct, errors, labels, scored
+from ventbench.views.runs import STEPS, Floats, distinct, errors, labels, scored, shared_tracks
 
 APPLICATION = "ventbench"
 
@@ -102,24 +101,28 @@ def log_about(stream: rr.RecordingStream, runs: Sequence[Trajectories], names: l
 
 
 def log_target(stream: rr.RecordingStream, run: Trajectories) -> None:
-    """Target pressure of every lung, one line a PIP."""
+    """Target pressure of every lung while a controller acts: a level line for each PIP.
+
+    The falls to PEEP are left out: six of them from six pressures to one hide what is measured.
+    """
     series = ["target, cmH2O"] * len(run.pips)
+    phase = np.arange(STEPS) % protocol.BREATH_STEPS
+    acting = phase < protocol.INSPIRATION_STEPS
     for lung, values in zip(run.lungs, run.target, strict=True):
-        _send(stream, f"/{lung}/target", run.time, values, series, [graphics.TARGET_COLOR], 1.0)
+        level = np.where(acting, values, np.nan)
+        _send(stream, f"/{lung}/target", run.time, level, series, [palette.TARGET], 1.0)
 
 
 def log_scored(stream: rr.RecordingStream, run: Trajectories) -> None:
     """A bar along the bottom of every plot where the run is scored."""
     bar = np.where(scored(), 0.0, np.nan)[None]
     for lung in run.lungs:
-        _send(
-            stream, f"/{lung}/scored", run.time, bar, ["scored part"], [graphics.SCORED_COLOR], 6.0
-        )
+        _send(stream, f"/{lung}/scored", run.time, bar, ["scored part"], [palette.SCORED], 6.0)
 
 
 def log_run(stream: rr.RecordingStream, run: Trajectories) -> None:
     """Pressure, valves and error of every lung, one line a PIP in that PIP's colour."""
-    colors = [graphics.pip_color(j) for j in range(len(run.pips))]
+    colors = [palette.PIPS[j % len(palette.PIPS)] for j in range(len(run.pips))]
     for quantity, unit, array in _quantities(run):
         series = [f"PIP {pip:g}, {unit}" for pip in run.pips]
         for lung, values in zip(run.lungs, array, strict=True):
@@ -128,7 +131,7 @@ def log_run(stream: rr.RecordingStream, run: Trajectories) -> None:
 
 def log_reference(stream: rr.RecordingStream, run: Trajectories, name: str, index: int) -> None:
     """Pressure, valves and error of a run to compare with: thin, one colour, under its name."""
-    colors = [graphics.REFERENCE_COLORS[index % len(graphics.REFERENCE_COLORS)]]
+    colors = [palette.REFERENCES[index % len(palette.REFERENCES)]]
     for quantity, unit, array in _quantities(run):
         series = [f"{name}, {unit}"] * len(run.pips)
         for lung, values in zip(run.lungs, array, strict=True):
@@ -157,7 +160,7 @@ def _send(
     """Style once, values in bulk; ``values`` has shape ``(series, T)``."""
     n = len(series)
     look = rr.SeriesLines(
-        colors=[graphics.rgb(colors[i % len(colors)]) for i in range(n)],
+        colors=[palette.rgb(colors[i % len(colors)]) for i in range(n)],
         widths=[width] * n,
         names=series,
         # A valve holds its command until the next step.
@@ -172,15 +175,18 @@ def _send(
 
 
 def _plots(runs: Sequence[Trajectories]) -> tuple[Plot, ...]:
-    """Pressure, u_in, error and u_out, on axes that hold all runs."""
+    """Pressure, u_in and error, on axes that hold all runs.
+
+    The expiratory valve is logged but not shown: no controller moves it. Its room goes to u_in,
+    whose axis else has one mark.
+    """
     highest = _top([x for run in runs for x in (run.pressure, run.target)])
     pressure = min(1.06 * highest, 2.0 * protocol.SAFETY_PRESSURE)
-    u_in = max(10.0, min(1.06 * _top([run.u_in for run in runs]), 1.06 * protocol.U_MAX))
+    u_in = 1.06 * protocol.U_MAX
     return (
         Plot("pressure", "airway pressure, cmH2O", (-0.05 * pressure, pressure), 4.0),
-        Plot("u_in", "inspiratory valve u_in, %", (-0.06 * u_in, u_in), 2.2),
+        Plot("u_in", "inspiratory valve u_in, %", (-0.06 * u_in, u_in), 3.6),
         Plot("error", "error = pressure - target, cmH2O", None, 2.2),
-        Plot("u_out", "expiratory valve u_out, 1 open", (-0.1, 1.1), 1.3),
     )
 
 
@@ -194,16 +200,16 @@ def blueprint(runs: Sequence[Trajectories], names: Sequence[str], tab: int = 0) 
     """
     lungs = runs[0].lungs
     columns = len({parse_lung(lung).C for lung in lungs})
-    *overview, u_out = _plots(runs)
+    plots = _plots(runs)
     grids = [
         rrb.Grid(
             *(_view(lung, plot, _last_scored_breath(), legend=lung == lungs[-1]) for lung in lungs),
             grid_columns=columns,
             name=f"All lungs: {plot.quantity}",
         )
-        for plot in overview
+        for plot in plots
     ]
-    details = [_lung_tab(lung, (*overview, u_out), names[1:]) for lung in lungs]
+    details = [_lung_tab(lung, plots, names[1:]) for lung in lungs]
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Tabs(*grids, *details, active_tab=tab, name="Run"),
@@ -256,12 +262,17 @@ def _view(
 
 
 def _last_scored_breath() -> rrb.TimeAxis:
-    """One breath: over more time, small plots lose the labels of their time axes."""
+    """One breath: over more time, small plots lose the labels of their time axes.
+
+    It ends before the next full second, whose label would be cut at the edge.
+    """
     breath = protocol.BREATH_STEPS * protocol.DT
     start = max(protocol.SCORED_BREATHS) * breath
     at = rr.TimeRangeBoundary.absolute
     return rrb.TimeAxis(
-        view_range=rr.TimeRange(start=at(seconds=start - 0.15), end=at(seconds=start + breath))
+        view_range=rr.TimeRange(
+            start=at(seconds=start - 0.15), end=at(seconds=start + breath - 0.1)
+        )
     )
 
 
@@ -279,13 +290,12 @@ def markdown(runs: Sequence[Trajectories], names: Sequence[str]) -> str:
     """
     given, names = names, [escape_markdown(name) for name in names]
     first, last = min(protocol.SCORED_BREATHS) + 1, max(protocol.SCORED_BREATHS) + 1
-    track = runs[0].track if runs[0].track in ("performance", "robustness") else "unknown"
     breath = protocol.BREATH_STEPS * protocol.DT
     compared = f"- **thin lines** in a lung's tab: {', '.join(names[1:])}\n" if names[1:] else ""
     lines = [
         f"# {names[0]}",
         "",
-        f"{track} track, protocol {protocol.VERSION}",
+        f"{escape_markdown(shared_tracks(runs))}, protocol {protocol.VERSION}",
         "",
         "## Score, cmH2O",
         "",
@@ -297,14 +307,15 @@ def markdown(runs: Sequence[Trajectories], names: Sequence[str]) -> str:
         "## What you see",
         "",
         f"- **one colour a PIP**, {min(runs[0].pips):g} to {max(runs[0].pips):g} cmH2O",
-        "- **thin grey**: target",
+        "- **thin grey**: target, while the controller acts",
         f"{compared}- **green bar** at the bottom: scored part",
         "",
         f"**All lungs**: one plot a lung, breath {last}. "
         "R is resistance, cmH2O/(L/s); C compliance, mL/cmH2O.",
         "",
         f"**A lung's tab**: the whole run, {protocol.BREATHS} breaths of {breath:g} s, with "
-        "pressure, valves and error above each other.",
+        "pressure, u_in and error above each other. The expiratory valve is the same for all runs: "
+        "closed in the inspiration; its data are in `u_out`.",
         "",
         "The time axis is seconds since the run began. Hover to read values, drag to move, "
         "Ctrl + scroll to zoom, double-click to reset, click a legend entry to hide it.",

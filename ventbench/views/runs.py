@@ -86,6 +86,12 @@ def distinct(names: Sequence[str]) -> list[str]:
     return seen
 
 
+def shared_tracks(runs: Sequence[Trajectories]) -> str:
+    """Name the track of runs, or the tracks: ``performance and robustness tracks``."""
+    tracks = list(dict.fromkeys(run.track for run in runs))
+    return f"{' and '.join(tracks)} {'track' if len(tracks) == 1 else 'tracks'}"
+
+
 def scored() -> NDArray[np.bool_]:
     """Scored steps of a run: inspirations of the scored breaths, shape ``(T,)``."""
     breath, phase = np.divmod(np.arange(STEPS), protocol.BREATH_STEPS)

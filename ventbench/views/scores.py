@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ventbench.errors import InputError
+from ventbench.metrics import bootstrap
 from ventbench.text import number
 from ventbench.trajectories import Trajectories
 from ventbench.views.runs import Floats, errors
@@ -71,6 +72,22 @@ def draws(score: Mapping[str, Any]) -> str:
         return number(mean)
     low, high = (number(_number(name, limit)) for limit in limits)
     return f"{number(mean)} [{low}, {high}]"
+
+
+def paired_draws(own: Mapping[str, Any], other: Mapping[str, Any]) -> bootstrap.Summary | None:
+    """Compare two scores draw by draw; None unless both have the same draws without a failure."""
+    first, second = own.get("draws"), other.get("draws")
+    if not (isinstance(first, Mapping) and isinstance(second, Mapping)):
+        return None
+    own_values = ("score", "ci95", "values")
+    about = [{k: v for k, v in draws.items() if k not in own_values} for draws in (first, second)]
+    if about[0] != about[1]:
+        return None
+    values = [draws.get("values") or () for draws in (first, second)]
+    if len(values[0]) != len(values[1]) or None in (*values[0], *values[1]) or not len(values[0]):
+        return None
+    # What the draws have in common cancels.
+    return bootstrap.summary(np.subtract(*np.array(values, dtype=np.float64)))
 
 
 def failures(score: Mapping[str, Any]) -> list[str]:

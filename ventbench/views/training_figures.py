@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.extras import require
-from ventbench.views.graphics import RUN_COLORS
+from ventbench.palette import RUNS
 
 if TYPE_CHECKING:
     from ventbench.training.pid_grid import PIDGrid
@@ -33,9 +33,7 @@ CURVE_LABELS = {
     "dqn": "DQN",
 }
 
-_CURVE_COLORS = dict(
-    zip(CURVE_LABELS, (RUN_COLORS[0], RUN_COLORS[4], RUN_COLORS[2], RUN_COLORS[3]), strict=True)
-)
+_CURVE_COLORS = dict(zip(CURVE_LABELS, (RUNS[0], RUNS[3], RUNS[1], RUNS[2]), strict=True))
 
 
 def gain_map_png(grid: PIDGrid, *, each: bool = True, single: bool = True) -> bytes:

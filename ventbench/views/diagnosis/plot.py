@@ -6,17 +6,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ventbench import palette
 from ventbench.diagnosis import report_text
 from ventbench.diagnosis.result import Diagnosis
-from ventbench.views import graphics
 from ventbench.views.diagnosis.charts import STAGES, worst
 
 #: Colours of the recording and of the three simulators, on white.
 _COLORS = {
-    "recorded": "#16191d",
-    "before": graphics.RUN_COLORS[1],
-    "refit": graphics.RUN_COLORS[2],
-    "after": graphics.RUN_COLORS[0],
+    "recorded": palette.INK,
+    "before": palette.GREY,
+    "refit": palette.RUNS[1],
+    "after": palette.RUNS[0],
 }
 
 #: Breaths that are drawn at most.

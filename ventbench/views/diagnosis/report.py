@@ -9,12 +9,13 @@ import numpy as np
 from markupsafe import Markup
 
 import ventbench
+from ventbench import palette
 from ventbench.diagnosis import report_text
 from ventbench.diagnosis.findings import ErrorRegion, MissingMechanism, OpenLoopError
 from ventbench.diagnosis.result import RECORD_NEXT, Diagnosis
 from ventbench.physics import Physics, mechanism
 from ventbench.physics.characteristics import characteristic
-from ventbench.views import graphics, mathml
+from ventbench.views import mathml
 from ventbench.views.diagnosis import charts, diagram
 
 #: Places that are told in words; the charts show all.
@@ -47,8 +48,8 @@ def html(diagnosis: Diagnosis) -> str:
         ],
         commands_file=RECORD_NEXT,
         plant=diagnosis.simulator,
-        light=graphics.RUN_COLORS,
-        dark=graphics.RUN_COLORS_DARK,
+        light=(palette.RUNS[0], palette.GREY, *palette.RUNS[1:]),
+        dark=(palette.RUNS_DARK[0], palette.GREY_DARK, *palette.RUNS_DARK[1:]),
         mechanisms=[_named(diagnosis, missing) for missing in diagnosis.mechanisms],
         alternatives=report_text.alternatives(diagnosis),
         bars=bars(diagnosis),

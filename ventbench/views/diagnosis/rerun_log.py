@@ -10,11 +10,11 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from ventbench import palette
 from ventbench.diagnosis import report_text
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.errors import InputError
 from ventbench.text import escape_markdown
-from ventbench.views import graphics
 from ventbench.views.diagnosis.charts import STAGES, rmse
 from ventbench.views.runs import Floats
 
@@ -22,10 +22,10 @@ APPLICATION = "ventbench"
 
 #: Colours of the three simulators, and of the recording, on dark and light ground.
 COLORS = {
-    "before": graphics.TARGET_COLOR,
-    "refit": graphics.PIP_COLORS[5],
-    "after": graphics.PIP_COLORS[1],
-    "recorded": graphics.PIP_COLORS[2],
+    "before": palette.TARGET,
+    "refit": palette.PIPS[5],
+    "after": palette.PIPS[1],
+    "recorded": palette.PIPS[2],
 }
 
 #: Pixels of a map for each sample and breath.
@@ -108,7 +108,7 @@ def log_lung(
 
     def send(entity: str, values: Floats, name: str, color: str, width: float) -> None:
         look = rr.SeriesLines(
-            colors=[graphics.rgb(color)],
+            colors=[palette.rgb(color)],
             widths=[width],
             names=[name],
             interpolation_mode="StepAfter" if entity.startswith("u_") else "Linear",
@@ -125,10 +125,10 @@ def log_lung(
         simulated = getattr(traces, key)[index]
         send(f"pressure/{key}", simulated, text, COLORS[key], 1.5)
         send(f"error/{key}", breaths.pressure - simulated, text, COLORS[key], 1.5)
-    send("u_in", breaths.u_in, "u_in, %", graphics.PIP_COLORS[4], 1.5)
-    send("u_out", np.asarray(breaths.u_out, float), "u_out, 1 open", graphics.PIP_COLORS[0], 1.5)
+    send("u_in", breaths.u_in, "u_in, %", palette.PIPS[4], 1.5)
+    send("u_out", np.asarray(breaths.u_out, float), "u_out, 1 open", palette.PIPS[0], 1.5)
     held = np.where(traces.held_out[index][:, None] & breaths.valid, 0.0, np.nan)
-    send("held_out", held, "held out of every fit", graphics.REFERENCE_COLORS[0], 6.0)
+    send("held_out", held, "held out of every fit", palette.REFERENCES[0], 6.0)
 
 
 def log_by_breath(stream: rr.RecordingStream, diagnosis: Diagnosis) -> None:
@@ -136,7 +136,7 @@ def log_by_breath(stream: rr.RecordingStream, diagnosis: Diagnosis) -> None:
     number = np.arange(1, len(diagnosis.traces.breaths) + 1)
     for key, _, _ in _stages(diagnosis):
         values = np.nan_to_num(rmse(diagnosis.traces, getattr(diagnosis.traces, key)))
-        bars = rr.BarChart(values, color=graphics.rgb(COLORS[key]), abscissa=number)
+        bars = rr.BarChart(values, color=palette.rgb(COLORS[key]), abscissa=number)
         stream.log(f"/by_breath/{key}", bars, static=True)
 
 
@@ -157,7 +157,7 @@ def log_maps(stream: rr.RecordingStream, diagnosis: Diagnosis) -> None:
 def diverging(share: Floats) -> np.ndarray:
     """Blue below zero, white at zero, red above; grey where unknown, uint8 ``(..., 3)``."""
     known = np.clip(np.nan_to_num(share), -1.0, 1.0)[..., None]
-    red, blue = np.array(graphics.rgb("#c4370a")), np.array(graphics.rgb("#0065b3"))
+    red, blue = np.array(palette.rgb("#c4370a")), np.array(palette.rgb("#0065b3"))
     end = np.where(known > 0, red, blue)
     color = 255.0 + np.abs(known) * (end - 255.0)
     return np.where(np.isfinite(share)[..., None], color, 128.0).round().astype(np.uint8)

@@ -10,11 +10,25 @@ import numpy as np
 import pytest
 
 from ventbench import protocol, rig_draws, seasons
-from ventbench.board import build, canonical, create, frames, ranking, record, store, verify
+from ventbench.board import (
+    build,
+    canonical,
+    create,
+    frames,
+    ranking,
+    record,
+    rerun,
+    store,
+    stress_table,
+    verify,
+)
 from ventbench.board.replay import differences, draws_of, replay
 from ventbench.errors import InputError
 from ventbench.headroom import reference as references
 from ventbench.plants import frozen
+from ventbench.stress.results import DRAWS, pip_columns
+from ventbench.stress.score import StressScore
+from ventbench.stress.stressors import conditions
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.rig_scoring import run_on_rigs
 
@@ -50,10 +64,47 @@ def score(rigs, reference):
 
 
 @pytest.fixture(scope="module")
-def draft(rigs, score, tmp_path_factory):
+def stressed():
+    """Make a stress score of a submission: errors of a level, and noise that all share."""
+
+    def make(score, level, noise=0.0):
+        chosen, drawn = conditions(), score.rig_draws
+        shape = (len(chosen), 6, DRAWS)
+        random = np.random.default_rng(4)
+        error = level + random.uniform(0.0, 1.0, shape)
+        apart = np.random.default_rng(5).normal(size=shape[1:])
+        error += noise * (apart - apart.mean())
+        commands = np.full((*shape, protocol.BREATHS, protocol.INSPIRATION_STEPS), level)
+        return StressScore(
+            conditions=chosen,
+            lungs=score.lungs,
+            pips=np.array(protocol.PIPS)[pip_columns(6, DRAWS)],
+            rig=drawn.rig[:, :DRAWS],
+            member=drawn.member[:, :DRAWS],
+            error=error,
+            safe=np.ones(shape, bool),
+            survived=error < 1.8,
+            alarm_s=0.1 * error,
+            peak=30.0 + error,
+            volume=400.0 + error,
+            submission=score.submission,
+            drawn=drawn,
+            plateau_error=error,
+            requested=commands,
+            failures={},
+            sandbox=SANDBOX,
+            simulators=None,
+            timing={},
+        )
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def draft(rigs, score, stressed, tmp_path_factory):
     """Make a record: the commands of the PID times a factor on some draws, under any name."""
 
-    def make(name, factor=1.0, draws=slice(None)):
+    def make(name, factor=1.0, draws=slice(None), stress=None):
         folder = entry_folder(tmp_path_factory.mktemp("rig") / name, "pid_robust", name)
         manifest = dataclasses.replace(score.submission.manifest, name=name)
         entry = dataclasses.replace(
@@ -68,7 +119,8 @@ def draft(rigs, score, tmp_path_factory):
             drawn=found.drawn, safe=found.safe, peak=found.peak.max(axis=(0, 2)),
             controllable=np.moveaxis(np.asarray(found.controllable), 0, 1),
         )  # fmt: skip
-        return create.create(varied, rigs, now=NOW)
+        own = None if stress is None else stressed(varied, *stress)
+        return create.create(varied, rigs, stress=own, now=NOW)
 
     return make
 
@@ -76,10 +128,10 @@ def draft(rigs, score, tmp_path_factory):
 @pytest.fixture(scope="module")
 def drafts(draft):
     return {
-        "pid_robust": draft("pid_robust"),
-        "softer": draft("softer", 0.8),
+        "pid_robust": draft("pid_robust", stress=(2.0,)),
+        "softer": draft("softer", 0.8, stress=(1.0,)),
         # Better than the PID in some draws and worse in the others.
-        "uneven": draft("uneven", 0.97, slice(1, 11)),
+        "uneven": draft("uneven", 0.97, slice(1, 11), stress=(1.02, 0.2)),
         "zero": draft("zero", 0.0),
     }
 
@@ -133,22 +185,102 @@ def test_schema_names_what_is_wrong(drafts, change, message):
         opened(made)
 
 
-def test_entries_that_cannot_be_told_apart_share_a_rank(board):
+def test_a_rank_counts_the_entries_that_are_better_beyond_doubt(board):
     (track,) = (x for x in frames.load_tracks(board, version=2) if x.name == "robustness")
-    ranks = {row.record.name: row.rank for row in track.ranked}
-    rows = {row.record.name: row for row in track.ranked}
     records = [row.record for row in track.ranked]
     means = ranking._resampled(records, [r.ranked_values for r in records])
-    for i, one in enumerate(records):
-        for j, other in enumerate(records):
-            low, high = np.quantile(means[i] - means[j], (0.025, 0.975))
-            if low <= 0.0 <= high:
-                assert ranks[one.name] == ranks[other.name]
-    assert ranks["zero"] == 4
-    assert len(set(ranks.values())) > 1
+    for row, own in zip(track.ranked, means, strict=True):
+        limits = [np.quantile(own - other, (0.025, 0.975)) for other in means]
+        better = sum(low > 1e-9 for low, _ in limits)
+        worse = sum(high < -1e-9 for _, high in limits)
+        assert row.ranks == (1 + better, 4 - worse)
+        assert row.rank == row.ranks[0]
+    assert track.ranked[-1].record.name == "zero"
+    assert track.ranked[-1].ranks == (4, 4)
+    rows = {row.record.name: row for row in track.ranked}
     own = rows["pid_robust"].normalised
     assert own is not None
     assert own.score.value == pytest.approx(100.0)
+
+
+def test_ranks_that_are_not_transitive():
+    """The middle one is told from neither end, the ends from each other."""
+    spread = np.linspace(-1.0, 1.0, 2001)
+    means = np.stack([0.0 * spread, 0.7 + spread, 1.4 + 0.0 * spread])
+    assert ranking.rank_ranges(means) == [(1, 2), (1, 3), (2, 3)]
+
+
+def test_stress_is_ranked_and_shown(board):
+    (track,) = (x for x in frames.load_tracks(board, version=2) if x.name == "robustness")
+    rows = stress_table.rows(track)
+    assert [row.name for row in rows] == ["softer", "uneven", "pid_robust"]
+    # Two differ by one number in all runs, the third only in noise.
+    assert [row.ranks for row in rows] == [(1, 2), (1, 2), (3, 3)]
+    assert rows[0].score is not None
+    assert rows[0].score.value == pytest.approx(rows[0].tables.error[1:].mean())
+    groups = stress_table.chart(rows)
+    fields = [field for group in groups for row in group["rows"] for field in row["fields"]]
+    assert sum(field is not None for field in fields) == 3 * (len(conditions()) - 1)
+    page = (board / "index.html").read_text()
+    assert "Stressor by severity" in page
+    for row in rows:
+        own = (board / f"entries/v2/robustness/{row.name}.html").read_text()
+        assert f"{row.score.value:.2f}" in own
+        assert f"{row.score.value:.2f}" in page
+    assert "Stressor" not in (board / "entries/v2/robustness/zero.html").read_text()
+    table = frames.load_board(board, track="robustness").set_index("name")
+    assert table.stress_cmH2O["softer"] == pytest.approx(rows[0].score.value)
+    assert np.isnan(table.stress_cmH2O["zero"])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda v: v.update(track="performance"),
+            "key track: the submission does not enter|stress",
+        ),
+        (lambda v: v["stress"]["conditions"].pop(), "key stress.errors: does not have the shape"),
+        (lambda v: v["stress"]["conditions"].reverse(), "conditions: must begin with none"),
+        (lambda v: v["stress"]["conditions"].__setitem__(3, "flood:mild"), "no condition of the"),
+        (lambda v: v["stress"]["pips"][0].reverse(), "does not have all conditions and draws"),
+        (lambda v: v["stress"]["volume_mL"][0].pop(), "key stress.volume_mL: does not have"),
+        (lambda v: v["stress"]["safe"][1][0].__setitem__(0, False), "was not safe has survived"),
+    ],
+)
+def test_stress_tables_are_checked(drafts, change, message):
+    value = json.loads(drafts["softer"].content)
+    change(value)
+    made = dataclasses.replace(drafts["softer"], content=canonical.canonical(value))
+    with pytest.raises(InputError, match=message):
+        opened(made)
+
+
+def test_a_second_stress_run_is_compared(drafts, stressed, score):
+    recorded = opened(drafts["softer"]).stress
+    assert recorded is not None
+    again = stressed(score, 1.0)
+    assert rerun.stress_difference(recorded, again) == ""
+    other = dataclasses.replace(again, requested=again.requested + 1e-12)
+    assert "commands have SHA-256" in rerun.stress_difference(recorded, other)
+    for key, text in (("error", "stress.errors"), ("volume", "stress.volume_mL")):
+        moved = dataclasses.replace(again, **{key: getattr(again, key) + 2.0})
+        assert rerun.stress_difference(recorded, moved).startswith(text)
+    newer = dataclasses.replace(recorded, stressors=recorded.stressors + 1)
+    assert "stressors are version" in rerun.stress_difference(newer, again)
+
+
+def test_a_record_takes_no_stress_score_of_another_submission(rigs, score, stressed):
+    stress = stressed(score, 1.0)
+    entry = dataclasses.replace(stress.submission, sha256="0" * 64)
+    with pytest.raises(InputError, match="changed between"):
+        create.create(score, rigs, stress=dataclasses.replace(stress, submission=entry))
+    few = dataclasses.replace(stress, conditions=stress.conditions[:5], error=stress.error[:5])
+    with pytest.raises(InputError, match="all conditions and draws"):
+        create.create(score, rigs, stress=few)
+    home = dataclasses.replace(stress, sandbox=None)
+    with pytest.raises(InputError, match="full sandbox"):
+        create.create(score, rigs, stress=home)
 
 
 def test_everything_verifies(board, rigs, reference, monkeypatch):

@@ -58,7 +58,8 @@ def test_the_plateau_may_be_off_by_2_cmH2O_and_4_percent(draws: StressDraws) -> 
 def test_an_interval_needs_two_draws_and_holds_the_mean(score: StressScore) -> None:
     assert all(math.isnan(x) for x in score.interval(score.error[0]))
     cells = draw_cells(load_rigs(), 6)
-    six = dataclasses.replace(score, drawn=cells.drawn, pips=cells.nominal_pip)
+    drawn = {"rig": cells.drawn.rig, "member": cells.drawn.member, "pips": cells.nominal_pip}
+    six = dataclasses.replace(score, **drawn)
     lung, noise = np.arange(6.0)[:, None], np.random.default_rng(0).normal(size=(6, 6))
     low, high = six.interval(lung + 0.1 * cells.nominal_pip)
     assert high - low < 1e-9  # lungs and PIPs are no chance
@@ -71,7 +72,8 @@ def test_an_interval_needs_two_draws_and_holds_the_mean(score: StressScore) -> N
 def test_a_difference_is_paired(score: StressScore) -> None:
     cells = draw_cells(load_rigs(), 6)
     error = np.random.default_rng(1).uniform(1.0, 9.0, (len(score.conditions), 6, 6))
-    one = dataclasses.replace(score, drawn=cells.drawn, pips=cells.nominal_pip, error=error)
+    drawn = {"rig": cells.drawn.rig, "member": cells.drawn.member, "pips": cells.nominal_pip}
+    one = dataclasses.replace(score, **drawn, error=error)
     two = dataclasses.replace(one, error=error + 0.25)
     difference, (low, high) = two.difference(one)
     assert (difference, low, high) == pytest.approx((0.25, 0.25, 0.25))

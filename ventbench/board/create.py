@@ -26,6 +26,8 @@ from ventbench.board import actions, canonical, record, schema
 from ventbench.board.hardware import HardwareRecord
 from ventbench.board.replay import TRACE_BREATH, Replayed, ReplayPlants, differences, replay
 from ventbench.errors import InputError
+from ventbench.stress import stressors
+from ventbench.stress.score import StressScore
 from ventbench.submissions.folder import combined_hash, file_hashes
 from ventbench.submissions.result import CellFailure, Score
 
@@ -67,6 +69,7 @@ def create(
     score: Score,
     simulators: ReplayPlants,
     *,
+    stress: StressScore | None = None,
     official: bool = True,
     source: Mapping[str, Any] | None = None,
     supersedes: str | None = None,
@@ -78,6 +81,7 @@ def create(
     Args:
         score: over all lungs, PIPs and published draws.
         simulators: that it was scored on.
+        stress: the same submission on the stress track, for a record of the robustness track.
         official: whether to call it so if its sandbox allows that.
         source: where the submission came from, such as commit and pull request.
         supersedes: SHA-256 of the record that this one corrects.
@@ -120,6 +124,7 @@ def create(
         "simulators": dict(simulators.about()),
         "draws": draws.about() if score.rig_draws is None else score.rig_draws.about(),
         **_on_rigs(score),
+        **_stressed(score, stress),
         "lungs": list(score.lungs),
         "pips": list(score.pips),
         "errors": {"nominal": _plain(score.nominal), "drawn": _plain(score.drawn)},
@@ -179,13 +184,55 @@ def _on_rigs(score: Score) -> dict[str, Any]:
     }
 
 
-def keep(folder: Path, scores: Sequence[Score], simulators: ReplayPlants) -> list[Path]:
+def _stressed(score: Score, stress: StressScore | None) -> dict[str, Any]:
+    """What the stress track adds to a record."""
+    if stress is None:
+        return {}
+    label = score.submission.label
+    if stress.submission.sha256 != score.submission.sha256:
+        raise InputError(f"{label} was changed between its score and its stress score")
+    if score.rig_draws is None or (
+        stress.drawn.about() | {"count": 0} != score.rig_draws.about() | {"count": 0}
+    ):
+        raise InputError(f"{label}: score and stress score are of different draws")
+    if not stress.complete:
+        raise InputError(f"{label}: a record needs all conditions and draws of the stress track")
+    if score.official and (stress.sandbox or {}).get("official") is not True:
+        raise InputError(f"{label}: the stress score was not made in the full sandbox")
+    return {
+        "stress": {
+            "stressors": stressors.VERSION,
+            "conditions": [condition.id for condition in stress.conditions],
+            "pips": stress.pips.tolist(),
+            "errors": _plain(stress.error),
+            "safe": stress.safe.tolist(),
+            "survived": stress.survived.tolist(),
+            "above_alarm_ms": np.round(1e3 * stress.alarm_s).astype(int).tolist(),
+            "peak_centi_cmH2O": np.round(100.0 * stress.peak).astype(int).tolist(),
+            "volume_mL": np.round(stress.volume).astype(int).tolist(),
+            "commands_sha256": stress_digest(stress.requested),
+        }
+    }
+
+
+def stress_digest(requested: NDArray[np.float64]) -> str:
+    """SHA-256 of the commands of the stress track."""
+    return canonical.digest(np.ascontiguousarray(requested, "<f8").tobytes())
+
+
+def keep(
+    folder: Path,
+    scores: Sequence[Score],
+    simulators: ReplayPlants,
+    stress: Mapping[str, StressScore] | None = None,
+) -> list[Path]:
     """Write the records of some scores.
 
     Args:
         folder: for records and commands.
         scores: over all lungs, PIPs and published draws.
         simulators: that they were scored on.
+        stress: stress scores by the name of the submission, for records of the robustness track.
 
     Returns:
         Paths of the records, for ``ventbench board add``.
@@ -193,7 +240,12 @@ def keep(folder: Path, scores: Sequence[Score], simulators: ReplayPlants) -> lis
     Raises:
         InputError: as of :func:`create`; nothing has then been written.
     """
-    drafts = [create(score, simulators) for score in scores]
+    stressed = {
+        score: (stress or {}).get(score.submission.manifest.name)
+        for score in scores
+        if score.track == "robustness"
+    }
+    drafts = [create(score, simulators, stress=stressed.get(score)) for score in scores]
     return [draft.save(folder) for draft in drafts]
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ventbench import protocol
-from ventbench.board import hardware_table, pages, plots
+from ventbench.board import hardware_table, pages, plots, stress_table
 from ventbench.board.hardware_table import HardwareRow
 from ventbench.board.ranking import BASELINES, Row, Track
 from ventbench.board.record import Record
@@ -31,6 +31,7 @@ def render_all(
     template = environment.get_template("entry.html.j2")
     base = track.baseline
     other = None if base is None else plots.paths(base)
+    stressed = stress_table.rows(track)
     made = {}
     for status, row in track.rows:
         path = pages.entry_path(track.version, track.name, row.record.name)
@@ -42,6 +43,9 @@ def render_all(
         values["hardware"] = [
             hardware_table.shown(own) for own in measured if own.record.name == row.record.name
         ]
+        stress = stress_table.of_entry(stressed, row.record.name)
+        values["stress"] = None if stress is None else stress_table.shown(stress)
+        values["chart"] = [] if stress is None else stress_table.chart([stress])
         values["back"] = "../" * path.count("/") + pages.version_path(track.version, versions)
         values["root"] = "../" * path.count("/")
         made[path] = template.render(values).encode()

@@ -29,13 +29,15 @@ COLUMNS = (
     "normalised", "normalised_low", "normalised_high", "normalised_to_pid",
     "normalised_to_pid_low", "normalised_to_pid_high", "normalised_to_above",
     "normalised_to_above_low", "normalised_to_above_high", "season",
+    "stress_cmH2O", "stress_low", "stress_high", "stress_rise_cmH2O", "stress_survived",
+    "stress_unsafe_runs",
 )  # fmt: skip
 
 #: Where commands look for a leaderboard.
 FOLDER = Path("leaderboard")
 
 #: Whole numbers that an entry may lack.
-_NULLABLE_INTEGERS = ("rank", "rank_low", "rank_high")
+_NULLABLE_INTEGERS = ("rank", "rank_low", "rank_high", "stress_unsafe_runs")
 
 
 def load_board(
@@ -64,6 +66,9 @@ def load_board(
       ranks, with its interval; ``normalised_to_pid``, ``normalised_to_above`` with limits: its
       differences; ``normalised_R5C10``, ...: of each lung; missing in version 1;
     - ``season``: of the draws, in version 2;
+    - ``stress_cmH2O``, ``stress_low``, ``stress_high``: stress score with its interval, cmH2O;
+      ``stress_rise_cmH2O``: what the stressors add; ``stress_survived``: share of runs, 0 to 1;
+      ``stress_unsafe_runs``: how many; missing where the stress track was not run;
     - ``score_R5C10_cmH2O``, ...: mean error over draws and PIPs of each lung, cmH2O, and
       ``nominal_R5C10_cmH2O``, ...: mean nominal error over PIPs of each lung, cmH2O.
 
@@ -238,6 +243,7 @@ def _values(version: int, track: str, status: str, row: Row) -> dict[str, Any]:
         plain("; ".join(row.entry.reasons)),
         *_normalised(row),
         header.draws.season or "",
+        *_stress(record),
     )
     return dict(zip(COLUMNS, values, strict=True))
 
@@ -259,6 +265,15 @@ def _normalised(row: Row) -> tuple[float, ...]:
     if own is None:
         return (math.nan,) * 9
     return (*_interval(own.score), *_interval(own.to_baseline), *_interval(own.to_above))
+
+
+def _stress(record: Record) -> tuple[float | int | None, ...]:
+    if record.stress is None:
+        return (math.nan,) * 5 + (None,)
+    own = record.stress.tables
+    low, high = own.interval(own.by_lung_and_draw)
+    rise = own.score - own.unstressed
+    return own.score, low, high, rise, own.survived_share, int((~own.safe[1:]).sum())
 
 
 def _interval(estimate: Interval | None) -> tuple[float, float, float]:

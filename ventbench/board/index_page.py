@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ventbench import protocol
-from ventbench.board import hardware_table, pages
+from ventbench.board import hardware_table, pages, stress_table
 from ventbench.board.hardware_table import HardwareRow
 from ventbench.board.ranking import BASELINES, Interval, Row, SealedEntry, Track
 from ventbench.board.sealed import DECIMALS
@@ -40,6 +40,7 @@ def render(
     measured = {track.name: hardware_table.rows(store.records, track) for track in tracks}
     rows = [(track, status, row) for track in tracks for status, row in track.rows]
     header = rows[0][2].record.header if rows else None
+    stressed = [row for track in tracks for row in stress_table.rows(track)]
     return environment.get_template("index.html.j2").render(
         version=version,
         versions=[
@@ -53,6 +54,8 @@ def render(
         simulators=pages.flatten(header.simulators) if header else [],
         draws=header.draws if header else None,
         normalised=version > 1,
+        stress=[stress_table.shown(row) for row in stressed],
+        chart=stress_table.chart(stressed),
         head=store.head,
         records=len(store.records),
         hardware=[

@@ -136,8 +136,9 @@ class Row:
 
     Attributes:
         entry: whose row it is.
-        rank: from 1, equal for equal scores; None if it is not ranked.
-        ranks: 95 % interval of the rank; None if it is not ranked.
+        rank: from 1; None if it is not ranked. See :func:`places`.
+        ranks: ranks that it may have: in version 1 the 95 % interval over resamples, in version 2
+            by :func:`rank_ranges`; None if it is not ranked.
         score: mean over draws, cmH2O; None if a cell failed.
         to_baseline: difference to the track's PID; None for the PID itself, or without one.
         to_above: difference to the entry above; None for the first.
@@ -371,8 +372,9 @@ def rank(entries: Sequence[Entry], track: str) -> list[Row]:
         return []
     records = [entry.record for entry in ordered]
     ranked = [record.ranked_values for record in records]
-    low, high = _rank_intervals(_resampled(records, ranked))
+    means = _resampled(records, ranked)
     taken = places(records, ranked)
+    ranges = _rank_intervals(means) if records[0].headroom is None else rank_ranges(means)
     base = baseline(records, track)
     errors = _comparisons(records, [record.drawn.mean(axis=2).T for record in records], base)
     scaled: list[Comparison | None] = [None] * len(records)
@@ -382,7 +384,7 @@ def rank(entries: Sequence[Entry], track: str) -> list[Row]:
         Row(
             entry=entry,
             rank=taken[i],
-            ranks=(int(low[i]), int(high[i])),
+            ranks=ranges[i],
             score=errors[i].score,
             to_baseline=errors[i].to_baseline,
             to_above=errors[i].to_above,
@@ -413,32 +415,31 @@ def _comparisons(
 def places(records: Sequence[Record], values: Sequence[Floats]) -> list[int]:
     """Rank records of one version by values of shape ``(L, K)``; lower is better.
 
-    In version 1 equal means share a rank. In version 2 two entries share a rank if the paired 95 %
-    interval of their difference holds zero, and so do all between them: a rank tells entries apart
-    that the draws, rigs and members tell apart.
+    In version 1 equal means share a rank. In version 2 the rank is one more than the number of
+    entries that are better beyond doubt; see :func:`rank_ranges`.
     """
+    if records and records[0].headroom is not None:
+        return [best for best, _ in rank_ranges(_resampled(records, values))]
     keys = np.array([_rounded(own) for own in values])
-    if not records or records[0].headroom is None:
-        return [1 + int(np.sum(keys < key)) for key in keys]
-    means = _resampled(records, values)
-    order = np.argsort(keys, kind="stable")
-    # The first place, in the order of the means, whose entry cannot be told from each one.
-    first = [
-        next(
-            (j for j in range(i) if not _interval(values[at] - values[order[j]],
-                                                  means[at] - means[order[j]]).clear),
-            i,
-        )
-        for i, at in enumerate(order)
-    ]  # fmt: skip
-    ranks = [0] * len(order)
-    rank = 1
-    for i, at in enumerate(order):
-        # Nobody from here on is tied with anybody before: a new rank begins.
-        if min(first[i:]) >= i:
-            rank = i + 1
-        ranks[at] = rank
-    return ranks
+    return [1 + int(np.sum(keys < key)) for key in keys]
+
+
+def rank_ranges(means: Floats) -> list[tuple[int, int]]:
+    """Ranks that entries may have, by paired comparison of each with each; lower is better.
+
+    The best is 1 + the number of entries that are better beyond doubt, the worst the number of
+    entries less those that are worse beyond doubt. Beyond doubt: the paired 95 % interval of the
+    difference does not hold zero; no allowance is made for the number of pairs.
+
+    Args:
+        means: resampled alike for all entries, shape ``(N, resamples)``.
+    """
+    count, least = len(means), 10.0**-DECIMALS
+    ranges = []
+    for own in means:
+        low, high = np.quantile(own - means, (0.025, 0.975), axis=1)
+        ranges.append((1 + int(np.sum(low > least)), count - int(np.sum(high < -least))))
+    return ranges
 
 
 def unranked_rows(entries: Sequence[Entry]) -> list[Row]:
@@ -496,7 +497,7 @@ def _interval(values: Floats, means: Floats) -> Interval:
     return Interval(float(np.mean(values)), float(low), float(high))
 
 
-def _rank_intervals(means: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _rank_intervals(means: Floats) -> list[tuple[int, int]]:
     """95 % intervals of ranks that are counted within each resample."""
     rounded = np.round(means, DECIMALS)
     ranks = np.empty(means.shape, np.int64)
@@ -505,4 +506,4 @@ def _rank_intervals(means: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]
         ranks[:, column] = 1 + np.searchsorted(np.sort(values), values, side="left")
     low = np.quantile(ranks, 0.025, axis=1, method="lower")
     high = np.quantile(ranks, 0.975, axis=1, method="higher")
-    return low.astype(np.int64), high.astype(np.int64)
+    return list(zip(low.astype(int).tolist(), high.astype(int).tolist(), strict=True))

@@ -16,6 +16,9 @@ from ventbench.board import canonical, hardware, layout, schema
 from ventbench.board.hardware import HardwareRecord
 from ventbench.errors import InputError
 from ventbench.metrics.normalised import normalised
+from ventbench.stress.results import StressTables
+from ventbench.stress.stressors import VERSION as STRESSORS_VERSION
+from ventbench.stress.stressors import condition_of
 
 Floats = NDArray[np.float64]
 
@@ -49,6 +52,21 @@ class RecordHeadroom:
 
 
 @dataclass(frozen=True)
+class RecordStress:
+    """Runs under missing physics, as a record has them.
+
+    Attributes:
+        stressors: version of the table of stressors.
+        tables: figures of all runs; volumes to 1 mL, times to 1 ms.
+        commands_sha256: of all commands.
+    """
+
+    stressors: int
+    tables: StressTables
+    commands_sha256: str
+
+
+@dataclass(frozen=True)
 class Record(schema.Submitted):
     """A record's content, checked; L lungs, P PIPs, K draws.
 
@@ -67,6 +85,7 @@ class Record(schema.Submitted):
         steps_above: longest time above the safety limit of each run, steps, shape
             ``(1 + K, L, P)``.
         headroom: what protocol version 2 adds; None in version 1.
+        stress: runs under missing physics, on the robustness track of version 2; None without.
     """
 
     sha256: str
@@ -80,6 +99,7 @@ class Record(schema.Submitted):
     peak: Floats
     steps_above: NDArray[np.int64]
     headroom: RecordHeadroom | None = None
+    stress: RecordStress | None = None
 
     @property
     def track(self) -> str:
@@ -256,6 +276,7 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
         peak=np.array(values.safety.peak_centi_cmH2O) / 100.0,
         steps_above=np.array(values.safety.steps_above),
         headroom=_headroom(values),
+        stress=_stress(values, label),
     )
 
 
@@ -269,6 +290,38 @@ def _headroom(values: schema.ScoreContent) -> RecordHeadroom | None:
         np.array(values.headroom.attainable, float),
         np.array(values.headroom.pid, float),
     )
+
+
+def _stress(values: schema.ScoreContent, label: str) -> RecordStress | None:
+    own = values.stress
+    if own is None or values.rigs is None:
+        return None
+    chosen = tuple(condition_of(name, f"{label}, key stress.conditions") for name in own.conditions)
+    if chosen[0].stressors or len(set(chosen)) < len(chosen):
+        raise InputError(
+            f"{label}, key stress.conditions: must begin with none and name each condition once"
+        )
+    draws = len(own.pips[0])
+    tables = StressTables(
+        conditions=chosen,
+        lungs=tuple(values.lungs),
+        pips=np.array(own.pips, float),
+        rig=np.array(values.rigs.session)[:, :draws],
+        member=np.array(values.rigs.member)[:, :draws],
+        error=np.array(own.errors, float),
+        safe=np.array(own.safe, bool),
+        survived=np.array(own.survived, bool),
+        alarm_s=np.array(own.above_alarm_ms) / 1e3,
+        peak=np.array(own.peak_centi_cmH2O) / 100.0,
+        volume=np.array(own.volume_mL, float),
+    )
+    if own.stressors == STRESSORS_VERSION and not tables.complete:
+        raise InputError(
+            f"{label}, key stress: does not have all conditions and draws of the stress track"
+        )
+    if np.any(tables.survived & ~(tables.safe & np.isfinite(tables.error))):
+        raise InputError(f"{label}, key stress.survived: a run that was not safe has survived")
+    return RecordStress(own.stressors, tables, own.commands_sha256)
 
 
 def load(path: Path, *, strict: bool = True) -> AnyRecord:

@@ -20,10 +20,13 @@ from numpy.typing import NDArray
 
 from ventbench import data_files, draws, protocol
 from ventbench.board import actions, canonical, create, store
-from ventbench.board.record import Record
-from ventbench.board.replay import ReplayPlants, draws_of
+from ventbench.board.record import Record, RecordStress
+from ventbench.board.replay import TOLERANCE, ReplayPlants, draws_of
 from ventbench.errors import InputError
 from ventbench.resume import WorkFolder
+from ventbench.stress import stressors
+from ventbench.stress.run import draw_cells
+from ventbench.stress.score import StressScore, run_stress
 from ventbench.submissions.folder import Submission, file_hashes, open_submission
 from ventbench.submissions.rig_scoring import rigs_of, run_on_rigs
 from ventbench.submissions.runner import Runner
@@ -211,6 +214,7 @@ def _run(
 ) -> Outcome:
     """Run the code of one record and compare."""
     begun = time.perf_counter()
+    stress: StressScore | None = None
     try:
         submission = open_submission(str(code))
         _check_same(submission, score)
@@ -228,12 +232,18 @@ def _run(
             drawn = draws_of(score.header, simulators, season.revealed if season else None)
             rigs = rigs_of(simulators)
             result = run_on_rigs(submission, rigs, track=score.track, drawn=drawn, runner=runner)
+            if score.stress is not None:
+                cells = draw_cells(rigs, score.stress.tables.pips.shape[1], drawn=drawn)
+                chosen = score.stress.tables.conditions
+                stress = run_stress(submission, cells, chosen, runner=runner)
         _check_same(open_submission(str(code)), score)
         recorded = actions.load(score, folder / store.RECORDS)
         detail = difference(score, recorded, result.requested)
         failed = {(x.lung, x.pip, x.draw) for x in result.failures}
         if not detail and failed != {(x.lung, x.pip, x.draw) for x in score.header.failures}:
             detail = f"{len(failed)} cells failed, {score.header.failed_cells} in the record"
+        if not detail and score.stress is not None and stress is not None:
+            detail = stress_difference(score.stress, stress)
     except (InputError, FloatingPointError) as error:
         detail = f"its code cannot be run: {error}"
     seconds = round(time.perf_counter() - begun, 1)
@@ -245,6 +255,38 @@ def _check_same(submission: Submission, score: Record) -> None:
     """Refuse code that has changed since it was found."""
     if submission.sha256 != score.header.submission.sha256:
         raise InputError(f"{submission.label} was changed while it ran")
+
+
+def stress_difference(recorded: RecordStress, again: StressScore) -> str:
+    """Describe how runs of the stress track differ from the recorded ones; empty if they do not.
+
+    Args:
+        recorded: figures and hash of the commands.
+        again: the second run.
+    """
+    if recorded.stressors != stressors.VERSION:
+        return f"stress: its stressors are version {recorded.stressors}, not {stressors.VERSION}"
+    here = create.stress_digest(again.requested)
+    if here != recorded.commands_sha256:
+        return (
+            f"stress: commands have SHA-256 {here[:12]}, {recorded.commands_sha256[:12]} recorded"
+        )
+    tables = recorded.tables
+    pairs = {
+        "errors": (tables.error, again.error, TOLERANCE),
+        "safe": (tables.safe, again.safe, 0.0),
+        "survived": (tables.survived, again.survived, 0.0),
+        "above_alarm_ms": (tables.alarm_s, again.alarm_s, 1e-3),
+        "peak_centi_cmH2O": (tables.peak, again.peak, 0.011),
+        "volume_mL": (tables.volume, again.volume, 1.0),
+    }
+    for key, (old, new, tolerance) in pairs.items():
+        # A failed run has no error; -1 stands for it on both sides.
+        ours, theirs = (np.nan_to_num(np.asarray(x, float), nan=-1.0) for x in (new, old))
+        off = np.abs(ours - theirs)
+        if off.max() > tolerance:
+            return f"stress.{key}: differs by up to {off.max():.3g} from the record"
+    return ""
 
 
 def difference(score: Record, recorded: Floats, again: Floats) -> str:

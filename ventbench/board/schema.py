@@ -203,6 +203,26 @@ class RecordedHeadroom(_Table, frozen=True):
     pid: list[list[list[Annotated[float, msgspec.Meta(ge=0.0)]]]]
 
 
+class RecordedStress(_Table, frozen=True):
+    """Runs under missing physics; S conditions, L lungs, n of the record's draws; version 2.
+
+    Tables have shape ``(S, L, n)``, the first condition is none; ``pips`` has shape ``(L, n)``.
+    ``commands_sha256`` is that of all commands, float64, ``(S, L, n, BREATHS, INSPIRATION_STEPS)``:
+    they are not kept, but a second run must give them again.
+    """
+
+    stressors: Version
+    conditions: Annotated[list[Text], msgspec.Meta(min_length=2, max_length=1000)]
+    pips: list[list[float]]
+    errors: list[list[list[Error]]]
+    safe: list[list[list[bool]]]
+    survived: list[list[list[bool]]]
+    above_alarm_ms: list[list[list[Annotated[int, msgspec.Meta(ge=0, le=2**31)]]]]
+    peak_centi_cmH2O: list[list[list[SmallInt]]]
+    volume_mL: list[list[list[SmallInt]]]
+    commands_sha256: Sha256
+
+
 class Trace(_Table, frozen=True):
     """A nominal inspiration of each cell, ``(L, P, S)``, for the page."""
 
@@ -262,6 +282,7 @@ class ScoreContent(ScoreHeader, frozen=True, tag_field="kind", tag="score"):
     trace: Trace
     rigs: RecordedRigs | None = None
     headroom: RecordedHeadroom | None = None
+    stress: RecordedStress | None = None
 
     def header(self) -> ScoreHeader:
         """Everything but the large tables."""
@@ -441,6 +462,13 @@ def _check_shapes(record: ScoreContent, label: str) -> None:
         for key in ("error", "attainable", "pid"):
             table = getattr(record.headroom, key)
             shapes = {**shapes, f"headroom.{key}": (table, (1 + draws, lungs, pips))}
+    if record.stress is not None:
+        cells = (lungs, min(draws, len(record.stress.pips[0])) if record.stress.pips else 0)
+        shapes = {**shapes, "stress.pips": (record.stress.pips, cells)}
+        size = (len(record.stress.conditions), *cells)
+        keys = ("errors", "safe", "survived", "above_alarm_ms", "peak_centi_cmH2O", "volume_mL")
+        for key in keys:
+            shapes = {**shapes, f"stress.{key}": (getattr(record.stress, key), size)}
     for key, (table, shape) in shapes.items():
         if not has_shape(table, shape):
             raise InputError(f"{label}, key {key}: does not have the shape {shape}")
@@ -463,6 +491,10 @@ def _check_consistent(record: ScoreContent, label: str) -> None:
     for key, value in second.items():
         if record.protocol in protocol.VERSIONS and (value is not None) != (record.protocol == 2):
             raise InputError(f"{label}, key {key}: belongs to protocol version 2 and no other")
+    if record.stress is not None and (record.protocol, record.track) != (2, "robustness"):
+        raise InputError(
+            f"{label}, key stress: belongs to the robustness track of protocol version 2"
+        )
     if record.protocol in protocol.VERSIONS and (
         tuple(lungs) != LUNG_IDS or tuple(pips) != protocol.PIPS
     ):

@@ -106,6 +106,8 @@ def scores_of(score: Record) -> dict[str, float | None]:
     means = {"score_cmh2o": float(score.by_draw.mean())}
     if score.headroom is not None:
         means["normalised"] = float(score.ranked_values.mean())
+    if score.stress is not None:
+        means["stress_cmh2o"] = score.stress.tables.score
     return {key: round(mean, DECIMALS) if mean == mean else None for key, mean in means.items()}
 
 

@@ -401,7 +401,7 @@ def show(
     ] = None,
     json: JsonFile = None,
 ) -> None:
-    """Show the ranking of both tracks.
+    """Show the ranking of both tracks, and in version 2 that under missing physics.
 
     With --lung the table has a column for each PIP of that lung, or for each lung with `all`: the
     normalised score in version 2, the error in cmH2O in version 1, over the draws.
@@ -423,6 +423,8 @@ def show(
     console = Console(stderr=str(json) == "-")
     for track in tracks:
         console.print(_table(track) if lung is None else _lung_table(track, lung))
+        if lung is None and any(row.record.stress for row in track.ranked):
+            console.print(_stress_table(track))
         if track.sealed:
             console.print(_sealed_table(track))
 
@@ -478,6 +480,7 @@ def _table(track: Track) -> Table:
 
 def _normalised_table(track: Track) -> Table:
     """Version 2: the normalised score ranks; errors in cmH2O beside it."""
+    from rich import box
     from rich.markup import escape
     from rich.table import Table
 
@@ -485,22 +488,49 @@ def _normalised_table(track: Track) -> Table:
 
     title = f"{track.name}, version {track.version}: 0 = best attainable, 100 = best PID"
     season = {row.record.header.draws.season for _, row in track.rows}
-    table = Table(title=title, caption=f"draws: {', '.join(sorted(filter(None, season)))}")
+    caption = f"draws: {', '.join(sorted(filter(None, season)))}"
+    table = Table(title=title, caption=caption, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     columns = ("rank", "entry", "normalised", "95 %", "ranks", "error", "nominal", "state")
     for name in columns:
         left = name in ("entry", "state")
-        table.add_column(name, justify="left" if left else "right", no_wrap=name == "entry")
+        table.add_column(name, justify="left" if left else "right", no_wrap=name != "state")
     for status, row in track.rows:
         own = None if row.normalised is None else row.normalised.score
         table.add_row(
             "" if row.rank is None else str(row.rank),
             row.record.name,
             "failed" if own is None else f"{own.value:.1f}",
-            "" if own is None else f"{own.low:.1f} to {own.high:.1f}",
-            "" if row.ranks is None else f"{row.ranks[0]} to {row.ranks[1]}",
+            "" if own is None else f"{own.low:.1f}..{own.high:.1f}",
+            "" if row.ranks is None else f"{row.ranks[0]}..{row.ranks[1]}",
             "failed" if row.score is None else f"{row.score.value:.3f}",
             f"{row.nominal:.3f}" if row.nominal == row.nominal else "failed",
             escape(plain("; ".join((status, *row.entry.reasons)))[:120]),
+        )
+    return table
+
+
+def _stress_table(track: Track) -> Table:
+    """Version 2: entries of the robustness track under missing physics."""
+    from rich import box
+    from rich.table import Table
+
+    from ventbench.board import stress_table
+
+    title = f"stress, version {track.version}: mean |airway pressure - PIP|, cmH2O"
+    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in ("rank", "entry", "score", "95 %", "ranks", "without", "survived", "unsafe runs"):
+        table.add_column(name, justify="left" if name == "entry" else "right", no_wrap=True)
+    for row in map(stress_table.shown, stress_table.rows(track)):
+        score, ranks = row["score"], row["ranks"]
+        table.add_row(
+            "" if row["rank"] is None else str(row["rank"]),
+            row["name"],
+            "failed" if score is None else score["text"],
+            "" if score is None else score["limits"].replace(" to ", ".."),
+            "" if ranks is None else f"{ranks[0]}..{ranks[1]}",
+            row["unstressed"],
+            f"{row['survived']} %",
+            f"{row['unsafe']} of {row['runs']}",
         )
     return table
 

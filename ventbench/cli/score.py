@@ -10,8 +10,11 @@ import typer
 from ventbench.cli.options import JsonFile, PlantName, claim_out, emit
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
+    from ventbench.stress.score import StressScore
+    from ventbench.submissions.folder import Submission
     from ventbench.submissions.result import Score
 
 Track = Literal["performance", "robustness", "stress"]
@@ -56,7 +59,11 @@ def score(
     ] = False,
     record: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Write a record for `board add` here; needs --draws 20."),
+        typer.Option(
+            metavar="DIR",
+            help="Write a record for `board add` here; needs --draws 20. Records of the robustness "
+            "track hold the stress score too.",
+        ),
     ] = None,
     plant: PlantName = "frozen",
     protocol: Annotated[
@@ -68,6 +75,13 @@ def score(
             "lung.",
         ),
     ] = 1,
+    stress: Annotated[
+        bool,
+        typer.Option(
+            help="With --protocol 2: also run entries of the robustness track under missing "
+            "physics; six draws with --draws 6 or more, else one."
+        ),
+    ] = True,
     in_process: Annotated[
         bool,
         typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
@@ -76,7 +90,8 @@ def score(
 ) -> None:
     """Score controllers on the six frozen lung simulators.
 
-    The score is the mean |pressure - target| over the inspirations, cmH2O; lower is better. Each
+    The score is the mean |pressure - target| over the inspirations, cmH2O; lower is better. With
+    `--protocol 2` the normalised score and the score under missing physics stand beside it. Each
     controller runs in sandboxed processes that have no access to the simulators. With another
     `--plant` the lungs are those of that plant, and the score is not official.
 
@@ -91,11 +106,9 @@ def score(
     from ventbench.submissions.folder import open_submission
 
     if track == "stress":
-        if record is not None:
-            raise InputError("--record does not go with the stress track: leave it out")
         from ventbench.cli.stress import score_entries
 
-        return score_entries(names, draws, out, report, plant, in_process, json)
+        return score_entries(names, draws, out, report, plant, in_process, json, record)
     if record is not None and draws < 20:
         raise InputError("--record needs all published draws: add --draws 20")
     if report and out is None:
@@ -124,11 +137,22 @@ def score(
                 )
             )
     results = [result.to_json() for result in scores]
+    stressed: dict[str, StressScore] = {}
+    if protocol == 2:
+        if stress:
+            stressed = _stressed(opened, plant, draws, in_process, progress)
+        for values in results:
+            own = stressed.get(values["name"])
+            values["stress"] = None if own is None else own.to_json()
     emit(results[0] if len(results) == 1 else {"submissions": results}, json)
     console = Console(stderr=str(json) == "-")
     console.print(_table(results))
     if protocol == 2:
         console.print(_normalised_table(results))
+    if stressed:
+        from ventbench.cli.stress import stress_table
+
+        console.print(stress_table([own.to_json() for own in stressed.values()]))
     because = dict.fromkeys(reason for result in scores for reason in result.not_official_because)
     if because:
         progress.print(f"These scores are not official: {', '.join(because)}.", style="yellow")
@@ -136,16 +160,39 @@ def score(
         for failure in result.failures[:3]:
             progress.print(failure.message, style="red", markup=False)
     if out is not None:
-        for path in _keep(out, scores, report):
+        for path in _keep(out, scores, stressed, report):
             console.print(f"wrote {path}", markup=False, highlight=False)
     if record is not None:
         from ventbench.board import create
         from ventbench.plants import frozen
 
-        for path in create.keep(record, scores, frozen.load(protocol)):
+        for path in create.keep(record, scores, frozen.load(protocol), stressed):
             console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
-    if any(result.failures for result in scores):
+    if any(result.failures for result in (*scores, *stressed.values())):
         raise typer.Exit(1)
+
+
+def _stressed(
+    entries: list[Submission], plant: str, draws: int, in_process: bool, progress: Console
+) -> dict[str, StressScore]:
+    """Stress scores, by name, of the entries that need not be told the lung."""
+    from ventbench.stress.results import DRAWS
+    from ventbench.stress.score import score_stress
+
+    scores = {}
+    for entry in entries:
+        name = entry.manifest.name
+        if "robustness" not in entry.manifest.tracks:
+            progress.print(f"{name} must be told its lung: it has no stress score")
+            continue
+        with progress.status(f"stressing {entry.label}"):
+            scores[name] = score_stress(
+                entry,
+                simulator=plant,
+                draws=DRAWS if draws >= DRAWS else 1,
+                sandbox=not in_process,
+            )
+    return scores
 
 
 def _table(scores: list[dict[str, Any]]) -> Table:
@@ -198,10 +245,19 @@ def _normalised_table(scores: list[dict[str, Any]]) -> Table | str:
     return table
 
 
-def _keep(out: Path, scores: list[Score], report: bool) -> list[Path]:
+def _keep(
+    out: Path, scores: list[Score], stressed: dict[str, StressScore], report: bool
+) -> list[Path]:
     written = [out / result.submission.manifest.name for result in scores]
     for folder, result in zip(written, scores, strict=True):
         result.save(folder)
+    for name, own in stressed.items():
+        own.save(out / name)
+    if report and stressed:
+        from ventbench.views.stress import write_stress_chart
+
+        values = [own.to_json() for own in stressed.values()]
+        written.append(write_stress_chart(out / "stress.png", values))
     if report:
         from ventbench import views
 

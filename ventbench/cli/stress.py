@@ -10,7 +10,11 @@ import typer
 from ventbench.cli.options import JsonFile, emit
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
+
+    from ventbench.stress.score import StressScore
+    from ventbench.submissions.folder import Submission
 
 
 def score_entries(
@@ -21,18 +25,25 @@ def score_entries(
     plant: str,
     in_process: bool,
     json: Path | None,
+    record: Path | None = None,
 ) -> None:
-    """Score entries on the stress track; arguments are the options of ``ventbench score``."""
+    """Score entries on the stress track; arguments are the options of ``ventbench score``.
+
+    A record of the stress track is that of the robustness track with the stress score in it, so
+    that one is scored too.
+    """
     import numpy as np
     from rich.console import Console
 
     from ventbench.errors import InputError
-    from ventbench.stress.run import DRAWS
+    from ventbench.stress.results import DRAWS
     from ventbench.stress.score import score_stress
     from ventbench.submissions.folder import open_submission
 
     if report and out is None:
         raise InputError("--report needs --out DIR to write to")
+    if record is not None and (draws not in (0, DRAWS) or plant != "frozen"):
+        raise InputError(f"--record of the stress track needs {DRAWS} draws on the frozen rigs")
     opened = [open_submission(name) for name in names]
     progress = Console(stderr=True)
     scores = []
@@ -49,7 +60,7 @@ def score_entries(
     results = [result.to_json() for result in scores]
     emit(results[0] if len(results) == 1 else {"submissions": results}, json)
     console = Console(stderr=str(json) == "-")
-    console.print(_table(results))
+    console.print(stress_table(results))
     for result in scores[1:]:
         difference, limits = result.difference(scores[0])
         if np.isfinite(difference):
@@ -69,6 +80,9 @@ def score_entries(
             written.append(write_stress_chart(out / "stress.png", results))
         for path in written:
             console.print(f"wrote {path}", markup=False, highlight=False)
+    if record is not None:
+        for path in _write_records(record, opened, scores, in_process, progress):
+            console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
     failed = [failure for result in results for failure in result["failures"]]
     for failure in failed[:3]:
         place = f"{failure['condition']}, {failure['lung']}, draw {failure['draw']}"
@@ -108,8 +122,37 @@ def register(app: typer.Typer) -> None:
     app.command()(stressors)
 
 
-def _table(scores: list[dict[str, Any]]) -> Table:
-    """Return a table with the figures above, then a row for each category."""
+def _write_records(
+    folder: Path,
+    entries: list[Submission],
+    stressed: list[StressScore],
+    in_process: bool,
+    progress: Console,
+) -> list[Path]:
+    """Score the robustness track too, and write records with both."""
+    from ventbench import rig_draws
+    from ventbench.board import create
+    from ventbench.plants import frozen
+    from ventbench.submissions import scoring
+
+    scores = []
+    for entry in entries:
+        with progress.status(f"scoring {entry.label}"):
+            scores.append(
+                scoring.score(
+                    entry,
+                    track="robustness",
+                    draws=rig_draws.COUNT,
+                    sandbox=not in_process,
+                    protocol=2,
+                )
+            )
+    by_name = {own.submission.manifest.name: own for own in stressed}
+    return create.keep(folder, scores, frozen.load(2), by_name)
+
+
+def stress_table(scores: list[dict[str, Any]]) -> Table:
+    """Return a table of stress scores: the figures, then a row for each category."""
     from rich.table import Table
 
     def show(value: float | None, digits: int = 2) -> str:

@@ -37,6 +37,9 @@ from ventbench.resume import ARRAY, WorkFolder, fingerprint
 #: The published file for the development draws.
 FILE = "bounds-v2.npz"
 
+#: Its SHA-256, as `ventbench headroom` prints it: a change of the bounds is a change of this line.
+SHA256 = "558d7c57af148feabb78e2df260d7aa3598cf8956e90af8655939398c6062eef"
+
 #: By how much a second optimiser may do better, cmH2O: a tenth of the least headroom.
 TOLERANCE = 0.1 * metric.LEAST_HEADROOM
 
@@ -134,9 +137,15 @@ def published() -> Reference:
     """The reference of the development draws that travels with ventbench.
 
     Raises:
-        InputError: if it is missing or damaged.
+        InputError: if it is missing, damaged, or not the published one.
     """
-    return load(data_files.data_path(FILE))
+    path = data_files.data_path(FILE)
+    reference = load(path)
+    if files.sha256(path) != SHA256:
+        raise InputError(
+            f"{path} is not the published file: its SHA-256 is {files.sha256(path)}, not {SHA256}"
+        )
+    return reference
 
 
 def reference_of(

@@ -23,6 +23,7 @@ from ventbench.interfaces import Controller, Plant, Task
 from ventbench.lungs import Lung
 from ventbench.rig_draws import RigDraws
 from ventbench.stress.plants import Stressed, stressed_plants
+from ventbench.stress.results import DRAWS, pip_columns
 from ventbench.stress.stressors import Condition
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import Submission
@@ -33,12 +34,6 @@ Floats = NDArray[np.float64]
 
 #: Name of the track.
 TRACK = "stress"
-
-#: Place of the PIP of the first lung in each draw; the other lungs follow it.
-_TURNS = (0, 3, 1, 4, 2, 5)
-
-#: Number of draws of an official score: each lung has each PIP once under every condition.
-DRAWS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +70,7 @@ def draw_cells(rigs: Rigs, n: int = DRAWS, *, drawn: RigDraws | None = None) -> 
     """
     drawn = rigs.draws(n) if drawn is None else drawn.first(n)
     count = len(rigs.lungs)
-    order = np.arange(count)[:, None] + np.array(_TURNS)[np.arange(n) % len(_TURNS)]
-    at = (np.arange(count)[:, None], np.arange(n), order % len(protocol.PIPS))
+    at = (np.arange(count)[:, None], np.arange(n), pip_columns(count, n))
     scenario = jax.tree.map(lambda leaf: np.asarray(leaf)[at], drawn.cells)
     if rigs.sessions is None:
         plants = jax.tree.map(

@@ -1,9 +1,6 @@
-"""The stress score: error, safety and volume under every condition, beside the same run without it.
+"""The stress score: every run under every condition, beside the same run without a stressor.
 
-A run is *survived* if the controller did not fail, passed the protocol's safety gate in every
-breath, and held the plateau of the last breath (mean of its last 0.3 s) within
-``2 cmH2O + 4 % of PIP`` of PIP. That is the tolerance that makers of ventilators declare for airway
-pressure; the last breath, because a controller may take two breaths to notice.
+:mod:`ventbench.stress.results` says what the figures are.
 """
 
 from __future__ import annotations
@@ -24,16 +21,14 @@ from numpy.typing import NDArray
 
 import ventbench
 from ventbench import files, protocol
-from ventbench.errors import InputError
-from ventbench.lungs import LUNG_IDS
 from ventbench.metrics.figures import time_above_alarm
-from ventbench.metrics.rig_bootstrap import resampled_scores
 from ventbench.metrics.score import passes_safety_gate, run_error
 from ventbench.metrics.step_response import steady_error
 from ventbench.plants.catalog import Given
 from ventbench.rig_draws import RigDraws
-from ventbench.stress.run import DRAWS, TRACK, StressDraws, StressRun, draw_cells, step_through
-from ventbench.stress.stressors import CATEGORIES, VERSION, Condition, conditions, stressor
+from ventbench.stress.results import DRAWS, StressTables
+from ventbench.stress.run import TRACK, StressDraws, StressRun, draw_cells, step_through
+from ventbench.stress.stressors import VERSION, Condition, conditions, stressor
 from ventbench.submissions.errors import Failure, SubmissionError
 from ventbench.submissions.folder import Submission, as_submission
 from ventbench.submissions.rig_scoring import load_rigs
@@ -56,26 +51,15 @@ _SHOWN = 10
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class StressScore:
+class StressScore(StressTables):
     """Result of one submission on the stress track; S conditions, L lungs, n draws.
 
-    The first condition is none: the same cells without a stressor. ``print(score)`` shows the
-    conditions that cost most.
+    ``print(score)`` shows the conditions that cost most.
 
     Attributes:
         submission: what was scored.
-        conditions: length S.
-        lungs: ids, length L.
-        pips: nominal PIP, cmH2O, ``(L, n)``.
         drawn: the draws: rig and member of each lung and draw.
-        error: mean |airway pressure - PIP| over the scored inspirations, cmH2O, ``(S, L, n)``; NaN
-            where the controller failed.
-        safe: whether a run passed the safety gate in all breaths, ``(S, L, n)``.
         plateau_error: |mean of the last 0.3 s - PIP| of the last breath, cmH2O, ``(S, L, n)``.
-        survived: see the module, ``(S, L, n)``.
-        alarm_s: time above PIP + 15 % in a breath, the longest of the run, s, ``(S, L, n)``.
-        peak: highest pressure, cmH2O, ``(S, L, n)``.
-        volume: volume in the lung at the end of the scored inspirations, mean, mL, ``(S, L, n)``.
         requested: all commands, %, ``(S, L, n, BREATHS, INSPIRATION_STEPS)``.
         failures: what failed, by (condition, lung, draw).
         sandbox: the runner's layers; None in this process.
@@ -84,17 +68,8 @@ class StressScore:
     """
 
     submission: Submission
-    conditions: tuple[Condition, ...]
-    lungs: tuple[str, ...]
-    pips: Floats
     drawn: RigDraws
-    error: Floats
-    safe: NDArray[np.bool_]
     plateau_error: Floats
-    survived: NDArray[np.bool_]
-    alarm_s: Floats
-    peak: Floats
-    volume: Floats
     requested: Floats
     failures: Mapping[tuple[int, int, int], Failure]
     sandbox: Mapping[str, Any] | None
@@ -102,80 +77,6 @@ class StressScore:
     timing: Mapping[str, float]
 
     track = TRACK
-
-    @property
-    def score(self) -> float:
-        """Stress score, cmH2O: mean error over all stressed conditions, NaN if any cell failed."""
-        return float(np.mean(self.error[1:]))
-
-    @property
-    def unstressed(self) -> float:
-        """Mean error of the same cells without a stressor, cmH2O."""
-        return float(np.mean(self.error[0]))
-
-    @property
-    def survived_share(self) -> float:
-        """Share of the stressed runs that were survived, 0..1."""
-        return float(np.mean(self.survived[1:]))
-
-    @property
-    def rise(self) -> Floats:
-        """Error less that of the same cell without a stressor, cmH2O, ``(S, L, n)``."""
-        return self.error - self.error[:1]
-
-    @property
-    def volume_ratio(self) -> Floats:
-        """Volume over that of the same cell without a stressor, ``(S, L, n)``."""
-        return self.volume / self.volume[:1]
-
-    @property
-    def complete(self) -> bool:
-        """Whether all conditions, lungs and draws of the track were run."""
-        return (
-            self.conditions == conditions()
-            and self.lungs == LUNG_IDS
-            and self.pips.shape[1] == DRAWS
-        )
-
-    def interval(self, values: Floats) -> tuple[float, float]:
-        """95 % interval of a mean over cells: draws, rigs and ensemble members are resampled.
-
-        PIPs are chosen, not drawn, and lungs and PIPs form a Latin square: what a PIP adds on
-        average is taken out before, as what a lung adds is.
-
-        Args:
-            values: ``(L, n)``, such as a mean over conditions; any unit.
-        """
-        if values.shape[1] < 2 or not np.isfinite(values).all():
-            return math.nan, math.nan
-        levels, index, count = np.unique(self.pips, return_inverse=True, return_counts=True)
-        if count.min() > 1:
-            index = index.reshape(values.shape)
-            sums = np.bincount(index.ravel(), weights=values.ravel(), minlength=len(levels))
-            values = values - (sums / count)[index] + values.mean()
-        means = resampled_scores(values, self.drawn.rig, self.drawn.member)
-        low, high = np.quantile(means, (0.025, 0.975))
-        return float(low), float(high)
-
-    def difference(self, other: StressScore) -> tuple[float, tuple[float, float]]:
-        """Stress score less that of another entry, cmH2O, and its paired 95 % interval.
-
-        Raises:
-            InputError: if the other one was run on other draws or under other conditions.
-        """
-        same = (
-            self.conditions == other.conditions
-            and self.lungs == other.lungs
-            and np.array_equal(self.pips, other.pips)
-            and self.drawn.about() == other.drawn.about()
-        )
-        if not same:
-            raise InputError(
-                f"{self.submission.label} and {other.submission.label} were run under different "
-                "conditions or on different draws; score both alike"
-            )
-        change = (self.error - other.error)[1:].mean(axis=0)
-        return float(change.mean()), self.interval(change)
 
     def to_frame(self) -> pd.DataFrame:
         """One row a run: condition, severity, lung, PIP, draw and all figures."""
@@ -188,8 +89,8 @@ class StressScore:
                 "condition": np.array([c.id for c in self.conditions])[s],
                 "lung": np.array(self.lungs)[lung],
                 "pip_cmH2O": self.pips[lung, draw],
-                "rig": self.drawn.rig[lung, draw],
-                "member": self.drawn.member[lung, draw],
+                "rig": self.rig[lung, draw],
+                "member": self.member[lung, draw],
                 "draw": draw + 1,
                 "error_cmH2O": self.error.ravel(),
                 "rise_cmH2O": self.rise.ravel(),
@@ -203,43 +104,15 @@ class StressScore:
             }
         )
 
-    def summary(self) -> pd.DataFrame:
-        """One row a condition, by its id: means over cells, and the worst run."""
-        import pandas as pd
-
-        return pd.DataFrame([self._condition(k) for k in range(len(self.conditions))]).set_index(
-            "condition"
-        )
-
     def to_json(self) -> dict[str, Any]:
         """Return the score as JSON values, in the order in which a person reads it."""
         manifest = self.submission.manifest
-        stressed = self.error[1:].mean(axis=0)
-        worst = [self._condition(k) for k in range(1, len(self.conditions))]
-        worst_one = max(worst, key=lambda row: _order(row["error_cmH2O"]))
         return {
             "protocol": PROTOCOL,
             "track": TRACK,
             "stressors_version": VERSION,
             "name": manifest.name,
-            "score": _number(self.score),
-            "ci95": [_number(limit) for limit in self.interval(stressed)],
-            "unstressed": _number(self.unstressed),
-            "rise": _number(np.mean(self.rise[1:])),
-            "rise_ci95": [_number(limit) for limit in self.interval(self.rise[1:].mean(axis=0))],
-            "survived": self.survived_share,
-            "survived_ci95": [
-                _number(limit) for limit in self.interval(self.survived[1:].mean(axis=0))
-            ],
-            "survived_unstressed": float(np.mean(self.survived[0])),
-            "unsafe_runs": int(np.sum(~self.safe[1:])),
-            "stressed_runs": int(self.safe[1:].size),
-            "above_alarm_s": _number(np.mean(self.alarm_s[1:])),
-            "worst_condition": worst_one["condition"],
-            "worst_error": worst_one["error_cmH2O"],
-            "complete": self.complete,
-            "categories": self._categories(),
-            "conditions": [self._condition(k) for k in range(len(self.conditions))],
+            **self.headline(),
             "draws": self.drawn.about() | {"count": int(self.pips.shape[1])},
             "failures": [
                 {
@@ -270,43 +143,6 @@ class StressScore:
         files.write_json(folder / "stress.json", self.to_json())
         table = self.to_frame().to_csv(index=False, lineterminator="\n").encode()
         files.write_atomically(folder / "stress.csv", lambda file: file.write(table))
-
-    def _categories(self) -> dict[str, dict[str, float | None]]:
-        by_category = {}
-        for category in (*CATEGORIES, "pairs"):
-            at = [k for k, c in enumerate(self.conditions) if _category(c) == category]
-            if at:
-                by_category[category] = {
-                    "error_cmH2O": _number(np.mean(self.error[at])),
-                    "rise_cmH2O": _number(np.mean(self.rise[at])),
-                    "survived": float(np.mean(self.survived[at])),
-                    "unsafe_runs": int(np.sum(~self.safe[at])),
-                }
-        return by_category
-
-    def _condition(self, k: int) -> dict[str, Any]:
-        condition, error = self.conditions[k], self.error[k]
-        lung, draw = np.unravel_index(np.argmax(np.nan_to_num(error, nan=np.inf)), error.shape)
-        return {
-            "condition": condition.id,
-            "stressors": list(condition.stressors),
-            "severity": condition.severity,
-            "category": _category(condition),
-            "error_cmH2O": _number(np.mean(error)),
-            "ci95": [_number(limit) for limit in self.interval(error)],
-            "rise_cmH2O": _number(np.mean(self.rise[k])),
-            "rise_ci95": [_number(limit) for limit in self.interval(self.rise[k])],
-            "survived": float(np.mean(self.survived[k])),
-            "unsafe_runs": int(np.sum(~self.safe[k])),
-            "above_alarm_s": _number(np.mean(self.alarm_s[k])),
-            "peak_cmH2O": _number(np.max(self.peak[k])),
-            "volume_ratio": _number(np.median(self.volume_ratio[k])),
-            "worst": {
-                "lung": self.lungs[lung],
-                "pip": float(self.pips[lung, draw]),
-                "error_cmH2O": _number(error[lung, draw]),
-            },
-        }
 
     def _headline(self) -> str:
         name = self.submission.manifest.name
@@ -453,6 +289,8 @@ def assess(
         conditions=chosen,
         lungs=tuple(lung.id for lung in draws.lungs),
         pips=draws.nominal_pip,
+        rig=draws.drawn.rig,
+        member=draws.drawn.member,
         drawn=draws.drawn,
         error=error,
         safe=safe,
@@ -467,16 +305,3 @@ def assess(
         simulators=simulators,
         timing=timing or {},
     )
-
-
-def _category(condition: Condition) -> str:
-    categories = [stressor(name).category for name in condition.stressors]
-    return "pairs" if len(categories) > 1 else "".join(categories) or "none"
-
-
-def _number(value: float | np.floating) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def _order(value: float | None) -> float:
-    return math.inf if value is None else value

@@ -14,7 +14,6 @@ from typing import Literal
 
 from ventbench import protocol
 from ventbench.errors import InputError
-from ventbench.physics.catalogue import parameter
 
 #: Version of the table: stressors, strengths and pairs. Stress scores of two versions are not
 #: compared.
@@ -293,6 +292,18 @@ def stressor(name: str) -> Stressor:
     raise InputError(f"no stressor {name!r}; choose of {', '.join(s.name for s in STRESSORS)}")
 
 
+def condition_of(name: str, where: str) -> Condition:
+    """A condition by its :attr:`Condition.id`.
+
+    Raises:
+        InputError: if no condition of this table of stressors has it.
+    """
+    for condition in conditions():
+        if condition.id == name:
+            return condition
+    raise InputError(f"{where}: {name[:80]!r} is no condition of the stress track")
+
+
 def conditions() -> tuple[Condition, ...]:
     """All conditions of the track: nothing first, then each stressor twice, then the pairs."""
     single = [Condition((s.name,), severity) for s in STRESSORS for severity in SEVERITIES]
@@ -301,6 +312,8 @@ def conditions() -> tuple[Condition, ...]:
 
 def table() -> str:
     """The table of stressors as Markdown, as it stands in ``docs/stress.md``."""
+    from ventbench.physics.catalogue import parameter  # brings JAX, which reading records needs not
+
     lines = [
         "| stressor | what happens | changes | mild | strong | why these strengths |",
         "| --- | --- | --- | --- | --- | --- |",

@@ -1,0 +1,253 @@
+"""Tables of the stress track: error, safety and volume of every run, and what follows from them.
+
+A run is *survived* if the controller did not fail, passed the protocol's safety gate in every
+breath, and held the plateau of the last breath (mean of its last 0.3 s) within
+``2 cmH2O + 4 % of PIP`` of PIP. That is the tolerance that makers of ventilators declare for airway
+pressure; the last breath, because a controller may take two breaths to notice.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench import protocol
+from ventbench.errors import InputError
+from ventbench.lungs import LUNG_IDS
+from ventbench.metrics.rig_bootstrap import resampled_scores
+from ventbench.stress.stressors import CATEGORIES, Condition, conditions, stressor
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Floats = NDArray[np.float64]
+
+#: Number of draws of an official score: each lung has each PIP once under every condition.
+DRAWS = 6
+
+#: Place of the PIP of the first lung in each draw; the other lungs follow it.
+_TURNS = (0, 3, 1, 4, 2, 5)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StressTables:
+    """Figures of every run of an entry; S conditions, L lungs, n draws.
+
+    The first condition is none: the same cells without a stressor.
+
+    Attributes:
+        conditions: length S.
+        lungs: ids, length L.
+        pips: nominal PIP, cmH2O, ``(L, n)``.
+        rig: session of each lung in each draw, ``(L, n)``.
+        member: member of the ensemble, ``(L, n)``.
+        error: mean |airway pressure - PIP| over the scored inspirations, cmH2O, ``(S, L, n)``; NaN
+            where the controller failed.
+        safe: whether a run passed the safety gate in all breaths, ``(S, L, n)``.
+        survived: see the module, ``(S, L, n)``.
+        alarm_s: time above PIP + 15 % in a breath, the longest of the run, s, ``(S, L, n)``.
+        peak: highest pressure, cmH2O, ``(S, L, n)``.
+        volume: volume in the lung at the end of the scored inspirations, mean, mL, ``(S, L, n)``.
+    """
+
+    conditions: tuple[Condition, ...]
+    lungs: tuple[str, ...]
+    pips: Floats
+    rig: NDArray[np.int64]
+    member: NDArray[np.int64]
+    error: Floats
+    safe: NDArray[np.bool_]
+    survived: NDArray[np.bool_]
+    alarm_s: Floats
+    peak: Floats
+    volume: Floats
+
+    @property
+    def score(self) -> float:
+        """Stress score, cmH2O: mean error over all stressed conditions, NaN if any cell failed."""
+        return float(np.mean(self.error[1:]))
+
+    @property
+    def unstressed(self) -> float:
+        """Mean error of the same cells without a stressor, cmH2O."""
+        return float(np.mean(self.error[0]))
+
+    @property
+    def survived_share(self) -> float:
+        """Share of the stressed runs that were survived, 0..1."""
+        return float(np.mean(self.survived[1:]))
+
+    @property
+    def rise(self) -> Floats:
+        """Error less that of the same cell without a stressor, cmH2O, ``(S, L, n)``."""
+        return self.error - self.error[:1]
+
+    @property
+    def volume_ratio(self) -> Floats:
+        """Volume over that of the same cell without a stressor, ``(S, L, n)``."""
+        return self.volume / self.volume[:1]
+
+    @property
+    def complete(self) -> bool:
+        """Whether all conditions, lungs and draws of the track were run."""
+        return (
+            self.conditions == conditions()
+            and self.lungs == LUNG_IDS
+            and self.pips.shape[1] == DRAWS
+            and np.array_equal(self.pips, np.array(protocol.PIPS)[pip_columns(*self.pips.shape)])
+        )
+
+    @property
+    def by_lung_and_draw(self) -> Floats:
+        """Mean error over the stressed conditions, cmH2O, ``(L, n)``; NaN if one failed."""
+        return self.error[1:].mean(axis=0)
+
+    def resampled(self, values: Floats) -> Floats:
+        """Means over cells with draws, rigs and ensemble members resampled, alike for all entries.
+
+        PIPs are chosen, not drawn, and lungs and PIPs form a Latin square: what a PIP adds on
+        average is taken out before, as what a lung adds is.
+
+        Args:
+            values: ``(L, n)``, such as a mean over conditions; any unit.
+        """
+        levels, index, count = np.unique(self.pips, return_inverse=True, return_counts=True)
+        if count.min() > 1:
+            index = index.reshape(values.shape)
+            sums = np.bincount(index.ravel(), weights=values.ravel(), minlength=len(levels))
+            values = values - (sums / count)[index] + values.mean()
+        return resampled_scores(values, self.rig, self.member)
+
+    def interval(self, values: Floats) -> tuple[float, float]:
+        """95 % interval of a mean over cells, by :meth:`resampled`.
+
+        Args:
+            values: ``(L, n)``, such as a mean over conditions; any unit.
+        """
+        if values.shape[1] < 2 or not np.isfinite(values).all():
+            return math.nan, math.nan
+        low, high = np.quantile(self.resampled(values), (0.025, 0.975))
+        return float(low), float(high)
+
+    def comparable(self, other: StressTables) -> bool:
+        """Whether another entry was run under the same conditions on the same draws."""
+        return (
+            self.conditions == other.conditions
+            and self.lungs == other.lungs
+            and all(
+                np.array_equal(getattr(self, name), getattr(other, name))
+                for name in ("pips", "rig", "member")
+            )
+        )
+
+    def difference(self, other: StressTables) -> tuple[float, tuple[float, float]]:
+        """Stress score less that of another entry, cmH2O, and its paired 95 % interval.
+
+        Raises:
+            InputError: if the other one was run on other draws or under other conditions.
+        """
+        if not self.comparable(other):
+            raise InputError("these entries were run under different conditions or draws")
+        change = self.by_lung_and_draw - other.by_lung_and_draw
+        return float(change.mean()), self.interval(change)
+
+    def summary(self) -> pd.DataFrame:
+        """One row a condition, by its id: means over cells, and the worst run."""
+        import pandas as pd
+
+        return pd.DataFrame([self.of_condition(k) for k in range(len(self.conditions))]).set_index(
+            "condition"
+        )
+
+    def headline(self) -> dict[str, Any]:
+        """What a table shows of an entry, as JSON values: score, rise, survival, safety, worst."""
+        worst = [self.of_condition(k) for k in range(1, len(self.conditions))]
+        worst_one = max(worst, key=lambda row: _order(row["error_cmH2O"]))
+        stressed = self.by_lung_and_draw
+        return {
+            "score": number(self.score),
+            "ci95": [number(limit) for limit in self.interval(stressed)],
+            "unstressed": number(self.unstressed),
+            "rise": number(np.mean(self.rise[1:])),
+            "rise_ci95": [number(limit) for limit in self.interval(self.rise[1:].mean(axis=0))],
+            "survived": self.survived_share,
+            "survived_ci95": [
+                number(limit) for limit in self.interval(self.survived[1:].mean(axis=0))
+            ],
+            "survived_unstressed": float(np.mean(self.survived[0])),
+            "unsafe_runs": int(np.sum(~self.safe[1:])),
+            "stressed_runs": int(self.safe[1:].size),
+            "above_alarm_s": number(np.mean(self.alarm_s[1:])),
+            "worst_condition": worst_one["condition"],
+            "worst_error": worst_one["error_cmH2O"],
+            "complete": self.complete,
+            "categories": self.by_category(),
+            "conditions": [self.of_condition(k) for k in range(len(self.conditions))],
+        }
+
+    def by_category(self) -> dict[str, dict[str, float | None]]:
+        """Means of each category of stressors, and of the pairs."""
+        means = {}
+        for category in (*CATEGORIES, "pairs"):
+            at = [k for k, c in enumerate(self.conditions) if category_of(c) == category]
+            if at:
+                means[category] = {
+                    "error_cmH2O": number(np.mean(self.error[at])),
+                    "rise_cmH2O": number(np.mean(self.rise[at])),
+                    "survived": float(np.mean(self.survived[at])),
+                    "unsafe_runs": int(np.sum(~self.safe[at])),
+                }
+        return means
+
+    def of_condition(self, k: int) -> dict[str, Any]:
+        """Means and the worst run of the k-th condition, as JSON values."""
+        condition, error = self.conditions[k], self.error[k]
+        lung, draw = np.unravel_index(np.argmax(np.nan_to_num(error, nan=np.inf)), error.shape)
+        return {
+            "condition": condition.id,
+            "stressors": list(condition.stressors),
+            "severity": condition.severity,
+            "category": category_of(condition),
+            "error_cmH2O": number(np.mean(error)),
+            "ci95": [number(limit) for limit in self.interval(error)],
+            "rise_cmH2O": number(np.mean(self.rise[k])),
+            "rise_ci95": [number(limit) for limit in self.interval(self.rise[k])],
+            "survived": float(np.mean(self.survived[k])),
+            "unsafe_runs": int(np.sum(~self.safe[k])),
+            "above_alarm_s": number(np.mean(self.alarm_s[k])),
+            "peak_cmH2O": number(np.max(self.peak[k])),
+            "volume_ratio": number(np.median(self.volume_ratio[k])),
+            "worst": {
+                "lung": self.lungs[lung],
+                "pip": float(self.pips[lung, draw]),
+                "error_cmH2O": number(error[lung, draw]),
+            },
+        }
+
+
+def pip_columns(lungs: int, n: int) -> NDArray[np.int64]:
+    """Place of the PIP of each lung and draw among the protocol's, ``(lungs, n)``.
+
+    In each draw the lungs have different PIPs, and over six draws each lung has each PIP once.
+    """
+    turns = np.array(_TURNS)[np.arange(n) % len(_TURNS)]
+    return (np.arange(lungs)[:, None] + turns) % len(protocol.PIPS)
+
+
+def category_of(condition: Condition) -> str:
+    """Category of a condition: of its stressor, ``"pairs"`` or ``"none"``."""
+    categories = [stressor(name).category for name in condition.stressors]
+    return "pairs" if len(categories) > 1 else "".join(categories) or "none"
+
+
+def number(value: float | np.floating) -> float | None:
+    """A JSON number; None where it does not exist."""
+    return float(value) if math.isfinite(value) else None
+
+
+def _order(value: float | None) -> float:
+    return math.inf if value is None else value

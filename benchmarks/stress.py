@@ -1,8 +1,9 @@
 """Figures of the bundled entries on the stress track: the table and the picture of docs/stress.md.
 
-Prints the table, and paired differences between the last entry and the others. Usage:
+Prints the table, and paired differences between the best entry and the others. The figures are
+those of the leaderboard's records; ``--run`` runs the bundled entries anew. Usage:
 
-    python benchmarks/stress.py [--draws N] [--write]
+    python benchmarks/stress.py [--run [--draws N]] [--write]
 
 ``--write`` puts table and picture into docs/.
 """
@@ -16,12 +17,16 @@ from pathlib import Path
 from typing import Any
 
 from ventbench import compilation
+from ventbench.board import stress_table
+from ventbench.board.frames import load_tracks
+from ventbench.stress.results import DRAWS, StressTables
 from ventbench.stress.score import score_stress
 from ventbench.stress.stressors import CATEGORIES
 from ventbench.views.stress import write_stress_chart
 
 ENTRIES = ("pid_robust", "residual_mlp_all", "ppo", "dqn", "adaptive_pid")
 DOCS = Path(__file__).parents[1] / "docs"
+LEADERBOARD = DOCS.parent / "leaderboard"
 
 
 def table(scores: list[dict[str, Any]]) -> str:
@@ -59,23 +64,37 @@ def table(scores: list[dict[str, Any]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", action="store_true", help="put table and picture into docs/")
-    parser.add_argument("--draws", type=int, default=6)
+    parser.add_argument("--run", action="store_true", help="run the entries anew, in this process")
+    parser.add_argument("--draws", type=int, default=DRAWS, help="with --run: number of draws")
     given = parser.parse_args()
-    compilation.keep()
-    results = [score_stress(name, draws=given.draws, sandbox=False) for name in ENTRIES]
-    scores = [result.to_json() for result in results]
+    tables = anew(given.draws) if given.run else recorded()
+    scores = [{"name": name, **own.headline()} for name, own in tables.items()]
     text = table(scores)
     print(text)
-    for result in results[:-1]:
-        difference, (low, high) = results[-1].difference(result)
-        names = f"{ENTRIES[-1]} less {result.submission.manifest.name}"
-        print(f"{names}: {difference:+.3f} cmH2O, paired 95 % interval {low:+.3f} to {high:+.3f}")
+    best = min(tables, key=lambda name: tables[name].score)
+    for name, own in tables.items():
+        if name != best:
+            difference, (low, high) = tables[best].difference(own)
+            limits = f"paired 95 % interval {low:+.3f} to {high:+.3f}"
+            print(f"{best} less {name}: {difference:+.3f} cmH2O, {limits}")
     if given.write:
         page = DOCS / "stress.md"
         block = f"<!-- figures -->\n{text}\n<!-- end -->"
         old = re.compile(r"<!-- figures -->\n.*?\n<!-- end -->", re.S)
         page.write_text(old.sub(lambda _: block, page.read_text("utf-8")), "utf-8")
         write_stress_chart(DOCS / "img" / "stress.png", scores)
+
+
+def recorded() -> dict[str, StressTables]:
+    """Tables of the records of the leaderboard, best first."""
+    (track,) = load_tracks(LEADERBOARD, track="robustness", version=2)
+    return {row.name: row.tables for row in stress_table.rows(track)}
+
+
+def anew(draws: int) -> dict[str, StressTables]:
+    """Tables of the bundled entries, run in this process."""
+    compilation.keep()
+    return {name: score_stress(name, draws=draws, sandbox=False) for name in ENTRIES}
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 import shutil
 from pathlib import Path
 
@@ -61,3 +62,16 @@ def test_no_byte_of_the_simulators_may_change(tmp_path: Path) -> None:
             assert problem.startswith("simulators: ")
             assert name == frozen.MANIFEST or name in problem
             flip(copy / name, place)
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/protocol_v2.md", "docs/stress.md"])
+def test_tables_of_the_docs_are_those_of_the_records(page: str) -> None:
+    root = FOLDER.parent
+    if page == "docs/stress.md":
+        tool = runpy.run_path(str(root / "benchmarks" / "stress.py"))
+        scores = [{"name": name, **own.headline()} for name, own in tool["recorded"]().items()]
+        table = tool["table"](scores)
+    else:
+        tool = runpy.run_path(str(root / "benchmarks" / "board_tables.py"))
+        table = tool["markdown"](short=page == "README.md")
+    assert table in (root / page).read_text("utf-8"), "run the benchmark with --write"

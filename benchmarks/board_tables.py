@@ -1,0 +1,77 @@
+"""Tables of README.md and docs/protocol_v2.md from the records of the leaderboard.
+
+Prints both; ``--write`` puts them where they belong. Usage:
+
+    python benchmarks/board_tables.py [--write]
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+import pandas as pd
+
+from ventbench.board.frames import load_board
+
+ROOT = Path(__file__).parents[1]
+
+#: Page, and columns of its table: title, text of a row of the board.
+PAGES = (ROOT / "README.md", ROOT / "docs" / "protocol_v2.md")
+
+
+def rows(short: bool) -> list[list[str]]:
+    """Title and rows of a table.
+
+    Args:
+        short: for README: without the nominal error and the difference to the PID.
+    """
+    board = load_board(ROOT / "leaderboard", version=2)
+    titles = ["track", "rank", "entry", "normalised", "error", "nominal", "to PID", "stress"]
+    table = [[*titles, "runs survived"]]
+    for row in board[board.status == "ranked"].itertuples():
+        ranks = f"{row.rank}"
+        if row.rank_low != row.rank_high:
+            ranks += f" ({row.rank_low} to {row.rank_high})"
+        there = pd.notna(row.stress_cmH2O)
+        pid = pd.notna(row.normalised_to_pid)
+        table.append(
+            [
+                str(row.track),
+                ranks,
+                str(row.name),
+                f"**{row.normalised:.1f}** [{row.normalised_low:.1f}, {row.normalised_high:.1f}]",
+                f"{row.score_cmH2O:.3f}",
+                f"{row.nominal_cmH2O:.3f}",
+                f"{row.normalised_to_pid:+.1f}" if pid else "",
+                f"{row.stress_cmH2O:.2f}" if there else "",
+                f"{100 * row.stress_survived:.0f} %" if there else "",
+            ]
+        )
+    left_out = {5, 6} if short else set()
+    return [[cell for k, cell in enumerate(line) if k not in left_out] for line in table]
+
+
+def markdown(short: bool) -> str:
+    """A table of :func:`rows`."""
+    title, *body = rows(short)
+    lines = [title, ["---"] * len(title), *body]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--write", action="store_true", help="put the tables into the pages")
+    given = parser.parse_args()
+    block = re.compile(r"<!-- board -->\n.*?<!-- end -->", re.S)
+    for page in PAGES:
+        table = markdown(short=page.name == "README.md")
+        print(f"{page.name}\n{table}\n")
+        if given.write:
+            text = f"<!-- board -->\n{table}\n<!-- end -->"
+            page.write_text(block.sub(lambda _, t=text: t, page.read_text("utf-8")), "utf-8")
+
+
+if __name__ == "__main__":
+    main()

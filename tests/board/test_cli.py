@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from ventbench.board import store
+from ventbench.board import frames, store
 from ventbench.cli import app
 from ventbench.errors import InputError
 from ventbench.plants import frozen
@@ -112,3 +112,58 @@ def test_score_keeps_a_record_that_can_be_added(tmp_path: Path) -> None:
     refused = RUN.invoke(app, ["score", "pid_robust", "--record", str(tmp_path / "other")])
     assert "add --draws 20" in str(refused.exception)
     assert not (tmp_path / "other").exists()
+
+
+def test_whose_each_record_is(leaderboard: Path, tmp_path: Path) -> None:
+    """File names are hashes: `board records` says whose, and whether they count."""
+    scores = store.load(leaderboard).scores
+    run("withdraw", scores[0].sha256[:12], "--reason", "a bug", "--folder", leaderboard)
+    report = tmp_path / "index.json"
+    text = run("records", "--folder", leaderboard, "--json", report)
+    rows = {row["record"]: row for row in json.loads(report.read_text())["records"]}
+    files = {path.stem for path in (leaderboard / "records").glob("*.json")}
+    assert set(rows) == files
+    for score in scores:
+        row = rows[score.sha256]
+        assert (row["name"], row["track"], row["kind"]) == (score.name, score.track, "score")
+        assert (leaderboard / "records" / f"{row['commands']}.actions").is_file()
+    assert rows[scores[0].sha256]["state"] == "withdrawn"
+    (withdrawal,) = (row for row in rows.values() if row["kind"] == "withdrawal")
+    assert withdrawal["name"] == scores[0].name
+    assert f"{len(rows)} records in" in text
+    assert scores[0].sha256[:8] in text
+
+
+def test_tables_fit_80_columns(full: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No line breaks within a cell, whether or not the terminal is wider."""
+    monkeypatch.setenv("COLUMNS", "80")
+    text = run("show", "--folder", full)
+    assert max(map(len, text.splitlines())) <= 80
+    for track in frames.load_tracks(full):
+        for status, row in track.rows:
+            if status == "ranked" and row.score is not None:
+                own = row.score
+                line = next(x for x in text.splitlines() if row.record.sha256[:8] in x)
+                assert row.record.name in line
+                assert f"{own.low:.3f}..{own.high:.3f}" in line
+    assert "…" not in text
+    assert "broken: not ranked" in text or "broken: not official" in text
+
+
+def test_a_rerun_elsewhere_replaces_no_official_record(
+    leaderboard: Path, draft, tmp_path: Path
+) -> None:
+    """The same entry scored on a laptop: it must name what it replaces, and be vouched for."""
+    official = next(x for x in store.load(leaderboard).scores if x.name == "softer")
+    path = draft("softer", factor=0.99).save(tmp_path)
+    said = run("add", path, "--folder", leaderboard, code=2)
+    assert "a new one must name it, with --supersedes" in said
+    unsigned = draft("softer", factor=0.98, supersedes=official.sha256).save(tmp_path)
+    run("add", unsigned, "--folder", leaderboard)  # nobody has accepted it
+    row = next(
+        row
+        for track in frames.load_tracks(leaderboard)
+        for _, row in track.rows
+        if row.record.name == "softer"
+    )
+    assert row.record.sha256 == official.sha256

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ventbench.board import pages, ranking, store
+from ventbench.board.hardware import HardwareRecord
 from ventbench.board.ranking import Interval, Row, Track
-from ventbench.board.record import Record
+from ventbench.board.record import Record, Sealed, Withdrawal, commands_of
 from ventbench.errors import InputError
 from ventbench.submissions.manifest import TRACKS
 from ventbench.text import plain
@@ -165,6 +166,62 @@ def load_tracks(
     if track is not None and track not in TRACKS:
         raise InputError(f"track {track!r} is not one of {', '.join(TRACKS)}")
     return [tracks for tracks in boards[chosen] if track in (None, tracks.name)]
+
+
+def record_index(folder: Path | str | None = None) -> list[dict[str, Any]]:
+    """List every record of a leaderboard in the order of the chain: whose each file is.
+
+    Args:
+        folder: of the leaderboard; ``leaderboard`` in the working directory by default.
+
+    Returns:
+        For each record ``record`` and ``commands`` (SHA-256, or None: they name the files in
+        ``records/``), ``kind`` (``"score"``, ``"hardware"``, ``"sealed"``, ``"withdrawal"``),
+        ``version``, ``track`` and ``name`` (of what is withdrawn, for a withdrawal), ``created``
+        (UTC) and ``state``: ``"ranked"``, ``"not ranked"``, ``"not official"``, ``"superseded"``,
+        ``"withdrawn"``, or empty for what has none.
+
+    Raises:
+        InputError: if there is no leaderboard, or a record was changed.
+    """
+    leaderboard = store.load(FOLDER if folder is None else Path(folder))
+    boards = ranking.boards(leaderboard.records, leaderboard.attested, leaderboard.breaches)
+    states = {
+        row.record.sha256: status
+        for tracks in boards.values()
+        for track in tracks
+        for status, row in track.rows
+    }
+    by_hash = {entry.sha256: entry for entry in leaderboard.records}
+    taken_back = {x.withdraws for x in leaderboard.records if isinstance(x, Withdrawal)}
+    rows = []
+    for entry in leaderboard.records:
+        about = by_hash.get(entry.withdraws) if isinstance(entry, Withdrawal) else entry
+        if about is None or isinstance(about, Withdrawal):  # refused when the folder is verified
+            continue
+        kind, state = "score", states.get(entry.sha256, "superseded")
+        if not isinstance(entry, Record):
+            kind = type(entry).__name__.removesuffix("Record").lower()
+            state = ""
+        rows.append(
+            {
+                "record": entry.sha256,
+                "commands": commands_of(entry),
+                "kind": kind,
+                "version": about.content.protocol
+                if isinstance(about, Sealed)
+                else about.header.protocol,
+                "track": about.track,
+                "name": about.name,
+                "created": entry.created if isinstance(entry, Withdrawal) else _created(entry),
+                "state": "withdrawn" if entry.sha256 in taken_back else state,
+            }
+        )
+    return rows
+
+
+def _created(entry: Record | Sealed | HardwareRecord) -> str:
+    return entry.content.created if isinstance(entry, Sealed) else entry.header.created
 
 
 def cell_means(record: Record, lung: str) -> dict[str, float | None]:

@@ -34,6 +34,9 @@ SeedFile = Annotated[
 ]
 FOLDER = Path("leaderboard")
 
+#: Characters of a hash that tables show, as `--supersedes` and `verify --rerun` take them.
+SHOWN = 8
+
 
 def _seed(path: Path | None) -> bytes | None:
     from ventbench import seasons
@@ -411,6 +414,7 @@ def show(
     from rich.console import Console
 
     from ventbench.board import frames
+    from ventbench.text import plain
 
     tracks = frames.load_tracks(folder, version=version)
     rows = [
@@ -422,11 +426,66 @@ def show(
     emit({"version": tracks[0].version, "rows": rows}, json)
     console = Console(stderr=str(json) == "-")
     for track in tracks:
-        console.print(_table(track) if lung is None else _lung_table(track, lung))
-        if lung is None and any(row.record.stress for row in track.ranked):
-            console.print(_stress_table(track))
+        if lung is not None:
+            console.print(_lung_table(track, lung))
+        else:
+            console.print(_table(track) if track.version == 1 else _normalised_table(track))
+            for status, row in track.rows:
+                if status != "ranked":
+                    why = plain("; ".join((status, *row.entry.reasons))[:300])
+                    console.print(f"{row.record.name}: {why}", markup=False, highlight=False)
+            if any(row.record.stress for row in track.ranked):
+                console.print(_stress_table(track))
         if track.sealed:
             console.print(_sealed_table(track))
+
+
+@app.command(name="records")
+def list_records(folder: Folder = FOLDER, json: JsonFile = None) -> None:
+    """List the files of `records/`: whose each is, and whether it counts.
+
+    Example: `ventbench board records`
+    """
+    from rich.console import Console
+
+    from ventbench.board import frames
+    from ventbench.text import plain
+
+    rows = frames.record_index(folder)
+    emit({"records": rows}, json)
+    table = _plain_table("")
+    for name in ("record", "entry", "track", "version", "kind", "made", "state"):
+        table.add_column(name, overflow="fold", justify="right" if name == "version" else "left")
+    for row in rows:
+        table.add_row(
+            row["record"][:SHOWN],
+            plain(row["name"]),
+            row["track"],
+            str(row["version"]),
+            row["kind"],
+            row["created"][:10],
+            row["state"],
+        )
+    console = Console(stderr=str(json) == "-")
+    console.print(table)
+    console.print(
+        f"{len(rows)} records in {folder / 'records'}; the beginning of a hash is enough."
+    )
+
+
+def _plain_table(title: str) -> Table:
+    """Return a table without frames, which fits 80 columns."""
+    from rich import box
+    from rich.table import Table
+
+    return Table(
+        title=title or None,
+        box=box.SIMPLE_HEAD,
+        padding=(0, 0, 0, 1),
+        pad_edge=False,
+        title_justify="left",
+        caption_justify="left",
+    )
 
 
 def _lung_table(track: Track, lung: str) -> Table:
@@ -452,19 +511,11 @@ def _lung_table(track: Track, lung: str) -> Table:
 
 
 def _table(track: Track) -> Table:
-    from rich.markup import escape
-    from rich.table import Table
-
-    from ventbench.text import plain
-
-    if track.version > 1:
-        return _normalised_table(track)
-    table = Table(title=f"{track.name}, version {track.version}: score over draws, cmH2O")
-    for name in ("rank", "entry", "score", "95 %", "to PID", "nominal", "worst cell", "state"):
-        left = name in ("entry", "state")
-        table.add_column(name, justify="left" if left else "right", no_wrap=name == "entry")
-    for status, row in track.rows:
-        worst, lung, pip = row.worst
+    """Return the ranking of version 1: errors in cmH2O."""
+    table = _plain_table(f"{track.name}, version {track.version}: score over draws, cmH2O")
+    for name in ("rank", "entry", "score", "95 %", "to PID", "nominal", "record"):
+        table.add_column(name, justify="left" if name in ("entry", "record") else "right")
+    for _, row in track.rows:
         table.add_row(
             "" if row.rank is None else str(row.rank),
             row.record.name,
@@ -472,29 +523,20 @@ def _table(track: Track) -> Table:
             _limits(row.score),
             "" if row.to_baseline is None else f"{row.to_baseline.value:+.3f}",
             f"{row.nominal:.3f}" if row.nominal == row.nominal else "failed",
-            f"{worst:.3f} {lung} {pip:g}" if lung else "",
-            escape(plain("; ".join((status, *row.entry.reasons)))[:120]),
+            row.record.sha256[:SHOWN],
         )
     return table
 
 
 def _normalised_table(track: Track) -> Table:
-    """Version 2: the normalised score ranks; errors in cmH2O beside it."""
-    from rich import box
-    from rich.markup import escape
-    from rich.table import Table
-
-    from ventbench.text import plain
-
+    """Return the ranking of version 2: the normalised score ranks; errors in cmH2O beside it."""
     title = f"{track.name}, version {track.version}: 0 = best attainable, 100 = best PID"
     season = {row.record.header.draws.season for _, row in track.rows}
-    caption = f"draws: {', '.join(sorted(filter(None, season)))}"
-    table = Table(title=title, caption=caption, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    columns = ("rank", "entry", "normalised", "95 %", "ranks", "error", "nominal", "state")
-    for name in columns:
-        left = name in ("entry", "state")
-        table.add_column(name, justify="left" if left else "right", no_wrap=name != "state")
-    for status, row in track.rows:
+    table = _plain_table(title)
+    table.caption = f"draws: {', '.join(sorted(filter(None, season)))}; error in cmH2O"
+    for name in ("rank", "entry", "score", "95 %", "ranks", "error", "record"):
+        table.add_column(name, justify="left" if name in ("entry", "record") else "right")
+    for _, row in track.rows:
         own = None if row.normalised is None else row.normalised.score
         table.add_row(
             "" if row.rank is None else str(row.rank),
@@ -503,8 +545,7 @@ def _normalised_table(track: Track) -> Table:
             "" if own is None else f"{own.low:.1f}..{own.high:.1f}",
             "" if row.ranks is None else f"{row.ranks[0]}..{row.ranks[1]}",
             "failed" if row.score is None else f"{row.score.value:.3f}",
-            f"{row.nominal:.3f}" if row.nominal == row.nominal else "failed",
-            escape(plain("; ".join((status, *row.entry.reasons)))[:120]),
+            row.record.sha256[:SHOWN],
         )
     return table
 
@@ -558,7 +599,7 @@ def _sealed_table(track: Track) -> Table:
 
 
 def _limits(interval: Interval | None) -> str:
-    return "" if interval is None else f"{interval.low:.3f} to {interval.high:.3f}"
+    return "" if interval is None else f"{interval.low:.3f}..{interval.high:.3f}"
 
 
 def register(parent: typer.Typer) -> None:

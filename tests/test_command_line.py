@@ -88,3 +88,24 @@ def test_doctor_names_what_is_missing(monkeypatch):
     ended = CliRunner().invoke(cli.app, ["doctor"])
     assert ended.exit_code == 1
     assert "not official: the sandbox lacks seccomp" in " ".join(ended.stdout.split())
+
+
+def test_quiet_stands_before_or_behind_a_command():
+    for given in (["--quiet", "score", "a"], ["score", "--quiet", "a"], ["score", "a", "--quiet"]):
+        assert cli._quiet_first(given) == ["--quiet", "score", "a"]
+    assert cli._quiet_first(["score", "a"]) == ["score", "a"]
+    assert cli._quiet_first(["score", "--", "--quiet"]) == ["score", "--", "--quiet"]
+
+
+def test_quiet_says_nothing_but_the_result(tmp_path):
+    """Without it a reading command shows what it does on stderr; results stay either way."""
+    script = "import sys; from ventbench import cli; from ventbench.cli import options\n"
+    script += "@cli.app.command()\ndef work():\n"
+    script += "    options.notes().print('note')\n    print('result')\n"
+    script += "    with options.bars() as shown:\n        options.counted(shown, 'steps')(1, 2)\n"
+    script += "sys.argv = ['ventbench', 'work', *sys.argv[2:]]\ncli.main()\n"
+    loud, quiet = _run(script), _run(script, "--quiet")
+    assert "note" in loud.stderr
+    assert quiet.stderr == ""
+    assert quiet.stdout == loud.stdout == "result\n"
+    assert quiet.returncode == 0

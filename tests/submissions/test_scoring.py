@@ -16,7 +16,7 @@ from ventbench.lungs import LUNG_IDS, LUNGS, lung
 from ventbench.metrics.score import run_error
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import take
-from ventbench.submissions import stepping
+from ventbench.submissions import runner, stepping
 from ventbench.submissions.errors import Failure, SubmissionError
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.runner import InProcessRunner
@@ -450,3 +450,38 @@ def test_failures_of_a_function_name_its_file_and_line(two_lungs):
 def test_what_cannot_be_scored(given, said):
     with pytest.raises(SubmissionError, match=said):
         score(given, simulator="physics")
+
+
+def test_progress_counts_the_rounds_of_all_sessions():
+    class Session:
+        closed = 0
+
+        def __init__(self):
+            self.failures = {0: "something"}
+
+        def act(self, observations):
+            return observations[:, 0]
+
+        def close(self):
+            Session.closed += 1
+
+    class Plain:
+        def __init__(self):
+            self.sandbox = {"layer": "none"}
+
+        def start(self, submission, tasks):
+            return Session()
+
+    seen = []
+    counting = runner.CountingRunner(Plain(), lambda *far: seen.append(far), sessions=2)
+    assert counting.sandbox == {"layer": "none"}
+    rows = np.arange(6.0).reshape(3, 2)
+    for _ in range(2):
+        session = counting.start(None, [None] * 3)
+        for _ in range(2):
+            np.testing.assert_array_equal(session.act(rows), rows[:, 0])
+        assert session.failures == {0: "something"}
+        session.close()
+    assert Session.closed == 2
+    total = 2 * protocol.BREATHS * protocol.INSPIRATION_STEPS
+    assert seen == [(1, total), (2, total), (3, total), (4, total)]

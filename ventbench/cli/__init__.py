@@ -6,6 +6,8 @@ Heavy packages are imported inside the commands, so that ``ventbench --help`` an
 
 from __future__ import annotations
 
+import sys
+
 import typer
 
 from ventbench import __version__
@@ -18,6 +20,7 @@ from ventbench.cli import (
     ending,
     headroom,
     mechanics,
+    options,
     proof,
     real_pairs,
     score,
@@ -51,8 +54,11 @@ def _root(
     version: bool = typer.Option(
         False, "--version", callback=_version, is_eager=True, help="Print the version and exit."
     ),
+    quiet: bool = typer.Option(
+        False, "--quiet", help="No progress and no notes on stderr; also behind any command."
+    ),
 ) -> None:
-    pass
+    options.be_quiet(quiet)
 
 
 score.register(app)
@@ -75,6 +81,13 @@ real_pairs.register(app)
 app.add_typer(data.app)
 
 
+def _quiet_first(arguments: list[str]) -> list[str]:
+    """Move ``--quiet`` to the front, where the program takes it whatever the command."""
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    own = [text for text in arguments[:end] if text != "--quiet"]
+    return ["--quiet"] * (len(own) < end) + own + arguments[end:]
+
+
 def main() -> None:
     """Entry point of the console script."""
-    ending.run(app, "ventbench")
+    ending.run(lambda: app(_quiet_first(sys.argv[1:])), "ventbench")

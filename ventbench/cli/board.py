@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ventbench.cli.options import JsonFile, emit
+from ventbench.cli.options import JsonFile, bars, counted, emit, notes
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -335,13 +335,13 @@ def verify(
     if records and not rerun:
         raise InputError("records are chosen for --rerun; without it all are verified")
     console = Console(stderr=str(json) == "-")
-    with Console(stderr=True).status("replaying") as status:
+    with bars() as shown:
         report = verifier.verify(
             folder,
             frozen.load,
             head=head,
             seed=_seed(seed),
-            progress=lambda done, all_: status.update(f"replayed {done} of {all_} records"),
+            progress=counted(shown, "replaying records"),
         )
     if rerun and not report.problems:  # else the records are not what they were
         _rerun(report, folder, records or [], source or [], out, jobs)
@@ -359,11 +359,9 @@ def _rerun(
     report: Report, folder: Path, records: list[str], sources: list[Path], out: Path, jobs: int
 ) -> None:
     """Run code again; note in the report what came of it."""
-    from rich.console import Console
-
     from ventbench.board import rerun
 
-    with Console(stderr=True).status("running code again") as status:
+    with notes().status("running code again") as status:
 
         def note(outcome: rerun.Outcome) -> None:
             if outcome.state == rerun.REPRODUCED:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, emit
+from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, emit, waiting
 
 #: Breaths that are explored side by side.
 _TOGETHER = 60
@@ -35,12 +35,9 @@ def check(
 
     Example: `ventbench data check lab.csv`
     """
-    from rich.console import Console
-
     from ventbench import recordings
 
-    console = Console(stderr=True)
-    with console.status(f"reading {file}"):
+    with waiting(f"reading {file}"):
         report = recordings.check(file, clip=clip, pad=pad)
     emit(report.to_dict(), json)
     for line in report.lines():
@@ -107,8 +104,6 @@ def import_(
 
     Example: `ventbench data import lab.csv --map Paw=pressure --flow-unit L/min --lung R20C50`
     """
-    from rich.console import Console
-
     from ventbench import recordings
     from ventbench.recordings.foreign import import_recording
 
@@ -116,7 +111,7 @@ def import_(
         "pressure": pressure_unit, "flow": flow_unit, "volume": volume_unit, "time": time_unit,
         "u_in": u_in_unit,
     }  # fmt: skip
-    with Console(stderr=True).status(f"reading {file}"):
+    with waiting(f"reading {file}"):
         imported = import_recording(
             file,
             columns=_pairs(columns, "--map"),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, claim_out, emit
+from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, claim_out, emit, notes, waiting
 
 #: Share of a diagnosis before which its remaining time is a guess.
 _TOO_EARLY = 0.15
@@ -84,11 +84,11 @@ def diagnose(
     if patient and passive:
         raise InputError("--patient and --passive contradict each other; choose one of them")
     extras.require("jinja2", "rerun")
-    progress = Console(stderr=True)
-    with progress.status(f"reading {recordings}"):
+    said = notes()
+    with waiting(f"reading {recordings}"):
         breaths = files.load(recordings, clip=clip, pad=pad)
     for note in breaths.notes:
-        progress.print(f"note: {note}", markup=False, highlight=False)
+        said.print(f"note: {note}", markup=False, highlight=False)
     diagnosis = _diagnose(breaths, plant, simulated, lung, patient, drive)
     written = diagnosis.save(out)
     emit(diagnosis.as_dict(), json)
@@ -106,7 +106,6 @@ def _diagnose(
     drive: str,
 ) -> Diagnosis:  # fmt: skip
     """Diagnose with a progress bar that says what is done and how long it will take."""
-    from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from ventbench import compilation
@@ -115,7 +114,7 @@ def _diagnose(
 
     compilation.keep()
     simulators = load_simulated(simulated, breaths) if simulated else load_simulators(plant)
-    console = Console(stderr=True)
+    console = notes()
     lungs = 1 if lung is not None else len(breaths.by_lung_index)
     console.print(expected_time(len(breaths), lungs, compilation.is_warm()), highlight=False)
     columns = (

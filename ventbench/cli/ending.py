@@ -6,10 +6,9 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from types import FrameType
 from typing import NoReturn
-
-import typer
 
 from ventbench.errors import InputError
 from ventbench.text import plain
@@ -18,11 +17,11 @@ from ventbench.text import plain
 INTERRUPTED = 130
 
 
-def run(app: typer.Typer, program: str, *, stopped: str = "") -> None:
+def run(app: Callable[[], object], program: str, *, stopped: str = "") -> None:
     """Run a command line to its end.
 
     Args:
-        app: the commands.
+        app: runs the commands with the arguments of the process.
         program: what the messages begin with.
         stopped: what is true after Ctrl-C, besides what a command keeps.
     """

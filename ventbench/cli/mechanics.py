@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ventbench.cli.options import Clip, JsonFile, Pad, emit
+from ventbench.cli.options import Clip, JsonFile, Pad, emit, waiting
 
 if TYPE_CHECKING:
     from ventbench.mechanics import Mechanics, SurveyedRun
@@ -34,15 +34,14 @@ def mechanics(
     """
     from rich.console import Console
 
-    progress = Console(stderr=True)
     console = Console(stderr=str(json) == "-")
     if _is_respiraworks(recordings):
-        with progress.status(f"identifying the lungs of {recordings}"):
+        with waiting(f"identifying the lungs of {recordings}"):
             runs = _survey(recordings)
         emit([_run(run) for run in runs], json)
         _say_runs(console, runs)
         return
-    with progress.status(f"identifying the lungs of {recordings}"):
+    with waiting(f"identifying the lungs of {recordings}"):
         lungs = _identify(recordings, clip=clip, pad=pad)
     emit([_lung(lung) for lung in lungs], json)
     console.print(_table(lungs))

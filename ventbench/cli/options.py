@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
 
 
 def claim_out(folder: Path | None) -> Path | None:
@@ -81,10 +86,54 @@ def emit(value: object, target: Path | None) -> None:
         files.write_json(target, value)
 
 
-def bars() -> Any:
-    """Return progress bars on stderr that show the finished share and the remaining time."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+_quiet = False
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    return Progress(*columns, transient=True, console=Console(stderr=True))
+
+def be_quiet(value: bool = True) -> None:
+    """Switch progress and notes off for the rest of this process: the option ``--quiet``."""
+    global _quiet
+    _quiet = value
+
+
+def notes() -> Console:
+    """Return the console on stderr for progress and notes; it says nothing after ``--quiet``."""
+    from rich.console import Console
+
+    return Console(stderr=True, quiet=_quiet)
+
+
+def bars() -> Progress:
+    """Return progress bars on stderr: the finished share, the time taken and the time left."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import TimeRemainingColumn as Remaining
+
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        Remaining(),
+    )
+    return Progress(*columns, transient=True, console=notes())
+
+
+def counted(shown: Progress, text: str) -> Callable[[int, int], None]:
+    """Add a bar and return what moves it: a function of how much is done and of how much in all."""
+    task = shown.add_task(text, total=None)
+
+    def progress(done: int, total: int) -> None:
+        shown.update(task, completed=done, total=total)
+
+    return progress
+
+
+def waiting(text: str) -> Progress:
+    """Return a spinner on stderr with the time taken, for work whose length nobody knows."""
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (
+        SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
+    )  # fmt: skip
+    shown = Progress(*columns, transient=True, console=notes())
+    shown.add_task(text, total=None)
+    return shown

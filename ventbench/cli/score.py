@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ventbench.cli.options import JsonFile, PlantName, claim_out, emit
+from ventbench.cli.options import JsonFile, PlantName, bars, claim_out, counted, emit
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -122,10 +122,9 @@ def score(
     if record is not None and plant != "frozen":
         raise InputError("--record needs the official simulators: leave out --plant")
     simulators = load_simulators(plant)
-    progress = Console(stderr=True)
     scores = []
     for entry in opened:
-        with progress.status(f"scoring {entry.label}"):
+        with bars() as shown:
             scores.append(
                 scoring.score(
                     entry,
@@ -134,6 +133,7 @@ def score(
                     draws=draws,
                     sandbox=not in_process,
                     protocol=protocol,
+                    progress=counted(shown, f"scoring {entry.label}"),
                 )
             )
     results = [result.to_json() for result in scores]
@@ -155,10 +155,12 @@ def score(
         console.print(stress_table([own.to_json() for own in stressed.values()]))
     because = dict.fromkeys(reason for result in scores for reason in result.not_official_because)
     if because:
-        progress.print(f"These scores are not official: {', '.join(because)}.", style="yellow")
+        Console(stderr=True).print(
+            f"These scores are not official: {', '.join(because)}.", style="yellow"
+        )
     for result in scores:
         for failure in result.failures[:3]:
-            progress.print(failure.message, style="red", markup=False)
+            Console(stderr=True).print(failure.message, style="red", markup=False)
     if out is not None:
         for path in _keep(out, scores, stressed, report):
             console.print(f"wrote {path}", markup=False, highlight=False)

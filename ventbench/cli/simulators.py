@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from ventbench import protocol
-from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, emit
+from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, emit, notes, waiting
 
 
 def lungs(
@@ -156,12 +156,12 @@ def open_loop(
     from ventbench import open_loop_report
     from ventbench import recordings as files
 
-    progress = Console(stderr=True)
-    with progress.status(f"reading {recordings}"):
+    said = notes()
+    with waiting(f"reading {recordings}"):
         breaths = files.load(recordings, clip=clip, pad=pad)
     for note in breaths.notes:
-        progress.print(f"note: {note}", markup=False, highlight=False)
-    with progress.status(f"simulating {len(breaths)} breaths"):
+        said.print(f"note: {note}", markup=False, highlight=False)
+    with waiting(f"simulating {len(breaths)} breaths"):
         result = open_loop_report.open_loop(breaths, plant)
     emit(result.as_dict(), json)
     console = Console(stderr=str(json) == "-")

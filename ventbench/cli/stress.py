@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from ventbench.cli.options import JsonFile, emit
+from ventbench.cli.options import JsonFile, bars, counted, emit
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -45,16 +45,16 @@ def score_entries(
     if record is not None and (draws not in (0, DRAWS) or plant != "frozen"):
         raise InputError(f"--record of the stress track needs {DRAWS} draws on the frozen rigs")
     opened = [open_submission(name) for name in names]
-    progress = Console(stderr=True)
     scores = []
     for entry in opened:
-        with progress.status(f"stressing {entry.label}"):
+        with bars() as shown:
             scores.append(
                 score_stress(
                     entry,
                     simulator=plant,
                     draws=draws or DRAWS,
                     sandbox=not in_process,
+                    progress=counted(shown, f"stressing {entry.label}"),
                 )
             )
     results = [result.to_json() for result in scores]
@@ -86,7 +86,7 @@ def score_entries(
     failed = [failure for result in results for failure in result["failures"]]
     for failure in failed[:3]:
         place = f"{failure['condition']}, {failure['lung']}, draw {failure['draw']}"
-        progress.print(f"{place}: {failure['what']}", style="red", markup=False)
+        Console(stderr=True).print(f"{place}: {failure['what']}", style="red", markup=False)
     if failed:
         raise typer.Exit(1)
 

@@ -90,14 +90,11 @@ def simulator(
 
 
 def _train_simulators(run: Any, folder: Path, out: Path) -> None:
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, transient=True) as bars:
-        task = bars.add_task("learning", total=1.0)
+    with bars() as shown:
+        task = shown.add_task("learning", total=1.0)
 
         def progress(what: str, share: float) -> None:
-            bars.update(task, description=what, completed=share)
+            shown.update(task, description=what, completed=share)
 
         run(folder, out, progress=progress)
     typer.echo(f"wrote {out}")
@@ -190,21 +187,18 @@ def residual(
 def _train_residual(
     names: tuple[str, ...] | None, out: Path, config: Any, seed: int, plant: str
 ) -> dict[str, Any]:
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
     from ventbench.training.residual import train_residual
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, transient=True) as bars:
+    with bars() as shown:
         tasks: dict[str, Any] = {}
 
         def report(what: str, progress: Any) -> None:
             if what not in tasks:
-                tasks[what] = bars.add_task(what, total=None)
+                tasks[what] = shown.add_task(what, total=None)
             if progress is not None:
                 done, total, loss = progress
                 text = f"{what}: {loss:.3f} cmH2O"
-                bars.update(tasks[what], description=text, completed=done, total=total)
+                shown.update(tasks[what], description=text, completed=done, total=total)
 
         trained = train_residual(
             names, out, config=config, seed=seed, simulator=plant, progress=report

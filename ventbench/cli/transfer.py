@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from ventbench.cli.options import JsonFile, emit
+from ventbench.cli.options import JsonFile, bars, counted, emit
 from ventbench.cli.score import Track
 
 
@@ -37,7 +37,7 @@ def transfer(
     from ventbench.submissions import rig_scoring
     from ventbench.submissions import transfer as transfers
     from ventbench.submissions.folder import open_submission
-    from ventbench.submissions.runner import InProcessRunner, Runner
+    from ventbench.submissions.runner import CountingRunner, InProcessRunner, Runner
 
     runner: Runner = InProcessRunner()
     if not in_process:
@@ -48,8 +48,9 @@ def transfer(
     rigs = rig_scoring.load_rigs()
     results = []
     for entry in opened:
-        with Console(stderr=True).status(f"running {entry.label}"):
-            results.append(transfers.transfer(entry, rigs, track=track, runner=runner))
+        with bars() as shown:
+            counting = CountingRunner(runner, counted(shown, f"running {entry.label}"))
+            results.append(transfers.transfer(entry, rigs, track=track, runner=counting))
     emit({"entries": [result.to_json() for result in results]}, json)
     table = Table(title="Mean |pressure - target| on rigs, cmH2O (lower is better)")
     table.add_column("entry")

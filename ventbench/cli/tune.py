@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ventbench.cli.options import JsonFile, PlantName, claim_out, emit
+from ventbench.cli.options import JsonFile, PlantName, bars, claim_out, counted, emit
 
 app = typer.Typer(name="tune", help="Search for the gains of a controller.", no_args_is_help=True)
 
@@ -78,25 +78,9 @@ def _search(
     scheduler: str | None,
     each: bool,
 ) -> tuple[Any, dict[str, Any]]:
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
     from ventbench.training.pid_grid import tune_pid
 
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    )  # fmt: skip
-    with Progress(*columns, transient=True) as bars:
-        task = bars.add_task("trajectories", total=None)
-
-        def progress(done: int, total: int) -> None:
-            bars.update(task, completed=done, total=total)
-
+    with bars() as shown:
         return tune_pid(
             names,
             out,
@@ -104,7 +88,7 @@ def _search(
             scheduler=scheduler,
             each=each,
             simulator=plant,
-            progress=progress,
+            progress=counted(shown, "trajectories"),
         )
 
 

@@ -32,7 +32,13 @@ from ventbench.stress.stressors import VERSION, Condition, conditions, stressor
 from ventbench.submissions.errors import Failure, SubmissionError
 from ventbench.submissions.folder import Submission, as_submission
 from ventbench.submissions.rig_scoring import load_rigs
-from ventbench.submissions.runner import InProcessRunner, Runner, runner_of
+from ventbench.submissions.runner import (
+    CountingRunner,
+    InProcessRunner,
+    Progress,
+    Runner,
+    runner_of,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -180,6 +186,7 @@ def score_stress(
     drawn: RigDraws | None = None,
     only: Sequence[str] = (),
     sandbox: bool = True,
+    progress: Progress | None = None,
 ) -> StressScore:
     """Score a controller under missing physics that it is not told of.
 
@@ -191,6 +198,7 @@ def score_stress(
         drawn: other draws than the development ones, such as those of a season.
         only: stressors to run; all conditions if empty.
         sandbox: run a folder in locked-down processes, as for :func:`ventbench.score`.
+        progress: called after each round of commands with rounds done and all rounds.
 
     Raises:
         SubmissionError: if there is no such submission, or it cannot be run at all.
@@ -208,9 +216,11 @@ def score_stress(
         False
     """
     entry = as_submission(submission)
-    runner = runner_of(entry, sandbox=sandbox)
+    runner: Runner = runner_of(entry, sandbox=sandbox)
     rigs = load_rigs(simulator)
     cells = draw_cells(rigs, draws, drawn=drawn)
+    if progress is not None:  # one session a draw
+        runner = CountingRunner(runner, progress, sessions=cells.nominal_pip.shape[1])
     return run_stress(entry, cells, chosen_conditions(only), runner=runner, simulators=rigs.about)
 
 

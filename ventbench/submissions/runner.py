@@ -7,18 +7,22 @@ time. Only numbers cross: a :class:`Task` for each cell at the start, then at ev
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench import protocol
 from ventbench.interfaces import Observation, Task
 from ventbench.sandbox.child.cell import Cell, Failed, controller_class
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import Submission
 
 Floats = NDArray[np.float64]
+
+#: Called with rounds of commands that are done, and all of them.
+Progress = Callable[[int, int], None]
 
 
 class ControllerSession(Protocol):
@@ -159,3 +163,45 @@ def runner_of(submission: Submission, *, sandbox: bool) -> Runner:
     from ventbench.sandbox.runner import SandboxRunner
 
     return SandboxRunner()
+
+
+class CountingRunner:
+    """Runs controllers as another runner does, and tells after each round how far it is.
+
+    Args:
+        runner: does the work.
+        progress: called with rounds done and all rounds.
+        sessions: how many sessions the whole score starts, each of one run of all breaths.
+    """
+
+    def __init__(self, runner: Runner, progress: Progress, sessions: int = 1):
+        self._runner, self._progress, self._done = runner, progress, 0
+        self._total = sessions * protocol.BREATHS * protocol.INSPIRATION_STEPS
+
+    @property
+    def sandbox(self) -> Mapping[str, Any] | None:
+        """Layers for the record, or None."""
+        return self._runner.sandbox
+
+    def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
+        """Make and reset one fresh controller for each cell; see :class:`Runner`."""
+        return _CountingSession(self._runner.start(submission, tasks), self._count)
+
+    def _count(self) -> None:
+        self._done += 1
+        self._progress(self._done, self._total)
+
+
+class _CountingSession:
+    def __init__(self, session: ControllerSession, count: Callable[[], None]):
+        self._session, self._count = session, count
+        self.close = session.close
+
+    @property
+    def failures(self) -> Mapping[int, Failure]:
+        return self._session.failures
+
+    def act(self, observations: Floats) -> Floats:
+        commands = self._session.act(observations)
+        self._count()
+        return commands

@@ -23,7 +23,13 @@ from ventbench.submissions import rig_scoring
 from ventbench.submissions.assembly import assemble, enter
 from ventbench.submissions.folder import Submission, as_submission
 from ventbench.submissions.result import Score
-from ventbench.submissions.runner import InProcessRunner, Runner, runner_of
+from ventbench.submissions.runner import (
+    CountingRunner,
+    InProcessRunner,
+    Progress,
+    Runner,
+    runner_of,
+)
 from ventbench.submissions.stepping import as_float64, replay, step_through
 
 Floats = NDArray[np.float64]
@@ -37,6 +43,7 @@ def score(
     draws: int = 0,
     sandbox: bool = True,
     protocol: int = 1,
+    progress: Progress | None = None,
 ) -> Score:
     """Score a controller on the lungs of a set of simulators.
 
@@ -54,6 +61,7 @@ def score(
             with all rights: only for code that you trust, and never official.
         protocol: version of the protocol. Version 2 scores airway pressure, draws on the rigs of
             each lung, and adds the normalised score.
+        progress: called after each round of commands with rounds done and all rounds.
 
     Returns:
         The score; ``print`` and notebooks show one row a lung.
@@ -74,7 +82,9 @@ def score(
         False
     """
     entry = as_submission(submission)
-    runner = runner_of(entry, sandbox=sandbox)
+    runner: Runner = runner_of(entry, sandbox=sandbox)
+    if progress is not None:
+        runner = CountingRunner(runner, progress)
     if protocol == 2:
         rigs = rig_scoring.load_rigs(simulator)
         return rig_scoring.run_on_rigs(entry, rigs, track=track, draws=draws, runner=runner)

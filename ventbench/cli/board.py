@@ -550,16 +550,15 @@ def _normalised_table(track: Track) -> Table:
 
 def _stress_table(track: Track) -> Table:
     """Version 2: entries of the robustness track under missing physics."""
-    from rich import box
-    from rich.table import Table
-
     from ventbench.board import stress_table
 
-    title = f"stress, version {track.version}: mean |airway pressure - PIP|, cmH2O"
-    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in ("rank", "entry", "score", "95 %", "ranks", "without", "survived", "unsafe runs"):
+    rows = [stress_table.shown(row) for row in stress_table.rows(track)]
+    table = _plain_table(f"stress, version {track.version}: mean |airway pressure - PIP|, cmH2O")
+    runs = ", ".join(sorted({str(row["runs"]) for row in rows}))
+    table.caption = f"survived, unsafe: of {runs} runs; calm: without stressors"
+    for name in ("rank", "entry", "score", "95 %", "ranks", "calm", "survived", "unsafe"):
         table.add_column(name, justify="left" if name == "entry" else "right", no_wrap=True)
-    for row in map(stress_table.shown, stress_table.rows(track)):
+    for row in rows:
         score, ranks = row["score"], row["ranks"]
         table.add_row(
             "" if row["rank"] is None else str(row["rank"]),
@@ -569,7 +568,7 @@ def _stress_table(track: Track) -> Table:
             "" if ranks is None else f"{ranks[0]}..{ranks[1]}",
             row["unstressed"],
             f"{row['survived']} %",
-            f"{row['unsafe']} of {row['runs']}",
+            str(row["unsafe"]),
         )
     return table
 

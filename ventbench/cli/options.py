@@ -22,9 +22,32 @@ def claim_out(folder: Path | None) -> Path | None:
     return folder
 
 
+def claim_json(path: Path | None) -> Path | None:
+    """Check the file of ``--json`` before anything is computed.
+
+    Raises:
+        InputError: if it is a folder, or lies in what is none.
+    """
+    from ventbench.errors import InputError
+
+    if path is None or str(path) == "-":
+        return path
+    if path.is_dir():
+        raise InputError(f"--json {path} is a folder; name a file, such as {path / 'result.json'}")
+    above = next((folder for folder in path.parents if folder.exists()), None)
+    if above is not None and not above.is_dir():
+        raise InputError(f"--json {path}: {above} is a file, not a folder; choose another place")
+    return path
+
+
 JsonFile = Annotated[
     Path | None,
-    typer.Option("--json", metavar="FILE", help="Also write the result as JSON; '-' for stdout."),
+    typer.Option(
+        "--json",
+        metavar="FILE",
+        help="Also write the result as JSON; '-' for stdout.",
+        callback=claim_json,
+    ),
 ]
 Clip = Annotated[
     bool, typer.Option("--clip", help="Clip u_in to 0..100 % instead of refusing the file.")

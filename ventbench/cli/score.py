@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ventbench.cli.options import JsonFile, PlantName, bars, claim_out, counted, emit
+from ventbench.cli.options import JsonFile, PlantName, bars, claim_out, counted, emit, notes
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
 
     from ventbench.stress.score import StressScore
@@ -140,7 +139,7 @@ def score(
     stressed: dict[str, StressScore] = {}
     if protocol == 2:
         if stress:
-            stressed = _stressed(opened, plant, draws, in_process, progress)
+            stressed = _stressed(opened, plant, draws, in_process)
         for values in results:
             own = stressed.get(values["name"])
             values["stress"] = None if own is None else own.to_json()
@@ -175,7 +174,7 @@ def score(
 
 
 def _stressed(
-    entries: list[Submission], plant: str, draws: int, in_process: bool, progress: Console
+    entries: list[Submission], plant: str, draws: int, in_process: bool
 ) -> dict[str, StressScore]:
     """Stress scores, by name, of the entries that need not be told the lung."""
     from ventbench.stress.results import DRAWS
@@ -185,14 +184,15 @@ def _stressed(
     for entry in entries:
         name = entry.manifest.name
         if "robustness" not in entry.manifest.tracks:
-            progress.print(f"{name} must be told its lung: it has no stress score")
+            notes().print(f"{name} must be told its lung: it has no stress score")
             continue
-        with progress.status(f"stressing {entry.label}"):
+        with bars() as shown:
             scores[name] = score_stress(
                 entry,
                 simulator=plant,
                 draws=DRAWS if draws >= DRAWS else 1,
                 sandbox=not in_process,
+                progress=counted(shown, f"stressing {entry.label}"),
             )
     return scores
 

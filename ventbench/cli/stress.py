@@ -10,7 +10,6 @@ import typer
 from ventbench.cli.options import JsonFile, bars, counted, emit
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
 
     from ventbench.stress.score import StressScore
@@ -81,7 +80,7 @@ def score_entries(
         for path in written:
             console.print(f"wrote {path}", markup=False, highlight=False)
     if record is not None:
-        for path in _write_records(record, opened, scores, in_process, progress):
+        for path in _write_records(record, opened, scores, in_process):
             console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
     failed = [failure for result in results for failure in result["failures"]]
     for failure in failed[:3]:
@@ -127,7 +126,6 @@ def _write_records(
     entries: list[Submission],
     stressed: list[StressScore],
     in_process: bool,
-    progress: Console,
 ) -> list[Path]:
     """Score the robustness track too, and write records with both."""
     from ventbench import rig_draws
@@ -137,7 +135,7 @@ def _write_records(
 
     scores = []
     for entry in entries:
-        with progress.status(f"scoring {entry.label}"):
+        with bars() as shown:
             scores.append(
                 scoring.score(
                     entry,
@@ -145,6 +143,7 @@ def _write_records(
                     draws=rig_draws.COUNT,
                     sandbox=not in_process,
                     protocol=2,
+                    progress=counted(shown, f"scoring {entry.label}"),
                 )
             )
     by_name = {own.submission.manifest.name: own for own in stressed}

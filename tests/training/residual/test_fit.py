@@ -311,11 +311,12 @@ def test_the_command_trains_and_tells(monkeypatch, tmp_path):
     assert not list((tmp_path / "parts").iterdir())
 
 
-def test_the_command_takes_one_lung_or_all():
-    run = CliRunner().invoke(app, ["train", "residual", "--lung", "R20C50", "--all"])
+def test_the_command_takes_one_lung_or_all(tmp_path):
+    command = ["train", "residual", "--out", str(tmp_path)]
+    run = CliRunner().invoke(app, [*command, "--lung", "R20C50", "--all"])
     assert isinstance(run.exception, InputError)
     assert "not both" in str(run.exception)
-    run = CliRunner().invoke(app, ["train", "residual", "--lung", "R50C10"])
+    run = CliRunner().invoke(app, [*command, "--lung", "R50C10"])
     assert "not a scored lung" in str(run.exception)
 
 

@@ -1,42 +1,52 @@
-"""A rig of one's own, end to end: recordings, simulators, what is missing, a better controller.
+"""A rig of one's own, end to end: recordings, what a simulator lacks, a better controller.
 
-The rig is emulated, so that there is a truth to test against: a lung of 12 cmH2O/(L/s) and
-30 mL/cmH2O whose inspiratory valve answers late and slowly and gives less than its data sheet says.
-Nobody is told. The steps are those that a laboratory would take:
+The rig is emulated, so that there is a truth to test against: a lung whose label is right, behind
+a valve that nobody has looked at. The steps are those that a laboratory would take:
 
 1. record breaths with the paper's exploration (``recordings/rig.csv``, public schema);
 2. take the simulator that one would have without recordings: an R-C lung at its label;
 3. diagnose it (``ventbench diagnose``), which gives ``corrected.json``;
 4. learn a simulator from the recordings alone (``ventbench train simulator``);
-5. tune a PID on each (``ventbench tune pid``), and run all of them on the rig.
+5. train the same controllers on each (``ventbench tune pid``, ``ventbench train residual``), and
+   run all of them on the rig, under noise and deviations that are the same for all.
 
-Usage: ``python benchmarks/own_rig.py [--out DIR] [--breaths N] [--iterations N] [--json FILE]``
+Usage: ``python benchmarks/own_rig.py [--out DIR] [--rig NAME] [--json FILE] [--page FILE]``.
+``--page docs/own_rig.md`` writes the tables into the page. Finished parts are kept in ``--out``.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
-from ventbench import files, recordings
+from ventbench import draws, files, precision, protocol, recordings, rollouts
+from ventbench.controllers.pid import PID
 from ventbench.diagnosis.diagnose import diagnose
-from ventbench.interfaces import Plant
+from ventbench.environment import nominal_scenario
+from ventbench.interfaces import Controller, Plant
 from ventbench.lungs import lung
+from ventbench.metrics.score import run_error
 from ventbench.physics import physics
 from ventbench.training import pid_grid
 from ventbench.training.exploration import ExplorationRanges, SimulatedVentilator, explore
+from ventbench.training.residual import ResidualConfig, train_residual
 from ventbench.training.rigs.fit import FitConfig
 from ventbench.training.rigs.train import RigConfig, train_rigs
 
+Floats = NDArray[np.float64]
+
 #: Label of the lung, which is true; no simulator of ours was made for it.
 LUNG = "R12C30"
-
-#: What nobody is told: dead time and lag of the valve, and its gain, mL/s per %.
-MISSING = {"valve_delay": {"delay": 0.045}, "valve_lag": {"tau": 0.05}}
-GAIN = 19.0
 
 #: Noise of the sensor, cmH2O.
 NOISE = 0.2
@@ -45,70 +55,231 @@ NOISE = 0.2
 RANGES = ExplorationRanges((0.5, 2.0, 0.0), (30.0, 60.0), (0.5, 1.0), (-20.0, 40.0))
 
 
-def rig() -> Plant:
-    """Return the emulated rig."""
-    return physics(lung(LUNG), MISSING, gain=GAIN)
+@dataclass(frozen=True)
+class Concealed:
+    """What nobody is told of a rig.
+
+    Attributes:
+        words: what it is, for the page.
+        mechanisms: mechanisms and their parameters.
+        gain: of the valve, mL/s per %; 22.8 by its data sheet.
+    """
+
+    words: str
+    mechanisms: Mapping[str, Mapping[str, float]]
+    gain: float = 22.8
 
 
-def record(path: Path, breaths: int, seed: int = 0) -> recordings.Breaths:
+#: Rigs to choose from. Strengths lie between *mild* and *strong* of the library.
+RIGS = {
+    "late": Concealed(
+        "a valve that answers 60 ms late and a sensor behind a filter of 80 ms",
+        {"valve_delay": {"delay": 0.06}, "sensor_lag": {"tau": 0.08}},
+    ),
+    "leak": Concealed("a leak of 15 mL/s at 1 cmH2O", {"leak": {"conductance": 15.0}}),
+    "droop": Concealed(
+        "a valve that loses 40 % of its flow towards 100 %", {"valve_curve": {"loss": 0.4}}
+    ),
+    "slow": Concealed(
+        "a valve that answers 45 ms late, with a lag of 50 ms, and gives 17 % less flow",
+        {"valve_delay": {"delay": 0.045}, "valve_lag": {"tau": 0.05}},
+        gain=19.0,
+    ),
+}
+
+#: What the controllers are trained on, in the order of the table.
+SIMULATORS = ("R-C lung at the label", "corrected", "learned", "the rig itself")
+
+
+def rig_of(concealed: Concealed) -> Plant:
+    """Return an emulated rig."""
+    return physics(lung(LUNG), concealed.mechanisms, gain=concealed.gain)
+
+
+def record(plant: Plant, path: Path, breaths: int, seed: int = 0) -> recordings.Breaths:
     """Explore the rig and write the recording."""
-    ventilator = SimulatedVentilator(rig(), width=4, noise=NOISE, seed=seed)
+    ventilator = SimulatedVentilator(plant, width=4, noise=NOISE, seed=seed)
     made = explore(ventilator, LUNG, breaths, seed=seed, ranges=RANGES)
     recordings.write(made, path)
     return recordings.load(path)
 
 
-def gains() -> np.ndarray:
+def gains() -> Floats:
     """Return the paper's gains without derivative part, %/cmH2O, shape ``(400, 3)``."""
     grid = pid_grid.paper_gains()
     return grid[grid[:, 2] == 0.0]
 
 
-def tuned(simulator: Any) -> tuple[tuple[float, ...], float]:
-    """Best gains on a simulator, and the error that it promises, cmH2O."""
+def errors(controller: Controller, plant: Plant) -> tuple[float, Floats]:
+    """Error without noise, cmH2O, and that of each of the 20 draws, shape ``(20,)``."""
+    with precision.float64():
+        plant = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), plant)
+        controller = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), controller)
+        out = []
+        for cells in (nominal_scenario(np.asarray(protocol.PIPS)), draws.scenarios()):
+            cells = jax.tree.map(jnp.asarray, cells)
+            run, _ = rollouts.closed_loop(plant, controller, cells)
+            out.append(run_error(run.pressure, np.asarray(cells.pip)[..., None, None]))
+    return float(out[0].mean()), out[1].mean(axis=-1)
+
+
+def trained_on(
+    simulator: Any, plant: Plant, out: Path, seeds: Sequence[int], updates: int
+) -> dict[str, Any]:
+    """Train a PID and networks on a simulator, and run them on the rig.
+
+    Returns:
+        Errors on the simulator (``promised``) and on the rig, cmH2O.
+    """
     grid, _ = pid_grid.tune_pid([LUNG], simulator=simulator, gains=gains(), single=False)
-    return grid.best(LUNG)
+    best, promised = grid.best(LUNG)
+    nominal, drawn = errors(PID(*best), plant)
+    result: dict[str, Any] = {
+        "pid": {"gains": list(best), "promised": promised, "rig": nominal, "draws": drawn.tolist()}
+    }
+    networks = []
+    for seed in seeds:
+        trained = train_residual(
+            [LUNG],
+            out / f"residual-{seed}",
+            config=ResidualConfig(updates=updates, members=1, agreement=0.0),
+            seed=seed,
+            gains=gains(),
+            simulator=simulator,
+        )
+        nominal, drawn = errors(trained.controllers[LUNG], plant)
+        promised = trained.report["networks"][LUNG]["error"][LUNG]
+        networks.append({"promised": promised, "rig": nominal, "draws": drawn.tolist()})
+    return result | {"residual": networks}
 
 
-def on_the_rig(best: tuple[float, ...]) -> float:
-    """Error of a PID on the rig itself, cmH2O."""
-    grid, _ = pid_grid.tune_pid([LUNG], simulator={LUNG: rig()}, gains=[best], single=False)
-    return grid.best(LUNG)[1]
+def difference(first: Floats, second: Floats, resamples: int = 2000) -> tuple[float, float, float]:
+    """Mean of ``first - second`` over seeds and draws, and its 95 % bootstrap interval.
+
+    Args:
+        first: shape ``(seeds, draws)``.
+        second: of the same shape, paired.
+        resamples: of seeds and draws, with replacement.
+    """
+    apart, random = first - second, np.random.default_rng(0)
+    seeds = random.integers(len(apart), size=(resamples, len(apart)))
+    drawn = random.integers(apart.shape[1], size=(resamples, apart.shape[1]))
+    means = [apart[np.ix_(s, d)].mean() for s, d in zip(seeds, drawn, strict=True)]
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(apart.mean()), float(low), float(high)
+
+
+def run(
+    name: str, out: Path, breaths: int, iterations: int, seeds: Sequence[int], updates: int
+) -> dict[str, Any]:
+    """Close the loop on one rig; a finished result in ``out`` is read."""
+    settings = [name, breaths, iterations, list(seeds), updates]
+    done = out / "result.json"
+    if done.is_file() and (result := json.loads(done.read_text()))["settings"] == settings:
+        return result
+    concealed, folder = RIGS[name], out / "recordings"
+    plant = rig_of(concealed)
+    folder.mkdir(parents=True, exist_ok=True)
+    recorded = record(plant, folder / "rig.csv", breaths)
+    diagnosis = diagnose(recorded, simulator="physics")
+    diagnosis.save(out / "diagnosis")
+    print(f"{name}: missing {', '.join(diagnosis.mechanisms) or 'nothing'}", flush=True)
+    corrected = out / "diagnosis" / "corrected.json"
+    simulators: dict[str, Any] = {
+        SIMULATORS[0]: {LUNG: physics(lung(LUNG))},
+        SIMULATORS[1]: corrected if corrected.is_file() else None,
+        SIMULATORS[2]: None,
+        SIMULATORS[3]: {LUNG: plant},
+    }
+    if iterations:
+        config = RigConfig(resamples=2, fit=FitConfig(iterations=iterations))
+        train_rigs(folder, out / "learned", config=config)
+        simulators[SIMULATORS[2]] = out / "learned"
+    rows = {}
+    for number, (label, simulator) in enumerate(simulators.items()):
+        if simulator is None:
+            continue
+        rows[label] = trained_on(simulator, plant, out / f"trained-{number}", seeds, updates)
+        networks = rows[label]["residual"]
+        print(
+            f"{label:24} PID {rows[label]['pid']['promised']:6.3f} -> "
+            f"{rows[label]['pid']['rig']:6.3f}   network "
+            f"{np.mean([x['promised'] for x in networks]):6.3f} -> "
+            f"{np.mean([x['rig'] for x in networks]):6.3f} cmH2O",
+            flush=True,
+        )
+    result = {"settings": settings, "missing": list(diagnosis.mechanisms), "trained_on": rows}
+    files.write_json(done, result)
+    return result
+
+
+def table(name: str, result: Mapping[str, Any]) -> str:
+    """Figures of one rig as Markdown."""
+    rows = result["trained_on"]
+
+    def drawn(label: str, kind: str) -> Floats:
+        parts = rows[label][kind]
+        return np.array([part["draws"] for part in (parts if kind == "residual" else [parts])])
+
+    lines = [
+        f"**{RIGS[name].words[0].upper()}{RIGS[name].words[1:]}.** The diagnosis names "
+        f"{', '.join(f'`{m}`' for m in result['missing']) or 'nothing'}.",
+        "",
+        "| trained on | PID: promised | on the rig | network: promised | on the rig | "
+        "network on the rig, 20 draws | difference to the R-C lung |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for label, row in rows.items():
+        networks, pid = row["residual"], row["pid"]
+        own = drawn(label, "residual")
+        apart = "" if label == SIMULATORS[0] else "{:+.3f} [{:+.3f}, {:+.3f}]".format(
+            *difference(own, drawn(SIMULATORS[0], "residual"))
+        )  # fmt: skip
+        lines.append(
+            f"| {label} | {pid['promised']:.3f} | {pid['rig']:.3f} "
+            f"| {np.mean([x['promised'] for x in networks]):.3f} "
+            f"| {np.mean([x['rig'] for x in networks]):.3f} | {own.mean():.3f} | {apart} |"
+        )
+    return "\n".join(lines)
+
+
+def write_page(page: Path, results: Mapping[str, Mapping[str, Any]]) -> None:
+    """Replace the part of a page between the two marks."""
+    text = "\n\n".join(table(name, result) for name, result in results.items())
+    marks = "<!-- begin: benchmarks/own_rig.py -->", "<!-- end: benchmarks/own_rig.py -->"
+    pattern = re.compile(f"{re.escape(marks[0])}.*{re.escape(marks[1])}", re.DOTALL)
+    before = page.read_text("utf-8")
+    if not pattern.search(before):
+        raise SystemExit(f"{page} has no part between {marks[0]} and {marks[1]}")
+    new = pattern.sub(lambda _: f"{marks[0]}\n{text}\n{marks[1]}", before)
+    files.write_atomically(page, lambda file: file.write(new.encode()))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, default=Path("runs/own_rig"))
+    parser.add_argument("--rig", choices=[*RIGS, "all"], default="all")
     parser.add_argument("--breaths", type=int, default=36)
-    parser.add_argument("--iterations", type=int, default=240)
+    parser.add_argument("--iterations", type=int, default=240, help="of learning; 0 leaves it out")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--updates", type=int, default=600)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--page", type=Path, help="page to write the tables into")
     options = parser.parse_args()
-    folder = options.out / "recordings"
-    folder.mkdir(parents=True, exist_ok=True)
-    breaths = record(folder / "rig.csv", options.breaths)
-    print(f"recorded {len(breaths)} breaths")
-
-    diagnosis = diagnose(breaths, simulator="physics")
-    diagnosis.save(options.out / "diagnosis")
-    print(f"missing: {diagnosis.mechanisms}")
-    config = RigConfig(resamples=2, fit=FitConfig(iterations=options.iterations))
-    train_rigs(folder, options.out / "learned", config=config)
-
-    simulators: dict[str, Any] = {
-        "physics at the label": "physics",
-        "corrected": options.out / "diagnosis" / "corrected.json",
-        "learned from the recordings": options.out / "learned",
-        "the rig itself": {LUNG: rig()},
+    names = list(RIGS) if options.rig == "all" else [options.rig]
+    seeds = range(options.seeds)
+    results = {
+        name: run(
+            name, options.out / name, options.breaths, options.iterations, seeds, options.updates
+        )
+        for name in names
     }
-    result = {}
-    print(f"{'PID tuned on':30} {'P, I':>12} {'promised':>9} {'on the rig':>11}  cmH2O")
-    for name, simulator in simulators.items():
-        best, promised = tuned(simulator)
-        real = on_the_rig(best)
-        result[name] = {"gains": list(best), "promised": promised, "on_the_rig": real}
-        print(f"{name:30} {f'{best[0]:g}, {best[1]:g}':>12} {promised:9.3f} {real:11.3f}")
+    for name, result in results.items():
+        print(table(name, result), end="\n\n")
     if options.json is not None:
-        files.write_json(options.json, result)
+        files.write_json(options.json, results)
+    if options.page is not None:
+        write_page(options.page, results)
 
 
 if __name__ == "__main__":

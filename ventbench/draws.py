@@ -150,6 +150,7 @@ def random_scenarios(
     spread: Array | float | None = None,
     breaths: int = protocol.BREATHS,
     smooth: bool = False,
+    ranges: Mapping[str, tuple[float, float]] = RANGES,
 ) -> Scenario:
     """Draw new cells from the distributions of the published draws, for training.
 
@@ -164,14 +165,15 @@ def random_scenarios(
         breaths: number of breaths with noise.
         smooth: represent the converter by noise of one step's width, since rounding has no
             derivative; else the cells round.
+        ranges: of the deviations, those of this version of the draws or of another.
 
     Returns:
         Cells of batch shape ``(n,)``.
     """
     n = pip.shape[0]
-    keys = jax.random.split(key, len(RANGES) + 3)
+    keys = jax.random.split(key, len(ranges) + 3)
     drawn = {}
-    for deviation_key, (name, (low, high)) in zip(keys, RANGES.items(), strict=False):
+    for deviation_key, (name, (low, high)) in zip(keys, ranges.items(), strict=False):
         if spread is None:
             drawn[name] = jax.random.uniform(deviation_key, (n,), minval=low, maxval=high)
         else:

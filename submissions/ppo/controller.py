@@ -13,7 +13,7 @@ class Controller:
     def reset(self, task):
         """Take the network of the lung, or the one for all if the lung is not told."""
         self.network = NETWORKS[task.lung or "all"]
-        self.features = network.Features()
+        self.features = self.network.features()
 
     def act(self, observation):
         """Return u_in, %: the PID plus the mean of the policy."""

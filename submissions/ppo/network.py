@@ -7,6 +7,9 @@ import numpy as np
 GAINS = (6.0, 6.0, 0.3)  # P, I, D, %/cmH2O: one set for all lungs, the best of the paper's grid
 TIME_CONSTANT = 0.5  # s, of both averages
 PAST = 4  # errors and commands before this step that are shown
+# With the breath before: earlier errors and commands of this breath, and steps of the last one.
+ERRORS, COMMANDS, AHEAD = 5, 6, 6
+BIAS, DT = 5.0, 0.03  # %, the command before an inspiration; s, the nominal control step
 
 
 class Features:
@@ -45,6 +48,44 @@ class Features:
         return np.array([*now, *past, *commands]), base
 
 
+class LookingBack:
+    """The features of `residual_mlp`: this breath, and the one before from this step on."""
+
+    def __init__(self):
+        """Nothing is known before the first breath."""
+        self.errors, self.commands = [], []  # at each step of this breath, cmH2O and %
+
+    def __call__(self, observation):
+        """Return the features, all of the order of 1, and the command of the PID, %."""
+        if observation.time == 0:
+            self.errors_before, self.commands_before = self.errors, self.commands
+            self.errors, self.commands = [], []
+            self.before = self.integral = self.derivative = 0.0
+        error = observation.target - observation.pressure
+        a = observation.dt / (observation.dt + TIME_CONSTANT)
+        self.integral += a * (error - self.integral)
+        self.derivative += a * (error - self.before - self.derivative)
+        self.before = error
+        # The latest first; before the breath the first error and the bias flow.
+        past = (self.errors[::-1] + [self.errors[0] if self.errors else error] * ERRORS)[:ERRORS]
+        self.errors.append(error)
+        self.commands.append(observation.previous_u_in)
+        commands = (self.commands[::-1] + [BIAS] * COMMANDS)[:COMMANDS]
+        step = len(self.errors) - 1
+        errors = [error, self.integral, self.derivative, *past, *window(self.errors_before, step)]
+        known = float(len(self.errors_before) > 0)
+        rest = [observation.target / 40, observation.time, (observation.dt / DT - 1) / 0.1, known]
+        commands += window(self.commands_before, step)
+        p, i, d = GAINS
+        base = min(max(p * error + i * self.integral + d * self.derivative, 0.0), 100.0)
+        return np.concatenate([np.array(errors) / 10, rest, np.array(commands) / 100]), base
+
+
+def window(values, first):
+    """Return the values of the breath before from a step on, zero where there are none."""
+    return (values[first : first + AHEAD] + [0.0] * AHEAD)[:AHEAD]
+
+
 class Network:
     """Dense layers with tanh between them: layer k does ``x @ wk + bk``."""
 
@@ -53,6 +94,10 @@ class Network:
         count = sum(key.startswith(f"{name}.w") for key in arrays)
         layers = [[arrays[f"{name}.{kind}{k}"] for kind in "wb"] for k in range(count)]
         self.layers = [(w.astype(float), b.astype(float)) for w, b in layers]
+
+    def features(self):
+        """Return what it is shown, which its number of inputs tells."""
+        return Features() if len(self.layers[0][0]) == 7 + 2 * PAST else LookingBack()
 
     def __call__(self, x):
         """Return the outputs for one vector of features."""

@@ -171,8 +171,13 @@ def rerun(
 
 
 def _folders(places: Sequence[Path]) -> Iterator[Path]:
-    """Folders that may hold a submission: the places themselves and those in them."""
-    for place in (*places, data_files.submissions_folder()):
+    """Folders that may hold a submission: the places themselves and those in them.
+
+    Also those in ``v1``: the bundled entries as they were scored for version 1.
+    """
+    bundled = data_files.submissions_folder()
+    several = (*places, bundled)
+    for place in (*several, *(place / "v1" for place in several)):
         if not place.is_dir():
             continue
         yield place

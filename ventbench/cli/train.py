@@ -38,6 +38,16 @@ Steps = Annotated[
     typer.Option(min=1, help="Control steps of experience; default: as in docs/reinforcement.md."),
 ]
 
+ProtocolVersion = Annotated[
+    int,
+    typer.Option(
+        "--protocol",
+        min=1,
+        max=2,
+        help="Version of the protocol to train for; 2: all rigs of each lung but the held-out one.",
+    ),
+]
+
 
 @train.callback()
 def _group() -> None:
@@ -133,7 +143,9 @@ def residual(
     agreement: Annotated[
         float | None,
         typer.Option(
-            min=0.0, help="Weight of the disagreement between the simulators; default: 1."
+            min=0.0,
+            help="Weight of the disagreement between the simulators; default: 1, and 0 for "
+            "--protocol 2.",
         ),
     ] = None,
     penalty: Annotated[
@@ -149,6 +161,7 @@ def residual(
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ] = Path("runs/residual"),
     plant: PlantName = "frozen",
+    version: ProtocolVersion = 1,
     json: JsonFile = None,
 ) -> None:
     """Train networks that correct the best PID, by differentiating through the simulators.
@@ -159,17 +172,20 @@ def residual(
 
     Example: `ventbench train residual --all --out runs/residual_all`
     """
+    from dataclasses import replace
+
     from rich.console import Console
 
     from ventbench.errors import InputError
-    from ventbench.training.residual import ResidualConfig
+    from ventbench.training.residual.fit import RIGS_CONFIG, ResidualConfig
     from ventbench.training.trained import ALL
 
     if lung is not None and every:
         raise InputError("give --lung ID or --all, not both")
     names = (ALL,) if every else None if lung is None else (lung,)
-    standard = ResidualConfig()
-    config = ResidualConfig(
+    standard = RIGS_CONFIG if version == 2 else ResidualConfig()
+    config = replace(
+        standard,
         updates=updates or standard.updates,
         members=members,
         spread=randomise,
@@ -231,6 +247,7 @@ def ppo(
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ] = Path("runs/ppo"),
     plant: PlantName = "frozen",
+    version: ProtocolVersion = 1,
     json: JsonFile = None,
 ) -> None:
     """Train networks that correct the PID, by proximal policy optimisation (PPO).
@@ -241,7 +258,7 @@ def ppo(
 
     Example: `ventbench train ppo --lung R20C50 --out runs/ppo-R20C50`
     """
-    _train_policies("ppo", lung, all_lungs, seed, seeds, steps, out, plant, json)
+    _train_policies("ppo", lung, all_lungs, seed, seeds, steps, out, plant, version, json)
 
 
 @train.command()
@@ -255,6 +272,7 @@ def dqn(
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ] = Path("runs/dqn"),
     plant: PlantName = "frozen",
+    version: ProtocolVersion = 1,
     json: JsonFile = None,
 ) -> None:
     """Train networks that choose among 19 corrections of the PID, by deep Q-learning (DQN).
@@ -265,7 +283,7 @@ def dqn(
 
     Example: `ventbench train dqn --lung R20C50 --out runs/dqn-R20C50`
     """
-    _train_policies("dqn", lung, all_lungs, seed, seeds, steps, out, plant, json)
+    _train_policies("dqn", lung, all_lungs, seed, seeds, steps, out, plant, version, json)
 
 
 def _train_policies(
@@ -277,6 +295,7 @@ def _train_policies(
     steps: int | None,
     out: Path,
     plant: str,
+    version: int,
     json: Path | None,
 ) -> None:
     from rich.console import Console
@@ -304,6 +323,7 @@ def _train_policies(
             seeds=range(seed, seed + seeds),
             steps=steps,
             simulator=plant,
+            version=version,
             progress=progress,
         )
     emit(trained.report, json)

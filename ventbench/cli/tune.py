@@ -44,12 +44,23 @@ def pid(
         str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler, such as tcp://host:8786.")
     ] = None,
     plant: PlantName = "frozen",
+    version: Annotated[
+        int,
+        typer.Option(
+            "--protocol",
+            min=1,
+            max=2,
+            help="Version of the protocol; 2: on all rigs of each lung but the held-out one, the "
+            "best also with noise; only with --all.",
+        ),
+    ] = 1,
     json: JsonFile = None,
 ) -> None:
     """Simulate the paper's 8,000 PIDs at six PIPs on the frozen simulators or others.
 
     P, I and D each take the values 0, 0.1, ..., 0.9, 1, 2, ..., 10 %/cmH2O; there is no noise.
-    Ctrl-C keeps the finished parts; the same command continues.
+    Ctrl-C keeps the finished parts; the same command continues. With --protocol 2 the 100 best also
+    run on draws of their own, and the best there win.
 
     Example: `ventbench tune pid --all --out runs/pid`
     """
@@ -60,8 +71,13 @@ def pid(
 
     if (lung is not None) + every + robust != 1:
         raise InputError("give exactly one of --lung LUNG, --all and --robust")
-    names = None if lung is None else (lung,)
-    grid, result = _search(names, plant, out, workers, scheduler, not robust)
+    if version == 2:
+        if not every or workers or scheduler is not None:
+            raise InputError("--protocol 2 tunes all lungs in this process: give --all alone")
+        grid, result = _search_rigs(plant, out)
+    else:
+        names = None if lung is None else (lung,)
+        grid, result = _search(names, plant, out, workers, scheduler, not robust)
     written = [TABLE, RESULT, *_plot(out / PLOT, grid, not robust, lung is None)]
     emit(result, json)
     console = Console(stderr=str(json) == "-")
@@ -90,6 +106,24 @@ def _search(
             simulator=plant,
             progress=counted(shown, "trajectories"),
         )
+
+
+def _search_rigs(plant: str, out: Path) -> tuple[Any, dict[str, Any]]:
+    """Tune for protocol version 2, and write the same files."""
+    from ventbench import files
+    from ventbench.cli.options import bars
+    from ventbench.training.pid_grid import RESULT, TABLE
+    from ventbench.training.rig_pid import tune_on_rigs
+
+    with bars() as shown:
+        task = shown.add_task("lungs", total=None)
+        tuned = tune_on_rigs(
+            plant, progress=lambda done, total: shown.update(task, completed=done, total=total)
+        )
+    tuned.nominal.save(out / TABLE)
+    result = tuned.to_json()
+    files.write_json(out / RESULT, result)
+    return tuned.nominal, result
 
 
 def _plot(path: Path, grid: Any, each: bool, single: bool) -> list[str]:

@@ -114,6 +114,19 @@ class Residual:
         self, state: ResidualState, observation: Observation
     ) -> tuple[ResidualState, Array, Array]:
         """Return the next state, the PID's command and the correction of it, %, shape ``(...)``."""
+        state, features, base = self.features(state, observation)
+        correction = self.limit * jnp.tanh(apply(self.layers, features)[..., 0])
+        return state, base, correction
+
+    def features(
+        self, state: ResidualState, observation: Observation
+    ) -> tuple[ResidualState, Array, Array]:
+        """Features of an observation.
+
+        Returns:
+            The next state, the features, shape ``(..., inputs(self))``, and the PID's command, %,
+            shape ``(...)``.
+        """
         error = observation.target - observation.pressure
         state = self._begin(state, observation, error)
         pid, base = self.pid.step(state.pid, observation)
@@ -144,13 +157,12 @@ class Residual:
             ],
             axis=-1,
         )
-        correction = self.limit * jnp.tanh(apply(self.layers, features)[..., 0])
         state = state.replace(  # type: ignore[attr-defined]
             errors=_push(error, state.errors),
             error_before=_append(state.error_before, zero),
             command_before=_append(state.command_before, zero),
         )
-        return state, base, correction
+        return state, features, base
 
     def _begin(self, state: ResidualState, seen: Observation, error: Array) -> ResidualState:
         """Turn the traces of the previous breath into memory at the first step of a breath."""

@@ -1,8 +1,10 @@
 """The PID with a correction by a small network, the policy of the reinforcement learners.
 
 All methods share the features that the network sees, the PID that it corrects, and the kind of
-network. The policy of PPO and of the policy gradient adds the network's output to the PID's
-command; the policy of DQN adds the one of 19 corrections that has the highest value.
+network. The features are 15 of this breath, or the 30 of the residual controller
+(:mod:`ventbench.controllers.residual`), which look back at the breath before. The policy of PPO and
+of the policy gradient adds the network's output to the PID's command; the policy of DQN adds the
+one of 19 corrections that has the highest value.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from jax import Array
 
 from ventbench import protocol
 from ventbench.controllers.pid import PID, PIDState
+from ventbench.controllers.residual import Residual, ResidualState, inputs
 from ventbench.files import write_atomically
 from ventbench.interfaces import Observation
 
@@ -28,8 +31,11 @@ GAINS = (6.0, 6.0, 0.3)
 #: Number of earlier errors, and of earlier commands, among the features.
 PAST = 4
 
-#: Number of features.
+#: Number of features of this breath.
 FEATURES = 2 * PAST + 7
+
+#: Gives the features that look back at the breath before; its network has no layers.
+_LOOKING_BACK = Residual(PID(*GAINS), ())
 
 #: Scales that bring the features to the order of 1: cmH2O, cmH2O and %.
 ERROR_SCALE, TARGET_SCALE, COMMAND_SCALE = 10.0, 40.0, 50.0
@@ -50,19 +56,39 @@ class FeatureState:
     commands: Array
 
 
-def init_features(shape: tuple[int, ...]) -> FeatureState:
-    """State before the first breath; each breath begins with a new one."""
+#: State of either kind of features.
+AnyFeatureState = FeatureState | ResidualState
+
+
+def feature_count(looks_back: bool = False) -> int:
+    """Number of features, with the breath before or without."""
+    return inputs(_LOOKING_BACK) if looks_back else FEATURES
+
+
+def init_features(shape: tuple[int, ...], looks_back: bool = False) -> AnyFeatureState:
+    """State before the first breath; one that does not look back is new at each breath."""
+    if looks_back:
+        return _LOOKING_BACK.init(shape)
     past = jnp.zeros((*shape, PAST))
     return FeatureState(PID(*GAINS).init(shape), past, past)
 
 
-def features(state: FeatureState, observation: Observation) -> tuple[FeatureState, Array, Array]:
+def features(
+    state: AnyFeatureState, observation: Observation
+) -> tuple[AnyFeatureState, Array, Array]:
     """Features of an observation.
 
+    Args:
+        state: from :func:`init_features`, which decides whether they look back.
+        observation: the observation.
+
     Returns:
-        The next state, the features, shape ``(..., FEATURES)``, and the command of the PID, clipped
-        to the valve's range, %, shape ``(...)``.
+        The next state, the features, shape ``(..., feature_count(looks_back))``, and the command of
+        the PID, clipped to the valve's range, %, shape ``(...)``.
     """
+    if isinstance(state, ResidualState):
+        state, seen, asked = _LOOKING_BACK.features(state, observation)
+        return state, seen, jnp.clip(asked, 0.0, protocol.U_MAX)
     restart = jnp.broadcast_to(observation.time == 0, jnp.shape(observation.pressure))[..., None]
     error = observation.target - observation.pressure
     before = jnp.where(restart, error[..., None], state.errors)
@@ -113,9 +139,9 @@ class TanhNetwork(nn.Module):
         return nn.Dense(self.outputs, kernel_init=start)(x)
 
 
-def init_parameters(network: TanhNetwork, key: Array) -> Parameters:
+def init_parameters(network: TanhNetwork, key: Array, looks_back: bool = False) -> Parameters:
     """Parameters at the start of a training."""
-    return network.init(key, jnp.zeros((1, FEATURES)))
+    return network.init(key, jnp.zeros((1, feature_count(looks_back))))
 
 
 def layers(parameters: Parameters) -> list[tuple[Array, Array]]:
@@ -141,16 +167,20 @@ class GaussianPolicy:
     Attributes:
         parameters: weights and biases of the network.
         network: a network with one output.
+        looks_back: whether the features look back at the breath before.
     """
 
     parameters: Parameters
     network: TanhNetwork = flax.struct.field(pytree_node=False)
+    looks_back: bool = flax.struct.field(pytree_node=False, default=False)
 
-    def init(self, shape: tuple[int, ...]) -> FeatureState:
+    def init(self, shape: tuple[int, ...]) -> AnyFeatureState:
         """State at the start of a run."""
-        return init_features(shape)
+        return init_features(shape, self.looks_back)
 
-    def step(self, state: FeatureState, observation: Observation) -> tuple[FeatureState, Array]:
+    def step(
+        self, state: AnyFeatureState, observation: Observation
+    ) -> tuple[AnyFeatureState, Array]:
         """Return the next state and ``u_in``, %."""
         state, x, base = features(state, observation)
         mean: Array = self.network.apply(self.parameters, x)  # type: ignore[assignment]
@@ -164,16 +194,20 @@ class GreedyPolicy:
     Attributes:
         parameters: weights and biases of the network.
         network: a network with one output for each of :data:`CHOICES`.
+        looks_back: whether the features look back at the breath before.
     """
 
     parameters: Parameters
     network: TanhNetwork = flax.struct.field(pytree_node=False)
+    looks_back: bool = flax.struct.field(pytree_node=False, default=False)
 
-    def init(self, shape: tuple[int, ...]) -> FeatureState:
+    def init(self, shape: tuple[int, ...]) -> AnyFeatureState:
         """State at the start of a run."""
-        return init_features(shape)
+        return init_features(shape, self.looks_back)
 
-    def step(self, state: FeatureState, observation: Observation) -> tuple[FeatureState, Array]:
+    def step(
+        self, state: AnyFeatureState, observation: Observation
+    ) -> tuple[AnyFeatureState, Array]:
         """Return the next state and ``u_in``, %."""
         state, x, base = features(state, observation)
         values: Array = self.network.apply(self.parameters, x)  # type: ignore[assignment]

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import pandas as pd
 
 from ventbench.errors import InputError
 from ventbench.interfaces import Controller
-from ventbench.lungs import LUNG_IDS, lung, scored_lung
+from ventbench.lungs import LUNG_IDS, Lung, lung, scored_lung
 from ventbench.plants.catalog import Given, load_simulators
 from ventbench.plants.simulators import Simulators
 
@@ -45,7 +45,16 @@ class TrainedControllers:
         return self.to_frame().to_html()
 
 
-def check_names(names: Sequence[str] | None, simulators: Simulators) -> tuple[str, ...]:
+class HasLungs(Protocol):
+    """Simulators, or plants to train on, of some lungs."""
+
+    @property
+    def lungs(self) -> tuple[Lung, ...]:
+        """The lungs."""
+        ...
+
+
+def check_names(names: Sequence[str] | None, simulators: HasLungs) -> tuple[str, ...]:
     """Return the names of networks to train, as lung ids or :data:`ALL`.
 
     Args:
@@ -63,9 +72,7 @@ def check_names(names: Sequence[str] | None, simulators: Simulators) -> tuple[st
             continue
         if known == LUNG_IDS:
             scored_lung(name)
-        raise InputError(
-            f"the simulators {simulators.name} have no lung {name}; they have {', '.join(known)}"
-        )
+        raise InputError(f"the simulators have no lung {name}; they have {', '.join(known)}")
     return tuple(name if name == ALL else lung(name).id for name in names)
 
 

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import draws, environment, precision, protocol, rollouts
+from ventbench import draws, environment, precision, protocol, rig_draws, rollouts
 from ventbench.controllers import rl_policy
 from ventbench.controllers.pid import PID
 from ventbench.controllers.rl_policy import GaussianPolicy, TanhNetwork, init_parameters
 from ventbench.interfaces import Observation
-from ventbench.lungs import LUNGS
+from ventbench.lungs import LUNGS, Lung
 from ventbench.metrics.score import run_error
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
@@ -99,14 +99,13 @@ def test_features_by_hand():
 
 
 def test_rewards_and_errors_are_the_scores(lungs):
-    cells = episodes.sample(jax.random.key(0), 6, vary=False)
     lung = jax.tree.map(lambda x: jnp.asarray(x[2:3], jnp.float32), lungs)
+    drawn = episodes.draw(jax.random.key(0), lung, 6, vary=False)
     pid = PID(*rl_policy.GAINS)
-    plants = episodes.plants_of_cells(lung, 6)
-    _, _, rewards = episodes.roll(plants, cells, lambda k, x, base: (base, None), jax.random.key(1))
-    start = np.asarray(cells.pip - cells.start)
+    _, _, rewards = episodes.roll(drawn, lambda k, x, base: (base, None), jax.random.key(1))
+    start = np.asarray(drawn.cells.pip - drawn.cells.start)
     from_rewards = (start - episodes.REWARD_SCALE * rewards.sum(axis=0)) / 34
-    errors = episodes.errors(lung, pid, cells, 6)
+    errors = episodes.errors(drawn, pid)
     run, _ = rollouts.closed_loop(
         jax.tree.map(lambda x: x[2], lungs),
         pid,
@@ -115,3 +114,58 @@ def test_rewards_and_errors_are_the_scores(lungs):
     wanted = run_error(run.pressure, np.asarray(protocol.PIPS)[:, None, None])
     np.testing.assert_allclose(errors, wanted, rtol=1e-4)
     np.testing.assert_allclose(from_rewards, wanted, rtol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def rig_lungs():
+    """Two plants of each of two lungs, the second of twice the resistance; weights that tell."""
+    with precision.float32():
+        first = stack([single_compartment(lung) for lung in LUNGS[:2]])
+        second = stack([single_compartment(Lung(2 * lung.R, lung.C)) for lung in LUNGS[:2]])
+        weights = jnp.arange(12.0).reshape(2, 6) + 1.0
+        return episodes.RigLungs(stack([first, second]), weights)
+
+
+def test_episodes_on_rigs_have_any_plant_their_weight_and_the_ranges_of_version_2(rig_lungs):
+    drawn = episodes.draw(jax.random.key(2), rig_lungs, 480, breaths=3)
+    lung, pip = np.arange(480) % 2, np.arange(480) // 2 % 6
+    np.testing.assert_array_equal(drawn.weight, 6 * lung + pip + 1)
+    ratio = np.asarray(drawn.plants.R) / np.array([lung.R for lung in LUNGS[:2]])[lung]
+    assert set(np.round(ratio, 3)) == {1.0, 2.0}
+    assert abs(np.mean(ratio > 1.5) - 0.5) < 0.1
+    low, high = rig_draws.RANGES["r_scale"]
+    assert low <= drawn.cells.r_scale.min() < 0.85
+    assert 1.15 < drawn.cells.r_scale.max() <= high
+    assert drawn.cells.noise.shape == (480, 3, 34)
+    assert drawn.airway
+    nominal = episodes.draw(jax.random.key(2), rig_lungs, 12, vary=False, breaths=3)
+    np.testing.assert_array_equal(nominal.plants.R, np.tile(rig_lungs.plants.R[0], 6))
+    assert not np.any(nominal.cells.noise)
+
+
+def test_three_breaths_remember_the_one_before_and_score_as_the_protocol(rig_lungs):
+    """Rewards and errors against the scorer's loop, with a policy that looks back."""
+    network = TanhNetwork((4,), 1, first=0.5)
+    policy = GaussianPolicy(
+        init_parameters(network, jax.random.key(1), looks_back=True), network, looks_back=True
+    )
+    drawn = episodes.draw(jax.random.key(3), rig_lungs, 4, breaths=3)
+
+    def act(key, x, base):
+        mean = network.apply(policy.parameters, x)[..., 0]
+        return base + rl_policy.SCALE * mean, x[..., 0]
+
+    x, kept, rewards = episodes.roll(drawn, act, jax.random.key(1), looks_back=True)
+    assert x.shape == (episodes.STEPS, 12, rl_policy.feature_count(looks_back=True))
+    np.testing.assert_array_equal(kept, x[..., 0])
+    before = np.asarray(x).reshape(episodes.STEPS, 3, 4, -1)[..., 8:14]
+    assert not before[:, 0].any()
+    assert before[:, 1:].any()
+    found, _ = rollouts.closed_loop(drawn.plants, policy, drawn.cells, airway=True)
+    error = np.abs(np.asarray(found.pressure) - np.asarray(drawn.cells.pip)[:, None, None])
+    weighted = error * np.asarray(drawn.weight)[:, None, None]
+    wanted = -weighted[..., 1:].transpose(2, 1, 0)
+    given = np.asarray(rewards).reshape(episodes.STEPS, 3, 4) * episodes.REWARD_SCALE
+    np.testing.assert_allclose(given, wanted, rtol=2e-3, atol=2e-3)
+    scored = weighted[:, protocol.SCORED_BREATHS].mean(axis=(1, 2))
+    np.testing.assert_allclose(episodes.errors(drawn, policy), scored, rtol=1e-3)

@@ -2,8 +2,10 @@
 
 The paper's objective, the mean of ``|pressure - PIP| + lambda |correction|`` over inspirations, is
 differentiated through the controller, the valve and the simulator. Each update runs every lung at
-every PIP: once on the official simulator without noise, and several times with deviations drawn as
-those of the published draws are.
+every PIP. For protocol version 1 that is once on the official simulator without noise, and several
+times with deviations drawn as those of the published draws are. For version 2 every run has
+deviations and is on any rig and member, the airway pressure counts, and errors are divided by what
+there is to gain in the cell, as in the normalised score.
 """
 
 from __future__ import annotations
@@ -21,12 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
+from numpy.typing import ArrayLike
 
+from ventbench import draws, protocol, rig_draws
 from ventbench import environment as env
-from ventbench import protocol
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import Residual, untrained
-from ventbench.draws import random_scenarios
 from ventbench.environment import Scenario
 from ventbench.interfaces import Plant
 from ventbench.resume import Checkpoint, fingerprint
@@ -37,9 +39,11 @@ class ResidualConfig:
     """Settings of the training of residual controllers; hashable, since they are static in ``jit``.
 
     Attributes:
+        protocol: version of the protocol that is trained for: which pressure counts, and how far
+            deviations reach.
         updates: number of updates of the network; the schedule stretches over them.
-        copies: runs of each lung at each PIP in an update: the first on the official simulator
-            without noise, the others with random deviations.
+        copies: runs of each lung at each PIP in an update. In version 1 the first is on the
+            official simulator without noise; all others have random deviations.
         learning_rate: peak of the cosine schedule of Adam.
         weight_decay: decay of the network's weights.
         lam: weight of the mean absolute correction, cmH2O for each %; the paper's lambda.
@@ -51,12 +55,14 @@ class ResidualConfig:
         commands: number of earlier commands that it sees.
         ahead: number of steps of the previous breath that it sees; 0 for none.
         limit: largest correction, %.
-        members: members of the simulators' ensemble, 1 (the official ones) to 5.
+        members: members of the simulators' ensemble, 1 (the official ones) to 5; in version 2 the
+            members of every rig are trained on.
         spread: reach of the deviations, as a multiple of the draws' ranges; 0 for none.
         round_robin: whether each update takes one lung at one PIP, in turn, as in the paper,
             instead of all of them.
     """
 
+    protocol: int = 1
     updates: int = 3000
     copies: int = 4
     learning_rate: float = 4e-3
@@ -79,6 +85,8 @@ class ResidualConfig:
         Raises:
             ValueError: naming the field and its value.
         """
+        if self.protocol not in protocol.VERSIONS:
+            raise ValueError(f"training: protocol = {self.protocol} is none of {protocol.VERSIONS}")
         for name in ("updates", "copies", "learning_rate", "limit", "members"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"training: {name} = {getattr(self, name)} must be positive")
@@ -95,6 +103,11 @@ class ResidualConfig:
                 raise ValueError(f"training: {name} = {getattr(self, name)} must not be negative")
         if not 0 <= self.spread <= 4:
             raise ValueError(f"training: spread = {self.spread} is outside 0..4")
+
+
+#: Settings for version 2. There is no term for the ensemble's disagreement: its members are among
+#: the plants that are trained on, and drawn when a controller is scored.
+RIGS_CONFIG = ResidualConfig(protocol=2, copies=6, agreement=0.0, first_breath=0.1)
 
 
 @jax.custom_vjp
@@ -121,7 +134,7 @@ class DifferentiableRun:
     """One run of three inspirations; every array ``(..., BREATHS, INSPIRATION_STEPS)``.
 
     Attributes:
-        pressure: true, cmH2O.
+        pressure: scored pressure, cmH2O.
         correction: correction of the PID's command, %.
         u_in: command as applied, %.
     """
@@ -131,13 +144,16 @@ class DifferentiableRun:
     u_in: Array
 
 
-def run(controller: Residual, plant: Plant, cell: Scenario) -> DifferentiableRun:
+def run(
+    controller: Residual, plant: Plant, cell: Scenario, airway: bool = False
+) -> DifferentiableRun:
     """Run a controller through three inspirations.
 
     Args:
         controller: the controller.
         plant: plant of one lung.
         cell: one cell, batch shape ``()``.
+        airway: return the airway pressure (protocol version 2), not the reading.
     """
     varied = env.vary(plant, cell)
     start = env.start_breath(varied, cell)
@@ -152,7 +168,8 @@ def run(controller: Residual, plant: Plant, cell: Scenario) -> DifferentiableRun
         seen = env.observe(cell, loop, breath, index)
         state, base, correction = controller.parts(state, seen)
         after, applied = env.inspire(varied, cell, loop, valve(base + correction))
-        return (state, after), DifferentiableRun(loop.pressure, correction, applied)
+        pressure = env.airway_pressure(varied, loop) if airway else loop.pressure
+        return (state, after), DifferentiableRun(pressure, correction, applied)
 
     count = jnp.arange(protocol.BREATHS * protocol.INSPIRATION_STEPS)
     at = (count // protocol.INSPIRATION_STEPS, count % protocol.INSPIRATION_STEPS)
@@ -162,7 +179,14 @@ def run(controller: Residual, plant: Plant, cell: Scenario) -> DifferentiableRun
 
 
 def objective(
-    controller: Residual, plants: Plant, cells: Scenario, first_breath: float, lam: float
+    controller: Residual,
+    plants: Plant,
+    cells: Scenario,
+    first_breath: float,
+    lam: float,
+    *,
+    airway: bool = False,
+    weight: Array | float = 1.0,
 ) -> tuple[Array, Array]:
     """Mean of ``|pressure - PIP| + lam |correction|`` over inspirations and runs.
 
@@ -172,15 +196,18 @@ def objective(
         cells: batch shape ``(n,)``.
         first_breath: weight of the first breath; the others have 1.
         lam: cmH2O for each %.
+        airway: see :func:`run`.
+        weight: of each run, shape ``(n,)`` or ``()``.
 
     Returns:
         The loss, cmH2O, and the applied commands, %, ``(n, BREATHS, INSPIRATION_STEPS)``.
     """
-    runs = jax.vmap(run, (None, 0, 0))(controller, plants, cells)
+    runs = jax.vmap(partial(run, airway=airway), (None, 0, 0))(controller, plants, cells)
     scored = jnp.isin(jnp.arange(protocol.BREATHS), jnp.array(protocol.SCORED_BREATHS))
-    weight = jnp.where(scored, 1.0, first_breath)[:, None]
+    breath = jnp.where(scored, 1.0, first_breath)[:, None]
     each = jnp.abs(runs.pressure - cells.pip[:, None, None]) + lam * jnp.abs(runs.correction)
-    return jnp.mean(each * weight) / jnp.mean(weight), runs.u_in
+    total = jnp.mean(each * breath * jnp.reshape(weight, (-1, 1, 1)))
+    return total / jnp.mean(breath), runs.u_in
 
 
 def disagreement(ensemble: Plant, cells: Scenario, u_in: Array) -> Array:
@@ -245,6 +272,7 @@ def _advance(
     plants: Plant,
     key: Array,
     first: Array,
+    weights: Array,
     config: ResidualConfig,
 ) -> tuple[tuple[Any, Any], Array]:
     """``CHUNK`` updates, fewer at the end; returns layers, the optimiser's state and mean loss."""
@@ -256,16 +284,29 @@ def _advance(
         layers, state = carry
         member_key, scenario_key = jax.random.split(jax.random.fold_in(key, number))
         lung, pip = _cells(number, lungs, len(protocol.PIPS), config)
-        nominal = jnp.arange(lung.size) % config.copies == 0
+        rigs = config.protocol == 2
+        nominal = (jnp.arange(lung.size) % config.copies == 0) & (not rigs)
         member = jax.random.randint(member_key, lung.shape, 0, members) * ~nominal
-        cells = random_scenarios(
-            scenario_key, pips[pip], spread=config.spread * ~nominal, smooth=True
+        cells = draws.random_scenarios(
+            scenario_key,
+            pips[pip],
+            spread=config.spread * ~nominal,
+            smooth=True,
+            ranges=rig_draws.RANGES if rigs else draws.RANGES,
         )
         those = jax.tree.map(lambda leaf: leaf[member, lung], plants)
 
         def value(layers: Any) -> Array:
             corrected = controller.replace(layers=layers)  # type: ignore[attr-defined]
-            error, u_in = objective(corrected, those, cells, config.first_breath, config.lam)
+            error, u_in = objective(
+                corrected,
+                those,
+                cells,
+                config.first_breath,
+                config.lam,
+                airway=rigs,
+                weight=weights[lung, pip],
+            )
             if config.agreement == 0 or members == 1:
                 return error
             some = slice(None, None, config.copies)  # the official runs
@@ -294,6 +335,8 @@ def fit(
     checkpoint: Path | None = None,
     progress: Progress | None = None,
     keep: bool = False,
+    weights: ArrayLike | None = None,
+    start: Residual | None = None,
 ) -> Residual:
     """Train the correction of a PID on one lung, or on several at once.
 
@@ -310,6 +353,9 @@ def fit(
             deleted at the end.
         progress: called after every ``CHUNK`` updates.
         keep: leave the checkpoint, so that a finished training is read from it.
+        weights: weight of each lung's error at each PIP, shape ``(lungs, P)``; 1 if not given.
+        start: trained controller with the same gains and windows to go on from; a new network if
+            not given.
 
     Returns:
         The controller, float32.
@@ -319,7 +365,11 @@ def fit(
         FloatingPointError: if the loss is not finite; the checkpoint stays at the last good one.
     """
     config = config or ResidualConfig()
-    plants = jax.tree.map(lambda leaf: jnp.asarray(leaf[: config.members], jnp.float32), plants)
+    most = config.members if config.protocol == 1 else None
+    plants = jax.tree.map(lambda leaf: jnp.asarray(leaf[:most], jnp.float32), plants)
+    lungs = jax.tree.leaves(plants)[0].shape[1]
+    shape = (lungs, len(protocol.PIPS))
+    weights = jnp.broadcast_to(jnp.asarray(1.0 if weights is None else weights, jnp.float32), shape)
     start_key, key = jax.random.split(jax.random.key(seed))
     like = Residual(
         PID(*(jnp.asarray(gain, jnp.float32) for gain in gains)),
@@ -330,15 +380,18 @@ def fit(
         limit=config.limit,
     )
     controller = untrained(start_key, like, config.widths)
+    if start is not None:
+        layers = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), start.layers)
+        controller = controller.replace(layers=layers)  # type: ignore[attr-defined]
     carry: Any = (controller.layers, _optimiser(config).init(controller.layers))
     settings = {
         "config": dataclasses.asdict(config), "gains": list(gains), "seed": seed,
-        "simulators": fingerprint(plants),
+        "simulators": fingerprint((plants, weights, controller.layers)),
     }  # fmt: skip
     stored = Checkpoint(checkpoint, settings)
     carry, first = stored.restore(carry)
     while first < config.updates:
-        new, loss = _advance(carry, like, plants, key, jnp.asarray(first), config)
+        new, loss = _advance(carry, like, plants, key, jnp.asarray(first), weights, config)
         loss = float(loss)
         if not np.isfinite(loss):
             raise FloatingPointError(

@@ -22,7 +22,9 @@ from ventbench.plants.catalog import Given
 from ventbench.plants.stacking import take
 from ventbench.training.pid_grid import search
 from ventbench.training.residual.fit import ResidualConfig, fit
-from ventbench.training.trained import ALL, TrainedControllers, check_names, simulators_to_train_on
+from ventbench.training.rig_pid import tune_on_rigs
+from ventbench.training.rig_plants import TrainingPlants, plants_to_train_on
+from ventbench.training.trained import ALL, TrainedControllers, check_names
 
 #: Files that are written.
 WEIGHTS, RESULT, PARTS = "weights.npz", "training.json", "parts"
@@ -55,7 +57,8 @@ def train_residual(
         networks: ids of lungs, a network each, or ``"all"`` for one network that serves all; a
             network for each lung of the simulators if not given.
         out: folder.
-        config: settings of the training.
+        config: settings of the training; its ``protocol`` says for which version of the protocol,
+            see :func:`ventbench.training.rig_plants.plants_to_train_on`.
         seed: seed of the weights and the random deviations, common to all networks.
         gains: grid of P, I, D, %/cmH2O, shape ``(G, 3)``, of which each network corrects the best
             PID; the paper's grid if not given.
@@ -71,20 +74,21 @@ def train_residual(
             training with other settings.
         FloatingPointError: if a training diverges.
     """
-    simulators, out = simulators_to_train_on(simulator), Path(out)
-    names, known = check_names(networks, simulators), [entry.id for entry in simulators.lungs]
     config, progress = config or ResidualConfig(), progress or (lambda what, how_far: None)
+    trained_on, out = plants_to_train_on(simulator, config.protocol), Path(out)
+    names, known = check_names(networks, trained_on), list(trained_on.names)
     progress("PID grid", None)
-    ensemble = simulators.ensemble
-    official = jax.tree.map(lambda leaf: np.asarray(leaf)[0], ensemble)
+    official = trained_on.nominal
     lungs = {name: take(official, index) for index, name in enumerate(known)}
     wanted = lungs if ALL in names else {name: lungs[name] for name in names}
-    grid = search(wanted, settings=simulators.about, gains=gains)
+    best_gains = _best_gains(simulator, trained_on, wanted, names, config, gains)
     controllers, about = {}, {}
     for name in names:
-        best, _ = grid.best(None if name == ALL else name)
+        best = best_gains[name]
         where = list(range(len(known))) if name == ALL else [known.index(name)]
-        plants = jax.tree.map(lambda leaf, where=where: np.asarray(leaf)[:, where], ensemble)
+        plants = jax.tree.map(
+            lambda leaf, where=where: np.asarray(leaf)[:, where], trained_on.plants
+        )
         started = time.perf_counter()
         with precision.float32():
             controllers[name] = fit(
@@ -95,19 +99,20 @@ def train_residual(
                 checkpoint=_checkpoint(out, name),
                 progress=lambda *how_far, name=name: progress(f"network {name}", how_far),
                 keep=True,
+                weights=trained_on.weights[where],
             )
         about[name] = {
             "gains": list(best),
             "seconds": round(time.perf_counter() - started, 1),
-            "error_pid": _errors(PID(*best), lungs, where),
-            "error": _errors(controllers[name], lungs, where),
+            "error_pid": _errors(PID(*best), lungs, where, config.protocol),
+            "error": _errors(controllers[name], lungs, where, config.protocol),
         }
     save_weights(out / WEIGHTS, controllers)
     report = {
         "networks": about,
         "recipe": dataclasses.asdict(config),
         "seed": seed,
-        "simulators": dict(simulators.about),
+        "simulators": dict(trained_on.about),
         "weights_sha256": files.sha256(out / WEIGHTS),
     }
     files.write_json(out / RESULT, report)
@@ -116,21 +121,34 @@ def train_residual(
     return TrainedControllers(controllers, report, out)
 
 
+def _best_gains(
+    simulator: Given, trained_on: TrainingPlants, lungs: Mapping[str, Plant], names: Sequence[str],
+    config: ResidualConfig, gains: NDArray[np.float64] | None,
+) -> dict[str, tuple[float, float, float]]:  # fmt: skip
+    """Gains of the PID that each network corrects, %/cmH2O."""
+    if config.protocol == 1:
+        grid = search(lungs, settings=trained_on.about, gains=gains)
+        return {name: grid.best(None if name == ALL else name)[0] for name in names}
+    tuned = tune_on_rigs(simulator, gains=gains)
+    each = dict(zip(tuned.lungs, tuned.gains, strict=True)) | {ALL: tuned.single}
+    return {name: tuple(each[name].tolist()) for name in names}
+
+
 def _checkpoint(out: Path, name: str) -> Path:
     return out / PARTS / f"{name}.npz"
 
 
 def _errors(
-    controller: Controller, lungs: Mapping[str, Plant], where: list[int]
+    controller: Controller, lungs: Mapping[str, Plant], where: list[int], version: int
 ) -> dict[str, float]:
-    """Nominal score on each lung, float64, cmH2O."""
+    """Nominal score on each lung by a version of the protocol, float64, cmH2O."""
     errors = {}
     with precision.float64():
         cells = nominal_scenario(np.array(protocol.PIPS))
         wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), controller)
         for name in [list(lungs)[index] for index in where]:
             plant = jax.tree.map(jnp.asarray, lungs[name])
-            inspirations, _ = rollouts.closed_loop(plant, wide, cells)
+            inspirations, _ = rollouts.closed_loop(plant, wide, cells, airway=version == 2)
             error = run_error(inspirations.pressure, np.asarray(cells.pip)[:, None, None])
             errors[name] = round(float(error.mean()), 6)
     return errors

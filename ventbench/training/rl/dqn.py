@@ -14,12 +14,10 @@ from jax import Array
 from ventbench.controllers import rl_policy
 from ventbench.controllers.rl_policy import (
     CHOICES,
-    FEATURES,
     GreedyPolicy,
     Parameters,
     TanhNetwork,
 )
-from ventbench.interfaces import Plant
 from ventbench.training.rl import episodes
 
 
@@ -28,11 +26,11 @@ class Replay:
     """Steps to learn from, the oldest overwritten first; N of them.
 
     Attributes:
-        features: features before the choice, ``(N, FEATURES)``.
+        features: features before the choice, ``(N, features)``.
         choice: index into the corrections, ``(N,)``.
         reward: discounted sum of the next rewards, ``(N,)``.
         discount: discount of what follows them; 0 where the breath ends, ``(N,)``.
-        following: features then, ``(N, FEATURES)``.
+        following: features then, ``(N, features)``.
     """
 
     features: Array
@@ -63,6 +61,8 @@ class DQN:
         iterations: iterations of a training, over which the learning rate falls to zero.
         learning_rate: initial learning rate of Adam.
         vary: draw cells with noise and deviations; false for nominal ones.
+        looks_back: let the features look back at the breath before; episodes then have three
+            breaths.
         widths: hidden layers of the network.
         updates: updates of an iteration.
         batch: steps of an update.
@@ -78,6 +78,7 @@ class DQN:
     iterations: int = 2400
     learning_rate: float = 3e-3
     vary: bool = True
+    looks_back: bool = False
     widths: tuple[int, ...] = (64, 64)
     updates: int = 8
     batch: int = 256
@@ -101,16 +102,16 @@ class DQN:
     def init(self, key: Array) -> DQNState:
         """Return the state at the start of a training."""
         network_key, key = jax.random.split(key)
-        parameters = rl_policy.init_parameters(self.network, network_key)
+        parameters = rl_policy.init_parameters(self.network, network_key, self.looks_back)
         size = self.memory * episodes.STEPS
-        seen, zero = jnp.zeros((size, FEATURES)), jnp.zeros((size,))
+        seen, zero = jnp.zeros((size, rl_policy.feature_count(self.looks_back))), jnp.zeros((size,))
         replay = Replay(seen, jnp.zeros((size,), jnp.int32), zero, zero, seen)
         iteration = jnp.zeros((), jnp.int32)
         optimiser = self._optimiser.init(parameters)
         return DQNState(parameters, parameters, optimiser, replay, key, iteration)
 
-    def iterate(self, state: DQNState, plants: Plant) -> DQNState:
-        """Collect breaths on lungs with leaves ``(L, ...)`` and learn from the replay."""
+    def iterate(self, state: DQNState, plants: episodes.Lungs) -> DQNState:
+        """Collect breaths on lungs and learn from the replay."""
         collect_key, learn_key, key = jax.random.split(state.key, 3)
         new = self._collect(state, plants, collect_key)
         count = self.breaths * episodes.STEPS
@@ -133,17 +134,17 @@ class DQN:
 
     def policy(self, state: DQNState) -> GreedyPolicy:
         """Policy so far: the choices of the target network, the smoother of the two."""
-        return GreedyPolicy(state.target, self.network)
+        return GreedyPolicy(state.target, self.network, self.looks_back)
 
     def _values(self, parameters: Any, x: Array) -> Array:
         return self.network.apply(parameters, x)  # type: ignore[return-value]
 
-    def _collect(self, state: DQNState, plants: Plant, key: Array) -> Replay:
+    def _collect(self, state: DQNState, plants: episodes.Lungs, key: Array) -> Replay:
         cells_key, roll_key = jax.random.split(key)
-        lungs = jax.tree.leaves(plants)[0].shape[0]
-        cells = episodes.sample(
-            cells_key, self.breaths, lungs, state.iteration * (self.breaths // lungs), self.vary
-        )
+        breaths = episodes.breaths_of(self.looks_back)
+        count = self.breaths // breaths
+        first = state.iteration * max(count // episodes.lung_count(plants), 1)
+        drawn = episodes.draw(cells_key, plants, count, first, self.vary, breaths=breaths)
         start, end = self.explore
         progress = jnp.minimum(state.iteration / (self.explored * self.iterations), 1.0)
         share = start + (end - start) * progress
@@ -156,8 +157,7 @@ class DQN:
             choice = jnp.where(explore, random, greedy)
             return base + jnp.asarray(CHOICES, base.dtype)[choice], choice
 
-        each = episodes.plants_of_cells(plants, self.breaths)
-        x, choice, rewards = episodes.roll(each, cells, act, roll_key)
+        x, choice, rewards = episodes.roll(drawn, act, roll_key, looks_back=self.looks_back)
         steps = jnp.arange(episodes.STEPS) + self.steps
         inside = steps < episodes.STEPS
         discount = jnp.where(inside, self.discount**self.steps, 0.0)

@@ -1,22 +1,25 @@
-"""Episodes of reinforcement learning: one breath each, many in one scan, and their returns.
+"""Episodes of reinforcement learning: breaths of many cells in one scan, and their returns.
+
+An episode is one breath, or three where the features look back at the breath before; returns end
+with the breath.
 
 In the functions of returns, time runs along the leading axis, and no reward comes after the last.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from ventbench import environment as env
-from ventbench import protocol
+from ventbench import protocol, rig_draws
 from ventbench.controllers import rl_policy
-from ventbench.draws import random_scenarios
+from ventbench.draws import RANGES, random_scenarios
 from ventbench.environment import Scenario
 from ventbench.interfaces import Plant
 
@@ -31,10 +34,104 @@ REWARD_SCALE = 10.0
 Act = Callable[[Array, Array, Array], tuple[Array, Any]]
 
 
+@flax.struct.dataclass
+class RigLungs:
+    """Lungs of protocol version 2 to learn on; see ``ventbench.training.rig_plants``.
+
+    Deviations have the ranges of version 2, and the airway pressure counts.
+
+    Attributes:
+        plants: K plants of each of L lungs, the nominal one first, leaves ``(K, L, ...)``.
+        weights: of the error of each lung at each PIP, ``(L, P)``.
+    """
+
+    plants: Any
+    weights: Array
+
+    @property
+    def nominal(self) -> Any:
+        """The nominal plants, leaves ``(L, ...)``."""
+        return jax.tree.map(lambda leaf: leaf[0], self.plants)
+
+
+#: Lungs to learn on: plants with leaves ``(L, ...)`` for protocol version 1, or of version 2.
+Lungs = Plant | RigLungs
+
+
+def lung_count(lungs: Lungs) -> int:
+    """Number of lungs L."""
+    if isinstance(lungs, RigLungs):
+        return lungs.weights.shape[0]
+    return jax.tree.leaves(lungs)[0].shape[0]
+
+
+@flax.struct.dataclass
+class Episodes:
+    """Cells to run, E of them, each with its plant.
+
+    Attributes:
+        plants: leaves ``(E, ...)``.
+        cells: E cells.
+        weight: of the errors in each, ``(E,)``.
+        airway: whether the airway pressure counts, not the reading.
+    """
+
+    plants: Any
+    cells: Scenario
+    weight: Array
+    airway: bool = flax.struct.field(pytree_node=False, default=False)
+
+
+def breaths_of(looks_back: bool) -> int:
+    """Breaths of an episode: those of a run where the features look back, else one."""
+    return protocol.BREATHS if looks_back else 1
+
+
+def draw(
+    key: Array,
+    lungs: Lungs,
+    count: int,
+    first: Array | int = 0,
+    vary: bool = True,
+    *,
+    breaths: int = 1,
+) -> Episodes:
+    """Draw episodes: the lungs in turn, on any of their plants, with new deviations.
+
+    Args:
+        key: key of the random numbers.
+        lungs: lungs to learn on.
+        count: number of episodes E.
+        first: which of the six PIPs comes first.
+        vary: false for nominal cells on nominal plants.
+        breaths: breaths of each episode.
+    """
+    number = lung_count(lungs)
+    lung = jnp.arange(count) % number
+    if not isinstance(lungs, RigLungs):
+        plants = jax.tree.map(lambda leaf: jnp.asarray(leaf)[lung], lungs)
+        cells = sample(key, count, number, first, vary, breaths=breaths)
+        return Episodes(plants, cells, jnp.ones(count))
+    which = jax.tree.leaves(lungs.plants)[0].shape[0]
+    plant_key = jax.random.fold_in(key, 1)
+    plant = jax.random.randint(plant_key, (count,), 0, which) * vary
+    plants = jax.tree.map(lambda leaf: jnp.asarray(leaf)[plant, lung], lungs.plants)
+    pip = (first + jnp.arange(count) // number) % len(protocol.PIPS)
+    cells = sample(key, count, number, first, vary, breaths=breaths, ranges=rig_draws.RANGES)
+    return Episodes(plants, cells, lungs.weights[lung, pip], airway=True)
+
+
 def sample(
-    key: Array, count: int, lungs: int = 1, first: Array | int = 0, vary: bool = True
+    key: Array,
+    count: int,
+    lungs: int = 1,
+    first: Array | int = 0,
+    vary: bool = True,
+    *,
+    breaths: int = 1,
+    ranges: Mapping[str, tuple[float, float]] = RANGES,
 ) -> Scenario:
-    """Draw cells of one breath each, with the deviations of the published draws.
+    """Draw cells with deviations as of the draws of a version of the protocol.
 
     Args:
         key: key of the random numbers.
@@ -42,67 +139,93 @@ def sample(
         lungs: cells of that many lungs in turn get the same nominal PIP.
         first: which of the six PIPs comes first.
         vary: false for nominal cells, without any deviation.
+        breaths: breaths of each cell.
+        ranges: of the deviations.
     """
     which = (first + jnp.arange(count) // lungs) % len(protocol.PIPS)
     pip = jnp.asarray(protocol.PIPS, jnp.result_type(float))[which]
-    return random_scenarios(key, pip, spread=None if vary else 0.0, breaths=1)
+    spread = None if vary else 0.0
+    return random_scenarios(key, pip, spread=spread, breaths=breaths, ranges=ranges)
 
 
-def plants_of_cells(plants: Plant, count: int) -> Plant:
-    """One plant for each of ``count`` cells, the lungs in turn: leaves ``(L, ...)`` repeated."""
-    lungs = jax.tree.leaves(plants)[0].shape[0]
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[jnp.arange(count) % lungs], plants)
-
-
-def roll(plants: Plant, cells: Scenario, act: Act, key: Array) -> tuple[Array, Any, Array]:
-    """Run one breath in every cell.
+def roll(
+    episodes: Episodes, act: Act, key: Array, *, looks_back: bool = False
+) -> tuple[Array, Any, Array]:
+    """Run episodes.
 
     Args:
-        plants: leaves ``(E, ...)``, as of :func:`plants_of_cells`.
-        cells: E of them.
-        act: see :data:`Act`; asked :data:`STEPS` times.
+        episodes: E of them, of one breath, or of three where the features look back.
+        act: see :data:`Act`; asked :data:`STEPS` times a breath.
         key: split for the steps.
+        looks_back: whether the features look back at the breath before.
 
     Returns:
-        Features before each command, shape ``(STEPS, E, FEATURES)``; what ``act`` kept; rewards,
-        ``-|error| / REWARD_SCALE`` after each command, shape ``(STEPS, E)``.
+        Of each of the B breaths of all episodes: features before each command, shape
+        ``(STEPS, B, features)``; what ``act`` kept; rewards, minus the weighted error after each
+        command over ``REWARD_SCALE``, shape ``(STEPS, B)``.
     """
-    varied = env.vary(plants, cells)
+    cells, weight = episodes.cells, episodes.weight
+    varied = env.vary(episodes.plants, cells)
+    start = env.start_breath(varied, cells)
+    memory = rl_policy.init_features(cells.pip.shape, looks_back)
 
-    def step(carry: Any, now: tuple[Array, Array]) -> tuple[Any, tuple[Array, Any, Array]]:
-        loop, memory = carry
-        index, key = now
-        memory, x, base = rl_policy.features(memory, env.observe(cells, loop, 0, index))
-        asked, kept = act(key, x, base)
-        loop, _ = env.inspire(varied, cells, loop, asked)
-        return (loop, memory), (x, kept, -jnp.abs(loop.pressure - cells.pip) / REWARD_SCALE)
+    def run(memory: Any, breath: Array | int, keys: Array) -> tuple[Any, Any]:
+        def step(carry: Any, now: tuple[Array, Array]) -> tuple[Any, tuple[Array, Any, Array]]:
+            loop, memory = carry
+            index, key = now
+            seen = env.observe(cells, loop, breath, index)
+            memory, x, base = rl_policy.features(memory, seen)
+            asked, kept = act(key, x, base)
+            loop, _ = env.inspire(varied, cells, loop, asked)
+            pressure = env.airway_pressure(varied, loop) if episodes.airway else loop.pressure
+            reward = -weight * jnp.abs(pressure - cells.pip) / REWARD_SCALE
+            return (loop, memory), (x, kept, reward)
 
-    start = (env.start_breath(varied, cells), rl_policy.init_features(cells.pip.shape))
-    _, out = jax.lax.scan(step, start, (jnp.arange(STEPS), jax.random.split(key, STEPS)))
-    return out
+        (loop, memory), out = jax.lax.scan(step, (start, memory), (jnp.arange(STEPS), keys))
+        if looks_back:  # the last observation is remembered too
+            memory, _, _ = rl_policy.features(memory, env.observe(cells, loop, breath, STEPS))
+        return memory, out
+
+    if not looks_back:
+        return run(memory, 0, jax.random.split(key, STEPS))[1]
+    keys = jax.random.split(key, (protocol.BREATHS, STEPS))
+    breaths = jnp.arange(protocol.BREATHS)
+    _, out = jax.lax.scan(lambda memory, x: run(memory, *x), memory, (breaths, keys))
+    # (breath, step, episode, ...) -> (step, breath and episode, ...)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(STEPS, -1, *x.shape[3:]), out)
 
 
-@partial(jax.jit, static_argnames="count")
-def errors(plants: Plant, controller: Any, cells: Scenario, count: int) -> Array:
-    """Mean ``|pressure - PIP|`` of one inspiration in each cell, cmH2O, shape ``(count,)``.
+@jax.jit
+def errors(episodes: Episodes, controller: Any) -> Array:
+    """Mean weighted ``|pressure - PIP|`` of each episode, cmH2O, shape ``(E,)``.
+
+    Of an episode of three breaths those that are scored count.
 
     Args:
-        plants: leaves ``(L, ...)``, the lungs of the cells in turn.
-        controller: pure controller that starts anew at each breath.
-        cells: ``count`` of them.
-        count: number of cells.
+        episodes: E of them.
+        controller: pure controller.
     """
-    varied = env.vary(plants_of_cells(plants, count), cells)
+    cells = episodes.cells
+    varied = env.vary(episodes.plants, cells)
+    start = env.start_breath(varied, cells)
+    breaths = cells.noise.shape[-2]
 
-    def step(carry: Any, index: Array) -> tuple[Any, Array]:
-        loop, state = carry
-        state, asked = controller.step(state, env.observe(cells, loop, 0, index))
-        after, _ = env.inspire(varied, cells, loop, asked)
-        return (after, state), jnp.abs(loop.pressure - cells.pip)
+    def run(state: Any, breath: Array | int) -> tuple[Any, Array]:
+        def step(carry: Any, index: Array) -> tuple[Any, Array]:
+            loop, state = carry
+            state, asked = controller.step(state, env.observe(cells, loop, breath, index))
+            after, _ = env.inspire(varied, cells, loop, asked)
+            pressure = env.airway_pressure(varied, loop) if episodes.airway else loop.pressure
+            return (after, state), jnp.abs(pressure - cells.pip)
 
-    start = (env.start_breath(varied, cells), controller.init(cells.pip.shape))
-    _, out = jax.lax.scan(step, start, jnp.arange(protocol.INSPIRATION_STEPS))
-    return jnp.mean(out, axis=0)
+        (_, state), out = jax.lax.scan(step, (start, state), jnp.arange(protocol.INSPIRATION_STEPS))
+        return state, jnp.mean(out, axis=0)
+
+    state = controller.init(cells.pip.shape)
+    if breaths == 1:
+        return run(state, 0)[1] * episodes.weight
+    _, each = jax.lax.scan(run, state, jnp.arange(breaths))
+    return jnp.mean(each[jnp.asarray(protocol.SCORED_BREATHS)], axis=0) * episodes.weight
 
 
 def discounted(rewards: Array, discount: float) -> Array:

@@ -17,8 +17,6 @@ from jax import Array
 from numpy.typing import NDArray
 
 from ventbench import environment, precision, protocol
-from ventbench.environment import Scenario
-from ventbench.interfaces import Plant
 from ventbench.resume import Checkpoint
 from ventbench.training.rl import episodes
 
@@ -40,8 +38,8 @@ class Method(Protocol):
         """State at the start."""
         ...
 
-    def iterate(self, state: Any, plants: Plant) -> Any:
-        """State one iteration later, on lungs with leaves ``(L, ...)``."""
+    def iterate(self, state: Any, plants: episodes.Lungs) -> Any:
+        """State one iteration later."""
         ...
 
     def policy(self, state: Any) -> Any:
@@ -92,29 +90,38 @@ class TrainedPolicies:
     compile_seconds: float
 
 
-def nominal_cells(lungs: int) -> Scenario:
-    """The six PIPs without deviation on each lung in turn, ``(6 * lungs,)``."""
-    return environment.nominal_scenario(np.repeat(np.asarray(protocol.PIPS), lungs))
+def nominal_error(lungs: episodes.Lungs, policy: Any) -> Array:
+    """Score without noise of a policy on the nominal plants of lungs, cmH2O.
+
+    The mean over lungs and PIPs, without weights; by the version of the protocol that the lungs are
+    of.
+    """
+    count = episodes.lung_count(lungs)
+    rigs = isinstance(lungs, episodes.RigLungs)
+    pips = np.repeat(np.asarray(protocol.PIPS), count)
+    which = jnp.arange(len(pips)) % count
+    plants = lungs.nominal if isinstance(lungs, episodes.RigLungs) else lungs
+    cells = environment.nominal_scenario(pips)
+    if not rigs:  # without noise each breath is the same
+        cells = cells.replace(noise=cells.noise[..., :1, :])  # type: ignore[attr-defined]
+    each = jax.tree.map(lambda leaf: jnp.asarray(leaf)[which], plants)
+    drawn = episodes.Episodes(each, cells, jnp.ones(len(pips)), airway=rigs)
+    return jnp.mean(episodes.errors(drawn, policy))
 
 
-def nominal_error(plants: Plant, policy: Any) -> Array:
-    """Score without noise of a policy on lungs with leaves ``(L, ...)``, cmH2O."""
-    lungs = jax.tree.leaves(plants)[0].shape[0]
-    return jnp.mean(episodes.errors(plants, policy, nominal_cells(lungs), 6 * lungs))
-
-
-def _fresh_error(plants: Plant, policy: Any) -> Array:
-    lungs = jax.tree.leaves(plants)[0].shape[0]
-    count = VALIDATION_CELLS * lungs
-    cells = episodes.sample(jax.random.key(VALIDATION_SEED), count, lungs)
-    return jnp.mean(episodes.errors(plants, policy, cells, count))
+def _fresh_error(lungs: episodes.Lungs, policy: Any) -> Array:
+    """Error on fresh cells, weighted as in the training."""
+    count = VALIDATION_CELLS * episodes.lung_count(lungs)
+    breaths = episodes.breaths_of(isinstance(lungs, episodes.RigLungs))
+    key = jax.random.key(VALIDATION_SEED)
+    return jnp.mean(episodes.errors(episodes.draw(key, lungs, count, breaths=breaths), policy))
 
 
 @partial(jax.jit, static_argnames=("method", "count"))
-def _advance(method: Method, runs: _Run, plants: Plant, count: int) -> tuple[_Run, Array]:
+def _advance(method: Method, runs: _Run, plants: episodes.Lungs, count: int) -> tuple[_Run, Array]:
     """``count`` iterations of each run, then both errors, shape ``(R, 2)``."""
 
-    def advance(run: _Run, plant: Plant) -> tuple[_Run, Array]:
+    def advance(run: _Run, plant: episodes.Lungs) -> tuple[_Run, Array]:
         def iterate(state: Any, _: None) -> tuple[Any, None]:
             return method.iterate(state, plant), None
 
@@ -129,7 +136,9 @@ def _advance(method: Method, runs: _Run, plants: Plant, count: int) -> tuple[_Ru
     return jax.vmap(advance)(runs, plants)
 
 
-def _start(method: Method, seeds: Sequence[int], plants: Plant) -> tuple[_Run, NDArray[np.float32]]:
+def _start(
+    method: Method, seeds: Sequence[int], plants: episodes.Lungs
+) -> tuple[_Run, NDArray[np.float32]]:
     numbers = jnp.asarray(np.asarray(seeds, np.uint32))
     keys = jax.vmap(jax.random.key)(numbers)
     states = jax.vmap(method.init)(keys)
@@ -140,7 +149,7 @@ def _start(method: Method, seeds: Sequence[int], plants: Plant) -> tuple[_Run, N
 
 def train(
     method: Method,
-    plants: Plant,
+    plants: episodes.Lungs,
     seeds: Sequence[int],
     *,
     chunk: int,
@@ -156,7 +165,7 @@ def train(
 
     Args:
         method: the recipe, common to all.
-        plants: lungs of each run, leaves ``(R, L, ...)``; taken in float32.
+        plants: lungs of each run, an axis ``(R, ...)`` in front of all leaves; taken in float32.
         seeds: one for each run.
         chunk: iterations between two points of the curves.
         about: text that tells one training from another, such as the simulators' hash.

@@ -18,7 +18,6 @@ from ventbench.controllers.rl_policy import (
     Parameters,
     TanhNetwork,
 )
-from ventbench.interfaces import Plant
 from ventbench.training.rl import episodes
 
 
@@ -41,6 +40,8 @@ class PolicyGradient:
         iterations: iterations of a training, over which the learning rate falls to zero.
         learning_rate: initial learning rate of Adam.
         vary: draw cells with noise and deviations; false for nominal ones.
+        looks_back: let the features look back at the breath before; episodes then have three
+            breaths.
         widths: hidden layers of the network.
     """
 
@@ -48,6 +49,7 @@ class PolicyGradient:
     iterations: int = 1600
     learning_rate: float = 3e-3
     vary: bool = True
+    looks_back: bool = False
     widths: tuple[int, ...] = (32, 32)
 
     @property
@@ -63,26 +65,25 @@ class PolicyGradient:
     def init(self, key: Array) -> PolicyGradientState:
         """Return the state at the start of a training."""
         network_key, key = jax.random.split(key)
-        parameters = rl_policy.init_parameters(self.network, network_key)
+        parameters = rl_policy.init_parameters(self.network, network_key, self.looks_back)
         return PolicyGradientState(
             parameters, self._optimiser.init(parameters), key, jnp.zeros((), jnp.int32)
         )
 
-    def iterate(self, state: PolicyGradientState, plants: Plant) -> PolicyGradientState:
-        """One update on lungs with leaves ``(L, ...)``."""
+    def iterate(self, state: PolicyGradientState, plants: episodes.Lungs) -> PolicyGradientState:
+        """One update on lungs."""
         cells_key, roll_key, key = jax.random.split(state.key, 3)
-        lungs = jax.tree.leaves(plants)[0].shape[0]
-        cells = episodes.sample(
-            cells_key, self.breaths, lungs, state.iteration * (self.breaths // lungs), self.vary
-        )
-        each = episodes.plants_of_cells(plants, self.breaths)
+        breaths = episodes.breaths_of(self.looks_back)
+        count = self.breaths // breaths
+        first = state.iteration * max(count // episodes.lung_count(plants), 1)
+        drawn = episodes.draw(cells_key, plants, count, first, self.vary, breaths=breaths)
 
         def loss(parameters: Parameters) -> Array:
             def act(key: Array, x: Array, base: Array) -> tuple[Array, None]:
                 mean: Array = self.network.apply(parameters, x)  # type: ignore[assignment]
                 return base + SCALE * mean[..., 0], None
 
-            return -jnp.mean(episodes.roll(each, cells, act, roll_key)[2])
+            return -jnp.mean(episodes.roll(drawn, act, roll_key, looks_back=self.looks_back)[2])
 
         gradient = jax.grad(loss)(state.parameters)
         updates, optimiser = self._optimiser.update(gradient, state.optimiser, state.parameters)
@@ -91,4 +92,4 @@ class PolicyGradient:
 
     def policy(self, state: PolicyGradientState) -> GaussianPolicy:
         """The learned policy."""
-        return GaussianPolicy(state.parameters, self.network)
+        return GaussianPolicy(state.parameters, self.network, self.looks_back)

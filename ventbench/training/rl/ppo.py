@@ -17,7 +17,6 @@ from ventbench.controllers.rl_policy import (
     GaussianPolicy,
     TanhNetwork,
 )
-from ventbench.interfaces import Plant
 from ventbench.training.rl import episodes
 
 
@@ -33,7 +32,7 @@ class PPOState:
 
 @flax.struct.dataclass
 class PPOBatch:
-    """Steps of breaths; ``features`` ``(N, FEATURES)``, all others ``(N,)``."""
+    """Steps of breaths; ``features`` ``(N, features)``, all others ``(N,)``."""
 
     features: Array
     action: Array
@@ -62,6 +61,8 @@ class PPO:
         iterations: iterations of a training, over which the learning rate falls to zero.
         learning_rate: initial learning rate of Adam.
         vary: draw cells with noise and deviations; false for nominal ones.
+        looks_back: let the features look back at the breath before; episodes then have three
+            breaths.
         widths: hidden layers of both networks.
         epochs: passes over a batch.
         minibatches: minibatches of a pass.
@@ -76,6 +77,7 @@ class PPO:
     iterations: int = 600
     learning_rate: float = 1e-3
     vary: bool = True
+    looks_back: bool = False
     widths: tuple[int, ...] = (32, 32)
     epochs: int = 6
     minibatches: int = 4
@@ -104,14 +106,14 @@ class PPO:
         """Return the state at the start of a training."""
         actor_key, critic_key, key = jax.random.split(key, 3)
         parameters = {
-            "actor": rl_policy.init_parameters(self.network, actor_key),
-            "critic": rl_policy.init_parameters(self._critic, critic_key),
+            "actor": rl_policy.init_parameters(self.network, actor_key, self.looks_back),
+            "critic": rl_policy.init_parameters(self._critic, critic_key, self.looks_back),
             "log_spread": jnp.log(jnp.asarray(self.spread)),
         }
         return PPOState(parameters, self._optimiser.init(parameters), key, jnp.zeros((), jnp.int32))
 
-    def iterate(self, state: PPOState, plants: Plant) -> PPOState:
-        """Collect breaths on lungs with leaves ``(L, ...)`` and learn from them."""
+    def iterate(self, state: PPOState, plants: episodes.Lungs) -> PPOState:
+        """Collect breaths on lungs and learn from them."""
         collect_key, learn_key, key = jax.random.split(state.key, 3)
         batch = self._collect(state, plants, collect_key)
 
@@ -128,7 +130,7 @@ class PPO:
 
     def policy(self, state: PPOState) -> GaussianPolicy:
         """The learned policy: its mean."""
-        return GaussianPolicy(state.parameters["actor"], self.network)
+        return GaussianPolicy(state.parameters["actor"], self.network, self.looks_back)
 
     def _mean(self, parameters: Any, x: Array) -> Array:
         return self.network.apply(parameters["actor"], x)[..., 0]  # type: ignore[index]
@@ -136,13 +138,13 @@ class PPO:
     def _value(self, parameters: Any, x: Array) -> Array:
         return self._critic.apply(parameters["critic"], x)[..., 0]  # type: ignore[index]
 
-    def _collect(self, state: PPOState, plants: Plant, key: Array) -> PPOBatch:
+    def _collect(self, state: PPOState, plants: episodes.Lungs, key: Array) -> PPOBatch:
         parameters = state.parameters
         cells_key, roll_key = jax.random.split(key)
-        lungs = jax.tree.leaves(plants)[0].shape[0]
-        cells = episodes.sample(
-            cells_key, self.breaths, lungs, state.iteration * (self.breaths // lungs), self.vary
-        )
+        breaths = episodes.breaths_of(self.looks_back)
+        count = self.breaths // breaths
+        first = state.iteration * max(count // episodes.lung_count(plants), 1)
+        drawn = episodes.draw(cells_key, plants, count, first, self.vary, breaths=breaths)
 
         def act(key: Array, x: Array, base: Array) -> tuple[Array, tuple[Array, Array]]:
             mean = self._mean(parameters, x)
@@ -150,8 +152,9 @@ class PPO:
             action = mean + jnp.exp(log_spread) * jax.random.normal(key, mean.shape)
             return base + SCALE * action, (action, log_probability(action, mean, log_spread))
 
-        each = episodes.plants_of_cells(plants, self.breaths)
-        x, (action, before), rewards = episodes.roll(each, cells, act, roll_key)
+        x, (action, before), rewards = episodes.roll(
+            drawn, act, roll_key, looks_back=self.looks_back
+        )
         value = self._value(parameters, x)
         advantage = episodes.advantages(rewards, value, self.discount, self.trace)
         batch = PPOBatch(x, action, before, advantage, value)

@@ -18,17 +18,13 @@ from ventbench.controllers.pid import PID
 from ventbench.errors import InputError
 from ventbench.plants.catalog import Given
 from ventbench.resume import fingerprint
+from ventbench.training.rig_plants import TrainingPlants, plants_to_train_on
 from ventbench.training.rl import episodes
 from ventbench.training.rl.dqn import DQN
 from ventbench.training.rl.parallel import TrainedPolicies, nominal_error, train
 from ventbench.training.rl.policy_gradient import PolicyGradient
 from ventbench.training.rl.ppo import PPO
-from ventbench.training.trained import (
-    ALL,
-    TrainedControllers,
-    check_names,
-    simulators_to_train_on,
-)
+from ventbench.training.trained import ALL, TrainedControllers, check_names
 
 #: Names of the methods, as commands and tables have them.
 METHODS = ("policy-gradient", "ppo", "dqn")
@@ -57,6 +53,7 @@ def train_ppo(
     steps: int | None = None,
     method: PPO | None = None,
     simulator: Given = "frozen",
+    version: int = 1,
     progress: Progress | None = None,
 ) -> TrainedControllers:
     """Train corrections of a PID by proximal policy optimisation.
@@ -79,6 +76,8 @@ def train_ppo(
         method: settings of every training; the published ones, which differ for one lung and for
             all six, if not given.
         simulator: simulators with plants, see :func:`ventbench.load_simulators`.
+        version: of the protocol to train for, see
+            :func:`ventbench.training.rig_plants.plants_to_train_on`.
         progress: see :data:`Progress`.
 
     Returns:
@@ -89,7 +88,7 @@ def train_ppo(
             holds an unfinished training with other settings.
         FloatingPointError: if a training diverges.
     """
-    return _train("ppo", networks, out, seeds, steps, method, simulator, progress)
+    return _train("ppo", networks, out, seeds, steps, method, simulator, version, progress)
 
 
 def train_dqn(
@@ -100,6 +99,7 @@ def train_dqn(
     steps: int | None = None,
     method: DQN | None = None,
     simulator: Given = "frozen",
+    version: int = 1,
     progress: Progress | None = None,
 ) -> TrainedControllers:
     """Train a choice among 19 corrections of a PID by deep Q-learning.
@@ -112,21 +112,23 @@ def train_dqn(
         trained = ventbench.train_dqn(["R20C50"], "runs/mine", steps=60_000)
         trained.report["networks"]["R20C50"]["error_fresh"]  # cmH2O, by seed
     """
-    return _train("dqn", networks, out, seeds, steps, method, simulator, progress)
+    return _train("dqn", networks, out, seeds, steps, method, simulator, version, progress)
 
 
-def method_for(name: str, lungs: int, steps: int | None = None) -> Method:
+def method_for(name: str, lungs: int, steps: int | None = None, version: int = 1) -> Method:
     """Return the published settings of a method.
 
     Args:
         name: one of :data:`METHODS`.
         lungs: on which one network is trained: 1 or 6.
         steps: control steps of experience; those of the published settings if not given.
+        version: of the protocol; in version 2 the features look back at the breath before.
 
     Raises:
         InputError: if the steps do not make one iteration.
     """
-    return _shortened((_ONE_LUNG if lungs == 1 else _ALL_LUNGS)[name], name, steps)
+    method = (_ONE_LUNG if lungs == 1 else _ALL_LUNGS)[name]
+    return _shortened(replace(method, looks_back=version == 2), name, steps)
 
 
 def _shortened(method: Method, name: str, steps: int | None) -> Method:
@@ -158,17 +160,20 @@ def _groups(names: Sequence[str], lungs: int) -> list[_Group]:
 
 def _train(
     name: str, networks: Sequence[str] | None, out: Path | str, seeds: Sequence[int],
-    steps: int | None, method: Method | None, simulator: Given, progress: Progress | None,
+    steps: int | None, method: Method | None, simulator: Given, version: int,
+    progress: Progress | None,
 ) -> TrainedControllers:  # fmt: skip
     began = time.perf_counter()
-    simulators, out = simulators_to_train_on(simulator), Path(out)
-    known = [entry.id for entry in simulators.lungs]
-    names = check_names(networks, simulators)
+    trained_on, out = plants_to_train_on(simulator, version), Path(out)
+    known = list(trained_on.names)
+    names = check_names(networks, trained_on)
     if networks is None and len(known) > 1:
         names = (*names, ALL)
     groups = _groups(names, len(known))
     methods = [
-        method_for(name, group.lungs, steps) if method is None else _shortened(method, name, steps)
+        method_for(name, group.lungs, steps, version)
+        if method is None
+        else _shortened(method, name, steps)
         for group in groups
     ]
     report = progress or (lambda *_: None)
@@ -176,7 +181,7 @@ def _train(
     for group, settings in zip(groups, methods, strict=True):
         label, kind = ", ".join(group.names), "all" if ALL in group.names else "one"
         checkpoints.append(out / f".{name}-{kind}.npz")
-        plants = _plants(simulators.stacked, known, group, len(seeds))
+        plants = _lungs(trained_on, version, group, len(seeds))
         trained = train(
             settings,
             plants,
@@ -196,7 +201,8 @@ def _train(
         "method": name,
         "recipes": used,
         "networks": about,
-        "simulators": dict(simulators.about),
+        "protocol": version,
+        "simulators": dict(trained_on.about),
         "jax": jax.__version__,
         "seconds": round(time.perf_counter() - began, 1),
     }
@@ -207,20 +213,27 @@ def _train(
     return TrainedControllers(policies, result, out)
 
 
-def _plants(plants: Any, known: Sequence[str], group: _Group, seeds: int) -> Any:
-    """Leaves ``(R, lungs, ...)``: the seeds of a network in a row."""
+def _lungs(trained_on: TrainingPlants, version: int, group: _Group, seeds: int) -> episodes.Lungs:
+    """Lungs of each run, an axis of R in front: the seeds of a network in a row."""
+    known = list(trained_on.names)
     if ALL in group.names:
-        return jax.tree.map(lambda leaf: np.repeat(leaf[None], seeds, axis=0), plants)
-    index = np.repeat([known.index(name) for name in group.names], seeds)
-    return jax.tree.map(lambda leaf: leaf[index][:, None], plants)
+        where = np.repeat([list(range(len(known)))], seeds, axis=0)
+    else:
+        where = np.repeat([[known.index(name)] for name in group.names], seeds, axis=0)
+    if version == 1:
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[where], trained_on.nominal)
+    plants = jax.tree.map(lambda leaf: np.asarray(leaf)[:, where], trained_on.plants)
+    # (plants, runs, lungs, ...) -> (runs, plants, lungs, ...)
+    plants = jax.tree.map(lambda leaf: np.moveaxis(leaf, 1, 0), plants)
+    return episodes.RigLungs(plants, trained_on.weights[where])
 
 
-def _pid_errors(plants: Any) -> list[float]:
+def _pid_errors(lungs: episodes.Lungs) -> list[float]:
     """Nominal error of the PID that is corrected, on the lungs of each run, cmH2O."""
     with precision.float32():
-        plants = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), plants)
+        lungs = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), lungs)
         pid = PID(*rl_policy.GAINS)
-        errors = jax.jit(jax.vmap(lambda plant: nominal_error(plant, pid)))(plants)
+        errors = jax.jit(jax.vmap(lambda own: nominal_error(own, pid)))(lungs)
         return [float(error) for error in errors]
 
 

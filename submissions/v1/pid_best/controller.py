@@ -1,0 +1,29 @@
+"""The paper's best PI controller on each lung, tuned by its authors on the physical one."""
+
+TIME_CONSTANT = 0.5  # s, of both averages
+
+# (P, I, D), %/cmH2O
+GAINS = {
+    "R5C10": (10.0, 0.2, 0.0),
+    "R5C20": (10.0, 10.0, 0.0),
+    "R5C50": (10.0, 10.0, 0.0),
+    "R20C10": (8.0, 1.0, 0.0),
+    "R20C20": (5.0, 10.0, 0.0),
+    "R20C50": (5.0, 10.0, 0.0),
+}
+
+
+class Controller:
+    def reset(self, task):
+        self.gains = GAINS[task.lung]
+
+    def act(self, observation):
+        if observation.time == 0:  # a new breath
+            self.before = self.integral = self.derivative = 0.0
+        error = observation.target - observation.pressure
+        a = observation.dt / (observation.dt + TIME_CONSTANT)
+        self.integral += a * (error - self.integral)
+        self.derivative += a * (error - self.before - self.derivative)
+        self.before = error
+        p, i, d = self.gains
+        return p * error + i * self.integral + d * self.derivative

@@ -73,6 +73,15 @@ def simulator(
             min=1, max=2, help="Recipe: 2, or 1 for the first frozen simulators and their files."
         ),
     ] = 2,
+    laminar_share: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help="Part of the labelled resistance that does not depend on the flow: 0.4 as in a "
+            "QuickLung, 1 for a linear resistor.",
+        ),
+    ] = 0.4,
 ) -> None:
     """Learn simulators from a folder of recordings in the public schema, with any R and C.
 
@@ -89,14 +98,17 @@ def simulator(
 
         if lungs is not None:
             raise InputError("--lungs has no meaning for --version 1, which lists the six lungs")
+        if laminar_share != 0.4:
+            raise InputError("--laminar-share has no meaning for --version 1")
         _train_simulators(train_simulator, folder, out)
         return
     from functools import partial
 
-    from ventbench.training.rigs.train import train_rigs
+    from ventbench.training.rigs.train import RigConfig, train_rigs
 
+    config = RigConfig(laminar_share=laminar_share)
     listed = None if lungs is None else [name.strip() for name in lungs.split(",")]
-    _train_simulators(partial(train_rigs, lungs=listed), folder, out)
+    _train_simulators(partial(train_rigs, lungs=listed, config=config), folder, out)
 
 
 def _train_simulators(run: Any, folder: Path, out: Path) -> None:

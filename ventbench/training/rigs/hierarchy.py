@@ -30,8 +30,16 @@ SHEET_FLOW = 2.28
 #: Degrees of freedom of the rigs' deviations.
 TAIL = 3.0
 
-#: Part of the labelled resistance that is laminar; a QuickLung's label holds at one flow only.
+#: Part of the labelled resistance that is laminar in a QuickLung, whose label holds at
+#: :data:`LABEL_FLOW` only: at half that flow its resistance is 70 % of the label.
 LAMINAR_SHARE = 0.4
+
+#: Flow at which a labelled resistance holds, L/s.
+LABEL_FLOW = 1.0
+
+#: Least part of the label that the prior gives to either kind of resistance: its logarithm is
+#: fitted.
+LEAST_SHARE = 0.02
 
 #: Command at which the flow of the data sheet holds, %.
 FULL_OPENING = 100.0
@@ -134,13 +142,15 @@ class Centre:
     same_spring: Array
 
 
-def centre(labels: Sequence[Lung], sessions: int) -> Centre:
+def centre(labels: Sequence[Lung], sessions: int, laminar_share: float = LAMINAR_SHARE) -> Centre:
     """Labels, the data sheet, and orders of magnitude of the rest.
 
     Args:
         labels: the L lungs.
         sessions: number of rigs, J.
+        laminar_share: part of the labelled resistance that does not depend on the flow.
     """
+    laminar = min(max(laminar_share, LEAST_SHARE), 1.0 - LEAST_SHARE)
     resistance = np.array([lung.R for lung in labels])
     compliance = np.array([lung.C for lung in labels])
 
@@ -152,8 +162,8 @@ def centre(labels: Sequence[Lung], sessions: int) -> Centre:
     pooled = replace(
         start,
         slopes=jnp.full_like(start.slopes, np.log(SHEET_FLOW / FULL_OPENING)),
-        R=jnp.asarray(np.log(LAMINAR_SHARE * resistance)),
-        K2=jnp.asarray(np.log((1.0 - LAMINAR_SHARE) * resistance)),
+        R=jnp.asarray(np.log(laminar * resistance)),
+        K2=jnp.asarray(np.log((1.0 - laminar) * resistance / LABEL_FLOW)),
         closing_lag=jnp.full(RIG_COUNT, np.log(0.01)),
     )
     sheet = jnp.asarray(np.log(SHEET_FLOW))

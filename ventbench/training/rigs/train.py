@@ -47,6 +47,7 @@ from ventbench.training.hybrid.fit import HybridConfig, fit_expiration
 from ventbench.training.hybrid.parameters import Pooled, plants
 from ventbench.training.rigs.fit import FitConfig, Fitted, Noise, fit
 from ventbench.training.rigs.hierarchy import (
+    LAMINAR_SHARE,
     SHEET_FLOW,
     Centre,
     Scales,
@@ -86,6 +87,8 @@ class RigConfig:
         reconstructed: weight of a breath whose pressure is partly blank; a measured one has 1.
         unlisted: weight of a breath of a lung that is not listed.
         seed: seed of folds, drawn priors and resampling.
+        laminar_share: part of the labelled resistance that does not depend on the flow, around
+            which the prior of the resistances lies: 0.4 as in a QuickLung, 1 for a linear resistor.
         fit: settings of the optimisation.
     """
 
@@ -94,7 +97,17 @@ class RigConfig:
     reconstructed: float = 0.4
     unlisted: float = 0.2
     seed: int = 0
+    laminar_share: float = LAMINAR_SHARE
     fit: FitConfig = field(default_factory=FitConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse a share that is none.
+
+        Raises:
+            InputError: naming it.
+        """
+        if not 0.0 <= self.laminar_share <= 1.0:
+            raise InputError(f"laminar share {self.laminar_share:g} is outside 0..1")
 
 
 @dataclass(frozen=True)
@@ -214,7 +227,7 @@ def _arrange(
         inspirations(data.breaths, table, data.labels, samples),
         whole_breaths(data.measured_breaths, table, data.labels),
         weight,
-        centre(data.labels, len(table)),
+        centre(data.labels, len(table), config.laminar_share),
         scales,
         noise,
     )
@@ -492,6 +505,10 @@ def _valve(problem: _Problem, members: Sequence[Pooled], fits: _Fits) -> dict[st
 def _provenance(
     data: RigRecordings, listed: tuple[str, ...], config: RigConfig, scales: Scales, noise: Noise
 ) -> dict[str, Any]:
+    settings = dataclasses.asdict(config)
+    if config.laminar_share == LAMINAR_SHARE:
+        # Not told, so that the recordings of version 2 give its manifest again to the byte.
+        del settings["laminar_share"]
     return {
         "format": frozen.RIGS_FORMAT,
         "version": VERSION,
@@ -502,7 +519,7 @@ def _provenance(
         "listed": list(listed),
         "split": {"by": "breath", "seed": config.seed, "folds": config.folds},
         "recipe": {
-            "rigs": dataclasses.asdict(config),
+            "rigs": settings,
             "scales": dataclasses.asdict(scales),
             "noise": dataclasses.asdict(noise),
         },

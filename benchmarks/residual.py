@@ -57,8 +57,8 @@ def main() -> None:
     best = [PID(*map(float, gains[k])) for k in error.argmin(axis=1)]
     single = [PID(*map(float, gains[int(error.mean(axis=0).argmin())]))] * len(LUNG_IDS)
     with precision.float64():
-        each = load_weights(open_submission("residual_mlp").folder / "weights.npz")
-        for_all = load_weights(open_submission("residual_mlp_all").folder / "weights.npz")[ALL]
+        each = load_weights(open_submission("v1/residual_mlp").folder / "weights.npz")
+        for_all = load_weights(open_submission("v1/residual_mlp_all").folder / "weights.npz")[ALL]
     result: dict[str, Any] = {}
 
     print(f"{'lung':8} {'rise':>7} {'reached':>7}   cmH2O")

@@ -1,15 +1,15 @@
-"""The paper's best PI controller on each lung, tuned by its authors on the physical one."""
+"""The best PID of the paper's grid on each lung, tuned on the rigs of version 2."""
 
 TIME_CONSTANT = 0.5  # s, of both averages
 
 # (P, I, D), %/cmH2O
 GAINS = {
-    "R5C10": (10.0, 0.2, 0.0),
-    "R5C20": (10.0, 10.0, 0.0),
-    "R5C50": (10.0, 10.0, 0.0),
-    "R20C10": (8.0, 1.0, 0.0),
-    "R20C20": (5.0, 10.0, 0.0),
-    "R20C50": (5.0, 10.0, 0.0),
+    "R5C10": (10.0, 0.0, 10.0),
+    "R5C20": (10.0, 3.0, 10.0),
+    "R5C50": (10.0, 10.0, 10.0),
+    "R20C10": (7.0, 0.1, 4.0),
+    "R20C20": (4.0, 10.0, 0.1),
+    "R20C50": (4.0, 10.0, 0.0),
 }
 
 

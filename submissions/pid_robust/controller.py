@@ -2,7 +2,7 @@
 
 TIME_CONSTANT = 0.5  # s, of both averages
 
-GAINS = (6.0, 6.0, 0.3)  # P, I, D, %/cmH2O
+GAINS = (10.0, 2.0, 9.0)  # P, I, D, %/cmH2O
 
 
 class Controller:

@@ -23,12 +23,12 @@ from ventbench.submissions.runner import InProcessRunner
 from ventbench.submissions.scoring import run_protocol, score
 
 GAINS = {
-    "R5C10": (10.0, 0.2),
-    "R5C20": (10.0, 10.0),
-    "R5C50": (10.0, 10.0),
-    "R20C10": (8.0, 1.0),
-    "R20C20": (5.0, 10.0),
-    "R20C50": (5.0, 10.0),
+    "R5C10": (10.0, 0.0, 10.0),
+    "R5C20": (10.0, 3.0, 10.0),
+    "R5C50": (10.0, 10.0, 10.0),
+    "R20C10": (7.0, 0.1, 4.0),
+    "R20C20": (4.0, 10.0, 0.1),
+    "R20C50": (4.0, 10.0, 0.0),
 }
 
 
@@ -66,7 +66,7 @@ def test_robust_pid(plants):
         found = run_protocol(open_submission("pid_robust"), plants, track=track)
         with precision.float64():
             cells = environment.nominal_scenario(np.array(protocol.PIPS))
-        expected = pure_errors(plants, cells, [(6.0, 6.0, 0.3)] * 6)
+        expected = pure_errors(plants, cells, [(10.0, 2.0, 9.0)] * 6)
         np.testing.assert_allclose(found.nominal, expected, rtol=0, atol=1e-9)
 
 

@@ -384,12 +384,12 @@ def test_the_rise_of_a_textbook_lung_is_that_of_its_formula():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["residual_mlp", "residual_mlp_all"])
+@pytest.mark.parametrize("name", ["v1/residual_mlp", "v1/residual_mlp_all"])
 def test_the_submissions_score_what_they_say(name):
     """Their READMEs' numbers, and the limits that they were made for."""
     nominal_score, drawn_score = {
-        "residual_mlp": (2.082, 2.172),
-        "residual_mlp_all": (2.159, 2.255),
+        "v1/residual_mlp": (2.082, 2.172),
+        "v1/residual_mlp_all": (2.159, 2.255),
     }[name]
     simulators = frozen.load()
     result = run_protocol(open_submission(name), simulators.plants, draws=20)

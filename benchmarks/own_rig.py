@@ -80,11 +80,6 @@ RIGS = {
     "droop": Concealed(
         "a valve that loses 40 % of its flow towards 100 %", {"valve_curve": {"loss": 0.4}}
     ),
-    "slow": Concealed(
-        "a valve that answers 45 ms late, with a lag of 50 ms, and gives 17 % less flow",
-        {"valve_delay": {"delay": 0.045}, "valve_lag": {"tau": 0.05}},
-        gain=19.0,
-    ),
 }
 
 #: What the controllers are trained on, in the order of the table.

@@ -127,7 +127,8 @@ def test_trajectories(best, plants):
     np.testing.assert_allclose(error, result.nominal, rtol=0, atol=1e-9)
     with precision.float64():
         cells = environment.nominal_scenario(np.array(protocol.PIPS))
-        inspired, expired = rollouts.closed_loop(take(plants, 4), PID(5.0, 10.0), cells, whole=True)
+        pid = PID(*GAINS["R20C20"])
+        inspired, expired = rollouts.closed_loop(take(plants, 4), pid, cells, whole=True)
     for name in ("pressure", "u_in"):
         whole = np.concatenate([getattr(inspired, name), getattr(expired, name)], axis=-1)
         np.testing.assert_allclose(

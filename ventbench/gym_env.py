@@ -215,7 +215,8 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, NDArray[np.flo
             plants = jax.tree.map(
                 lambda *leaf: jnp.stack(leaf), *(single._plants[i] for i in lungs)
             )
-            self._plants = episodes.plants_of_cells(plants, num_envs)
+            lung = jnp.arange(num_envs) % episodes.lung_count(plants)
+            self._plants = jax.tree.map(lambda leaf: jnp.asarray(leaf)[lung], plants)
         self._loop: env.LoopState | None = None
 
     def reset(

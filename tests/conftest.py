@@ -30,6 +30,20 @@ description = "A test."
 
 Make = Callable[..., Path]
 
+#: Compiler options of the fast tests. They run most functions once, so that optimising costs four
+#: times what it saves. The slow tests compile as users do; `XLA_FLAGS` of one's own come first.
+QUICK_COMPILER = (
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
+    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+)
+
+#: Objects that are made before Python looks for garbage, and how seldom it looks at older ones.
+#: Tracing makes many, and what collection has imported need not be gone through each time.
+GARBAGE_THRESHOLDS = (50_000, 20, 50)
+
+#: Slow tests that come last, the longest at the end: should time run out, the others have run.
+LAST = ("tests/training/", "tests/training/test_simulator.py::test_leads_to_the_frozen_simulators")
+
 #: Seconds of compiling from which the result is kept for other workers and later runs.
 KEPT_FROM_S = 0.1
 
@@ -42,14 +56,29 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--cost", metavar="FILE", help="append processor seconds of each test to FILE")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile quickly where slow tests are left out; before JAX reads its options."""
+    if config.option.markexpr == "not slow":
+        os.environ.setdefault("XLA_FLAGS", QUICK_COMPILER)
+
+
+def pytest_collection_finish() -> None:
+    """Leave what is imported out of the search for garbage."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(*GARBAGE_THRESHOLDS)
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark what ``slow.txt`` lists: whole tests, or one case of many."""
+    """Mark what ``slow.txt`` lists, whole tests or one case of many; order the slow ones."""
     text = (config.rootpath / "tests" / "slow.txt").read_text("utf-8")
     slow = {line.strip() for line in text.splitlines() if line.strip() and line[0] != "#"}
     for item in items:
         if item.nodeid in slow or item.nodeid.partition("[")[0] in slow:
             item.add_marker(pytest.mark.slow)
+    if "not slow" not in config.option.markexpr:
+        items.sort(key=lambda item: sum(item.nodeid.startswith(start) for start in LAST))
 
 
 @pytest.hookimpl(wrapper=True)

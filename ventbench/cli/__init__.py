@@ -23,6 +23,7 @@ from ventbench.cli import (
     options,
     proof,
     real_pairs,
+    reproduce,
     score,
     simulators,
     stress,
@@ -78,6 +79,7 @@ mechanics.register(app)
 doctor.register(app)
 proof.register(app)
 real_pairs.register(app)
+reproduce.register(app)
 app.add_typer(data.app)
 
 

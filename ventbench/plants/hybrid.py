@@ -9,11 +9,12 @@ switches between an opening and a closing table), and what differs from rig to r
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
+
 import flax.struct
 import jax.numpy as jnp
 from jax import Array
-
-from ventbench.physics.dead_time import window_weights
 
 #: Knots of the valve's piecewise linear curve, %; the last segment ends at infinity.
 VALVE_KNOTS = (0.0, 1.0, 2.0, 3.5, 5.0, 7.0, 10.0, 14.0, 19.0, 26.0, 36.0, 50.0, 70.0)
@@ -46,9 +47,9 @@ class HybridState:
         drop: airway pressure minus elastic recoil, cmH2O.
         sensor: pressure that the sensor shows, cmH2O.
         flow: flow out of the inspiratory valve, L/s.
-        commanded: flows that the last commands ask for, the latest first, L/s, ``(..., 7)``.
-        opened: expiratory valve during the last samples, the latest first, 0/1, ``(..., 7)``.
-        past: durations of the last samples, the latest first, s, ``(..., 6)``.
+        commanded: flows that the last 7 commands ask for, the latest first, L/s, one array each.
+        opened: expiratory valve during the last 7 samples, the latest first, 0/1, one array each.
+        past: durations of the last 6 samples, the latest first, s, one array each.
         plays: position of each play, %, one array a play.
         u_in: last command, %.
         peep: end-expiratory pressure, cmH2O.
@@ -59,9 +60,9 @@ class HybridState:
     drop: Array
     sensor: Array
     flow: Array
-    commanded: Array
-    opened: Array
-    past: Array
+    commanded: tuple[Array, ...]
+    opened: tuple[Array, ...]
+    past: tuple[Array, ...]
     plays: tuple[Array, ...]
     u_in: Array
     peep: Array
@@ -117,10 +118,11 @@ class Hybrid:
 
     def valve(self, u_in: Array) -> Array:
         """Flow that a steady command gives, L/s: monotone in ``u_in``, %."""
-        knots = jnp.asarray(VALVE_KNOTS, u_in.dtype)
-        widths = jnp.append(jnp.diff(knots), jnp.inf)
-        covered = jnp.clip(u_in[..., None] - knots, 0.0, widths)
-        return jnp.sum(self.slopes * covered, axis=-1)
+        flow = jnp.zeros_like(u_in)
+        for index, (knot, after) in enumerate(pairwise((*VALVE_KNOTS, math.inf))):
+            covered = jnp.clip(u_in - knot, 0.0, after - knot)
+            flow = flow + self.slopes[..., index] * covered
+        return flow
 
     def recoil(self, elastic: Array) -> tuple[Array, Array]:
         """Elastic recoil, cmH2O, and its relative slope, of ``V / C``, cmH2O."""
@@ -146,9 +148,9 @@ class Hybrid:
             drop=zero - self.offset,
             sensor=pressure,
             flow=flow,
-            commanded=_repeat(flow, MEMORY + 1),
-            opened=_repeat(zero + 1.0, MEMORY + 1),
-            past=_repeat(zero + 0.03, MEMORY),
+            commanded=(flow,) * (MEMORY + 1),
+            opened=(zero + 1.0,) * (MEMORY + 1),
+            past=(zero + 0.03,) * MEMORY,
             plays=tuple(rest for _ in PLAYS),
             u_in=rest,
             peep=pressure if peep is None else peep + zero,
@@ -162,6 +164,9 @@ class Hybrid:
 
         Each substep is an exponential step of the drop over the airway, with the airway's
         resistance and the elastic slope of its start.
+
+        What happened before lies in one array a sample, not along an axis of one array: then every
+        operation runs over the batch alone, and the compiler makes vector code of it.
         """
         plays = tuple(
             jnp.clip(play, u_in - half, u_in + half)
@@ -170,23 +175,21 @@ class Hybrid:
         effective = u_in + sum(
             self.direction[..., i] * (play - u_in) for i, play in enumerate(plays)
         )
-        commanded = _push(self.valve(jnp.maximum(effective, 0.0)), state.commanded)
-        opened = _push(u_out + jnp.zeros_like(state.u_in), state.opened)
+        commanded = (self.valve(jnp.maximum(effective, 0.0)), *state.commanded)
+        opened = (u_out + jnp.zeros_like(state.u_in), *state.opened)
         # Behind the expiratory valve stands what makes the resting flow hold PEEP.
         conductance = u_out * self.conductance + (1.0 - u_out) * self.closing_conductance
-        behind = state.peep - self.valve(self.rest + jnp.zeros_like(u_in)) / conductance
+        behind = state.peep - self.valve(self.rest) / conductance
         elastic, drop, sensor, flow = state.elastic, state.drop, state.sensor, state.flow
         opening = state.outlet
         h = dt / SUBSTEPS
         lag, smooth = jnp.exp(-h / self.valve_lag), jnp.exp(-h / self.sensor_lag)
         open_or_close = u_out * self.opening_delay + (1.0 - u_out) * self.closing_delay
-        for k in range(SUBSTEPS):
-            held = window_weights(k * h - self.valve_delay, h, state.past)
-            wanted = jnp.sum(held * commanded, axis=-1)
+        wanteds = _delayed(commanded, state.past, self.valve_delay, h)
+        wides = _delayed(opened, state.past, open_or_close, h)
+        for wanted, wide in zip(wanteds, wides, strict=True):
             inflow = wanted + (flow - wanted) * self.valve_lag / h * (1.0 - lag)  # mean over h
             flow = wanted + (flow - wanted) * lag
-            held = window_weights(k * h - open_or_close, h, state.past)
-            wide = jnp.sum(held * opened, axis=-1)
             if self.closing_lag is not None:
                 # It opens with a spring and closes against the pressure.
                 wide = jnp.maximum(wide, jnp.asarray(opening) * jnp.exp(-h / self.closing_lag))
@@ -200,8 +203,8 @@ class Hybrid:
             + self.falling * jnp.tanh(jnp.minimum(change, 0.0))
         )
         after = HybridState(
-            elastic, drop, sensor, flow, commanded[..., :-1], opened[..., :-1],
-            _push(dt + 0.0 * drop, state.past)[..., :-1], plays, u_in, state.peep, opening,
+            elastic, drop, sensor, flow, commanded[:-1], opened[:-1],
+            (dt + 0.0 * drop, *state.past[:-1]), plays, u_in, state.peep, opening,
         )  # fmt: skip
         return after, reading
 
@@ -239,9 +242,28 @@ class Hybrid:
         )
 
 
-def _repeat(value: Array, count: int) -> Array:
-    return jnp.repeat(value[..., None], count, axis=-1)
+def _delayed(
+    held: tuple[Array, ...], past: tuple[Array, ...], delay: Array, h: Array
+) -> list[Array]:
+    """Means of a delayed command over each of the substeps of a sample.
 
-
-def _push(value: Array, before: Array) -> Array:
-    return jnp.concatenate([value[..., None], before], axis=-1)
+    Args:
+        held: commands of this sample and of those before, the latest first, ``P + 2`` arrays; the
+            last holds for all earlier time.
+        past: durations of the P samples before, the latest first, s.
+        delay: dead time, s.
+        h: length of a substep, s.
+    """
+    # From each change of the command to the start of the sample, delayed, in substeps.
+    changes, before = [later - sooner for sooner, later in pairwise(held)], delay
+    ends = [before / h]
+    for duration in past:
+        before = before - duration
+        ends.append(before / h)
+    means = []
+    for k in range(SUBSTEPS):
+        mean = held[0]
+        for change, end in zip(changes, ends, strict=True):
+            mean = mean + change * jnp.clip(end - k, 0.0, 1.0)
+        means.append(mean)
+    return means

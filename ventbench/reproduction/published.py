@@ -1,0 +1,61 @@
+"""Figures that the paper prints: Suo et al., arXiv:2102.06779.
+
+The paper's pictures carry no numbers in the text. Of those only the claim can be compared, which
+stands with each section in :mod:`ventbench.reproduction.paper`.
+"""
+
+from __future__ import annotations
+
+#: Open-loop mean absolute error on held-out recordings of the real lung, cmH2O (appendix B.1).
+OPEN_LOOP = {
+    "R5C10": 0.64, "R5C20": 0.72, "R5C50": 0.39, "R20C10": 0.72, "R20C20": 0.60, "R20C50": 0.85,
+}  # fmt: skip
+
+#: Best P, I, D of the grid on the physical lung, %/cmH2O (appendix A.2).
+BEST_PID = {
+    "R5C10": (10.0, 0.2, 0.0), "R5C20": (10.0, 10.0, 0.0), "R5C50": (10.0, 10.0, 0.0),
+    "R20C10": (8.0, 1.0, 0.0), "R20C20": (5.0, 10.0, 0.0), "R20C50": (5.0, 10.0, 0.0),
+}  # fmt: skip
+
+#: Architecture search on R5C10: open-loop error, cmH2O, by setting and value (appendix B.1).
+ARCHITECTURES = {
+    "depth": {3: 0.696, 6: 0.649, 9: 0.643},
+    "N_B": {1: 0.643, 3: 0.677, 5: 0.718},
+    "H_p": {3: 0.649, 5: 0.643, 10: 0.648},
+    "width": {50: 0.679, 100: 0.651, 150: 0.643},
+    "H_c": {3: 0.676, 5: 0.648, 10: 0.643},
+}
+
+#: Trajectories of one lung in the grid: 20 values of P, 20 of I, six waveforms.
+TRAJECTORIES = 2400
+
+#: Trials with other hyper-parameters (section 6).
+TRIALS = {"PPO": 720, "DQN": 180}
+
+#: What needs the authors' hardware or gives no numbers, and why it is not reproduced here.
+NOT_REPRODUCED = (
+    ("figure 1", "drawing of the respiratory circuit", "a drawing, nothing to measure"),
+    ("figure 3", "the cluster of ten ventilators", "a photograph of hardware"),
+    (
+        "figures 7 and 8, on the lung",
+        "trained controller and best PID on the physical test lung",
+        "needs the ventilator and the QuickLung; here both run on simulators that were learned "
+        "from recordings of them. `ventbench-hardware run` does it where there is a rig",
+    ),
+    (
+        "table 2, on the lung",
+        "grid search over PIDs on the physical test lung",
+        "needs 14,400 runs of the rig; here the same grid runs on the simulators",
+    ),
+    (
+        "table 1, on the lung",
+        "exploratory breaths recorded on the physical test lung",
+        "the authors' training recordings are not public; the public ones are fewer and from many "
+        "rigs",
+    ),
+    (
+        "section 6",
+        "720 trials of hyper-parameters for PPO and 180 for DQN",
+        "their settings and results are not published; docs/reinforcement.md lists the trials here",
+    ),
+)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import ventbench
-from ventbench import files
+from ventbench import files, palette
 from ventbench.extras import require
 from ventbench.reproduction.report import Chart, HeatMap, Reproduction
 from ventbench.views import graphics
@@ -71,9 +71,10 @@ def html(reproduction: Reproduction) -> str:
             for section in reproduction.sections
         ],
         not_reproduced=reproduction.not_reproduced,
-        light=graphics.RUN_COLORS,
-        dark=graphics.RUN_COLORS_DARK,
+        colors=palette.css(),
+        run_colors=palette.RUNS,
         # What the style sheet of reports asks for besides.
+        shades=(),
         pips=range(3),
         names=(),
         version=ventbench.__version__,
@@ -135,7 +136,7 @@ def _map(chart: HeatMap) -> dict[str, Any]:
     values = np.asarray(chart.values, float)
     least = float(np.nanmin(values))
     row, column = np.unravel_index(int(np.nanargmin(values)), values.shape)
-    start, end = graphics.rgb(LIGHT), graphics.rgb(DARK)
+    start, end = palette.rgb(LIGHT), palette.rgb(DARK)
     fields = []
     for (i, j), value in np.ndenumerate(values):
         if not math.isfinite(value):

@@ -195,14 +195,8 @@ def run(
         if simulator is None:
             continue
         rows[label] = trained_on(simulator, plant, out / f"trained-{number}", seeds, updates)
-        networks = rows[label]["residual"]
-        print(
-            f"{label:24} PID {rows[label]['pid']['promised']:6.3f} -> "
-            f"{rows[label]['pid']['rig']:6.3f}   network "
-            f"{np.mean([x['promised'] for x in networks]):6.3f} -> "
-            f"{np.mean([x['rig'] for x in networks]):6.3f} cmH2O",
-            flush=True,
-        )
+        for part in (rows[label]["pid"], *rows[label]["residual"]):
+            print(f"{label:24} {part['promised']:6.3f} -> {part['rig']:6.3f} cmH2O", flush=True)
     result = {"settings": settings, "missing": list(diagnosis.mechanisms), "trained_on": rows}
     files.write_json(done, result)
     return result
@@ -210,31 +204,41 @@ def run(
 
 def table(name: str, result: Mapping[str, Any]) -> str:
     """Figures of one rig as Markdown."""
-    rows = result["trained_on"]
+    rows, words = result["trained_on"], RIGS[name].words
+    missing = ", ".join(f"`{mechanism}`" for mechanism in result["missing"]) or "nothing"
+    kinds = [("pid", "PID")]
+    if all(row["residual"] for row in rows.values()):
+        kinds.append(("residual", "network"))
+
+    def parts(label: str, kind: str) -> list[dict[str, Any]]:
+        return rows[label][kind] if kind == "residual" else [rows[label][kind]]
 
     def drawn(label: str, kind: str) -> Floats:
-        parts = rows[label][kind]
-        return np.array([part["draws"] for part in (parts if kind == "residual" else [parts])])
+        return np.array([part["draws"] for part in parts(label, kind)])
 
+    head = ["trained on"]
+    for _, title in kinds:
+        head += [f"{title}: promised", "on the rig", "20 draws", "difference to the R-C lung"]
     lines = [
-        f"**{RIGS[name].words[0].upper()}{RIGS[name].words[1:]}.** The diagnosis names "
-        f"{', '.join(f'`{m}`' for m in result['missing']) or 'nothing'}.",
+        f"**{words[0].upper()}{words[1:]}.** The diagnosis names {missing}.",
         "",
-        "| trained on | PID: promised | on the rig | network: promised | on the rig | "
-        "network on the rig, 20 draws | difference to the R-C lung |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
+        f"| {' | '.join(head)} |",
+        f"|{' --- |' * len(head)}",
     ]
-    for label, row in rows.items():
-        networks, pid = row["residual"], row["pid"]
-        own = drawn(label, "residual")
-        apart = "" if label == SIMULATORS[0] else "{:+.3f} [{:+.3f}, {:+.3f}]".format(
-            *difference(own, drawn(SIMULATORS[0], "residual"))
-        )  # fmt: skip
-        lines.append(
-            f"| {label} | {pid['promised']:.3f} | {pid['rig']:.3f} "
-            f"| {np.mean([x['promised'] for x in networks]):.3f} "
-            f"| {np.mean([x['rig'] for x in networks]):.3f} | {own.mean():.3f} | {apart} |"
-        )
+    for label in rows:
+        cells = [label]
+        for kind, _ in kinds:
+            own = drawn(label, kind)
+            cells += [
+                f"{np.mean([part['promised'] for part in parts(label, kind)]):.3f}",
+                f"{np.mean([part['rig'] for part in parts(label, kind)]):.3f}",
+                f"{own.mean():.3f}",
+            ]
+            apart = difference(own, drawn(SIMULATORS[0], kind))
+            cells.append(
+                "" if label == SIMULATORS[0] else "{:+.3f} [{:+.3f}, {:+.3f}]".format(*apart)
+            )
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -256,7 +260,7 @@ def main() -> None:
     parser.add_argument("--rig", choices=[*RIGS, "all"], default="all")
     parser.add_argument("--breaths", type=int, default=36)
     parser.add_argument("--iterations", type=int, default=240, help="of learning; 0 leaves it out")
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=3, help="of networks; 0: only a PID")
     parser.add_argument("--updates", type=int, default=600)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--page", type=Path, help="page to write the tables into")

@@ -130,8 +130,9 @@ def _best_gains(
         grid = search(lungs, settings=trained_on.about, gains=gains)
         return {name: grid.best(None if name == ALL else name)[0] for name in names}
     tuned = tune_on_rigs(simulator, gains=gains)
-    each = dict(zip(tuned.lungs, tuned.gains, strict=True)) | {ALL: tuned.single}
-    return {name: tuple(each[name].tolist()) for name in names}
+    each = dict(zip(tuned.lungs, tuned.gains.tolist(), strict=True))
+    each[ALL] = tuned.single.tolist()
+    return {name: (each[name][0], each[name][1], each[name][2]) for name in names}
 
 
 def _checkpoint(out: Path, name: str) -> Path:

@@ -124,7 +124,6 @@ def run(
 
     Example: `ventbench-hardware run submissions/pid_best --port /dev/ttyACM0 --lung R20C50`
     """
-    from hardware_eval import realtime
     from hardware_eval.bench.console import ConsoleOperator, RerunView, TerminalView, Views
     from hardware_eval.bench.loop import Bench
     from hardware_eval.bench.plan import make_plan
@@ -153,7 +152,7 @@ def run(
     line = ev.connect(port)
     person = ConsoleOperator(yes=yes, control=control, device=line.device)
     try:
-        with person.keys(), realtime.priority():
+        with person.keys():
             done = ev.evaluate(
                 entries, line, out, person, plan=plan, view=views, sandbox=sandbox, dry=dry_run,
                 before_lung=before_lung, settings=settings, operator_name=operator, notes=notes,
@@ -221,7 +220,6 @@ def selftest(
 
     Example: `ventbench-hardware selftest --port /dev/ttyACM0 --lung R20C50`
     """
-    from hardware_eval import realtime
     from hardware_eval.bench.console import ConsoleOperator
     from hardware_eval.bench.loop import Bench
     from hardware_eval.bench.safety import DEFAULT
@@ -233,7 +231,7 @@ def selftest(
     person = ConsoleOperator(yes=True)
     line = ev.connect(port)
     try:
-        with person.keys(), realtime.priority():
+        with person.keys():
             sheet = run_selftest(
                 Bench(line.client, line.clock, DEFAULT, person), label, simulator=plant
             )
@@ -307,7 +305,6 @@ def collect(
 
     Example: `ventbench-hardware collect --port /dev/ttyACM0 --lung R20C50 --breaths 600`
     """
-    from hardware_eval import realtime
     from hardware_eval.bench import collect as collection
     from hardware_eval.bench.console import ConsoleOperator
     from hardware_eval.bench.loop import Bench
@@ -324,7 +321,7 @@ def collect(
         if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
             raise typer.Exit(1)
         about = {"device": ev.device_about(line.client.welcome or line.client.hello())}
-        with person.keys(), realtime.priority(), bars() as shown:
+        with person.keys(), bars() as shown:
             bar = shown.add_task("exploring", total=breaths)
             done = collection.collect(
                 Bench(line.client, line.clock, DEFAULT, person), label, breaths, out, seed=seed,
@@ -355,6 +352,9 @@ def demo(
         typer.Option("--fast", help="On a virtual clock in this process, not on a terminal."),
     ] = False,
     breaths: Annotated[int, typer.Option(min=12, help="Breaths to explore.")] = 36,
+    plant: Annotated[
+        str, typer.Option(help="Simulators that lack the concealed physics: physics or frozen.")
+    ] = "physics",
     sandbox: Annotated[bool, typer.Option(help="Run entries as in scoring.")] = True,
     json: JsonFile = None,
 ) -> None:
@@ -366,7 +366,7 @@ def demo(
 
     to = sys.stderr if str(json) == "-" else sys.stdout
     done = run_demo(
-        conceal, out, breaths=breaths, real_time=not fast, sandbox=sandbox,
+        conceal, out, breaths=breaths, simulator=plant, real_time=not fast, sandbox=sandbox,
         tell=lambda text: print(text, file=to, flush=True),
     )  # fmt: skip
     emit(done.as_dict(), json)

@@ -48,6 +48,10 @@ PIPS = (10.0, 20.0, 30.0)
 #: Breaths that are collected for the comparison.
 BREATHS = 36
 
+#: Simulators of the demo. The concealed physics is all that the library's physics lacks; the
+#: frozen simulators differ from that physics by themselves, which hides what is concealed.
+SIMULATOR = "physics"
+
 #: Noise of the emulated sensor, cmH2O, and the step of its converter (PVP's).
 NOISE, QUANTUM = 0.1, 0.0703
 
@@ -195,6 +199,7 @@ def demo(
     *,
     pips: tuple[float, ...] = PIPS,
     breaths: int = BREATHS,
+    simulator: str = SIMULATOR,
     real_time: bool = True,
     sandbox: bool = True,
     tell: Callable[[str], None] = lambda text: None,
@@ -206,6 +211,7 @@ def demo(
         out: an empty folder for everything.
         pips: cmH2O.
         breaths: breaths to collect for the diagnosis.
+        simulator: name of the simulators, which the concealed physics is added to.
         real_time: over a pseudo-terminal in real time; else in this process on a virtual clock.
         sandbox: run entries as in scoring.
         tell: told every step as it begins.
@@ -219,18 +225,18 @@ def demo(
         raise InputError(f"{out} is not empty; choose another --out")
     out.mkdir(parents=True, exist_ok=True)
     # The public half of the concealed lung: its label and the seal. The plant stays in there.
-    hidden = conceal(words)
+    hidden = conceal(words, simulator)
     lung, seal = hidden.lung.id, out / "seal.json"
     hidden.write(seal)
     commitment = str(hidden.seal["commitment"])
     tell(f"1. a lung {lung} is sealed: {commitment[:16]}...")
-    plain = scored_plants("frozen", [lung]).plant(lung)
+    plain = scored_plants(simulator, [lung]).plant(lung)
     gains, _ = best_pid(plain, pips)
     entry = write_entry(out / "entries", "first_pid", gains)
     plan = _plan("first_pid", lung, pips)
     tell(f"2. the best PID in simulation: P I D = {_shown(gains)}")
     simulated = _on_simulator(plan, entry, SimulatedHal(plain, noise=NOISE, quantum=QUANTUM))
-    with _line(hidden.plant, words, lung, out, real_time) as line:
+    with _line(hidden.plant, words, simulator, lung, out, real_time) as line:
         tell("3. it runs on the lung")
         measured = _errors(_evaluate(plan, entry, line, out / "first", sandbox))
         tell(f"   {_said(measured)}; {_mean(simulated):.2f} cmH2O in simulation")
@@ -238,7 +244,7 @@ def demo(
         bench = Bench(line.client, line.clock, DEFAULT, SilentOperator(), rest=_REST)
         explored = collect(bench, lung, breaths, out / "explored")
     tell("5. simulator and lung are compared")
-    compared = compare(explored.breaths)
+    compared = compare(explored.breaths, simulator=simulator)
     diagnosis = compared.diagnoses[lung]
     diagnosis.save(out / "diagnosis")
     corrected: Plant = diagnosis.plants.get(lung, plain)
@@ -246,7 +252,7 @@ def demo(
     retuned_gains, predicted = best_pid(corrected, pips)
     second = write_entry(out / "entries", "retuned_pid", retuned_gains)
     tell(f"7. the best PID on the corrected simulator: P I D = {_shown(retuned_gains)}")
-    with _line(hidden.plant, words, lung, out, real_time) as line:
+    with _line(hidden.plant, words, simulator, lung, out, real_time) as line:
         again = _plan("retuned_pid", lung, pips)
         tell("8. it runs on the lung")
         retuned = _errors(_evaluate(again, second, line, out / "second", sandbox))
@@ -344,7 +350,9 @@ def _errors(done: Evaluation) -> dict[float, float]:
 
 
 @contextmanager
-def _line(plant: Plant, words: str, lung: str, out: Path, real_time: bool) -> Iterator[Line]:
+def _line(
+    plant: Plant, words: str, simulator: str, lung: str, out: Path, real_time: bool
+) -> Iterator[Line]:
     """A line to the emulated lung: in its own process, or in this one on a virtual clock."""
     if not real_time:
         hal = SimulatedHal(plant, name=f"emulated {lung}", noise=NOISE, quantum=QUANTUM)
@@ -353,12 +361,8 @@ def _line(plant: Plant, words: str, lung: str, out: Path, real_time: bool) -> It
         client.hello()
         yield Line(client, device.clock)
         return
-    from hardware_eval import realtime
-
     command = [sys.executable, "-m", "hardware_eval", "emulate", "--conceal", words]
-    command += ["--noise", str(NOISE), "--quantum", str(QUANTUM)]
-    with realtime.priority() as granted:
-        command += ["--realtime"] if granted else []
+    command += ["--plant", simulator, "--noise", str(NOISE), "--quantum", str(QUANTUM)]
     with open(out / "emulator.log", "a") as log:
         emulator = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
     try:
@@ -368,8 +372,7 @@ def _line(plant: Plant, words: str, lung: str, out: Path, real_time: bool) -> It
             raise InputError(f"the emulator did not start; see {out / 'emulator.log'}")
         line = ev.connect(port)
         try:
-            with realtime.priority():
-                yield line
+            yield line
         finally:
             line.client.close()
     finally:

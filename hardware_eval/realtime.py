@@ -10,9 +10,12 @@ from pathlib import Path
 #: Priority among real-time processes: below the kernel's own threads.
 PRIORITY = 40
 
+#: Priority of a device: its guard comes before a host on the same machine.
+DEVICE_PRIORITY = PRIORITY + 1
+
 
 def prefer() -> str | None:
-    """Ask for real-time scheduling (``SCHED_FIFO``) of all threads of this process.
+    """Ask for real-time scheduling (``SCHED_FIFO``) of all threads of this process, a device.
 
     Root has the right to it, and users with ``rtprio`` in ``/etc/security/limits.conf``.
 
@@ -27,7 +30,7 @@ def prefer() -> str | None:
         threads = [0]
     try:
         for thread in threads:
-            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(PRIORITY))
+            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(DEVICE_PRIORITY))
     except ProcessLookupError:  # a thread that has ended since
         return None
     except OSError as error:

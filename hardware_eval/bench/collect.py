@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hardware_eval import realtime
 from hardware_eval.bench import safety
-from hardware_eval.bench.loop import Bench, BreathLog, EmergencyStop
+from hardware_eval.bench.loop import Bench, BreathLog, EmergencyStop, answer_by
 from hardware_eval.bench.raw_log import RawLog, lines, recording
 from hardware_eval.bench.safety import SafetySample
 from hardware_eval.wire.errors import LinkError, NoAnswerError, RefusedError
@@ -106,7 +107,9 @@ class BenchVentilator:
         log.busy.append(0.0)
         if not self.stopped:
             try:
-                self._bench.client.command(*command)
+                self._bench.client.command(
+                    *command, answer_by(self._deadline, self._bench.clock.now())
+                )
                 self._last = command
             except RefusedError as error:
                 self.stopped = str(error)
@@ -125,16 +128,18 @@ class BenchVentilator:
             return np.full(1, np.nan)
         began = bench.clock.now()
         pressure = flow = applied = float("nan")
+        answered = False
         with contextlib.suppress(NoAnswerError):
             reading = bench.client.heartbeat()
             pressure, flow, applied = reading.pressure, reading.flow, reading.u_in
+            answered = True
         late = max(began - self._deadline, 0.0)
         log.time.append(began - self._start)
         log.pressure.append(pressure)
         log.flow.append(flow)
         log.target.append(self.pip)
         log.late.append(late)
-        sample = SafetySample(began, pressure, flow, *self._last, self.pip, late, applied)
+        sample = SafetySample(began, pressure, flow, *self._last, self.pip, late, applied, answered)
         self._safety = safety.step(bench.settings, self._safety, sample)
         if self._safety.trips:
             bench.client.vent()
@@ -196,7 +201,10 @@ def collect(
                 ventilator.pip = pip
                 # A breath at a time, each with a seed of its own: a restart repeats none.
                 own = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
-                explore(ventilator, lung, 1, seed=own, ranges=ranges, limits=limits, pips=(pip,))
+                with realtime.priority():
+                    explore(
+                        ventilator, lung, 1, seed=own, ranges=ranges, limits=limits, pips=(pip,)
+                    )
                 log.append(_line(ventilator.log, lung, pip, number, not ventilator.stopped))
                 spoilt = spoilt + 1 if ventilator.stopped else 0
                 progress(number)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
-from hardware_eval.realtime import has_priority, take_priority
+from hardware_eval.realtime import take_priority
 from ventbench.interfaces import Task
 
 Floats = NDArray[np.float64]
@@ -63,7 +63,8 @@ class SubmissionController:
         self._session = runner.start(submission, [task])
         self._real_time = real_time
         self._label = submission.manifest.name
-        begin = take_priority if has_priority() else None  # a thread that waits for a pipe
+        # A thread that waits for a pipe.
+        begin = take_priority if real_time else None
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="controller", initializer=begin)
         self._pending: Future[Floats] | None = None
         self._check()

@@ -20,6 +20,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hardware_eval import realtime
 from hardware_eval.bench import safety
 from hardware_eval.bench.controllers import ControllerFailedError, LiveController
 from hardware_eval.bench.plan import PERTURBED_BREATH, PERTURBED_STEP, PlannedRun
@@ -36,6 +37,10 @@ Floats = NDArray[np.float64]
 #: When a controller must have answered, s after the step's deadline: what is left of 30 ms is for
 #: the command's way to the device, and for this loop.
 ANSWER_BY = 0.022
+
+#: What is left of a step when the wait for the command's answer ends, s: the next step must not be
+#: late. An answer that comes later is missed, and the next reading tells what the device does.
+RESERVE = 0.002
 
 #: Rest at PEEP before a run, s: several time constants of the slowest lung (1.25 s).
 REST_S = 4.0
@@ -143,6 +148,7 @@ class RunResult:
         limited: commands that a limit of the bench cut.
         vented_after: time from the sample that tripped until the device had vented, s; NaN if
             nothing tripped.
+        held_up: whether host or line, too slow for the loop, ended it.
     """
 
     status: str
@@ -152,6 +158,7 @@ class RunResult:
     late_answers: int
     limited: int
     vented_after: float = math.nan
+    held_up: bool = False
 
     @property
     def error(self) -> float:
@@ -237,7 +244,7 @@ class _Loop:
         self._on_breath = on_breath
         self._safety = safety.init(parse_lung(run.lung))
         self._breaths: list[BreathLog] = []
-        self._late_answers = self._limited = 0
+        self._late_answers = self._limited = self._unanswered = 0
         self._command = (0.0, 1)
         self._disturbed = False
 
@@ -247,7 +254,7 @@ class _Loop:
         bench.client.vent()
         bench.clock.sleep_until(bench.clock.now() + bench.rest)
         # Collected before the device waits for commands: that takes longer than the watchdog does.
-        with no_collection():
+        with no_collection(), realtime.priority():
             start = bench.clock.now() + protocol.DT
             try:
                 bench.client.arm()
@@ -265,7 +272,22 @@ class _Loop:
                     return ended
                 if step == protocol.BREATH_STEPS - 1:
                     self._on_breath(breath, self._breaths[-1])
-        return self._ended("complete", "")
+        return self._measured()
+
+    def _measured(self) -> RunResult:
+        """The end of a run that went through; a score needs every pressure of its inspirations."""
+        if self._run.kind not in ("scored", "control"):
+            return self._ended("complete", "")
+        pressures = [
+            pressure
+            for k in protocol.SCORED_BREATHS
+            for pressure in self._breaths[k].pressure[: protocol.INSPIRATION_STEPS]
+        ]
+        missing = sum(math.isnan(pressure) for pressure in pressures)
+        if not missing:
+            return self._ended("complete", "")
+        reason = f"{missing} of {len(pressures)} scored steps have no pressure"
+        return self._ended("aborted", reason, held_up=missing <= self._unanswered)
 
     def _step(self, start: float, deadline: float, breath: int, step: int) -> RunResult | None:
         """One control step; a result ends the run."""
@@ -279,6 +301,7 @@ class _Loop:
             reading: Reading | None = bench.client.heartbeat()
         except NoAnswerError:
             reading = None
+            self._unanswered += 1
         except RefusedError as error:
             return self._ended("aborted", str(error))
         target = float(waveform.target(step, run.pip))
@@ -311,6 +334,7 @@ class _Loop:
             run.pip,
             late,
             math.nan if reading is None else reading.u_in,
+            reading is not None,
         )
         self._safety = safety.step(bench.settings, self._safety, sample)
         if not self._safety.trips:
@@ -318,12 +342,15 @@ class _Loop:
         bench.client.vent()
         first = self._safety.trips[0]
         status = "aborted" if all(trip.bench for trip in self._safety.trips) else "failed"
-        return self._ended(status, first.message, bench.clock.now() - began)
+        held_up = all(trip.check in safety.TIMING_CHECKS for trip in self._safety.trips)
+        return self._ended(status, first.message, bench.clock.now() - began, held_up)
 
     def _vented_by_device(self, flags: Flag) -> RunResult:
         # The device's pressure limit is the controller's to respect; all else is the bench's.
         status = "failed" if flags & Flag.OVERPRESSURE else "aborted"
-        return self._ended(status, f"the device vented: {(flags & _CAUSES).name}", 0.0)
+        return self._ended(
+            status, f"the device vented: {(flags & _CAUSES).name}", 0.0, is_held_up(flags)
+        )
 
     def _act(
         self, reading: Reading | None, deadline: float, step: int, target: float
@@ -353,7 +380,7 @@ class _Loop:
         else:
             command = (float(waveform.expiratory_command(step)), 1)
         try:
-            bench.client.command(*command)
+            bench.client.command(*command, answer_by(deadline, bench.clock.now()))
         except RefusedError as error:
             return self._refused(error)
         except NoAnswerError:
@@ -377,12 +404,14 @@ class _Loop:
             self._bench.operator.disturb(tube, True)
             self._disturbed = True
 
-    def _ended(self, status: str, reason: str, vented_after: float = math.nan) -> RunResult:
+    def _ended(
+        self, status: str, reason: str, vented_after: float = math.nan, held_up: bool = False
+    ) -> RunResult:
         if self._disturbed:
             self._bench.operator.disturb(self._run.perturbation, False)
         return RunResult(
             status, reason, self._safety.trips, tuple(self._breaths), self._late_answers,
-            self._limited, vented_after,
+            self._limited, vented_after, held_up,
         )  # fmt: skip
 
 
@@ -390,6 +419,19 @@ _CAUSES = (
     Flag.COMMANDS_STOPPED | Flag.OUT_OF_RANGE | Flag.OVERPRESSURE | Flag.SENSOR_LOST
     | Flag.DEVICE_LATE
 )  # fmt: skip
+
+
+_HELD_UP = Flag.COMMANDS_STOPPED | Flag.DEVICE_LATE
+
+
+def is_held_up(flags: Flag) -> bool:
+    """Whether the device vented because commands did not come, and for no other reason."""
+    return bool(flags & _HELD_UP) and not flags & _CAUSES & ~_HELD_UP
+
+
+def answer_by(deadline: float, now: float) -> float:
+    """Time that the answer to a step's command may take, s."""
+    return max(deadline + protocol.DT - RESERVE - now, 0.0)
 
 
 def _row(step: int, pressure: float, target: float, pip: float, previous: float) -> Floats:

@@ -104,6 +104,11 @@ class SafetySettings:
         0.0, "readings", 0.06, True,
         "Two steps without a number, or one outside -20..110 cmH2O: nothing can be controlled.",
     )  # fmt: skip
+    no_answer: Check = Check(
+        0.0, "answers", 0.06, True,
+        "Two steps without an answer: the host is blind, and the device's watchdog is about to "
+        "vent.",
+    )  # fmt: skip
     low_pressure: Check = Check(
         1.0, "cmH2O", 0.5, True,
         "Airway near ambient or below for half a second: PEEP is lost, or the sensor's tube is "
@@ -162,6 +167,7 @@ class SafetySample(NamedTuple):
         pip: target of this breath, cmH2O.
         late: how late this step began, s.
         applied: position of the inspiratory valve as the device reports it, %; NaN if unknown.
+        answered: whether the device answered; else there is no pressure, whatever the sensor does.
     """
 
     time: float
@@ -172,6 +178,11 @@ class SafetySample(NamedTuple):
     pip: float
     late: float
     applied: float = math.nan
+    answered: bool = True
+
+
+#: Checks that blame the host or the line, not the lung, its tubes or its sensor.
+TIMING_CHECKS = frozenset({"no_answer", "software_delay", "missed_deadlines"})
 
 
 @dataclass(frozen=True)
@@ -371,7 +382,8 @@ def _values(
             and (state.expected > settings.stuck_sensor.threshold or still > _STUCK_AT_REST_S),
         ),
         "implausible_slope": (jump, jump > settings.implausible_slope.threshold),
-        "no_reading": (0.0 if number else 1.0, not number),
+        "no_reading": (0.0 if number else 1.0, not number and sample.answered),
+        "no_answer": (0.0 if sample.answered else 1.0, not sample.answered),
         "low_pressure": (pressure, number and pressure < settings.low_pressure.threshold),
         "expiratory_valve": (
             left,

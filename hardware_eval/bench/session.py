@@ -6,6 +6,7 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,11 +22,15 @@ from hardware_eval.bench.loop import (
 from hardware_eval.bench.plan import CONTROL, Plan, PlannedRun, progress
 from hardware_eval.bench.raw_log import RawLog, lines
 from hardware_eval.bench.safety import SafetySettings
+from hardware_eval.realtime import take_priority
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.errors import LinkError
 
 #: Runs that the bench spoils in a row before the session gives up.
 MAX_ATTEMPTS = 3
+
+#: Runs that a busy host or a slow line ends in a row before the session gives up.
+MAX_HELD_UP = 10
 
 
 @dataclass(frozen=True)
@@ -105,7 +110,7 @@ def _runs(
     before_lung: Callable[[str], str],
     prepare_run: Callable[[PlannedRun], None],
 ) -> SessionEnd:
-    mounted, spoilt, made = "", 0, 0
+    mounted, spoilt, held_up, made = "", 0, 0, 0
     queue = list(remaining)
     while queue:
         run = queue[0]
@@ -140,6 +145,10 @@ def _runs(
             log.append({"type": "event", "what": "reconnected"})
             continue
         made += 1
+        if result.held_up and held_up + 1 < MAX_HELD_UP:
+            held_up += 1
+            bench.operator.tell(f"{result.reason}: host or line was held up; the run is repeated")
+            continue
         if result.status == "aborted":
             spoilt += 1
             if spoilt >= MAX_ATTEMPTS or not bench.operator.confirm(
@@ -147,7 +156,7 @@ def _runs(
             ):
                 return SessionEnd(False, result.reason, made)
             continue
-        spoilt = 0
+        spoilt = held_up = 0
         queue.pop(0)
         if result.status == "failed" and run.kind == "ramp":
             # What fails on the way up would fail at the top, with more pressure.
@@ -186,15 +195,24 @@ def _one(
         log.append(_run_line(run, attempt, "failed", str(error)))
         return RunResult("failed", str(error), (), (), 0, 0)
 
-    def on_breath(index: int, breath: BreathLog) -> None:
+    def write(index: int, breath: BreathLog) -> None:
         log.append(breath.line(run, attempt, index))
         if bench.view is not None:
             bench.view.breath(run, breath, done, total)
 
-    try:
-        result = run_once(bench, run, controller, on_breath=on_breath)
-    finally:
-        controller.close()
+    # A disk can take longer than a step; the thread has the loop's priority, or Python's lock would
+    # wait for it.
+    written: list[Future[None]] = []
+    with ThreadPoolExecutor(1, "log", initializer=take_priority) as writer:
+        try:
+            result = run_once(
+                bench, run, controller,
+                on_breath=lambda index, breath: written.append(writer.submit(write, index, breath)),
+            )  # fmt: skip
+        finally:
+            controller.close()
+    for each in written:
+        each.result()
     line = _run_line(run, attempt, result.status, result.reason)
     log.append(
         {

@@ -248,7 +248,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--realtime",
         action="store_true",
-        help="real-time scheduling, as on a device of its own; needs the right to it",
+        help="refuse to run without real-time scheduling, which is taken where it is granted",
     )
     parser.add_argument("--pressure-limit", type=float, help="device's own limit, cmH2O")
     given = parser.parse_args(arguments)
@@ -286,7 +286,8 @@ def _emulate(given: argparse.Namespace) -> int:
         hal, settings, link=given.link, control=given.control, line_faults=line_faults,
         log=given.log,
     )  # fmt: skip
-    if given.realtime and (reason := realtime.prefer()):
+    reason = realtime.prefer()
+    if given.realtime and reason:
         raise InputError(f"--realtime: {reason}; run as root, or without it")
     ended = False
 

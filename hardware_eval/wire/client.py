@@ -159,12 +159,13 @@ class Client:
         """
         return self._persist(Arm(), Reading)
 
-    def command(self, u_in: float, u_out: int) -> Reading:
+    def command(self, u_in: float, u_out: int, timeout: float | None = None) -> Reading:
         """Set the valves, and return what the device applied.
 
         Args:
             u_in: inspiratory valve, %.
             u_out: expiratory valve, 0 closed, 1 open.
+            timeout: time that the answer may take, s, if it is another than the client's.
 
         Returns:
             A reading that was taken when the command arrived.
@@ -176,7 +177,9 @@ class Client:
             DisconnectedError: if the port goes away.
         """
         seen = 0 if self.reading is None else milliseconds(self.reading.time)
-        return self._ask(Command(u_in, u_out, seen), Reading, self._timeout)
+        return self._ask(
+            Command(u_in, u_out, seen), Reading, self._timeout if timeout is None else timeout
+        )
 
     def heartbeat(self) -> Reading:
         """Take a fresh reading; moves no valve and does not feed the watchdog.

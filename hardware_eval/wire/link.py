@@ -1,14 +1,25 @@
-"""A serial line to a device: anything that pyserial opens, with errors that say what to do."""
+"""A serial line to a device: anything that pyserial opens, with errors that say what to do.
+
+Two threads read and write the port. Even where neither has to wait for the device, both can take
+long on a busy machine: the kernel moves the bytes of a terminal in threads of ordinary priority,
+and waits for them. The control loop puts bytes into a queue and takes them out of one, so that the
+port never holds it up.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
+from queue import Empty, SimpleQueue
 from typing import cast
 
 import serial
 
+from hardware_eval.realtime import take_priority
 from hardware_eval.wire.errors import (
     DisconnectedError,
     LinkError,
@@ -23,8 +34,8 @@ BAUD_RATE = 115_200
 #: Longest time in which the port does not take what is written, s.
 WRITE_TIMEOUT = 1.0
 
-#: A wait for bytes ends this late at most, s.
-READ_SLICE = 0.002
+#: The reading thread looks this often whether the port is to be closed, s.
+READ_SLICE = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +53,66 @@ class ReconnectPolicy:
     factor: float = 1.5
     longest: float = 2.0
     patience: float = 60.0
+
+
+class _Traffic:
+    """The threads of an open port.
+
+    Attributes:
+        outbox: what is to be sent; None ends the thread.
+        broken: what went wrong with the port; None if nothing did.
+    """
+
+    def __init__(self, port: serial.Serial) -> None:
+        self.outbox: SimpleQueue[bytes | None] = SimpleQueue()
+        self.broken: Exception | None = None
+        self._inbox: SimpleQueue[bytes] = SimpleQueue()
+        self._port, self._ended = port, False
+        self._threads = [
+            threading.Thread(target=work, name=f"port {work.__name__}", daemon=True)
+            for work in (self._receive, self._send)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def take(self, timeout: float) -> bytes:
+        """What arrived; waits ``timeout``, s, if nothing has."""
+        try:
+            data = self._inbox.get(timeout=max(timeout, 0.0))
+            while not self._inbox.empty():
+                data += self._inbox.get_nowait()
+        except Empty:
+            return b""
+        return data
+
+    def end(self) -> None:
+        """End both threads, once what is left has been sent."""
+        self._ended = True
+        self.outbox.put(None)
+        for thread in self._threads:
+            thread.join()
+
+    def _receive(self) -> None:
+        take_priority()
+        with self._breaks():
+            while not self._ended and self.broken is None:
+                if data := self._port.read(1):
+                    waiting = self._port.in_waiting
+                    self._inbox.put(data + self._port.read(waiting) if waiting else data)
+
+    def _send(self) -> None:
+        take_priority()
+        with self._breaks():
+            while (data := self.outbox.get()) is not None:
+                self._port.write(data)
+
+    @contextlib.contextmanager
+    def _breaks(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, TypeError, serial.SerialException) as error:
+            self.broken = self.broken or error
+            self._inbox.put(b"")  # wakes whoever waits
 
 
 class Link:
@@ -71,17 +142,17 @@ class Link:
         self._baud_rate = baud_rate
         self._policy = policy or ReconnectPolicy()
         self._port = self._open()
+        self._traffic = _Traffic(self._port)
 
     def write(self, data: bytes) -> None:
-        """Send bytes.
+        """Send bytes; returns before they are sent.
 
         Raises:
             DisconnectedError: if the port has gone.
         """
-        try:
-            self._port.write(data)
-        except (OSError, serial.SerialException) as error:
-            raise self._disconnected(error) from error
+        if self._traffic.broken is not None:
+            raise self._disconnected(self._traffic.broken)
+        self._traffic.outbox.put(data)
 
     def read(self, timeout: float) -> bytes:
         """Wait for bytes; empty if none come within ``timeout``, s.
@@ -89,19 +160,14 @@ class Link:
         Raises:
             DisconnectedError: if the port has gone.
         """
-        end = time.monotonic() + timeout
-        try:
-            while True:
-                if data := self._port.read(1):
-                    waiting = self._port.in_waiting
-                    return data + self._port.read(waiting) if waiting else data
-                if time.monotonic() >= end:
-                    return b""
-        except (OSError, TypeError, serial.SerialException) as error:
-            raise self._disconnected(error) from error
+        data = self._traffic.take(timeout)
+        if not data and self._traffic.broken is not None:
+            raise self._disconnected(self._traffic.broken)
+        return data
 
     def close(self) -> None:
-        """Release the port."""
+        """Send what is left, and release the port."""
+        self._traffic.end()
         self._port.close()
 
     def reopen(self) -> None:
@@ -115,6 +181,7 @@ class Link:
         while True:
             try:
                 self._port = self._open()
+                self._traffic = _Traffic(self._port)
                 return
             except LinkError as error:
                 if time.monotonic() + pause > end:

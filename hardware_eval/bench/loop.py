@@ -361,6 +361,10 @@ class _Loop:
         requested = math.nan
         if inspiring:
             previous = _BIAS if step == 0 else self._command[0]
+            if step == 0:
+                # A controller must see each breath begin; what the last command's answer told is
+                # at most a step old.
+                reading = reading or bench.client.reading
             if reading is not None:
                 row = _row(step, reading.pressure, target, run.pip, previous)
                 budget = deadline + ANSWER_BY - bench.clock.now()

@@ -26,7 +26,7 @@ def shared_device() -> LoopbackDevice:
 def device(shared_device: LoopbackDevice) -> Iterator[LoopbackDevice]:
     hal: Any = shared_device.service.hal
     yield shared_device
-    hal.faults = ()
+    hal.faults = shared_device.line.faults = ()
     shared_device.plug()
     shared_device.clock.advance(6.0)  # the watchdog vents, and the lung empties
 

@@ -63,6 +63,7 @@ FAULTS: dict[str, tuple[Callable[[int, SafetySample], SafetySample], float]] = {
     "missed_deadlines": (lambda i, s: s._replace(late=0.012), 0.12),
     "stuck_sensor": (lambda i, s: s._replace(pressure=12.0), 1.5),
     "no_reading": (lambda i, s: s._replace(pressure=math.nan), 0.06),
+    "no_answer": (lambda i, s: s._replace(pressure=math.nan, answered=False), 0.06),
     "low_pressure": (lambda i, s: s._replace(pressure=0.5 + 0.01 * (i % 2)), 0.5),
     "expiratory_valve": (
         lambda i, s: s._replace(pressure=24.0 + 0.01 * (i % 2) if s.u_out else s.pressure), 1.0

@@ -11,6 +11,7 @@ import pytest
 from hardware_eval.bench.collect import collect
 from hardware_eval.bench.loop import Bench, SilentOperator
 from hardware_eval.bench.selftest import LIMITS, selftest
+from hardware_eval.emulation.faults import LineFault, LineFaultKind
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import FaultKind, LungFault
 from ventbench.errors import InputError
@@ -26,6 +27,32 @@ def test_a_good_bench_goes(bench: Bench) -> None:
     # The emulated lung reports its flow, so that R and C are those of the label.
     assert pytest.approx(5.0, rel=0.15) == sheet.R
     assert pytest.approx(20.0, rel=0.05) == sheet.C
+
+
+def test_what_a_slow_line_spoils_is_repeated(bench: Bench, device: LoopbackDevice) -> None:
+    now = device.clock.now() - device.start
+    # Silent for 0.3 s within the first part, and for a step within the second.
+    device.line.faults = tuple(
+        LineFault(LineFaultKind.SILENT, now + start, now + start + length)
+        for start, length in ((2.6, 0.3), (9.2, 0.02))
+    )
+    sheet = selftest(bench, LUNG, simulator="physics")
+    assert sheet.go, str(sheet)
+    repeated = next(x for x in sheet.findings if x.name == "interruptions")
+    assert repeated.value == 1.0
+    assert "1 part repeated" in repeated.text
+
+
+def test_a_line_that_stays_silent_is_a_no_go_that_says_so(
+    bench: Bench, device: LoopbackDevice
+) -> None:
+    now = device.clock.now() - device.start
+    each = [LineFault(LineFaultKind.SILENT, now + 2.3 + k, now + 2.8 + k) for k in range(200)]
+    device.line.faults = tuple(each)
+    sheet = selftest(replace(bench, rest=0.5), LUNG, simulator="physics")
+    assert not sheet.go
+    assert any("close other programs" in problem for problem in sheet.problems())
+    assert "safety" not in {x.name for x in sheet.findings if not x.ok}
 
 
 def test_a_wrongly_set_lung_is_a_no_go_that_names_it(bench: Bench) -> None:

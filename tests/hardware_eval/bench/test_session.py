@@ -18,6 +18,7 @@ from hardware_eval.bench.plan import Plan, PlannedRun, make_plan
 from hardware_eval.bench.raw_log import RawLog, breaths, lines
 from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.bench.session import run_plan
+from hardware_eval.emulation.faults import LineFault, LineFaultKind
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import FaultKind, LungFault
 from hardware_eval.wire.errors import LinkError
@@ -84,6 +85,37 @@ def test_a_late_answer_repeats_the_last_command_and_counts(bench: Bench) -> None
     u_in = result.breaths[0].u_in
     assert u_in[5] == u_in[6] == u_in[4] != u_in[7]
     assert math.isnan(result.breaths[0].requested[5])
+
+
+def silent(device: LoopbackDevice, after: float, steps: float) -> None:
+    """Let the line be silent ``after`` a run of 2 s of rest begins, s, for some steps."""
+    begins = device.clock.now() - device.start + 2.0 + protocol.DT + after - 0.002
+    fault = LineFault(LineFaultKind.SILENT, begins, begins + steps * protocol.DT)
+    device.line.faults = (fault,)
+
+
+def test_a_step_without_an_answer_costs_a_scored_run_but_not_the_entry(
+    bench: Bench, device: LoopbackDevice
+) -> None:
+    breath = protocol.BREATH_STEPS * protocol.DT
+    for kind, status in (("scored", "aborted"), ("ramp", "complete")):
+        silent(device, breath, 0.9)
+        controller = Scripted()
+        result = run_once(bench, run(kind=kind), controller)
+        assert math.isnan(result.breaths[1].pressure[0])
+        assert (result.status, result.held_up) == (status, status == "aborted")
+        # The controller is told that a breath begins, by the answer to the last command.
+        assert [row[0] for row in controller.rows].count(0.0) == protocol.BREATHS
+
+
+def test_a_silent_line_ends_the_run_and_blames_neither_lung_nor_entry(
+    bench: Bench, device: LoopbackDevice
+) -> None:
+    silent(device, 0.5, 5.0)
+    result = run_once(bench, run(), Scripted())
+    assert (result.status, result.held_up) == ("aborted", True)
+    assert {trip.check for trip in result.trips} == {"no_answer"}
+    assert max(result.breaths[0].late) < protocol.DT  # the loop did not wait for it
 
 
 def test_a_controller_that_fails_ends_its_run(bench: Bench, device: LoopbackDevice) -> None:

@@ -125,7 +125,7 @@ def test_self_test_wrong_lung_run_and_board(terminal: DeviceOnTerminal, tmp_path
     assert built.exit_code == 0, built.output
     made = record.load(Path(path))
     assert isinstance(made, HardwareRecord)
-    page = (board / "index.html").read_text()
+    page = (board / "version-1.html").read_text()
     assert f"{made.score:.3f}" in page
     assert all(word in page for word in ("hardware", "gap", "emulator"))
 

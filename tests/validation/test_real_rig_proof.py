@@ -303,7 +303,8 @@ def test_the_command(app, recordings, tmp_path, diagnoses):
     assert ran.exit_code == (0 if met else 1)
     assert plain["met"] is met
     assert sorted(p.name for p in (tmp_path / "rc").iterdir()) == [
-        "corrected.json", "diagnosis.json", "diagnosis.rrd", "part.json", "report.html",
+        "corrected.json", "diagnosis.json", "diagnosis.rrd", "part.json", "record_next.csv",
+        "report.html",
     ]  # fmt: skip
     assert all(name in str(command.proof.__annotations__["only"]) for name in PARTS)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import runpy
 import shutil
 from types import SimpleNamespace
 
@@ -29,7 +30,7 @@ from ventbench.plants import frozen
 from ventbench.stress.results import DRAWS, pip_columns
 from ventbench.stress.score import StressScore
 from ventbench.stress.stressors import conditions
-from ventbench.submissions.folder import open_submission
+from ventbench.submissions.folder import open_submission, resolve
 from ventbench.submissions.rig_scoring import run_on_rigs
 
 from ..textbook_rigs import TextbookRigs
@@ -46,7 +47,8 @@ def reference(rigs):
     """The PID's true errors, and a tenth of them as what is attainable."""
     own = rigs.scored()
     drawn = own.draws(rig_draws.COUNT)
-    gains = np.tile([[6.0, 6.0, 0.3]], (6, 1))
+    controller = runpy.run_path(str(resolve("pid_robust") / "controller.py"))
+    gains = np.tile(controller["GAINS"], (6, 1))
     plants, cells = own.cells(drawn, protocol.PIPS)
     pid = references.pid_errors(plants, cells, gains)
     about = references.settings(own.about, drawn.about())

@@ -386,7 +386,8 @@ def fit(
     carry: Any = (controller.layers, _optimiser(config).init(controller.layers))
     settings = {
         "config": dataclasses.asdict(config), "gains": list(gains), "seed": seed,
-        "simulators": fingerprint((plants, weights, controller.layers)),
+        "simulators": fingerprint(plants), "weights": fingerprint(weights),
+        "start": None if start is None else fingerprint(start.layers),
     }  # fmt: skip
     stored = Checkpoint(checkpoint, settings)
     carry, first = stored.restore(carry)

@@ -8,16 +8,15 @@ Prints both; ``--write`` puts them where they belong. Usage:
 from __future__ import annotations
 
 import argparse
+import math
 import re
 from pathlib import Path
-
-import pandas as pd
 
 from ventbench.board.frames import load_board
 
 ROOT = Path(__file__).parents[1]
 
-#: Page, and columns of its table: title, text of a row of the board.
+#: Pages with a table; that of README is shorter.
 PAGES = (ROOT / "README.md", ROOT / "docs" / "protocol_v2.md")
 
 
@@ -30,23 +29,23 @@ def rows(short: bool) -> list[list[str]]:
     board = load_board(ROOT / "leaderboard", version=2)
     titles = ["track", "rank", "entry", "normalised", "error", "nominal", "to PID", "stress"]
     table = [[*titles, "runs survived"]]
-    for row in board[board.status == "ranked"].itertuples():
-        ranks = f"{row.rank}"
-        if row.rank_low != row.rank_high:
-            ranks += f" ({row.rank_low} to {row.rank_high})"
-        there = pd.notna(row.stress_cmH2O)
-        pid = pd.notna(row.normalised_to_pid)
+    for row in board.query("status == 'ranked'").to_dict(orient="records"):
+        ranks = f"{row['rank']}"
+        if row["rank_low"] != row["rank_high"]:
+            ranks += f" ({row['rank_low']} to {row['rank_high']})"
+        limits = f"[{row['normalised_low']:.1f}, {row['normalised_high']:.1f}]"
+        pid, stress = row["normalised_to_pid"], row["stress_cmH2O"]
         table.append(
             [
-                str(row.track),
+                row["track"],
                 ranks,
-                str(row.name),
-                f"**{row.normalised:.1f}** [{row.normalised_low:.1f}, {row.normalised_high:.1f}]",
-                f"{row.score_cmH2O:.3f}",
-                f"{row.nominal_cmH2O:.3f}",
-                f"{row.normalised_to_pid:+.1f}" if pid else "",
-                f"{row.stress_cmH2O:.2f}" if there else "",
-                f"{100 * row.stress_survived:.0f} %" if there else "",
+                row["name"],
+                f"**{row['normalised']:.1f}** {limits}",
+                f"{row['score_cmH2O']:.3f}",
+                f"{row['nominal_cmH2O']:.3f}",
+                f"{pid:+.1f}" if math.isfinite(pid) else "",
+                f"{stress:.2f}" if math.isfinite(stress) else "",
+                f"{100 * row['stress_survived']:.0f} %" if math.isfinite(stress) else "",
             ]
         )
     left_out = {5, 6} if short else set()

@@ -196,6 +196,7 @@ def test_a_rank_counts_the_entries_that_are_better_beyond_doubt(board):
         better = sum(low > 1e-9 for low, _ in limits)
         worse = sum(high < -1e-9 for _, high in limits)
         assert row.ranks == (1 + better, 4 - worse)
+        assert row.ranks is not None
         assert row.rank == row.ranks[0]
     assert track.ranked[-1].record.name == "zero"
     assert track.ranked[-1].ranks == (4, 4)
@@ -226,6 +227,7 @@ def test_stress_is_ranked_and_shown(board):
     page = (board / "index.html").read_text()
     assert "Stressor by severity" in page
     for row in rows:
+        assert row.score is not None
         own = (board / f"entries/v2/robustness/{row.name}.html").read_text()
         assert f"{row.score.value:.2f}" in own
         assert f"{row.score.value:.2f}" in page

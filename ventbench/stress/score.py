@@ -60,7 +60,8 @@ _SHOWN = 10
 class StressScore(StressTables):
     """Result of one submission on the stress track; S conditions, L lungs, n draws.
 
-    ``print(score)`` shows the conditions that cost most.
+    ``print(score)`` shows the conditions that cost most. Errors, safety and survival are those of
+    :class:`~ventbench.stress.results.StressTables`.
 
     Attributes:
         submission: what was scored.

@@ -158,3 +158,27 @@ def test_the_command(tmp_path: Path) -> None:
     assert json.loads((out / "pid_robust" / "stress.json").read_text()) == values
     assert (out / "stress.png").read_bytes()[:4] == b"\x89PNG"
     assert "all stressors" in result.stderr
+
+
+@pytest.mark.slow
+def test_one_command_gives_all_three_scores(tmp_path: Path) -> None:
+    out = tmp_path / "runs"
+    arguments = ["score", "pid_robust", "--protocol", "2", "--in-process", "--out", str(out)]
+    result = CliRunner().invoke(app, [*arguments, "--json", "-"])
+    assert result.exit_code == 0, result.output
+    values = json.loads(result.stdout)
+    assert values["score"] > 1.0
+    assert values["normalised"]["nominal"] > 100.0
+    assert values["stress"]["score"] > values["score"]
+    assert values["stress"]["draws"]["count"] == 1
+    assert json.loads((out / "pid_robust" / "stress.json").read_text()) == values["stress"]
+    assert "Normalised score" in result.stderr
+    assert "all stressors" in result.stderr
+
+
+def test_a_record_of_the_stress_track_needs_all_draws(tmp_path: Path) -> None:
+    arguments = ["score", "pid_robust", "--track", "stress", "--draws", "3"]
+    result = CliRunner().invoke(app, [*arguments, "--record", str(tmp_path)])
+    assert result.exit_code != 0
+    assert isinstance(result.exception, InputError)
+    assert "--record of the stress track needs 6 draws" in str(result.exception)

@@ -3,7 +3,9 @@
 For batched PID rollouts in float32 on a learned plant of the paper's size (9 x 150), prints the
 environment steps/s, the GFLOP/s (multiplications and additions of every executed layer, boundary
 network included) and the ratio to plain matrix products of the same layer shapes. Also prints the
-latency of one run of 300 steps and the steps/s of the other plants. Usage:
+latency of one run of 300 steps, the steps/s of the other plants, and for the frozen hybrid, which
+has no matrix products, the share of its own roofline: the time that its operations would take at
+the rates that vector kernels of the same operations reach in the same run. Usage:
 
     python benchmarks/rollout_speed.py [--batch 512 1024 2048] [--rounds 5] [--cpu-time]
         [--json FILE]
@@ -147,6 +149,87 @@ def throughput(plant: Learned, batches: list[int], rounds: int) -> list[dict[str
     return rows
 
 
+#: Operations that cost more than an addition, by their names in a jaxpr; all others count as one.
+DEAR = ("div", "sqrt", "exp", "tanh")
+
+
+def operations(plant: Plant, batch: int) -> dict[str, int]:
+    """Count the operations of one step on a batch: ``simple`` ones and each of :data:`DEAR`.
+
+    What occurs twice with equal operands counts once, and what no cell differs in not at all.
+    """
+    state = plant.init(jnp.full(batch, 5.0))
+    command = jnp.full(batch, 20.0)
+    dt = jnp.full(batch, protocol.DT)
+    closed = jax.make_jaxpr(plant.step)(state, command, jnp.zeros(batch), dt)
+    counts = dict.fromkeys(("simple", *DEAR), 0)
+    names: dict[Any, Any] = {}
+    seen: dict[Any, int] = {}
+
+    def name(variable: Any) -> Any:
+        return str(variable) if hasattr(variable, "val") else names.get(variable, variable)
+
+    def visit(jaxpr: Any) -> None:
+        for equation in jaxpr.eqns:
+            inner = equation.params.get("jaxpr")
+            if inner is not None:
+                body = getattr(inner, "jaxpr", inner)
+                names.update(zip(body.invars, map(name, equation.invars), strict=True))
+                visit(body)
+                names.update(zip(equation.outvars, map(name, body.outvars), strict=True))
+                continue
+            kind = equation.primitive.name
+            key = (kind, str(equation.params), tuple(map(name, equation.invars)))
+            first = seen.setdefault(key, len(seen))
+            names.update({out: (first, k) for k, out in enumerate(equation.outvars)})
+            # Moving data is no arithmetic.
+            free = ("broadcast_in_dim", "convert_element_type", "squeeze", "reshape", "slice")
+            if first == len(seen) - 1 and kind not in free and key not in counted:
+                counted.add(key)
+                if equation.outvars[0].aval.size >= batch:
+                    counts[kind if kind in DEAR else "simple"] += 1
+
+    counted: set[Any] = set()
+    visit(closed.jaxpr)
+    return counts
+
+
+def vector_rates(batch: int, repeats: int = 200, chain: int = 8) -> dict[str, float]:
+    """Return operations/s of this machine on vectors that stay in the cache, by kind."""
+    kernels: dict[str, tuple[int, Callable[[jax.Array], jax.Array]]] = {
+        "simple": (4, lambda x: jnp.minimum(jnp.maximum(x * 0.999 + 0.001, 0.1), 3.0)),
+        "div": (1, lambda x: 1.7 / x),
+        "sqrt": (1, jnp.sqrt),
+        "exp": (1, lambda x: jnp.exp(-x)),
+        "tanh": (1, jnp.tanh),
+    }
+    rates = {}
+    x = jnp.linspace(0.5, 2.0, batch, dtype=jnp.float32)
+    for name, (_, kernel) in kernels.items():
+
+        @jax.jit
+        def run(x: jax.Array, kernel: Callable[[jax.Array], jax.Array] = kernel) -> jax.Array:
+            def body(_: int, x: jax.Array) -> jax.Array:
+                for _ in range(chain):
+                    x = kernel(x)
+                return x
+
+            return jax.lax.fori_loop(0, repeats, body, x)
+
+        jax.block_until_ready(run(x))
+        best = min(seconds(lambda run=run: run(x)) for _ in range(10))
+        each = kernels[name][0] if name == "simple" else 1
+        rates[name] = batch * repeats * chain * each / best
+    return rates
+
+
+def roofline_share(plant: Plant, batch: int, steps_per_s: float) -> tuple[float, dict[str, int]]:
+    """Share of the rate that the operations of a step alone would allow, and their counts."""
+    counts, rates = operations(plant, batch), vector_rates(batch)
+    bound = 1.0 / sum(count / rates[kind] for kind, count in counts.items())
+    return steps_per_s / bound, counts
+
+
 def latency(plant: Plant, repeats: int = 50) -> dict[str, float]:
     """Return best and median milliseconds of one compiled run of one cell."""
     pid, scenario = PID(1.0, 3.0), nominal_scenario(20.0)
@@ -206,11 +289,21 @@ def main() -> None:
         jax.block_until_ready(run())
         others[other] = max(options.batch) * STEPS / min(seconds(run) for _ in range(10))
         print(f"  {other:24} {others[other]:12.0f}")
+    # With a batch that fits into the first cache, as the vector kernels have it.
+    small = min(options.batch)
+    pid, scenario = cells(small)
+    hybrid = OTHERS["frozen hybrid"]()
+    run = lambda: closed_loop(hybrid, pid, scenario)  # noqa: E731
+    jax.block_until_ready(run())
+    rate = small * STEPS / min(seconds(run) for _ in range(30))
+    share, counts = roofline_share(hybrid, small, rate)
+    listed = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    print(f"\nfrozen hybrid, batch {small}: {rate:.0f} steps/s, {share:.2f} of its roofline")
+    print(f"  operations of one step: {listed}")
     if options.json:
-        write_json(
-            options.json,
-            {"plant": name, "rows": rows, "ratio": ratio, "latency": single, "others": others},
-        )
+        result = {"plant": name, "rows": rows, "ratio": ratio, "latency": single}
+        result |= {"others": others, "hybrid_roofline": share, "hybrid_operations": counts}
+        write_json(options.json, result)
 
 
 if __name__ == "__main__":

@@ -162,7 +162,7 @@ def operations(plant: Plant, batch: int) -> dict[str, int]:
     command = jnp.full(batch, 20.0)
     dt = jnp.full(batch, protocol.DT)
     closed = jax.make_jaxpr(plant.step)(state, command, jnp.zeros(batch), dt)
-    counts = dict.fromkeys(("simple", *DEAR), 0)
+    counts: dict[str, int] = dict.fromkeys(("simple", *DEAR), 0)
     names: dict[Any, Any] = {}
     seen: dict[Any, int] = {}
 

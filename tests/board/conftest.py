@@ -44,7 +44,8 @@ def scores(simulators: Textbook) -> dict[str, Score]:
     """The two PIDs, scored."""
     found = {}
     for name in ("pid_best", "pid_robust"):
-        result = run_protocol(open_submission(name), simulators.plants, draws=draws.COUNT)
+        entry = open_submission(f"v1/{name}")
+        result = run_protocol(entry, simulators.plants, draws=draws.COUNT)
         found[name] = dataclasses.replace(
             result, sandbox=SANDBOX, frozen_sha256=frozen.MANIFEST_SHA256
         )
@@ -73,7 +74,7 @@ def draft(
         **about: Any,
     ) -> create.Draft:
         score = scores[base]
-        folder = entry_folder(tmp_path_factory.mktemp("entries") / name, base, name)
+        folder = entry_folder(tmp_path_factory.mktemp("entries") / name, f"v1/{base}", name)
         manifest = dataclasses.replace(score.submission.manifest, name=name)
         if texts is not None:
             manifest = dataclasses.replace(
@@ -111,7 +112,8 @@ def entry_folder(folder: Path, base: str, name: str) -> Path:
     """Copy a bundled submission under another name; the same files each time."""
     shutil.copytree(resolve(base), folder, ignore=lambda *_: ["__pycache__"])
     manifest = folder / "submission.toml"
-    manifest.write_text(manifest.read_text().replace(f'name = "{base}"', f'name = "{name}"'))
+    known = f'name = "{Path(base).name}"'
+    manifest.write_text(manifest.read_text().replace(known, f'name = "{name}"'))
     return folder
 
 

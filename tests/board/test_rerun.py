@@ -54,7 +54,7 @@ def three(draft, drafts, simulators, tmp_path_factory: pytest.TempPathFactory) -
 @pytest.fixture
 def code(tmp_path: Path) -> Path:
     for name in ("honest", "softer"):
-        entry_folder(tmp_path / "code" / name, "pid_best", name)
+        entry_folder(tmp_path / "code" / name, "v1/pid_best", name)
     return tmp_path / "code"
 
 

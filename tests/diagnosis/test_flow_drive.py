@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 
 import numpy as np
 import pytest
@@ -110,7 +109,6 @@ def test_the_ventilators_side_is_left_out():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif("VENTBENCH_LONG" not in os.environ, reason="takes ten minutes and 8 GiB")
 @pytest.mark.parametrize("quadratic", [0.0, 12.0])
 def test_a_diagnosis_from_flow(quadratic):
     diagnosis = diagnose(recorded(18, 50.0, quadratic, noise=0.15))

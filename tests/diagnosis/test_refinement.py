@@ -11,9 +11,11 @@ import pytest
 from ventbench.diagnosis import refinement
 from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.refinement import (
+    NonparametricFit,
     SingleTermAlternative,
     drop_compensating_terms,
     find_alternatives,
+    special_case_of,
 )
 from ventbench.diagnosis.selection import fit_with_noise, forward_selection
 
@@ -79,6 +81,24 @@ def test_a_single_mechanism_compensates_for_nothing(plain):
     said: list[str] = []
     assert drop_compensating_terms(plain.evaluator, plain.evaluator, one, said.append) is one
     assert not said
+
+
+@pytest.mark.parametrize(
+    ("acting", "term", "names"),
+    [
+        (small.effect("turbulent_resistance", quadratic=10.0), "flow_shape",
+         ("turbulent_resistance",)),
+        (small.effect("leak", conductance=20.0), "flow_shape", None),
+        (small.effect("turbulent_resistance", quadratic=10.0), "volume_resistance", None),
+    ],
+)  # fmt: skip
+def test_what_a_nonparametric_term_stands_for_is_named_if_it_is_most_of_it(acting, term, names):
+    breaths = small.made(acting, noise=0.1, seed=2)
+    evaluator, wide = small.split(breaths), small.split_wide(breaths)
+    base = fit_with_noise(evaluator, Hypothesis())
+    full = fit_with_noise(wide, Hypothesis((term,)), wide.fit(Hypothesis(), base.noise, base))
+    named = special_case_of(evaluator, base, NonparametricFit(term, full, 100.0))
+    assert (named and named.names) == names
 
 
 SUM = Hypothesis(("turbulent_resistance", "viscoelasticity", "leak"))

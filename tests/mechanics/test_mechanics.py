@@ -170,6 +170,19 @@ def test_what_is_needed_beyond_R_and_C(name):
         near(found.C, 20.0, 0.04)
 
 
+def test_a_late_sensor_is_told_beside_the_circuit_that_would_do_the_same():
+    """One lung cannot tell them apart: R c of tubing is the time constant of a sensor."""
+    plain = recording(20.0, 20.0, n=20, seed=5)
+    late = plain.pressure.copy()
+    for k in range(1, late.shape[1]):
+        kept = np.exp(-plain.dt[:, k - 1] / 0.03)
+        late[:, k] = kept * late[:, k - 1] + (1 - kept) * plain.pressure[:, k - 1 : k + 1].mean(1)
+    (term,) = only(replace(plain, pressure=late)).terms
+    assert term.name == "circuit_compliance"
+    assert term.alternatives == ("sensor_lag",)
+    near(term.parameters["equivalent_lag"], 0.03, 0.1)
+
+
 def test_a_leak_is_gas_that_does_not_come_back():
     """The sensor sees what leaks away behind it: 5 mL/s per cmH2O."""
     plain = recording(20.0, 20.0, n=20, seed=6)

@@ -58,6 +58,7 @@ class Breath:
         self.source = 30 / (1 - (1 - loss) ** 2) if loss else np.inf
         self.lag, self.second = self.get("valve_lag", "tau"), self.get("valve_lag", "second")
         self.slow = self.get("sensor_lag", "tau")
+        self.opening, self.opened_at = 0.0, 0.0  # lag of the expiratory valve, and when it opens
         self.ratio, self.relax = self.get("viscoelasticity", "ratio"), 1.0
         if self.ratio:
             self.relax = m["viscoelasticity"]["time"]
@@ -106,8 +107,12 @@ class Breath:
                 xtol=1e-13,
             )  # fmt: skip
 
+        wide = opened
+        if opened and self.opening:
+            wide = 1 - np.exp(-(t - self.opened_at) / self.opening)
+
         def out(p):
-            return opened * max(p - self.peep, 0.0) / self.R_ex
+            return wide * max(p - self.peep, 0.0) / self.R_ex
 
         if not self.tank:
             airway = brentq(
@@ -151,6 +156,9 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
     times = np.concatenate([[0.0], np.cumsum(dt[:-1])])
     asked = [gain / 1000 * u for u in valve_positions(u_in, m)]
     late, late_out = rig.get("valve_delay", "delay"), rig.get("exhalation_valve_delay", "opening")
+    rig.opening = late_out * rig.get("exhalation_valve_delay", "slow")
+    late_out -= rig.opening
+    opens = times[1:][np.diff(u_out) > 0] + late_out
     edges = set(times) | set(times + late) | set(times + late_out)
     if "patient_effort" in m:
         e = m["patient_effort"]
@@ -169,6 +177,8 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
         middle = (a + b) / 2
         wanted = held(asked, 0.0, middle - late)
         opened = held(u_out, 0.0, middle - late_out) and held(u_out, 0.0, middle)
+        if opened and rig.opening:
+            rig.opened_at = max(opens[opens < middle])
         found = solve_ivp(
             rig.slope, (a, b), y, "LSODA", rtol=1e-8, atol=1e-10, args=(wanted, opened)
         )

@@ -20,6 +20,7 @@ TOLERANCE = {
     "exhalation_valve_delay": (0.04, 0.008),
     "inertance": (0.1, 0.02),
     # The power is rounded off at small flow, where one below 1.75 is steep.
+    "exhalation_valve_delay.slow": (0.04, 0.008),
     "turbulent_resistance.exponent": (0.008, 0.003),
 }
 EXACT = (0.004, 0.001)
@@ -48,6 +49,8 @@ def test_each_mechanism(name, level, predicted):
         ("valve_hysteresis.give", 1.0),
         ("valve_hysteresis.give", 0.4),
         ("sensor_drift.warming", 3.0),
+        ("exhalation_valve_delay.slow", 1.0),
+        ("exhalation_valve_delay.slow", 0.5),
     ],
 )
 def test_each_shape(path, value, predicted):

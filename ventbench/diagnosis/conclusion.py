@@ -32,6 +32,7 @@ from ventbench.diagnosis.refinement import (
     drop_compensating_terms,
     eliminate_beside_input,
     find_alternatives,
+    special_case_of,
     without_breath_terms,
 )
 from ventbench.diagnosis.screening import component_of
@@ -40,6 +41,7 @@ from ventbench.diagnosis.selection import (
     Progress,
     fit_with_noise,
     forward_selection,
+    free_shape_parameters,
     passes_heldout_test,
 )
 from ventbench.diagnosis.settings import SelectionConfig
@@ -130,7 +132,15 @@ def conclude(evaluator: Evaluator, wider: Callable[[], Evaluator], tell: Progres
         full = selected
     elif remaining.term is not None:
         selected, fit = backward_elimination(evaluator, wide, selected, remaining.term)
-        unnamed, full = UnnamedEffect(component_of(fit.term), fit.term, None, fit.nats), fit.full
+        named = special_case_of(evaluator, selected, fit)
+        beside = fit if named is None else None
+        if named is not None:
+            selected = free_shape_parameters(evaluator, named)
+            full, beside = selected, _best_term(wide, selected)
+        if beside is not None:
+            place = component_of(beside.term)
+            unnamed = UnnamedEffect(place, beside.term, None, beside.nats)
+            full = beside.full
     tell("comparing alternatives")
     selected, alternatives = find_alternatives(
         evaluator, selected, comparisons, swap=unnamed is None

@@ -113,9 +113,12 @@ def _interval(fitted: Fit, path: str, group: int) -> ConfidenceInterval:
     either near the bounds.
     """
     ends = interval(fitted, path, group)
-    owner = path.rpartition(".")[0]
+    owner, _, short = path.rpartition(".")
     about = parameter(path)
-    if path != strength_path(owner) or about.kinked or not ends.low <= about.neutral <= ends.high:
+    # The sum of two lags in series is known where their difference is not.
+    exchanged = any(short in pair for pair in mechanism(owner).description.interchangeable)
+    unclear = path == strength_path(owner) or exchanged
+    if not unclear or about.kinked or not ends.low <= about.neutral <= ends.high:
         return ends
     return ConfidenceInterval(ends.value, *profile_interval(fitted, path, group))
 

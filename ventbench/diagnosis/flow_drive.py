@@ -32,8 +32,9 @@ _VENTILATOR_TERMS = frozenset(
      "outlet_shape", "outlet_memory"}
 )  # fmt: skip
 
-#: Least interval of the readings that are used, s, and most readings of a breath.
-_READINGS, _MOST = 0.02, 150
+#: Interval of the readings that are used, s, as far as whole samples allow, and most readings of a
+#: breath.
+_READINGS, _MOST = 0.03, 150
 
 #: Time before a reading, s, in which the flow stands as it is at the reading: a mean over the whole
 #: interval would lag, and R times that lag is pressure.
@@ -103,8 +104,9 @@ def drive_grid(breaths: Breaths) -> tuple[Breaths, NDArray[np.int64]]:
     for i in range(len(breaths)):
         length = int(breaths.valid[i].sum())
         time, flow = breaths.time[i, :length], breaths.flow[i, :length]  # type: ignore[index]
-        every = max(_READINGS, time[-1] / _MOST)
-        picked = np.searchsorted(time, np.arange(0.0, time[-1], every) - 1e-9)
+        step = float(np.median(np.diff(time)))  # even readings, so that few substeps suffice
+        every = step * max(int(_READINGS / step + 1e-6), -int(-time[-1] // (_MOST * step)), 1)
+        picked = np.searchsorted(time, np.arange(0.0, time[-1], every) - 0.25 * step)
         picked = np.unique(np.append(picked, length - 1))
         at = time[picked]
         gap = np.diff(at)

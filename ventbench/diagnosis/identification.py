@@ -23,11 +23,11 @@ from ventbench.diagnosis.hypothesis import (
     varies_by_breath,
 )
 from ventbench.diagnosis.plausibility import excludes_neutral
-from ventbench.diagnosis.screening import all_parameter_paths
+from ventbench.diagnosis.screening import all_parameter_paths, library_paths
 from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
-from ventbench.physics.catalogue import mechanism, paths
+from ventbench.physics.catalogue import mechanism
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit
@@ -200,11 +200,13 @@ def identify(
         settings: every threshold.
         fitted: which breaths the final fit may use, ``(n,)``; all but the testing ones if None.
     """
-    narrow = make_evaluator(data, held, paths(), excluded, settings)
+    names = library_paths(excluded)
+    narrow = make_evaluator(data, held, names, excluded, settings)
     wide: list[Evaluator] = []
 
     def widened() -> Evaluator:
-        wide.append(make_evaluator(data, held, all_parameter_paths(settings), excluded, settings))
+        every = all_parameter_paths(settings, excluded)
+        wide.append(make_evaluator(data, held, every, excluded, settings))
         return wide[0]
 
     conclusion = conclude(narrow, widened, tell)
@@ -215,7 +217,7 @@ def identify(
     final = evaluator.training
     if not has_term:  # a nonparametric term is fitted to the training breaths alone, to save time
         chosen = ~held if fitted is None else fitted
-        final = make_partition(data.select(chosen), paths(), settings)
+        final = make_partition(data.select(chosen), names, settings)
     while True:
         fit = estimates.final_fit(conclusion.full, final, evaluator)
         vague = [name for name in conclusion.names if not _is_definite(fit, name)]

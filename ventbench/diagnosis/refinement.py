@@ -248,6 +248,45 @@ def backward_elimination(
     return selected, NonparametricFit(term, full, nats)
 
 
+def special_case_of(
+    evaluator: Evaluator, selected: FittedModel, unnamed: NonparametricFit
+) -> FittedModel | None:
+    """The selected mechanisms and one that a nonparametric term contains, if it is most of it.
+
+    Forward selection may have gone another way: a lag of the valve in a lung of high resistance
+    looks like a circuit at first, and three names that make up for that are no better than the
+    term, which replaces them. What the term stands for has a name all the same.
+
+    Args:
+        evaluator: evaluator with the library's parameters.
+        selected: the mechanisms that are kept beside the term.
+        unnamed: the term beside them.
+
+    Returns:
+        The mechanisms with the new one last, fitted with its noise; None if none is needed that
+        explains at least half of what the term does.
+    """
+    related = special_cases(unnamed.term)
+    names = tuple(name for name in related if name in evaluator.allowed_mechanisms)
+    if not names or set(related) & set(selected.names):
+        return None
+    noise = unnamed.full.noise
+    without = evaluator.fit(selected.hypothesis, noise, selected)
+    whole = unnamed.full.log_likelihood - without.log_likelihood
+    white = fit_with_white_noise(evaluator, selected)
+    candidates = screen_mechanisms(selected, white, evaluator.settings, names)
+    comparison = compare_candidates(evaluator, selected, candidates, white)
+    if comparison is None:
+        return None
+    first = comparison.ranked[0].fitted
+    best = fit_with_noise(evaluator, first.hypothesis, first)
+    by_name = best.log_likelihood_at(noise) - without.log_likelihood
+    if by_name < evaluator.settings.refinement.related_share * whole:
+        return None
+    beside = evaluator.fit(selected.hypothesis, best.noise, selected)
+    return best if is_needed(evaluator, best, beside) else None
+
+
 def eliminate_beside_input(
     evaluator: Evaluator, selected: FittedModel, latent: LatentInput, nats: float
 ) -> FittedModel:

@@ -7,12 +7,13 @@ so that its best gain follows from the derivatives.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
-from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.linearisation import Linearisation, linearise
 from ventbench.diagnosis.patient_effort import breath_term
 from ventbench.diagnosis.settings import ScreeningSettings, SelectionConfig
@@ -33,6 +34,8 @@ class Candidate:
         start: values to start a fit from, by path.
         nats: log-likelihood that it is expected to gain.
         white_nats: log-likelihood that it would gain if the noise were white.
+        other_starts: values at the other settings of its grid that promise something, by path: a
+            gas that rings has a local minimum for each number of periods between two samples.
     """
 
     name: str
@@ -40,6 +43,7 @@ class Candidate:
     start: dict[str, float]
     nats: float
     white_nats: float
+    other_starts: tuple[dict[str, float], ...] = ()
 
     @property
     def promise(self) -> float:
@@ -76,7 +80,8 @@ def screen_mechanisms(
         screened = breath_term((name,), settings).screen(linear)
         if screened is None:
             return _screen(predictor, linear, name, settings.screening)
-        return Candidate(name, Hypothesis((name,)), screened.start, *screened.nats)
+        nats, white_nats = screened.nats
+        return Candidate(name, Hypothesis((name,)), screened.start, nats, white_nats)
 
     candidates = parallel_map(candidate, missing)
     by_nats = sorted(candidates, key=lambda candidate: -candidate.nats)
@@ -88,12 +93,19 @@ def screen_mechanisms(
 def _screen(
     predictor: Predictor, linear: list[Linearisation], name: str, settings: ScreeningSettings
 ) -> Candidate:
-    """Simulate a mechanism at all points of its grid, and keep the best."""
+    """Simulate a mechanism at all points of its grid, and keep the best.
+
+    A shape parameter is free where another value than its default promises more.
+    """
     order = predictor.names
     first, *others = library()[name].description.parameters
     best, start = np.zeros(len(linear)), {}
     own = [f"{name}.{first.name}", *(f"{name}.{p.name}" for p in others)]
     grids = [first.screening_strengths(), *(other.grid or (None,) for other in others)]
+    shapes = {f"{name}.{p.name}": p.neutral for p in others if p.shape and not p.discrete}
+    usual = np.zeros(len(linear))  # the best gains with every shape as it is by default
+    starts: dict[tuple[float, ...], tuple[float, dict[str, float]]] = {}
+    several = [f"{name}.{p.name}" for p in others if p.grid and not p.shape]
     work, points = [], []
     for setting, (k, linearisation) in product(product(*grids), enumerate(linear)):
         trial = linearisation.values.copy()
@@ -107,16 +119,27 @@ def _screen(
         if not np.all(np.isfinite(prediction)):
             continue
         nats, multiple = linearisation.gain(linearisation.template(prediction))
-        if multiple <= 0 or nats <= best[k]:
+        if multiple <= 0:
+            continue
+        if all(given.get(path, neutral) == neutral for path, neutral in shapes.items()):
+            usual[k] = max(usual[k], nats)
+        step = float(np.clip(multiple, settings.min_step, settings.max_step))
+        scale = 1.0 if first.kinked else step
+        strength = float(np.clip(given[own[0]] * scale, first.low, first.high))
+        place = tuple(given[path] for path in several)
+        if nats > starts.get(place, (0.0, {}))[0]:
+            starts[place] = (nats, given | {own[0]: strength})
+        if nats <= best[k]:
             continue
         if nats > best.max():
-            step = float(np.clip(multiple, settings.min_step, settings.max_step))
-            scale = 1.0 if first.kinked else step
-            strength = float(np.clip(given[own[0]] * scale, first.low, first.high))
             start = given | {own[0]: strength}
         best[k] = nats
     fixed = {p: v for p, v in start.items() if parameter(p).discrete and v != parameter(p).neutral}
-    return Candidate(name, Hypothesis((name,), (), tuple(fixed.items())), start, *map(float, best))
+    asked = float(best.max() - usual.max()) > settings.shape_promise
+    free = tuple(p for p in shapes if asked and start.get(p, shapes[p]) != shapes[p])
+    added = Hypothesis((name,), free, tuple(fixed.items()))
+    rest = tuple(trial for _, trial in starts.values() if trial != start) if several else ()
+    return Candidate(name, added, start, float(best[0]), float(best[1]), rest)
 
 
 def nonparametric_terms(settings: SelectionConfig) -> tuple[str, ...]:
@@ -125,9 +148,24 @@ def nonparametric_terms(settings: SelectionConfig) -> tuple[str, ...]:
     return tuple(basis_terms()) if chosen is None else chosen
 
 
-def all_parameter_paths(settings: SelectionConfig) -> tuple[str, ...]:
-    """Paths of the parameters of the library and of the basis terms that are candidates."""
-    return paths((*library(), *nonparametric_terms(settings)))
+def library_paths(excluded: Collection[str] = ()) -> tuple[str, ...]:
+    """Paths of the parameters of the library without mechanisms that cannot act.
+
+    Those of terms that differ from breath to breath stay in any case, so that test lungs and
+    patients share compiled functions.
+    """
+    return paths(_compiled(excluded))
+
+
+def all_parameter_paths(
+    settings: SelectionConfig, excluded: Collection[str] = ()
+) -> tuple[str, ...]:
+    """Paths of :func:`library_paths` and of the basis terms that are candidates."""
+    return paths((*_compiled(excluded), *nonparametric_terms(settings)))
+
+
+def _compiled(excluded: Collection[str]) -> tuple[str, ...]:
+    return tuple(name for name in library() if name not in excluded or varies_by_breath(name))
 
 
 def component_of(term: str) -> str:
@@ -161,7 +199,7 @@ def score_nonparametric_terms(fitted: FittedModel, settings: SelectionConfig) ->
             _linear_gain(linearisation, rows[:, own], prior_sd)
             for linearisation, rows in zip(linear, projected, strict=True)
         ]
-        candidates.append(Candidate(name, Hypothesis((name,)), {}, *gains))
+        candidates.append(Candidate(name, Hypothesis((name,)), {}, gains[0], gains[1]))
     return sorted(candidates, key=lambda candidate: -candidate.promise)
 
 

@@ -31,6 +31,7 @@ from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import Noise, robust_noise
+from ventbench.system_id.problem import parameter_of
 
 #: Is told what is being done.
 Progress = Callable[[str], None]
@@ -251,17 +252,31 @@ def compare_candidates(
         chosen = chosen[: settings.fitted_candidates]
     # Noise that was estimated with an effect in the residual would hide the effect from its fit.
     white = replace(current.noise, ar=(0.0, 0.0))
-    models = parallel_map(
-        lambda candidate: evaluator.fit(
-            current.hypothesis.plus(candidate.hypothesis),
+    shifts: tuple[dict[str, float], ...] = ({}, *_other_dead_times(warm_start or current))
+    work = [
+        (k, start | shift)
+        for k, candidate in enumerate(chosen)
+        for start in (candidate.start, *candidate.other_starts)
+        for shift in (shifts if not varies_by_breath(candidate.name) else shifts[:1])
+    ]
+    fits = parallel_map(
+        lambda job: evaluator.fit(
+            current.hypothesis.plus(chosen[job[0]].hypothesis),
             white,
             warm_start or current,
-            candidate.start,
+            job[1],
             iterations=evaluator.settings.fit.quick_iterations,
             tolerance=evaluator.settings.fit.quick_tolerance,
         ),
-        chosen,
+        work,
     )
+    models = [
+        min(
+            (model for (j, _), model in zip(work, fits, strict=True) if j == k),
+            key=lambda model: model.minimum.cost,
+        )
+        for k in range(len(chosen))
+    ]
     criteria = _Criteria(evaluator)
     own = parallel_map(lambda model: criteria(model, estimate_noise(model)), models)
     noise = criteria.better_noise(models[int(np.argmin(own))], current.noise)
@@ -284,6 +299,23 @@ def compare_candidates(
     )
     gains = evaluator.held_out_log_likelihood(order[0])
     return Comparison(current, ranked, gains - evaluator.held_out_log_likelihood(current))
+
+
+def _other_dead_times(fitted: FittedModel) -> list[dict[str, float]]:
+    """Values of each fitted dead time one sample before and after, by path.
+
+    A dead time that was fitted without an effect may stand on the wrong side of a sample, where
+    nothing that is added to it alone helps.
+    """
+    interval = float(np.median(fitted.problem.data.dt))
+    others = []
+    for path in fitted.hypothesis.paths:
+        about = parameter_of(path)
+        if about.kinked and about.scan:
+            value = float(np.median(fitted.column(path)))
+            near = {min(max(value + step, about.low), about.high) for step in (-interval, interval)}
+            others += [{path: other} for other in sorted(near - {value})]
+    return others
 
 
 def _fit_contenders(
@@ -394,11 +426,20 @@ def _fallback(evaluator: Evaluator, comparison: Comparison) -> FittedModel | Non
 
 
 def free_shape_parameters(evaluator: Evaluator, current: FittedModel) -> FittedModel:
-    """Free the shape parameters of the newest term that the recording asks for."""
+    """Free the shape parameters of the newest term that the recording asks for, and no others.
+
+    Screening frees a shape that promises more than the default one. Where the fit needs no such
+    freedom, the default returns.
+    """
     name = current.hypothesis.names[-1]
     for about in mechanism(name).description.parameters:
         path = f"{name}.{about.name}"
         if not about.shape or about.discrete:
+            continue
+        if path in current.hypothesis.free:
+            usual = evaluator.fit(current.hypothesis.with_default(path), current.noise, current)
+            if evaluator.criterion(usual) <= evaluator.criterion(current):
+                current = usual
             continue
         freed = current.hypothesis.plus(Hypothesis((name,), (path,)))
         freer = evaluator.fit(freed, current.noise, current)

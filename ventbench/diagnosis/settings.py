@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 #: Raised when a value or the meaning of a setting changes.
-VERSION = "selection-2"
+VERSION = "selection-3"
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class FitSettings:
             within the tolerance of the fits.
         noise_rounds: most times that parameters and noise are estimated in turn.
         delay_gain: log-likelihood, nats, by which another dead time must be better to be jumped to.
+        delay_rounds: most times that a fit is continued from another dead time.
     """
 
     tolerance: float = 0.02
@@ -67,6 +68,7 @@ class FitSettings:
     noise_gain: float = 2.0
     noise_rounds: int = 5
     delay_gain: float = 2.0
+    delay_rounds: int = 2
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,8 @@ class ScreeningSettings:
         ridge: eigenvalues of a projection below this share of the largest count as zero.
         min_step: least multiple of a template that starts a fit.
         max_step: largest multiple of a template that starts a fit; first order does not hold far.
+        shape_promise: nats by which another shape than the default must promise more to be fitted
+            from the start; a parameter costs about half the logarithm of the samples.
         derivatives_at_once: directions of one compiled derivative.
         nonparametric_terms: basis terms that are candidates; None for all that are registered.
     """
@@ -87,6 +91,7 @@ class ScreeningSettings:
     ridge: float = 1e-9
     min_step: float = 0.2
     max_step: float = 3.0
+    shape_promise: float = 4.0
     derivatives_at_once: int = 16
     nonparametric_terms: tuple[str, ...] | None = None
 

@@ -158,7 +158,7 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
         known = tuple(sorted(known, key=lambda setting: setting != label))
     return Mechanics(
         name, best.resistance(0.0), best.compliance(), full.offset(),
-        (*_circuit_term(circuit), *(full.term(term) for term in selected)),
+        (*_circuit_term(circuit, best), *(full.term(term) for term in selected)),
         match, known, noise, len(table), samples, notes,
     )  # fmt: skip
 
@@ -198,10 +198,21 @@ def _best_for_label(full: LungFit, plain: LungFit, label: Lung) -> LungFit:
     return plain
 
 
-def _circuit_term(circuit: CircuitEstimate | None) -> tuple[Term, ...]:
+def _circuit_term(circuit: CircuitEstimate | None, lung: LungFit) -> tuple[Term, ...]:
+    """The compliance of the circuit, and the lag of a pressure sensor that would do the same.
+
+    Behind a circuit of compliance c, a linear lung has ``p (1 + c / C) + R c dp/dt = R Q + V / C``;
+    with a sensor that lags by tau, it has ``p + tau dp/dt = R Q + V / C``. The two are one
+    equation, so that one lung cannot tell them apart.
+    """
     if circuit is None:
         return ()
-    parameters = {"compliance": circuit.compliance}
+    shared = lung.resistance(0.0).value / (1.0 + circuit.compliance.value / lung.compliance().value)
+    low, high = circuit.compliance.ci95
+    lag = Estimate(
+        1e-3 * shared * circuit.compliance.value, "s", (1e-3 * shared * low, 1e-3 * shared * high)
+    )
+    parameters = {"compliance": circuit.compliance, "equivalent_lag": lag}
     return (Term("circuit_compliance", parameters, circuit.nats, circuit.effect, ("sensor_lag",)),)
 
 

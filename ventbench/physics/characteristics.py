@@ -82,7 +82,7 @@ def characteristic(
         if _has(shown, "dead_time"):
             return _late(float(jnp.asarray(shown.dead_time(own))), end)
         if _has(shown, "outlet_dead_time"):
-            return _late_outlet(shown, own, end)
+            return _late_outlet(shown, own, base, end)
         if _has(shown, "inflow"):
             return _flow_step(shown, own, end)
         if _has(shown, "reading"):
@@ -138,18 +138,26 @@ def _late(delay: float, end: float) -> Characteristic:
     )
 
 
-def _late_outlet(shown: Mechanism, own: Values, end: float) -> Characteristic:
+def _late_outlet(
+    shown: Mechanism, own: Values, base: Mapping[str, float], end: float
+) -> Characteristic:
     """Expiratory valve that is told to open, and later to close."""
-    x = np.linspace(-0.2 * end, 2.2 * end, 4 * _STATIC)
+    x = np.linspace(-0.2 * end, 2.2 * end, 2 * _STATIC)
     opening, closing = (
         float(jnp.asarray(shown.outlet_dead_time(own, jnp.asarray(u_out)))) for u_out in (1.0, 0.0)
     )
     told = (x >= 0) & (x < end)
-    done = (x >= opening) & (x < end + closing)
+    done = ((x >= opening) & (x < end + closing)).astype(np.float64)
+    if shown.stateful:  # how far it is open
+        view, state = _view(base, length=jnp.asarray(x[1] - x[0]))[0], jnp.asarray(0.0)
+        for k, far in enumerate(done):
+            told_now = view.replace(opened=jnp.asarray(far))  # type: ignore[attr-defined]
+            state = shown.next_state(own, state, jnp.asarray(0.0), told_now)
+            done[k] = float(state)
     return Characteristic(
         x * 1e3,
         told.astype(np.float64),
-        done.astype(np.float64),
+        done,
         "time since it is told to open, ms",
         "expiratory valve, 1 open",
     )

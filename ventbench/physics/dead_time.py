@@ -37,9 +37,10 @@ def resolution_of(dt: NDArray[np.float64]) -> tuple[int, int]:
     Args:
         dt: intervals between samples, s, ``(n, T)``.
     """
-    substeps, memory = resolution(float(np.median(dt)))
-    substeps = max(substeps, resolution(float(np.quantile(dt, _LONG)))[0])
-    # Where samples lie close together, more of them are needed to reach back as far.
+    substeps, memory = resolution(float(np.quantile(dt, _LONG)))
+    substeps = max(substeps, resolution(float(np.median(dt)))[0])
+    # Where samples lie close together, more of them are needed to reach back as far. A median says
+    # nothing of that: of a grid with two samples at each reading, it would ask for hundreds.
     passed = np.cumsum(dt, axis=1)
     for row in passed:
         reaches = np.searchsorted(row, row + LONGEST_DEAD_TIME)

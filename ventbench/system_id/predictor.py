@@ -14,8 +14,9 @@ import numpy as np
 from jax import Array
 
 from ventbench.executor import parallel_map
-from ventbench.physics.catalogue import parameter
+from ventbench.physics.catalogue import mechanism, parameter
 from ventbench.physics.dead_time import resolution_of
+from ventbench.physics.mechanism import Mechanism
 from ventbench.physics.model import Physics
 from ventbench.precision import float64
 from ventbench.system_id.data import Data, Floats
@@ -26,8 +27,13 @@ START = "start"
 #: Numbers of breaths to compile for, unless told otherwise; larger data are divided.
 SIZES = (4, 8, 16, 32, 64)
 
-#: Numbers of points to compile for, each for all breaths; a larger number is divided.
-_WIDTHS = (1, 4, 8)
+#: Numbers of points to compile for, each for all breaths; a larger number is divided. A third size
+#: would take as long to compile as a diagnosis takes.
+_WIDTHS = (1, 8)
+
+#: Least share of the points of a compiled size that must be asked for: eight points take as long as
+#: three one by one.
+_FILLED = 0.375
 
 #: Step of a difference quotient, as a share of a parameter's range or, on a log scale, of its
 #: value: rounding and truncation errors are about equal there.
@@ -106,6 +112,8 @@ class Predictor:
         parts = max(-(-len(data) // self._part), 1)
         padded = data.padded(parts * self._part)
         enough, memory = resolution_of(data.dt)
+        if not any(_has_dead_time(name) for name in names):
+            memory = 1
         self.substeps, self.memory = substeps or enough, memory
         flow = data.measured.shape[1] > 1
         self._static = {
@@ -191,14 +199,26 @@ class Predictor:
         return np.where(values + move > definition.high, -move, move)
 
 
+def _has_dead_time(path: str) -> bool:
+    """Whether a parameter belongs to a mechanism that delays a command."""
+    owner = path.rpartition(".")[0]
+    if not owner:
+        return False
+    own = type(mechanism(owner))
+    return (
+        own.dead_time is not Mechanism.dead_time
+        or own.outlet_dead_time is not Mechanism.outlet_dead_time
+    )
+
+
 def _groups(count: int) -> list[tuple[int, int, int]]:
     """First and last of the points that are computed at once, and the compiled number of points.
 
-    A group may lack up to a quarter of that number.
+    A group may lack up to five of eight.
     """
     groups, first = [], 0
     while first < count:
-        width = max(width for width in _WIDTHS if 0.75 * width <= count - first)
+        width = max(width for width in _WIDTHS if _FILLED * width <= count - first)
         last = min(first + width, count)
         groups.append((first, last, width))
         first = last

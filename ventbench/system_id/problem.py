@@ -212,6 +212,12 @@ class Problem:
         """Negative log posterior, up to a constant; infinite if the model is unstable."""
         return self._cost(self._white(self.residual(x)), x)
 
+    def costs(self, points: Floats) -> Floats:
+        """Costs at several points ``(m, U)``, simulated together, ``(m,)``."""
+        seen = self.predictor.predict_all(np.stack([self.values(x) for x in points]))
+        pairs = zip(seen, points, strict=True)
+        return np.array([self._cost(self._white(self._residual(s)), x) for s, x in pairs])
+
     def scores(self, x: Floats) -> tuple[float, Floats, Floats]:
         """Cost with the prior; gradient and Gauss-Newton Hessian of the likelihood by breath.
 

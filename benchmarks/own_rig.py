@@ -178,7 +178,8 @@ def run(
     recorded = record(plant, folder / "rig.csv", breaths)
     diagnosis = diagnose(recorded, simulator="physics")
     diagnosis.save(out / "diagnosis")
-    print(f"{name}: missing {', '.join(diagnosis.mechanisms) or 'nothing'}", flush=True)
+    missing = [mechanism.name for mechanism in diagnosis.mechanisms]
+    print(f"{name}: missing {', '.join(missing) or 'nothing'}", flush=True)
     corrected = out / "diagnosis" / "corrected.json"
     simulators: dict[str, Any] = {
         SIMULATORS[0]: {LUNG: physics(lung(LUNG))},
@@ -197,7 +198,7 @@ def run(
         rows[label] = trained_on(simulator, plant, out / f"trained-{number}", seeds, updates)
         for part in (rows[label]["pid"], *rows[label]["residual"]):
             print(f"{label:24} {part['promised']:6.3f} -> {part['rig']:6.3f} cmH2O", flush=True)
-    result = {"settings": settings, "missing": list(diagnosis.mechanisms), "trained_on": rows}
+    result = {"settings": settings, "missing": missing, "trained_on": rows}
     files.write_json(done, result)
     return result
 

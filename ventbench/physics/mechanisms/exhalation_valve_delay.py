@@ -21,10 +21,7 @@ class ExhalationValveDelay(Mechanism):
         name="exhalation_valve_delay",
         title="delay of the expiratory valve",
         site="expiratory valve",
-        equation=(
-            "opening slow do/dt = u_out(t - opening (1 - slow)) - o while it opens; "
-            "o = u_out(t - closing) while it closes"
-        ),
+        equation="opening slow do/dt = u_out(t - opening (1 - slow)) - o",
         parameters=(
             Parameter(
                 "opening",

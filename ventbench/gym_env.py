@@ -215,8 +215,8 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, NDArray[np.flo
             plants = jax.tree.map(
                 lambda *leaf: jnp.stack(leaf), *(single._plants[i] for i in lungs)
             )
-            lung = jnp.arange(num_envs) % episodes.lung_count(plants)
-            self._plants = jax.tree.map(lambda leaf: jnp.asarray(leaf)[lung], plants)
+            which = jnp.arange(num_envs) % episodes.lung_count(plants)
+            self._plants = jax.tree.map(lambda leaf: jnp.asarray(leaf)[which], plants)
         self._loop: env.LoopState | None = None
 
     def reset(

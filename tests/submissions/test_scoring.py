@@ -474,11 +474,13 @@ def test_progress_counts_the_rounds_of_all_sessions():
             return Session()
 
     seen = []
-    counting = runner.CountingRunner(Plain(), lambda *far: seen.append(far), sessions=2)
+    plain: Any = Plain()
+    nothing: Any = None
+    counting = runner.CountingRunner(plain, lambda *far: seen.append(far), sessions=2)
     assert counting.sandbox == {"layer": "none"}
     rows = np.arange(6.0).reshape(3, 2)
     for _ in range(2):
-        session = counting.start(None, [None] * 3)
+        session = counting.start(nothing, [nothing] * 3)
         for _ in range(2):
             np.testing.assert_array_equal(session.act(rows), rows[:, 0])
         assert session.failures == {0: "something"}

@@ -39,7 +39,7 @@ def test_every_member_of_every_training_rig_is_there_and_no_held_out_one(officia
         zip(official.training_rigs, official.held_out_rigs, strict=True)
     ):
         assert apart not in rigs
-        trained = {tuple(row) for row in np.stack([given.plants.E, given.plants.R], -1)[:, lung]}
+        trained = {tuple(row) for row in np.stack([plants.E, plants.R], -1)[:, lung]}
         wanted = {
             tuple(row) for row in np.stack([members.E, members.R], -1)[:, rigs].reshape(-1, 2)
         }

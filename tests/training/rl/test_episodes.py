@@ -152,7 +152,7 @@ def test_three_breaths_remember_the_one_before_and_score_as_the_protocol(rig_lun
     drawn = episodes.draw(jax.random.key(3), rig_lungs, 4, breaths=3)
 
     def act(key, x, base):
-        mean = network.apply(policy.parameters, x)[..., 0]
+        mean = jnp.asarray(network.apply(policy.parameters, x))[..., 0]
         return base + rl_policy.SCALE * mean, x[..., 0]
 
     x, kept, rewards = episodes.roll(drawn, act, jax.random.key(1), looks_back=True)

@@ -225,7 +225,7 @@ def _lungs(trained_on: TrainingPlants, version: int, group: _Group, seeds: int) 
     plants = jax.tree.map(lambda leaf: np.asarray(leaf)[:, where], trained_on.plants)
     # (plants, runs, lungs, ...) -> (runs, plants, lungs, ...)
     plants = jax.tree.map(lambda leaf: np.moveaxis(leaf, 1, 0), plants)
-    return episodes.RigLungs(plants, trained_on.weights[where])
+    return episodes.RigLungs(plants, jnp.asarray(trained_on.weights[where]))
 
 
 def _pid_errors(lungs: episodes.Lungs) -> list[float]:

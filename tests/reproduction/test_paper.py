@@ -15,7 +15,7 @@ from ventbench.cli import app
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
-from ventbench.reproduction import paper, published
+from ventbench.reproduction import controller_sections, paper, published, simulator_sections
 from ventbench.reproduction.report import Chart, HeatMap, Line, Reproduction, Section, Table
 from ventbench.training.pid_grid import PIDGrid
 
@@ -46,23 +46,25 @@ def test_stored_errors_are_those_of_the_official_simulators(stored):
 
 def test_distances_are_sums_over_the_steps_of_an_inspiration(stored):
     for about in stored["horizon"]["lungs"].values():
-        for kind in paper.KINDS:
+        for kind in simulator_sections.KINDS:
             longest = len(about[kind]["by_step"])
             assert longest - 4 < about[kind]["distance"] / about[kind]["mae"] <= longest
 
 
 def test_errors_by_horizon_say_whether_they_grow(stored):
-    section = paper.by_horizon(stored["horizon"])
+    section = simulator_sections.by_horizon(stored["horizon"])
     assert section.verdict in ("agrees", "in part")
-    assert [line.name for line in section.charts[0].lines] == list(paper.KINDS.values())
+    assert [line.name for line in section.charts[0].lines] == list(
+        simulator_sections.KINDS.values()
+    )
     grown = copy.deepcopy(stored["horizon"])
     for about in grown["lungs"].values():
         about["hybrid"]["by_step"] = [0.01 * 1.3**k for k in range(30)]
-    assert paper.by_horizon(grown).verdict == "differs"
+    assert simulator_sections.by_horizon(grown).verdict == "differs"
 
 
 def test_networks_are_set_beside_the_papers(stored):
-    section = paper.architectures(stored["networks"])
+    section = simulator_sections.architectures(stored["networks"])
     rows = {row[0]: row[1:] for row in section.tables[0].rows}
     assert rows["width 150"][0] == 0.643
     wide, usual = rows["width 150"][2], rows["width 48"][2]
@@ -75,19 +77,19 @@ def test_networks_are_set_beside_the_papers(stored):
 def test_the_grid_ranks_the_papers_gains():
     error = np.full(len(GAINS), 3.0)
     error[0] = 1.0
-    section = paper.best_gains(grid_of(error))
+    section = controller_sections.best_gains(grid_of(error))
     row = section.tables[0].rows[0]
     assert row[:3] == ("R5C10", "10, 0.2", 3.0)
     assert row[3:5] == ("2, 0", 1.0)
     assert section.verdict == "in part"
     error[1:] = 1.02
-    assert paper.best_gains(grid_of(error)).verdict == "agrees"
+    assert controller_sections.best_gains(grid_of(error)).verdict == "agrees"
 
 
 def test_a_grid_without_the_papers_gains_is_refused():
     grid = PIDGrid(LUNG_IDS, protocol.PIPS, GAINS[:1], np.ones((6, 1, 6), np.float32))
     with pytest.raises(InputError, match=r"does not contain P, I, D = 10, 0\.2, 0"):
-        paper.best_gains(grid)
+        controller_sections.best_gains(grid)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +97,7 @@ def test_a_grid_without_the_papers_gains_is_refused():
 )
 def test_the_residual_network_is_judged_by_lung(residual, verdict):
     grid = grid_of(np.linspace(1.0, 2.0, len(GAINS)))
-    section = paper.performance(grid, np.full((6, 6), residual))
+    section = controller_sections.performance(grid, np.full((6, 6), residual))
     assert section.verdict == verdict
     assert section.tables[0].rows[0][3] == pytest.approx(100.0 * (residual - 1.0), abs=1e-3)
 
@@ -103,21 +105,24 @@ def test_the_residual_network_is_judged_by_lung(residual, verdict):
 def test_one_network_for_all_must_win_by_more():
     grid = grid_of(np.linspace(1.0, 2.0, len(GAINS)))
     own, shared = np.full((6, 6), 0.9), np.full((6, 6), 0.8)
-    assert paper.robustness(grid, own, shared).verdict == "agrees"
-    assert paper.robustness(grid, shared, own).verdict == "in part"
+    assert controller_sections.robustness(grid, own, shared).verdict == "agrees"
+    assert controller_sections.robustness(grid, shared, own).verdict == "in part"
 
 
 def test_reinforcement_learning_is_compared_by_the_mean():
     errors = {"residual": np.ones((6, 6)), "PPO": np.ones((6, 6)), "DQN": 2 * np.ones((6, 6))}
-    assert paper.reinforcement(errors).verdict == "agrees"
-    assert paper.reinforcement(errors | {"PPO": 0.5 * np.ones((6, 6))}).verdict == "differs"
+    assert controller_sections.reinforcement(errors).verdict == "agrees"
+    assert (
+        controller_sections.reinforcement(errors | {"PPO": 0.5 * np.ones((6, 6))}).verdict
+        == "differs"
+    )
 
 
 def test_studies_have_their_claims(stored):
-    samples = paper.sample_efficiency(stored["samples"])
+    samples = controller_sections.sample_efficiency(stored["samples"])
     assert samples.verdict == "in part"
     assert "ppo" in {row[0] for row in samples.tables[0].rows}
-    assert paper.regularisation(stored["controllers"]).verdict == "differs"
+    assert controller_sections.regularisation(stored["controllers"]).verdict == "differs"
 
 
 def small_page():
@@ -189,9 +194,9 @@ def test_the_whole_page_agrees_with_scores_and_manifest(tmp_path, monkeypatch):
 
 
 def test_errors_by_horizon_can_be_measured_again(stored, public_recordings):
-    again = paper.measure_horizon(public_recordings / paper.MEASURED)
+    again = simulator_sections.measure_horizon(public_recordings / paper.MEASURED)
     for name, about in stored["horizon"]["lungs"].items():
-        for kind in paper.KINDS:
+        for kind in simulator_sections.KINDS:
             np.testing.assert_allclose(
                 again["lungs"][name][kind]["by_step"], about[kind]["by_step"], atol=2e-3
             )

@@ -1,7 +1,7 @@
 """Figures that the paper prints: Suo et al., arXiv:2102.06779.
 
 The paper's pictures carry no numbers in the text. Of those only the claim can be compared, which
-stands with each section in :mod:`ventbench.reproduction.paper`.
+stands with each section in the modules beside this one.
 """
 
 from __future__ import annotations

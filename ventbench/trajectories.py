@@ -204,4 +204,9 @@ def load(path: Path) -> Trajectories:
             )
     # What np.load raises for a text, an empty or cut-off file, and for a plain array (TypeError).
     except (KeyError, ValueError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path} is not a trajectory file of ventbench: {error}") from error
+        # numpy takes whatever it does not know for a pickle, and advises to load that unsafely.
+        why = "it is no .npz archive" if "pickle" in str(error) else str(error)
+        raise InputError(
+            f"{path} is not a trajectory file of ventbench: {why}; score the submission again with "
+            "`ventbench score SUBMISSION --out DIR`"
+        ) from error

@@ -49,7 +49,8 @@ def parse(content: bytes, label: str) -> Any:
         value = json.loads(content)
     # ValueError: also not UTF-8, and integers of thousands of digits.
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{label} is not JSON: {error}") from None
+        why = "it is no text" if isinstance(error, UnicodeDecodeError) else error
+        raise InputError(f"{label} is not JSON: {why}") from None
     try:
         same = canonical(value) == content
     except (ValueError, TypeError, RecursionError):

@@ -184,7 +184,10 @@ def record_index(folder: Path | str | None = None) -> list[dict[str, Any]]:
     Raises:
         InputError: if there is no leaderboard, or a record was changed.
     """
-    leaderboard = store.load(FOLDER if folder is None else Path(folder))
+    path = FOLDER if folder is None else Path(folder)
+    leaderboard = store.load(path)
+    if not leaderboard.records:
+        raise InputError(f"{path} holds no record; add one with `ventbench board add`")
     boards = ranking.boards(leaderboard.records, leaderboard.attested, leaderboard.breaches)
     states = {
         row.record.sha256: status

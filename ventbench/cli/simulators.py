@@ -151,16 +151,23 @@ def open_loop(
 
     Example: `ventbench open-loop recording.csv --json errors.json`
     """
+    import numpy as np
     from rich.console import Console
 
     from ventbench import open_loop_report
     from ventbench import recordings as files
+    from ventbench.errors import InputError
 
     said = notes()
     with waiting(f"reading {recordings}"):
         breaths = files.load(recordings, clip=clip, pad=pad)
     for note in breaths.notes:
         said.print(f"note: {note}", markup=False, highlight=False)
+    if not np.isfinite(breaths.pressure).any():
+        raise InputError(
+            f"{recordings}: all pressures are blank; fill them in: there is nothing to compare a "
+            "simulator with"
+        )
     with waiting(f"simulating {len(breaths)} breaths"):
         result = open_loop_report.open_loop(breaths, plant)
     emit(result.as_dict(), json)

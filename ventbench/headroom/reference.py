@@ -126,8 +126,10 @@ def load(path: Path) -> Reference:
     except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
         if isinstance(error, InputError):
             raise
+        # numpy takes whatever it does not know for a pickle.
+        why = "it is no .npz archive" if "pickle" in str(error) else error
         raise InputError(
-            f"{path} is not a file of reference errors: {error}; make it with `ventbench headroom`"
+            f"{path} is not a file of reference errors: {why}; make it with `ventbench headroom`"
         ) from error
     return Reference(about, **arrays)
 

@@ -86,8 +86,9 @@ def load_plants(path: Path, as_array: Callable[[Any], Any] = np.asarray) -> dict
             lung(name).id: _decode(node, arrays, as_array) for name, node in head["lungs"].items()
         }
     except (AttributeError, KeyError, TypeError, ValueError) as error:
+        why = "it is no text" if isinstance(error, UnicodeDecodeError) else error
         raise InputError(
-            f"{path} is not a file of plants ({error}); give a corrected.json that "
+            f"{path} is not a file of plants ({why}); give a corrected.json that "
             "`ventbench diagnose` wrote"
         ) from error
 

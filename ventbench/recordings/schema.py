@@ -150,7 +150,7 @@ def _advice(names: Sequence[str], missing: Sequence[str]) -> str:
             "with ventbench.recordings.load_respiraworks."
         )
     if len(names) == 1 and any(mark in names[0] for mark in ";\t|"):
-        return "The columns must be separated by commas."
+        return "The columns must be separated by commas; `ventbench data import` reads others."
     hints = []
     for name in missing:
         plain = {other.strip().lower(): other for other in names if other not in COLUMNS}

@@ -156,12 +156,19 @@ def _decoded(file: str) -> tuple[str, str]:
         except (OSError, EOFError) as error:
             raise InputError(f"{file} cannot be unpacked ({error})") from None
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return data.decode("utf-16"), "UTF-16"
+        try:
+            return data.decode("utf-16"), "UTF-16"
+        except UnicodeDecodeError:
+            raise InputError(
+                f"{file} begins like UTF-16 text and is none; export it as CSV"
+            ) from None
     try:
         return data.decode("utf-8-sig"), "UTF-8"
     except UnicodeDecodeError:
         if b"\x00" in data[:4096]:
-            raise InputError(f"{file} is no text, Parquet or MATLAB file") from None
+            raise InputError(
+                f"{file} is no text, Parquet or MATLAB file; export it as CSV"
+            ) from None
         return data.decode("latin-1"), "Latin-1"
 
 

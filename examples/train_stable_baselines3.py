@@ -52,8 +52,8 @@ class Ventilators(VecEnv):
     def get_attr(self, attr_name, indices=None):
         return [getattr(self.made, attr_name, None)] * self.num_envs
 
-    # VecEnv demands the next two methods, and PPO calls neither: they reach into single environments,
-    # and here all of them are one compiled program.
+    # VecEnv demands the next two methods, and PPO calls neither: they reach into single
+    # environments, and here all of them are one compiled program.
     def set_attr(self, attr_name, value, indices=None):
         raise NotImplementedError
 

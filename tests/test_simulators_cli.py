@@ -167,7 +167,7 @@ def test_train_needs_recordings(tmp_path, monkeypatch):
 def test_train_hands_over_folder_target_and_progress(tmp_path, monkeypatch):
     called = []
 
-    def train(folder, out, *, lungs=None, progress):
+    def train(folder, out, *, lungs=None, config=None, progress):
         progress("half", 0.5)
         called.append((folder, out, lungs))
 

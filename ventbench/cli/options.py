@@ -10,7 +10,7 @@ import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress
+    from rich.progress import Progress, ProgressColumn
 
 
 def claim_out(folder: Path | None) -> Path | None:
@@ -127,7 +127,7 @@ def notes() -> Console:
 
 def bars() -> Progress:
     """Return progress bars on stderr: the finished share, the time taken and the time left."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import TimeRemainingColumn as Remaining
 
     columns = (
@@ -137,7 +137,15 @@ def bars() -> Progress:
         TextColumn("left"),
         Remaining(),
     )
-    return Progress(*columns, transient=True, console=notes())
+    return _progress(*columns)
+
+
+def _progress(*columns: ProgressColumn) -> Progress:
+    from rich.progress import Progress
+
+    console = notes()
+    # Where stderr is a file, bars would leave nothing but an empty line.
+    return Progress(*columns, transient=True, console=console, disable=not console.is_terminal)
 
 
 def counted(shown: Progress, text: str) -> Callable[[int, int], None]:
@@ -152,11 +160,11 @@ def counted(shown: Progress, text: str) -> Callable[[int, int], None]:
 
 def waiting(text: str) -> Progress:
     """Return a spinner on stderr with the time taken, for work whose length nobody knows."""
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (
         SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
     )  # fmt: skip
-    shown = Progress(*columns, transient=True, console=notes())
+    shown = _progress(*columns)
     shown.add_task(text, total=None)
     return shown

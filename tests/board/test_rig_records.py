@@ -265,8 +265,6 @@ def test_a_second_stress_run_is_compared(drafts, stressed, score):
     assert recorded is not None
     again = stressed(score, 1.0)
     assert rerun.stress_difference(recorded, again) == ""
-    other = dataclasses.replace(again, requested=again.requested + 1e-12)
-    assert "commands have SHA-256" in rerun.stress_difference(recorded, other)
     for key, text in (("error", "stress.errors"), ("volume", "stress.volume_mL")):
         moved = dataclasses.replace(again, **{key: getattr(again, key) + 2.0})
         assert rerun.stress_difference(recorded, moved).startswith(text)

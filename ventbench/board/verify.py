@@ -61,6 +61,7 @@ class Report:
         unsealed: how many sealed records were looked into.
         reproduced: how many were run again and gave the same commands; see
             :mod:`ventbench.board.rerun`.
+        second_runs: what each second run showed, one sentence a record.
         deviation: largest difference between a recorded error and its replay, cmH2O.
         problems: one sentence each; empty if all is well.
         notes: what could not be checked, which is no problem.
@@ -71,6 +72,7 @@ class Report:
     replayed: int = 0
     unsealed: int = 0
     reproduced: int = 0
+    second_runs: list[str] = field(default_factory=list)
     deviation: float = 0.0
     problems: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

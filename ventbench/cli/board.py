@@ -317,7 +317,7 @@ def verify(
     """Check every hash and signature, replay every record and rebuild every page.
 
     With --rerun, the code that each record names by its hashes runs again, and its commands must
-    be the recorded ones to the bit. Records whose code is not at hand are listed.
+    be the recorded ones to 0.001 %. Records whose code is not at hand are listed.
 
     The exit code is 1 if there is any problem. Each problem names its file.
 
@@ -371,6 +371,7 @@ def _rerun(
         outcomes = rerun.rerun(
             folder, records=records, sources=sources, work=out, jobs=jobs, progress=note
         )
+    report.second_runs = [str(x) for x in outcomes]
     report.problems += [str(x) for x in outcomes if x.state == rerun.DIFFERENT]
     report.notes += [str(x) for x in outcomes if x.state == rerun.NOT_RERUN]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from ventbench.executor import (
     THREADS,
     InProcess,
     executor,
+    in_order,
     parallel_map,
     results,
     thread_count,
@@ -83,6 +85,24 @@ def test_a_dask_worker_that_is_killed_loses_nothing_and_counts_nothing_twice(tmp
                     os.kill(killed.pid, 9)
         assert killed is not None
     assert sorted(found, key=int) == list(jobs)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_results_of_jobs_are_in_the_order_of_their_arguments(workers):
+    second, told = threading.Event(), []
+
+    def job(number):
+        if workers and number == 0:
+            assert second.wait(20.0)  # the first ends last
+        if number == 1:
+            second.set()
+        return number * number
+
+    pool = ThreadPoolExecutor(workers) if workers else InProcess()
+    arguments = [(number,) for number in range(5)]
+    with pool:
+        assert in_order(pool, job, arguments, lambda *x: told.append(x)) == [0, 1, 4, 9, 16]
+    assert told == [(number, 5) for number in range(1, 6)]
 
 
 @pytest.mark.parametrize("count", ["1", "3"])

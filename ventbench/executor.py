@@ -136,6 +136,33 @@ def results(
             yield running.pop(future), result
 
 
+def in_order(
+    pool: futures.Executor,
+    function: Callable[..., ResultT],
+    arguments: Iterable[tuple[Any, ...]],
+    progress: Callable[[int, int], None] | None = None,
+) -> list[ResultT]:
+    """Return the results of jobs in the order of their arguments.
+
+    Args:
+        pool: executor.
+        function: what every job runs.
+        arguments: of each job.
+        progress: called with the number of jobs that are done and the number of all.
+
+    Raises:
+        InputError: if a worker process has died.
+        Exception: whatever a job raises.
+    """
+    jobs = {str(index): own for index, own in enumerate(arguments)}
+    kept: dict[str, ResultT] = {}
+    for name, result in results(pool, function, jobs):
+        kept[name] = result
+        if progress is not None:
+            progress(len(kept), len(jobs))
+    return [kept[name] for name in jobs]
+
+
 def parallel_map(
     work: Callable[[ArgumentT], ResultT], arguments: Iterable[ArgumentT]
 ) -> list[ResultT]:

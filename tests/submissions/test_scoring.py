@@ -7,8 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from ventbench import draws, environment, precision, protocol, rollouts, waveform
+from ventbench.cli import app
 from ventbench.controllers.pid import PID
 from ventbench.errors import InputError
 from ventbench.interfaces import Task
@@ -488,3 +490,27 @@ def test_progress_counts_the_rounds_of_all_sessions():
     assert Session.closed == 2
     total = 2 * protocol.BREATHS * protocol.INSPIRATION_STEPS
     assert seen == [(1, total), (2, total), (3, total), (4, total)]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")  # of Dask's own, about ports and closing
+def test_entries_on_a_cluster_have_the_scores_that_they_have_here(tmp_path):
+    distributed = pytest.importorskip("distributed", reason="the extra ventbench[dask] is missing")
+
+    def scores(*options: object) -> dict[str, Any]:
+        file = tmp_path / "scores.json"
+        words = ("score", "pid_robust", "pid_best", "--plant", "physics", "--in-process")
+        ended = CliRunner().invoke(app, [*words, "--json", str(file), *map(str, options)])
+        assert ended.exit_code == 0, ended.output
+        return {
+            entry["name"]: entry["lungs"] for entry in json.loads(file.read_text())["submissions"]
+        }
+
+    started = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None,
+        host="127.0.0.1", local_directory=str(tmp_path),
+    )  # fmt: skip
+    with started as cluster:
+        there = scores("--scheduler", cluster.scheduler_address)
+    assert list(there) == ["pid_robust", "pid_best"]
+    assert there == scores()

@@ -7,10 +7,8 @@ interrupted run continues, and several processes can share the work.
 
 from __future__ import annotations
 
-import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +21,7 @@ from ventbench.board import actions, canonical, create, store
 from ventbench.board.record import Record, RecordStress
 from ventbench.board.replay import ReplayPlants, draws_of
 from ventbench.errors import InputError
+from ventbench.executor import executor, results
 from ventbench.resume import WorkFolder
 from ventbench.stress import stressors
 from ventbench.stress.run import draw_cells
@@ -105,6 +104,7 @@ def rerun(
     sources: Sequence[Path] = (),
     work: Path,
     jobs: int = 1,
+    scheduler: str | None = None,
     load: Callable[[int], ReplayPlants] = frozen_simulators,
     runner: Callable[[], Runner] = sandboxed,
     progress: Callable[[Outcome], None] | None = None,
@@ -116,9 +116,10 @@ def rerun(
         records: hashes of the records, or the beginnings of them; all scores if empty.
         sources: folders with the code: of one submission, or of several.
         work: folder for what is finished; the same one continues.
-        jobs: number of processes.
-        load: gives the simulators of a version; with several processes, a function of a module.
-        runner: gives the runner; with several processes, a function of a module.
+        jobs: number of processes; 1 for this one alone.
+        scheduler: address of a Dask scheduler instead, whose workers see the same files.
+        load: gives the simulators of a version; outside of this process, a function of a module.
+        runner: gives the runner; outside of this process, a function of a module.
         progress: called after each record.
 
     Returns:
@@ -126,7 +127,7 @@ def rerun(
 
     Raises:
         InputError: if a hash names no record, ``work`` belongs to other versions, or this machine
-            cannot run submissions as official scores are run.
+            cannot run submissions as official scores are run, or a worker process died.
         OSError: if a file cannot be read or written.
     """
     board = store.load(folder)
@@ -164,19 +165,17 @@ def rerun(
             note(Outcome(score.sha256, score.name, score.track, NOT_RERUN, why))
         else:
             todo.append((score, code))
-    if jobs == 1 or len(todo) < 2:
+    if scheduler is None and (jobs == 1 or len(todo) < 2):
         for score, code in todo:
             note(_run(score, code, folder, load(score.version), runner()))
-    else:
-        # Fresh processes: JAX has threads, which a fork would cut off.
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-            running = [
-                pool.submit(_run_in_process, score.sha256, code, folder, load, runner)
-                for score, code in todo
-            ]
-            for finished in as_completed(running):
-                note(finished.result())
+    elif todo:
+        work_of = {
+            score.sha256: (score.sha256, code.resolve(), folder.resolve(), load, runner)
+            for score, code in todo
+        }
+        with executor(jobs if scheduler is None else 0, scheduler) as pool:
+            for _, outcome in results(pool, _run_in_process, work_of):
+                note(outcome)
     return [outcomes[score.sha256] for score in scores]
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ventbench.cli import seasons
-from ventbench.cli.options import JsonFile, bars, counted, emit, notes
+from ventbench.cli.options import JsonFile, Scheduler, bars, counted, emit, notes
 from ventbench.cli.seasons import FOLDER, Folder, SeedFile, seed_of
 
 if TYPE_CHECKING:
@@ -175,6 +175,7 @@ def verify(
         ),
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes of --rerun.")] = 1,
+    scheduler: Scheduler = None,
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="Finished runs of --rerun; it continues from them.")
     ] = Path("runs/rerun"),
@@ -210,7 +211,7 @@ def verify(
             progress=counted(shown, "replaying records"),
         )
     if rerun and not report.problems:  # else the records are not what they were
-        _rerun(report, folder, records or [], source or [], out, jobs)
+        _rerun(report, folder, records or [], source or [], out, jobs, scheduler)
     emit(dataclasses.asdict(report), json)
     for note in report.notes:
         console.print(f"note: {plain(note)}", markup=False, highlight=False)
@@ -222,8 +223,9 @@ def verify(
 
 
 def _rerun(
-    report: Report, folder: Path, records: list[str], sources: list[Path], out: Path, jobs: int
-) -> None:
+    report: Report, folder: Path, records: list[str], sources: list[Path], out: Path, jobs: int,
+    scheduler: str | None,
+) -> None:  # fmt: skip
     """Run code again; note in the report what came of it."""
     from ventbench.board import rerun
 
@@ -235,8 +237,9 @@ def _rerun(
             status.update(f"{report.reproduced} records reproduced")
 
         outcomes = rerun.rerun(
-            folder, records=records, sources=sources, work=out, jobs=jobs, progress=note
-        )
+            folder, records=records, sources=sources, work=out, jobs=jobs,
+            scheduler=scheduler, progress=note,
+        )  # fmt: skip
     report.second_runs = [str(x) for x in outcomes]
     report.problems += [str(x) for x in outcomes if x.state == rerun.DIFFERENT]
     report.notes += [str(x) for x in outcomes if x.state == rerun.NOT_RERUN]

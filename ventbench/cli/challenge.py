@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from ventbench.cli.options import JsonFile, ResultsPage, claim_out, emit
+from ventbench.cli.options import JsonFile, ResultsPage, Scheduler, claim_out, emit
 
 challenge = typer.Typer(
     name="challenge",
@@ -79,6 +79,7 @@ def answer(
     jobs: Annotated[
         int, typer.Option(min=1, help="Number of processes, each with one thread.")
     ] = 2,
+    scheduler: Scheduler = None,
     round_: Round = 1,
 ) -> None:
     """Diagnose every recording without reading the sealed answers.
@@ -97,7 +98,10 @@ def answer(
         def progress(done: int, total: int) -> None:
             shown.update(task, completed=done, total=total)
 
-        failed = work(ChallengeFolder(folder, round_), jobs=jobs, progress=progress)
+        place = folder if scheduler is None else folder.resolve()
+        failed = work(
+            ChallengeFolder(place, round_), jobs=jobs, scheduler=scheduler, progress=progress
+        )
     for name, problem in sorted(failed.items()):
         typer.echo(f"{name}: no answer: {problem}", err=True)
     if failed:

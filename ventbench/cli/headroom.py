@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from ventbench.cli.options import JsonFile, bars, emit
+from ventbench.cli.options import JsonFile, Scheduler, Workers, bars, emit
 
 #: Cells of the second optimiser: every so many of all.
 _EVERY = 31
@@ -33,10 +33,8 @@ def headroom(
             "second optimiser must find nothing better.",
         ),
     ] = None,
-    workers: Annotated[int, typer.Option(min=0, help="Processes; 0 for this one alone.")] = 0,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Address of a Dask scheduler instead.")
-    ] = None,
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
     json: JsonFile = None,
 ) -> None:
     """Compute the best attainable error and the best PID of every cell of protocol version 2.

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, ProgressColumn
+
+    from ventbench.submissions.folder import Submission
+
+ResultT = TypeVar("ResultT")
 
 
 def claim_out(folder: Path | None) -> Path | None:
@@ -61,6 +65,18 @@ PlantName = Annotated[
         help="Simulators: frozen (the official ones), learned, physics, two_balloon, a file of "
         "plants such as corrected.json, a CSV or Parquet file of simulated pressures, or "
         "module:function.",
+    ),
+]
+Workers = Annotated[
+    int,
+    typer.Option(min=0, help="Number of processes; 0 uses this one, with all cores."),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Dask scheduler, such as tcp://host:8786, in place of processes on this machine; its "
+        "workers must see the same files.",
     ),
 ]
 ResultsPage = Annotated[
@@ -156,6 +172,36 @@ def counted(shown: Progress, text: str) -> Callable[[int, int], None]:
         shown.update(task, completed=done, total=total)
 
     return progress
+
+
+def of_each_entry(
+    what: str,
+    work: Callable[..., ResultT],
+    entries: Sequence[Submission],
+    workers: int = 0,
+    scheduler: str | None = None,
+) -> list[ResultT]:
+    """Compute something of each entry: in turn with a bar each, or beside each other.
+
+    Args:
+        what: is done, such as ``scoring``.
+        work: takes an entry, and ``progress`` in this process; beside each other, a function of a
+            module with arguments that can be sent.
+        entries: in the order of the results.
+        workers: processes; 0 for this one.
+        scheduler: address of a Dask scheduler instead.
+    """
+    from ventbench.executor import executor, in_order
+
+    if not workers and scheduler is None:
+        done = []
+        for entry in entries:
+            with bars() as shown:
+                done.append(work(entry, progress=counted(shown, f"{what} {entry.label}")))
+        return done
+    with bars() as shown, executor(workers, scheduler) as pool:
+        jobs = [(entry,) for entry in entries]
+        return in_order(pool, work, jobs, counted(shown, f"{what} {len(jobs)} entries"))
 
 
 def waiting(text: str) -> Progress:

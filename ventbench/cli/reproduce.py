@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ventbench.cli.options import JsonFile, RecordingsDir, bars, emit
+from ventbench.cli.options import JsonFile, RecordingsDir, Scheduler, Workers, bars, emit
 
 app = typer.Typer(name="reproduce", help="Set published results beside ours.", no_args_is_help=True)
 
@@ -37,12 +37,8 @@ def paper(
     version: Annotated[
         int, typer.Option("--protocol", min=1, max=2, help="Version of the protocol.")
     ] = 2,
-    workers: Annotated[
-        int, typer.Option(min=0, help="Number of processes; 0 uses this one, with all cores.")
-    ] = 0,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler, such as tcp://host:8786.")
-    ] = None,
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
     page: Annotated[
         Path | None, typer.Option("--html", metavar="FILE", help="Write the page, with charts.")
     ] = None,

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ventbench.cli.options import JsonFile, PlantName, bars, claim_out, counted, emit, notes
+from ventbench.cli.options import (
+    JsonFile,
+    PlantName,
+    Scheduler,
+    Workers,
+    claim_out,
+    emit,
+    notes,
+    of_each_entry,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -85,6 +94,8 @@ def score(
         bool,
         typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
     ] = False,
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
     json: JsonFile = None,
 ) -> None:
     """Score controllers on the six frozen lung simulators.
@@ -92,10 +103,13 @@ def score(
     The score is the mean |pressure - target| over the inspirations, cmH2O; lower is better. With
     `--protocol 2` the normalised score and the score under missing physics stand beside it. Each
     controller runs in sandboxed processes that have no access to the simulators. With another
-    `--plant` the lungs are those of that plant, and the score is not official.
+    `--plant` the lungs are those of that plant, and the score is not official. Several controllers
+    are scored in turn, or at the same time with `--workers` or `--scheduler`.
 
     Example: `ventbench score submissions/pid_best --json score.json`
     """
+    from functools import partial
+
     from rich.console import Console
 
     from ventbench import extras
@@ -107,7 +121,9 @@ def score(
     if track == "stress":
         from ventbench.cli.stress import score_entries
 
-        return score_entries(names, draws, out, report, plant, in_process, json, record)
+        return score_entries(
+            names, draws, out, report, plant, in_process, json, record, (workers, scheduler)
+        )
     if record is not None and draws < 20:
         raise InputError("--record needs all published draws: add --draws 20")
     if report and out is None:
@@ -120,26 +136,21 @@ def score(
         raise InputError(f"two submissions have the same name: {', '.join(sorted(entries))}")
     if record is not None and plant != "frozen":
         raise InputError("--record needs the official simulators: leave out --plant")
-    simulators = load_simulators(plant)
-    scores = []
-    for entry in opened:
-        with bars() as shown:
-            scores.append(
-                scoring.score(
-                    entry,
-                    simulator=plant if protocol == 2 else simulators,
-                    track=track,
-                    draws=draws,
-                    sandbox=not in_process,
-                    protocol=protocol,
-                    progress=counted(shown, f"scoring {entry.label}"),
-                )
-            )
+    load_simulators(plant)  # whatever is wrong with it is told before anything runs
+    work = partial(
+        scoring.score,
+        simulator=plant,
+        track=track,
+        draws=draws,
+        sandbox=not in_process,
+        protocol=protocol,
+    )
+    scores = of_each_entry("scoring", work, opened, workers, scheduler)
     results = [result.to_json() for result in scores]
     stressed: dict[str, StressScore] = {}
     if protocol == 2:
         if stress:
-            stressed = _stressed(opened, plant, draws, in_process)
+            stressed = _stressed(opened, plant, draws, in_process, workers, scheduler)
         for values in results:
             own = stressed.get(values["name"])
             values["stress"] = None if own is None else own.to_json()
@@ -174,27 +185,28 @@ def score(
 
 
 def _stressed(
-    entries: list[Submission], plant: str, draws: int, in_process: bool
-) -> dict[str, StressScore]:
+    entries: list[Submission], plant: str, draws: int, in_process: bool, workers: int,
+    scheduler: str | None,
+) -> dict[str, StressScore]:  # fmt: skip
     """Stress scores, by name, of the entries that need not be told the lung."""
+    from functools import partial
+
     from ventbench.stress.results import DRAWS
     from ventbench.stress.score import score_stress
 
-    scores = {}
+    fitting = [entry for entry in entries if "robustness" in entry.manifest.tracks]
     for entry in entries:
-        name = entry.manifest.name
-        if "robustness" not in entry.manifest.tracks:
+        if entry not in fitting:
+            name = entry.manifest.name
             notes().print(f"{name} must be told its lung: it has no stress score")
-            continue
-        with bars() as shown:
-            scores[name] = score_stress(
-                entry,
-                simulator=plant,
-                draws=DRAWS if draws >= DRAWS else 1,
-                sandbox=not in_process,
-                progress=counted(shown, f"stressing {entry.label}"),
-            )
-    return scores
+    work = partial(
+        score_stress,
+        simulator=plant,
+        draws=DRAWS if draws >= DRAWS else 1,
+        sandbox=not in_process,
+    )
+    scores = of_each_entry("stressing", work, fitting, workers, scheduler)
+    return {own.submission.manifest.name: own for own in scores}
 
 
 def _table(scores: list[dict[str, Any]]) -> Table:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from ventbench.cli.options import JsonFile, bars, counted, emit
+from ventbench.cli.options import JsonFile, emit, of_each_entry
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -25,12 +25,17 @@ def score_entries(
     in_process: bool,
     json: Path | None,
     record: Path | None = None,
+    parallel: tuple[int, str | None] = (0, None),
 ) -> None:
     """Score entries on the stress track; arguments are the options of ``ventbench score``.
+
+    ``parallel`` holds its ``--workers`` and ``--scheduler``.
 
     A record of the stress track is that of the robustness track with the stress score in it, so
     that one is scored too.
     """
+    from functools import partial
+
     import numpy as np
     from rich.console import Console
 
@@ -44,18 +49,8 @@ def score_entries(
     if record is not None and (draws not in (0, DRAWS) or plant != "frozen"):
         raise InputError(f"--record of the stress track needs {DRAWS} draws on the frozen rigs")
     opened = [open_submission(name) for name in names]
-    scores = []
-    for entry in opened:
-        with bars() as shown:
-            scores.append(
-                score_stress(
-                    entry,
-                    simulator=plant,
-                    draws=draws or DRAWS,
-                    sandbox=not in_process,
-                    progress=counted(shown, f"stressing {entry.label}"),
-                )
-            )
+    work = partial(score_stress, simulator=plant, draws=draws or DRAWS, sandbox=not in_process)
+    scores = of_each_entry("stressing", work, opened, *parallel)
     results = [result.to_json() for result in scores]
     emit(results[0] if len(results) == 1 else {"submissions": results}, json)
     console = Console(stderr=str(json) == "-")
@@ -80,7 +75,7 @@ def score_entries(
         for path in written:
             console.print(f"wrote {path}", markup=False, highlight=False)
     if record is not None:
-        for path in _write_records(record, opened, scores, in_process):
+        for path in _write_records(record, opened, scores, in_process, parallel):
             console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
     failed = [failure for result in results for failure in result["failures"]]
     for failure in failed[:3]:
@@ -126,26 +121,24 @@ def _write_records(
     entries: list[Submission],
     stressed: list[StressScore],
     in_process: bool,
+    parallel: tuple[int, str | None],
 ) -> list[Path]:
     """Score the robustness track too, and write records with both."""
+    from functools import partial
+
     from ventbench import rig_draws
     from ventbench.board import create
     from ventbench.plants import frozen
     from ventbench.submissions import scoring
 
-    scores = []
-    for entry in entries:
-        with bars() as shown:
-            scores.append(
-                scoring.score(
-                    entry,
-                    track="robustness",
-                    draws=rig_draws.COUNT,
-                    sandbox=not in_process,
-                    protocol=2,
-                    progress=counted(shown, f"scoring {entry.label}"),
-                )
-            )
+    work = partial(
+        scoring.score,
+        track="robustness",
+        draws=rig_draws.COUNT,
+        sandbox=not in_process,
+        protocol=2,
+    )
+    scores = of_each_entry("scoring", work, entries, *parallel)
     by_name = {own.submission.manifest.name: own for own in stressed}
     return create.keep(folder, scores, frozen.load(2), by_name)
 

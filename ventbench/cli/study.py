@@ -7,7 +7,16 @@ from typing import Annotated, Any
 
 import typer
 
-from ventbench.cli.options import JsonFile, RecordingsDir, bars, claim_out, emit, recordings_folder
+from ventbench.cli.options import (
+    JsonFile,
+    RecordingsDir,
+    Scheduler,
+    Workers,
+    bars,
+    claim_out,
+    emit,
+    recordings_folder,
+)
 
 study = typer.Typer(
     name="study", help="Compare training methods, and variants of a design.", no_args_is_help=True
@@ -116,6 +125,8 @@ def controllers(
     out: Annotated[
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ] = Path("runs/controllers"),
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
     json: JsonFile = None,
 ) -> None:
     """Remove or change one part of the residual controller at a time.
@@ -137,6 +148,7 @@ def controllers(
         task = shown.add_task("controllers", total=1.0)
         runs = work.compare(
             frozen.load(), out, range(seeds), config=config, only=only,
+            workers=workers, scheduler=scheduler,
             progress=lambda what, share: shown.update(task, completed=share, description=what),
         )  # fmt: skip
     table = work.summary(runs)

@@ -7,7 +7,16 @@ from typing import Annotated, Any
 
 import typer
 
-from ventbench.cli.options import JsonFile, PlantName, bars, claim_out, counted, emit
+from ventbench.cli.options import (
+    JsonFile,
+    PlantName,
+    Scheduler,
+    Workers,
+    bars,
+    claim_out,
+    counted,
+    emit,
+)
 
 app = typer.Typer(name="tune", help="Search for the gains of a controller.", no_args_is_help=True)
 
@@ -37,12 +46,8 @@ def pid(
         Path,
         typer.Option(metavar="DIR", callback=claim_out, help="Folder for table, plot and result."),
     ] = Path("runs/pid"),
-    workers: Annotated[
-        int, typer.Option(min=0, help="Number of processes; 0 uses this one, with all cores.")
-    ] = 0,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler, such as tcp://host:8786.")
-    ] = None,
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
     plant: PlantName = "frozen",
     version: Annotated[
         int,

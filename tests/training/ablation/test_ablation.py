@@ -101,6 +101,17 @@ def test_controllers_are_compared(tmp_path):
         compare(simulators=Textbook(2.0))
 
 
+@pytest.mark.slow
+def test_a_training_in_another_process_is_that_in_this_one(tmp_path):
+    def compare(folder: str, workers: int) -> pd.DataFrame:
+        return controllers.compare(
+            Textbook(), tmp_path / folder, (0,), config=SMALL, only=[], draws=1, gains=GAINS,
+            workers=workers,
+        )  # fmt: skip
+
+    pd.testing.assert_frame_equal(compare("there", 1), compare("here", 0))
+
+
 def test_the_table_of_controllers_pairs_seeds():
     figures = {"draws": 3.0, "exploitation": 0.4}
     runs = pd.DataFrame(

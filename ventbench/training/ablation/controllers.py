@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from ventbench import files, precision, protocol, rollouts
 from ventbench.board.replay import spread
+from ventbench.executor import InProcess, executor, results
 from ventbench.interfaces import Controller
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics.score import passes_safety_gate, run_error
@@ -91,6 +93,8 @@ def compare(
     only: Sequence[str] | None = None,
     draws: int = DRAWS,
     gains: Gains | None = None,
+    workers: int = 0,
+    scheduler: str | None = None,
     progress: Progress = lambda *_: None,
 ) -> pd.DataFrame:
     """Train one network for all six lungs by each variant with each seed.
@@ -105,6 +109,8 @@ def compare(
         only: names of variants; all if not given. The base is always included.
         draws: published draws to score on.
         gains: P, I, D of the PID; the best single set of the paper's grid if not given.
+        workers: processes, each with a training at a time; 0 for this one alone.
+        scheduler: address of a Dask scheduler instead, whose workers see the same files.
         progress: see :data:`Progress`.
 
     Returns:
@@ -120,26 +126,35 @@ def compare(
         "config": asdict(config), "gains": list(gains), "draws": draws,
         "simulators": simulators.about(),
     }  # fmt: skip
-    work, rows = WorkFolder(out / "rows", about), []
-    todo = [(name, seed) for name in chosen for seed in seeds]
-    for number, (name, seed) in enumerate(todo):
-        variant = chosen[name]
-        own = (0.0, 0.0, 0.0) if variant.direct else gains
-        part = f"{name.replace(' ', '-')}-{seed}"
+    work = WorkFolder((out / "rows").resolve(), about)
+    trainings = {
+        f"{name.replace(' ', '-')}-{seed}": (name, seed) for name in chosen for seed in seeds
+    }
+    done = [part for part in trainings if work.has(part)]
+    for number, part in enumerate(done):
+        progress(trainings[part][0], number / len(trainings))
+    with executor(workers, scheduler) as pool:
 
-        def tell(share: float, name: str = name, number: int = number) -> None:
-            progress(name, (number + share) / len(todo))
+        def tell(part: str, share: float) -> None:
+            progress(trainings[part][0], (len(done) + share) / len(trainings))
 
-        def make(
-            variant: Variant = variant, own: Gains = own, seed: int = seed, part: str = part,
-            tell: Callable[[float], None] = tell,
-        ) -> dict[str, float]:  # fmt: skip
+        def job(part: str) -> tuple[Any, ...]:
+            name, seed = trainings[part]
+            own = (0.0, 0.0, 0.0) if chosen[name].direct else gains
+            # What happens within a training can only be told where it runs here.
+            within = partial(tell, part) if isinstance(pool, InProcess) else None
             checkpoint = work.checkpoint(part)
-            return _trained(simulators, own, variant.config, seed, draws, checkpoint, tell)
+            return simulators, own, chosen[name].config, seed, draws, checkpoint, within
 
-        tell(0.0)
-        rows.append({"variant": name, "seed": seed} | work.get(part, make))
-    runs = pd.DataFrame(rows)
+        jobs = {part: job(part) for part in trainings if part not in done}
+        for part, figures in results(pool, _trained, jobs):
+            work.put(part, figures)
+            done.append(part)
+            tell(part, 0.0)
+    runs = pd.DataFrame(
+        {"variant": name, "seed": seed} | work.read(part)
+        for part, (name, seed) in trainings.items()
+    )
     files.write_text(out / "runs.csv", runs.round(5).to_csv(index=False))
     files.write_text(out / "summary.csv", summary(runs).round(4).to_csv(index=False))
     return runs
@@ -171,13 +186,16 @@ def summary(runs: pd.DataFrame) -> pd.DataFrame:
 
 def _trained(
     simulators: frozen.Frozen, gains: Gains, config: ResidualConfig, seed: int, draws: int,
-    checkpoint: Path, tell: Callable[[float], None],
+    checkpoint: Path, tell: Callable[[float], None] | None,
 ) -> dict[str, float]:  # fmt: skip
+    def told(done: int, total: int, _: float) -> None:
+        if tell is not None:
+            tell(done / total)
+
     with precision.float32():
         controller = fit(
             jax.tree.map(np.asarray, simulators.ensemble), gains, config=config, seed=seed,
-            checkpoint=checkpoint, progress=lambda done, total, loss: tell(done / total),
-            keep=True,
+            checkpoint=checkpoint, progress=told, keep=True,
         )  # fmt: skip
     error, exploitation, _ = score_controllers(
         simulators, [controller] * len(LUNG_IDS), protocol.PIPS, draws

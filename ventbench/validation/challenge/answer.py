@@ -58,8 +58,8 @@ Work = Mapping[str, tuple[Any, ...]]
 
 
 def answer(
-    folder: ChallengeFolder, *, jobs: int = 2, diagnose: Diagnose | None = None,
-    cases_per_process: int = _CASES_PER_PROCESS,
+    folder: ChallengeFolder, *, jobs: int = 2, scheduler: str | None = None,
+    diagnose: Diagnose | None = None, cases_per_process: int = _CASES_PER_PROCESS,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, str]:  # fmt: skip
     """Answer all cases that have no answer yet; each answer is written as soon as it is there.
@@ -67,6 +67,8 @@ def answer(
     Args:
         folder: folder of the challenge.
         jobs: number of processes of one thread each; 0 to work in this process.
+        scheduler: address of a Dask scheduler instead, whose workers see the same files; ``jobs``
+            then has no meaning, and each worker uses as many threads as its environment says.
         diagnose: the diagnosis; ventbench's own if None.
         cases_per_process: mean number of cases after which a new process replaces an old one.
         progress: called with the number of answered cases and the number of all cases.
@@ -91,8 +93,10 @@ def answer(
     }
     done, failed = len(entries) - len(work), {}
     progress(done, len(entries))
+    if scheduler is not None:
+        jobs, cases_per_process = 0, len(work)  # a cluster renews its workers itself
     for batch in _batches(work, cases_per_process * max(jobs, 1)):
-        with _single_threaded(), executor(jobs) as pool:
+        with _single_threaded(), executor(jobs, scheduler) as pool:
             for name, problem in results(pool, _answer_case, batch):
                 done += 1
                 progress(done, len(entries))

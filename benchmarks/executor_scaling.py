@@ -19,6 +19,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
+from typing import Any
 
 from ventbench.executor import executor, in_order
 from ventbench.stress.score import score_stress
@@ -53,9 +54,10 @@ def opened(workers: int, cluster: bool) -> Iterator[Executor]:
         with executor(workers) as pool:
             yield pool
         return
-    from distributed import LocalCluster
+    import distributed
 
-    with LocalCluster(
+    local: Any = distributed.LocalCluster
+    with local(
         n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None,
         host="127.0.0.1",
     ) as started, executor(0, started.scheduler_address) as pool:  # fmt: skip

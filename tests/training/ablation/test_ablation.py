@@ -104,8 +104,9 @@ def test_controllers_are_compared(tmp_path):
 @pytest.mark.slow
 def test_a_training_in_another_process_is_that_in_this_one(tmp_path):
     def compare(folder: str, workers: int) -> pd.DataFrame:
+        lungs: Any = Textbook()
         return controllers.compare(
-            Textbook(), tmp_path / folder, (0,), config=SMALL, only=[], draws=1, gains=GAINS,
+            lungs, tmp_path / folder, (0,), config=SMALL, only=[], draws=1, gains=GAINS,
             workers=workers,
         )  # fmt: skip
 

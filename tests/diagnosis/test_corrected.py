@@ -155,7 +155,7 @@ def test_a_function_has_corrected_pressures_but_no_plants(breaths, fake):
     )
     assert correction.plants == {}
     np.testing.assert_allclose(correction.pressures["after"], after)
-    assert "has no plant that could be corrected" in correction.notes[0]
+    assert f"no plant stands behind {simulators.name} that" in correction.notes[0]
 
 
 @pytest.mark.parametrize("label", [(20.0, 20.0), (50.0, 10.0), (5.0, 50.0)])

@@ -170,17 +170,34 @@ def test_what_is_needed_beyond_R_and_C(name):
         near(found.C, 20.0, 0.04)
 
 
-def test_a_late_sensor_is_told_beside_the_circuit_that_would_do_the_same():
-    """One lung cannot tell them apart: R c of tubing is the time constant of a sensor."""
-    plain = recording(20.0, 20.0, n=20, seed=5)
-    late = plain.pressure.copy()
+def late_by(recorded: Breaths, lag: float) -> Breaths:
+    """The recording with a pressure sensor of time constant ``lag``, s."""
+    late = recorded.pressure.copy()
     for k in range(1, late.shape[1]):
-        kept = np.exp(-plain.dt[:, k - 1] / 0.03)
-        late[:, k] = kept * late[:, k - 1] + (1 - kept) * plain.pressure[:, k - 1 : k + 1].mean(1)
-    (term,) = only(replace(plain, pressure=late)).terms
+        kept = np.exp(-recorded.dt[:, k - 1] / lag)
+        middle = recorded.pressure[:, k - 1 : k + 1].mean(axis=1)
+        late[:, k] = kept * late[:, k - 1] + (1 - kept) * middle
+    return replace(recorded, pressure=late)
+
+
+def test_a_late_sensor_is_told_beside_the_circuit_that_would_do_the_same():
+    """One linear lung cannot tell them apart: R c of tubing is the time constant of a sensor."""
+    (term,) = only(late_by(recording(20.0, 20.0, n=20, seed=5), 0.03)).terms
     assert term.name == "circuit_compliance"
     assert term.alternatives == ("sensor_lag",)
     near(term.parameters["equivalent_lag"], 0.03, 0.1)
+
+
+@pytest.mark.parametrize(("R", "quadratic", "lag"), [(20.0, 30.0, 0.03), (10.0, 0.0, 0.08)])
+def test_a_sensor_that_no_circuit_could_delay_as_much_is_named(R, quadratic, lag):
+    """A parabolic resistor tells the two apart, and so does a lag that would need 8 mL/cmH2O."""
+    rohrer = lambda V, Q, slope, t, p: quadratic * Q * np.abs(Q)  # noqa: E731
+    found = only(late_by(recording(R, 50.0, rohrer, n=20, seed=5, sigma=0.02), lag))
+    terms = {term.name: term for term in found.terms}
+    assert "circuit_compliance" not in terms
+    near(terms["sensor_lag"].parameters["tau"], lag, 0.15)
+    assert set(terms) <= {"sensor_lag", "turbulent_resistance"}
+    near(found.C, 50.0, 0.05)
 
 
 def test_a_leak_is_gas_that_does_not_come_back():

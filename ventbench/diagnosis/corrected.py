@@ -107,10 +107,11 @@ def correct(
     }
     if not simulators.has_plants:
         note = (
-            f"{simulators.name} has no plant that could be corrected, so there is no "
-            "corrected.json; the corrected pressures of the recorded breaths are in the diagnosis."
+            f"There is no corrected.json, since no plant stands behind {simulators.name} that "
+            "could be corrected; the corrected pressures of the recorded breaths are in the "
+            "diagnosis."
         )
-        return Correction(final, errors, {}, chosen, unchanged, (*notes, _capital(note)))
+        return Correction(final, errors, {}, chosen, unchanged, (*notes, note))
     given = {
         name: simulators.plant_of_breath(breaths, int(index[0]))
         for name, index in breaths.by_lung_index.items()
@@ -304,7 +305,3 @@ def _square(evaluator: Evaluator, model: FittedModel, partition: Partition) -> f
     data = partition.data
     error = (evaluator.predict(model, partition) - data.measured) * data.weight
     return float(np.sum(error**2))
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

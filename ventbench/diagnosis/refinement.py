@@ -276,9 +276,19 @@ def special_case_of(
     white = fit_with_white_noise(evaluator, selected)
     candidates = screen_mechanisms(selected, white, evaluator.settings, names)
     comparison = compare_candidates(evaluator, selected, candidates, white)
-    if comparison is None:
+    # R, C and the valves that were fitted beside the term are near the truth; those fitted without
+    # it make up for the effect, and a fit that starts from them may end in a local minimum.
+    trials = parallel_map(
+        lambda name: evaluator.fit(
+            selected.hypothesis.plus(Hypothesis((name,))), noise, unnamed.full
+        ),
+        [name for name in names if not varies_by_breath(name)],
+    )
+    if comparison is not None:
+        trials.append(comparison.ranked[0].fitted)
+    if not trials:
         return None
-    first = comparison.ranked[0].fitted
+    first = min(trials, key=lambda trial: evaluator.criterion(trial, noise))
     best = fit_with_noise(evaluator, first.hypothesis, first)
     by_name = best.log_likelihood_at(noise) - without.log_likelihood
     if by_name < evaluator.settings.refinement.related_share * whole:

@@ -35,11 +35,11 @@ from ventbench.mechanics.segments import Segment, clipped_share, segments
 from ventbench.mechanics.soundness import problem_with
 from ventbench.mechanics.term_selection import (
     FEWEST_BREATHS,
-    CircuitEstimate,
+    DelayEstimate,
     SelectedTerm,
-    behind_circuit,
-    circuit_compliance,
+    delay,
     select_terms,
+    without_delay,
 )
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id.fit import t_quantile
@@ -132,11 +132,10 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
             f"{name}: no piece of a breath has pressure with flow or volume for about a second; "
             "record longer pieces"
         )
-    circuit = circuit_compliance(measured)
-    compliance = circuit.compliance.value if circuit else 0.0
-    at_lung = tuple(behind_circuit(segment, compliance) for segment in measured)
+    delayed_by = delay(measured)
+    at_lung = tuple(without_delay(segment, delayed_by) for segment in measured)
     table = cross_products(at_lung)
-    selected = select_terms(table)
+    selected = select_terms(table, delayed_by)
     full = _fit_lung(table, selected, at_lung, breaths)
     plain = _fit_lung(table, _quadratic_resistance(table), at_lung, breaths)
     label = Lung(float(breaths.R[0]), float(breaths.C[0]))
@@ -158,7 +157,7 @@ def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
         known = tuple(sorted(known, key=lambda setting: setting != label))
     return Mechanics(
         name, best.resistance(0.0), best.compliance(), full.offset(),
-        (*_circuit_term(circuit, best), *(full.term(term) for term in selected)),
+        (*_delay_term(delayed_by, best), *(full.term(term) for term in selected)),
         match, known, noise, len(table), samples, notes,
     )  # fmt: skip
 
@@ -198,22 +197,19 @@ def _best_for_label(full: LungFit, plain: LungFit, label: Lung) -> LungFit:
     return plain
 
 
-def _circuit_term(circuit: CircuitEstimate | None, lung: LungFit) -> tuple[Term, ...]:
-    """The compliance of the circuit, and the lag of a pressure sensor that would do the same.
-
-    Behind a circuit of compliance c, a linear lung has ``p (1 + c / C) + R c dp/dt = R Q + V / C``;
-    with a sensor that lags by tau, it has ``p + tau dp/dt = R Q + V / C``. The two are one
-    equation, so that one lung cannot tell them apart.
-    """
-    if circuit is None:
+def _delay_term(delayed_by: DelayEstimate | None, lung: LungFit) -> tuple[Term, ...]:
+    """The delay; for a circuit also the lag of a pressure sensor that would do the same."""
+    if delayed_by is None:
         return ()
-    shared = lung.resistance(0.0).value / (1.0 + circuit.compliance.value / lung.compliance().value)
-    low, high = circuit.compliance.ci95
-    lag = Estimate(
-        1e-3 * shared * circuit.compliance.value, "s", (1e-3 * shared * low, 1e-3 * shared * high)
-    )
-    parameters = {"compliance": circuit.compliance, "equivalent_lag": lag}
-    return (Term("circuit_compliance", parameters, circuit.nats, circuit.effect, ("sensor_lag",)),)
+    name, value = delayed_by.name, delayed_by.value
+    if name == "circuit_compliance":
+        shared = lung.resistance(0.0).value / (1.0 + value.value / lung.compliance().value)
+        low, high = (1e-3 * shared * end for end in value.ci95)
+        lag = Estimate(1e-3 * shared * value.value, "s", (low, high))
+        parameters = {"compliance": value, "equivalent_lag": lag}
+    else:
+        parameters = {"tau": value}
+    return (Term(name, parameters, delayed_by.nats, delayed_by.effect, delayed_by.alternatives),)
 
 
 def _notes(

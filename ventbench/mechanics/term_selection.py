@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,12 +44,6 @@ _MOST_UNCERTAINTY = 0.1
 #: Fewest breaths that can be split, and most terms.
 FEWEST_BREATHS, MOST_TERMS = 4, 5
 
-#: Circuit compliances to choose from, mL/cmH2O.
-_COMPLIANCES = tuple(float(c) for c in np.arange(0.0, 4.01, 0.25))
-
-#: Least circuit compliance that is reported, mL/cmH2O, and its least standard deviation.
-_LEAST_COMPLIANCE, _LEAST_DEVIATION = 0.1, 0.02
-
 
 @dataclass(frozen=True)
 class SelectedTerm:
@@ -77,14 +71,24 @@ class _Trial:
     passes: bool
 
 
-def select_terms(table: CrossProducts) -> tuple[SelectedTerm, ...]:
-    """Select the terms that are needed beyond R and C, forward, with backward checks."""
+def select_terms(
+    table: CrossProducts, delayed_by: DelayEstimate | None = None
+) -> tuple[SelectedTerm, ...]:
+    """Select the terms that are needed beyond R and C, forward, with backward checks.
+
+    Args:
+        table: cross products of the breaths, without the delay.
+        delayed_by: the delay. A lag of the sensor is not sought twice, as negative inertance.
+    """
+    positive = POSITIVE
+    if delayed_by is not None and delayed_by.name == _SENSOR.name:
+        positive = (*positive, "inertance")
     selected: list[SelectedTerm] = []
     dropped: set[str] = set()
     while len(table) >= FEWEST_BREATHS and len(selected) < MOST_TERMS:
         columns = _columns(selected)
         excluded = {term.name for term in selected} | dropped
-        trials = [_trial(table, columns, name) for name in TERMS if name not in excluded]
+        trials = [_trial(table, columns, name, positive) for name in TERMS if name not in excluded]
         passing = [trial for trial in trials if trial.passes]
         if not passing:
             break
@@ -96,7 +100,7 @@ def select_terms(table: CrossProducts) -> tuple[SelectedTerm, ...]:
         # The new term may make an earlier one superfluous.
         for term in selected[:-1]:
             rest = [other for other in selected if other is not term]
-            if not _trial(table, _columns(rest), term.name).passes:
+            if not _trial(table, _columns(rest), term.name, positive).passes:
                 selected = rest
                 dropped.add(term.name)
     return tuple(selected)
@@ -106,20 +110,22 @@ def _columns(selected: list[SelectedTerm]) -> tuple[int, ...]:
     return (*range(len(BASE)), *(term.column for term in selected))
 
 
-def _trial(table: CrossProducts, columns: tuple[int, ...], name: str) -> _Trial:
+def _trial(
+    table: CrossProducts, columns: tuple[int, ...], name: str, positive: tuple[str, ...]
+) -> _Trial:
     """Try one more term: its best column on all breaths, and its gain on held-out breaths."""
     every = np.ones(len(table), bool)
-    column = _best_column(table, every, columns, name)
+    column = _best_column(table, every, columns, name, positive)
     whole = fit(table, every, (*columns, column))
     ratios, gains = [], []
     for train in splits(len(table)):
-        trained = _best_column(table, train, columns, name)
+        trained = _best_column(table, train, columns, name, positive)
         richer = fit(table, train, (*columns, trained))
         # Split likelihood ratio: since the null hypothesis is fitted to the held-out breaths
         # themselves, a ratio above 1 / alpha has a probability below alpha, whatever the model.
         null = fit(table, ~train, columns)
         ratio = log_likelihood(table, richer) - log_likelihood(table, null)
-        ratios.append(float(ratio[~train].sum()) if _allowed(name, richer) else -np.inf)
+        ratios.append(float(ratio[~train].sum()) if _allowed(name, richer, positive) else -np.inf)
         known = log_likelihood(table, richer) - log_likelihood(table, fit(table, train, columns))
         gains.append(np.where(train, np.nan, known))
     nats = float(np.logaddexp.reduce(ratios) - np.log(len(ratios)))
@@ -129,7 +135,7 @@ def _trial(table: CrossProducts, columns: tuple[int, ...], name: str) -> _Trial:
         nats > LEAST_NATS
         and float(np.mean(by_breath > 0)) >= _LEAST_AGREEMENT
         and size > max(_LEAST_EFFECT, _LEAST_EFFECT_SHARE * whole.sigma)
-        and _allowed(name, whole)
+        and _allowed(name, whole, positive)
         and _plausible(table, whole)
     )
     return _Trial(name, column, nats, float(by_breath.sum()), passes)
@@ -143,7 +149,11 @@ def _plausible(table: CrossProducts, fitted: RegressionFit) -> bool:
 
 
 def _best_column(
-    table: CrossProducts, which: NDArray[np.bool_], columns: tuple[int, ...], name: str
+    table: CrossProducts,
+    which: NDArray[np.bool_],
+    columns: tuple[int, ...],
+    name: str,
+    positive: tuple[str, ...],
 ) -> int:
     """The column of a term with the highest likelihood on some breaths."""
     options = columns_of(name)
@@ -152,15 +162,15 @@ def _best_column(
 
     def value(column: int) -> float:
         fitted = fit(table, which, (*columns, column))
-        if not _allowed(name, fitted):
+        if not _allowed(name, fitted, positive):
             return -np.inf
         return float(log_likelihood(table, fitted)[which].sum())
 
     return max(options, key=value)
 
 
-def _allowed(name: str, fitted: RegressionFit) -> bool:
-    return name not in POSITIVE or fitted.coefficients[-1] > 0.0
+def _allowed(name: str, fitted: RegressionFit, positive: tuple[str, ...]) -> bool:
+    return name not in positive or fitted.coefficients[-1] > 0.0
 
 
 def splits(count: int) -> list[NDArray[np.bool_]]:
@@ -171,54 +181,55 @@ def splits(count: int) -> list[NDArray[np.bool_]]:
 
 
 @dataclass(frozen=True)
-class CircuitEstimate:
-    """Compliance of the circuit between flow sensor and lung.
+class DelayEstimate:
+    """What delays the pressure behind a change of the flow: the circuit, or the pressure sensor.
 
     Attributes:
-        compliance: mL/cmH2O.
+        name: ``circuit_compliance`` or ``sensor_lag``.
+        value: compliance of the circuit between flow sensor and lung, mL/cmH2O, or time constant of
+            the pressure sensor, s.
         nats: log-likelihood ratio on held-out breaths.
         effect: root mean square of what it alone explains, cmH2O.
+        alternatives: the other name if it would explain nearly as much.
     """
 
-    compliance: Estimate
+    name: str
+    value: Estimate
     nats: float
     effect: float
+    alternatives: tuple[str, ...]
 
 
-def circuit_compliance(segments: Sequence[Segment]) -> CircuitEstimate | None:
-    """Estimate the compliance of the circuit; None if the breaths do not need it.
+def delay(segments: Sequence[Segment]) -> DelayEstimate | None:
+    """Estimate what delays the pressure; None if the breaths do not need it.
 
-    The lung's flow is that of the sensor less the circuit's compliance times the rise of the
-    pressure. Since this changes flow and volume in every other term, it is estimated first, on a
-    grid.
+    Since a delay changes the signals of every other term, it is estimated first, on a grid.
+
+    Behind a circuit of compliance c, a linear lung has ``p (1 + c / C) + R c dp/dt = R Q + V / C``;
+    with a sensor that lags by tau, it has ``p + tau dp/dt = R Q + V / C``. One linear lung cannot
+    tell them apart: then the circuit, which every ventilator has, is named. The quadratic part of
+    the resistance tells them apart, and so does a lag for which no circuit is large enough.
     """
-    columns = (*range(len(BASE)), *columns_of("turbulent_resistance"))
-    tables = [
-        cross_products([behind_circuit(s, c) for s in segments], columns) for c in _COMPLIANCES
-    ]
-    null, count = tables[0], len(tables[0])
-    if count < FEWEST_BREATHS:
+    if len({segment.breath for segment in segments}) < FEWEST_BREATHS:
         return None
-    ratios = []
-    for train in splits(count):
-        best = max(tables, key=lambda table: _value(table, train))
-        with_circuit = fit(best, train, range(len(columns)))
-        without_circuit = fit(null, ~train, range(len(columns)))
-        gain = log_likelihood(best, with_circuit) - log_likelihood(null, without_circuit)
-        ratios.append(float(gain[~train].sum()))
-    nats = float(np.logaddexp.reduce(ratios) - np.log(len(ratios)))
-    every = np.ones(count, bool)
-    value = _peak(tables, every)
-    if nats <= LEAST_NATS or value < _LEAST_COMPLIANCE:
+    circuit, sensor = (_likelihoods(segments, family) for family in (_CIRCUIT, _SENSOR))
+    candidates = {
+        family.name: estimate
+        for family, tables in ((_CIRCUIT, circuit), (_SENSOR, sensor))
+        if (estimate := _delay(family, tables)) is not None
+    }
+    if not candidates:
         return None
-    jackknife = [_peak(tables, np.arange(count) != i) for i in range(count)]
-    sd = float(np.sqrt((count - 1) * np.var(jackknife)))
-    reach = t_quantile(max(count - 1, 4)) * max(sd, _LEAST_DEVIATION)
-    ends = (max(value - reach, 0.0), value + reach)
-    nearest = tables[round(value / (_COMPLIANCES[1] - _COMPLIANCES[0]))]
-    variances = [_residual_variance(table, every) for table in (null, nearest)]
-    effect = float(np.sqrt(max(variances[0] - variances[1], 0.0)))
-    return CircuitEstimate(Estimate(value, "mL/cmH2O", ends), nats, effect)
+    every = np.ones(len(circuit[0]), bool)
+    gains = {
+        _CIRCUIT.name: max(map(_scaled_value, circuit, _CIRCUIT.grid)),
+        _SENSOR.name: max(_value(table, every) for table in sensor),
+    }
+    none, most = _value(circuit[0], every), max(gains[name] for name in candidates)
+    least = most - max(LEAST_NATS, _ALTERNATIVE_SHARE * (most - none))
+    best = next(estimate for name, estimate in candidates.items() if gains[name] >= least)
+    others = tuple(name for name in gains if name != best.name and gains[name] >= least)
+    return replace(best, alternatives=others)
 
 
 def behind_circuit(segment: Segment, compliance: float) -> Segment:
@@ -234,9 +245,108 @@ def behind_circuit(segment: Segment, compliance: float) -> Segment:
     )
 
 
+def before_sensor(segment: Segment, lag: float) -> Segment:
+    """The segment with the pressure in front of a sensor of time constant ``lag``, s."""
+    if lag == 0.0:
+        return segment
+    return replace(
+        segment,
+        pressure=segment.pressure + lag * segment.rise,
+        rise=segment.rise + lag * segment.bend,
+        dose=segment.dose + lag * (segment.pressure - segment.pressure[0]),
+    )
+
+
+@dataclass(frozen=True)
+class _DelayFamily:
+    """A cause of a delay: the strengths to choose from, and what it does to the signals.
+
+    Attributes:
+        name: name of the effect.
+        unit: unit of its strength.
+        grid: strengths, equally spaced from zero on.
+        undo: the signals without a delay of some strength.
+        least: least strength that is reported.
+        deviation: least standard deviation of a strength.
+    """
+
+    name: str
+    unit: str
+    grid: tuple[float, ...]
+    undo: Callable[[Segment, float], Segment]
+    least: float
+    deviation: float
+
+
+#: Circuits from 0 to 4 mL/cmH2O, and sensors from 0 to 150 ms. A lag shorter than a sample at
+#: 100 Hz cannot be told from clocks that differ, so that it is not reported.
+_CIRCUIT = _DelayFamily(
+    "circuit_compliance", "mL/cmH2O", tuple(np.arange(0.0, 4.01, 0.25).tolist()), behind_circuit,
+    least=0.1, deviation=0.02,
+)  # fmt: skip
+_SENSOR = _DelayFamily(
+    "sensor_lag", "s", tuple(np.arange(0.0, 0.1501, 0.01).tolist()), before_sensor,
+    least=0.01, deviation=0.001,
+)  # fmt: skip
+
+
+def without_delay(segment: Segment, estimate: DelayEstimate | None) -> Segment:
+    """The segment as it would be without the delay."""
+    if estimate is None:
+        return segment
+    undo = _CIRCUIT.undo if estimate.name == _CIRCUIT.name else _SENSOR.undo
+    return undo(segment, estimate.value.value)
+
+
+def _likelihoods(segments: Sequence[Segment], family: _DelayFamily) -> list[CrossProducts]:
+    """Cross products of R, C and the quadratic part of the resistance, for each strength."""
+    columns = (*range(len(BASE)), *columns_of("turbulent_resistance"))
+    return [
+        cross_products([family.undo(segment, strength) for segment in segments], columns)
+        for strength in family.grid
+    ]
+
+
+def _delay(family: _DelayFamily, tables: Sequence[CrossProducts]) -> DelayEstimate | None:
+    """The strength of a delay; None if held-out breaths do not need it."""
+    null, count = tables[0], len(tables[0])
+    columns = range(null.products.shape[-1] - 1)
+    ratios = []
+    for train in splits(count):
+        best = max(tables, key=lambda table: _value(table, train))
+        ratio = log_likelihood(best, fit(best, train, columns))
+        ratio = ratio - log_likelihood(null, fit(null, ~train, columns))
+        ratios.append(float(ratio[~train].sum()))
+    nats = float(np.logaddexp.reduce(ratios) - np.log(len(ratios)))
+    every = np.ones(count, bool)
+    value = _peak(family, tables, every)
+    if nats <= LEAST_NATS or value < family.least:
+        return None
+    jackknife = [_peak(family, tables, np.arange(count) != i) for i in range(count)]
+    sd = float(np.sqrt((count - 1) * np.var(jackknife)))
+    reach = t_quantile(max(count - 1, 4)) * max(sd, family.deviation)
+    ends = (max(value - reach, 0.0), value + reach)
+    nearest = tables[round(value / family.grid[1])]
+    variances = [_residual_variance(table, every) for table in (null, nearest)]
+    effect = float(np.sqrt(max(variances[0] - variances[1], 0.0)))
+    return DelayEstimate(family.name, Estimate(value, family.unit, ends), nats, effect, ())
+
+
 def _value(table: CrossProducts, which: NDArray[np.bool_]) -> float:
     fitted = fit(table, which, range(table.products.shape[-1] - 1))
     return float(log_likelihood(table, fitted)[which].sum())
+
+
+def _scaled_value(table: CrossProducts, compliance: float) -> float:
+    """Log-likelihood behind a circuit, for residuals of the measured pressure.
+
+    The residuals of a lung behind a circuit are larger by ``1 + c / C``, which says nothing about
+    the circuit, but would decide between it and a sensor.
+    """
+    every = np.ones(len(table), bool)
+    elastance = fit(table, every, range(table.products.shape[-1] - 1)).coefficients[1]
+    scale = 1.0 + max(elastance, 0.0) * compliance / 1000.0
+    return _value(table, every) + float(table.freedom.sum() * np.log(scale))
 
 
 def _residual_variance(table: CrossProducts, which: NDArray[np.bool_]) -> float:
@@ -245,13 +355,13 @@ def _residual_variance(table: CrossProducts, which: NDArray[np.bool_]) -> float:
     return fitted.sigma**2 / (1.0 - GRID[fitted.grid] ** 2)
 
 
-def _peak(tables: Sequence[CrossProducts], which: NDArray[np.bool_]) -> float:
-    """Compliance of the largest likelihood, by a parabola through the best of the grid."""
+def _peak(family: _DelayFamily, tables: Sequence[CrossProducts], which: NDArray[np.bool_]) -> float:
+    """Strength of the largest likelihood, by a parabola through the best of the grid."""
     values = np.array([_value(table, which) for table in tables])
     k = int(np.argmax(values))
     if k in (0, len(values) - 1):
-        return _COMPLIANCES[k]
+        return family.grid[k]
     left, middle, right = values[k - 1 : k + 2]
     bend = left - 2.0 * middle + right
     shift = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
-    return _COMPLIANCES[k] + float(np.clip(shift, -0.5, 0.5)) * (_COMPLIANCES[1] - _COMPLIANCES[0])
+    return family.grid[k] + float(np.clip(shift, -0.5, 0.5)) * family.grid[1]

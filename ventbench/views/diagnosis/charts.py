@@ -261,7 +261,7 @@ def _panel(
     seen = [recorded[within], *(simulated[key][within] for key, _ in looks if key != "before")]
     near = Chart(
         (low, high), limits(*seen), "", "magnified, cmH2O",
-        f"{name.capitalize()} from {low:.2f} to {high:.2f} s, magnified.", height=130.0,
+        f"{name[:1].upper() + name[1:]} from {low:.2f} to {high:.2f} s, magnified.", height=130.0,
     )  # fmt: skip
     for chart, part in ((pressure, slice(None)), (near, within)):
         chart.line("seen", time[part], recorded[part])

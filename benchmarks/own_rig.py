@@ -11,16 +11,17 @@ a valve that nobody has looked at. The steps are those that a laboratory would t
    run all of them on the rig, under noise and deviations that are the same for all.
 
 Usage: ``python benchmarks/own_rig.py [--out DIR] [--rig NAME] [--json FILE] [--page FILE]``.
-``--page docs/own_rig.md`` writes the tables into the page. Finished parts are kept in ``--out``.
+``--page docs/own_rig.md`` writes the tables into the page. Diagnosis, simulators and each training
+are kept in ``--out`` when they are finished, so that the same command continues.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from ventbench.interfaces import Controller, Plant
 from ventbench.lungs import lung
 from ventbench.metrics.score import run_error
 from ventbench.physics import physics
+from ventbench.resume import WorkFolder
 from ventbench.training import pid_grid
 from ventbench.training.exploration import ExplorationRanges, SimulatedVentilator, explore
 from ventbench.training.residual import ResidualConfig, train_residual
@@ -118,34 +120,33 @@ def errors(controller: Controller, plant: Plant) -> tuple[float, Floats]:
     return float(out[0].mean()), out[1].mean(axis=-1)
 
 
-def trained_on(
-    simulator: Any, plant: Plant, out: Path, seeds: Sequence[int], updates: int
-) -> dict[str, Any]:
-    """Train a PID and networks on a simulator, and run them on the rig.
+def tuned_on(simulator: Any, plant: Plant) -> dict[str, Any]:
+    """Tune a PID on a simulator, and run it on the rig.
 
     Returns:
-        Errors on the simulator (``promised``) and on the rig, cmH2O.
+        Gains, and errors on the simulator (``promised``) and on the rig, cmH2O.
     """
     grid, _ = pid_grid.tune_pid([LUNG], simulator=simulator, gains=gains(), single=False)
     best, promised = grid.best(LUNG)
     nominal, drawn = errors(PID(*best), plant)
-    result: dict[str, Any] = {
-        "pid": {"gains": list(best), "promised": promised, "rig": nominal, "draws": drawn.tolist()}
-    }
-    networks = []
-    for seed in seeds:
-        trained = train_residual(
-            [LUNG],
-            out / f"residual-{seed}",
-            config=ResidualConfig(updates=updates, members=1, agreement=0.0),
-            seed=seed,
-            gains=gains(),
-            simulator=simulator,
-        )
-        nominal, drawn = errors(trained.controllers[LUNG], plant)
-        promised = trained.report["networks"][LUNG]["error"][LUNG]
-        networks.append({"promised": promised, "rig": nominal, "draws": drawn.tolist()})
-    return result | {"residual": networks}
+    return {"gains": list(best), "promised": promised, "rig": nominal, "draws": drawn.tolist()}
+
+
+def trained_on(
+    simulator: Any, best: Sequence[float], plant: Plant, out: Path, seed: int, updates: int
+) -> dict[str, Any]:
+    """Train a network on a simulator, and run it on the rig; errors as of :func:`tuned_on`."""
+    trained = train_residual(
+        [LUNG],
+        out,
+        config=ResidualConfig(updates=updates, members=1, agreement=0.0),
+        seed=seed,
+        gains=np.array([best]),  # the grid was searched before
+        simulator=simulator,
+    )
+    nominal, drawn = errors(trained.controllers[LUNG], plant)
+    promised = trained.report["networks"][LUNG]["error"][LUNG]
+    return {"promised": promised, "rig": nominal, "draws": drawn.tolist()}
 
 
 def difference(first: Floats, second: Floats, resamples: int = 2000) -> tuple[float, float, float]:
@@ -167,40 +168,43 @@ def difference(first: Floats, second: Floats, resamples: int = 2000) -> tuple[fl
 def run(
     name: str, out: Path, breaths: int, iterations: int, seeds: Sequence[int], updates: int
 ) -> dict[str, Any]:
-    """Close the loop on one rig; a finished result in ``out`` is read."""
-    settings = [name, breaths, iterations, list(seeds), updates]
-    done = out / "result.json"
-    if done.is_file() and (result := json.loads(done.read_text()))["settings"] == settings:
-        return result
-    concealed, folder = RIGS[name], out / "recordings"
-    plant = rig_of(concealed)
-    folder.mkdir(parents=True, exist_ok=True)
-    recorded = record(plant, folder / "rig.csv", breaths)
-    diagnosis = diagnose(recorded, simulator="physics")
-    diagnosis.save(out / "diagnosis")
-    missing = [mechanism.name for mechanism in diagnosis.mechanisms]
+    """Close the loop on one rig; finished parts are read from ``out``."""
+    concealed, plant = RIGS[name], rig_of(RIGS[name])
+    settings = {"rig": name, "words": concealed.words, "breaths": breaths}
+    settings |= {"iterations": iterations, "updates": updates}
+    work, folder = WorkFolder(out / "parts", settings), out / "recordings"
+
+    def diagnosed() -> list[str]:
+        folder.mkdir(parents=True, exist_ok=True)
+        diagnosis = diagnose(record(plant, folder / "rig.csv", breaths), simulator="physics")
+        diagnosis.save(out / "diagnosis")
+        return [mechanism.name for mechanism in diagnosis.mechanisms]
+
+    missing = work.get("missing", diagnosed)
     print(f"{name}: missing {', '.join(missing) or 'nothing'}", flush=True)
-    corrected = out / "diagnosis" / "corrected.json"
-    simulators: dict[str, Any] = {
-        SIMULATORS[0]: {LUNG: physics(lung(LUNG))},
-        SIMULATORS[1]: corrected if corrected.is_file() else None,
-        SIMULATORS[2]: None,
-        SIMULATORS[3]: {LUNG: plant},
-    }
+    simulators: dict[str, Any] = {SIMULATORS[0]: {LUNG: physics(lung(LUNG))}}
+    corrected, learned = out / "diagnosis" / "corrected.json", out / "learned"
+    if corrected.is_file():
+        simulators[SIMULATORS[1]] = corrected
     if iterations:
-        config = RigConfig(resamples=2, fit=FitConfig(iterations=iterations))
-        train_rigs(folder, out / "learned", config=config)
-        simulators[SIMULATORS[2]] = out / "learned"
+        if not (learned / "manifest.toml").is_file():
+            config = RigConfig(resamples=2, fit=FitConfig(iterations=iterations))
+            train_rigs(folder, learned, config=config)
+        simulators[SIMULATORS[2]] = learned
+    simulators[SIMULATORS[3]] = {LUNG: plant}
     rows = {}
-    for number, (label, simulator) in enumerate(simulators.items()):
-        if simulator is None:
-            continue
-        rows[label] = trained_on(simulator, plant, out / f"trained-{number}", seeds, updates)
-        for part in (rows[label]["pid"], *rows[label]["residual"]):
+    for label, simulator in simulators.items():
+        number = SIMULATORS.index(label)
+        pid = work.get(f"pid-{number}", partial(tuned_on, simulator, plant))
+        networks = []
+        for seed in seeds:
+            place = out / f"trained-{number}" / f"residual-{seed}"
+            train = partial(trained_on, simulator, pid["gains"], plant, place, seed, updates)
+            networks.append(work.get(f"residual-{number}-{seed}", train))
+        rows[label] = {"pid": pid, "residual": networks}
+        for part in (pid, *networks):
             print(f"{label:24} {part['promised']:6.3f} -> {part['rig']:6.3f} cmH2O", flush=True)
-    result = {"settings": settings, "missing": missing, "trained_on": rows}
-    files.write_json(done, result)
-    return result
+    return {"missing": missing, "trained_on": rows}
 
 
 def table(name: str, result: Mapping[str, Any]) -> str:

@@ -8,18 +8,15 @@ from __future__ import annotations
 import dataclasses
 import html
 import math
-import platform
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-import ventbench
 from ventbench import files, protocol
 from ventbench.metrics.figures import time_above_alarm
 from ventbench.metrics.score import passes_safety_gate, run_error
@@ -31,6 +28,7 @@ from ventbench.stress.run import TRACK, StressDraws, StressRun, draw_cells, step
 from ventbench.stress.stressors import VERSION, Condition, conditions, stressor
 from ventbench.submissions.errors import Failure, SubmissionError
 from ventbench.submissions.folder import Submission, as_submission
+from ventbench.submissions.result import package_versions
 from ventbench.submissions.rig_scoring import load_rigs
 from ventbench.submissions.runner import (
     CountingRunner,
@@ -133,11 +131,7 @@ class StressScore(StressTables):
             "sandbox": None if self.sandbox is None else dict(self.sandbox),
             "submission": {"sha256": self.submission.sha256, **dataclasses.asdict(manifest)},
             "simulators": None if self.simulators is None else dict(self.simulators),
-            "versions": {
-                "ventbench": ventbench.__version__,
-                "python": platform.python_version(),
-                **{name: version(name) for name in ("jax", "jaxlib", "numpy")},
-            },
+            "versions": package_versions(),
             "timing": dict(self.timing),
         }
 

@@ -188,11 +188,7 @@ class Score:
                 **dataclasses.asdict(manifest),
             },
             "simulators": None if self.simulators is None else dict(self.simulators),
-            "versions": {
-                "ventbench": ventbench.__version__,
-                "python": platform.python_version(),
-                **{name: version(name) for name in ("jax", "jaxlib", "numpy")},
-            },
+            "versions": package_versions(),
             "timing": dict(self.timing),
         }
 
@@ -350,6 +346,15 @@ class Score:
             "commands": total,
             "share": (below + above) / total,
         }
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of ventbench, Python and the packages that compute a score."""
+    return {
+        "ventbench": ventbench.__version__,
+        "python": platform.python_version(),
+        **{name: version(name) for name in ("jax", "jaxlib", "numpy")},
+    }
 
 
 def _official_simulators(version: int) -> str:

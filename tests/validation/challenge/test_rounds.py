@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from functools import partial
 
@@ -106,6 +107,33 @@ def test_processes_make_room_for_new_ones(made, tmp_path):
     assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
     firsts = [value["first_in_process"] for value in folder.answers().values()]
     assert firsts == [True, False, True]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")  # of Dask's own, about ports and closing
+def test_a_cluster_that_loses_a_worker_answers_all(made, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="the extra ventbench[dask] is missing")
+    folder = ChallengeFolder(tmp_path / "c")
+    shutil.copytree(made[0], folder.path, ignore=shutil.ignore_patterns("answers", "requests"))
+    killed = []
+
+    def lose_one(done, total):
+        if done == 1:
+            worker = next(iter(cluster.workers.values()))
+            os.kill(worker.pid, 9)
+            killed.append(worker.pid)
+
+    started = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None,
+        host="127.0.0.1", local_directory=str(tmp_path),
+    )  # fmt: skip
+    with started as cluster:
+        failed = answer(
+            folder, scheduler=cluster.scheduler_address, diagnose=sees_nothing, progress=lose_one
+        )
+    assert failed == {}
+    assert len(killed) == 1
+    assert sorted(folder.answers()) == sorted(folder.cases())
 
 
 def test_a_recording_that_cannot_be_read_does_not_stop_the_others(tmp_path):

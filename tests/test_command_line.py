@@ -4,9 +4,11 @@ import json
 import subprocess
 import sys
 
+import pytest
 from typer.testing import CliRunner
 
 from ventbench import cli
+from ventbench.errors import InputError
 from ventbench.sandbox.runner import SandboxRunner
 
 STOPPED = """
@@ -88,6 +90,25 @@ def test_doctor_names_what_is_missing(monkeypatch):
     ended = CliRunner().invoke(cli.app, ["doctor"])
     assert ended.exit_code == 1
     assert "not official: the sandbox lacks seccomp" in " ".join(ended.stdout.split())
+
+
+def test_completion_is_offered():
+    text = CliRunner().invoke(cli.app, ["--help"], terminal_width=200).stdout
+    assert "--install-completion" in text
+    assert "--show-completion" in text
+
+
+def test_without_the_extra_a_report_is_refused_before_anything_is_scored(monkeypatch, tmp_path):
+    from ventbench.submissions import scoring
+
+    monkeypatch.setattr(scoring, "score", lambda *_, **__: pytest.fail("scored first"))
+    for missing in ("jinja2", "rerun"):
+        monkeypatch.setitem(sys.modules, missing, None)
+        wanted = ["score", "pid_best", "--out", str(tmp_path), "--report"]
+        ended = CliRunner().invoke(cli.app, wanted)
+        assert isinstance(ended.exception, InputError)
+        assert f"need {missing}: install ventbench[view]" in str(ended.exception)
+        monkeypatch.delitem(sys.modules, missing)
 
 
 def test_quiet_stands_before_or_behind_a_command():

@@ -1,12 +1,18 @@
 """The scripts of examples/ run as they stand."""
 
+import ast
 import importlib.util
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+
+from ventbench.controllers.pid import PID
+from ventbench.interfaces import Observation
 
 ROOT = Path(__file__).parents[1]
 SCRIPTS = sorted((ROOT / "examples").glob("*.py"))
@@ -20,6 +26,29 @@ def test_the_readme_lists_every_script():
     listed = (ROOT / "examples" / "README.md").read_text("utf-8")
     assert len(SCRIPTS) >= 4
     assert not [path.name for path in SCRIPTS if f"[{path.name}]({path.name})" not in listed]
+
+
+def test_the_corrected_pid_without_a_correction_is_the_pid():
+    """Of the script that needs another library: the class that it puts into its submission."""
+    tree = ast.parse((ROOT / "examples" / "train_stable_baselines3.py").read_text("utf-8"))
+    (written,) = [node for node in tree.body if getattr(node, "name", "") == "CorrectedPID"]
+    names: dict[str, Any] = {"np": np}
+    exec(compile(ast.Module([written], []), "example", "exec"), names)
+    corrected, alone = names["CorrectedPID"](), PID(*names["CorrectedPID"].GAINS)
+    rng, state, before = np.random.default_rng(0), alone.init((3,)), np.zeros(3)
+    for k in range(40):
+        target, pressure = np.full(3, 25.0), rng.uniform(5.0, 30.0, 3)
+        time, dt = 0.03 * (k % 33), 0.03  # a second breath begins after 33 steps
+        ahead = np.tile(target[:, None], 10)
+        x = [pressure / 40, target / 40, *(ahead.T / 40), before / 50 - 1]
+        seen = corrected.see(np.stack([*x, np.full(3, time), np.full(3, dt / 0.03)], axis=-1))
+        assert seen.shape == (3, 26)
+        observation = Observation(time, dt, pressure, target, ahead, before)
+        state, wanted = alone.step(state, observation)
+        before = corrected.command(np.zeros(3))
+        np.testing.assert_allclose(before, np.clip(wanted, 0.0, 100.0), rtol=1e-5, atol=1e-5)
+    larger = corrected.command(np.full(3, 0.2))
+    np.testing.assert_allclose(larger, np.clip(corrected.pid + 10.0, 0.0, 100.0))
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from ventbench import open_loop_report
 from ventbench.cli import app
 from ventbench.errors import InputError
-from ventbench.lungs import LUNG_IDS, lung
+from ventbench.lungs import LUNG_IDS, RECORDED_LUNGS, lung
 from ventbench.open_loop_report import Misfit, OpenLoopReport
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
@@ -135,6 +135,18 @@ def test_breaths_without_a_first_pressure_are_not_judged(breaths):
     assert result["not_judged"] == [2, 6]
     assert [one["breaths"] for one in result["lungs"].values()] == [2, 2]
     assert "2 breaths have no first pressure" in report.misfit_lines()[-1]
+
+
+def test_progress_counts_every_simulated_breath(simulators, breaths):
+    """Three passes, and one for each explanation that a suspect breath is tried with."""
+    told = []
+    open_loop_report.open_loop(breaths, progress=lambda *counts: told.append(counts))
+    assert told == [(6, 18), (12, 18), (18, 18)]
+    told.clear()
+    wrong = replace(breaths, C=np.where(breaths.breath_id == 1, 50.0, breaths.C))
+    open_loop_report.open_loop(wrong, progress=lambda *counts: told.append(counts))
+    tried = len(open_loop_report.GAINS) + len(RECORDED_LUNGS)
+    assert told[2:] == [(18, 18), *((18 + k, 18 + tried) for k in range(1, tried + 1))]
 
 
 def test_many_misfits_are_told_in_few_lines():

@@ -148,7 +148,10 @@ class OpenLoopReport:
         return title + frame.to_html(float_format="%.2f") + below
 
 
-def open_loop(breaths: Breaths | Path | str, simulator: Given = "frozen") -> OpenLoopReport:
+def open_loop(
+    breaths: Breaths | Path | str, simulator: Given = "frozen",
+    *, progress: Callable[[int, int], object] | None = None,
+) -> OpenLoopReport:  # fmt: skip
     """Measure how far simulators stray from recorded breaths under the recorded commands.
 
     The error of a breath is the mean |simulated - recorded| pressure over its inspiratory samples,
@@ -158,6 +161,8 @@ def open_loop(breaths: Breaths | Path | str, simulator: Given = "frozen") -> Ope
         breaths: n recorded breaths, or the path of a recording.
         simulator: a name, a file, a plant, plants by lung, a function of commands or an array of
             simulated pressures ``(n, T)``; see :func:`ventbench.load_simulators`.
+        progress: called with how many breaths have been simulated and how many there are; the
+            second number grows if breaths do not seem to fit their label.
 
     Returns:
         Errors by lung, and the breaths that do not fit their label.
@@ -175,12 +180,24 @@ def open_loop(breaths: Breaths | Path | str, simulator: Given = "frozen") -> Ope
         breaths = load(breaths)
     official = frozen.load()
     tested = load_simulators(simulator, breaths=breaths)
-    error = mean_errors(tested.pressures(breaths), breaths)
-    crossed = mean_errors(tested.pressures(breaths, cross_fitted=True), breaths)
-    held_out, unseen = tested.held_out(breaths), tested.unseen(breaths)
     # Whether a label is wrong can be asked where there are official simulators to compare with.
     recorded = {lung.id for lung in RECORDED_LUNGS}
     known = [index for lung, index in breaths.by_lung_index.items() if lung in recorded]
+    done, total = 0, 2 * len(breaths) + sum(map(len, known))
+
+    def count(simulated: int) -> None:
+        nonlocal done
+        done += simulated
+        if progress is not None:
+            progress(done, total)
+
+    def more(simulated: int) -> None:
+        nonlocal total
+        total += simulated
+
+    error = mean_errors(tested.pressures(breaths, progress=count), breaths)
+    crossed = mean_errors(tested.pressures(breaths, cross_fitted=True, progress=count), breaths)
+    held_out, unseen = tested.held_out(breaths), tested.unseen(breaths)
     doubtful: Sequence[Misfit] = ()
     if known:
         judged = breaths.select(np.sort(np.concatenate(known)))
@@ -188,8 +205,10 @@ def open_loop(breaths: Breaths | Path | str, simulator: Given = "frozen") -> Ope
             official.cross_fitted,
             lambda plants, gain: replace(plants, slopes=plants.slopes * gain),
             judged,
-            errors(official.cross_fitted, judged),
+            errors(official.cross_fitted, judged, count),
             tuple((lung.R, lung.C) for lung in RECORDED_LUNGS),
+            more,
+            count,
         )
     apart = np.isin(breaths.breath_id, [misfit.breath_id for misfit in doubtful])
 
@@ -218,9 +237,11 @@ def _shown(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def errors(plants_for: PlantsFor, breaths: Breaths) -> Floats:
+def errors(
+    plants_for: PlantsFor, breaths: Breaths, progress: Callable[[int], object] | None = None
+) -> Floats:
     """Open-loop MAE of each breath by some plants; see :func:`mean_errors`."""
-    return mean_errors(open_loop_breaths(plants_for, breaths), breaths)
+    return mean_errors(open_loop_breaths(plants_for, breaths, progress), breaths)
 
 
 def mean_errors(simulated: Floats, breaths: Breaths) -> Floats:
@@ -243,6 +264,8 @@ def misfits(
     breaths: Breaths,
     error: Floats,
     settings: tuple[tuple[float, float], ...],
+    expected: Callable[[int], object] = lambda simulated: None,
+    progress: Callable[[int], object] = lambda simulated: None,
 ) -> list[Misfit]:
     """Find breaths that do not fit their label.
 
@@ -255,20 +278,23 @@ def misfits(
         breaths: n breaths.
         error: error of each breath under its label, cmH2O, shape ``(n,)``.
         settings: the (R, C) that are tried.
+        expected: called once with the number of breaths that will be simulated, if any.
+        progress: called with numbers of breaths, as they are done.
     """
     index = np.flatnonzero(error > SUSPECT)
     if index.size == 0:
         return []
+    expected((len(settings) + len(GAINS)) * index.size)
     suspects = breaths.select(index)
     names, explained = [], []
     for r, c in settings:
         other = replace(suspects, R=np.full(index.size, r), C=np.full(index.size, c))
         names.append(f"lung R{r:g}C{c:g}")
-        explained.append(errors(plants_for, other))
+        explained.append(errors(plants_for, other, progress))
     for gain in GAINS:
         names.append(f"valve gain x {gain:g}")
         explained.append(
-            errors(lambda part, gain=gain: with_gain(plants_for(part), gain), suspects)
+            errors(lambda part, gain=gain: with_gain(plants_for(part), gain), suspects, progress)
         )
     best = np.argmin(explained, axis=0)
     least = np.min(explained, axis=0)

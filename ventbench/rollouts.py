@@ -51,7 +51,9 @@ def open_loop(plant: Plant, start: Array, u_in: Array, u_out: Array, dt: Array) 
     return jnp.concatenate([start[:, None], jnp.moveaxis(pressure, 0, 1)], axis=1)
 
 
-def open_loop_breaths(plants_for: PlantsFor, breaths: Breaths) -> NDArray[np.float64]:
+def open_loop_breaths(
+    plants_for: PlantsFor, breaths: Breaths, progress: Callable[[int], object] | None = None
+) -> NDArray[np.float64]:
     """Pressures that plants answer to the commands of recorded breaths with, in batches.
 
     Each breath starts at its first recorded pressure.
@@ -59,6 +61,7 @@ def open_loop_breaths(plants_for: PlantsFor, breaths: Breaths) -> NDArray[np.flo
     Args:
         plants_for: see :data:`PlantsFor`.
         breaths: n breaths of T samples.
+        progress: called with the number of breaths of each batch, as it is done.
 
     Returns:
         cmH2O, shape ``(n, T)``; NaN for a breath whose first pressure is blank.
@@ -74,6 +77,8 @@ def open_loop_breaths(plants_for: PlantsFor, breaths: Breaths) -> NDArray[np.flo
             start, *commands = (jnp.asarray(x, float) for x in columns)
             answer = open_loop(plants_for(part), start, *commands)
             parts.append(np.asarray(answer)[: min(batch, n - first)])
+            if progress is not None:
+                progress(len(parts[-1]))
     return np.concatenate(parts)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -132,6 +133,16 @@ def test_whose_each_record_is(leaderboard: Path, tmp_path: Path) -> None:
     assert withdrawal["name"] == scores[0].name
     assert f"{len(rows)} records in" in text
     assert scores[0].sha256[:8] in text
+
+
+def test_without_the_extra_the_board_is_shown_and_a_page_says_what_it_needs(
+    leaderboard: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for missing in ("jinja2", "markupsafe"):
+        monkeypatch.setitem(sys.modules, missing, None)
+    name = store.load(leaderboard).scores[0].name
+    assert name in run("show", "--folder", leaderboard)
+    assert "need jinja2: install ventbench[view]" in run("build", "--folder", leaderboard, code=2)
 
 
 def test_tables_fit_80_columns(full: Path, monkeypatch: pytest.MonkeyPatch) -> None:

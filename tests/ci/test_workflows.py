@@ -127,6 +127,19 @@ def test_only_the_tests_fill_a_cache():
     assert [path.stem for path in FILES if "cache:" in path.read_text()] == ["test"]
 
 
+def test_slow_tests_run_on_schedule_and_branches_may_be_main_or_master():
+    started = read(FOLDER / "test.yml")[True]
+    assert started["schedule"][0]["cron"]
+    assert started["push"]["branches"] == ["main", "master"]
+    slow = read(FOLDER / "test.yml")["jobs"]["slow"]
+    assert any("make test-slow" in step.get("run", "") for step in slow["steps"])
+
+
+def test_actions_are_kept_up_to_date():
+    (update,) = read(FOLDER.parent / "dependabot.yml")["updates"]
+    assert update["package-ecosystem"] == "github-actions"
+
+
 def test_the_advisory_job_can_only_read():
     content = read(FOLDER / "score-pr.yml")
     assert list(content[True]) == ["pull_request"]

@@ -16,6 +16,7 @@ import typer.main
 from _pytest.mark.structures import ParameterSet
 
 from ventbench.cli import app
+from ventbench.interfaces import Observation, Task
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted(
@@ -92,6 +93,29 @@ def test_commands_parse(page: Path) -> None:
     """Every command exists and takes the options that the page gives it."""
     problems = {line: problem for line in commands(page) if (problem := parse(line))}
     assert not problems
+
+
+def test_the_page_of_commands_names_every_command() -> None:
+    text = (ROOT / "docs" / "commands.md").read_text("utf-8")
+    top: Any = typer.main.get_command(app)
+    for name, command in top.commands.items():
+        for inner in getattr(command, "commands", ()) or [""]:
+            known = f"ventbench {name} {inner}".rstrip() in text or f"`{inner}`" in text
+            assert known, f"{name} {inner}"
+
+
+def test_the_page_of_submissions_names_all_that_a_controller_sees() -> None:
+    text = (ROOT / "submissions" / "README.md").read_text("utf-8")
+    for field in (*Task._fields, *Observation._fields):
+        assert f"- `{field}`:" in text
+
+
+def test_a_resistance_has_one_unit() -> None:
+    """R is in cmH2O/(L/s) everywhere; "cmH2O s/L" is the same and looks like another."""
+    other = re.compile(r"cmH2O ?[*·]? ?s ?/ ?L\b")
+    assert other.search("R in cmH2O s/L")
+    pages = [*PAGES, *ROOT.glob("*/README.md"), *ROOT.glob("ventbench/cli/*.py")]
+    assert not [page.name for page in pages if other.search(page.read_text("utf-8"))]
 
 
 def test_wrong_commands_do_not_parse() -> None:

@@ -15,7 +15,8 @@ from typer.testing import CliRunner
 from tests.diagnosis import made
 from ventbench.cli import mechanics as command
 from ventbench.errors import InputError
-from ventbench.recordings import Breaths, join, write
+from ventbench.mechanics import identify
+from ventbench.recordings import Breaths, join, load, write
 
 app = typer.Typer()
 command.register(app)
@@ -61,6 +62,15 @@ def test_lungs_of_the_public_schema(recording, tmp_path):
     assert large["C"]["value"] == pytest.approx(50.0, rel=0.1)
     assert large["match"]["fitted_R"] == pytest.approx(20.0, rel=0.15)
     assert json.loads(run(recording, "--json", "-")) == [small, large]
+
+
+def test_progress_counts_breaths_lung_by_lung(recording):
+    told = []
+    identify(load(recording), lambda *counts: told.append(counts))
+    assert told == sorted(told)
+    assert len(set(told)) > 6
+    assert (6, 12) in told
+    assert told[-1] == (12, 12)
 
 
 def test_another_label_is_said_so(tmp_path):

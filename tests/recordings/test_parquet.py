@@ -34,6 +34,18 @@ def test_a_bad_value_names_its_row(table, tmp_path):
     assert caught.value.value == "104.2"
 
 
+def test_progress_ends_at_the_whole_file(make, tmp_path):
+    """Bytes of text, rows of Parquet."""
+    for name in ("lab.csv", "lab.csv.gz", "lab.parquet"):
+        path = tmp_path / name
+        write(make(3), path)
+        whole = 24 if name == "lab.parquet" else path.stat().st_size
+        for read in (load, check):
+            told = []
+            read(path, progress=lambda *counts, told=told: told.append(counts))
+            assert told[-1] == (whole, whole), name
+
+
 def test_wrong_types(table, tmp_path):
     words = pa.array([str(x) for x in table["u_in"].to_pylist()])
     floats = pa.array(np.asarray(table["breath_id"], dtype=float))

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, emit, waiting
+from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, bars, counted, emit, waiting
 
 #: Breaths that are explored side by side.
 _TOGETHER = 60
@@ -37,8 +37,9 @@ def check(
     """
     from ventbench import recordings
 
-    with waiting(f"reading {file}"):
-        report = recordings.check(file, clip=clip, pad=pad)
+    with bars() as shown:
+        reading = counted(shown, f"reading {file}")
+        report = recordings.check(file, clip=clip, pad=pad, progress=reading)
     emit(report.to_dict(), json)
     for line in report.lines():
         typer.echo(line, err=str(json) == "-")

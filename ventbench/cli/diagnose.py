@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, claim_out, emit, notes, waiting
+from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, claim_out, counted, emit, notes
+from ventbench.cli.options import bars as progress_bars
 
 #: Share of a diagnosis before which its remaining time is a guess.
 _TOO_EARLY = 0.15
@@ -85,8 +86,9 @@ def diagnose(
         raise InputError("--patient and --passive contradict each other; choose one of them")
     extras.require("jinja2", "rerun")
     said = notes()
-    with waiting(f"reading {recordings}"):
-        breaths = files.load(recordings, clip=clip, pad=pad)
+    with progress_bars() as shown:
+        reading = counted(shown, f"reading {recordings}")
+        breaths = files.load(recordings, clip=clip, pad=pad, progress=reading)
     for note in breaths.notes:
         said.print(f"note: {note}", markup=False, highlight=False)
     diagnosis = _diagnose(breaths, plant, simulated, lung, patient, drive)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ventbench.cli.options import Clip, JsonFile, Pad, emit, waiting
+from ventbench.cli.options import Clip, JsonFile, Pad, bars, counted, emit
 
 if TYPE_CHECKING:
     from ventbench.mechanics import Mechanics, SurveyedRun
@@ -36,13 +37,12 @@ def mechanics(
 
     console = Console(stderr=str(json) == "-")
     if _is_respiraworks(recordings):
-        with waiting(f"identifying the lungs of {recordings}"):
-            runs = _survey(recordings)
+        with bars() as shown:
+            runs = _survey(recordings, counted(shown, f"identifying the lungs of {recordings}"))
         emit([_run(run) for run in runs], json)
         _say_runs(console, runs)
         return
-    with waiting(f"identifying the lungs of {recordings}"):
-        lungs = _identify(recordings, clip=clip, pad=pad)
+    lungs = _identify(recordings, clip=clip, pad=pad)
     emit([_lung(lung) for lung in lungs], json)
     console.print(_table(lungs))
     for lung in lungs:
@@ -65,11 +65,11 @@ def _is_respiraworks(path: Path) -> bool:
         return False
 
 
-def _survey(path: Path) -> tuple[SurveyedRun, ...]:
+def _survey(path: Path, progress: Callable[[int, int], None]) -> tuple[SurveyedRun, ...]:
     from ventbench.errors import InputError
     from ventbench.mechanics import survey
 
-    runs = survey(path)
+    runs = survey(path, progress)
     if all(run.mechanics is None for run in runs):
         raise InputError(f"{path}: no run has flow or volume; log one of them beside pressure")
     return runs
@@ -80,14 +80,17 @@ def _identify(path: Path, *, clip: bool, pad: bool) -> tuple[Mechanics, ...]:
     from ventbench.errors import InputError
     from ventbench.mechanics import identify
 
-    breaths = recordings.load(path, clip=clip, pad=pad)
+    with bars() as shown:
+        reading = counted(shown, f"reading {path}")
+        breaths = recordings.load(path, clip=clip, pad=pad, progress=reading)
     if breaths.flow is None and breaths.volume is None:
         raise InputError(
             f"{path}: there is neither a column flow (mL/s) nor volume (mL); record one of them, "
             "or use `ventbench diagnose`, which needs the pressure only"
         )
     try:
-        return identify(breaths)
+        with bars() as shown:
+            return identify(breaths, counted(shown, f"identifying the lungs of {path}"))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from ventbench import protocol
-from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, emit, notes, waiting
+from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, bars, counted, emit, notes
 
 
 def lungs(
@@ -159,8 +159,9 @@ def open_loop(
     from ventbench.errors import InputError
 
     said = notes()
-    with waiting(f"reading {recordings}"):
-        breaths = files.load(recordings, clip=clip, pad=pad)
+    with bars() as shown:
+        reading = counted(shown, f"reading {recordings}")
+        breaths = files.load(recordings, clip=clip, pad=pad, progress=reading)
     for note in breaths.notes:
         said.print(f"note: {note}", markup=False, highlight=False)
     if not np.isfinite(breaths.pressure).any():
@@ -168,8 +169,9 @@ def open_loop(
             f"{recordings}: all pressures are blank; fill them in: there is nothing to compare a "
             "simulator with"
         )
-    with waiting(f"simulating {len(breaths)} breaths"):
-        result = open_loop_report.open_loop(breaths, plant)
+    with bars() as shown:
+        simulating = counted(shown, f"simulating {len(breaths)} breaths")
+        result = open_loop_report.open_loop(breaths, plant, progress=simulating)
     emit(result.as_dict(), json)
     console = Console(stderr=str(json) == "-")
     console.print(_open_loop_table(result.as_dict()))

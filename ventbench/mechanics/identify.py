@@ -116,23 +116,45 @@ class Mechanics:
     notes: tuple[str, ...]
 
 
-def identify(breaths: Breaths) -> tuple[Mechanics, ...]:
+#: Shares of the time that a lung takes, measured: smoothing, and what delays the pressure.
+_SMOOTHING, _DELAY = 0.15, 0.7
+
+
+def identify(
+    breaths: Breaths, progress: Callable[[int, int], object] | None = None
+) -> tuple[Mechanics, ...]:
     """Identify each lung of a recording with flow or volume.
+
+    Args:
+        breaths: the recording.
+        progress: called with how much is done and of how much, in breaths: the breaths of the
+            lungs that are identified, and a share of those of the lung under way.
 
     Raises:
         InputError: if neither is recorded, or too little of a lung to tell R from C.
     """
-    return tuple(_identify_lung(name, part) for name, part in breaths.by_lung().items())
+    lungs, done = [], 0
+    for name, part in breaths.by_lung().items():
+
+        def told(share: float, done: int = done, count: int = len(part)) -> None:
+            if progress is not None:
+                progress(done + int(share * count), len(breaths))
+
+        lungs.append(_identify_lung(name, part, told))
+        told(1.0)
+        done += len(part)
+    return tuple(lungs)
 
 
-def _identify_lung(name: str, breaths: Breaths) -> Mechanics:
+def _identify_lung(name: str, breaths: Breaths, told: Callable[[float], None]) -> Mechanics:
     measured = segments(breaths)
     if not measured:
         raise InputError(
             f"{name}: no piece of a breath has pressure with flow or volume for about a second; "
             "record longer pieces"
         )
-    delayed_by = delay(measured)
+    told(_SMOOTHING)
+    delayed_by = delay(measured, lambda share: told(_SMOOTHING + _DELAY * share))
     at_lung = tuple(without_delay(segment, delayed_by) for segment in measured)
     table = cross_products(at_lung)
     selected = select_terms(table, delayed_by)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,17 +64,26 @@ def breaths_of(run: RespiraWorksRun) -> Breaths:
     )  # fmt: skip
 
 
-def survey(path: str | os.PathLike[str]) -> tuple[SurveyedRun, ...]:
+def survey(
+    path: str | os.PathLike[str], progress: Callable[[int, int], object] | None = None
+) -> tuple[SurveyedRun, ...]:
     """Identify the lung of every run of a RespiraWorks file.
+
+    Args:
+        path: the file.
+        progress: called with how many runs have been identified and how many there are.
 
     Raises:
         RecordingError: if the file cannot be read.
     """
     surveyed = []
-    for run in load_respiraworks(path):
+    runs = load_respiraworks(path)
+    for run in runs:
         breaths = breaths_of(run)
         measured = breaths.flow is not None or breaths.volume is not None
         surveyed.append(SurveyedRun(run, identify(breaths)[0] if measured else None))
+        if progress is not None:
+            progress(len(surveyed), len(runs))
     return tuple(surveyed)
 
 

@@ -200,7 +200,9 @@ class DelayEstimate:
     alternatives: tuple[str, ...]
 
 
-def delay(segments: Sequence[Segment]) -> DelayEstimate | None:
+def delay(
+    segments: Sequence[Segment], progress: Callable[[float], object] = lambda share: None
+) -> DelayEstimate | None:
     """Estimate what delays the pressure; None if the breaths do not need it.
 
     Since a delay changes the signals of every other term, it is estimated first, on a grid.
@@ -209,10 +211,21 @@ def delay(segments: Sequence[Segment]) -> DelayEstimate | None:
     with a sensor that lags by tau, it has ``p + tau dp/dt = R Q + V / C``. One linear lung cannot
     tell them apart: then the circuit, which every ventilator has, is named. The quadratic part of
     the resistance tells them apart, and so does a lag for which no circuit is large enough.
+
+    Args:
+        segments: pieces of the recording.
+        progress: called with the share of the grids that is done.
     """
     if len({segment.breath for segment in segments}) < FEWEST_BREATHS:
         return None
-    circuit, sensor = (_likelihoods(segments, family) for family in (_CIRCUIT, _SENSOR))
+    steps, done = len(_CIRCUIT.grid) + len(_SENSOR.grid), 0
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        progress(done / steps)
+
+    circuit, sensor = (_likelihoods(segments, family, step) for family in (_CIRCUIT, _SENSOR))
     candidates = {
         family.name: estimate
         for family, tables in ((_CIRCUIT, circuit), (_SENSOR, sensor))
@@ -298,13 +311,17 @@ def without_delay(segment: Segment, estimate: DelayEstimate | None) -> Segment:
     return undo(segment, estimate.value.value)
 
 
-def _likelihoods(segments: Sequence[Segment], family: _DelayFamily) -> list[CrossProducts]:
+def _likelihoods(
+    segments: Sequence[Segment], family: _DelayFamily, step: Callable[[], None]
+) -> list[CrossProducts]:
     """Cross products of R, C and the quadratic part of the resistance, for each strength."""
     columns = (*range(len(BASE)), *columns_of("turbulent_resistance"))
-    return [
-        cross_products([family.undo(segment, strength) for segment in segments], columns)
-        for strength in family.grid
-    ]
+    tables = []
+    for strength in family.grid:
+        undone = [family.undo(segment, strength) for segment in segments]
+        tables.append(cross_products(undone, columns))
+        step()
+    return tables
 
 
 def _delay(family: _DelayFamily, tables: Sequence[CrossProducts]) -> DelayEstimate | None:

@@ -149,12 +149,16 @@ class Simulators:
             return np.ones(len(breaths), bool)
         return self._training.unseen(breaths)
 
-    def pressures(self, breaths: Breaths, *, cross_fitted: bool = False) -> Floats:
+    def pressures(
+        self, breaths: Breaths, *, cross_fitted: bool = False,
+        progress: Callable[[int], object] | None = None,
+    ) -> Floats:  # fmt: skip
         """Open-loop answers to recorded commands, each from the first recorded pressure.
 
         Args:
             breaths: n breaths of T samples.
             cross_fitted: True for the answers of the plants of :meth:`cross_fitted`.
+            progress: called with numbers of breaths, as they are done.
 
         Returns:
             cmH2O, shape ``(n, T)``; NaN for a breath whose first pressure is blank.
@@ -164,12 +168,15 @@ class Simulators:
                 another shape, or a table lacks a breath.
         """
         if self._function is not None:
-            return self._by_function(self._function, breaths)
+            return self._by_function(self._function, breaths, progress)
         if self._for_breaths is None:
-            return self._by_table(breaths)
+            answers = self._by_table(breaths)
+            if progress is not None:
+                progress(len(breaths))
+            return answers
         plants_for = self.cross_fitted if cross_fitted else self.for_breaths
         try:
-            return open_loop_breaths(plants_for, breaths)
+            return open_loop_breaths(plants_for, breaths, progress)
         except jax.errors.JAXTypeError as error:
             raise InputError(
                 f"{self.name}: JAX cannot trace this plant's init or step "
@@ -211,7 +218,10 @@ class Simulators:
             return f"{self.name} is a function of whole commands, not a plant with init and step."
         return f"{self.name} holds simulated pressures of recorded breaths, not a simulator."
 
-    def _by_function(self, function: PythonSimulator, breaths: Breaths) -> Floats:
+    def _by_function(
+        self, function: PythonSimulator, breaths: Breaths,
+        progress: Callable[[int], object] | None,
+    ) -> Floats:  # fmt: skip
         answers = np.full(breaths.pressure.shape, np.nan)
         for i, start in enumerate(breaths.pressure[:, 0].tolist()):
             if np.isfinite(start):
@@ -224,6 +234,8 @@ class Simulators:
                     function, u_in[samples], u_out[samples], dt[samples], label, start, what, flow
                 )
                 answers[i, samples], answers[i, ~samples] = answer, answer[-1]
+            if progress is not None:
+                progress(1)
         return answers
 
     def _call(

@@ -32,6 +32,8 @@ class CsvSource:
         warnings: about columns that are ignored.
         sha256: SHA-256 of the file on disk; None until all chunks are read.
         block: bytes of text that are read at a time.
+        size: bytes of the file.
+        done: bytes that have been read.
     """
 
     file: str
@@ -41,6 +43,8 @@ class CsvSource:
     sha256: str | None = None
     place: str = field(default="line", init=False)
     block: int = BLOCK
+    size: int = field(default=0, init=False)
+    done: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
         """Read and check the header.
@@ -50,6 +54,7 @@ class CsvSource:
         """
         self.names = _header(self.file, self.kind)
         self.warnings = check_header(self.file, self.names, 1)
+        self.size = os.path.getsize(self.file)
 
     def chunks(self) -> Iterator[Chunk]:
         """Yield the rows in order.
@@ -99,6 +104,7 @@ class CsvSource:
         for batch in batches:
             if batch.num_rows:
                 chunk = chunk_of_batch(batch, row0, last_id)
+                self.done = reader.count
                 yield chunk
                 row0 += len(chunk)
                 last_id = int(chunk.columns["breath_id"][-1])
@@ -257,6 +263,7 @@ class HashingReader:
         """Open the file at `path`."""
         self._stream = open(path, "rb")  # noqa: SIM115 (closed by close)
         self._hash = hashlib.sha256()
+        self.count = 0  # bytes that have been read
 
     @property
     def closed(self) -> bool:
@@ -267,6 +274,7 @@ class HashingReader:
         """Read and hash up to `size` bytes."""
         data = self._stream.read(size)
         self._hash.update(data)
+        self.count += len(data)
         return data
 
     def readable(self) -> bool:

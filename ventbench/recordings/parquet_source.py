@@ -30,6 +30,8 @@ class ParquetSource:
         warnings: about columns that are ignored.
         sha256: SHA-256 of the file; None until all chunks are read.
         batch: rows that are read at a time.
+        size: rows of the file.
+        done: rows that have been read.
     """
 
     file: str
@@ -39,6 +41,8 @@ class ParquetSource:
     sha256: str | None = None
     place: str = field(default="row", init=False)
     batch: int = BATCH
+    size: int = field(default=0, init=False)
+    done: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
         """Read and check names and types.
@@ -76,10 +80,12 @@ class ParquetSource:
         row0, last_id = 0, None
         try:
             with parquet.ParquetFile(self.file) as stream:
+                self.size = stream.metadata.num_rows
                 columns = [name for name in COLUMNS if name in self.names]
                 for batch in stream.iter_batches(self.batch, columns=columns):
                     if batch.num_rows:
                         chunk = chunk_of_batch(batch, row0, last_id)
+                        self.done = row0 + len(chunk)
                         yield chunk
                         row0 += len(chunk)
                         last_id = int(chunk.columns["breath_id"][-1])

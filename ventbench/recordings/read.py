@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -29,13 +29,20 @@ VARIABLE = "VENTBENCH_RECORDINGS"
 FilePath = str | os.PathLike[str]
 
 
-def load(path: FilePath, *, clip: bool = False, pad: bool = False) -> Breaths:
+#: What is told how much of a file has been read, and of how much: bytes, or rows of Parquet.
+Progress = Callable[[int, int], object]
+
+
+def load(
+    path: FilePath, *, clip: bool = False, pad: bool = False, progress: Progress | None = None
+) -> Breaths:
     """Read a recording (CSV, gzipped CSV or Parquet) into memory.
 
     Args:
         path: the file.
         clip: clip u_in to 0..100 %.
         pad: accept breaths of unequal length and pad the short ones (see `Breaths`).
+        progress: called with how much has been read and of how much, block by block.
 
     Returns:
         All breaths; `notes` says what was inferred, interpolated or ignored.
@@ -55,6 +62,8 @@ def load(path: FilePath, *, clip: bool = False, pad: bool = False) -> Breaths:
     blocks: list[Block] = []
     for block in scan(source, log, clip=clip):
         tally.add(block)
+        if progress is not None:
+            progress(source.done, source.size)
         if log.counts["problem"]:
             blocks.clear()
         else:
@@ -68,13 +77,16 @@ def load(path: FilePath, *, clip: bool = False, pad: bool = False) -> Breaths:
     return replace(breaths, sha256=source.sha256, notes=notes)
 
 
-def check(path: FilePath, *, clip: bool = False, pad: bool = False) -> RecordingReport:
+def check(
+    path: FilePath, *, clip: bool = False, pad: bool = False, progress: Progress | None = None
+) -> RecordingReport:
     """Check a recording; needs about 80 bytes of memory a breath.
 
     Args:
         path: the file.
         clip: see `load`.
         pad: see `load`.
+        progress: see `load`.
 
     Returns:
         What the file holds and what is wrong with it; also for a file that cannot be read. A file
@@ -87,6 +99,8 @@ def check(path: FilePath, *, clip: bool = False, pad: bool = False) -> Recording
         source = open_source(path)
         for block in scan(source, log, clip=clip):
             tally.add(block)
+            if progress is not None:
+                progress(source.done, source.size)
         _check_whole(source, tally, log, pad=pad)
     except RecordingError as error:
         kind = source.kind if source else None

@@ -117,7 +117,7 @@ class Mechanics:
 
 
 #: Shares of the time that a lung takes, measured: smoothing, and what delays the pressure.
-_SMOOTHING, _DELAY = 0.15, 0.7
+_SMOOTHING, _DELAY = 0.08, 0.62
 
 
 def identify(

@@ -173,6 +173,8 @@ def networks(
     out: Annotated[
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ] = Path("runs/networks"),
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
     json: JsonFile = None,
 ) -> None:
     """Change windows, width, depth and boundary networks of the paper's simulators, one at a time.
@@ -191,7 +193,7 @@ def networks(
     with bars() as shown:
         task = shown.add_task("networks", total=1.0)
         breaths = work.compare(
-            folder, out, only=only,
+            folder, out, only=only, workers=workers, scheduler=scheduler,
             progress=lambda what, share: shown.update(task, completed=share, description=what),
         )  # fmt: skip
     table = work.summary(breaths)

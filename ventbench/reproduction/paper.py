@@ -75,7 +75,8 @@ def reproduce_paper(
             ``recordings``, architectures; an hour on 2 cores.
         out: folder in which ``full`` keeps finished trainings, so that the same call continues.
         seeds: trainings of each method in the learning curves.
-        workers: processes for grid and entries; 0 for this one alone.
+        workers: processes for grid, entries and the studies of controllers and networks; 0 for
+            this one alone.
         scheduler: address of a Dask scheduler instead.
         gains: P, I, D, %/cmH2O, shape ``(G, 3)``; the paper's 8,000 if not given. They must
             contain those of the paper's table.
@@ -103,7 +104,9 @@ def reproduce_paper(
         tell("errors by horizon", 0.0)
         kept["horizon"] = simulators.measure_horizon(Path(recordings) / MEASURED)
     if full:
-        kept |= _studies(Path(out), None if recordings is None else Path(recordings), seeds, tell)
+        source = None if recordings is None else Path(recordings)
+        parallel = {"workers": workers, "scheduler": scheduler}
+        kept |= _studies(Path(out), source, seeds, parallel, tell)
     with executor(workers, scheduler) as pool:
         tell("PID grid", 0.1)
         grid = pid_grid.search(
@@ -166,9 +169,9 @@ def _scored(name: str, track: str, version: int) -> tuple[Floats, Floats]:
 
 
 def _studies(
-    out: Path, recordings: Path | None, seeds: int, tell: Progress
+    out: Path, recordings: Path | None, seeds: int, parallel: Mapping[str, Any], tell: Progress
 ) -> dict[str, dict[str, Any]]:
-    """Run the studies of minutes again, as JSON values."""
+    """Run the studies of minutes again, as JSON values; ``parallel``: workers and scheduler."""
     from ventbench.training import study
     from ventbench.training.ablation import controllers, networks
     from ventbench.training.residual import ResidualConfig
@@ -182,7 +185,7 @@ def _studies(
     kept["samples"] = stored_samples(curves, seeds)
     config = ResidualConfig(updates=1000)
     runs = controllers.compare(
-        frozen.load(), out / "controllers", [0], config=config,
+        frozen.load(), out / "controllers", [0], config=config, **parallel,
         progress=lambda what, share: tell(f"controllers: {what}", share),
     )  # fmt: skip
     known = controllers.variants(config)
@@ -196,7 +199,7 @@ def _studies(
     }
     if recordings is not None:
         breaths = networks.compare(
-            recordings, out / "networks",
+            recordings, out / "networks", **parallel,
             progress=lambda what, share: tell(f"networks: {what}", share),
         )  # fmt: skip
         names = {"depth": "depth", "N_B": "boundaries", "H_p": "pressures", "H_c": "controls"}

@@ -132,6 +132,22 @@ def test_the_table_of_controllers_pairs_seeds():
 
 
 @pytest.mark.slow
+def test_networks_of_another_process_are_those_of_this_one(tmp_path, make_synthetic):
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    write(make_synthetic(each=2), folder / simulator.MEASURED)
+    write(make_synthetic(each=1, seed=1, first_id=1000), folder / simulator.RECONSTRUCTED)
+
+    def compare(out: str, workers: int) -> pd.DataFrame:
+        return networks.compare(
+            folder, tmp_path / out, base=TINY, config=LearnedConfig(steps=1, batch=2), members=2,
+            only=[], workers=workers,
+        )  # fmt: skip
+
+    pd.testing.assert_frame_equal(compare("there", 1), compare("here", 0))
+
+
+@pytest.mark.slow
 def test_networks_are_compared(tmp_path, make_synthetic):
     folder, out = tmp_path / "recordings", tmp_path / "out"
     folder.mkdir()

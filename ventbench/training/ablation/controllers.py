@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 
 from ventbench import files, precision, protocol, rollouts
 from ventbench.board.replay import spread
-from ventbench.executor import InProcess, executor, results
 from ventbench.interfaces import Controller
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics.score import passes_safety_gate, run_error
@@ -25,6 +23,7 @@ from ventbench.plants.stacking import take
 from ventbench.resume import WorkFolder
 from ventbench.submissions.scoring import protocol_cells
 from ventbench.training import pid_grid
+from ventbench.training.ablation.trainings import Progress, Tell, finish
 from ventbench.training.residual import ResidualConfig, fit
 
 #: Published draws to score on.
@@ -35,9 +34,6 @@ BASE = "base"
 
 #: Figures by which trainings are compared.
 FIGURES = ("nominal", "draws", "exploitation")
-
-#: Called with what is trained and the share of all that is done.
-Progress = Callable[[str, float], None]
 
 Gains = tuple[float, float, float]
 
@@ -130,27 +126,15 @@ def compare(
     trainings = {
         f"{name.replace(' ', '-')}-{seed}": (name, seed) for name in chosen for seed in seeds
     }
-    done = [part for part in trainings if work.has(part)]
-    for number, part in enumerate(done):
-        progress(trainings[part][0], number / len(trainings))
-    with executor(workers, scheduler) as pool:
-
-        def tell(part: str, share: float) -> None:
-            progress(trainings[part][0], (len(done) + share) / len(trainings))
-
-        def job(part: str) -> tuple[Any, ...]:
-            name, seed = trainings[part]
-            own = (0.0, 0.0, 0.0) if chosen[name].direct else gains
-            # What happens within a training can only be told where it runs here.
-            within = partial(tell, part) if isinstance(pool, InProcess) else None
-            checkpoint = work.checkpoint(part)
-            return simulators, own, chosen[name].config, seed, draws, checkpoint, within
-
-        jobs = {part: job(part) for part in trainings if part not in done}
-        for part, figures in results(pool, _trained, jobs):
-            work.put(part, figures)
-            done.append(part)
-            tell(part, 0.0)
+    jobs = {}
+    for part, (name, seed) in trainings.items():
+        own = (0.0, 0.0, 0.0) if chosen[name].direct else gains
+        checkpoint = work.checkpoint(part)
+        jobs[part] = (simulators, own, chosen[name].config, seed, draws, checkpoint)
+    finish(
+        work, _trained, jobs, workers=workers, scheduler=scheduler,
+        progress=lambda part, share: progress(trainings[part][0], share),
+    )  # fmt: skip
     runs = pd.DataFrame(
         {"variant": name, "seed": seed} | work.read(part)
         for part, (name, seed) in trainings.items()
@@ -186,7 +170,7 @@ def summary(runs: pd.DataFrame) -> pd.DataFrame:
 
 def _trained(
     simulators: frozen.Frozen, gains: Gains, config: ResidualConfig, seed: int, draws: int,
-    checkpoint: Path, tell: Callable[[float], None] | None,
+    checkpoint: Path, tell: Tell | None,
 ) -> dict[str, float]:  # fmt: skip
     def told(done: int, total: int, _: float) -> None:
         if tell is not None:

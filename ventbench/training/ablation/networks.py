@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -20,13 +20,11 @@ from ventbench.plants.stacking import VmappedPlant
 from ventbench.recordings import Breaths
 from ventbench.resume import WorkFolder
 from ventbench.training import simulator
+from ventbench.training.ablation.trainings import Progress, Tell, finish
 from ventbench.training.learned import LearnedConfig
 
 #: Name of the variant that all others are compared with.
 BASE = "base"
-
-#: Called with what is trained and the share of all that is done.
-Progress = Callable[[str, float], None]
 
 
 def variants(base: Architecture) -> dict[str, Architecture]:
@@ -49,6 +47,8 @@ def compare(
     config: LearnedConfig | None = None,
     members: int = simulator.MEMBERS,
     only: Sequence[str] | None = None,
+    workers: int = 0,
+    scheduler: str | None = None,
     progress: Progress = lambda *_: None,
 ) -> pd.DataFrame:
     """Train each variant on each scored lung, once for each fold of the measured breaths.
@@ -63,6 +63,8 @@ def compare(
         config: settings of all trainings.
         members: folds of the measured breaths, and networks of each lung.
         only: names of variants; all if not given. The base is always included.
+        workers: processes, each with a variant at a time; 0 for this one alone.
+        scheduler: address of a Dask scheduler instead, whose workers see the same files.
         progress: see :data:`Progress`.
 
     Returns:
@@ -84,22 +86,21 @@ def compare(
         "architecture": asdict(base), "config": asdict(config), "recordings": hashes,
         "members": members,
     }  # fmt: skip
-    work, tables = WorkFolder(out / "rows", about), []
-    for number, (name, architecture) in enumerate(chosen.items()):
-
-        def tell(share: float, name: str = name, number: int = number) -> None:
-            progress(name, (number + share) / len(chosen))
-
-        def make(
-            architecture: Architecture = architecture, tell: Callable[[float], None] = tell
-        ) -> list[float]:
-            nets = _nets(data, architecture, config, members, work.checkpoint("network"), tell)
-            return _errors(nets, judged, fold).tolist()
-
-        tell(0.0)
-        errors = work.get(name.replace(" ", "-"), make)
-        columns = {"breath_id": judged.breath_id, "lung": judged.lung_ids, "error": errors}
-        tables.append(pd.DataFrame({"variant": name} | columns))
+    work = WorkFolder((out / "rows").resolve(), about)
+    parts = {name.replace(" ", "-"): name for name in chosen}
+    jobs = {
+        part: (data, judged, fold, chosen[name], config, members, work.checkpoint(part))
+        for part, name in parts.items()
+    }
+    finish(
+        work, _judged, jobs, workers=workers, scheduler=scheduler,
+        progress=lambda part, share: progress(parts[part], share),
+    )  # fmt: skip
+    columns = {"breath_id": judged.breath_id, "lung": judged.lung_ids}
+    tables = [
+        pd.DataFrame({"variant": name, **columns, "error": work.read(part)})
+        for part, name in parts.items()
+    ]
     breaths = pd.concat(tables, ignore_index=True)
     files.write_text(out / "breaths.csv", breaths.round(5).to_csv(index=False))
     files.write_text(out / "summary.csv", summary(breaths).round(4).to_csv(index=False))
@@ -122,9 +123,19 @@ def summary(breaths: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def _judged(
+    data: simulator.TrainingRecordings, judged: Breaths, fold: np.ndarray,
+    architecture: Architecture, config: LearnedConfig, members: int, checkpoint: Path,
+    tell: Tell | None,
+) -> list[float]:  # fmt: skip
+    """Train the networks of an architecture; errors as of :func:`_errors`."""
+    nets = _nets(data, architecture, config, members, checkpoint, tell or (lambda share: None))
+    return _errors(nets, judged, fold).tolist()
+
+
 def _nets(
     data: simulator.TrainingRecordings, architecture: Architecture, config: LearnedConfig,
-    count: int, checkpoint: Path, tell: Callable[[float], None],
+    count: int, checkpoint: Path, tell: Tell,
 ) -> Any:  # fmt: skip
     """Networks of the scored lungs, leaves ``(members, 6, ...)``."""
     ids = [lung.id for lung in RECORDED_LUNGS]

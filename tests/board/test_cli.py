@@ -38,9 +38,13 @@ def run(*arguments: object, code: int = 0) -> str:
 
 def test_from_records_to_a_verified_board(drafts, tmp_path: Path) -> None:
     folder = tmp_path / "board"
-    for name in ("pid_best", "softer", "broken"):
-        path = drafts[name].save(tmp_path / "records")
-        assert f"added {name} (performance)" in run("add", path, "--folder", folder)
+    names = ("pid_best", "softer", "broken")
+    paths = [drafts[name].save(tmp_path / "records") for name in names]
+    refused = run("add", *paths, "--supersedes", "f00", "--folder", folder, code=2)
+    assert "--supersedes is about one record" in refused
+    added = run("add", *paths, "--folder", folder)
+    for name in names:
+        assert f"added {name} (performance)" in added
     accept(folder)
     assert "3 records, 5 files, 5 changed" in run("build", "--folder", folder)
     assert "3 records, 5 files, 0 changed" in run("build", "--folder", folder)
@@ -159,6 +163,12 @@ def test_tables_fit_80_columns(full: Path, monkeypatch: pytest.MonkeyPatch) -> N
                 assert f"{own.low:.3f}..{own.high:.3f}" in line
     assert "…" not in text
     assert "broken: not ranked" in text or "broken: not official" in text
+
+
+def test_an_entry_that_nobody_vouches_for_says_so_once(drafts, tmp_path: Path) -> None:
+    run("add", drafts["softer"].save(tmp_path), "--folder", tmp_path / "board")
+    said = " ".join(run("show", "--folder", tmp_path / "board").split())
+    assert "softer: not official: no key of this leaderboard has signed the record" in said
 
 
 def test_a_rerun_elsewhere_replaces_no_official_record(

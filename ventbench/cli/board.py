@@ -28,10 +28,11 @@ SHOWN = 8
 
 @app.command()
 def add(
-    record: Annotated[
-        Path,
+    paths: Annotated[
+        list[Path],
         typer.Argument(
-            help="JSON file of `ventbench score --record DIR`, with its commands next to it."
+            metavar="RECORD...",
+            help="JSON files of `ventbench score --record DIR`, each with its commands next to it.",
         ),
     ],
     supersedes: Annotated[
@@ -48,7 +49,7 @@ def add(
     seed: SeedFile = None,
     folder: Folder = FOLDER,
 ) -> None:
-    """Add a record if its replay gives the recorded numbers.
+    """Add records whose replay gives the recorded numbers.
 
     A sealed record of a season can only be replayed by those who hold the seed of the season
     (--seed); else it is checked once the season is revealed.
@@ -64,16 +65,19 @@ def add(
     about = {key: text for key, _, text in parts}
     if not all(about.values()):
         raise InputError("--source needs KEY=TEXT, such as commit=9c1e5d0")
+    if supersedes is not None and len(paths) > 1:
+        raise InputError("--supersedes is about one record: add the others by themselves")
     if supersedes is not None:
         supersedes = store.find_record(store.load(folder), supersedes).sha256
-    new = create.amend(record, supersedes=supersedes, reason=reason, source=about)
-    if isinstance(records.load(new), records.Sealed):
-        held = seed_of(seed)
-        simulators = None if held is None else frozen.load
-        added = store.add_sealed(folder, new, seed=held, simulators=simulators)
-    else:
-        added = store.add(folder, new, frozen.load)
-    typer.echo(f"added {added.name} ({added.track}): record {added.sha256}")
+    for path in paths:
+        new = create.amend(path, supersedes=supersedes, reason=reason, source=about)
+        if isinstance(records.load(new), records.Sealed):
+            held = seed_of(seed)
+            simulators = None if held is None else frozen.load
+            added = store.add_sealed(folder, new, seed=held, simulators=simulators)
+        else:
+            added = store.add(folder, new, frozen.load)
+        typer.echo(f"added {added.name} ({added.track}): record {added.sha256}")
     typer.echo("next: ventbench board build")
 
 
@@ -300,7 +304,9 @@ def show(
             console.print(_table(track) if track.version == 1 else _normalised_table(track))
             for status, row in track.rows:
                 if status != "ranked":
-                    why = plain("; ".join((status, *row.entry.reasons))[:300])
+                    reasons = row.entry.reasons
+                    said = any(reason.startswith(status) for reason in reasons)
+                    why = plain("; ".join(reasons if said else (status, *reasons))[:300])
                     console.print(f"{row.record.name}: {why}", markup=False, highlight=False)
             if any(row.record.stress for row in track.ranked):
                 console.print(_stress_table(track))

@@ -101,6 +101,20 @@ def test_what_a_nonparametric_term_stands_for_is_named_if_it_is_most_of_it(actin
     assert (named and named.names) == names
 
 
+def test_what_a_term_stands_for_is_named_where_no_mechanism_looks_promising(monkeypatch):
+    """As a lag of the valve where R is large: what was fitted without it makes up for it."""
+    breaths = small.made(small.effect("turbulent_resistance", quadratic=10.0), noise=0.1, seed=2)
+    evaluator, wide = small.split(breaths), small.split_wide(breaths)
+    base = fit_with_noise(evaluator, Hypothesis())
+    full = fit_with_noise(
+        wide, Hypothesis(("flow_shape",)), wide.fit(Hypothesis(), base.noise, base)
+    )
+    monkeypatch.setattr(refinement, "compare_candidates", lambda *_: None)
+    named = special_case_of(evaluator, base, NonparametricFit("flow_shape", full, 100.0))
+    assert named is not None
+    assert named.column("turbulent_resistance.quadratic")[0] == pytest.approx(10.0, rel=0.2)
+
+
 SUM = Hypothesis(("turbulent_resistance", "viscoelasticity", "leak"))
 
 

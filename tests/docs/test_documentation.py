@@ -25,8 +25,8 @@ PAGES = sorted(
     if page.name != "LICENSE.md"
 )
 
-#: What makes a block take minutes on a machine that has compiled nothing yet.
-SLOW = re.compile(r"diagnose\(|train_|\bfit\(")
+#: What makes a block take seconds to minutes on a machine that has compiled nothing yet.
+SLOW = re.compile(r"diagnose\(|train_|\bfit\(|ventbench\.score\(")
 
 
 def blocks(page: Path, language: str) -> list[str]:

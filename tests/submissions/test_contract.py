@@ -67,6 +67,12 @@ def test_our_own_are_ready(name):
     contract.assert_ready(name, InProcessRunner())
 
 
+def test_progress_ends_when_all_rounds_are_done():
+    told = []
+    contract.check("pid_robust", InProcessRunner(), progress=lambda *counts: told.append(counts))
+    assert told[-1][0] == told[-1][1] == len(told)
+
+
 def test_assert_ready_says_all(make):
     folder = make(act="return 'a'")
     with pytest.raises(AssertionError) as caught:

@@ -116,8 +116,11 @@ def test_the_same_seed_gives_the_same_breaths_and_another_others():
 
 
 def test_breaths_can_be_written_and_read(tmp_path):
-    found = explore(ventilator(width=5), "R20C50", 7)
+    told = []
+    count = lambda *counts: told.append(counts)  # noqa: E731
+    found = explore(ventilator(width=5), "R20C50", 7, progress=count)
     assert len(found) == 7
+    assert told == [(5, 7), (7, 7)]
     write(found, tmp_path / "explored.csv")
     again = load(tmp_path / "explored.csv")
     np.testing.assert_array_equal(again.u_in, found.u_in)

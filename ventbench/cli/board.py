@@ -69,15 +69,22 @@ def add(
         raise InputError("--supersedes is about one record: add the others by themselves")
     if supersedes is not None:
         supersedes = store.find_record(store.load(folder), supersedes).sha256
-    for path in paths:
-        new = create.amend(path, supersedes=supersedes, reason=reason, source=about)
-        if isinstance(records.load(new), records.Sealed):
-            held = seed_of(seed)
-            simulators = None if held is None else frozen.load
-            added = store.add_sealed(folder, new, seed=held, simulators=simulators)
-        else:
-            added = store.add(folder, new, frozen.load)
-        typer.echo(f"added {added.name} ({added.track}): record {added.sha256}")
+    done = []
+    try:
+        with bars() as shown:
+            replaying = counted(shown, "replaying records")
+            for path in paths:
+                new = create.amend(path, supersedes=supersedes, reason=reason, source=about)
+                if isinstance(records.load(new), records.Sealed):
+                    held = seed_of(seed)
+                    simulators = None if held is None else frozen.load
+                    done.append(store.add_sealed(folder, new, seed=held, simulators=simulators))
+                else:
+                    done.append(store.add(folder, new, frozen.load))
+                replaying(len(done), len(paths))
+    finally:  # also those before one that is refused
+        for added in done:
+            typer.echo(f"added {added.name} ({added.track}): record {added.sha256}")
     typer.echo("next: ventbench board build")
 
 

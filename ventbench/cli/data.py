@@ -187,7 +187,9 @@ def explore(
     ventilator = exploration.SimulatedVentilator(
         chosen, min(breaths, _TOGETHER), noise=noise, seed=seed
     )
-    made = exploration.explore(ventilator, lung, breaths, seed=seed)
+    with bars() as shown:
+        exploring = counted(shown, f"exploring {lung}")
+        made = exploration.explore(ventilator, lung, breaths, seed=seed, progress=exploring)
     recordings.write(made, out)
     for note in made.notes:
         typer.echo(f"note: {note}", err=True)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from ventbench.cli.options import JsonFile, emit
+from ventbench.cli.options import JsonFile, bars, counted, emit
 
 Family = Literal["pid", "residual", "ppo", "dqn", "other"]
 
@@ -54,7 +54,12 @@ def check(
     from ventbench.submissions import contract
     from ventbench.submissions.runner import InProcessRunner
 
-    report = contract.check(submission, InProcessRunner() if in_process else None)
+    with bars() as shown:
+        report = contract.check(
+            submission,
+            InProcessRunner() if in_process else None,
+            progress=counted(shown, f"running {submission}"),
+        )
     emit(report.to_json(), json)
     for line in report.lines():
         typer.echo(line, err=str(json) == "-")

@@ -66,8 +66,15 @@ _OTHER_ADVICE = "see the limits of the sandbox in docs/submitting.md"
 _TO_RUN: tuple[Group, ...] = ("run", "repeat", "time")
 
 
+#: Rounds of a check: plain runs, the timed one, and three in one process with two resets between.
+_ROUNDS = STEPS + STEPS + 3 * STEPS + 2
+
+
 def check(
-    name: str, runner: Runner | None = None, clock: Callable[[], float] = time.perf_counter
+    name: str,
+    runner: Runner | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+    progress: Callable[[int, int], object] | None = None,
 ) -> CheckReport:
     """Find everything that is wrong with a submission.
 
@@ -78,6 +85,7 @@ def check(
         name: path of a folder, or the name of a bundled submission.
         runner: runs the controller; the sandbox if not given.
         clock: times the calls of ``act``, s.
+        progress: called with rounds of the runs that are done, and all of them.
 
     Raises:
         SubmissionError: if there is no such folder.
@@ -93,7 +101,15 @@ def check(
         from ventbench.sandbox.runner import SandboxRunner
 
         runner = SandboxRunner(allowance=Allowance(total_s=120.0))
-    return _ran(opened, runner, findings, clock)
+    done = 0
+
+    def count() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, _ROUNDS)
+
+    return _ran(opened, runner, findings, clock, count)
 
 
 def assert_ready(name: str, runner: Runner | None = None) -> None:
@@ -119,7 +135,11 @@ def _opened(name: str) -> Submission | None:
 
 
 def _ran(
-    submission: Submission, runner: Runner, findings: list[Finding], clock: Callable[[], float]
+    submission: Submission,
+    runner: Runner,
+    findings: list[Finding],
+    clock: Callable[[], float],
+    count: Callable[[], None],
 ) -> CheckReport:
     name, tracks = submission.label, submission.manifest.tracks
     plain_runs = plain(tracks)
@@ -129,12 +149,12 @@ def _ran(
     try:
         # The folder as it is, through the runner that scores it: what can be told from a score by
         # its frames or files is the last run alone, whose answers show nothing but its resets.
-        answers = run_all(submission, runs, runner, clock)
+        answers = run_all(submission, runs, runner, clock, count)
         # By itself, so that the time does not depend on how many run beside it.
         timed_run = plain_runs[0]._replace(script=breaths())
-        timed_answers = run_all(submission, [timed_run], runner, clock)
+        timed_answers = run_all(submission, [timed_run], runner, clock, count)
         with driven(submission) as driver:
-            answers = joined(answers, run_all(driver, [thrice], runner, clock))
+            answers = joined(answers, run_all(driver, [thrice], runner, clock, count))
             runs = [*runs, thrice]
     except SubmissionError as error:
         problems = [_import_finding(problem, name) for problem in error.problems]

@@ -230,6 +230,7 @@ def run_all(
     runs: Sequence[ContractRun],
     runner: Runner,
     clock: Callable[[], float] = time.perf_counter,
+    count: Callable[[], None] = lambda: None,
 ) -> Answers:
     """Run all runs side by side.
 
@@ -238,6 +239,7 @@ def run_all(
         runs: fresh ones.
         runner: runs the controllers.
         clock: times the calls of ``act``, s.
+        count: called after each round.
 
     Raises:
         SubmissionError: if the code cannot be imported.
@@ -255,6 +257,7 @@ def run_all(
             start = clock()
             answers = session.act(batch)
             seconds.append((clock() - start) / live)
+            count()
             for k in sorted(waiting):
                 if k in session.failures:
                     failures[k] = session.failures[k]

@@ -7,6 +7,7 @@ second one. Where the paper's text ends at "t_min", t_max is meant.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -184,6 +185,7 @@ def explore(
     limits: Limits | None = None,
     pips: tuple[float, ...] = protocol.PIPS,
     peep: float = protocol.PEEP,
+    progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Breaths:
     """Explore a ventilator; the PIPs take turns.
 
@@ -196,6 +198,7 @@ def explore(
         limits: see :class:`Limits`.
         pips: cmH2O.
         peep: cmH2O.
+        progress: called with how many breaths are done, and how many were asked for.
 
     Returns:
         Whole breaths; fewer than asked for, with a note, where the limits ended it.
@@ -217,6 +220,7 @@ def explore(
         made = _breaths(ventilator, pip, peep, ranges, limits, added)
         columns.append(made)
         done += ventilator.width
+        progress(min(done, breaths), breaths)
         vented += int(np.sum(made[1][:, : protocol.INSPIRATION_STEPS].any(axis=1)))
     together = zip(*columns, strict=True)
     u_in, u_out, pressure = (np.concatenate(column)[:breaths] for column in together)

@@ -310,11 +310,17 @@ def collect(
     from hardware_eval.bench.loop import Bench
     from hardware_eval.bench.safety import DEFAULT
     from hardware_eval.results import evaluate as ev
+    from ventbench import protocol
     from ventbench.cli.options import bars
     from ventbench.lungs import scored_lung
     from ventbench.training.exploration import Limits
 
     label = scored_lung(lung).id
+    highest = protocol.SAFETY_PRESSURE
+    if not protocol.PEEP < ease <= highest:
+        raise InputError(
+            f"--ease {ease:g} cmH2O: give more than {protocol.PEEP:g} and at most {highest:g}"
+        )
     person = ConsoleOperator(yes=yes)
     line = ev.connect(port)
     try:

@@ -1,15 +1,14 @@
 """The loop closed: a lung that conceals physics, found, corrected for, and controlled better.
 
 An emulated lung conceals physics that the simulators lack, drawn from the challenge and sealed. A
-PID that is the best of the paper's grid in simulation runs on it and does worse than there. The
-comparison of a recording with the simulator names what is missing; the corrected simulator chooses
-the PID anew; it runs on the same lung. Only then the seal is opened. Nothing in between reads it.
+controller that was planned on a simulator runs on it and does worse than there. The comparison of a
+recording with the simulator names what is missing; the controller is planned again on the corrected
+simulator and runs on the same lung. Only then the seal is opened. Nothing in between reads it.
 """
 
 from __future__ import annotations
 
 import html
-import itertools
 import subprocess
 import sys
 import time
@@ -20,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hardware_eval.bench.collect import collect
 from hardware_eval.bench.loop import Bench, Operator, SilentOperator, run_once
@@ -30,6 +28,7 @@ from hardware_eval.bench.safety import DEFAULT
 from hardware_eval.emulation.concealed import conceal, reveal
 from hardware_eval.emulation.loopback import loopback
 from hardware_eval.emulation.simulated import SimulatedHal
+from hardware_eval.planned import plan_controller
 from hardware_eval.results import evaluate as ev
 from hardware_eval.results.compare import Comparison, compare, scored_plants
 from hardware_eval.results.evaluate import Evaluation, Line
@@ -38,9 +37,6 @@ from ventbench import files
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
 from ventbench.submissions.folder import open_submission
-from ventbench.submissions.scaffold import contents
-
-Floats = NDArray[np.float64]
 
 #: PIPs of the demo, cmH2O: few, so that it takes minutes.
 PIPS = (10.0, 20.0, 30.0)
@@ -70,15 +66,15 @@ class Demo:
         words: what the lung was drawn from.
         lung: its label.
         commitment: hash of the sealed answer, published first.
-        gains: P, I, D of the entry before and after the correction, %/cmH2O.
+        gains: P, I, D of the feedback before and after the correction, %/cmH2O.
         simulated: error of the entry on the emulator of the plain simulator, by PIP.
         measured: its error on the lung that conceals something, by PIP.
         comparison: simulators against the collected recording.
         verdict: of the diagnosis.
         named: mechanisms that it names, with their parameters.
         open_loop: held-out open-loop error before, refitted and after the correction.
-        predicted: error of the retuned entry on the corrected simulator, mean over PIPs.
-        retuned: error of the retuned entry on the lung, by PIP.
+        predicted: error of the replanned entry on the corrected simulator, mean over PIPs.
+        retuned: error of the replanned entry on the lung, by PIP.
         truth: what the seal held.
         folder: where everything lies.
         seconds: duration.
@@ -107,7 +103,7 @@ class Demo:
 
     @property
     def better(self) -> bool:
-        """Whether the retuned entry does better on the lung than the first."""
+        """Whether the replanned entry does better on the lung than the first."""
         return _mean(self.retuned) < _mean(self.measured)
 
     def as_dict(self) -> dict[str, Any]:
@@ -138,21 +134,20 @@ class Demo:
 
     def steps(self) -> list[tuple[str, str]]:
         """Title and figures of every step."""
-        named = "; ".join(
-            f"{name} ({', '.join(f'{key} {value:.3g}' for key, value in values.items())})"
-            for name, values in self.named.items()
-        )
-        truth = ", ".join(f"{key} {value:.3g}" for key, value in self.truth["parameters"].items())
+        named = "; ".join(_mechanism(name, values) for name, values in self.named.items())
+        truth = _mechanism(self.truth["name"], self.truth["parameters"])
         before, refit, after = self.open_loop
         first, second = (" ".join(f"{gain:g}" for gain in gains) for gains in self.gains)
-        change = ""
-        if np.isfinite(_mean(self.measured)) and np.isfinite(_mean(self.retuned)):
-            share = 100.0 * (_mean(self.retuned) / _mean(self.measured) - 1.0)
-            change = f", {share:+.0f} % against the first"
         return [
             ("A lung is sealed", f"{self.lung}; commitment {self.commitment[:16]}..."),
-            ("The best PID in simulation", f"P I D = {first}: {_mean(self.simulated):.2f} cmH2O"),
-            ("The same PID on the lung", _said(self.measured)),
+            (
+                "A controller is planned on the simulator",
+                f"{_mean(self.simulated):.2f} cmH2O there; feedback P I D = {first}",
+            ),
+            (
+                "The same controller on the lung",
+                f"{_said(self.measured)}{_against(self.simulated, self.measured, 'simulation')}",
+            ),
             (
                 "The comparison",
                 f"{len(self.comparison.breaths)} breaths explored; open-loop error "
@@ -164,15 +159,17 @@ class Demo:
                 f"held-out open-loop error {before:.2f}, refitted {refit:.2f}, corrected "
                 f"{after:.2f}",
             ),
-            ("The PID retuned on it", f"P I D = {second}: {self.predicted:.2f} cmH2O predicted"),
             (
-                "The retuned PID on the lung",
-                f"{_said(self.retuned)}{change}",
+                "The controller is planned again on it",
+                f"{self.predicted:.2f} cmH2O predicted; feedback P I D = {second}",
+            ),
+            (
+                "The replanned controller on the lung",
+                f"{_said(self.retuned)}{_against(self.measured, self.retuned, 'the first')}",
             ),
             (
                 "The seal is opened",
-                f"{self.truth['name']} ({truth}), {self.truth['strength']}: "
-                f"{'named' if self.right else 'not named'}",
+                f"{truth}, {self.truth['strength']}: {'named' if self.right else 'not named'}",
             ),
         ]
 
@@ -181,8 +178,20 @@ class Demo:
         return "\n".join([*rows, f"{self.seconds:.0f} s; report: {self.folder / 'report.html'}"])
 
 
+def _mechanism(name: str, parameters: Mapping[str, float]) -> str:
+    values = ", ".join(f"{key} {value:.3g}" for key, value in parameters.items())
+    return f"{name.replace('_', ' ')} ({values})"
+
+
 def _mean(errors: Mapping[float, float]) -> float:
     return float(np.mean(list(errors.values())))
+
+
+def _against(before: Mapping[float, float], after: Mapping[float, float], what: str) -> str:
+    """Change of the mean error in words; nothing if a check ended a run."""
+    if not np.isfinite(_mean(before)) or not np.isfinite(_mean(after)):
+        return ""
+    return f", {100.0 * (_mean(after) / _mean(before) - 1.0):+.0f} % against {what}"
 
 
 def _said(errors: Mapping[float, float]) -> str:
@@ -231,11 +240,11 @@ def demo(
     commitment = str(hidden.seal["commitment"])
     tell(f"1. a lung {lung} is sealed: {commitment[:16]}...")
     plain = scored_plants(simulator, [lung]).plant(lung)
-    gains, _ = best_pid(plain, pips)
-    entry = write_entry(out / "entries", "first_pid", gains)
-    plan = _plan("first_pid", lung, pips)
-    tell(f"2. the best PID in simulation: P I D = {_shown(gains)}")
-    simulated = _on_simulator(plan, entry, SimulatedHal(plain, noise=NOISE, quantum=QUANTUM))
+    planned = plan_controller(plain, pips)
+    entry = planned.write(out / "entries", "first")
+    plan = _plan("first", lung, pips)
+    tell(f"2. a controller is planned on the simulator: {planned.error:.2f} cmH2O predicted")
+    simulated = error_on(SimulatedHal(plain, noise=NOISE, quantum=QUANTUM), entry, lung, pips)
     with _line(hidden.plant, words, simulator, lung, out, real_time) as line:
         tell("3. it runs on the lung")
         measured = _errors(_evaluate(plan, entry, line, out / "first", sandbox))
@@ -249,23 +258,24 @@ def demo(
     diagnosis.save(out / "diagnosis")
     corrected: Plant = diagnosis.plants.get(lung, plain)
     tell(f"6. {str(diagnosis).splitlines()[0]}")
-    retuned_gains, predicted = best_pid(corrected, pips)
-    second = write_entry(out / "entries", "retuned_pid", retuned_gains)
-    tell(f"7. the best PID on the corrected simulator: P I D = {_shown(retuned_gains)}")
+    replanned = plan_controller(corrected, pips)
+    second = replanned.write(out / "entries", "replanned")
+    tell(f"7. it is planned again on the corrected one: {replanned.error:.2f} cmH2O predicted")
     with _line(hidden.plant, words, simulator, lung, out, real_time) as line:
-        again = _plan("retuned_pid", lung, pips)
+        again = _plan("replanned", lung, pips)
         tell("8. it runs on the lung")
         retuned = _errors(_evaluate(again, second, line, out / "second", sandbox))
     _, effect = reveal(seal, words)
     errors = diagnosis.open_loop
+    gains = ((*planned.gains, 0.0), (*replanned.gains, 0.0))
     done = Demo(
-        words, lung, commitment, (gains, retuned_gains), simulated, measured, compared,
+        words, lung, commitment, gains, simulated, measured, compared,
         diagnosis.verdict,
         {
             x.name: {key: estimate.value for key, estimate in x.parameters.items()}
             for x in diagnosis.mechanisms
         },
-        (errors.before.mae, errors.refit.mae, errors.after.mae), predicted, retuned,
+        (errors.before.mae, errors.refit.mae, errors.after.mae), replanned.error, retuned,
         {"name": effect.name, "strength": effect.strength, "parameters": dict(effect.parameters)},
         out, time.perf_counter() - began,
     )  # fmt: skip
@@ -275,47 +285,26 @@ def demo(
     return done
 
 
-def _shown(gains: tuple[float, ...]) -> str:
-    return " ".join(f"{gain:g}" for gain in gains)
-
-
-def best_pid(plant: Plant, pips: tuple[float, ...]) -> tuple[tuple[float, float, float], float]:
-    """The best of the paper's PI gains on a plant, and its mean error, cmH2O."""
-    import jax
-
-    from ventbench.training import pid_grid
-
-    grid = np.array(list(itertools.product(pid_grid.VALUES, pid_grid.VALUES, (0.0,))))
-    stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], plant)
-    error = pid_grid.errors(stacked, grid, pips)[0].mean(axis=1, dtype=np.float64)
-    error = np.where(np.isfinite(error), error, np.inf)
-    best = int(np.argmin(error))
-    P, I, D = grid[best].tolist()  # noqa: E741 - the field's names
-    return (P, I, D), float(error[best])
-
-
-def write_entry(folder: Path, name: str, gains: tuple[float, float, float]) -> Path:
-    """Write a PID as a submission; returns its folder."""
-    for file, content in contents(name, "pid").items():
-        if file == "controller.py":
-            text = content.decode()
-            line = next(x for x in text.splitlines() if x.startswith("GAINS ="))
-            content = text.replace(line, f"GAINS = {gains}  # P, I, D, %/cmH2O").encode()
-        (folder / name).mkdir(parents=True, exist_ok=True)
-        (folder / name / file).write_bytes(content)
-    return folder / name
-
-
 def _plan(name: str, lung: str, pips: tuple[float, ...]) -> Plan:
     return make_plan([name], [lung], pips=pips, repeats=1, control_every=0)
 
 
-def _on_simulator(plan: Plan, entry: Path, hal: SimulatedHal) -> dict[float, float]:
-    """Errors of an entry on an emulator of a plain simulator, by PIP."""
+def error_on(
+    hal: SimulatedHal, entry: Path, lung: str, pips: tuple[float, ...]
+) -> dict[float, float]:
+    """Errors of an entry on an emulator in this process, cmH2O, by PIP.
+
+    Args:
+        hal: the emulated lung.
+        entry: folder of the entry, which runs in this process.
+        lung: its label, which the entry is told.
+        pips: cmH2O.
+    """
     device = loopback(hal)
     client = Client(device, device.clock)
     client.hello()
     bench = Bench(client, device.clock, DEFAULT, SilentOperator(), rest=_REST)
+    plan = _plan(entry.name, lung, pips)
     make = ev.controllers([open_submission(str(entry))], plan.track, ev.make_runner(False),
                           real_time=False)  # fmt: skip
     errors = {}
@@ -387,11 +376,11 @@ body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:60rem;padding
 color:#1b1f24;background:#fff}h1{font-size:1.6rem}ol{padding-left:1.4rem}li{margin:.4rem 0}
 table{border-collapse:collapse;margin:1rem 0}
 th,td{padding:.3rem .8rem;text-align:right;border-bottom:1px solid #d7dce2}
-th:first-child,td:first-child{text-align:left}svg{max-width:100%}.note{color:#57606a}
+th:first-child,td:first-child{text-align:left}svg{display:block}.note{color:#57606a}
 @media(prefers-color-scheme:dark){body{background:#14181d;color:#e6e9ed}td,th{border-color:#39414b}}
 """
 
-_COLOURS = {"simulated": "#6b7785", "measured": "#c4462d", "retuned": "#1f7a5c"}
+_COLOURS = {"in simulation": "#6b7785", "on the lung": "#c4462d", "replanned": "#1f7a5c"}
 
 
 def _report(done: Demo) -> str:
@@ -408,6 +397,7 @@ def _report(done: Demo) -> str:
         + "</tr>"
         for pip in done.simulated
     )
+    heads = "".join(f"<th>{name}</th>" for name in _COLOURS)
     waves = "".join(
         f"<tr><td>{html.escape(name)}</td><td>{x.breaths}</td><td>{x.mae:.2f}</td>"
         f"<td>{x.bias:+.2f}</td></tr>"
@@ -424,8 +414,8 @@ def _report(done: Demo) -> str:
         "<p class=note>Mean |pressure - target| over the scored inspirations, cmH2O: lower is "
         "better. The lung is emulated in software behind the real wire protocol.</p>"
         f"<ol>{steps}</ol>{_bars(done)}"
-        "<table><tr><th>PIP</th><th>simulated</th><th>on the lung</th><th>retuned, on the lung"
-        f"</th></tr>{rows}</table><h2>Open-loop distance by waveform</h2><table><tr><th>plateau, "
+        f"<table><tr><th>PIP, cmH2O</th>{heads}</tr>{rows}</table>"
+        "<h2>Open-loop distance by waveform</h2><table><tr><th>plateau, "
         f"cmH2O</th><th>breaths</th><th>error a step</th><th>bias</th></tr>{waves}</table>"
         f"<h2>The diagnosis in its own words</h2>{sentences}"
         '<p><a href="diagnosis/report.html">its report</a>, <a href="demo.json">all figures</a>, '
@@ -435,28 +425,33 @@ def _report(done: Demo) -> str:
 
 
 def _bars(done: Demo) -> str:
-    """Errors by PIP as grouped bars."""
-    groups = {"simulated": done.simulated, "measured": done.measured, "retuned": done.retuned}
+    """Errors by PIP as grouped bars, each with its value."""
+    groups = dict(zip(_COLOURS, (done.simulated, done.measured, done.retuned), strict=True))
     finite = [x for errors in groups.values() for x in errors.values() if np.isfinite(x)]
-    scale = 160.0 / max([*finite, 1e-9])
+    scale = 150.0 / max([*finite, 1e-9])
     parts = []
     for place, pip in enumerate(done.simulated):
+        left = 6 + 112 * place
         for k, (name, errors) in enumerate(groups.items()):
-            height = scale * min(errors[pip], 1e9) if np.isfinite(errors[pip]) else 160.0
-            x = 40 + 150 * place + 36 * k
+            ended = not np.isfinite(errors[pip])
+            height, value = (150.0, "stopped") if ended else (scale * errors[pip], errors[pip])
+            value = value if isinstance(value, str) else f"{value:.2f}"
+            x, top = left + 33 * k, 175.0 - height
             parts.append(
-                f'<rect x="{x}" y="{190 - height:.1f}" width="32" height="{height:.1f}" '
-                f'fill="{_COLOURS[name]}"><title>{name}, PIP {pip:g}: {errors[pip]:.2f}</title>'
-                "</rect>"
+                f'<rect x="{x}" y="{top:.1f}" width="30" height="{height:.1f}" '
+                f'fill="{_COLOURS[name]}"><title>{name}, PIP {pip:g}: {value}</title></rect>'
+                f'<text x="{x + 15}" y="{top - 4:.1f}" font-size="11" text-anchor="middle">'
+                f"{value}</text>"
             )
-        parts.append(f'<text x="{40 + 150 * place}" y="208">PIP {pip:g}</text>')
-    width = 60 + 150 * len(done.simulated)
+        parts.append(f'<text x="{left + 48}" y="193" text-anchor="middle">PIP {pip:g}</text>')
+    width = max(112 * len(done.simulated), 336)
     legend = "".join(
-        f'<text x="{40 + 130 * k}" y="234" fill="{colour}">{name}</text>'
+        f'<rect x="{6 + 112 * k}" y="206" width="10" height="10" fill="{colour}"/>'
+        f'<text x="{21 + 112 * k}" y="216">{name}</text>'
         for k, (name, colour) in enumerate(_COLOURS.items())
     )
     return (
-        f'<svg viewBox="0 0 {max(width, 430)} 240" width="{max(width, 430)}" role="img" '
-        f'font-size="14" fill="currentColor" aria-label="Errors by PIP">{"".join(parts)}{legend}'
+        f'<svg viewBox="0 0 {width} 222" style="width:min(100%,{1.5 * width:g}px)" role="img" '
+        f'font-size="13" fill="currentColor" aria-label="Errors by PIP">{"".join(parts)}{legend}'
         "</svg>"
     )

@@ -64,7 +64,13 @@ class SimulatedHal:
             noise: standard deviation of the sensor's noise, cmH2O.
             quantum: step of the sensor's converter, cmH2O; 0 for none.
             seed: of the noise.
+
+        Raises:
+            InputError: if noise or quantum is negative or not finite.
         """
+        for what, value in (("noise", noise), ("quantum", quantum)):
+            if not 0.0 <= value < math.inf:
+                raise InputError(f"--{what} {value:g} cmH2O: give 0 or more, such as 0.1")
         self._noise, self._quantum = noise, quantum
         leaves = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(plant))
         calibration = hashlib.sha256(type(plant).__name__.encode() + leaves).digest()
@@ -80,7 +86,7 @@ class SimulatedHal:
         def advance(vector: jax.Array, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
             u_in, u_out, dt, r_scale, restart = inputs
             state = unravel(vector)
-            state = _breath_begun(state, restart)
+            state = breath_begun(state, restart)
             own = plant.vary(r_scale, jnp.ones_like(r_scale)) if varies else plant  # type: ignore[attr-defined]
             after, pressure, flow = _observed(own, state, u_in, u_out, dt)
             return ravel_pytree(after)[0], jnp.stack([pressure, flow])
@@ -206,7 +212,7 @@ class SimulatedHal:
         return self._advance(self._state, inputs)
 
 
-def _breath_begun(state: Any, restart: jax.Array) -> Any:
+def breath_begun(state: Any, restart: jax.Array) -> Any:
     """Restart the time in the breath where ``restart`` is 1: some mechanisms act by it."""
 
     def restarted(part: Any) -> Any:

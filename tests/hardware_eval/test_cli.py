@@ -17,6 +17,7 @@ from hardware_eval.results import evaluate
 from hardware_eval.results.evaluate import Line
 from ventbench.board import record
 from ventbench.board.hardware import HardwareRecord
+from ventbench.errors import InputError
 
 MANUAL = Path(cli.__file__).parent / "README.md"
 
@@ -84,3 +85,16 @@ def test_wrong_numbers_and_ports_are_bad_input(
             cli.main()
         assert ended.value.code == 2
         assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("ease", ["nan", "5", "99"])
+def test_pressures_that_would_not_ease_are_refused_before_the_port_is_opened(
+    ease: str, tmp_path: Path
+) -> None:
+    done = invoke(
+        "collect", "--port", "/dev/nothing", "--lung", "R5C20", "--ease", ease, "--yes",
+        "--out", str(tmp_path / "out"),
+    )  # fmt: skip
+    assert isinstance(done.exception, InputError)
+    assert f"--ease {ease} cmH2O: give more than 5 and at most" in str(done.exception)
+    assert not (tmp_path / "out").exists()

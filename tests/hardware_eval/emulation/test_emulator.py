@@ -189,6 +189,9 @@ def test_wrong_arguments_say_what_to_do(tmp_path: Path, capsys: pytest.CaptureFi
     assert "KIND@START" in capsys.readouterr().err
     assert emulator_module.main(["--lung", "X"]) == 2
     assert "R20C50" in capsys.readouterr().err
+    for words in (["--noise", "-1"], ["--quantum", "nan"]):
+        assert emulator_module.main(["--plant", "single_compartment", *words]) == 2
+        assert f"{words[0]} {words[1]} cmH2O: give 0 or more" in capsys.readouterr().err
     taken = tmp_path / "taken"
     taken.touch()
     with pytest.raises(InputError, match="remove it"):

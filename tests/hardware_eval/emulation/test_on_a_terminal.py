@@ -1,11 +1,12 @@
 """The acceptance of a bench over a real pseudo-terminal; every byte goes through kernel and link.
 
 Time is virtual, so that a busy machine can be slow but not late; one test runs in real time, and
-holds that a test that a busy machine spoils says so.
+waits for what happens rather than for a time.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import select
@@ -28,7 +29,9 @@ from hardware_eval.emulation.simulated import SimulatedHal, simulated_lung
 from hardware_eval.results import evaluate
 from hardware_eval.results.evaluate import Line
 from hardware_eval.wire.client import Client
+from hardware_eval.wire.errors import RefusedError
 from hardware_eval.wire.link import Link
+from hardware_eval.wire.messages import Capability, Flag, Mode
 from ventbench.board import record
 from ventbench.board.hardware import HardwareRecord
 from ventbench.cli import app as ventbench
@@ -131,23 +134,41 @@ def test_self_test_wrong_lung_run_and_board(terminal: DeviceOnTerminal, tmp_path
 
 
 @pytest.mark.slow
-def test_in_real_time_it_goes_or_says_that_the_machine_is_busy(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "hardware_eval"]
+def test_an_emulator_of_its_own_vents_when_its_host_falls_silent(tmp_path: Path) -> None:
+    """In real time, each step as soon as the last one has happened: nothing must be in time."""
+    link = tmp_path / "lung"
+    command = [sys.executable, "-m", "hardware_eval", "emulate", "--link", str(link)]
     emulator = subprocess.Popen(
-        [*command, "emulate", "--lung", LUNG, "--link", str(tmp_path / "lung")],
+        [*command, "--lung", LUNG, "--plant", "single_compartment"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
         assert emulator.stdout is not None
-        port = emulator.stdout.readline().strip()
-        assert port, emulator.communicate()[1]
-        tested = [*command, "selftest", "--port", port, "--lung", LUNG]
-        done = subprocess.run(tested, capture_output=True, text=True, timeout=900, check=False)
+        assert emulator.stdout.readline().strip(), emulator.communicate()[1]
+        client = Client(Link(str(link)), timeout=PATIENCE)
+        welcome = client.hello()
+        assert LUNG in welcome.name
+        assert Capability.SIMULATED in welcome.capabilities
+        end = time.monotonic() + PATIENCE
+        # A busy machine may be so slow that the watchdog vents between two messages: once more.
+        while not _obeyed(client):
+            assert time.monotonic() < end, "the device never ran"
+        while (reading := client.heartbeat()).mode is not Mode.VENTED:
+            assert time.monotonic() < end, "the watchdog did not vent"
+        assert Flag.COMMANDS_STOPPED in reading.flags
+        assert (reading.u_in, reading.u_out) == (0.0, 1)
+        client.close()
     finally:
         emulator.terminate()
-        emulator.communicate()
-    told = done.stdout + done.stderr
-    failed = {line.split()[1] for line in told.splitlines() if line.startswith("  NO-GO")}
-    # What a machine may lack is time. Nothing may be wrong with the lung or its tubes.
-    assert failed <= {"interruptions", "on_time", "latest_step", "round_trip"}, told
-    assert done.returncode == (1 if failed else 0) or "did not answer" in told, told
+        _, told = emulator.communicate()
+    assert emulator.returncode == 0, told
+    assert not link.is_symlink()
+
+
+def _obeyed(client: Client) -> bool:
+    """Arm and inspire a little; whether the valves moved before the watchdog vented."""
+    client.arm()
+    with contextlib.suppress(RefusedError):
+        reading = client.command(10.0, 0)
+        return reading.mode is Mode.RUNNING and reading.u_in == 10.0
+    return False

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -57,6 +59,22 @@ def _die(_: int) -> None:
 def test_a_dead_worker_process_is_told():
     with pytest.raises(InputError, match="a worker process died"), executor(1) as pool:
         list(results(pool, _die, {"a": (1,)}))
+
+
+def _waits_for_ever(begun: str) -> None:
+    Path(begun).touch()
+    threading.Event().wait()
+
+
+@pytest.mark.slow
+def test_an_interrupt_of_this_process_alone_ends_its_workers(tmp_path):
+    begun, before = tmp_path / "begun", set(multiprocessing.active_children())
+    with pytest.raises(KeyboardInterrupt), executor(1) as pool:  # noqa: PT012
+        pool.submit(_waits_for_ever, str(begun))
+        while not begun.exists():
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+    assert set(multiprocessing.active_children()) == before
 
 
 def _slowly(plant, gains):

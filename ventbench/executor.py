@@ -50,6 +50,8 @@ class InProcess(futures.Executor):
 def executor(workers: int = 0, scheduler: str | None = None) -> Iterator[futures.Executor]:
     """Open an executor; what has not begun when the block is left by an error never runs.
 
+    An interrupt also ends the jobs that run in processes of this machine.
+
     Args:
         workers: processes on this machine; 0 for none but this one.
         scheduler: address of a Dask scheduler instead, such as ``tcp://host:8786``.
@@ -70,10 +72,16 @@ def executor(workers: int = 0, scheduler: str | None = None) -> Iterator[futures
     if workers == 0:
         yield InProcess()
         return
+    others = set(multiprocessing.active_children())
     # Not forked: JAX has threads, whose locks a fork would leave closed.
     pool = futures.ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
     try:
         yield pool
+    except KeyboardInterrupt:
+        # An interrupt may reach this process alone, and a job may run for minutes.
+        for worker in set(multiprocessing.active_children()) - others:
+            worker.terminate()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jinja2
 import numpy as np
 
 import ventbench
@@ -16,6 +15,7 @@ from ventbench.text import number
 from ventbench.trajectories import Trajectories
 from ventbench.views import graphics, panels, scores
 from ventbench.views.runs import Floats, labels, shared_tracks
+from ventbench.views.templating import template
 
 #: Limits between the shades of differences, cmH2O, and how much colour each shade has, %.
 SHADE_LIMITS, SHADES = (0.02, 0.2, 0.7, 2.0), (12, 24, 38, 55)
@@ -33,14 +33,7 @@ def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None
     """
     names = labels(runs)
     numbers = scores.collect(runs, given)
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("ventbench.views"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("report.html.j2").render(
+    return template("report.html.j2").render(
         title=names[0],
         names=names,
         classes=[f"r{palette.run_index(i)}" for i in range(len(runs))],

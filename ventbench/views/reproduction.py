@@ -50,16 +50,9 @@ def write_reproduction(path: Path | str, reproduction: Reproduction) -> Path:
 
 def html(reproduction: Reproduction) -> str:
     """Return the page; see :func:`write_reproduction`."""
-    import jinja2
+    from ventbench.views.templating import template
 
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("ventbench.views"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("reproduction.html.j2").render(
+    return template("reproduction.html.j2").render(
         about=reproduction.about,
         summary=reproduction.summary(),
         sections=[

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
@@ -17,6 +16,7 @@ from ventbench.physics import Physics, mechanism
 from ventbench.physics.characteristics import characteristic
 from ventbench.views import mathml
 from ventbench.views.diagnosis import charts, diagram
+from ventbench.views.templating import template
 
 #: Places that are told in words; the charts show all.
 PLACES = 6
@@ -24,17 +24,10 @@ PLACES = 6
 
 def html(diagnosis: Diagnosis) -> str:
     """Return the whole page; equal input gives equal text."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("ventbench.views.diagnosis"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     listed = diagram.entries(diagnosis)
     lead = [report_text.effect(diagnosis), report_text.remaining(diagnosis)]
     lead += [report_text.scatter(diagnosis)]
-    return environment.get_template("diagnosis.html.j2").render(
+    return template("diagnosis.html.j2", "ventbench.views.diagnosis").render(
         headline=report_text.headline(diagnosis),
         facts=facts(diagnosis),
         lead=[text for text in lead if text],

@@ -9,9 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.conclusion import conclude, is_unresolved
-from ventbench.diagnosis.estimates import nonparametric_term
-from ventbench.diagnosis.latent_inputs import ALVEOLUS, SUPPLY
+from ventbench.diagnosis.conclusion import (
+    UnnamedEffect,
+    _best_input,
+    _is_negligible_input,
+    conclude,
+    is_unresolved,
+)
+from ventbench.diagnosis.estimates import nonparametric_term, split_form
+from ventbench.diagnosis.findings import NonparametricTerm
+from ventbench.diagnosis.latent_inputs import ALVEOLUS, GAIN_SCATTER, MEASUREMENT, SUPPLY
 from ventbench.recordings import join
 
 from . import small
@@ -73,6 +80,79 @@ def test_a_candidate_that_explains_much_and_is_rejected_leaves_the_recording_unr
 
 def test_without_a_comparison_nothing_is_unresolved():
     assert not is_unresolved(compared({})[0], [])
+
+
+@pytest.mark.parametrize(
+    ("place", "names", "form_of"),
+    [
+        ("f(u)", ("valve_curve", "leak"), ("valve_curve",)),
+        ("f(u)", ("leak",), ()),  # another place: a further effect
+        ("memory of u", ("valve_delay", "valve_lag"), ("valve_delay", "valve_lag")),
+        (ALVEOLUS, ("patient_effort",), ()),  # differs from breath to breath
+        ("f(V)", (), ()),
+    ],
+)
+def test_a_term_that_contains_a_named_mechanism_is_its_form(place, names, form_of):
+    curve = np.zeros(3)
+    term = NonparametricTerm(place, "meaning", 0.5, 30.0, curve, "%", curve, "mL/s")
+    form, other = split_form(term, names)
+    if form_of:
+        assert other is None
+        assert form is not None
+        assert form.form_of == form_of
+    else:
+        assert form is None
+        assert other is term
+    assert split_form(None, names) == (None, None)
+
+
+def latent(place: str, nats: float, size: float = 0.2) -> Any:
+    return SimpleNamespace(
+        place=place, size=size, periodic=False, training_log_likelihood=nats,
+        held_out_log_likelihood=np.full(6, nats / 6),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("nats", "noise", "scatter", "accepted"),
+    [
+        (30.0, 5.0, 5.0, True),
+        (30.0, 25.0, 5.0, False),  # coloured noise explains nearly as much
+        (30.0, 5.0, 25.0, False),  # so does a gain that differs from breath to breath
+        (6.0, -20.0, -20.0, False),  # too little
+    ],
+)
+def test_an_input_must_explain_more_than_every_nuisance(nats, noise, scatter, accepted):
+    inputs = {
+        place: latent(place, gain)
+        for place, gain in (
+            (ALVEOLUS, nats), (SUPPLY, nats - 5.0), (MEASUREMENT, noise), (GAIN_SCATTER, scatter),
+        )
+    }  # fmt: skip
+    best = _best_input(inputs, np.zeros(6), small.SETTINGS)
+    assert (best is not None) is accepted
+    if best is not None:
+        assert best.name == ALVEOLUS
+
+
+@pytest.mark.parametrize(
+    ("nats", "size", "names", "negligible"),
+    [
+        (40.0, 0.2, ("valve_hysteresis",), True),
+        (40.0, 0.8, ("valve_hysteresis",), False),  # as large as an effect
+        (400.0, 0.2, ("valve_hysteresis",), False),  # explains much
+        (40.0, 0.2, (), False),  # nothing else is missing
+    ],
+)
+def test_a_small_input_beside_strong_mechanisms_is_negligible(nats, size, names, negligible):
+    evaluator: Any = SimpleNamespace(
+        fit=lambda hypothesis, noise, start: SimpleNamespace(nats=0.0),
+        held_out_log_likelihood=lambda fitted: np.full(4, fitted.nats / 4),
+        settings=small.SETTINGS,
+    )
+    selected: Any = SimpleNamespace(names=names, noise=None, nats=3000.0)
+    unnamed = UnnamedEffect(ALVEOLUS, None, latent(ALVEOLUS, nats, size), nats)
+    assert _is_negligible_input(evaluator, selected, unnamed) is negligible
 
 
 def test_a_mechanism_is_enough():

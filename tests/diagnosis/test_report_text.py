@@ -153,6 +153,15 @@ def test_other_verdicts():
     )
     term = made.unnamed(12).nonparametric
     assert term is not None
+    own = dataclasses.replace(term, name="f(u)", form_of=("valve_delay",))
+    bent = dataclasses.replace(made.diagnosis(12), form=own)
+    assert "inspiratory valve, in another form than the library's (odds" in report_text.verdict(
+        bent
+    )
+    assert "; mending it takes" in report_text.answer(bent)
+    assert report_text.nonparametric_term(bent).startswith(
+        "The form of the dead time of the inspiratory valve differs from the library's: "
+    )
     named = dataclasses.replace(term, name="f(V)", meaning="f(V): the recoil of the lung")
     text = report_text.verdict(dataclasses.replace(made.unnamed(12), nonparametric=named))
     assert text.endswith("its place in the model is f(V) (the recoil of the lung)")

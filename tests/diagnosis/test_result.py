@@ -49,6 +49,16 @@ def test_the_interface():
     assert plain["sentences"][0].startswith("Missing in the physics simulator")
 
 
+def test_the_form_of_a_mechanism_is_no_further_effect():
+    term = made.unnamed(12).nonparametric
+    assert term is not None
+    own = dataclasses.replace(term, form_of=("valve_delay",))
+    plain = dataclasses.replace(made.diagnosis(12), form=own).as_dict()
+    assert plain["slot"] is None
+    assert (plain["form"]["of"], plain["form"]["name"]) == (["valve_delay"], "R(V)")
+    assert made.diagnosis(12).as_dict()["form"] is None
+
+
 def test_a_slot_and_nothing():
     slot = made.unnamed(12).as_dict()["slot"]
     assert (slot["name"], slot["explains"]) == ("R(V)", 0.83)

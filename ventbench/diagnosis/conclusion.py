@@ -18,6 +18,7 @@ from ventbench.diagnosis.latent_inputs import (
     GAIN_SCATTER,
     MEASUREMENT,
     PLACES,
+    SUPPLY,
     LatentInput,
     fit_latent_inputs,
     log_likelihood_without_input,
@@ -254,7 +255,10 @@ def _explain_remaining_error(
     scatter, settings = inputs.pop(GAIN_SCATTER), evaluator.settings
     scattered = _gain_scatters(scatter, inputs, reference, term, settings)
     gain_sd = scatter.size if scattered else 0.0
-    return _Unexplained(term, _best_input(inputs, reference, settings), gain_sd)
+    latent = _best_input({GAIN_SCATTER: scatter, **inputs}, reference, settings)
+    if latent is not None and _is_negligible_input(evaluator, selected, latent):
+        latent = None
+    return _Unexplained(term, latent, gain_sd)
 
 
 def _best_term(wide: Evaluator, selected: FittedModel) -> NonparametricFit | None:
@@ -280,7 +284,11 @@ def _gain_scatters(
     term: NonparametricFit | None,
     settings: SelectionConfig,
 ) -> bool:
-    """Whether scatter of the valve's gain explains more than any term or latent input."""
+    """Whether scatter of the valve's gain explains much of what any latent input does.
+
+    A course within each breath imitates a gain that differs from breath to breath. The gain is the
+    simpler of the two, and what it leaves is searched anew.
+    """
     gained = scatter.held_out_log_likelihood - reference
     nats = float(gained.sum())
     if not passes_heldout_test(gained, settings.held_out_test):
@@ -296,20 +304,49 @@ def _gain_scatters(
 def _best_input(
     inputs: dict[str, LatentInput], reference: Floats, settings: SelectionConfig
 ) -> UnnamedEffect | None:
-    """The latent input that explains more than the mechanisms and than coloured noise, if any."""
+    """The latent input that explains more than the mechanisms and than any nuisance, if any.
+
+    Coloured noise and a gain that differs from breath to breath are nuisances.
+    """
     test, limits = settings.held_out_test, settings.latent_inputs
     physical = dict(inputs)
-    sensor = physical.pop(MEASUREMENT)
+    nuisances = physical.pop(MEASUREMENT), physical.pop(GAIN_SCATTER)
+    sensor = nuisances[0]
     best = max(physical.values(), key=lambda latent: latent.training_log_likelihood)
     gained = best.held_out_log_likelihood - reference
-    ahead = float((best.held_out_log_likelihood - sensor.held_out_log_likelihood).sum())
-    if passes_heldout_test(gained, test, limits.threshold) and ahead > test.threshold:
+    ahead = min(
+        float((best.held_out_log_likelihood - other.held_out_log_likelihood).sum())
+        for other in nuisances
+    )
+    if passes_heldout_test(gained, test, limits.threshold) and ahead > limits.threshold:
         return UnnamedEffect(best.place, None, best, float(gained.sum()))
     gained = sensor.held_out_log_likelihood - reference
     hum = sensor.periodic and sensor.size >= limits.sensor_amplitude
     if passes_heldout_test(gained, test) and hum:
         return UnnamedEffect(MEASUREMENT, None, sensor, float(gained.sum()))
     return None
+
+
+def _is_negligible_input(
+    evaluator: Evaluator, selected: FittedModel, unnamed: UnnamedEffect
+) -> bool:
+    """Whether an input is far weaker than a mild effect and explains little beside the mechanisms.
+
+    With many breaths, the least difference between the form of a mechanism and the library's passes
+    the held-out test; :func:`~ventbench.diagnosis.selection.is_negligible` is the same question
+    asked of mechanisms.
+    """
+    latent, settings = unnamed.latent_input, evaluator.settings
+    if latent is None or not selected.names:
+        return False
+    limits = settings.latent_inputs
+    least = limits.least_size * (limits.relative_size if latent.place == SUPPLY else 1.0)
+    if latent.size >= least:
+        return False
+    base = evaluator.fit(Hypothesis(), selected.noise, selected)
+    held_out = evaluator.held_out_log_likelihood(selected)
+    by_names = float((held_out - evaluator.held_out_log_likelihood(base)).sum())
+    return unnamed.nats < settings.held_out_test.negligible_share * by_names
 
 
 def _supported(

@@ -213,6 +213,7 @@ def diagnose(
         )
         for stage in ("refit", "after")
     )  # fmt: skip
+    form, term = estimates.split_form(term, tuple(missing))
     unnamed = term is not None or conclusion.unresolved or (rejected and location)
     unnamed = unnamed or is_unexplained(open_loop, settings.correction)
     verdict: Verdict = "named" if missing else "unnamed" if unnamed else "nothing_missing"
@@ -226,6 +227,7 @@ def diagnose(
             for name, changed in missing.items()
         ),
         nonparametric=term,
+        form=form,
         location=location,
         remaining=remaining,
         open_loop=open_loop,

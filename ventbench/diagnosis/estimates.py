@@ -16,7 +16,14 @@ from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY, Lat
 from ventbench.diagnosis.screening import component_of
 from ventbench.interfaces import Plant
 from ventbench.mechanics.labels import Estimate, LungMatch
-from ventbench.physics.catalogue import library, mechanism, parameter, paths, strength_path
+from ventbench.physics.catalogue import (
+    library,
+    mechanism,
+    parameter,
+    paths,
+    special_cases,
+    strength_path,
+)
 from ventbench.physics.component_curves import component_curves, without_absorbed
 from ventbench.physics.model import Physics
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
@@ -205,6 +212,30 @@ def nonparametric_term(conclusion: Conclusion) -> NonparametricTerm | None:
     x, y, x_unit, y_unit = _curve(conclusion.full, place.term)
     meaning = NONPARAMETRIC_COMPONENTS[place.name].meaning
     return NonparametricTerm(place.name, meaning, explains, place.nats, x, x_unit, y, y_unit)
+
+
+def split_form(
+    term: NonparametricTerm | None, names: tuple[str, ...]
+) -> tuple[NonparametricTerm | None, NonparametricTerm | None]:
+    """Tell whether a nonparametric term is a missing mechanism's form, or a further effect.
+
+    A curve of the valve in any form contains the library's curve of the valve. Beside that name,
+    the term does not say that something else acts: it says how the curve runs.
+
+    Args:
+        term: the term, or None.
+        names: missing mechanisms.
+
+    Returns:
+        The term as the form of some of the mechanisms, and as a further effect; at most one of
+        them is not None.
+    """
+    component = None if term is None else NONPARAMETRIC_COMPONENTS.get(term.name)
+    if term is None or component is None:
+        return None, term
+    contained = {name for basis in component.terms for name in special_cases(basis)}
+    form_of = tuple(name for name in names if name in contained)
+    return (replace(term, form_of=form_of), None) if form_of else (None, term)
 
 
 def _share(conclusion: Conclusion) -> float:

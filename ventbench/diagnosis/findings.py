@@ -60,6 +60,8 @@ class NonparametricTerm:
         x_unit: name and unit of ``x``, such as ``volume, mL``.
         y: value of the term, without the part that R and C can absorb, ``(k,)``.
         y_unit: name and unit of ``y``.
+        form_of: missing mechanisms that the term contains. If there are any, the term is no further
+            effect: it shows how their form differs from the library's.
     """
 
     name: str
@@ -70,6 +72,7 @@ class NonparametricTerm:
     x_unit: str
     y: Floats
     y_unit: str
+    form_of: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -199,6 +202,8 @@ class Findings:
         verdict: see :data:`Verdict`.
         mechanisms: missing ones, the most important first.
         nonparametric: a term for an effect that is not in the library, or None.
+        form: a term for what the form of a missing mechanism lacks, or None; see
+            :attr:`NonparametricTerm.form_of`.
         location: regions in which the refitted simulator errs, the most certain first.
         open_loop: errors before and after the correction.
         lungs: one for each lung of the recording.
@@ -236,6 +241,7 @@ class Findings:
     notes: tuple[str, ...]
     seconds: float
     settings: SelectionConfig = DEFAULT
+    form: NonparametricTerm | None = None
     remaining: tuple[ErrorRegion, ...] = ()
     split: dict[str, tuple[int, ...]] = field(default_factory=dict)
     chosen: dict[str, Stage] = field(default_factory=dict)

@@ -101,6 +101,10 @@ def verdict(findings: Findings) -> str:
         )
     names = _listed([title(mechanism.name) for mechanism in findings.mechanisms])
     rest = "" if term is None else ", and an effect that is not in the library"
+    if findings.form is not None:
+        several = len(findings.mechanisms) > 1
+        which = f"; {_listed([title(name) for name in findings.form.form_of])}" if several else ""
+        rest = f"{which}, in another form than the library's{rest}"
     return f"Missing in {simulator}: {names}{rest} ({sureness(findings)})"
 
 
@@ -344,8 +348,15 @@ def request(findings: Findings) -> str:
 
 
 def nonparametric_term(findings: Findings) -> str:
-    """Sentence on where an unnamed effect acts, and how much it explains."""
-    term = findings.nonparametric
+    """Sentence on where an unnamed effect acts, or on a mechanism's form, and what it explains."""
+    form, term = findings.form, findings.nonparametric
+    if form is not None:
+        what = _listed([title(name) for name in form.form_of])
+        return (
+            f"The form of the {what} differs from the library's: a nonparametric term for "
+            f"{place(form)} beside it gains {form.nats:.0f} nats on held-out breaths and explains "
+            f"{100 * form.explains:.0f} % of the squared error that it leaves above the noise."
+        )
     if term is None:
         return ""
     start = "In addition to these mechanisms, a" if findings.verdict == "named" else "A"

@@ -178,6 +178,9 @@ class Diagnosis(Findings):
             "verdict": self.verdict,
             "mechanisms": [_mechanism(missing) for missing in self.mechanisms],
             "slot": None if self.nonparametric is None else _nonparametric(self.nonparametric),
+            "form": None
+            if self.form is None
+            else {"of": list(self.form.form_of), **_nonparametric(self.form)},
             "location": [_region(region) for region in self.location],
             "remaining": [_region(region) for region in self.remaining],
             "open_loop": _open_loop(self.open_loop),

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 #: Raised when a value or the meaning of a setting changes.
-VERSION = "selection-3"
+VERSION = "selection-4"
 
 
 @dataclass(frozen=True)
@@ -274,7 +274,10 @@ class LatentInputSettings:
         min_variance: eigenvalues of a unit covariance below this are left out.
         min_noise_share: least share of the samples that the noise is taken to be estimated from.
         threshold: held-out log-likelihood, nats, from which an input is accepted: more than for a
-            term, since places, scales and sizes are searched.
+            term, since places, scales and sizes are searched. It must also be this far ahead of
+            coloured noise and of scatter of the valve's gain.
+        least_size: standard deviation, cmH2O, below which an input beside mechanisms is negligible
+            if it explains little of what they do: a fifth of a mild effort.
         sensor_amplitude: standard deviation, cmH2O, from which a periodic input at the sensor is
             told; less is noise.
         scatter_share: share of what inputs explain from which scatter of the valve's gain between
@@ -294,8 +297,9 @@ class LatentInputSettings:
     min_variance: float = 1e-2
     min_noise_share: float = 0.2
     threshold: float = 8.0
+    least_size: float = 0.4
     sensor_amplitude: float = 0.3
-    scatter_share: float = 1.0
+    scatter_share: float = 0.5
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,9 @@ def test_wilson_is_the_published_interval():
 def test_right_is_the_name_and_nothing_else():
     assert judged("single", [LEAK], answer("named", mechanism("leak"))).right
     assert not judged("single", [LEAK], answer("named", mechanism("leak"), slot="f(V)")).right
+    bent = judged("single", [LEAK], answer("named", mechanism("leak"), form="leak"))
+    assert bent.right
+    assert (bent.slot, bent.form) == (None, "leak")
     both = answer("named", mechanism("leak"), mechanism("valve_lag"))
     assert not judged("single", [LEAK], both).right
     assert judged("single", [LEAK], both).wrong == {"valve_lag"}

@@ -32,7 +32,9 @@ def mechanism(name: str, *alternatives: str, **parameters: tuple[float, float, f
     }
 
 
-def answer(verdict: str, *mechanisms: Any, slot: str | None = None, **changed: Any) -> Any:
+def answer(
+    verdict: str, *mechanisms: Any, slot: str | None = None, form: str | None = None, **changed: Any
+) -> Any:
     """The file of an answer."""
     rmse = {stage: {"mae": 0.0, "rmse": x} for stage, x in
             (("before", 1.0), ("refit", 0.6), ("after", 0.3))}  # fmt: skip
@@ -45,6 +47,7 @@ def answer(verdict: str, *mechanisms: Any, slot: str | None = None, **changed: A
             "verdict": verdict,
             "mechanisms": list(mechanisms),
             "slot": None if slot is None else {"name": slot},
+            "form": None if form is None else {"name": form},
             "open_loop": rmse | {"held_out_breaths": [1, 2]},
         },
     } | changed

@@ -91,6 +91,8 @@ def figures(cases: Sequence[JudgedCase]) -> list[Figure]:
         share("mild: a wrong name", (bool(c.wrong) for c in mild), most=0.02),
         share("single: true name given or among two alternatives",
               (c.listed == c.library for c in seen), least=0.98),
+        share("single: right, with a nonparametric term for its form",
+              (c.right and c.form is not None for c in seen)),
         share("below the detection limit: silence or the right answer",
               (c.silent or (c.named == c.library and bool(c.named)) or c.right for c in under),
               least=0.99),
@@ -194,6 +196,7 @@ def _answer_in_words(case: JudgedCase) -> str:
     if case.verdict == "unnamed":
         return f"unnamed: {case.slot}"
     name = next(iter(case.named)) if len(case.named) == 1 else _SEVERAL
+    name = name if case.form is None else f"{name} (form: {case.form})"
     return name if case.slot is None else f"{name} + {case.slot}"
 
 

@@ -174,6 +174,7 @@ class JudgedCase:
         listed: true mechanisms that are named or among the first two alternatives to a name.
         open: whether the answer lists alternatives.
         slot: place without a name that the answer gives, or None.
+        form: place of the nonparametric term that shows the form of a named mechanism, or None.
         right_slot: whether that place is one of the effect's.
         estimates: parameters of rightly named effects in the library's form.
         before: held-out open-loop RMSE of the given simulator, cmH2O.
@@ -196,6 +197,7 @@ class JudgedCase:
     listed: frozenset[str]
     open: bool
     slot: str | None
+    form: str | None
     right_slot: bool
     estimates: tuple[EstimateAgainstTruth, ...]
     before: float
@@ -270,6 +272,7 @@ def judge(drawn: DrawnCase, nats: list[float], answer: dict[str, Any]) -> Judged
         listed=library & (named | alternatives),
         open=any(mechanism["alternatives"] for mechanism in mechanisms),
         slot=place,
+        form=(diagnosis.get("form") or {}).get("name"),
         right_slot=place in right_places(case) or equivalent,
         estimates=_estimates(true_values(case), mechanisms),
         before=diagnosis["open_loop"]["before"]["rmse"],

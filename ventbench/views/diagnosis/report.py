@@ -55,12 +55,15 @@ def html(diagnosis: Diagnosis) -> str:
         remaining=[_place(diagnosis, place) for place in diagnosis.remaining[:PLACES]],
         more=max(len(diagnosis.location) - PLACES, 0),
         axes=charts.by_axis(diagnosis),
-        slot=diagnosis.nonparametric,
+        slot=diagnosis.form or diagnosis.nonparametric,
         open_loop=report_text.open_loop(diagnosis),
         slot_words=report_text.nonparametric_term(diagnosis),
+        slot_title="The form of what is missing"
+        if diagnosis.form is not None
+        else "An effect outside the library",
         slot_chart=None
-        if diagnosis.nonparametric is None
-        else charts.nonparametric_term(diagnosis.nonparametric),
+        if (shown := diagnosis.form or diagnosis.nonparametric) is None
+        else charts.nonparametric_term(shown),
         request=diagnosis.request,
         request_words=report_text.request(diagnosis),
         request_charts=[] if diagnosis.request is None else charts.request(diagnosis.request),

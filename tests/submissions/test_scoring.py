@@ -423,6 +423,25 @@ def test_a_folder_a_name_a_class_and_a_function_are_scored_alike(make, two_lungs
     assert function.to_json()["submission"]["sha256"] is None
 
 
+def test_one_command_scores_every_track_that_an_entry_enters(make, tmp_path):
+    folder = make(act="return 3.0 if self.task.lung is None else 9.0")
+    out = tmp_path / "runs"
+
+    def scored(track, *options):
+        words = ["score", str(folder), "--plant", "physics", "--in-process", "--json", "-"]
+        ended = CliRunner().invoke(app, [*words, "--track", track, *options])
+        assert ended.exit_code == 0, ended.output
+        return json.loads(ended.stdout)
+
+    both = scored("all", "--out", str(out))["submissions"]
+    assert [entry["track"] for entry in both] == ["robustness", "performance"]
+    assert len({entry["score"] for entry in both}) == 2
+    for entry in both:
+        assert entry["lungs"] == scored(entry["track"])["lungs"]
+        kept = json.loads((out / entry["name"] / entry["track"] / "score.json").read_text())
+        assert kept["score"] == entry["score"]
+
+
 def test_a_folder_runs_in_the_sandbox_unless_told_otherwise(make, two_lungs):
     result = score(make(act="return 3.0"), simulator=two_lungs)
     assert result.sandbox is not None

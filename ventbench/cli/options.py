@@ -177,17 +177,18 @@ def counted(shown: Progress, text: str) -> Callable[[int, int], None]:
 def of_each_entry(
     what: str,
     work: Callable[..., ResultT],
-    entries: Sequence[Submission],
+    jobs: Sequence[tuple[Submission, *tuple[str, ...]]],
     workers: int = 0,
     scheduler: str | None = None,
 ) -> list[ResultT]:
-    """Compute something of each entry: in turn with a bar each, or beside each other.
+    """Compute something of entries: one job after the other with a bar each, or side by side.
 
     Args:
         what: is done, such as ``scoring``.
-        work: takes an entry, and ``progress`` in this process; beside each other, a function of a
-            module with arguments that can be sent.
-        entries: in the order of the results.
+        work: takes what a job holds, and ``progress`` in this process; side by side, a function of
+            a module with arguments that can be sent.
+        jobs: an entry each, with what else the work is told, such as a track; in the order of the
+            results.
         workers: processes; 0 for this one.
         scheduler: address of a Dask scheduler instead.
     """
@@ -195,13 +196,13 @@ def of_each_entry(
 
     if not workers and scheduler is None:
         done = []
-        for entry in entries:
+        for job in jobs:
+            title = ", ".join((job[0].label, *job[1:]))
             with bars() as shown:
-                done.append(work(entry, progress=counted(shown, f"{what} {entry.label}")))
+                done.append(work(*job, progress=counted(shown, f"{what} {title}")))
         return done
     with bars() as shown, executor(workers, scheduler) as pool:
-        jobs = [(entry,) for entry in entries]
-        return in_order(pool, work, jobs, counted(shown, f"{what} {len(jobs)} entries"))
+        return in_order(pool, work, jobs, counted(shown, f"{what}, {len(jobs)} jobs"))
 
 
 def waiting(text: str) -> Progress:

@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from ventbench.stress.score import StressScore
     from ventbench.submissions.folder import Submission
     from ventbench.submissions.result import Score
+    from ventbench.submissions.runner import Progress
 
-Track = Literal["performance", "robustness", "stress"]
+Track = Literal["performance", "robustness", "stress", "all"]
 
 
 def score(
@@ -37,7 +38,7 @@ def score(
         Track | None,
         typer.Option(
             help="Track to score; default: the first of the submission. `stress` runs it under "
-            "missing physics that it is not told of."
+            "missing physics that it is not told of; `all` scores each track that it enters."
         ),
     ] = None,
     draws: Annotated[
@@ -69,8 +70,8 @@ def score(
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Write a record for `board add` here; needs --draws 20. Records of the robustness "
-            "track hold the stress score too.",
+            help="Write a record of each track for `board add` here; needs --draws 20. Records of "
+            "the robustness track hold the stress score too.",
         ),
     ] = None,
     plant: PlantName = "frozen",
@@ -107,6 +108,8 @@ def score(
     are scored in turn, or at the same time with `--workers` or `--scheduler`.
 
     Example: `ventbench score submissions/pid_best --json score.json`
+
+    Example: `ventbench score adaptive_pid --protocol 2 --track all --draws 20 --record runs/record`
     """
     from functools import partial
 
@@ -115,8 +118,8 @@ def score(
     from ventbench import extras
     from ventbench.errors import InputError
     from ventbench.plants.catalog import load_simulators
-    from ventbench.submissions import scoring
     from ventbench.submissions.folder import open_submission
+    from ventbench.submissions.result import Score
 
     if track == "stress":
         from ventbench.cli.stress import score_entries
@@ -137,20 +140,22 @@ def score(
     if record is not None and plant != "frozen":
         raise InputError("--record needs the official simulators: leave out --plant")
     load_simulators(plant)  # whatever is wrong with it is told before anything runs
-    work = partial(
-        scoring.score,
-        simulator=plant,
-        track=track,
-        draws=draws,
-        sandbox=not in_process,
-        protocol=protocol,
-    )
-    scores = of_each_entry("scoring", work, opened, workers, scheduler)
+    tracks = [
+        entry.manifest.tracks if track == "all" else (track or entry.manifest.tracks[0],)
+        for entry in opened
+    ]
+    jobs = [(entry, each) for entry, own in zip(opened, tracks, strict=True) for each in own]
+    # Stress takes longest: beside other work it comes first.
+    under_stress = [(entry, "stress") for entry in opened if protocol == 2 and stress]
+    jobs = [job for job in under_stress if _has_stress_score(job[0])] + jobs
+    work = partial(_run, simulator=plant, draws=draws, sandbox=not in_process, protocol=protocol)
+    done = of_each_entry("scoring", work, jobs, workers, scheduler)
+    scores = [result for result in done if isinstance(result, Score)]
+    stressed = {
+        result.submission.manifest.name: result for result in done if not isinstance(result, Score)
+    }
     results = [result.to_json() for result in scores]
-    stressed: dict[str, StressScore] = {}
     if protocol == 2:
-        if stress:
-            stressed = _stressed(opened, plant, draws, in_process, workers, scheduler)
         for values in results:
             own = stressed.get(values["name"])
             values["stress"] = None if own is None else own.to_json()
@@ -184,29 +189,44 @@ def score(
         raise typer.Exit(1)
 
 
-def _stressed(
-    entries: list[Submission], plant: str, draws: int, in_process: bool, workers: int,
-    scheduler: str | None,
-) -> dict[str, StressScore]:  # fmt: skip
-    """Stress scores, by name, of the entries that need not be told the lung."""
-    from functools import partial
+def _run(
+    entry: Submission,
+    track: str | None,
+    *,
+    simulator: str,
+    draws: int,
+    sandbox: bool,
+    protocol: int,
+    progress: Progress | None = None,
+) -> Score | StressScore:
+    """Score an entry on a track, which may be ``"stress"``; in this process or in another one."""
+    if track == "stress":
+        from ventbench.stress.results import DRAWS
+        from ventbench.stress.score import score_stress
 
-    from ventbench.stress.results import DRAWS
-    from ventbench.stress.score import score_stress
+        some = DRAWS if draws >= DRAWS else 1
+        return score_stress(
+            entry, simulator=simulator, draws=some, sandbox=sandbox, progress=progress
+        )
+    from ventbench.submissions import scoring
 
-    fitting = [entry for entry in entries if "robustness" in entry.manifest.tracks]
-    for entry in entries:
-        if entry not in fitting:
-            name = entry.manifest.name
-            notes().print(f"{name} must be told its lung: it has no stress score")
-    work = partial(
-        score_stress,
-        simulator=plant,
-        draws=DRAWS if draws >= DRAWS else 1,
-        sandbox=not in_process,
+    return scoring.score(
+        entry,
+        simulator=simulator,
+        track=track,
+        draws=draws,
+        sandbox=sandbox,
+        protocol=protocol,
+        progress=progress,
     )
-    scores = of_each_entry("stressing", work, fitting, workers, scheduler)
-    return {own.submission.manifest.name: own for own in scores}
+
+
+def _has_stress_score(entry: Submission) -> bool:
+    """Whether an entry need not be told its lung; says so if it must."""
+    if "robustness" in entry.manifest.tracks:
+        return True
+    notes().print(f"{entry.manifest.name} must be told its lung: it has no stress score")
+    return False
 
 
 def _table(scores: list[dict[str, Any]]) -> Table:
@@ -262,9 +282,17 @@ def _normalised_table(scores: list[dict[str, Any]]) -> Table | str:
 def _keep(
     out: Path, scores: list[Score], stressed: dict[str, StressScore], report: bool
 ) -> list[Path]:
-    written = [out / result.submission.manifest.name for result in scores]
-    for folder, result in zip(written, scores, strict=True):
-        result.save(folder)
+    """Write a folder for each entry, with one for each track in it where there are several."""
+    from dataclasses import replace
+
+    names = [result.submission.manifest.name for result in scores]
+    several = len(set(names)) < len(names)
+    written, runs = [], []
+    for name, result in zip(names, scores, strict=True):
+        run = result.trajectories
+        written.append(out / name / result.track if several else out / name)
+        runs.append(replace(run, name=f"{name}, {result.track}") if several else run)
+        result.save(written[-1])
     for name, own in stressed.items():
         own.save(out / name)
     if report and stressed:
@@ -275,7 +303,6 @@ def _keep(
     if report:
         from ventbench import views
 
-        runs = [result.trajectories for result in scores]
         values = [result.to_json() for result in scores]
         written.append(views.write_report(out / "report.html", runs, values))
         written.append(views.write_rerun(out / "scores.rrd", runs))

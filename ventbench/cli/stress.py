@@ -50,7 +50,7 @@ def score_entries(
         raise InputError(f"--record of the stress track needs {DRAWS} draws on the frozen rigs")
     opened = [open_submission(name) for name in names]
     work = partial(score_stress, simulator=plant, draws=draws or DRAWS, sandbox=not in_process)
-    scores = of_each_entry("stressing", work, opened, *parallel)
+    scores = of_each_entry("stressing", work, [(entry,) for entry in opened], *parallel)
     results = [result.to_json() for result in scores]
     emit(results[0] if len(results) == 1 else {"submissions": results}, json)
     console = Console(stderr=str(json) == "-")
@@ -138,7 +138,7 @@ def _write_records(
         sandbox=not in_process,
         protocol=2,
     )
-    scores = of_each_entry("scoring", work, entries, *parallel)
+    scores = of_each_entry("scoring", work, [(entry,) for entry in entries], *parallel)
     by_name = {own.submission.manifest.name: own for own in stressed}
     return create.keep(folder, scores, frozen.load(2), by_name)
 

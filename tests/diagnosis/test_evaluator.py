@@ -285,3 +285,18 @@ def test_every_breath_is_held_out_once(turbulent, both):
         turbulent.held_out_log_likelihood(both[0]) - turbulent.held_out_log_likelihood(both[1])
     )
     assert gained.sum() > 50.0
+
+
+def test_one_batch_of_a_long_recording_ranks_candidates(turbulent, both):
+    named, _ = both
+    assert turbulent.for_ranking is turbulent
+    few = dataclasses.replace(
+        turbulent.settings, data=dataclasses.replace(turbulent.settings.data, batch_size=4)
+    )
+    long = dataclasses.replace(turbulent, settings=few)
+    assert long.for_ranking.training.data.lung.shape == (4,)
+    assert set(long.for_ranking.training.data.position) < set(turbulent.training.data.position)
+    less = long.restricted(named)
+    values = {tuple(row) for row in less.values.round(9).tolist()}
+    assert values < {tuple(row) for row in named.values.round(9).tolist()}
+    assert less.log_likelihood < named.log_likelihood

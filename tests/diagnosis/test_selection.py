@@ -17,7 +17,6 @@ from ventbench.diagnosis.selection import (
     fit_with_noise,
     fit_with_white_noise,
     forward_selection,
-    free_shape_parameters,
     passes_heldout_test,
 )
 from ventbench.diagnosis.settings import HeldOutTestSettings
@@ -190,34 +189,14 @@ def test_a_term_that_another_replaces_is_dropped():
     assert drop_redundant_terms(evaluator, kept).hypothesis.names == ("sensor_lag", "sensor_drift")
 
 
-@pytest.mark.parametrize("form", ["linear", "library"])
-def test_a_shape_parameter_is_freed_if_the_recording_asks_for_it(form):
-    effect = small.effect("leak", form, conductance=20.0)
-    evaluator = small.split(small.made(effect, noise=0.1, seed=5))
-    found = free_shape_parameters(
-        evaluator, evaluator.fit(Hypothesis(("leak",)), Noise((0.1,), (0.0,)))
-    )
-    # The library's is an orifice.
-    assert found.hypothesis.free == (("leak.exponent",) if form == "linear" else ())
-    wanted = 1.0 if form == "linear" else 0.5
-    assert found.column("leak.exponent")[0] == pytest.approx(wanted, abs=0.05)
+def test_one_mechanism_takes_the_place_of_two_that_imitate_it():
+    effect = small.effect("supply_droop", drop=0.3, recovery=0.8)
+    evaluator = small.split(small.made(effect, noise=0.1, seed=3))
+    two = fit_with_noise(evaluator, Hypothesis(("supply_pressure", "valve_curve")))
+    instead = selection.replace_pair(evaluator, two)
+    assert instead is not None
+    assert instead.names == ("supply_droop",)
 
 
-@pytest.mark.parametrize(
-    ("effect", "path", "wanted"),
-    [
-        (small.effect("valve_lag", "two lags", tau=0.1), "valve_lag.second", 0.05),
-        (small.effect("valve_hysteresis", "soft play", width=5.0), "valve_hysteresis.give", 1.0),
-        (
-            small.effect("turbulent_resistance", "exponent 1.75", quadratic=10.0),
-            "turbulent_resistance.exponent",
-            1.75,
-        ),
-        (small.effect("sensor_drift", "warming", drift=3.0), "sensor_drift.warming", 3.0),
-    ],
-)
-def test_another_form_is_found_by_a_shape_parameter(effect, path, wanted):
-    evaluator = small.split(small.made(effect, noise=0.03, seed=5))
-    found = free_shape_parameters(evaluator, fit_with_noise(evaluator, Hypothesis((effect.name,))))
-    assert found.hypothesis.free == (path,)
-    assert found.column(path)[0] == pytest.approx(wanted, rel=0.15)
+def test_a_single_mechanism_has_no_pair_to_replace(turbulent, both):
+    assert selection.replace_pair(turbulent, both[0]) is None

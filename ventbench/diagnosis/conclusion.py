@@ -42,10 +42,10 @@ from ventbench.diagnosis.selection import (
     Progress,
     fit_with_noise,
     forward_selection,
-    free_shape_parameters,
     passes_heldout_test,
 )
 from ventbench.diagnosis.settings import SelectionConfig
+from ventbench.diagnosis.shape_parameters import free_shape_parameters
 from ventbench.executor import parallel_map
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import Noise

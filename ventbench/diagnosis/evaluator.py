@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import product
 from weakref import WeakKeyDictionary
 
@@ -41,6 +42,7 @@ def fit(
     gain_sd: float = 0.0,
     tolerance: float | None = None,
     iterations: int | None = None,
+    delay_rounds: int | None = None,
     settings: SelectionConfig = DEFAULT,
 ) -> FittedModel:
     """Find the maximum-likelihood parameters of a hypothesis.
@@ -58,6 +60,7 @@ def fit(
         tolerance: expected fall of the cost, nats, at which the search ends; as in ``settings`` if
             None.
         iterations: most steps; as in ``settings`` if None.
+        delay_rounds: most times that it goes on from another dead time; as in ``settings`` if None.
         settings: every threshold.
     """
     extra = ("gain",) if gain_sd else ()
@@ -83,7 +86,7 @@ def fit(
         tolerance=settings.fit.tolerance if tolerance is None else tolerance,
         iterations=settings.fit.iterations if iterations is None else iterations,
     )  # fmt: skip
-    for _ in range(settings.fit.delay_rounds):
+    for _ in range(settings.fit.delay_rounds if delay_rounds is None else delay_rounds):
         beyond = _beyond_the_cliff(problem, minimum, settings)
         if beyond is None:
             break
@@ -238,13 +241,53 @@ class Evaluator:
         restart: bool = False,
         iterations: int | None = None,
         tolerance: float | None = None,
+        delay_rounds: int | None = None,
     ) -> FittedModel:
         """Fit a hypothesis to the training breaths, or to ``partition``; see :func:`fit`."""
         return fit(
             partition or self.training, hypothesis, noise, warm_start=warm_start, start=start,
             restart=restart, gain_sd=self.gain_sd, tolerance=tolerance, iterations=iterations,
-            settings=self.settings,
+            delay_rounds=delay_rounds, settings=self.settings,
         )  # fmt: skip
+
+    @cached_property
+    def for_ranking(self) -> Evaluator:
+        """Evaluator with as many training breaths as rank candidates: one batch of simulations.
+
+        This one, if the recording has no more of them.
+        """
+        index = self._ranking_breaths
+        if len(index) == len(self.training.data):
+            return self
+        names = self.training.predictor.names
+        partition = make_partition(self.training.data.select(index), names, self.settings)
+        return replace(self, training=partition)
+
+    def restricted(self, fitted: FittedModel) -> FittedModel:
+        """A model of the training breaths as one of the breaths of :attr:`for_ranking`."""
+        partition = self.for_ranking.training
+        if partition is self.training:
+            return fitted
+        paths, fixed = fitted.problem.unknowns.paths, dict(fitted.hypothesis.fixed)
+        problem = make_problem(partition, paths, fitted.noise, fixed, self.gain_sd)
+        index = self._ranking_breaths
+        x = problem.unknowns.pack({path: fitted.column(path)[index] for path in paths})
+        size = len(x)
+        minimum = Minimum(x, problem.cost(x), np.zeros(size), np.eye(size), 0, False)
+        likelihood = float(problem.log_likelihood(x).sum())
+        return FittedModel(fitted.hypothesis, problem, minimum, likelihood)
+
+    @cached_property
+    def _ranking_breaths(self) -> NDArray[np.intp]:
+        """Evenly spaced training breaths: one batch, but at least two of each lung."""
+        lungs, size = self.training.data.lung, len(self.training.data)
+        share = min(1.0, self.settings.data.batch_size / size)
+        chosen = []
+        for lung in np.unique(lungs):
+            index = np.flatnonzero(lungs == lung)
+            count = min(len(index), max(2, int(share * len(index))))
+            chosen.append(index[np.linspace(0, len(index) - 1, count).round().astype(int)])
+        return np.sort(np.concatenate(chosen))
 
     def held_out_log_likelihood(self, fitted: FittedModel) -> Floats:
         """Log-likelihood of each held-out breath, nats, ``(n,)``.
@@ -345,7 +388,7 @@ class Evaluator:
         same |= ~same.any(axis=1, keepdims=True)
         first = np.argmax(same, axis=1)
         for column, name in enumerate(partition.predictor.names):
-            if name != "position" and name in names and not self._differs_by_breath(name):
+            if name != "position" and name in names and not self.differs_by_breath(name):
                 parameter = parameter_of(name)  # rounding must not carry a value beyond its bound
                 value = fitted.values[first, names.index(name)]
                 values[:, column] = np.clip(value, parameter.low, parameter.high)
@@ -355,7 +398,8 @@ class Evaluator:
         """Term of a model whose parameters differ from breath to breath."""
         return breath_term(fitted.names, self.settings)
 
-    def _differs_by_breath(self, path: str) -> bool:
+    def differs_by_breath(self, path: str) -> bool:
+        """Whether a parameter has a value of its own in each breath."""
         if path == "gain":
             return self.gain_sd > 0
         return path == START or ("." in path and parameter_of(path).scope == "breath")

@@ -264,12 +264,17 @@ def special_case_of(
 
     Returns:
         The mechanisms with the new one last, fitted with its noise; None if none is needed that
-        explains at least half of what the term does.
+        explains at least half of what the term does, or nearly all of it where the term may be no
+        more than the form of a mechanism that is selected already.
     """
     related = special_cases(unnamed.term)
-    names = tuple(name for name in related if name in evaluator.allowed_mechanisms)
-    if not names or set(related) & set(selected.names):
+    others = set(related) - set(selected.names)
+    names = tuple(name for name in evaluator.allowed_mechanisms if name in others)
+    if not names:
         return None
+    settings = evaluator.settings.refinement
+    is_form = bool(set(related) & set(selected.names))  # the term may be the form of a name
+    share = settings.beside_related_share if is_form else settings.related_share
     noise = unnamed.full.noise
     without = evaluator.fit(selected.hypothesis, noise, selected)
     whole = unnamed.full.log_likelihood - without.log_likelihood
@@ -291,7 +296,7 @@ def special_case_of(
     first = min(trials, key=lambda trial: evaluator.criterion(trial, noise))
     best = fit_with_noise(evaluator, first.hypothesis, first)
     by_name = best.log_likelihood_at(noise) - without.log_likelihood
-    if by_name < evaluator.settings.refinement.related_share * whole:
+    if by_name < share * whole:
         return None
     beside = evaluator.fit(selected.hypothesis, best.noise, selected)
     return best if is_needed(evaluator, best, beside) else None

@@ -11,13 +11,17 @@ cross-validated one; and it must not be a negligible strength that trims other t
 parameters of the new term are freed if both criteria ask for it, and earlier terms that the new one
 makes redundant are dropped. Patient effort has parameters of its own in each breath and can imitate
 any sum of effects, so effects that are the same in all breaths come first, and effort has to
-explain more than slowly varying sensor noise would. The search ends when no candidate passes.
+explain more than slowly varying sensor noise would. The search ends when no candidate passes and
+no pair of terms can be exchanged for one mechanism.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 
@@ -27,14 +31,22 @@ from ventbench.diagnosis.latent_inputs import exceeds_sensor_noise
 from ventbench.diagnosis.plausibility import is_plausible
 from ventbench.diagnosis.screening import Candidate, screen_mechanisms
 from ventbench.diagnosis.settings import DEFAULT, HeldOutTestSettings
+from ventbench.diagnosis.shape_parameters import (
+    fit_with_shape,
+    free_shape_parameters,
+    other_dead_times,
+    shapes_at_default,
+)
 from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import Noise, robust_noise
-from ventbench.system_id.problem import parameter_of
 
 #: Is told what is being done.
 Progress = Callable[[str], None]
+
+#: Physical values that a fit starts from, by path.
+Start = dict[str, Any]
 
 #: Gives a simpler model that ends the search in place of the current one, or None.
 Replacement = Callable[[FittedModel], FittedModel | None]
@@ -97,12 +109,15 @@ def forward_selection(
         white = fit_with_white_noise(evaluator, current)
         candidates = screen_mechanisms(current, white, settings, evaluator.allowed_mechanisms)
         comparison = compare_candidates(evaluator, current, candidates, white)
-        if comparison is None:
-            break
-        comparisons.append(comparison)
-        best = _accepted(evaluator, comparison)
+        if comparison is not None:
+            comparisons.append(comparison)
+        best = None if comparison is None else _accepted(evaluator, comparison)
         if best is None:
-            break
+            best = replace_pair(evaluator, current)
+            if best is None:
+                break
+            current = best
+            continue
         current = drop_redundant_terms(evaluator, free_shape_parameters(evaluator, best))
         if len(current.names) < settings.forward.replacement_terms:
             continue
@@ -247,36 +262,14 @@ def compare_candidates(
     ]
     if not chosen:
         return None
-    # Templates are linear: where much is missing they rank badly, and all are fitted.
-    if max(candidate.nats for candidate in chosen) < settings.large_gain:
-        chosen = chosen[: settings.fitted_candidates]
+    # Templates are linear: where much is missing they rank badly, and all are fitted. Even one that
+    # promises nothing may be right: where a refit has hidden a lag of the sensor in a resistance
+    # near zero, no jump of the pressure is left that the lag could round.
+    much = max(candidate.nats for candidate in chosen) >= settings.large_gain
+    chosen = candidates if much else chosen[: settings.fitted_candidates]
     # Noise that was estimated with an effect in the residual would hide the effect from its fit.
-    white = replace(current.noise, ar=(0.0, 0.0))
-    shifts: tuple[dict[str, float], ...] = ({}, *_other_dead_times(warm_start or current))
-    work = [
-        (k, start | shift)
-        for k, candidate in enumerate(chosen)
-        for start in (candidate.start, *candidate.other_starts)
-        for shift in (shifts if not varies_by_breath(candidate.name) else shifts[:1])
-    ]
-    fits = parallel_map(
-        lambda job: evaluator.fit(
-            current.hypothesis.plus(chosen[job[0]].hypothesis),
-            white,
-            warm_start or current,
-            job[1],
-            iterations=evaluator.settings.fit.quick_iterations,
-            tolerance=evaluator.settings.fit.quick_tolerance,
-        ),
-        work,
-    )
-    models = [
-        min(
-            (model for (j, _), model in zip(work, fits, strict=True) if j == k),
-            key=lambda model: model.minimum.cost,
-        )
-        for k in range(len(chosen))
-    ]
+    white, first = replace(current.noise, ar=(0.0, 0.0)), warm_start or current
+    models = _quick_fits(evaluator, current, chosen, white, first, far=much)
     criteria = _Criteria(evaluator)
     own = parallel_map(lambda model: criteria(model, estimate_noise(model)), models)
     noise = criteria.better_noise(models[int(np.argmin(own))], current.noise)
@@ -286,12 +279,16 @@ def compare_candidates(
         order[0] = evaluator.fit(order[0].hypothesis, noise, order[0])
         noise = criteria.better_noise(order[0], noise)
         order = criteria.order(order, noise)
-        best = criteria(order[0], noise)
-        gained = criteria(current, noise) - best
-        limit = best + max(settings.contender_criterion, settings.contender_share * gained)
+        limit = _contention(evaluator, criteria, current, order[0], noise)
         order = criteria.order(_fit_contenders(evaluator, order, noise, criteria, limit), noise)
         if criteria.better_noise(order[0], noise) is noise:
             break
+    limit = _contention(evaluator, criteria, current, order[0], noise)
+    if len(order) > 1 and criteria(order[1], noise) < limit:
+        freer = _free_contenders(evaluator, order, noise, criteria, limit)
+        order = criteria.order(freer, noise)
+        noise = criteria.better_noise(order[0], noise)
+        order = criteria.order(order, noise)
     if noise is not current.noise:
         current = evaluator.fit(current.hypothesis, noise, current)
     ranked = tuple(
@@ -301,21 +298,87 @@ def compare_candidates(
     return Comparison(current, ranked, gains - evaluator.held_out_log_likelihood(current))
 
 
-def _other_dead_times(fitted: FittedModel) -> list[dict[str, float]]:
-    """Values of each fitted dead time one sample before and after, by path.
+def _quick_fits(
+    evaluator: Evaluator,
+    current: FittedModel,
+    candidates: list[Candidate],
+    noise: Noise,
+    warm_start: FittedModel,
+    *,
+    far: bool,
+) -> list[FittedModel]:
+    """First fits of candidates, each from its best start.
 
-    A dead time that was fitted without an effect may stand on the wrong side of a sample, where
-    nothing that is added to it alone helps.
+    Where a fit may have to go far (``far``), the templates of the screening extrapolate badly, and
+    the refit's R and C make up for the effect: a mild effect is tried too, with these and with the
+    label's. A few steps from every start show which two are worth going on from.
+
+    Of a long recording, one batch of its breaths ranks them, and those that may win are fitted to
+    all of its training breaths.
     """
-    interval = float(np.median(fitted.problem.data.dt))
-    others = []
-    for path in fitted.hypothesis.paths:
-        about = parameter_of(path)
-        if about.kinked and about.scan:
-            value = float(np.median(fitted.column(path)))
-            near = {min(max(value + step, about.low), about.high) for step in (-interval, interval)}
-            others += [{path: other} for other in sorted(near - {value})]
-    return others
+    small, settings = evaluator.for_ranking, evaluator.settings
+    first, data = evaluator.restricted(warm_start), small.training.data
+    quick = partial(
+        Evaluator.fit,
+        iterations=settings.fit.quick_iterations,
+        tolerance=settings.fit.quick_tolerance,
+    )
+    shifts: list[Start] = [{}, *other_dead_times(warm_start)]
+    label: Start = {"R": data.R, "C": data.C}
+
+    def quick_fit(candidate: Candidate) -> FittedModel:
+        hypothesis = current.hypothesis.plus(candidate.hypothesis)
+        starts: list[Start] = [candidate.start, *candidate.other_starts]
+        if not varies_by_breath(candidate.name):
+            starts = [start | shift for start in starts for shift in shifts]
+            starts += [{}, label] if far else []
+        if len(starts) <= settings.fit.continued_starts:
+            fits = [quick(small, hypothesis, noise, first, start) for start in starts]
+        else:
+            steps = settings.fit.start_iterations
+            raced = [
+                small.fit(hypothesis, noise, first, start, iterations=steps, delay_rounds=0)
+                for start in starts
+            ]
+            raced.sort(key=lambda model: model.minimum.cost)
+            ahead = raced[: settings.fit.continued_starts]
+            fits = [quick(small, hypothesis, noise, model) for model in ahead]
+        return min(fits, key=lambda model: model.minimum.cost)
+
+    models = parallel_map(quick_fit, candidates)
+    if small is evaluator:
+        return models
+    criteria = _Criteria(small)
+    own = parallel_map(lambda model: criteria(model, estimate_noise(model)), models)
+    noise_left = estimate_noise(models[int(np.argmin(own))])
+    models = criteria.order(models, noise_left)
+    limit = _contention(evaluator, criteria, evaluator.restricted(current), models[0], noise_left)
+    count = settings.forward.fitted_candidates
+    kept = [m for k, m in enumerate(models) if k < count or criteria(m, noise_left) < limit]
+
+    def on_all(model: FittedModel) -> FittedModel:
+        values = small.transferred_values(model, evaluator.training)
+        start = {
+            path: values[:, k]
+            for k, path in enumerate(model.problem.predictor.names)
+            if not small.differs_by_breath(path)
+        }
+        return quick(evaluator, model.hypothesis, noise, warm_start, start)
+
+    return parallel_map(on_all, kept)
+
+
+def _contention(
+    evaluator: Evaluator,
+    criteria: _Criteria,
+    current: FittedModel,
+    best: FittedModel,
+    noise: Noise,
+) -> float:
+    """Criterion below which a candidate may still win."""
+    settings, least = evaluator.settings.forward, criteria(best, noise)
+    gained = criteria(current, noise) - least
+    return least + max(settings.contender_criterion, settings.contender_share * gained)
 
 
 def _fit_contenders(
@@ -333,6 +396,31 @@ def _fit_contenders(
         return model
 
     return parallel_map(continued, models)
+
+
+def _free_contenders(
+    evaluator: Evaluator,
+    models: list[FittedModel],
+    noise: Noise,
+    criteria: _Criteria,
+    limit: float,
+) -> list[FittedModel]:
+    """Free the shapes of the newest terms of models that may win, where the criterion asks for it.
+
+    Mechanisms that act alike are told apart by their shapes: a supply that recovers in 1.4 s and
+    is fitted with the default of 1 s may lose to one whose pressure is finite.
+    """
+
+    def freest(model: FittedModel) -> FittedModel:
+        if criteria(model, noise) >= limit or varies_by_breath(model.names[-1]):
+            return model
+        for path in shapes_at_default(model):
+            freer = fit_with_shape(evaluator, model, path, noise)
+            if criteria(freer, noise) < criteria(model, noise):
+                model = freer
+        return model
+
+    return parallel_map(freest, models)
 
 
 class _Criteria:
@@ -425,33 +513,6 @@ def _fallback(evaluator: Evaluator, comparison: Comparison) -> FittedModel | Non
     return None
 
 
-def free_shape_parameters(evaluator: Evaluator, current: FittedModel) -> FittedModel:
-    """Free the shape parameters of the newest term that the recording asks for, and no others.
-
-    Screening frees a shape that promises more than the default one. Where the fit needs no such
-    freedom, the default returns.
-    """
-    name = current.hypothesis.names[-1]
-    for about in mechanism(name).description.parameters:
-        path = f"{name}.{about.name}"
-        if not about.shape or about.discrete:
-            continue
-        if path in current.hypothesis.free:
-            usual = evaluator.fit(current.hypothesis.with_default(path), current.noise, current)
-            if evaluator.criterion(usual) <= evaluator.criterion(current):
-                current = usual
-            continue
-        freed = current.hypothesis.plus(Hypothesis((name,), (path,)))
-        freer = evaluator.fit(freed, current.noise, current)
-        if evaluator.criterion(freer) > evaluator.criterion(current):
-            continue
-        before = evaluator.held_out_log_likelihood(current)
-        gained = float((evaluator.held_out_log_likelihood(freer) - before).sum())
-        if gained > evaluator.settings.forward.shape_gain:
-            current = freer
-    return current
-
-
 def drop_redundant_terms(evaluator: Evaluator, current: FittedModel) -> FittedModel:
     """Drop earlier terms that are no longer needed, or have become negligible."""
     for name in current.hypothesis.names[:-1]:
@@ -460,3 +521,77 @@ def drop_redundant_terms(evaluator: Evaluator, current: FittedModel) -> FittedMo
         if not needed or is_negligible(evaluator, current, without, name):
             current = without
     return current
+
+
+def replace_pair(evaluator: Evaluator, current: FittedModel) -> FittedModel | None:
+    """One mechanism in the place of two, if the criterion prefers it; else None.
+
+    Where the right mechanism loses a round narrowly, the one that is taken and a second one may
+    imitate it together, and neither can be exchanged alone: a circuit's compliance with a late
+    expiratory valve for gas that has inertia. Mechanisms that are confusable with either are
+    fitted in their place, from the values of the full fit, and held-out breaths must not object.
+    So is each of the two with its shape free: a valve with a second lag instead of a circuit
+    behind a valve with one.
+    """
+    names = [name for name in current.names if not varies_by_breath(name)]
+    pairs = list(combinations(names, 2))
+    work = [
+        (current.hypothesis.without(*pair), name, start)
+        for pair in pairs
+        for name in _rivals(evaluator, current, pair)
+        for start in _grid_starts(name)
+    ]
+    alone = [
+        (current.hypothesis.without(*pair), name, {})
+        for pair in pairs
+        for name in pair
+        if shapes_at_default(current, name)
+    ]
+    if not work and not alone:
+        return None
+
+    def fitted(job: tuple[Hypothesis, str, dict[str, float]]) -> FittedModel:
+        rest, name, start = job
+        return evaluator.fit(rest.plus(Hypothesis((name,))), current.noise, current, start)
+
+    def freest(model: FittedModel) -> FittedModel:
+        for path in shapes_at_default(model):
+            freer = fit_with_shape(evaluator, model, path, current.noise)
+            if evaluator.criterion(freer) < evaluator.criterion(model):
+                model = freer
+        return model
+
+    criterion = evaluator.criterion(current)
+    limit = criterion + evaluator.settings.forward.contender_criterion
+    close = [model for model in parallel_map(fitted, work) if evaluator.criterion(model) < limit]
+    models = parallel_map(freest, close + parallel_map(fitted, alone))
+    best = min(models, key=evaluator.criterion, default=None)
+    if best is None or evaluator.criterion(best) >= criterion:
+        return None
+    held_out = evaluator.held_out_log_likelihood(current)
+    lost = held_out - evaluator.held_out_log_likelihood(best)
+    if passes_heldout_test(lost, evaluator.settings.held_out_test):
+        return None
+    return fit_with_noise(evaluator, best.hypothesis, best)
+
+
+def _rivals(evaluator: Evaluator, current: FittedModel, pair: tuple[str, ...]) -> list[str]:
+    """Mechanisms that are confusable with one of a pair, and are not selected."""
+    listed = {name for own in pair for name in mechanism(own).description.confusable}
+    return [
+        name
+        for name in evaluator.allowed_mechanisms
+        if name not in current.names
+        and not varies_by_breath(name)
+        and (name in listed or set(mechanism(name).description.confusable) & set(pair))
+    ]
+
+
+def _grid_starts(name: str) -> list[dict[str, float]]:
+    """Starts of a fit: the settings of the parameters that change a mechanism's effect much."""
+    grids = {
+        f"{name}.{about.name}": about.grid
+        for about in mechanism(name).description.parameters
+        if about.grid and not about.shape
+    }
+    return [dict(zip(grids, setting, strict=True)) for setting in product(*grids.values())]

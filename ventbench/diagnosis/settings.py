@@ -50,7 +50,9 @@ class FitSettings:
         quick_iterations: most steps of the first fit of a candidate.
         breath_tolerance: ends the fit of a breath's own parameters to a breath that is evaluated.
         breath_iterations: most steps of that fit, whose parameters act almost linearly.
-        start_iterations: most steps where a hypothesis is fitted again with a wider simulator.
+        start_iterations: most steps where a hypothesis is fitted again with a wider simulator, or
+            where starts are compared.
+        continued_starts: starts of a candidate from which its first fit goes on.
         noise_gain: log-likelihood, nats, that another estimate of the noise must gain; less is
             within the tolerance of the fits.
         noise_rounds: most times that parameters and noise are estimated in turn.
@@ -65,6 +67,7 @@ class FitSettings:
     breath_tolerance: float = 0.1
     breath_iterations: int = 4
     start_iterations: int = 3
+    continued_starts: int = 2
     noise_gain: float = 2.0
     noise_rounds: int = 5
     delay_gain: float = 2.0
@@ -170,6 +173,8 @@ class RefinementSettings:
             near its top.
         related_share: share of what a nonparametric term explains from which a mechanism that it
             contains as a special case stands.
+        beside_related_share: the same where such a mechanism is selected already, of which the term
+            may be the form: another one must explain nearly all that the term does.
         compensating_share: share of what is explained below which a mechanism beside a
             nonparametric term only compensates for its form.
         max_compensating_share: share of what is explained up to which a mechanism may only
@@ -191,6 +196,7 @@ class RefinementSettings:
 
     fitted_terms: int = 5
     related_share: float = 0.5
+    beside_related_share: float = 0.9
     compensating_share: float = 0.1
     max_compensating_share: float = 0.5
     shortfall_share: float = 0.05

@@ -1,0 +1,96 @@
+"""Shape parameters of a hypothesis's newest term, and other starts of dead times.
+
+An exponent, a recovery time or a second lag stays at its default unless the recording asks for
+another value. Mechanisms that act alike may differ by their shape alone, so that rivals are
+compared with free shapes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ventbench.diagnosis.evaluator import Evaluator
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
+from ventbench.executor import parallel_map
+from ventbench.physics.catalogue import mechanism
+from ventbench.system_id.noise import Noise
+from ventbench.system_id.problem import parameter_of
+
+
+def free_shape_parameters(evaluator: Evaluator, current: FittedModel) -> FittedModel:
+    """Free the shape parameters of the newest term that the recording asks for, and no others.
+
+    Screening frees a shape that promises more than the default one. Where the fit needs no such
+    freedom, the default returns.
+    """
+    name = current.hypothesis.names[-1]
+    for about in mechanism(name).description.parameters:
+        path = f"{name}.{about.name}"
+        if not about.shape or about.discrete:
+            continue
+        if path in current.hypothesis.free:
+            usual = evaluator.fit(current.hypothesis.with_default(path), current.noise, current)
+            if evaluator.criterion(usual) <= evaluator.criterion(current):
+                current = usual
+            continue
+        freer = fit_with_shape(evaluator, current, path, current.noise)
+        if evaluator.criterion(freer) > evaluator.criterion(current):
+            continue
+        before = evaluator.held_out_log_likelihood(current)
+        gained = float((evaluator.held_out_log_likelihood(freer) - before).sum())
+        if gained > evaluator.settings.forward.shape_gain:
+            current = freer
+    return current
+
+
+def fit_with_shape(
+    evaluator: Evaluator, model: FittedModel, path: str, noise: Noise
+) -> FittedModel:
+    """Fit a model with a shape parameter of its newest term free as well.
+
+    A lag that was fitted alone is as long as the two that it stands for, and a dead time before it
+    makes up for what is left: neither moves by itself. A parameter that can be exchanged with
+    another one therefore also starts at half of it, with each dead time as it is and one sample
+    off.
+    """
+    name, _, short = path.rpartition(".")
+    freed = model.hypothesis.plus(Hypothesis((name,), (path,)))
+    starts: list[dict[str, Any]] = [{}]
+    for pair in mechanism(name).description.interchangeable:
+        if short in pair:
+            other = f"{name}.{pair[1 - pair.index(short)]}"
+            halves = dict.fromkeys((path, other), 0.5 * model.column(other))
+            starts += [halves | shift for shift in ({}, *other_dead_times(model))]
+    fits = parallel_map(lambda start: evaluator.fit(freed, noise, model, start), starts)
+    return min(fits, key=lambda fitted: fitted.minimum.cost)
+
+
+def shapes_at_default(model: FittedModel, name: str | None = None) -> list[str]:
+    """Paths of a term's continuous shape parameters that are not fitted; the newest's if None."""
+    name = name or model.names[-1]
+    paths = {
+        f"{name}.{about.name}"
+        for about in mechanism(name).description.parameters
+        if about.shape and not about.discrete
+    }
+    fitted = {*model.hypothesis.free, *(path for path, _ in model.hypothesis.fixed)}
+    return sorted(paths - fitted)
+
+
+def other_dead_times(fitted: FittedModel) -> list[dict[str, float]]:
+    """Values of each fitted dead time one sample before and after, by path.
+
+    A dead time that was fitted without an effect may stand on the wrong side of a sample, where
+    nothing that is added to it alone helps.
+    """
+    interval = float(np.median(fitted.problem.data.dt))
+    others = []
+    for path in fitted.hypothesis.paths:
+        about = parameter_of(path)
+        if about.kinked and about.scan:
+            value = float(np.median(fitted.column(path)))
+            near = {min(max(value + step, about.low), about.high) for step in (-interval, interval)}
+            others += [{path: other} for other in sorted(near - {value})]
+    return others

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any
 
 import jax
@@ -66,7 +68,7 @@ def test_version_1_and_other_simulators_have_one_plant_a_lung_or_their_ensemble(
 
 
 @pytest.mark.slow
-def test_gains_are_tuned_on_draws_of_their_own(official):
+def test_gains_are_tuned_on_draws_of_their_own(official, monkeypatch):
     told = []
     tuned = rig_pid.tune_on_rigs(gains=PIDS, draws=2, progress=lambda *x: told.append(x))
     assert told[-1] == (6, 6)
@@ -77,6 +79,19 @@ def test_gains_are_tuned_on_draws_of_their_own(official):
     assert result["lungs"]["R5C10"]["error"] == pytest.approx(tuned.errors[0])
     assert result["simulators"]["manifest_sha256"] == official.manifest_sha256
     assert rig_pid.TUNING_SEED != seasons.DEVELOPMENT_SEED
+
+    asked = []
+
+    @contextmanager
+    def cluster(*where):
+        asked.append(where)
+        with ThreadPoolExecutor(2) as pool:
+            yield pool
+
+    monkeypatch.setattr(rig_pid, "executor", cluster)
+    again = rig_pid.tune_on_rigs(gains=PIDS, draws=2, scheduler="tcp://elsewhere:8786")
+    assert asked == [(0, "tcp://elsewhere:8786")]
+    assert again.to_json() == result
 
 
 @pytest.mark.slow

@@ -45,6 +45,7 @@ def make(
         ),
     ] = "all",
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
+    scheduler: Scheduler = None,
     generator: Annotated[
         Literal["first", "stranger"],
         typer.Option(
@@ -66,8 +67,9 @@ def make(
 
     with bars() as shown:
         task = shown.add_task("recording", total=cases)
+        place = out if scheduler is None else out.resolve()
         hashed = work(
-            seed, out, kind, cases, jobs=jobs, source=generator,
+            seed, place, kind, cases, jobs=jobs, scheduler=scheduler, source=generator,
             progress=lambda done: shown.update(task, completed=done),
         )  # fmt: skip
     typer.echo(f"wrote {cases} recordings to {out}; commitment {hashed}")
@@ -135,6 +137,7 @@ def reveal(
     jobs: Annotated[
         int, typer.Option(min=0, help="Processes for --oracle; 0 for this process alone.")
     ] = 0,
+    scheduler: Scheduler = None,
     json: JsonFile = None,
     page: ResultsPage = None,
 ) -> None:
@@ -157,9 +160,11 @@ def reveal(
         def progress(done: int, total: int) -> None:
             shown.update(task, completed=done, total=total)
 
+        place = folder if scheduler is None else folder.resolve()
         result = work(
-            ChallengeFolder(folder, round_), seed, with_oracle=oracle, jobs=jobs, progress=progress
-        )
+            ChallengeFolder(place, round_), seed, with_oracle=oracle, jobs=jobs,
+            scheduler=scheduler, progress=progress,
+        )  # fmt: skip
     emit(result.as_dict(), json)
     if page is not None:
         total = len(ChallengeFolder(folder).cases())

@@ -77,9 +77,9 @@ def pid(
     if (lung is not None) + every + robust != 1:
         raise InputError("give exactly one of --lung LUNG, --all and --robust")
     if version == 2:
-        if not every or workers or scheduler is not None:
-            raise InputError("--protocol 2 tunes all lungs in this process: give --all alone")
-        grid, result = _search_rigs(plant, out)
+        if not every:
+            raise InputError("--protocol 2 tunes all lungs: give --all")
+        grid, result = _search_rigs(plant, out, workers, scheduler)
     else:
         names = None if lung is None else (lung,)
         grid, result = _search(names, plant, out, workers, scheduler, not robust)
@@ -113,18 +113,17 @@ def _search(
         )
 
 
-def _search_rigs(plant: str, out: Path) -> tuple[Any, dict[str, Any]]:
+def _search_rigs(
+    plant: str, out: Path, workers: int, scheduler: str | None
+) -> tuple[Any, dict[str, Any]]:
     """Tune for protocol version 2, and write the same files."""
     from ventbench import files
-    from ventbench.cli.options import bars
     from ventbench.training.pid_grid import RESULT, TABLE
     from ventbench.training.rig_pid import tune_on_rigs
 
     with bars() as shown:
-        task = shown.add_task("lungs", total=None)
-        tuned = tune_on_rigs(
-            plant, progress=lambda done, total: shown.update(task, completed=done, total=total)
-        )
+        progress = counted(shown, "lungs")
+        tuned = tune_on_rigs(plant, progress=progress, workers=workers, scheduler=scheduler)
     tuned.nominal.save(out / TABLE)
     result = tuned.to_json()
     files.write_json(out / RESULT, result)

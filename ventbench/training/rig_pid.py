@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from ventbench import precision, protocol, rig_draws, rollouts
 from ventbench.controllers.pid import PID
 from ventbench.environment import Scenario
+from ventbench.executor import InProcess, executor, in_order
 from ventbench.interfaces import Plant
 from ventbench.metrics.normalised import controllable_error
 from ventbench.plants.catalog import Given
@@ -54,28 +56,32 @@ def _pressures(plant: Plant, gains: Array, cells: Scenario) -> Array:
     return jax.vmap(run)(gains)
 
 
-def nominal_errors(rigs: Rigs, gains: Floats, progress: Progress | None = None) -> Floats:
+def nominal_errors(
+    rigs: Rigs, gains: Floats, progress: Progress | None = None, pool: Executor | None = None
+) -> Floats:
     """Mean error of each PID without noise over the scored rigs of each lung, member 0.
 
     Args:
         rigs: L lungs.
         gains: P, I, D, %/cmH2O, shape ``(G, 3)``.
         progress: see :data:`Progress`.
+        pool: computes the lungs side by side; this process if not given.
 
     Returns:
         Of the airway pressure, cmH2O, shape ``(L, G, P)``.
     """
-    errors = []
-    for lung in range(len(rigs.lungs)):
-        if rigs.sessions is None:
-            own = jax.tree.map(lambda x, i=lung: np.asarray(x)[i : i + 1], rigs.plants)
-        else:
-            sessions = list(rigs.sessions[lung])
-            own = jax.tree.map(lambda x, s=sessions: np.asarray(x)[0, s], rigs.plants)
-        errors.append(pid_grid.errors(own, gains, airway=True).mean(axis=0, dtype=np.float64))
-        if progress is not None:
-            progress(lung + 1, len(rigs.lungs))
-    return np.stack(errors)
+    jobs = [(_nominal_plants(rigs, lung), gains) for lung in range(len(rigs.lungs))]
+    return np.stack(in_order(pool or InProcess(), _nominal_errors, jobs, progress))
+
+
+def _nominal_plants(rigs: Rigs, lung: int) -> Plant:
+    """Plants of a lung's scored rigs, member 0."""
+    at = slice(lung, lung + 1) if rigs.sessions is None else (0, list(rigs.sessions[lung]))
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[at], rigs.plants)
+
+
+def _nominal_errors(plants: Plant, gains: Floats) -> Floats:
+    return pid_grid.errors(plants, gains, airway=True).mean(axis=0, dtype=np.float64)
 
 
 def drawn_errors(rigs: Rigs, drawn: RigDraws, lung: int, gains: Floats) -> Floats:
@@ -183,6 +189,8 @@ def tune_on_rigs(
     gains: Floats | None = None,
     draws: int = rig_draws.COUNT,
     progress: Progress | None = None,
+    workers: int = 0,
+    scheduler: str | None = None,
 ) -> TunedPIDs:
     """Find the best PIDs for protocol version 2, of each lung and of all.
 
@@ -195,6 +203,8 @@ def tune_on_rigs(
         gains: P, I, D, %/cmH2O, shape ``(G, 3)``; the paper's 8,000 if not given.
         draws: number of draws for tuning that decide among the best.
         progress: see :data:`Progress`.
+        workers: processes, a lung each; 0 for this one alone, which uses all cores.
+        scheduler: address of a Dask scheduler instead.
     """
     grid = pid_grid.paper_gains() if gains is None else np.asarray(gains, float)
     scored = load_rigs(simulator)
@@ -206,13 +216,18 @@ def tune_on_rigs(
         rigs = replace(scored, sessions=sessions)
     drawn = rig_draws.build(sessions, rigs.members, seed=seed, season=TUNING, n=draws)
     weights = plants_to_train_on(simulator, version=2).weights
-    nominal = nominal_errors(rigs, grid, progress)
-    weighted = np.einsum("lgp,lp->lg", nominal, weights)
-    single = np.argsort(weighted.sum(axis=0), kind="stable")[:FINALISTS]
+    with executor(workers, scheduler) as pool:
+        nominal = nominal_errors(rigs, grid, progress, pool)
+        weighted = np.einsum("lgp,lp->lg", nominal, weights)
+        single = np.argsort(weighted.sum(axis=0), kind="stable")[:FINALISTS]
+        finalists = np.argsort(weighted, axis=1, kind="stable")[:, :FINALISTS]
+        jobs = [
+            (rigs, drawn, lung, grid[np.concatenate([own, single])])
+            for lung, own in enumerate(finalists)
+        ]
+        every = in_order(pool, drawn_errors, jobs)
     chosen, least, together = [], [], []
-    for lung, error in enumerate(weighted):
-        own = np.argsort(error, kind="stable")[:FINALISTS]
-        on_draws = drawn_errors(rigs, drawn, lung, grid[np.concatenate([own, single])])
+    for lung, (own, on_draws) in enumerate(zip(finalists, every, strict=True)):
         best = int(np.argmin(on_draws[: len(own)] @ weights[lung]))
         chosen.append(grid[own[best]])
         least.append(on_draws[best].mean())

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
@@ -12,8 +13,10 @@ from typer.testing import CliRunner
 
 from ventbench.cli import challenge
 from ventbench.errors import InputError
+from ventbench.executor import InProcess
 from ventbench.recordings import load
 from ventbench.validation.challenge import requests
+from ventbench.validation.challenge import reveal as reveal_module
 from ventbench.validation.challenge.answer import answer
 from ventbench.validation.challenge.folder import ChallengeFolder
 from ventbench.validation.challenge.make import make
@@ -111,10 +114,9 @@ def test_processes_make_room_for_new_ones(made, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # of Dask's own, about ports and closing
-def test_a_cluster_that_loses_a_worker_answers_all(made, tmp_path):
+def test_a_cluster_that_loses_a_worker_makes_and_answers_all(made, tmp_path):
     distributed = pytest.importorskip("distributed", reason="the extra ventbench[dask] is missing")
     folder = ChallengeFolder(tmp_path / "c")
-    shutil.copytree(made[0], folder.path, ignore=shutil.ignore_patterns("answers", "requests"))
     killed = []
 
     def lose_one(done, total):
@@ -128,9 +130,10 @@ def test_a_cluster_that_loses_a_worker_answers_all(made, tmp_path):
         host="127.0.0.1", local_directory=str(tmp_path),
     )  # fmt: skip
     with started as cluster:
-        failed = answer(
-            folder, scheduler=cluster.scheduler_address, diagnose=sees_nothing, progress=lose_one
-        )
+        address = cluster.scheduler_address
+        promised = make(SECRET, folder.path, "masked", 3, scheduler=address, record=coarsely)
+        failed = answer(folder, scheduler=address, diagnose=sees_nothing, progress=lose_one)
+    assert promised == made[1]
     assert failed == {}
     assert len(killed) == 1
     assert sorted(folder.answers()) == sorted(folder.cases())
@@ -163,6 +166,22 @@ def test_the_one_who_knows_is_right(answered):
     assert all(case.named == case.library for case in found.cases)
     assert found.unanswered == ()
     assert sum(sum(row.values()) for row in found.confusion.values()) == 3
+
+
+def test_fits_that_know_the_truth_run_where_they_are_told(answered, monkeypatch):
+    asked = []
+
+    @contextmanager
+    def cluster(*where):
+        asked.append(where)
+        yield InProcess()
+
+    monkeypatch.setattr(reveal_module, "executor", cluster)
+    monkeypatch.setattr(reveal_module, "oracle_rmse_of_file", lambda path, held_out, names: 0.5)
+    found = reveal(answered, SECRET, with_oracle=True, scheduler="tcp://elsewhere:8786")
+    assert asked == [(0, "tcp://elsewhere:8786")]
+    ratio = next(f for f in found.figures if f.what.endswith("oracle's, median"))
+    assert ratio.value == np.median([case.after / 0.5 for case in found.cases])
 
 
 def test_more_breaths_resolve(answered):

@@ -71,6 +71,7 @@ class ChallengeResult:
 
 def reveal(
     folder: ChallengeFolder, secret: str, *, with_oracle: bool = False, jobs: int = 0,
+    scheduler: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> ChallengeResult:  # fmt: skip
     """Check all hashes and score the answers.
@@ -80,6 +81,7 @@ def reveal(
         secret: secret that the challenge was made with.
         with_oracle: compare with fits that know the true structure, which takes seconds a case.
         jobs: number of processes that fit; 0 to work in this process.
+        scheduler: address of a Dask scheduler instead, whose workers see the same files.
         progress: called with the number of finished fits and the number of all fits.
 
     Raises:
@@ -94,7 +96,7 @@ def reveal(
     if folder.round == 2:
         measured.append(second_round(_judged(ChallengeFolder(folder.path), truth), cases))
     if with_oracle:
-        measured += _against_oracle(folder, truth, cases, jobs, progress)
+        measured += _against_oracle(folder, truth, cases, (jobs, scheduler), progress)
     return ChallengeResult(
         folder.commitment.read_text().split()[0],
         tuple(name for name in _expected(folder) if name not in cases),
@@ -129,9 +131,12 @@ def _judged(folder: ChallengeFolder, truth: Truth) -> dict[str, JudgedCase]:
 
 def _against_oracle(
     folder: ChallengeFolder, truth: Truth, cases: dict[str, JudgedCase],
-    jobs: int, progress: Callable[[int, int], None],
+    parallel: tuple[int, str | None], progress: Callable[[int, int], None],
 ) -> list[Figure]:  # fmt: skip
-    """Ratios of the held-out RMSE to that of a fit with the true structure."""
+    """Ratios of the held-out RMSE to that of a fit with the true structure.
+
+    ``parallel`` holds the number of processes and the scheduler of :func:`reveal`.
+    """
     answers, ratios = folder.answers(), []
     fits = {
         d.case.name: (
@@ -142,7 +147,7 @@ def _against_oracle(
         for d, _ in truth
         if d.case.name in cases and d.kind != "outside"
     }
-    with executor(jobs) as pool:
+    with executor(*parallel) as pool:
         for name, best in results(pool, oracle_rmse_of_file, fits):
             ratios.append(cases[name].after / best)
             progress(len(ratios), len(fits))

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from ventbench import compilation, precision
 from ventbench.lungs import LUNG_IDS
@@ -35,6 +36,7 @@ from ventbench.training.hybrid.parameters import plants
 from ventbench.training.rigs.fit import FitConfig, Noise, fit
 from ventbench.training.rigs.hierarchy import Scales, centre
 from ventbench.training.rigs.recordings import RigRecordings, load_rig_recordings
+from ventbench.training.rigs.train import UNRECORDED_SLOPE
 
 Floats = NDArray[np.float64]
 
@@ -136,6 +138,15 @@ def best(
                 error = np.where(gained, tried, error)
                 at = at | {name: np.where(gained, value, at[name])}
     return error, at
+
+
+def without_spread(plant: Hybrid, chosen: Judged, simulators: frozen.Frozen) -> Hybrid:
+    """Plants as they were fitted, before the members were spread where the valve is wide open."""
+    folds = simulators.manifest["split"]["folds"]
+    rank = np.maximum(chosen.member - 1, 0)
+    shift = np.where(chosen.member > 0, UNRECORDED_SLOPE * ndtri((rank + 0.5) / folds), 0.0)
+    last = jnp.asarray(plant.slopes)[:, -1] * jnp.exp(-shift)
+    return plant.replace(slopes=jnp.asarray(plant.slopes).at[:, -1].set(last))  # type: ignore[attr-defined]
 
 
 def judged(recordings: RigRecordings, simulators: frozen.Frozen) -> Judged:
@@ -295,6 +306,8 @@ def report(recordings: RigRecordings, write: Callable[..., None] = print) -> Non
     write("|---" * 8 + "|")
     write(f"| paper | {' | '.join(f'{value:.2f}' for value in PAPER)} | |")
     write(row("held out", held_out, lung))
+    narrow = breath_error(without_spread(plant, chosen, simulators), data, {})
+    write(row(f"held out, without the spread above {WIDE_OPEN:g} %", narrow, lung))
     write(row("seen by the fit", breath_error(of_member(np.zeros_like(lung)), data, {}), lung))
     rows(plant, chosen, write)
     corrected, at = best(plant, data, ("gain",), np.arange(len(lung)))

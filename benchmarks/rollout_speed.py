@@ -223,6 +223,36 @@ def vector_rates(batch: int, repeats: int = 200, chain: int = 8) -> dict[str, fl
     return rates
 
 
+#: Arrays of the loop that measures how fast data moves: as many as a step of the hybrid hands on.
+STREAMS = 40
+
+
+def bytes_moved(plant: Plant, batch: int) -> tuple[float, int]:
+    """Bytes that one compiled step of a cell reads and writes, by XLA, and the number of loops."""
+    state = plant.init(jnp.full(batch, 5.0))
+    command, dt = jnp.full(batch, 20.0), jnp.full(batch, protocol.DT)
+    step = jax.jit(type(plant).step)
+    compiled = step.lower(plant, state, command, jnp.zeros(batch), dt).compile()
+    analysis: Any = compiled.cost_analysis()
+    return analysis["bytes accessed"] / batch, str(compiled.as_text()).count(" fusion(")
+
+
+def stream_rate(batch: int, repeats: int = 1000) -> float:
+    """Bytes/s that loops over :data:`STREAMS` vectors of the batch read and write."""
+
+    @jax.jit
+    def run(values: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        def body(_: int, values: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+            return tuple(0.5 * value + 0.1 for value in (*values[1:], values[0]))
+
+        return jax.lax.fori_loop(0, repeats, body, values)
+
+    values = tuple(jnp.full(batch, float(k), jnp.float32) for k in range(STREAMS))
+    jax.block_until_ready(run(values))
+    best = min(seconds(lambda: run(values)) for _ in range(10))
+    return 2 * STREAMS * batch * 4 * repeats / best
+
+
 def roofline_share(plant: Plant, batch: int, steps_per_s: float) -> tuple[float, dict[str, int]]:
     """Share of the rate that the operations of a step alone would allow, and their counts."""
     counts, rates = operations(plant, batch), vector_rates(batch)
@@ -300,6 +330,10 @@ def main() -> None:
     listed = ", ".join(f"{count} {kind}" for kind, count in counts.items())
     print(f"\nfrozen hybrid, batch {small}: {rate:.0f} steps/s, {share:.2f} of its roofline")
     print(f"  operations of one step: {listed}")
+    moved, loops = bytes_moved(hybrid, small)
+    stream = stream_rate(small)
+    print(f"  a step takes {1e9 / rate:.0f} ns a cell; its {loops} loops move {moved:.0f} bytes,")
+    print(f"  which takes {1e9 * moved / stream:.0f} ns at {stream / 1e9:.0f} GB/s")
     if options.json:
         result = {"plant": name, "rows": rows, "ratio": ratio, "latency": single}
         result |= {"others": others, "hybrid_roofline": share, "hybrid_operations": counts}

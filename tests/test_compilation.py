@@ -6,8 +6,10 @@ from types import SimpleNamespace
 
 import jax
 import pytest
+from typer.testing import CliRunner
 
 from ventbench import compilation
+from ventbench.cli import app
 
 
 @pytest.fixture
@@ -30,6 +32,13 @@ def test_it_is_made_and_used(monkeypatch, tmp_path, setting):
     compilation.keep()
     assert (tmp_path / "a" / "b").is_dir()
     assert jax.config.jax_compilation_cache_dir == str(tmp_path / "a" / "b")  # type: ignore[attr-defined]
+
+
+def test_a_score_keeps_what_it_compiles(monkeypatch, tmp_path, setting):
+    monkeypatch.setenv("VENTBENCH_CACHE", str(tmp_path / "kept"))
+    words = ["score", "pid_best", "--plant", "physics", "--in-process"]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "kept")  # type: ignore[attr-defined]
 
 
 def test_an_empty_name_keeps_nothing(monkeypatch, setting):

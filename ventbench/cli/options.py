@@ -183,6 +183,8 @@ def of_each_entry(
 ) -> list[ResultT]:
     """Compute something of entries: one job after the other with a bar each, or side by side.
 
+    What JAX compiles for it is kept from one run to the next, see ``ventbench.compilation``.
+
     Args:
         what: is done, such as ``scoring``.
         work: takes what a job holds, and ``progress`` in this process; side by side, a function of
@@ -192,9 +194,13 @@ def of_each_entry(
         workers: processes; 0 for this one.
         scheduler: address of a Dask scheduler instead.
     """
+    from functools import partial
+
+    from ventbench import compilation
     from ventbench.executor import executor, in_order
 
     if not workers and scheduler is None:
+        compilation.keep()
         done = []
         for job in jobs:
             title = ", ".join((job[0].label, *job[1:]))
@@ -202,7 +208,16 @@ def of_each_entry(
                 done.append(work(*job, progress=counted(shown, f"{what} {title}")))
         return done
     with bars() as shown, executor(workers, scheduler) as pool:
-        return in_order(pool, work, jobs, counted(shown, f"{what}, {len(jobs)} jobs"))
+        progress = counted(shown, f"{what}, {len(jobs)} jobs")
+        return in_order(pool, partial(_keeping, work), jobs, progress)
+
+
+def _keeping(work: Callable[..., ResultT], *job: object) -> ResultT:
+    """Do a job in another process, which keeps what it compiles too."""
+    from ventbench import compilation
+
+    compilation.keep()
+    return work(*job)
 
 
 def waiting(text: str) -> Progress:

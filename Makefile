@@ -16,7 +16,7 @@ DEMO := $(VENV)/bin/ventbench score submissions/pid_best submissions/pid_robust 
 	--out runs/demo --report
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow lint format docs lock bench wheel clean
+.PHONY: help setup demo check test test-slow lint format docs lock bench wheel clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -27,17 +27,19 @@ setup: $(READY) ## make .venv, or bring it up to date
 demo: setup ## score the PID submissions on the six lungs: table, report, rerun file
 	$(DEMO)
 
-test: lint ## lint, type check and the fast tests
+test: check ## ruff, arrows between rooms and the fast tests
 	$(PY) -m pytest -n auto --dist loadfile $(PYTEST_ARGS)
 	@echo "The fast tests passed. 'make test-slow' runs the proofs that take minutes."
 
 test-slow: setup ## the tests that take minutes
 	$(PY) -m pytest -n auto -m slow $(PYTEST_ARGS)
 
-lint: setup ## ruff, arrows between rooms and pyright, changing nothing
+check: setup ## ruff and arrows between rooms, changing nothing
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(VENV)/bin/lint-imports --no-cache --no-logo
+
+lint: check ## the same and pyright, which takes a minute
 	$(PY) -m pyright --pythonpath $(PY)
 
 format: setup ## let ruff mend and format the code

@@ -109,7 +109,7 @@ def test_what_a_term_stands_for_is_named_where_no_mechanism_looks_promising(monk
     full = fit_with_noise(
         wide, Hypothesis(("flow_shape",)), wide.fit(Hypothesis(), base.noise, base)
     )
-    monkeypatch.setattr(refinement, "compare_candidates", lambda *_: None)
+    monkeypatch.setattr(refinement, "compare_candidates", lambda *_, **__: None)
     named = special_case_of(evaluator, base, NonparametricFit("flow_shape", full, 100.0))
     assert named is not None
     assert named.column("turbulent_resistance.quadratic")[0] == pytest.approx(10.0, rel=0.2)

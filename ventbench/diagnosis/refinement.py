@@ -65,7 +65,8 @@ class NonparametricFit:
 def compare_nonparametric_terms(wide: Evaluator, current: FittedModel) -> Comparison | None:
     """Fit the most promising nonparametric terms beside a model; None if none is promising."""
     candidates = score_nonparametric_terms(current, wide.settings)
-    return compare_candidates(wide, current, candidates[: wide.settings.refinement.fitted_terms])
+    chosen = candidates[: wide.settings.refinement.fitted_terms]
+    return compare_candidates(wide, current, chosen, restarts=False)
 
 
 class SingleTermAlternative:
@@ -452,7 +453,7 @@ def _ranked_instead(
             base, white, evaluator.settings, evaluator.allowed_mechanisms
         )
         others = [candidate for candidate in candidates if candidate.name != name]
-        comparison = compare_candidates(evaluator, base, others, white)
+        comparison = compare_candidates(evaluator, base, others, white, restarts=False)
         if comparison is None or not passes_heldout_test(
             comparison.held_out_gain, evaluator.settings.held_out_test
         ):

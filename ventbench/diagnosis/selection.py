@@ -247,6 +247,8 @@ def compare_candidates(
     current: FittedModel,
     candidates: list[Candidate],
     warm_start: FittedModel | None = None,
+    *,
+    restarts: bool = True,
 ) -> Comparison | None:
     """Fit the candidates and rank them by BIC at one noise; None if none is promising.
 
@@ -255,6 +257,8 @@ def compare_candidates(
         current: the model that candidates are added to.
         candidates: the most promising first.
         warm_start: the model that fits start from; ``current`` if None.
+        restarts: whether fits may have to go far where much is missing; not where the start has the
+            R and C of a better model.
     """
     settings = evaluator.settings.forward
     chosen = [
@@ -266,10 +270,13 @@ def compare_candidates(
     # promises nothing may be right: where a refit has hidden a lag of the sensor in a resistance
     # near zero, no jump of the pressure is left that the lag could round.
     much = max(candidate.nats for candidate in chosen) >= settings.large_gain
-    chosen = candidates if much else chosen[: settings.fitted_candidates]
+    if not much:
+        chosen = chosen[: settings.fitted_candidates]
+    elif restarts:
+        chosen = candidates
     # Noise that was estimated with an effect in the residual would hide the effect from its fit.
     white, first = replace(current.noise, ar=(0.0, 0.0)), warm_start or current
-    models = _quick_fits(evaluator, current, chosen, white, first, far=much)
+    models = _quick_fits(evaluator, current, chosen, white, first, far=much and restarts)
     criteria = _Criteria(evaluator)
     own = parallel_map(lambda model: criteria(model, estimate_noise(model)), models)
     noise = criteria.better_noise(models[int(np.argmin(own))], current.noise)

@@ -362,17 +362,30 @@ def _quick_fits(
     limit = _contention(evaluator, criteria, evaluator.restricted(current), models[0], noise_left)
     count = settings.forward.fitted_candidates
     kept = [m for k, m in enumerate(models) if k < count or criteria(m, noise_left) < limit]
+    return parallel_map(partial(_fit_to_all, evaluator, warm_start=warm_start), kept)
 
-    def on_all(model: FittedModel) -> FittedModel:
-        values = small.transferred_values(model, evaluator.training)
-        start = {
-            path: values[:, k]
-            for k, path in enumerate(model.problem.predictor.names)
-            if not small.differs_by_breath(path)
-        }
-        return quick(evaluator, model.hypothesis, noise, warm_start, start)
 
-    return parallel_map(on_all, kept)
+def _fit_to_all(evaluator: Evaluator, model: FittedModel, warm_start: FittedModel) -> FittedModel:
+    """A model of the breaths that rank candidates, fitted to all training breaths, quickly.
+
+    Args:
+        evaluator: evaluator of the recording.
+        model: fitted with ``evaluator.for_ranking``.
+        warm_start: a model of all training breaths, which has the breaths' own parameters.
+    """
+    small, settings = evaluator.for_ranking, evaluator.settings.fit
+    if small is evaluator:
+        return model
+    values = small.transferred_values(model, evaluator.training)
+    start = {
+        path: values[:, k]
+        for k, path in enumerate(model.problem.predictor.names)
+        if not small.differs_by_breath(path)
+    }
+    return evaluator.fit(
+        model.hypothesis, model.noise, warm_start, start,
+        iterations=settings.quick_iterations, tolerance=settings.quick_tolerance,
+    )  # fmt: skip
 
 
 def _contention(
@@ -557,21 +570,25 @@ def replace_pair(evaluator: Evaluator, current: FittedModel) -> FittedModel | No
     if not work and not alone:
         return None
 
+    small, first = evaluator.for_ranking, evaluator.restricted(current)
+
     def fitted(job: tuple[Hypothesis, str, dict[str, float]]) -> FittedModel:
         rest, name, start = job
-        return evaluator.fit(rest.plus(Hypothesis((name,))), current.noise, current, start)
+        return small.fit(rest.plus(Hypothesis((name,))), current.noise, first, start)
 
     def freest(model: FittedModel) -> FittedModel:
         for path in shapes_at_default(model):
-            freer = fit_with_shape(evaluator, model, path, current.noise)
-            if evaluator.criterion(freer) < evaluator.criterion(model):
+            freer = fit_with_shape(small, model, path, current.noise)
+            if small.criterion(freer) < small.criterion(model):
                 model = freer
         return model
 
+    limit = small.criterion(first) + evaluator.settings.forward.contender_criterion
+    close = [model for model in parallel_map(fitted, work) if small.criterion(model) < limit]
+    freer = parallel_map(freest, close + parallel_map(fitted, alone))
+    close = [model for model in freer if small.criterion(model) < limit]
+    models = parallel_map(partial(_fit_to_all, evaluator, warm_start=current), close)
     criterion = evaluator.criterion(current)
-    limit = criterion + evaluator.settings.forward.contender_criterion
-    close = [model for model in parallel_map(fitted, work) if evaluator.criterion(model) < limit]
-    models = parallel_map(freest, close + parallel_map(fitted, alone))
     best = min(models, key=evaluator.criterion, default=None)
     if best is None or evaluator.criterion(best) >= criterion:
         return None

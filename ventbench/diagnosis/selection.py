@@ -550,8 +550,8 @@ def replace_pair(evaluator: Evaluator, current: FittedModel) -> FittedModel | No
     imitate it together, and neither can be exchanged alone: a circuit's compliance with a late
     expiratory valve for gas that has inertia. Mechanisms that are confusable with either are
     fitted in their place, from the values of the full fit, and held-out breaths must not object.
-    So is each of the two with its shape free: a valve with a second lag instead of a circuit
-    behind a valve with one.
+    So is each of the two by itself, with its shape free or from its grid: a valve with a second lag
+    instead of a circuit behind a valve with one, or an inertance with more tubing before it.
     """
     names = [name for name in current.names if not varies_by_breath(name)]
     pairs = list(combinations(names, 2))
@@ -562,10 +562,11 @@ def replace_pair(evaluator: Evaluator, current: FittedModel) -> FittedModel | No
         for start in _grid_starts(name)
     ]
     alone = [
-        (current.hypothesis.without(*pair), name, {})
+        (current.hypothesis.without(*pair), name, start)
         for pair in pairs
         for name in pair
-        if shapes_at_default(current, name)
+        for start in _grid_starts(name)
+        if start or shapes_at_default(current, name)
     ]
     if not work and not alone:
         return None

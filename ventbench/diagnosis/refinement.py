@@ -31,6 +31,7 @@ from ventbench.diagnosis.latent_inputs import (
     fit_latent_inputs,
     log_likelihood_without_input,
 )
+from ventbench.diagnosis.plausibility import is_plausible
 from ventbench.diagnosis.screening import score_nonparametric_terms, screen_mechanisms
 from ventbench.diagnosis.selection import (
     Comparison,
@@ -298,6 +299,8 @@ def special_case_of(
     best = fit_with_noise(evaluator, first.hypothesis, first)
     by_name = best.log_likelihood_at(noise) - without.log_likelihood
     if by_name < share * whole:
+        return None
+    if not is_plausible(best, best.names[-1], evaluator.settings.plausibility):
         return None
     beside = evaluator.fit(selected.hypothesis, best.noise, selected)
     return best if is_needed(evaluator, best, beside) else None

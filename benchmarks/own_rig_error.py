@@ -26,7 +26,7 @@ from scipy.special import ndtri
 
 from ventbench import compilation, precision
 from ventbench.lungs import LUNG_IDS
-from ventbench.metrics.extrapolation import WIDE_OPEN
+from ventbench.metrics.open_loop import WIDE_OPEN
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import Hybrid
 from ventbench.recordings import Breaths, recordings_dir

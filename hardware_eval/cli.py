@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from ventbench import __version__
-from ventbench.cli import ending
+from ventbench.cli import options
 from ventbench.cli.options import JsonFile, emit
 from ventbench.errors import InputError
 from ventbench.text import plain
@@ -407,4 +407,4 @@ def replay(
 
 def main() -> None:
     """Entry point of the console script."""
-    ending.run(app, "ventbench-hardware", stopped="the lung is vented")
+    options.run(app, "ventbench-hardware", stopped="the lung is vented")

@@ -5,7 +5,7 @@ import jax
 import numpy as np
 import pytest
 
-from ventbench import data_files, draws, files, precision, protocol
+from ventbench import draws, files, precision, protocol
 from ventbench.errors import InputError
 
 
@@ -16,7 +16,7 @@ def cells():
 
 
 def test_build_gives_what_is_frozen():
-    with np.load(data_files.data_path(draws.FILE)) as npz:
+    with np.load(files.data_path(draws.FILE)) as npz:
         frozen = {name: npz[name] for name in npz.files}
     built = draws.build()
     assert built.keys() == frozen.keys()
@@ -25,7 +25,7 @@ def test_build_gives_what_is_frozen():
 
 
 def test_file_is_the_published_one():
-    assert files.sha256(data_files.data_path(draws.FILE)) == draws.SHA256
+    assert files.sha256(files.data_path(draws.FILE)) == draws.SHA256
 
 
 def test_cells(cells):
@@ -76,10 +76,10 @@ def test_no_draws_for_other_pips():
 
 def test_changed_file_is_refused(tmp_path, monkeypatch):
     path = tmp_path / draws.FILE
-    content = bytearray(data_files.data_path(draws.FILE).read_bytes())
+    content = bytearray(files.data_path(draws.FILE).read_bytes())
     content[5000] ^= 1
     path.write_bytes(content)
-    monkeypatch.setattr(draws.data_files, "data_path", lambda name: path)
+    monkeypatch.setattr(draws.files, "data_path", lambda name: path)
     draws._frozen.cache_clear()
     with pytest.raises(InputError, match="not the published draws version 1: its SHA-256 is"):
         draws.scenarios()
@@ -87,9 +87,9 @@ def test_changed_file_is_refused(tmp_path, monkeypatch):
 
 
 def test_missing_file_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr(data_files, "_PACKAGE", tmp_path / "ventbench")
+    monkeypatch.setattr(files, "_PACKAGE", tmp_path / "ventbench")
     with pytest.raises(InputError, match=r"data/draws-v1.npz is missing"):
-        data_files.data_path(draws.FILE)
+        files.data_path(draws.FILE)
 
 
 def test_wheel_comes_before_a_folder_beside_it(tmp_path, monkeypatch):
@@ -98,14 +98,14 @@ def test_wheel_comes_before_a_folder_beside_it(tmp_path, monkeypatch):
     (package / "_data" / "x").touch()
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "x").touch()
-    monkeypatch.setattr(data_files, "_PACKAGE", package)
-    assert data_files.data_path("x") == package / "_data" / "x"
+    monkeypatch.setattr(files, "_PACKAGE", package)
+    assert files.data_path("x") == package / "_data" / "x"
 
 
 def test_script_writes_the_file_again(tmp_path):
     again = tmp_path / "again.npz"
     digest = draws.write(again)
-    assert members(again) == members(data_files.data_path(draws.FILE))
+    assert members(again) == members(files.data_path(draws.FILE))
     if sys.version_info >= (3, 11, 4):  # before, zipfile wrote other headers around the arrays
         assert digest == draws.SHA256
 

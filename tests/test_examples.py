@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ventbench import files, recordings
-from ventbench.data_files import example
+from ventbench.files import example
 
 FOLDER = example("manifest.toml").parent
 MANIFEST = tomllib.loads((FOLDER / "manifest.toml").read_text("utf-8"))

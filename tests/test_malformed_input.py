@@ -12,8 +12,8 @@ import pytest
 from typer.testing import CliRunner
 
 from ventbench.cli import app
-from ventbench.data_files import example
 from ventbench.errors import InputError
+from ventbench.files import example
 
 RUN = CliRunner()
 SOUND = str(example("sound.csv"))

@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ventbench.board.frames import load_board as load_board
-    from ventbench.data_files import example as example
     from ventbench.diagnosis.diagnose import diagnose as diagnose
     from ventbench.diagnosis.result import Diagnosis as Diagnosis
     from ventbench.errors import InputError as InputError
+    from ventbench.files import example as example
     from ventbench.interfaces import Controller as Controller
     from ventbench.interfaces import Observation as Observation
     from ventbench.interfaces import Plant as Plant
@@ -73,7 +73,7 @@ _SOURCES = {
     "Task": ("interfaces", "Task"),
     "Trajectories": ("trajectories", "Trajectories"),
     "diagnose": ("diagnosis.diagnose", "diagnose"),
-    "example": ("data_files", "example"),
+    "example": ("files", "example"),
     "import_recording": ("recordings.foreign", "import_recording"),
     "load_board": ("board.frames", "load_board"),
     "load_recording": ("recordings", "load"),

@@ -22,7 +22,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from ventbench import data_files, files, protocol
+from ventbench import files, protocol
 from ventbench.environment import Scenario
 from ventbench.errors import InputError
 
@@ -102,7 +102,7 @@ def about() -> dict[str, Any]:
 
 @functools.cache
 def _frozen() -> dict[str, Floats]:
-    path = data_files.data_path(FILE)
+    path = files.data_path(FILE)
     content = path.read_bytes()
     sha256 = hashlib.sha256(content).hexdigest()
     if sha256 != SHA256:

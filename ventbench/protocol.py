@@ -9,7 +9,7 @@ from __future__ import annotations
 VERSION = 1
 
 #: Versions that this ventbench scores and replays. What differs in version 2 is in
-#: :mod:`ventbench.rig_draws`, :mod:`ventbench.metrics.normalised` and
+#: :mod:`ventbench.rig_draws`, :mod:`ventbench.metrics.score` and
 #: :mod:`ventbench.submissions.rig_scoring`.
 VERSIONS = (1, 2)
 

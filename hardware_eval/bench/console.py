@@ -149,9 +149,9 @@ class RerunView:
     """
 
     def __init__(self, target: str) -> None:
-        from ventbench import extras
+        from ventbench import errors
 
-        extras.require("rerun")
+        errors.require("rerun")
         import rerun as rr
 
         self._rr: Any = rr

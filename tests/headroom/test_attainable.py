@@ -7,7 +7,7 @@ import pytest
 from ventbench import precision
 from ventbench.environment import nominal_scenario
 from ventbench.headroom import attainable
-from ventbench.headroom.cross_check import second_optimum
+from ventbench.headroom.attainable import second_optimum
 from ventbench.lungs import LUNGS
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack

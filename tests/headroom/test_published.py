@@ -7,7 +7,7 @@ import pytest
 from ventbench import precision, protocol
 from ventbench.headroom import attainable
 from ventbench.headroom import reference as references
-from ventbench.metrics.normalised import LEAST_HEADROOM
+from ventbench.metrics.score import LEAST_HEADROOM
 from ventbench.submissions.rig_scoring import load_rigs
 
 

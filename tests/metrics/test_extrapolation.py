@@ -5,13 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ventbench.metrics.extrapolation import (
-    EDGES,
-    SPARSE_BELOW,
-    by_lung,
-    command_counts,
-    extrapolation,
-)
+from ventbench.metrics.open_loop import EDGES, SPARSE_BELOW, by_lung, command_counts, extrapolation
 
 
 def test_commands_are_counted_in_ranges_of_ten():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ventbench import protocol
-from ventbench.metrics.normalised import LEAST_HEADROOM, controllable_error, normalised
+from ventbench.metrics.score import LEAST_HEADROOM, controllable_error, normalised
 
 
 def test_ends_of_the_scale():

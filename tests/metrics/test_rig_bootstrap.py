@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ventbench.metrics.rig_bootstrap import resampled_scores
+from ventbench.metrics.bootstrap import resampled_scores
 
 LUNGS, DRAWS = 6, 24
 RIG = np.arange(DRAWS) % 4 + 10 * np.arange(LUNGS)[:, None]

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from ventbench.errors import InputError
 from ventbench.recordings import Breaths, iter_breaths, join, load, make_breaths, write
 from ventbench.recordings.csv_source import CsvSource
-from ventbench.recordings.parquet_source import ParquetSource
 from ventbench.recordings.problems import ProblemLog
-from ventbench.recordings.scan import join_blocks, scan
+from ventbench.recordings.scan import ParquetSource, join_blocks, scan
 
 FIELDS = [
     "breath_id",

@@ -15,7 +15,7 @@ from ventbench.cli.data import app
 from ventbench.errors import InputError
 from ventbench.recordings import check, load, write
 from ventbench.recordings.foreign import import_recording
-from ventbench.recordings.foreign.units import UNITS, conversion
+from ventbench.recordings.foreign.tables import UNITS, conversion
 
 RATE, PERIOD = 50.0, 3.0
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.data_files import submissions_folder
+from ventbench.files import submissions_folder
 from ventbench.interfaces import Observation, Task
 from ventbench.sandbox.child.cell import controller_class
 

@@ -3,7 +3,7 @@ import os
 
 import pytest
 
-from ventbench import data_files
+from ventbench import files
 from ventbench.submissions import folder
 from ventbench.submissions.errors import SubmissionError
 from ventbench.submissions.folder import bundled, open_submission, resolve
@@ -12,7 +12,7 @@ from ventbench.submissions.folder import bundled, open_submission, resolve
 def test_bundled_by_name_and_by_path(monkeypatch):
     assert {"pid_best", "pid_robust"} <= set(bundled())
     by_name = open_submission("pid_best")
-    monkeypatch.chdir(data_files.submissions_folder().parent)
+    monkeypatch.chdir(files.submissions_folder().parent)
     by_path = open_submission("submissions/pid_best/")
     assert by_name.folder == by_path.folder
     assert by_name.sha256 == by_path.sha256

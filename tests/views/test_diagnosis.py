@@ -20,7 +20,7 @@ from ventbench.diagnosis.result import Diagnosis
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics import library
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
-from ventbench.views.diagnosis import diagram, write_report, write_rerun
+from ventbench.views.diagnosis import report, write_report, write_rerun
 from ventbench.views.diagnosis.charts import (
     Chart,
     by_axis,
@@ -108,7 +108,7 @@ def test_the_guilty_part_of_the_rig_is_lit(found: Diagnosis, tmp_path: Path) -> 
     (rig,) = [attrs for _, attrs in page.tags if attrs.get("class") == "rig"]
     assert rig["aria-label"].endswith("inspiratory valve: dead time of the inspiratory valve.")
     looks = [attrs["class"] for _, attrs in page.tags if attrs.get("class", "").startswith("part")]
-    assert len(looks) == len(diagram.PARTS)
+    assert len(looks) == len(report.PARTS)
     assert [look.split()[1:] for look in looks].count(["lit"]) == 1
     unnamed = Page(write_report(tmp_path / "u.html", made.unnamed(12)).read_text())
     assert "part suspect" in {attrs.get("class") for _, attrs in unnamed.tags}
@@ -117,7 +117,7 @@ def test_the_guilty_part_of_the_rig_is_lit(found: Diagnosis, tmp_path: Path) -> 
     both = dataclasses.replace(
         found, mechanisms=found.mechanisms * 2, nonparametric=made.unnamed(12).nonparametric
     )
-    parts = diagram.parts(diagram.entries(both))
+    parts = report.parts(report.entries(both))
     assert parts["inspiratory valve"].badge == "1, 2"
     assert (parts["airway"].look, parts["airway"].badge) == ("suspect", "3")
 
@@ -126,7 +126,7 @@ def test_the_guilty_part_of_the_rig_is_lit(found: Diagnosis, tmp_path: Path) -> 
 def test_every_place_is_in_the_picture(place: str) -> None:
     term = made.unnamed(12).nonparametric
     assert term is not None
-    assert diagram.site_of_term(dataclasses.replace(term, name=place)) in diagram.PARTS
+    assert report.site_of_term(dataclasses.replace(term, name=place)) in report.PARTS
 
 
 @pytest.mark.parametrize("name", library())

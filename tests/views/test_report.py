@@ -14,7 +14,7 @@ from ventbench import protocol
 from ventbench.errors import InputError
 from ventbench.text import number
 from ventbench.trajectories import Trajectories
-from ventbench.views import graphics, panels, report, scores, write_figure, write_report
+from ventbench.views import graphics, report, scores, write_figure, write_report
 from ventbench.views import runs as shared
 
 pytest.importorskip("jinja2", reason="needs the extra ventbench[view]")
@@ -242,8 +242,10 @@ def test_the_valve_has_one_axis(best: Trajectories, robust: Trajectories) -> Non
         }
         assert len(figures) == 36
         assert len(marks) == 1
-    column = panels.panels([quiet])[0][0]
-    top = panels.VALVE_TOP + panels.VALVE_HEIGHT * (1.0 - quiet.u_in[0, 0].max() / protocol.U_MAX)
+    column = graphics.panels([quiet])[0][0]
+    top = graphics.VALVE_TOP + graphics.VALVE_HEIGHT * (
+        1.0 - quiet.u_in[0, 0].max() / protocol.U_MAX
+    )
     assert column.valves[0][:, 1].min() == pytest.approx(top, abs=2.0), "not stretched to its range"
 
 

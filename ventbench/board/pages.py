@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from ventbench import palette, protocol
 from ventbench.board.ranking import Interval
-from ventbench.extras import require
-from ventbench.text import number, plain
+from ventbench.text import number, page_templates, plain
 
 if TYPE_CHECKING:
     import jinja2
@@ -41,17 +40,7 @@ def environment() -> jinja2.Environment:
     Raises:
         InputError: if jinja2 is not installed.
     """
-    require("jinja2")
-    import jinja2
-
-    made = jinja2.Environment(
-        loader=jinja2.PackageLoader("ventbench.board"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        finalize=_shown,
-    )
+    made = page_templates("ventbench.board", shown=_shown)
     style, script = palette.css() + _asset("board.css"), _asset("board.js")
     made.globals.update(
         style=trusted(style),

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.board.record import AnyRecord, Record, Sealed, Withdrawal
-from ventbench.metrics import bootstrap, rig_bootstrap
+from ventbench.metrics import bootstrap
 from ventbench.submissions.manifest import TRACKS
 
 Floats = NDArray[np.float64]
@@ -488,7 +488,7 @@ def _resampled(records: Sequence[Record], values: Sequence[Floats]) -> Floats:
             rows.append(bootstrap.resampled_means(own.mean(axis=0)))
         else:
             session, member = record.headroom.session, record.headroom.member
-            rows.append(rig_bootstrap.resampled_scores(own, session, member))
+            rows.append(bootstrap.resampled_scores(own, session, member))
     return np.stack(rows)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ventbench.board import canonical, hardware, layout, schema
 from ventbench.board.hardware import HardwareRecord
 from ventbench.errors import InputError
-from ventbench.metrics.normalised import normalised
+from ventbench.metrics.score import normalised
 from ventbench.stress.results import StressTables
 from ventbench.stress.stressors import VERSION as STRESSORS_VERSION
 from ventbench.stress.stressors import condition_of

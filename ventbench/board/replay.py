@@ -26,8 +26,13 @@ from ventbench.board.schema import ScoreHeader
 from ventbench.environment import Scenario
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
-from ventbench.metrics.normalised import controllable_error
-from ventbench.metrics.score import longest_run, passes_safety_gate, run_error, safety_limit
+from ventbench.metrics.score import (
+    controllable_error,
+    longest_run,
+    passes_safety_gate,
+    run_error,
+    safety_limit,
+)
 from ventbench.rig_draws import RigDraws
 from ventbench.seasons import DEVELOPMENT_SEED
 from ventbench.submissions.rig_scoring import rigs_of

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import data_files, draws, protocol
+from ventbench import draws, files, protocol
 from ventbench.board import actions, canonical, create, store
 from ventbench.board.record import Record, RecordStress
 from ventbench.board.replay import ReplayPlants, draws_of
@@ -184,7 +184,7 @@ def _folders(places: Sequence[Path]) -> Iterator[Path]:
 
     Also those in ``v1``: the bundled entries as they were scored for version 1.
     """
-    bundled = data_files.submissions_folder()
+    bundled = files.submissions_folder()
     several = (*places, bundled)
     for place in (*several, *(place / "v1" for place in several)):
         if not place.is_dir():

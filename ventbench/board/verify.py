@@ -38,7 +38,7 @@ from ventbench.board.replay import (
 )
 from ventbench.errors import InputError
 from ventbench.headroom.reference import published, reference_of
-from ventbench.metrics.normalised import normalised
+from ventbench.metrics.score import normalised
 from ventbench.rig_draws import RigDraws
 
 Floats = NDArray[np.float64]

@@ -17,20 +17,16 @@ from ventbench.cli import (
     data,
     diagnose,
     doctor,
-    ending,
     headroom,
     mechanics,
     options,
     proof,
-    real_pairs,
     reproduce,
     score,
     simulators,
     stress,
     study,
-    submit,
     train,
-    transfer,
     tune,
     view,
 )
@@ -64,8 +60,6 @@ def _root(
 
 score.register(app)
 headroom.register(app)
-transfer.register(app)
-submit.register(app)
 simulators.register(app)
 tune.register(app)
 train.register(app)
@@ -78,7 +72,6 @@ challenge.register(app)
 mechanics.register(app)
 doctor.register(app)
 proof.register(app)
-real_pairs.register(app)
 reproduce.register(app)
 app.add_typer(data.app)
 
@@ -92,4 +85,4 @@ def _quiet_first(arguments: list[str]) -> list[str]:
 
 def main() -> None:
     """Entry point of the console script."""
-    ending.run(lambda: app(_quiet_first(sys.argv[1:])), "ventbench")
+    options.run(lambda: app(_quiet_first(sys.argv[1:])), "ventbench")

@@ -73,7 +73,7 @@ def diagnose(
     """
     from rich.console import Console
 
-    from ventbench import extras
+    from ventbench import errors
     from ventbench import recordings as files
     from ventbench.errors import InputError
 
@@ -84,7 +84,7 @@ def diagnose(
 
     if patient and passive:
         raise InputError("--patient and --passive contradict each other; choose one of them")
-    extras.require("jinja2", "rerun")
+    errors.require("jinja2", "rerun")
     said = notes()
     with progress_bars() as shown:
         reading = counted(shown, f"reading {recordings}")

@@ -1,4 +1,4 @@
-"""``ventbench score``: score submissions by the protocol."""
+"""``ventbench score``, ``transfer``, ``new`` and ``check``: write, check and score submissions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from ventbench.cli.options import (
     PlantName,
     Scheduler,
     Workers,
+    bars,
     claim_out,
+    counted,
     emit,
     notes,
     of_each_entry,
@@ -115,7 +117,7 @@ def score(
 
     from rich.console import Console
 
-    from ventbench import extras
+    from ventbench import errors
     from ventbench.errors import InputError
     from ventbench.plants.catalog import load_simulators
     from ventbench.submissions.folder import open_submission
@@ -132,7 +134,7 @@ def score(
     if report and out is None:
         raise InputError("--report needs --out DIR to write to")
     if report:
-        extras.require("jinja2", "rerun")
+        errors.require("jinja2", "rerun")
     opened = [open_submission(name) for name in names]
     entries = [entry.manifest.name for entry in opened]
     if len(set(entries)) < len(entries):
@@ -309,6 +311,128 @@ def _keep(
     return written
 
 
+def transfer(
+    names: Annotated[
+        list[str],
+        typer.Argument(metavar="SUBMISSION...", help="Folders or names of bundled submissions."),
+    ],
+    track: Annotated[
+        Track | None, typer.Option(help="Track to score; default: the first of the submission.")
+    ] = None,
+    in_process: Annotated[
+        bool,
+        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
+    ] = False,
+    json: JsonFile = None,
+) -> None:
+    """Score controllers on every rig and every member of the ensemble, without noise.
+
+    Columns: the reference rig of each lung, which the nominal score uses; the same rig in the other
+    members of the ensemble; the lung's other rigs; the rig on which no entry of ours was trained.
+
+    Example: `ventbench transfer pid_best residual_mlp --json transfer.json`
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from ventbench.submissions import rig_scoring
+    from ventbench.submissions import transfer as transfers
+    from ventbench.submissions.folder import open_submission
+    from ventbench.submissions.runner import CountingRunner, InProcessRunner, Runner
+
+    runner: Runner = InProcessRunner()
+    if not in_process:
+        from ventbench.sandbox.runner import SandboxRunner
+
+        runner = SandboxRunner()
+    opened = [open_submission(name) for name in names]
+    rigs = rig_scoring.load_rigs()
+    results = []
+    for entry in opened:
+        with bars() as shown:
+            counting = CountingRunner(runner, counted(shown, f"running {entry.label}"))
+            results.append(transfers.transfer(entry, rigs, track=track, runner=counting))
+    emit({"entries": [result.to_json() for result in results]}, json)
+    table = Table(title="Mean |pressure - target| on rigs, cmH2O (lower is better)")
+    table.add_column("entry")
+    for group in transfers.GROUPS:
+        plants = int(results[0].plants[group].sum())
+        table.add_column(f"{group}\n{plants} plants", justify="right")
+    best = {
+        group: min((result.mean(group) for result in results), default=0.0)
+        for group in transfers.GROUPS
+    }
+    for result in results:
+        cells = []
+        for group in transfers.GROUPS:
+            value = result.mean(group)
+            text = f"{value:.3f}" if value == value else "-"
+            cells.append(f"[bold]{text}[/bold]" if value == best[group] else text)
+        table.add_row(f"{result.name}, {result.track}", *cells)
+    Console(stderr=str(json) == "-").print(table)
+
+
+Family = Literal["pid", "residual", "ppo", "dqn", "other"]
+
+
+def new(
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="At most 40 lower-case letters, digits and underscores, starting with a letter."
+        ),
+    ],
+    family: Annotated[Family, typer.Option(help="Kind of controller to start from.")] = "pid",
+    folder: Annotated[
+        Path, typer.Option("--dir", metavar="DIR", help="Folder in which NAME/ is written.")
+    ] = Path("."),
+) -> None:
+    """Write a submission that can be scored at once; change it into your own.
+
+    Example: `ventbench new demo && ventbench check demo && ventbench score demo`
+    """
+    from ventbench.submissions import scaffold
+
+    path = scaffold.create(name, family, folder)
+    typer.echo(f"wrote {path}: " + ", ".join(sorted(entry.name for entry in path.iterdir())))
+    typer.echo(f"next: ventbench check {path} && ventbench score {path}")
+
+
+def check(
+    submission: Annotated[str, typer.Argument(help="Folder or name of a bundled submission.")],
+    in_process: Annotated[
+        bool,
+        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
+    ] = False,
+    json: JsonFile = None,
+) -> None:
+    """Report every problem that keeps a submission from the leaderboard.
+
+    Reads its files, manifest and sources, then runs it for a few breaths in the sandbox. The exit
+    code is 0 if it is ready, 1 if it has problems, and 2 if there is nothing to check or no sandbox
+    to run it in.
+
+    Example: `ventbench check submissions/mine --json check.json`
+    """
+    from ventbench.submissions import contract
+    from ventbench.submissions.runner import InProcessRunner
+
+    with bars() as shown:
+        report = contract.check(
+            submission,
+            InProcessRunner() if in_process else None,
+            progress=counted(shown, f"running {submission}"),
+        )
+    emit(report.to_json(), json)
+    for line in report.lines():
+        typer.echo(line, err=str(json) == "-")
+    if not report.ok:
+        raise typer.Exit(1)
+
+
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add the commands."""
     app.command()(score)
+    app.command()(transfer)
+    app.command()(new)
+    app.command()(check)

@@ -80,7 +80,7 @@ def coverage(
     from ventbench.board import actions
     from ventbench.board import record as records
     from ventbench.errors import InputError
-    from ventbench.metrics import extrapolation
+    from ventbench.metrics import open_loop
     from ventbench.plants import frozen
 
     entry = records.load(record)
@@ -90,7 +90,7 @@ def coverage(
     if not all("recorded_commands" in about for about in lungs.values()):
         raise InputError("the frozen simulators tell no recorded commands; train them again")
     commands = actions.load(entry, record.parent).clip(0.0, 100.0)
-    by_lung = extrapolation.by_lung(dict(zip(entry.lungs, commands, strict=True)), lungs)
+    by_lung = open_loop.by_lung(dict(zip(entry.lungs, commands, strict=True)), lungs)
     emit({name: asdict(share) for name, share in by_lung.items()}, json)
     table = Table(title="Commands beyond the recordings, % of all")
     for name in ("lung", "70 % and above", "ranges hardly recorded", "recorded at 70 % and above"):

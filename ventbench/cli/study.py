@@ -58,11 +58,11 @@ def samples(
     """
     from rich.console import Console
 
-    from ventbench import extras, files
+    from ventbench import errors, files
     from ventbench.lungs import scored_lung
     from ventbench.training import study as work
 
-    extras.require("matplotlib")
+    errors.require("matplotlib")
     with bars() as shown:
         tasks: dict[str, Any] = {}
 

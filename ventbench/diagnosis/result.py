@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import ventbench
-from ventbench import extras, files
+from ventbench import errors, files
 from ventbench.diagnosis import report_text
 from ventbench.diagnosis.findings import (
     BreathRequest,
@@ -104,7 +104,7 @@ class Diagnosis(Findings):
         Raises:
             InputError: if the extra ``ventbench[view]`` is missing.
         """
-        extras.require("matplotlib")
+        errors.require("matplotlib")
         return import_module(f"{_VIEWS}.plot").figure(self)
 
     def save(self, folder: Path | str) -> list[Path]:
@@ -125,7 +125,7 @@ class Diagnosis(Findings):
             InputError: if the extra ``ventbench[view]`` is missing.
             OSError: if a file cannot be written.
         """
-        extras.require("jinja2", "rerun")
+        errors.require("jinja2", "rerun")
         views, folder = import_module(_VIEWS), Path(folder)
         plain, corrected = folder / "diagnosis.json", folder / "corrected.json"
         files.write_json(plain, self.as_dict())

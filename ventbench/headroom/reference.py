@@ -23,15 +23,15 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench import data_files, files, precision, rollouts
+from ventbench import files, precision, rollouts
 from ventbench.controllers.pid import PID
 from ventbench.environment import Scenario
 from ventbench.errors import InputError
 from ventbench.executor import InProcess, results
 from ventbench.headroom import attainable
-from ventbench.headroom.cross_check import second_optimum
+from ventbench.headroom.attainable import second_optimum
 from ventbench.interfaces import Plant
-from ventbench.metrics import normalised as metric
+from ventbench.metrics import score as metric
 from ventbench.resume import ARRAY, WorkFolder, fingerprint
 
 #: The published file for the development draws.
@@ -58,7 +58,7 @@ class Reference:
     """Reference errors of L lungs, nominal cells in front of K draws, and P PIPs.
 
     All errors leave the first step of an inspiration out, see
-    :func:`ventbench.metrics.normalised.controllable_error`.
+    :func:`ventbench.metrics.score.controllable_error`.
 
     Attributes:
         about: hashes of the simulators, and season, commitment and number of the draws.
@@ -141,7 +141,7 @@ def published() -> Reference:
     Raises:
         InputError: if it is missing, damaged, or not the published one.
     """
-    path = data_files.data_path(FILE)
+    path = files.data_path(FILE)
     reference = load(path)
     if files.sha256(path) != SHA256:
         raise InputError(

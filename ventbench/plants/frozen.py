@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench import files
-from ventbench.data_files import data_path
 from ventbench.errors import InputError
+from ventbench.files import data_path
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNGS, RECORDED_LUNGS
 from ventbench.plants.hybrid import Hybrid

@@ -1,14 +1,19 @@
-"""A file as checked blocks of whole breaths, which `load`, `iter_breaths` and `check` share."""
+"""A file as checked blocks of whole breaths, which `load`, `iter_breaths` and `check` share.
+
+Parquet is read here in batches, CSV in :mod:`ventbench.recordings.csv_source`.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ventbench.files import sha256
 from ventbench.recordings.checks import (
     check_ids,
     check_lung,
@@ -18,11 +23,111 @@ from ventbench.recordings.checks import (
     check_values,
 )
 from ventbench.recordings.csv_source import CsvSource, locate_rows
-from ventbench.recordings.parquet_source import ParquetSource
-from ventbench.recordings.problems import Place, ProblemLog, fail
-from ventbench.recordings.rows import Rows, whole_breaths
-from ventbench.recordings.schema import Kind
+from ventbench.recordings.problems import Place, ProblemLog, RecordingError, RecordingProblem, fail
+from ventbench.recordings.rows import Chunk, Rows, chunk_of_batch, whole_breaths
+from ventbench.recordings.schema import COLUMNS, Kind, check_header
 from ventbench.recordings.times import KnownTimes, known_times, leading_zeros
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+BATCH = 1 << 17
+"""Rows read at a time."""
+
+
+@dataclass
+class ParquetSource:
+    """A Parquet file that is read once, in order.
+
+    Attributes:
+        file: the path as the caller wrote it.
+        kind: `parquet`.
+        names: column names.
+        warnings: about columns that are ignored.
+        sha256: SHA-256 of the file; None until all chunks are read.
+        batch: rows that are read at a time.
+        size: rows of the file.
+        done: rows that have been read.
+    """
+
+    file: str
+    kind: Kind = "parquet"
+    names: tuple[str, ...] = ()
+    warnings: tuple[RecordingProblem, ...] = ()
+    sha256: str | None = None
+    place: str = field(default="row", init=False)
+    batch: int = BATCH
+    size: int = field(default=0, init=False)
+    done: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        """Read and check names and types.
+
+        Raises:
+            RecordingError: the file is damaged, or its columns are not those of a recording.
+        """
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        try:
+            schema = parquet.read_schema(self.file)
+        except (pa.ArrowException, OSError) as error:
+            raise _damaged(self.file, error) from None
+        self.names = tuple(schema.names)
+        self.warnings = check_header(self.file, self.names, None)
+        problems = [
+            problem
+            for name in self.names
+            if name in COLUMNS
+            for problem in _check_type(self.file, name, schema.field(name).type)
+        ]
+        if problems:
+            raise RecordingError(problems)
+
+    def chunks(self) -> Iterator[Chunk]:
+        """Yield the rows in order.
+
+        Raises:
+            RecordingError: the file is damaged.
+        """
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        row0, last_id = 0, None
+        try:
+            with parquet.ParquetFile(self.file) as stream:
+                self.size = stream.metadata.num_rows
+                columns = [name for name in COLUMNS if name in self.names]
+                for batch in stream.iter_batches(self.batch, columns=columns):
+                    if batch.num_rows:
+                        chunk = chunk_of_batch(batch, row0, last_id)
+                        self.done = row0 + len(chunk)
+                        yield chunk
+                        row0 += len(chunk)
+                        last_id = int(chunk.columns["breath_id"][-1])
+            self.sha256 = sha256(Path(self.file))
+        except (pa.ArrowException, OSError) as error:
+            raise _damaged(self.file, error) from None
+
+
+def _check_type(file: str, name: str, kind: pa.DataType) -> Iterator[RecordingProblem]:
+    from pyarrow import types
+
+    if COLUMNS[name].whole:
+        good, needed = types.is_integer(kind), "int64"
+    else:
+        good, needed = types.is_integer(kind) or types.is_floating(kind), "double"
+        good = good or (name == "u_out" and types.is_boolean(kind))
+    if not good:
+        what = f"the column has type {kind}, but numbers are needed"
+        yield RecordingProblem(file, what, f"Write it as {needed}.", None, name, str(kind), "row")
+
+
+def _damaged(file: str, error: Exception) -> RecordingError:
+    text = str(error).strip().splitlines()[0].rstrip(".")
+    return fail(file, f"the Parquet file cannot be read ({text})", "Write or copy it again.")
+
 
 Source = CsvSource | ParquetSource
 

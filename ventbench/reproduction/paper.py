@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ventbench
-from ventbench import data_files
+from ventbench import files
 from ventbench.errors import InputError
 from ventbench.executor import executor, results
 from ventbench.lungs import LUNG_IDS, lung
@@ -150,7 +150,7 @@ def load_stored(path: Path | None = None) -> dict[str, Any]:
     Raises:
         InputError: if they are missing or not JSON.
     """
-    path = path or data_files.data_path(STORED)
+    path = path or files.data_path(STORED)
     try:
         return json.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ventbench.errors import InputError
 from ventbench.sandbox.child.failures import SubmissionError
-from ventbench.sandbox.child.preload import NUMPY
+from ventbench.sandbox.child.zygote import NUMPY
 from ventbench.sandbox.reader import UnreadableError, read_apart
 
 

@@ -2,7 +2,7 @@
 
 Parsers are not made for hostile input: a regular expression may take hours, a deeply nested
 expression overflows the stack, a small archive unpacks to gigabytes. In the child that costs an
-entry its chance and the scorer nothing.
+entry its chance and the scorer nothing. The zygote starts its interpreter with the same options.
 """
 
 from __future__ import annotations
@@ -18,8 +18,28 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ventbench.sandbox.child.reader import OUT_OF_MEMORY, TOO_DEEP
-from ventbench.sandbox.interpreter import ENVIRONMENT, OPTIONS, ROOT, SITE
+
+#: The folder that holds ``ventbench``, and the one of installed packages.
+ROOT = str(Path(__file__).resolve().parents[2])
+SITE = str(Path(np.__file__).resolve().parents[1])
+
+#: Not -I, which would make it ignore the fixed hash seed: the environment holds nothing but this.
+OPTIONS = ("-P", "-s", "-S", "-B")
+ENVIRONMENT = {
+    "PYTHONHASHSEED": "0",
+    "LC_ALL": "C.UTF-8",
+    "TZ": "UTC",
+    "HOME": "/nonexistent",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "VECLIB_MAXIMUM_THREADS": "1",
+    "JAX_PLATFORMS": "cpu",
+}
+
 
 #: Bytes of address space beyond the interpreter's: weights unpack to at most 100 MB.
 MEMORY = 1 << 30

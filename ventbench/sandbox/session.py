@@ -1,7 +1,8 @@
-"""The cells of one submission, from start to close.
+"""The cells of one submission, from start to close, and what their failures are called.
 
 While they run, this process has room for the descriptors of their pipes and cannot be read by
-other processes of the same user.
+other processes of the same user. Whatever a cell says was written by the submission: it is cut,
+escaped and believed in nothing.
 """
 
 from __future__ import annotations
@@ -9,10 +10,11 @@ from __future__ import annotations
 import contextlib
 import random
 import resource
+import signal
 import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +22,11 @@ from numpy.typing import NDArray
 from ventbench import protocol
 from ventbench.interfaces import Task
 from ventbench.sandbox.child import libc, lockdown, wire
-from ventbench.sandbox.child.failures import Failure, SubmissionError
+from ventbench.sandbox.child.failures import Failure, SubmissionError, printable
 from ventbench.sandbox.child.wire import Reply
 from ventbench.sandbox.configuration import Allowance, SandboxError, configuration
 from ventbench.sandbox.pipes import Clock, Outcome, Pipes
-from ventbench.sandbox.verdict import Verdict, ended, failed, not_answered
-from ventbench.sandbox.zygote import ZygoteClient
+from ventbench.sandbox.zygote import ZygoteClient, signal_name
 
 Floats = NDArray[np.float64]
 
@@ -251,3 +252,71 @@ def show_process() -> None:
         # 2, "for root alone", cannot be set again by hand; 0 is what it means for others.
         if libc.LINUX and _hiders == 0 and _dumpable_before == 1:
             libc.prctl(libc.PR_SET_DUMPABLE, 1)
+
+
+#: Kinds that a cell may give itself, before the first observation and after it.
+_BEFORE, _DURING = ("reset", "import", "construct"), ("act", "type", "value")
+
+
+class Verdict(NamedTuple):
+    """Kind, words and detail of a ``child.failures.Failure``."""
+
+    kind: str
+    what: str
+    detail: str = ""
+
+
+def failed(text: bytes, sequence: int) -> Verdict:
+    """Verdict on a cell that reported a failure itself.
+
+    Args:
+        text: kind, words, detail and the last that it printed, separated by zero bytes.
+        sequence: number of the observation that it was answering; 0 before the first.
+    """
+    kind, what, detail, printed = _fields(text)
+    kinds = _DURING if sequence else _BEFORE
+    kind = kind if kind in kinds else kinds[0]
+    # An import's problems are one on a line, and each is cut and escaped by itself.
+    what = "\n".join(printable(line) for line in what.splitlines()[:20])
+    return Verdict(kind, what or "the submission ended itself", _with_prints(detail, printed))
+
+
+def ended(status: int | None) -> Verdict:
+    """Verdict on a cell whose pipe has closed without an answer.
+
+    Args:
+        status: exit code or minus a signal's number; None if it lives on.
+    """
+    if status is None:
+        return Verdict("wire", "the controller closed its pipe")
+    if status >= 0:
+        return Verdict("exit", f"the controller ended its process (exit code {status})")
+    if -status == signal.SIGXCPU:
+        return Verdict("cpu", "the controller used up its processor time (SIGXCPU)")
+    return Verdict("crash", f"the controller's process was ended by {signal_name(status)}")
+
+
+def not_answered(outcome: Outcome, limit_s: float, total: bool) -> Verdict:
+    """Verdict on a cell that was out of time.
+
+    Args:
+        outcome: what it said when it was asked where it is.
+        limit_s: how long was waited.
+        total: whether that was the limit of the whole session.
+    """
+    limit = f"within {limit_s:g} s" + (" for the whole score" if total else "")
+    _, _, detail, printed = _fields(outcome.text if isinstance(outcome, Reply) else b"")
+    what = f"the controller did not answer {limit}"
+    return Verdict("timeout", what, _with_prints(detail, printed))
+
+
+def _fields(text: bytes) -> list[str]:
+    fields = text.decode(errors="replace").split("\0", 3)
+    return [*fields, "", "", ""][:4]
+
+
+def _with_prints(detail: str, printed: str) -> str:
+    parts = [printable(detail)] if detail else []
+    if printed:
+        parts.append(f"it printed {printable(printed[-400:], 400)}")
+    return "; ".join(parts)

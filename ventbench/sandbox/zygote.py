@@ -28,7 +28,7 @@ from ventbench.sandbox.child.zygote import (
     TOKEN,
 )
 from ventbench.sandbox.configuration import SandboxError
-from ventbench.sandbox.interpreter import ENVIRONMENT, OPTIONS, ROOT, SITE
+from ventbench.sandbox.reader import ENVIRONMENT, OPTIONS, ROOT, SITE
 
 _BOOT = (
     "import sys; sys.path.insert(0, sys.argv[2]); from ventbench.sandbox.child import zygote; "

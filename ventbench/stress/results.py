@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ventbench import protocol
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS
-from ventbench.metrics.rig_bootstrap import resampled_scores
+from ventbench.metrics.bootstrap import resampled_scores
 from ventbench.stress.stressors import CATEGORIES, Condition, conditions, stressor
 
 if TYPE_CHECKING:

@@ -40,7 +40,7 @@ from ventbench.submissions.errors import (
     SubmissionError,
 )
 from ventbench.submissions.folder import CONTROLLER, Submission, open_submission, resolve
-from ventbench.submissions.inspection import inspect_folder
+from ventbench.submissions.review import inspect_folder
 from ventbench.submissions.runner import Runner
 
 Floats = NDArray[np.float64]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ventbench import data_files, files
+from ventbench import files
 from ventbench.interfaces import API_VERSION, Task
 from ventbench.sandbox.child.sources import CONTROLLER as CONTROLLER
 from ventbench.sandbox.child.sources import walk
@@ -54,13 +54,13 @@ class Submission:
 
 def bundled() -> list[str]:
     """Names of the submissions that travel with ventbench."""
-    folder = data_files.submissions_folder()
+    folder = files.submissions_folder()
     return sorted(path.parent.name for path in folder.glob(f"*/{MANIFEST}"))
 
 
 def archived() -> list[str]:
     """Names of the bundled submissions as they were scored for earlier protocols: ``v1/NAME``."""
-    folder = data_files.submissions_folder()
+    folder = files.submissions_folder()
     paths = (path.parent for path in folder.glob(f"v[0-9]/*/{MANIFEST}"))
     return sorted(path.relative_to(folder).as_posix() for path in paths)
 
@@ -81,7 +81,7 @@ def resolve(name: str) -> Path:
     if path.is_file():
         raise SubmissionError(f"{name} is a file; give the folder that holds {CONTROLLER}")
     if name in bundled() or name in archived():
-        return data_files.submissions_folder() / name
+        return files.submissions_folder() / name
     close = difflib.get_close_matches(path.name, bundled(), n=1)
     hint = f"did you mean {close[0]}?" if close else f"bundled are {', '.join(bundled())}"
     raise SubmissionError(f"{name}: no such folder and no bundled submission of that name; {hint}")

@@ -19,7 +19,7 @@ import ventbench
 from ventbench import draws, files, protocol
 from ventbench.headroom.reference import Reference
 from ventbench.lungs import LUNG_IDS
-from ventbench.metrics import bootstrap, rig_bootstrap
+from ventbench.metrics import bootstrap
 from ventbench.metrics.score import lung_score
 from ventbench.plants import frozen
 from ventbench.rig_draws import RigDraws
@@ -324,7 +324,7 @@ class Score:
         assert self.rig_draws is not None
         lungs = slice(first, first + values.shape[1])
         rig, member = self.rig_draws.rig[lungs], self.rig_draws.member[lungs]
-        resampled = rig_bootstrap.resampled_scores(values.T, rig, member)
+        resampled = bootstrap.resampled_scores(values.T, rig, member)
         low, high = np.quantile(resampled, (0.025, 0.975))
         return float(values.mean()), (float(low), float(high))
 

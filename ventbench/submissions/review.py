@@ -2,20 +2,29 @@
 
 None of it is forbidden, and the sandbox does not rest on it. But each of these has served an
 attack, and a reader of a pull request should see them all without searching.
+
+:func:`inspect_folder` finds all that reading a folder shows in a limited process, which runs none
+of it.
 """
 
 from __future__ import annotations
 
 import ast
+import dataclasses
 import re
 import unicodedata
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from ventbench.sandbox.child.cell import source_text
 from ventbench.sandbox.child.sources import sources
+from ventbench.sandbox.reader import UnreadableError, read_apart
 from ventbench.submissions.errors import Finding
+from ventbench.submissions.file_checks import check_files
+from ventbench.submissions.manifest import check_manifest
+from ventbench.submissions.static_checks import check_sources
 
 _MODULES = {
     **dict.fromkeys(("gc", "inspect", "traceback"), "looks into Python's own objects and frames"),
@@ -139,3 +148,67 @@ def _module(name: str) -> Iterator[tuple[str, str]]:
     top = name.partition(".")[0]
     if top in _MODULES:
         yield name, _MODULES[top]
+
+
+#: Most findings of one kind that are listed.
+LISTED = 200
+
+_CHECKS = ("manifest", "files", "sources", "review")
+
+
+def findings_as_json(folder: str, check: str) -> list[dict[str, Any]]:
+    """Make one kind of check on a folder, for a process that answers in JSON.
+
+    Args:
+        folder: the submission's.
+        check: ``"manifest"``, ``"files"``, ``"sources"`` or ``"review"``.
+    """
+    path = Path(folder)
+    if check == "manifest":
+        findings = check_manifest(path)[0]
+    else:
+        checks = {"files": check_files, "sources": check_sources, "review": review}
+        findings = checks[check](path)
+    # Problems first: what is cut off must not be what stops the submission.
+    kept = sorted(findings, key=lambda finding: not finding.problem)[:LISTED]
+    return [dataclasses.asdict(finding) for finding in findings if finding in kept]
+
+
+def all_findings_as_json(folder: str) -> list[dict[str, Any]]:
+    """Make every check on a folder, for a process that answers in JSON.
+
+    Args:
+        folder: the submission's.
+    """
+    return [finding for check in _CHECKS for finding in findings_as_json(folder, check)]
+
+
+def inspect_folder(folder: Path) -> tuple[Finding, ...]:
+    """Return what is wrong with the manifest, the files and the sources of a submission.
+
+    One process makes all checks. Where a check ends the process, each check gets its own, so that
+    the answer says which files cannot be read and still has what the other checks find.
+
+    Args:
+        folder: the submission's; nothing in it is run or imported.
+    """
+    try:
+        together = read_apart("ventbench.submissions.review:all_findings_as_json", folder)
+        return tuple(Finding(**finding) for finding in together)
+    except UnreadableError:
+        return _each_apart(folder)
+
+
+def _each_apart(folder: Path) -> tuple[Finding, ...]:
+    findings: list[Finding] = []
+    for check in _CHECKS:
+        try:
+            function = "ventbench.submissions.review:findings_as_json"
+            found = read_apart(function, folder, [check])
+        except UnreadableError as error:
+            group = check if check in ("manifest", "files") else "source"
+            advice = "make its files smaller and plainer"
+            findings.append(Finding(group, "the folder", str(error), advice))  # type: ignore[arg-type]
+            continue
+        findings += [Finding(**finding) for finding in found]
+    return tuple(findings)

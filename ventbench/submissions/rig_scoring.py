@@ -20,7 +20,7 @@ from ventbench.errors import InputError
 from ventbench.headroom.reference import Reference, reference_of
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNGS, Lung
-from ventbench.metrics.normalised import controllable_error
+from ventbench.metrics.score import controllable_error
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators
 from ventbench.rig_draws import RigDraws

@@ -25,7 +25,7 @@ from ventbench.controllers.pid import PID
 from ventbench.environment import Scenario
 from ventbench.executor import InProcess, executor, in_order
 from ventbench.interfaces import Plant
-from ventbench.metrics.normalised import controllable_error
+from ventbench.metrics.score import controllable_error
 from ventbench.plants.catalog import Given
 from ventbench.rig_draws import RigDraws
 from ventbench.submissions.rig_scoring import Rigs, load_rigs

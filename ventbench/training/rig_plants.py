@@ -15,12 +15,12 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import data_files, draws, protocol, rig_draws
+from ventbench import draws, files, protocol, rig_draws
 from ventbench.errors import InputError
 from ventbench.headroom import reference
 from ventbench.interfaces import Plant
 from ventbench.lungs import LUNGS, Lung
-from ventbench.metrics.normalised import LEAST_HEADROOM
+from ventbench.metrics.score import LEAST_HEADROOM
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given
 from ventbench.training.trained import simulators_to_train_on
@@ -99,7 +99,7 @@ def _stacked(official: frozen.Frozen) -> Plant:
 
 
 def _weights(official: frozen.Frozen) -> Floats:
-    bounds = reference.load(data_files.data_path(reference.FILE))
+    bounds = reference.load(files.data_path(reference.FILE))
     if bounds.about["simulators"] != official.manifest_sha256:
         return np.ones((len(LUNGS), len(protocol.PIPS)))
     inverse = 1.0 / np.maximum(bounds.pid[:, 0] - bounds.attainable[:, 0], LEAST_HEADROOM)

@@ -22,7 +22,7 @@ from ventbench.palette import BAND, INK, QUIET
 from ventbench.palette import LINE as RULE
 from ventbench.text import number
 from ventbench.trajectories import Trajectories
-from ventbench.views import panels, scores
+from ventbench.views import graphics, scores
 from ventbench.views.runs import Floats, labels, shared_tracks
 
 #: Width, pixels.
@@ -51,19 +51,19 @@ def png(runs: Sequence[Trajectories]) -> bytes:
         runs: matching runs, the one to look at first.
     """
     columns, rows = len(runs[0].pips), len(runs[0].lungs)
-    width = 2 * MARGIN + columns * panels.WIDTH + (columns - 1) * GAP
+    width = 2 * MARGIN + columns * graphics.WIDTH + (columns - 1) * GAP
     row_head = ROW_HEAD + ERROR_ROW * (_error_rows(len(runs)) - 1)
-    height = 2 * MARGIN + HEAD + len(runs) * LEGEND + rows * (row_head + panels.HEIGHT)
+    height = 2 * MARGIN + HEAD + len(runs) * LEGEND + rows * (row_head + graphics.HEIGHT)
     draw = Drawing(width, height, PIXELS)
     numbers, names = scores.collect(runs), [draw.known(name) for name in labels(runs)]
     start = _head(draw, names, shared_tracks(runs))
-    for i, row in enumerate(panels.panels(runs)):
-        top = start + i * (row_head + panels.HEIGHT)
+    for i, row in enumerate(graphics.panels(runs)):
+        top = start + i * (row_head + graphics.HEIGHT)
         _row_head(draw, row[0].lung, names, numbers.lungs[:, i], top)
         for j, panel in enumerate(row):
-            origin = (MARGIN + j * (panels.WIDTH + GAP), top + row_head)
+            origin = (MARGIN + j * (graphics.WIDTH + GAP), top + row_head)
             _panel(draw, panel, numbers.cells[:, i, j], origin, first=j == 0)
-    used = start + rows * (row_head + panels.HEIGHT) + MARGIN
+    used = start + rows * (row_head + graphics.HEIGHT) + MARGIN
     output = io.BytesIO()
     image = draw.image()
     # Room was kept for a legend of one row a run.
@@ -78,7 +78,7 @@ def _head(draw: Drawing, names: Sequence[str], track: str) -> float:
     draw.text(MARGIN, MARGIN + 14, names[0], 17, INK, weight="bold")
     about = f"{draw.known(track)}, protocol {protocol.VERSION}"
     read = (
-        f"Breath {panels.BREATH + 1} on each lung at each PIP. Above: airway pressure, cmH2O; "
+        f"Breath {graphics.BREATH + 1} on each lung at each PIP. Above: airway pressure, cmH2O; "
         "below: u_in, %; against time, s. Band: scored. Numbers: mean absolute error, cmH2O."
     )
     draw.text(MARGIN, MARGIN + 34, f"{about}. {read}", 10, QUIET)
@@ -110,22 +110,26 @@ def _row_head(draw: Drawing, lung: str, names: Sequence[str], errors: Floats, to
 
 
 def _panel(
-    draw: Drawing, panel: panels.RunPanel, errors: Floats, origin: tuple[float, float], first: bool
+    draw: Drawing,
+    panel: graphics.RunPanel,
+    errors: Floats,
+    origin: tuple[float, float],
+    first: bool,
 ) -> None:
     at = np.array(origin)
-    left, right = panels.LEFT, panels.LEFT + panels.PLOT_WIDTH
-    bottom = panels.VALVE_TOP + panels.VALVE_HEIGHT
-    end = float(panels.time_x(protocol.INSPIRATION_STEPS * protocol.DT))
-    band = np.array([[left, panels.TOP], [end, panels.TOP], [end, bottom], [left, bottom]])
+    left, right = graphics.LEFT, graphics.LEFT + graphics.PLOT_WIDTH
+    bottom = graphics.VALVE_TOP + graphics.VALVE_HEIGHT
+    end = float(graphics.time_x(protocol.INSPIRATION_STEPS * protocol.DT))
+    band = np.array([[left, graphics.TOP], [end, graphics.TOP], [end, bottom], [left, bottom]])
     draw.fill(at + band, BAND, 1.0)
-    marks = [*panel.ticks, *((u, float(panels.valve_y(u))) for u in panels.VALVE_MARKS)]
+    marks = [*panel.ticks, *((u, float(graphics.valve_y(u))) for u in graphics.VALVE_MARKS)]
     for value, y in marks:
         draw.line(at + np.array([[left, y], [right, y]]), RULE, 0.7, 0)
         draw.text(at[0] + left - 4, at[1] + y + 3, f"{value:g}", 8.5, QUIET, ha="right")
-    for t in panels.TIMES:
-        x, last = float(panels.time_x(t)), t == panels.TIMES[-1]
+    for t in graphics.TIMES:
+        x, last = float(graphics.time_x(t)), t == graphics.TIMES[-1]
         text = f"{t:g}{' s' if last else ''}"
-        draw.text(at[0] + x, at[1] + panels.HEIGHT - 3, text, 8.5, QUIET, ha="center")
+        draw.text(at[0] + x, at[1] + graphics.HEIGHT - 3, text, 8.5, QUIET, ha="center")
     draw.text(at[0] + left, at[1] - 1, f"PIP {panel.pip:g}", 9, QUIET)
     for k, error in enumerate(errors):
         line, place = divmod(k, ERRORS)
@@ -135,10 +139,10 @@ def _panel(
         look = {"weight": "bold"} if k == 0 else {}
         draw.text(x, y, number(error), 9, _color(k), ha="right", **look)
     if first:
-        draw.text(at[0] + right, at[1] + panels.TOP + 9, "cmH2O", 8.5, QUIET, ha="right")
-        draw.text(at[0] + right, at[1] + panels.VALVE_TOP + 10, "u_in, %", 8.5, QUIET, ha="right")
-    target = panels.inspiration(panel.target)
-    scored = panels.inspiration(panel.pressures[0])
+        draw.text(at[0] + right, at[1] + graphics.TOP + 9, "cmH2O", 8.5, QUIET, ha="right")
+        draw.text(at[0] + right, at[1] + graphics.VALVE_TOP + 10, "u_in, %", 8.5, QUIET, ha="right")
+    target = graphics.inspiration(panel.target)
+    scored = graphics.inspiration(panel.pressures[0])
     if np.isfinite(scored).all():
         area = np.concatenate([_inside(scored), target[::-1]])
         draw.fill(at + area, _color(0), 0.16)
@@ -147,12 +151,12 @@ def _panel(
         order = 2 + (k == 0)
         line = _inside(panel.pressures[k])
         draw.line(at + line, _color(k), 0.9, order, 0.5)
-        draw.line(at + panels.inspiration(line), _color(k), _width(k), order)
+        draw.line(at + graphics.inspiration(line), _color(k), _width(k), order)
         draw.line(at + panel.valves[k], _color(k), 1.0, order)
     if panel.above is not None:
         draw.text(
             at[0] + right,
-            at[1] + panels.TOP + 21,
+            at[1] + graphics.TOP + 21,
             f"↑ {panel.above:.0f}",
             8.5,
             _color(0),
@@ -162,7 +166,7 @@ def _panel(
 
 def _inside(line: Floats) -> Floats:
     """A pressure line that stays in its frame."""
-    limits = (panels.TOP, panels.TOP + panels.PRESSURE_HEIGHT)
+    limits = (graphics.TOP, graphics.TOP + graphics.PRESSURE_HEIGHT)
     return np.stack([line[:, 0], np.clip(line[:, 1], *limits)], axis=-1)
 
 

@@ -11,11 +11,10 @@ import ventbench
 from ventbench import palette, protocol
 from ventbench.lungs import lung as parse_lung
 from ventbench.metrics import bootstrap
-from ventbench.text import number
+from ventbench.text import number, page_templates
 from ventbench.trajectories import Trajectories
-from ventbench.views import graphics, panels, scores
+from ventbench.views import graphics, scores
 from ventbench.views.runs import Floats, labels, shared_tracks
-from ventbench.views.templating import template
 
 #: Limits between the shades of differences, cmH2O, and how much colour each shade has, %.
 SHADE_LIMITS, SHADES = (0.02, 0.2, 0.7, 2.0), (12, 24, 38, 55)
@@ -33,7 +32,8 @@ def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None
     """
     names = labels(runs)
     numbers = scores.collect(runs, given)
-    return template("report.html.j2").render(
+    page = page_templates("ventbench.views").get_template("report.html.j2")
+    return page.render(
         title=names[0],
         names=names,
         classes=[f"r{palette.run_index(i)}" for i in range(len(runs))],
@@ -52,7 +52,7 @@ def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None
         frame=frame(),
         protocol=protocol,
         scored=[breath + 1 for breath in protocol.SCORED_BREATHS],
-        shown_breath=panels.BREATH + 1,
+        shown_breath=graphics.BREATH + 1,
         official=given is not None,
         provenance=[scores.provenance(score) for score in given or ()],
         failures=[scores.failures(score) for score in given or ()],
@@ -139,35 +139,37 @@ def sections(
             "scores": [number(value) for value in numbers.lungs[:, i]],
             "panels": [_panel(panel, names, numbers.cells[:, i, j]) for j, panel in enumerate(row)],
         }
-        for i, row in enumerate(panels.panels(runs))
+        for i, row in enumerate(graphics.panels(runs))
     ]
 
 
 def frame() -> dict[str, Any]:
     """Elements that all panels share: sizes, time ticks, the scored part."""
-    end = float(panels.time_x(protocol.INSPIRATION_STEPS * protocol.DT))
+    end = float(graphics.time_x(protocol.INSPIRATION_STEPS * protocol.DT))
     return {
-        "width": panels.WIDTH,
-        "height": panels.HEIGHT,
-        "left": panels.LEFT,
-        "right": panels.LEFT + panels.PLOT_WIDTH,
-        "top": panels.TOP,
-        "bottom": panels.TOP + panels.PRESSURE_HEIGHT,
-        "scored_width": round(end - panels.LEFT, 1),
+        "width": graphics.WIDTH,
+        "height": graphics.HEIGHT,
+        "left": graphics.LEFT,
+        "right": graphics.LEFT + graphics.PLOT_WIDTH,
+        "top": graphics.TOP,
+        "bottom": graphics.TOP + graphics.PRESSURE_HEIGHT,
+        "scored_width": round(end - graphics.LEFT, 1),
         "scored_end": round(end, 1),
-        "valve_top": panels.VALVE_TOP,
-        "valve_bottom": panels.VALVE_TOP + panels.VALVE_HEIGHT,
-        "commands": [(f"{u:g}", round(float(panels.valve_y(u)), 1)) for u in panels.VALVE_MARKS],
-        "times": [(f"{t:g}", round(float(panels.time_x(t)), 1)) for t in panels.TIMES],
+        "valve_top": graphics.VALVE_TOP,
+        "valve_bottom": graphics.VALVE_TOP + graphics.VALVE_HEIGHT,
+        "commands": [
+            (f"{u:g}", round(float(graphics.valve_y(u)), 1)) for u in graphics.VALVE_MARKS
+        ],
+        "times": [(f"{t:g}", round(float(graphics.time_x(t)), 1)) for t in graphics.TIMES],
     }
 
 
-def _panel(panel: panels.RunPanel, names: Sequence[str], errors: Floats) -> dict[str, Any]:
+def _panel(panel: graphics.RunPanel, names: Sequence[str], errors: Floats) -> dict[str, Any]:
     errors_text = "; ".join(
         f"{name} {number(e)}{' cmH2O' if np.isfinite(e) else ''}"
         for name, e in zip(names, errors, strict=True)
     )
-    first = panels.inspiration(panel.pressures[0])
+    first = graphics.inspiration(panel.pressures[0])
     return {
         "pip": f"{panel.pip:g}",
         "alt": f"{panel.lung} at PIP {panel.pip:g} cmH2O: pressure and u_in over one breath. "
@@ -175,9 +177,9 @@ def _panel(panel: panels.RunPanel, names: Sequence[str], errors: Floats) -> dict
         "errors": [number(error) for error in errors],
         "ticks": [(f"{value:g}", round(y, 1)) for value, y in panel.ticks],
         "target": graphics.path(panel.target),
-        "area": graphics.area(first, panels.inspiration(panel.target)),
+        "area": graphics.area(first, graphics.inspiration(panel.target)),
         "pressures": [graphics.path(line) for line in panel.pressures],
-        "scored": [graphics.path(panels.inspiration(line)) for line in panel.pressures],
+        "scored": [graphics.path(graphics.inspiration(line)) for line in panel.pressures],
         "valves": [graphics.path(line) for line in panel.valves],
         "above": None if panel.above is None else f"{panel.above:.0f}",
     }

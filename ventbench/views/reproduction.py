@@ -10,7 +10,7 @@ import numpy as np
 
 import ventbench
 from ventbench import files, palette
-from ventbench.extras import require
+from ventbench.errors import require
 from ventbench.reproduction.report import Chart, HeatMap, Reproduction
 from ventbench.views import graphics
 
@@ -50,9 +50,10 @@ def write_reproduction(path: Path | str, reproduction: Reproduction) -> Path:
 
 def html(reproduction: Reproduction) -> str:
     """Return the page; see :func:`write_reproduction`."""
-    from ventbench.views.templating import template
+    from ventbench.text import page_templates
 
-    return template("reproduction.html.j2").render(
+    page = page_templates("ventbench.views").get_template("reproduction.html.j2")
+    return page.render(
         about=reproduction.about,
         summary=reproduction.summary(),
         sections=[

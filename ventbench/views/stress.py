@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ventbench import files
-from ventbench.errors import InputError
-from ventbench.extras import require
+from ventbench.errors import InputError, require
 from ventbench.stress.stressors import CATEGORIES, SEVERITIES, stressor
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.extras import require
+from ventbench.errors import require
 from ventbench.palette import RUNS
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ventbench import extras, files
+from ventbench import errors, files
 from ventbench.trajectories import Trajectories
 from ventbench.views.runs import check
 
@@ -30,7 +30,7 @@ def write_rerun(path: Path | str, runs: Sequence[Trajectories]) -> Path:
     """
     path = Path(path)
     check(runs)
-    extras.require("rerun")
+    errors.require("rerun")
     from ventbench.views import rerun_log
 
     content = rerun_log.recording(runs)
@@ -62,7 +62,7 @@ def write_report(
     """
     path = Path(path)
     check(runs)
-    extras.require("jinja2")
+    errors.require("jinja2")
     from ventbench.views import report
 
     files.write_text(path, report.html(runs, scores))
@@ -85,7 +85,7 @@ def write_figure(path: Path | str, runs: Sequence[Trajectories]) -> Path:
     """
     path = Path(path)
     check(runs)
-    extras.require("matplotlib")
+    errors.require("matplotlib")
     from ventbench.views import figure
 
     content = figure.png(runs)
@@ -115,7 +115,7 @@ def open_viewer(path: Path | str) -> bool:
     """
     path = Path(path)
     path.open("rb").close()
-    extras.require("rerun")
+    errors.require("rerun")
     if not has_display():
         print(
             f"No display here. Open the file where there is one: rerun {path}\n"

@@ -21,8 +21,7 @@ from ventbench.lungs import Lung
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
 from ventbench.recordings.foreign.breath_onsets import bridged, find_breaths, is_high
 from ventbench.recordings.foreign.layouts import LAYOUTS, ROLES, USUAL, Layout, recognise
-from ventbench.recordings.foreign.tables import Table, read_table
-from ventbench.recordings.foreign.units import Conversion, conversion
+from ventbench.recordings.foreign.tables import Conversion, Table, conversion, read_table
 from ventbench.recordings.schema import COLUMNS
 
 Floats = NDArray[np.float64]

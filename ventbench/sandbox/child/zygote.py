@@ -3,13 +3,15 @@
 It is executed afresh, so none of the scorer's memory is in it, and it never runs submitted code.
 A cell is named by a random token and told its task as bytes that the zygote never reads. A fork
 leaves the loop by returning to :func:`main`, so that no frame of the zygote stays below the
-submission's, and takes along nothing but its own task and pipes.
+submission's, and takes along nothing but its own task and pipes. What every cell finds imported is
+imported here, once; the folders of those packages are all that a cell may import more from.
 """
 
 from __future__ import annotations
 
 import contextlib
 import gc
+import importlib
 import json
 import os
 import select
@@ -17,12 +19,25 @@ import signal
 import socket
 import struct
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from . import isolation, preload, serve
+from . import isolation, serve
 from .isolation import RANDOM
 from .lockdown import CellLimits, Lockdown
+
+#: Imported once by the zygote, so that cells need not: what small controllers use.
+STANDARD = (
+    *("abc", "array", "ast", "base64", "bisect", "cmath", "collections.abc", "contextlib", "copy"),
+    *("csv", "dataclasses", "decimal", "enum", "fractions", "functools", "hashlib", "heapq"),
+    *("inspect", "io", "itertools", "json", "linecache", "logging", "math", "numbers", "operator"),
+    *("pathlib", "pickle", "random", "re", "statistics", "string", "struct", "textwrap", "time"),
+    *("traceback", "types", "typing", "warnings", "weakref", "zipfile", "zlib", "encodings.cp437"),
+)
+NUMPY = ("numpy", "numpy.fft", "numpy.linalg", "numpy.polynomial", "numpy.random")
+
+_SITE = ("site-packages", "dist-packages")
 
 #: Bytes of a token.
 TOKEN = 16
@@ -170,7 +185,7 @@ def _serve(
     config = _configuration(control)
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as file:
         file.write("1000")  # if memory runs out, a cell ends and not the scorer
-    readable, listable = preload.load(config["packages"], config["site"])
+    readable, listable = load_packages(config["packages"], config["site"])
     prepared = Lockdown(
         [RANDOM, *readable],
         listable,
@@ -192,6 +207,50 @@ def _serve(
         if not forks.is_child:
             zygote.end()
     return [] if start is None else [(setup, prepared, start)]
+
+
+def load_packages(packages: Iterable[str], site: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Import what cells share, then take the folders of packages off the search path.
+
+    Only packages that are imported here can be imported in a cell: others, ventbench's simulators
+    and data among them, are neither on its path nor readable.
+
+    Args:
+        packages: modules beyond the standard library; those that are not installed are skipped.
+        site: folders of installed packages.
+
+    Returns:
+        What a cell may read, and the folders of which it may read the names alone.
+    """
+    for name in STANDARD:
+        importlib.import_module(name)
+    standard = [path for path in sys.path if os.path.isdir(path)]
+    site = list(site)
+    sys.path.extend(site)
+    for name in packages:
+        with contextlib.suppress(ModuleNotFoundError):
+            importlib.import_module(name)
+    sys.path[:] = standard
+    for path in site:
+        sys.path_importer_cache.pop(path, None)
+    packages = [folder for path in site for folder in _imported(path)]
+    return [*packages, *(entry for path in standard for entry in _entries(path))], standard
+
+
+def _imported(site: str) -> list[str]:
+    """Files and folders of what has been imported from there, with shared libraries beside it."""
+    imported = set()
+    for module in list(sys.modules.values()):
+        file = getattr(module, "__file__", None)
+        if file and file.startswith(site + os.sep):
+            top = file[len(site) + 1 :].split(os.sep)[0]
+            imported |= {top, f"{top}.libs"}
+    return sorted(os.path.join(site, name) for name in imported - {"ventbench", "ventbench.libs"})
+
+
+def _entries(folder: str) -> list[str]:
+    """Everything in a folder of the standard library but the packages installed there."""
+    return [os.path.join(folder, name) for name in os.listdir(folder) if name not in _SITE]
 
 
 def main(descriptor: int, apart: str) -> None:

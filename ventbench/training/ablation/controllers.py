@@ -23,7 +23,7 @@ from ventbench.plants.stacking import take
 from ventbench.resume import WorkFolder
 from ventbench.submissions.scoring import protocol_cells
 from ventbench.training import pid_grid
-from ventbench.training.ablation.trainings import Progress, Tell, finish
+from ventbench.training.ablation.networks import Progress, Tell, finish
 from ventbench.training.residual import ResidualConfig, fit
 
 #: Published draws to score on.

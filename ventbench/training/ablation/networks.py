@@ -1,9 +1,13 @@
-"""Ablation of the paper's simulator: windows, width, depth and boundary networks."""
+"""Ablation of the paper's simulator: windows, width, depth and boundary networks.
+
+:func:`finish` runs the trainings of any study that are not finished, here or beside each other.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +17,7 @@ import numpy as np
 import pandas as pd
 
 from ventbench import files, open_loop_report
+from ventbench.executor import InProcess, executor, results
 from ventbench.lungs import LUNG_IDS, RECORDED_LUNGS
 from ventbench.metrics import bootstrap
 from ventbench.plants.learned import Architecture
@@ -20,7 +25,6 @@ from ventbench.plants.stacking import VmappedPlant
 from ventbench.recordings import Breaths
 from ventbench.resume import WorkFolder
 from ventbench.training import simulator
-from ventbench.training.ablation.trainings import Progress, Tell, finish
 from ventbench.training.learned import LearnedConfig
 
 #: Name of the variant that all others are compared with.
@@ -164,3 +168,57 @@ def _errors(nets: Any, breaths: Breaths, fold: np.ndarray) -> np.ndarray:
         return VmappedPlant(jax.tree.map(lambda leaf: jnp.asarray(leaf[member, at]), nets))
 
     return open_loop_report.errors(plants_for, breaths)
+
+
+#: Called with what is trained and the share of all that is done.
+Progress = Callable[[str, float], None]
+
+#: Takes the share of a training that is done.
+Tell = Callable[[float], None]
+
+
+def finish(
+    work: WorkFolder,
+    function: Callable[..., Any],
+    jobs: Mapping[str, tuple[Any, ...]],
+    *,
+    workers: int = 0,
+    scheduler: str | None = None,
+    progress: Progress = lambda *_: None,
+) -> None:
+    """Compute the results that a folder does not have yet.
+
+    Args:
+        work: keeps each result as soon as it is there.
+        function: of a module; takes the arguments of a job, then :data:`Tell` or None, and returns
+            JSON values.
+        jobs: arguments by name of the result.
+        workers: processes, each with a training at a time; 0 for this one alone.
+        scheduler: address of a Dask scheduler instead, whose workers see the same files.
+        progress: what happens within a training can only be told where it runs in this process.
+
+    Raises:
+        InputError: if the scheduler cannot be reached, or a worker process has died.
+    """
+    done = 0
+
+    def tell(name: str, share: float) -> None:
+        progress(name, (done + share) / len(jobs))
+
+    missing = {}
+    for name, arguments in jobs.items():
+        if work.has(name):
+            tell(name, 0.0)
+            done += 1
+        else:
+            missing[name] = arguments
+    with executor(workers, scheduler) as pool:
+        here = isinstance(pool, InProcess)
+        told = {
+            name: (*arguments, partial(tell, name) if here else None)
+            for name, arguments in missing.items()
+        }
+        for name, result in results(pool, function, told):
+            work.put(name, result)
+            done += 1
+            tell(name, 0.0)

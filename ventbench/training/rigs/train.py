@@ -26,7 +26,7 @@ from scipy.special import ndtri
 from ventbench import files, open_loop_report, precision
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS, Lung, lung
-from ventbench.metrics.extrapolation import WIDE_OPEN, command_counts
+from ventbench.metrics.open_loop import WIDE_OPEN, command_counts
 from ventbench.plants import frozen, sessions
 from ventbench.plants.frozen import BY_ALL, seen
 from ventbench.plants.hybrid import Hybrid

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ventbench import extras, files
+from ventbench import errors, files
 
 if TYPE_CHECKING:
     from ventbench.diagnosis.result import Diagnosis
@@ -28,7 +28,7 @@ def write_report(path: Path | str, diagnosis: Diagnosis) -> Path:
         OSError: if the file cannot be written.
     """
     path = Path(path)
-    extras.require("jinja2")
+    errors.require("jinja2")
     from ventbench.views.diagnosis import report
 
     files.write_text(path, report.html(diagnosis))
@@ -50,7 +50,7 @@ def write_rerun(path: Path | str, diagnosis: Diagnosis) -> Path:
         OSError: if the file cannot be written.
     """
     path = Path(path)
-    extras.require("rerun")
+    errors.require("rerun")
     from ventbench.views.diagnosis import rerun_log
 
     content = rerun_log.recording(diagnosis)

@@ -161,12 +161,12 @@ CHOICES = (
 
 
 @flax.struct.dataclass
-class GaussianPolicy:
-    """The PID plus :data:`SCALE` times the network's output, the mean of a Gaussian policy.
+class CorrectedPID:
+    """The PID plus a correction that a network decides on.
 
     Attributes:
         parameters: weights and biases of the network.
-        network: a network with one output.
+        network: what the outputs of the network mean is told by the kind of policy.
         looks_back: whether the features look back at the breath before.
     """
 
@@ -183,35 +183,30 @@ class GaussianPolicy:
     ) -> tuple[AnyFeatureState, Array]:
         """Return the next state and ``u_in``, %."""
         state, x, base = features(state, observation)
-        mean: Array = self.network.apply(self.parameters, x)  # type: ignore[assignment]
-        return state, base + SCALE * mean[..., 0]
+        outputs: Array = self.network.apply(self.parameters, x)  # type: ignore[assignment]
+        return state, base + self.correction(outputs)
+
+    def correction(self, outputs: Array) -> Array:
+        """Correction, %, shape ``(...)``, for outputs, shape ``(..., outputs)``."""
+        raise NotImplementedError
 
 
 @flax.struct.dataclass
-class GreedyPolicy:
-    """The PID plus the correction to which the network gives the highest value.
+class GaussianPolicy(CorrectedPID):
+    """The PID plus :data:`SCALE` times the network's one output, the mean of a Gaussian policy."""
 
-    Attributes:
-        parameters: weights and biases of the network.
-        network: a network with one output for each of :data:`CHOICES`.
-        looks_back: whether the features look back at the breath before.
-    """
+    def correction(self, outputs: Array) -> Array:
+        """:data:`SCALE` times the output."""
+        return SCALE * outputs[..., 0]
 
-    parameters: Parameters
-    network: TanhNetwork = flax.struct.field(pytree_node=False)
-    looks_back: bool = flax.struct.field(pytree_node=False, default=False)
 
-    def init(self, shape: tuple[int, ...]) -> AnyFeatureState:
-        """State at the start of a run."""
-        return init_features(shape, self.looks_back)
+@flax.struct.dataclass
+class GreedyPolicy(CorrectedPID):
+    """The PID plus the one of :data:`CHOICES` to which the network gives the highest value."""
 
-    def step(
-        self, state: AnyFeatureState, observation: Observation
-    ) -> tuple[AnyFeatureState, Array]:
-        """Return the next state and ``u_in``, %."""
-        state, x, base = features(state, observation)
-        values: Array = self.network.apply(self.parameters, x)  # type: ignore[assignment]
-        return state, base + jnp.asarray(CHOICES, base.dtype)[jnp.argmax(values, axis=-1)]
+    def correction(self, outputs: Array) -> Array:
+        """The choice of the highest output."""
+        return jnp.asarray(CHOICES, outputs.dtype)[jnp.argmax(outputs, axis=-1)]
 
 
 def arrays(policies: Mapping[str, Any]) -> dict[str, np.ndarray]:

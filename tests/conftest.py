@@ -98,6 +98,7 @@ def _compiled_once(pytestconfig: pytest.Config) -> None:
     """Share compiled functions between workers, and between runs, in pytest's cache folder."""
     import jax
 
+    jax.config.update("jax_traceback_in_locations_limit", 0)  # a tenth of what lowering costs
     folder = pytestconfig.rootpath / ".pytest_cache" / "compiled"
     if folder.exists() and not os.access(folder, os.W_OK):
         return  # of another user, as whom the exploits run once more

@@ -173,9 +173,11 @@ def test_a_simulator_that_lacks_nothing_is_not_made_worse(own):
     np.testing.assert_allclose(own.traces.after[:, 0], own.traces.before[:, 0], atol=1e-9)
 
 
-def test_the_corrected_plant_answers_as_the_report_says(own, breaths):
-    answer = load_simulators(own.plants).pressures(breaths)
-    np.testing.assert_allclose(answer, own.traces.after, atol=1e-3)
+@pytest.mark.parametrize("which", ["found", "own"])
+def test_the_corrected_plant_answers_as_the_report_says(which, request, breaths):
+    diagnosis: Diagnosis = request.getfixturevalue(which)
+    answer = load_simulators(diagnosis.plants).pressures(breaths)
+    np.testing.assert_allclose(answer, diagnosis.traces.after, atol=1e-3)
 
 
 @pytest.mark.slow  # two more conclusions

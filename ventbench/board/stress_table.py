@@ -167,7 +167,7 @@ def _line(
 
 
 def _field(entry: StressRow, at: int, title: str) -> dict[str, Any]:
-    own = entry.tables.of_condition(at)
+    own = entry.tables.by_condition[at]
     share, rise = own["survived"], _float(own["rise_cmH2O"])
     unsafe = own["unsafe_runs"]
     return {

@@ -17,6 +17,7 @@ scatter is counted in each of the three, so the intervals are rather too wide th
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -137,29 +138,38 @@ def resampled_scores(
         raise ValueError(
             f"values {values.shape}, rigs {rig.shape} and members {member.shape} differ in shape"
         )
-    bits = np.random.PCG64(seed)
     off = (values - values.mean(axis=1, keepdims=True)) / values.size
-    n = values.shape[1]
-    changes = np.zeros(resamples)
-    # All by whole numbers from the raw stream, which no numpy version changes.
-    for own in off:
-        changes += (_counts(bits, resamples, n) - 1.0) @ own
+    parts = [(own, 1.0) for own in off]
     for own, of_lung in zip(off, rig, strict=True):
-        changes += _level(bits, resamples, own, of_lung)
-    changes += _level(bits, resamples, off.ravel(), member.ravel())
+        parts += _level(own, of_lung)
+    parts += _level(off.ravel(), member.ravel())
+    changes = np.zeros(resamples)
+    sizes = tuple(len(sums) for sums, _ in parts)
+    for (sums, widening), more in zip(parts, _excess(seed, resamples, sizes), strict=True):
+        changes += widening * (more @ sums)
     changes += values.mean()
     return changes
 
 
-def _level(bits: np.random.PCG64, resamples: int, off: Floats, level: NDArray) -> Floats:
-    """Changes of the score by resampling the levels of a factor, shape ``(resamples,)``."""
+def _level(off: Floats, level: NDArray) -> list[tuple[Floats, float]]:
+    """Sums of a factor's levels and how they are widened; none where it has only one level."""
     names, index = np.unique(level, return_inverse=True)
     count = len(names)
     if count < 2:
-        return np.zeros(resamples)
-    sums = np.bincount(index, weights=off, minlength=count)
-    widening = math.sqrt(count / (count - 1))
-    return (widening * ((_counts(bits, resamples, count) - 1.0) @ sums)).astype(np.float64)
+        return []
+    sums = np.bincount(index, weights=off, minlength=count).astype(np.float64)
+    return [(sums, math.sqrt(count / (count - 1)))]
+
+
+@functools.lru_cache(maxsize=4)
+def _excess(seed: int, resamples: int, sizes: tuple[int, ...]) -> tuple[Floats, ...]:
+    """How much more often than once each thing is taken, ``(resamples, size)`` for each size.
+
+    All tables over the same draws are resampled alike, and a board does so thousands of times. All
+    is made by whole numbers from the raw stream, which no numpy version changes.
+    """
+    bits = np.random.PCG64(seed)
+    return tuple(_counts(bits, resamples, size) - 1.0 for size in sizes)
 
 
 def _counts(bits: np.random.PCG64, resamples: int, count: int) -> Floats:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -159,14 +160,11 @@ class StressTables:
         """One row a condition, by its id: means over cells, and the worst run."""
         import pandas as pd
 
-        return pd.DataFrame([self.of_condition(k) for k in range(len(self.conditions))]).set_index(
-            "condition"
-        )
+        return pd.DataFrame(list(self.by_condition)).set_index("condition")
 
     def headline(self) -> dict[str, Any]:
         """What a table shows of an entry, as JSON values: score, rise, survival, safety, worst."""
-        worst = [self.of_condition(k) for k in range(1, len(self.conditions))]
-        worst_one = max(worst, key=lambda row: _order(row["error_cmH2O"]))
+        worst_one = max(self.by_condition[1:], key=lambda row: _order(row["error_cmH2O"]))
         stressed = self.by_lung_and_draw
         return {
             "score": number(self.score),
@@ -186,7 +184,7 @@ class StressTables:
             "worst_error": worst_one["error_cmH2O"],
             "complete": self.complete,
             "categories": self.by_category(),
-            "conditions": [self.of_condition(k) for k in range(len(self.conditions))],
+            "conditions": list(self.by_condition),
         }
 
     def by_category(self) -> dict[str, dict[str, float | None]]:
@@ -203,8 +201,12 @@ class StressTables:
                 }
         return means
 
-    def of_condition(self, k: int) -> dict[str, Any]:
-        """Means and the worst run of the k-th condition, as JSON values."""
+    @cached_property
+    def by_condition(self) -> tuple[dict[str, Any], ...]:
+        """Means and the worst run of each condition, as JSON values; not to be changed."""
+        return tuple(self._of_condition(k) for k in range(len(self.conditions)))
+
+    def _of_condition(self, k: int) -> dict[str, Any]:
         condition, error = self.conditions[k], self.error[k]
         lung, draw = np.unravel_index(np.argmax(np.nan_to_num(error, nan=np.inf)), error.shape)
         return {

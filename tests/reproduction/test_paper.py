@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+import os
 
 import numpy as np
 import pytest
@@ -15,8 +16,10 @@ from ventbench.cli import app
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
+from ventbench.plants.learned import Architecture
 from ventbench.reproduction import controller_sections, paper, published, simulator_sections
 from ventbench.reproduction.report import Chart, HeatMap, Line, Reproduction, Section, Table
+from ventbench.training.learned import LearnedConfig
 from ventbench.training.pid_grid import PIDGrid
 
 GAINS = np.array([(2.0, 0.0, 0.0), *published.BEST_PID.values(), (0.0, 4.0, 0.0), (5.0, 10.0, 1.0)])
@@ -123,6 +126,9 @@ def test_studies_have_their_claims(stored):
     assert samples.verdict == "in part"
     assert "ppo" in {row[0] for row in samples.tables[0].rows}
     assert controller_sections.regularisation(stored["controllers"]).verdict == "differs"
+    unfinished = copy.deepcopy(stored["samples"])
+    unfinished["methods"][-1]["episodes_to_best_pid"] = None
+    assert "Not all methods" in controller_sections.sample_efficiency(unfinished).finding
 
 
 def small_page():
@@ -191,6 +197,26 @@ def test_the_whole_page_agrees_with_scores_and_manifest(tmp_path, monkeypatch):
         assert row[2] == official[row[0]]["own_rig_mae"]
     assert (tmp_path / "paper.html").read_text().count("<svg") >= 8
     assert (tmp_path / "paper.md").read_text().startswith("# The paper, reproduced")
+
+
+@pytest.mark.skipif("VENTBENCH_LONG" not in os.environ, reason="compiles for minutes")
+def test_the_studies_run_again_and_give_a_whole_page(tmp_path, public_recordings):
+    tiny = Architecture(pressures=2, controls=2, width=4, depth=2, boundaries=1, boundary_width=4)
+    networks = {
+        "base": tiny, "config": LearnedConfig(steps=1, batch=2), "members": 2, "only": ["H_c 1"],
+    }  # fmt: skip
+    sizes = paper.StudySizes(0.01, 2, 1, ("direct",), networks)
+    page, kept = paper.reproduce_paper(
+        recordings=public_recordings, full=True, out=tmp_path, seeds=2, gains=GAINS, sizes=sizes
+    )
+    sections = {section.id: section for section in page.sections}
+    lines = {line.name: line for line in sections["samples"].charts[0].lines}
+    assert set(lines) == {"policy-gradient-short", "policy-gradient", "ppo", "dqn"}
+    assert all(np.all(np.diff(line.x) > 0) for line in lines.values())
+    assert [row["variant"] for row in kept["controllers"]["variants"]] == ["base", "direct"]
+    assert kept["samples"]["about"]["command"] == "ventbench study samples --seeds 2"
+    assert {row["variant"] for row in kept["networks"]["variants"]} == {"base", "H_c 1"}
+    json.dumps(kept, allow_nan=False)
 
 
 def test_errors_by_horizon_can_be_measured_again(stored, public_recordings):

@@ -25,14 +25,14 @@ def paper(
         typer.Option(
             "--full",
             help="Also run the studies again: learning curves, parts of the controller, and with "
-            "--recordings the shapes of networks. About an hour on 2 cores.",
+            "--recordings the shapes of networks. Hours on 2 cores; the same command continues.",
         ),
     ] = False,
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="Folder in which --full keeps finished trainings.")
     ] = Path("runs/paper"),
     seeds: Annotated[
-        int, typer.Option(min=1, max=32, help="Trainings of each method with --full.")
+        int, typer.Option(min=1, max=32, help="Trainings of each method and part with --full.")
     ] = 5,
     version: Annotated[
         int, typer.Option("--protocol", min=1, max=2, help="Version of the protocol.")

@@ -286,14 +286,22 @@ def sample_efficiency(samples: Mapping[str, Any]) -> Section:
         (name, *(_plain_number(row[key]) for key in columns)) for name, row in methods.items()
     )
     gradient = methods["policy-gradient"]
-    others = [methods[name]["episodes_to_best_pid"] for name in ("ppo", "dqn")]
+    reached = [methods[name]["episodes_to_best_pid"] for name in ("policy-gradient", "ppo", "dqn")]
     short = methods["policy-gradient-short"]
-    fewer = [x / gradient["episodes_to_best_pid"] for x in others]
+    if None in reached:  # such as in trainings cut short
+        first = "Not all methods beat the best PID."
+    else:
+        fewer = [count / reached[0] for count in reached[1:]]
+        first = (
+            f"It beats the best PID after {reached[0]} breaths, {fewer[0]:.0f} and {fewer[1]:.0f} "
+            "times fewer than PPO and DQN."
+        )
     close = short["final"] <= 1.02 * min(row["final"] for row in methods.values())
     lines = tuple(
         Line(name, tuple(curve["episodes"]), tuple(curve["score"]))
         for name, curve in samples["curves"].items()
     )
+    elsewhere = "" if lines else "; the curves are drawn in docs/reinforcement.md"
     chart = Chart(
         f"{samples['lung']}: score without noise against experience", "breaths", "cmH2O", lines,
         logarithmic=True,
@@ -302,13 +310,12 @@ def sample_efficiency(samples: Mapping[str, Any]) -> Section:
         "samples", "Breaths of experience", "figure 11, contribution 4, conclusion 3",
         "The policy gradient converges in about 100 episodes, PPO and DQN in tens of thousands.",
         "agrees" if close else "in part",
-        f"It beats the best PID after {gradient['episodes_to_best_pid']} breaths, {fewer[0]:.0f} "
-        f"and {fewer[1]:.0f} times fewer than PPO and DQN. But within 96 breaths it stops at "
+        f"{first} But within {short['episodes']} breaths it stops at "
         f"{short['final']:.2f} cmH2O, and with {gradient['episodes']:,} it reaches "
         f"{gradient['final']:.2f}. An episode here is one inspiration; in the paper a pass over "
         "all PIPs.",
         f"`{samples['about']['command']}`, stored, simulators version "
-        f"{samples['about']['simulators']}; {samples['seeds']} seeds",
+        f"{samples['about']['simulators']}; {samples['seeds']} seeds{elsewhere}",
         (
             Table(
                 f"{samples['lung']}: score without noise, cmH2O (interquartile mean, 95 %), and "

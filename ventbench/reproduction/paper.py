@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,25 @@ CURVE_POINTS = 40
 Progress = Callable[[str, float], None]
 
 
+@dataclass(frozen=True)
+class StudySizes:
+    """How much the studies of ``full`` train; smaller ones try the whole out.
+
+    Attributes:
+        curves: share of the full length of the trainings of the learning curves.
+        updates: updates of each training of the parts of the controller.
+        draws: published draws on which those are scored.
+        parts: names of the parts that are varied; all if None.
+        networks: further arguments of :func:`ventbench.training.ablation.networks.compare`.
+    """
+
+    curves: float = 1.0
+    updates: int = 400
+    draws: int = 20
+    parts: tuple[str, ...] | None = None
+    networks: Mapping[str, Any] = field(default_factory=dict)
+
+
 def reproduce_paper(
     *,
     protocol_version: int = 2,
@@ -60,6 +80,7 @@ def reproduce_paper(
     full: bool = False,
     out: Path | str = "runs/paper",
     seeds: int = 5,
+    sizes: StudySizes | None = None,
     workers: int = 0,
     scheduler: str | None = None,
     gains: NDArray[np.float64] | None = None,
@@ -72,9 +93,10 @@ def reproduce_paper(
         protocol_version: 2 scores airway pressure on the reference rigs; 1 the first simulators.
         recordings: folder of the public recordings: errors by horizon are measured again.
         full: run the studies again too: learning curves, parts of the controller and, with
-            ``recordings``, architectures; an hour on 2 cores.
+            ``recordings``, architectures; hours on 2 cores.
         out: folder in which ``full`` keeps finished trainings, so that the same call continues.
-        seeds: trainings of each method in the learning curves.
+        seeds: trainings of each method and of each part of the controller with ``full``.
+        sizes: of the studies of ``full``.
         workers: processes for grid, entries and the studies of controllers and networks; 0 for
             this one alone.
         scheduler: address of a Dask scheduler instead.
@@ -106,7 +128,7 @@ def reproduce_paper(
     if full:
         source = None if recordings is None else Path(recordings)
         parallel = {"workers": workers, "scheduler": scheduler}
-        kept |= _studies(Path(out), source, seeds, parallel, tell)
+        kept |= _studies(Path(out), source, seeds, sizes or StudySizes(), parallel, tell)
     with executor(workers, scheduler) as pool:
         tell("PID grid", 0.1)
         grid = pid_grid.search(
@@ -169,8 +191,9 @@ def _scored(name: str, track: str, version: int) -> tuple[Floats, Floats]:
 
 
 def _studies(
-    out: Path, recordings: Path | None, seeds: int, parallel: Mapping[str, Any], tell: Progress
-) -> dict[str, dict[str, Any]]:
+    out: Path, recordings: Path | None, seeds: int, sizes: StudySizes, parallel: Mapping[str, Any],
+    tell: Progress,
+) -> dict[str, dict[str, Any]]:  # fmt: skip
     """Run the studies of minutes again, as JSON values; ``parallel``: workers and scheduler."""
     from ventbench.training import study
     from ventbench.training.ablation import controllers, networks
@@ -179,18 +202,22 @@ def _studies(
 
     kept: dict[str, dict[str, Any]] = {}
     curves = study.sample_efficiency(
-        lung("R20C50"), range(seeds), out / "samples",
+        lung("R20C50"), range(seeds), out / "samples", share=sizes.curves,
         progress=lambda method, share, best: tell(f"learning curves: {method}", share),
     )  # fmt: skip
     kept["samples"] = stored_samples(curves, seeds)
-    config = ResidualConfig(updates=1000)
+    config = ResidualConfig(updates=sizes.updates)
     runs = controllers.compare(
-        frozen.load(), out / "controllers", [0], config=config, **parallel,
+        frozen.load(), out / "controllers", range(seeds), config=config, only=sizes.parts,
+        draws=sizes.draws, **parallel,
         progress=lambda what, share: tell(f"controllers: {what}", share),
     )  # fmt: skip
     known = controllers.variants(config)
     kept["controllers"] = {
-        "about": {"command": "ventbench study controllers --seeds 1", "simulators": 1},
+        "about": {
+            "command": f"ventbench study controllers --seeds {seeds} --updates {sizes.updates}",
+            "simulators": 1,
+        },
         "variants": [
             {"variant": row["variant"], "meaning": known[str(row["variant"])].meaning}
             | {figure: round(float(row[figure]), 4) for figure in controllers.FIGURES}
@@ -199,7 +226,7 @@ def _studies(
     }
     if recordings is not None:
         breaths = networks.compare(
-            recordings, out / "networks", **parallel,
+            recordings, out / "networks", **parallel, **sizes.networks,
             progress=lambda what, share: tell(f"networks: {what}", share),
         )  # fmt: skip
         names = {"depth": "depth", "N_B": "boundaries", "H_p": "pressures", "H_c": "controls"}

@@ -21,11 +21,11 @@ from ventbench.mechanics.labels import (
 from ventbench.mechanics.regression import (
     BASE,
     COLUMNS,
-    GRID,
     TIMES,
     CrossProducts,
     RegressionFit,
     columns_of,
+    course,
     covariance,
     cross_products,
     effect_size,
@@ -39,7 +39,6 @@ from ventbench.mechanics.term_selection import (
     SelectedTerm,
     delay,
     select_terms,
-    without_delay,
 )
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id.fit import t_quantile
@@ -61,6 +60,9 @@ _EXTRAPOLATION_ERROR = 0.5
 
 #: Least degrees of freedom of an interval; with fewer it would say nothing.
 _LEAST_FREEDOM = 4
+
+#: Faults of the flow sensor that look like an effect.
+_SENSORS = {"inertance": ("flow_sensor_lag",), "leak": ("flow_sensor_zero",)}
 
 #: Largest product of R and leak for which R and 1/C are corrected.
 _MOST_LEAK = 0.5
@@ -154,16 +156,15 @@ def _identify_lung(name: str, breaths: Breaths, told: Callable[[float], None]) -
             "record longer pieces"
         )
     told(_SMOOTHING)
-    delayed_by = delay(measured, lambda share: told(_SMOOTHING + _DELAY * share))
-    at_lung = tuple(without_delay(segment, delayed_by) for segment in measured)
+    at_lung, delayed_by = delay(measured, lambda share: told(_SMOOTHING + _DELAY * share))
     table = cross_products(at_lung)
-    selected = select_terms(table, delayed_by)
+    selected = select_terms(table)
     full = _fit_lung(table, selected, at_lung, breaths)
     plain = _fit_lung(table, _quadratic_resistance(table), at_lung, breaths)
     label = Lung(float(breaths.R[0]), float(breaths.C[0]))
     best = _best_for_label(full, plain, label)
     source = "pressure and flow" if breaths.flow is not None else "pressure and volume"
-    noise = float(full.fitted.sigma / np.sqrt(1.0 - GRID[full.fitted.grid] ** 2))
+    noise = float(full.fitted.sigma / np.sqrt(1.0 - full.fitted.autocorrelation**2))
     notes = tuple(_notes(breaths, at_lung, table, noise))
     samples = sum(len(segment) for segment in at_lung)
     problem = problem_with(breaths, best.resistance(0.0), best.compliance())
@@ -310,9 +311,10 @@ class LungFit:
         """Median initial pressure of the segments that begin where their breath does, cmH2O."""
         values = []
         for segment in (s for s in self.segments if s.first):
-            rows = np.stack([COLUMNS[c].values(segment) for c in self.fitted.columns], axis=1)
+            rows = course(segment, [COLUMNS[c] for c in self.fitted.columns])[segment.rows]
             left = segment.pressure - rows @ self.fitted.coefficients
-            values.append(float(np.polyval(np.polyfit(segment.time, left, 1), 0.0)))
+            line = np.polyfit(segment.time[segment.rows], left, 1)
+            values.append(float(np.polyval(line, 0.0)))
         if not values:
             return Estimate(float("nan"), "cmH2O", (float("nan"), float("nan")))
         median, count = float(np.median(values)), len(values)
@@ -325,9 +327,7 @@ class LungFit:
     def term(self, selected: SelectedTerm) -> Term:
         """The term with its parameters, in the units of the library if the library has it."""
         name = selected.name
-        if name == "inertance" and self._coefficient(name) < 0.0:
-            name = "sensor_lag"
-        others = selected.alternatives + (("flow_sensor_lag",) if name == "inertance" else ())
+        others = selected.alternatives + _SENSORS.get(name, ())
         size = effect_size(self.table, self.fitted, selected.column)
         return Term(name, self._parameters(name, selected.column), selected.nats, size, others)
 
@@ -348,8 +348,6 @@ class LungFit:
         if name == "leak":
             leak = self._derived(lambda x: 1000.0 * x(name) / x("elastance"), "mL/s per cmH2O")
             return {"conductance": leak}
-        if name == "sensor_lag":
-            return {"tau": self._derived(lambda x: -x("inertance") / x("resistance"), "s")}
         time = COLUMNS[column].time
         assert time is not None
         low = max((t for t in TIMES if t < time), default=time)

@@ -1,14 +1,21 @@
 """Regression of pressure on flow and volume: columns, cross products, fits, likelihoods.
 
-Each segment of a breath has an offset and a drift of its own, and first-order autoregressive noise.
-For each autocorrelation of a grid, all columns are whitened and projected off offset and drift
-once; every fit of any columns then needs only sums of small matrices.
+Each segment of a breath has an offset of its own, a drift, and first-order autoregressive noise.
+The drifts scatter around that of a flow sensor whose zero is off. Both have normal priors, the
+second of which is a constant (:data:`ZERO`), so that a leak, which also makes the volume drift, can
+be told where a flow sensor could not be so far off. For each noise of a grid, all columns are
+whitened and projected off the offsets once; every fit of any columns then needs only sums of small
+matrices.
+
+A lag of the pressure sensor delays the columns, and not the measured pressure back: a derivative of
+the measured pressure would have its noise, which makes a lag look shorter than it is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +25,23 @@ from ventbench.mechanics.segments import Segment
 Floats = NDArray[np.float64]
 
 #: Autocorrelations between neighbouring smoothed samples.
-GRID = (0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.88, 0.94)
+_AUTOCORRELATIONS = (0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.88, 0.94)
+
+#: Standard deviations of the drift between segments, over that of the noise's innovations, 1/s.
+_DRIFTS = (0.05, 0.25, 1.0, 4.0, 16.0)
+
+#: Standard deviation of what a lag has in it from before a segment, over that of the innovations.
+_START = 30.0
+
+#: Models of the noise to choose from: autocorrelation, and scatter of the drift.
+GRID = tuple(product(_AUTOCORRELATIONS, _DRIFTS))
+
+#: Standard deviation of the zero of flow sensors, L/s. In the clean public runs, none of which has
+#: a known leak, it is 1 to 8 mL/s, and twice that in few.
+ZERO = 0.005
+
+#: Least elastance from which the drift of a flow sensor's zero is computed, cmH2O/L.
+_LEAST_ELASTANCE = 2.5
 
 #: Smallest standard deviation of the noise, cmH2O; a smaller one is an artefact of rounding.
 _LEAST_SIGMA = 0.005
@@ -33,13 +56,16 @@ class RegressionColumn:
 
     Attributes:
         term: name of the effect.
-        values: values of the column in a segment, ``(n,)``.
+        values: values of the column at the m samples of a segment, ``(m,)``.
         time: relaxation time, s, or None.
+        of_pressure: whether the column is made of the measured pressure, which a lag has delayed
+            already.
     """
 
     term: str
     values: Callable[[Segment], Floats]
     time: float | None = None
+    of_pressure: bool = False
 
 
 def _relaxing_volume(time: float, periodic: bool) -> Callable[[Segment], Floats]:
@@ -61,11 +87,14 @@ def _relaxing_volume(time: float, periodic: bool) -> Callable[[Segment], Floats]
     return values
 
 
-#: Columns of R and 1/C, which every fit has.
+#: Columns that every fit has: R, 1/C, and the drift by a flow sensor's zero.
 BASE = (
     RegressionColumn("resistance", lambda s: s.flow),
     RegressionColumn("elastance", lambda s: s.volume),
+    RegressionColumn("flow_zero", lambda s: s.time),
 )
+
+_ELASTANCE, _FLOW_ZERO = 1, 2
 
 #: All columns.
 COLUMNS = (
@@ -73,7 +102,7 @@ COLUMNS = (
     RegressionColumn("turbulent_resistance", lambda s: s.flow * np.abs(s.flow)),
     RegressionColumn("nonlinear_compliance", lambda s: s.volume**2),
     RegressionColumn("inertance", lambda s: s.slope),
-    RegressionColumn("leak", lambda s: -s.dose),
+    RegressionColumn("leak", lambda s: -s.dose, of_pressure=True),
     RegressionColumn("direction_resistance", lambda s: np.minimum(s.flow, 0.0)),
     RegressionColumn("volume_resistance", lambda s: s.flow * s.volume),
     RegressionColumn("expiratory_flow", lambda s: np.minimum(s.flow, 0.0) * np.abs(s.flow)),
@@ -88,7 +117,7 @@ COLUMNS = (
 TERMS = tuple(dict.fromkeys(column.term for column in COLUMNS[len(BASE) :]))
 
 #: Terms whose coefficient must be positive.
-POSITIVE = ("turbulent_resistance", "viscoelasticity", "leak")
+POSITIVE = ("turbulent_resistance", "viscoelasticity", "leak", "inertance")
 
 
 def columns_of(term: str) -> tuple[int, ...]:
@@ -96,15 +125,45 @@ def columns_of(term: str) -> tuple[int, ...]:
     return tuple(i for i, column in enumerate(COLUMNS) if column.term == term)
 
 
+def lagged(time: Floats, values: Floats, lag: float) -> Floats:
+    """Response of a first-order lag to signals ``(m, k)``; at rest at the first sample.
+
+    Exact for signals that are linear between the samples.
+
+    Args:
+        time: s, increasing, ``(m,)``.
+        values: signals, ``(m, k)``.
+        lag: time constant, s.
+    """
+    if lag <= 0.0 or len(time) < 2:
+        return values
+    step = np.diff(time)[:, None]
+    kept = np.exp(-step / lag)
+    falls = lag * np.diff(values, axis=0) / step * (1.0 - kept)
+    behind = np.zeros_like(values)
+    for k, (share, lost) in enumerate(zip(kept.tolist(), falls, strict=True)):
+        behind[k + 1] = share[0] * behind[k] + lost
+    return values - behind
+
+
+def course(segment: Segment, columns: Sequence[RegressionColumn]) -> Floats:
+    """Columns at all samples of a segment, as late as its pressure, ``(m, k)``."""
+    values = np.stack([column.values(segment) for column in columns], axis=1)
+    late = [k for k, column in enumerate(columns) if not column.of_pressure]
+    if segment.lag and late:
+        values[:, late] = lagged(segment.time, values[:, late], segment.lag)
+    return values
+
+
 @dataclass(frozen=True, eq=False)
 class CrossProducts:
     """Cross products of the columns and the pressure, of b breaths.
 
     Attributes:
-        products: ``(b, g, K + 1, K + 1)`` for the g autocorrelations of :data:`GRID` and K columns;
+        products: ``(b, g, K + 1, K + 1)`` for the g models of noise of :data:`GRID` and K columns;
             the last row and column belong to the pressure.
-        freedom: number of samples less offsets and drifts, ``(b,)``.
-        constant: part of the log-likelihood that depends on the autocorrelation alone, ``(b, g)``.
+        freedom: number of samples less offsets, ``(b,)``.
+        constant: part of the log-likelihood that depends on the model of noise alone, ``(b, g)``.
         breaths: index of each breath in the recording, ``(b,)``.
     """
 
@@ -126,13 +185,33 @@ class RegressionFit:
         columns: indices of the columns.
         coefficients: ``(k,)``.
         sigma: standard deviation of the innovations of the noise, cmH2O.
-        grid: index of the autocorrelation in :data:`GRID`.
+        grid: index of the model of noise in :data:`GRID`.
     """
 
     columns: tuple[int, ...]
     coefficients: Floats
     sigma: float
     grid: int
+
+    @property
+    def autocorrelation(self) -> float:
+        """Autocorrelation between neighbouring samples of the noise."""
+        return GRID[self.grid][0]
+
+    @property
+    def zero_precision(self) -> float:
+        """Prior precision, 1 / variance, of the drift by the flow sensor's zero, s2/cmH2O2."""
+        return float(_zero_precision(self.coefficients[_ELASTANCE]))
+
+    @property
+    def log_prior(self) -> float:
+        """Logarithm of the prior density of the flow sensor's zero, up to a constant."""
+        return -0.5 * self.zero_precision * float(self.coefficients[_FLOW_ZERO]) ** 2
+
+
+def _zero_precision(elastance: Floats | float) -> Floats:
+    """Prior precision of the drift by the flow sensor's zero, by elastances, cmH2O/L."""
+    return (np.maximum(elastance, _LEAST_ELASTANCE) * ZERO) ** -2.0
 
 
 def cross_products(
@@ -142,24 +221,46 @@ def cross_products(
 
     Args:
         segments: segments of the breaths.
-        columns: indices of the columns; all if None.
+        columns: indices of the columns, those of :data:`BASE` first; all if None.
     """
     chosen = COLUMNS if columns is None else [COLUMNS[c] for c in columns]
     indices = sorted({segment.breath for segment in segments})
     size = len(chosen) + 1
     products = np.zeros((len(indices), len(GRID), size, size))
     freedom, constant = np.zeros(len(indices)), np.zeros((len(indices), len(GRID)))
+    rho = np.array(_AUTOCORRELATIONS)
     for segment in segments:
         row = indices.index(segment.breath)
-        full = np.stack([c.values(segment) for c in chosen] + [segment.pressure], axis=1)
-        drift = np.stack([np.ones(len(segment)), segment.time - segment.time.mean()], axis=1)
-        freedom[row] += len(segment) - drift.shape[1]
-        white, nuisance = (_whiten(signals, segment.begins) for signals in (full, drift))
-        basis, upper = np.linalg.qr(nuisance)
-        white = white - basis @ (basis.mT @ white)
-        products[row] += white.mT @ white
-        constant[row] += 0.5 * segment.begins.sum() * np.log(1.0 - np.square(GRID))
-        constant[row] -= np.log(np.abs(np.diagonal(upper, axis1=1, axis2=2))).sum(axis=1)
+        time = segment.time[segment.rows]
+        signals = np.concatenate(
+            [
+                course(segment, chosen)[segment.rows],
+                np.stack([segment.pressure, time - time.mean(), np.ones(len(time))], axis=1),
+            ],
+            axis=1,
+        )
+        freedom[row] += len(segment) - 1
+        white = _whiten(signals, segment.begins)
+        known = 0.5 * segment.begins.sum() * np.log(1.0 - rho**2)
+        if segment.lag > 0.0:
+            start = np.exp(-(time - segment.time[0]) / segment.lag)[:, None]
+            white, factor = _without_start(white, _whiten(start, segment.begins)[..., 0])
+            known = known - factor
+        length = np.linalg.norm(white[..., -1], axis=1)
+        level = white[..., -1] / length[:, None]
+        white = white[..., :-1] - level[..., None] * (level[:, None] @ white[..., :-1])
+        ramp, white = white[..., -1], white[..., :-1]
+        squares = white.mT @ white
+        along = (ramp[:, None] @ white)[:, 0]  # (r, K + 1)
+        size_of_ramp = np.vecdot(ramp, ramp)
+        known = known - np.log(length)
+        # A drift of scatter s adds s2 times the outer product of the ramp to the covariance.
+        scatter = np.square(_DRIFTS)
+        grown = 1.0 + scatter * size_of_ramp[:, None]  # (r, d)
+        outer = along[:, :, None] * along[:, None, :]
+        taken = (scatter / grown)[..., None, None] * outer[:, None]
+        products[row] += (squares[:, None] - taken).reshape(len(GRID), size, size)
+        constant[row] += (known[:, None] - 0.5 * np.log(grown)).reshape(-1)
     return CrossProducts(products, freedom, constant, np.array(indices, np.int64))
 
 
@@ -169,20 +270,29 @@ def fit(table: CrossProducts, which: NDArray[np.bool_], columns: Sequence[int]) 
     Args:
         table: table of the breaths.
         which: breaths to fit, bool ``(b,)``.
-        columns: indices of the columns.
+        columns: indices of the columns, those of :data:`BASE` first.
     """
     columns = tuple(columns)
     pick = [*columns, -1]
-    total = table.products[
-        np.ix_(np.flatnonzero(which).tolist(), range(len(GRID)), pick, pick)
-    ].sum(axis=0)
+    total = table.products[which].sum(axis=0)[:, pick][:, :, pick]
     freedom = float(table.freedom[which].sum())
     constants = table.constant[which].sum(axis=0)
-    right = total[:, :-1, -1]
-    x = np.linalg.solve(_regularised(total[:, :-1, :-1]), right[..., None])[..., 0]
-    square = np.maximum(total[:, -1, -1] - np.vecdot(x, right), 0.0)
-    sigma = np.maximum(np.sqrt(square / max(freedom - len(columns), 1.0)), _LEAST_SIGMA)
+    left, right = _regularised(total[:, :-1, :-1]), total[:, :-1, -1]
+
+    def sigma_of(x: Floats) -> tuple[Floats, Floats]:
+        towards = np.concatenate([x, np.full((len(x), 1), -1.0)], axis=1)
+        square = np.maximum(np.einsum("gi,gij,gj->g", towards, total, towards), 0.0)
+        sigma = np.sqrt(square / max(freedom - len(columns), 1.0))
+        return np.maximum(sigma, _LEAST_SIGMA), square
+
+    x = np.linalg.solve(left, right[..., None])[..., 0]
+    precision = _zero_precision(x[:, _ELASTANCE])
+    left = left.copy()
+    left[:, _FLOW_ZERO, _FLOW_ZERO] += sigma_of(x)[0] ** 2 * precision
+    x = np.linalg.solve(left, right[..., None])[..., 0]
+    sigma, square = sigma_of(x)
     value = constants - freedom * np.log(sigma) - 0.5 * square / sigma**2
+    value -= 0.5 * precision * x[:, _FLOW_ZERO] ** 2
     best = int(np.argmax(value))
     return RegressionFit(columns, x[best], float(sigma[best]), best)
 
@@ -190,7 +300,7 @@ def fit(table: CrossProducts, which: NDArray[np.bool_], columns: Sequence[int]) 
 def log_likelihood(table: CrossProducts, fitted: RegressionFit) -> Floats:
     """Log-likelihood of each breath, ``(b,)``, up to a constant.
 
-    Offsets and drifts are integrated out.
+    Offsets and the scatter of drifts are integrated out.
     """
     pick = [*fitted.columns, -1]
     products = table.products[:, fitted.grid][:, pick][:, :, pick]
@@ -212,7 +322,9 @@ def covariance(table: CrossProducts, fitted: RegressionFit) -> Floats:
     columns = list(fitted.columns)
     products = table.products[:, fitted.grid]
     curvature = products[:, columns][:, :, columns]
-    bread = np.asarray(np.linalg.inv(_regularised(curvature.sum(axis=0))), np.float64)
+    total = _regularised(curvature.sum(axis=0))
+    total[_FLOW_ZERO, _FLOW_ZERO] += fitted.sigma**2 * fitted.zero_precision
+    bread = np.asarray(np.linalg.inv(total), np.float64)
     model = bread * fitted.sigma**2
     count = len(table)
     if count < 3:
@@ -225,8 +337,11 @@ def covariance(table: CrossProducts, fitted: RegressionFit) -> Floats:
 
 
 def effect_size(table: CrossProducts, fitted: RegressionFit, column: int) -> float:
-    """Root mean square of what a column explains beyond the others, cmH2O."""
-    others = [c for c in fitted.columns if c != column]
+    """Root mean square of what a column explains beyond the others, cmH2O.
+
+    The zero of the flow sensor is not among the others, since its prior bounds what it explains.
+    """
+    others = [c for c in fitted.columns if c not in (column, _FLOW_ZERO)]
     total = table.products[:, 0].sum(axis=0)
     square = total[column, column]
     if others:
@@ -239,12 +354,29 @@ def effect_size(table: CrossProducts, fitted: RegressionFit, column: int) -> flo
 
 
 def _whiten(values: Floats, begins: NDArray[np.bool_]) -> Floats:
-    """Whiten signals ``(n, c)`` for each autocorrelation of the grid, ``(g, n, c)``."""
-    rho = np.array(GRID)[:, None, None]
-    white = np.repeat(values[None], len(GRID), axis=0)
+    """Whiten signals ``(n, c)`` for each autocorrelation, ``(r, n, c)``."""
+    rho = np.array(_AUTOCORRELATIONS)[:, None, None]
+    white = np.repeat(values[None], len(rho), axis=0)
     white[:, 1:] -= rho * values[:-1]
     white[:, begins] = np.sqrt(1.0 - rho**2) * values[begins]
     return white
+
+
+def _without_start(white: Floats, start: Floats) -> tuple[Floats, Floats]:
+    """Whiten signals ``(r, n, c)`` for what a lag still has in it from before the segment.
+
+    Args:
+        white: whitened signals.
+        start: its whitened course, ``(r, n)``.
+
+    Returns:
+        The signals, and half the logarithm of the determinant of the covariance, ``(r,)``.
+    """
+    length = np.maximum(np.linalg.norm(start, axis=1), 1e-12)
+    grown = np.sqrt(1.0 + (_START * length) ** 2)
+    unit = (start / length[:, None])[..., None]
+    taken = (1.0 - 1.0 / grown)[:, None, None]
+    return white - taken * unit * (unit.mT @ white), np.log(grown)
 
 
 def _regularised(matrix: Floats) -> Floats:

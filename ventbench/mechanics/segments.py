@@ -23,43 +23,50 @@ WINDOW = 0.04
 #: Fewest smoothed samples of a segment.
 FEWEST_SAMPLES = 12
 
+#: Samples at which flow is known in half a window, about: a lag is exact for a signal that is
+#: linear between them.
+_PER_HALF_WINDOW = 4
+
 #: Number of successive samples at the highest or lowest reading that count as clipped.
 _CLIPPED_RUN = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """A breath, or a part of it over which the volume is known, as n smoothed samples.
+    """A breath, or a part of it over which the volume is known, as smoothed signals.
+
+    What flows is known at m closely spaced samples, since a lag needs all of its course. The
+    pressure is compared at n of them, half a window apart.
 
     Attributes:
         breath: index of the breath.
         first: whether the segment begins where the breath does.
-        begins: True at the first sample after a gap, bool ``(n,)``.
-        time: time from the start of the breath, s, ``(n,)``.
-        pressure: cmH2O, ``(n,)``.
-        volume: volume from the start of the segment, L, ``(n,)``.
-        flow: L/s, ``(n,)``.
-        slope: derivative of the flow, L/s2, ``(n,)``.
-        dose: integral of the pressure from the start of the segment, cmH2O s, ``(n,)``.
-        rise: derivative of the pressure, cmH2O/s, ``(n,)``.
-        bend: second derivative of the pressure, cmH2O/s2, ``(n,)``.
+        rows: which of the m samples are compared, ``(n,)``.
+        begins: True at the first compared sample after a gap, bool ``(n,)``.
+        pressure: at the compared samples, cmH2O, ``(n,)``.
+        time: time from the start of the breath, s, ``(m,)``.
+        volume: volume from the start of the segment, L, ``(m,)``.
+        flow: L/s, ``(m,)``.
+        slope: derivative of the flow, L/s2, ``(m,)``.
+        dose: integral of the pressure from the start of the segment, cmH2O s, ``(m,)``.
+        lag: time constant of the pressure sensor, s.
     """
 
     breath: int
     first: bool
+    rows: NDArray[np.int64]
     begins: NDArray[np.bool_]
-    time: Floats
     pressure: Floats
+    time: Floats
     volume: Floats
     flow: Floats
     slope: Floats
     dose: Floats
-    rise: Floats
-    bend: Floats
+    lag: float = 0.0
 
     def __len__(self) -> int:
-        """Number of samples n."""
-        return len(self.time)
+        """Number of compared samples n."""
+        return len(self.rows)
 
 
 def segments(breaths: Breaths) -> tuple[Segment, ...]:
@@ -106,36 +113,34 @@ def clipped_share(breaths: Breaths) -> float:
 
 def _smoothed(
     time: Floats, pressure: Floats, flow: Floats | None, volume: Floats | None
-) -> tuple[NDArray[np.bool_], *tuple[Floats, ...]] | None:
-    """Fields of a segment from ``begins`` on; None if the segment would be too short."""
+) -> tuple[NDArray[np.int64], NDArray[np.bool_], *tuple[Floats, ...]] | None:
+    """Fields of a segment from ``rows`` on; None if the segment would be too short."""
     if len(time) < 3:
         return None
     half = max(1, round(WINDOW / float(np.median(np.diff(time)))))
+    step = max(1, half // _PER_HALF_WINDOW)
     filled = _volume(time, flow, volume)
-    known = np.isfinite(pressure) & np.isfinite(filled)
-    known &= True if flow is None else np.isfinite(flow)
-    centres, begins = _centres(known, half)
-    if len(centres) < FEWEST_SAMPLES:
+    flows = np.isfinite(filled)
+    flows &= True if flow is None else np.isfinite(flow)
+    fine = np.concatenate([
+        np.arange(start + half, stop - half, step) for start, stop in _runs(flows)
+    ] or [np.zeros(0, int)])  # fmt: skip
+    rows, begins = _compared(fine, flows & np.isfinite(pressure), half, step)
+    if len(rows) < FEWEST_SAMPLES:
         return None
-    value, change = window_weights(time, half, centres)
+    value, change = window_weights(time, half, fine)
     filled = filled - filled[np.isfinite(filled)][0]
     at = np.isfinite(pressure)
-    unbroken = np.interp(time, time[at], pressure[at])
-    dose = integrate(time, unbroken)
-    signals = np.stack([time, pressure, filled, dose])
-    near = np.lib.stride_tricks.sliding_window_view(signals, 2 * half + 1, axis=1)[
-        :, centres - half
-    ]
-    t, p, v, dose = np.einsum("kcw,cw->kc", near, value)
-    rise = weighted_sum(near[1], change)
-    bend = weighted_sum(windows(differentiate(time, unbroken, half), half)[centres - half], change)
+    dose = integrate(time, np.interp(time, time[at], pressure[at]))
+    t, v, dose = (weighted_sum(windows(x, half)[fine - half], value) for x in (time, filled, dose))
+    p = weighted_sum(windows(pressure, half)[fine[rows] - half], value[rows])
     if flow is None:
         flow = differentiate(time, filled, half)
-        q = flow[centres]
+        q = flow[fine]
     else:
-        q = weighted_sum(windows(flow, half)[centres - half], value)
-    slope = weighted_sum(windows(flow, half)[centres - half], change)
-    return begins, t, p, v, q, slope, dose, rise, bend
+        q = weighted_sum(windows(flow, half)[fine - half], value)
+    slope = weighted_sum(windows(flow, half)[fine - half], change)
+    return rows, begins, p, t, v, q, slope, dose
 
 
 def _volume(time: Floats, flow: Floats | None, volume: Floats | None) -> Floats:
@@ -145,14 +150,35 @@ def _volume(time: Floats, flow: Floats | None, volume: Floats | None) -> Floats:
     return integrate(time, flow)
 
 
-def _centres(known: NDArray[np.bool_], half: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Centres of windows of known samples, half a window apart, and which of them follow a gap."""
-    runs = [np.arange(start + half, stop - half, half + 1) for start, stop in _runs(known)]
-    runs = [run for run in runs if len(run)]
-    if not runs:
-        return np.zeros(0, np.intp), np.zeros(0, bool)
-    begins = np.concatenate([np.arange(len(run)) == 0 for run in runs])
-    return np.concatenate(runs), begins
+def _compared(
+    fine: NDArray[np.intp], known: NDArray[np.bool_], half: int, step: int
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Centres of windows of known samples, half a window apart, and which of them follow a gap.
+
+    Args:
+        fine: centres of windows in which flow and volume are known, ``(m,)``.
+        known: samples at which the pressure is known too, ``(T,)``.
+        half: half the width of the window, samples.
+        step: distance of the centres, samples.
+
+    Returns:
+        Indices into ``fine``, ``(n,)``, and a mask, ``(n,)``.
+    """
+    complete = np.zeros(len(known), bool)
+    for start, stop in _runs(known):
+        complete[start + half : stop - half] = True
+    whole = complete[fine]
+    # A run ends where a window is incomplete, and where the next centre is further away.
+    ends = np.flatnonzero(np.diff(fine) > step) + 1
+    rows: list[NDArray[np.int64]] = []
+    for part in np.split(np.arange(len(fine)), ends):
+        offset = int(part[0]) if len(part) else 0
+        for start, stop in _runs(whole[part]):
+            rows.append(np.arange(offset + start, offset + stop, -(-(half + 1) // step)))
+    if not rows:
+        return np.zeros(0, np.int64), np.zeros(0, bool)
+    begins = np.concatenate([np.arange(len(run)) == 0 for run in rows])
+    return np.concatenate(rows), begins
 
 
 def _runs(known: NDArray[np.bool_]) -> list[tuple[int, int]]:

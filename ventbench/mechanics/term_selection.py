@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from ventbench.mechanics.labels import Estimate
 from ventbench.mechanics.regression import (
     BASE,
-    GRID,
+    COLUMNS,
     POSITIVE,
     TERMS,
     CrossProducts,
     RegressionFit,
     columns_of,
+    course,
     covariance,
     cross_products,
     effect_size,
@@ -26,8 +27,17 @@ from ventbench.mechanics.regression import (
 from ventbench.mechanics.segments import Segment
 from ventbench.system_id.fit import t_quantile
 
+Floats = NDArray[np.float64]
+
 #: Log-likelihood ratio on held-out breaths that a term needs: one false term in a hundred.
 LEAST_NATS = 4.6
+
+#: Terms that are accepted as well if held-out breaths gain this much over the model without the
+#: term, fitted to the same breaths as the model with it, and this many times the scatter of the
+#: gains over breaths. Nearly all of a leak looks like a drift. A model without it that is fitted to
+#: the held-out breaths themselves can give these drifts that differ, and so always explains
+#: breaths that differ from each other by more than their noise.
+_BY_GAIN, _LEAST_GAIN, _LEAST_GAIN_SCATTER = ("leak",), 6.9, 1.3
 
 #: Share of the held-out breaths whose likelihood must rise.
 _LEAST_AGREEMENT = 0.6
@@ -52,7 +62,7 @@ class SelectedTerm:
     Attributes:
         name: name of the effect.
         column: index of its column.
-        nats: log-likelihood ratio on held-out breaths.
+        nats: log-likelihood ratio on held-out breaths, or what they gain (see :data:`_BY_GAIN`).
         alternatives: other terms that would have gained nearly as much.
     """
 
@@ -71,24 +81,18 @@ class _Trial:
     passes: bool
 
 
-def select_terms(
-    table: CrossProducts, delayed_by: DelayEstimate | None = None
-) -> tuple[SelectedTerm, ...]:
+def select_terms(table: CrossProducts) -> tuple[SelectedTerm, ...]:
     """Select the terms that are needed beyond R and C, forward, with backward checks.
 
     Args:
         table: cross products of the breaths, without the delay.
-        delayed_by: the delay. A lag of the sensor is not sought twice, as negative inertance.
     """
-    positive = POSITIVE
-    if delayed_by is not None and delayed_by.name == _SENSOR.name:
-        positive = (*positive, "inertance")
     selected: list[SelectedTerm] = []
     dropped: set[str] = set()
     while len(table) >= FEWEST_BREATHS and len(selected) < MOST_TERMS:
         columns = _columns(selected)
         excluded = {term.name for term in selected} | dropped
-        trials = [_trial(table, columns, name, positive) for name in TERMS if name not in excluded]
+        trials = [_trial(table, columns, name) for name in TERMS if name not in excluded]
         passing = [trial for trial in trials if trial.passes]
         if not passing:
             break
@@ -96,11 +100,12 @@ def select_terms(
         near = [t for t in passing if t.gain >= most - max(LEAST_NATS, _ALTERNATIVE_SHARE * most)]
         best = near[0]  # TERMS are in the order of how common they are
         others = tuple(trial.name for trial in near[1:])
-        selected.append(SelectedTerm(best.name, best.column, best.nats, others))
+        nats = best.nats if best.nats > LEAST_NATS else best.gain
+        selected.append(SelectedTerm(best.name, best.column, nats, others))
         # The new term may make an earlier one superfluous.
         for term in selected[:-1]:
             rest = [other for other in selected if other is not term]
-            if not _trial(table, _columns(rest), term.name, positive).passes:
+            if not _trial(table, _columns(rest), term.name).passes:
                 selected = rest
                 dropped.add(term.name)
     return tuple(selected)
@@ -110,41 +115,43 @@ def _columns(selected: list[SelectedTerm]) -> tuple[int, ...]:
     return (*range(len(BASE)), *(term.column for term in selected))
 
 
-def _trial(
-    table: CrossProducts, columns: tuple[int, ...], name: str, positive: tuple[str, ...]
-) -> _Trial:
+def _trial(table: CrossProducts, columns: tuple[int, ...], name: str) -> _Trial:
     """Try one more term: its best column on all breaths, and its gain on held-out breaths."""
     every = np.ones(len(table), bool)
-    column = _best_column(table, every, columns, name, positive)
+    column = _best_column(table, every, columns, name)
     whole = fit(table, every, (*columns, column))
     ratios, gains = [], []
     for train in splits(len(table)):
-        trained = _best_column(table, train, columns, name, positive)
+        trained = _best_column(table, train, columns, name)
         richer = fit(table, train, (*columns, trained))
         # Split likelihood ratio: since the null hypothesis is fitted to the held-out breaths
         # themselves, a ratio above 1 / alpha has a probability below alpha, whatever the model.
         null = fit(table, ~train, columns)
         ratio = log_likelihood(table, richer) - log_likelihood(table, null)
-        ratios.append(float(ratio[~train].sum()) if _allowed(name, richer, positive) else -np.inf)
+        ratio_of_all = float(ratio[~train].sum()) - null.log_prior
+        ratios.append(ratio_of_all if _allowed(name, richer) else -np.inf)
         known = log_likelihood(table, richer) - log_likelihood(table, fit(table, train, columns))
         gains.append(np.where(train, np.nan, known))
     nats = float(np.logaddexp.reduce(ratios) - np.log(len(ratios)))
     by_breath = np.nanmean(gains, axis=0)
     size = effect_size(table, whole, column)
-    passes = (
-        nats > LEAST_NATS
+    gain = float(by_breath.sum())
+    scatter = float(np.std(by_breath, ddof=1)) * np.sqrt(len(by_breath))
+    clear = gain > max(_LEAST_GAIN, _LEAST_GAIN_SCATTER * scatter)
+    passes = bool(
+        (nats > LEAST_NATS or (name in _BY_GAIN and clear))
         and float(np.mean(by_breath > 0)) >= _LEAST_AGREEMENT
         and size > max(_LEAST_EFFECT, _LEAST_EFFECT_SHARE * whole.sigma)
-        and _allowed(name, whole, positive)
+        and _allowed(name, whole)
         and _plausible(table, whole)
     )
-    return _Trial(name, column, nats, float(by_breath.sum()), passes)
+    return _Trial(name, column, nats, gain, passes)
 
 
 def _plausible(table: CrossProducts, fitted: RegressionFit) -> bool:
     """Whether R and C are still distinct from the other terms, and not negative."""
-    sd = np.sqrt(np.diag(covariance(table, fitted))[: len(BASE)])
-    resistance, elastance = fitted.coefficients[: len(BASE)]
+    sd = np.sqrt(np.diag(covariance(table, fitted))[:2])
+    resistance, elastance = fitted.coefficients[:2]
     return resistance > -2.0 * sd[0] and elastance > 0.0 and sd[1] < _MOST_UNCERTAINTY * elastance
 
 
@@ -153,7 +160,6 @@ def _best_column(
     which: NDArray[np.bool_],
     columns: tuple[int, ...],
     name: str,
-    positive: tuple[str, ...],
 ) -> int:
     """The column of a term with the highest likelihood on some breaths."""
     options = columns_of(name)
@@ -162,15 +168,15 @@ def _best_column(
 
     def value(column: int) -> float:
         fitted = fit(table, which, (*columns, column))
-        if not _allowed(name, fitted, positive):
+        if not _allowed(name, fitted):
             return -np.inf
-        return float(log_likelihood(table, fitted)[which].sum())
+        return float(log_likelihood(table, fitted)[which].sum()) + fitted.log_prior
 
     return max(options, key=value)
 
 
-def _allowed(name: str, fitted: RegressionFit, positive: tuple[str, ...]) -> bool:
-    return name not in positive or fitted.coefficients[-1] > 0.0
+def _allowed(name: str, fitted: RegressionFit) -> bool:
+    return name not in POSITIVE or fitted.coefficients[-1] > 0.0
 
 
 def splits(count: int) -> list[NDArray[np.bool_]]:
@@ -202,8 +208,8 @@ class DelayEstimate:
 
 def delay(
     segments: Sequence[Segment], progress: Callable[[float], object] = lambda share: None
-) -> DelayEstimate | None:
-    """Estimate what delays the pressure; None if the breaths do not need it.
+) -> tuple[tuple[Segment, ...], DelayEstimate | None]:
+    """Estimate what delays the pressure, and take it into account.
 
     Since a delay changes the signals of every other term, it is estimated first, on a grid.
 
@@ -212,73 +218,139 @@ def delay(
     tell them apart: then the circuit, which every ventilator has, is named. The quadratic part of
     the resistance tells them apart, and so does a lag for which no circuit is large enough.
 
+    Neither is computed from derivatives of the measured pressure, whose noise would make both look
+    smaller than they are. A lag delays the signals of the lung; what a circuit takes up is computed
+    from the pressure that the best lag predicts, which has no noise (an instrumental variable).
+
     Args:
         segments: pieces of the recording.
         progress: called with the share of the grids that is done.
+
+    Returns:
+        The segments with the delay, if there is one: with the sensor's lag, or with flow and volume
+        behind the circuit. The delay is None if the breaths do not need it.
     """
     if len({segment.breath for segment in segments}) < FEWEST_BREATHS:
-        return None
+        return tuple(segments), None
     steps, done = len(_CIRCUIT.grid) + len(_SENSOR.grid), 0
 
-    def step() -> None:
+    def tables_of(family: _DelayFamily, change: _Change) -> list[CrossProducts]:
         nonlocal done
-        done += 1
-        progress(done / steps)
+        tables = []
+        for strength in family.grid:
+            changed = [change(k, strength) for k in range(len(segments))]
+            tables.append(cross_products(changed, _COLUMNS))
+            done += 1
+            progress(done / steps)
+        return tables
 
-    circuit, sensor = (_likelihoods(segments, family, step) for family in (_CIRCUIT, _SENSOR))
+    sensor = tables_of(_SENSOR, lambda k, lag: replace(segments[k], lag=lag))
+    every = np.ones(len(sensor[0]), bool)
+    best = max(range(len(sensor)), key=lambda k: _value(sensor[k], every))
+    smooth = predicted(segments, sensor[best], _SENSOR.grid[best])
+    circuit = tables_of(_CIRCUIT, lambda k, c: behind_circuit(segments[k], smooth[k], c))
     candidates = {
         family.name: estimate
         for family, tables in ((_CIRCUIT, circuit), (_SENSOR, sensor))
         if (estimate := _delay(family, tables)) is not None
     }
     if not candidates:
-        return None
-    every = np.ones(len(circuit[0]), bool)
+        return tuple(segments), None
     gains = {
-        _CIRCUIT.name: max(map(_scaled_value, circuit, _CIRCUIT.grid)),
+        _CIRCUIT.name: max(_value(table, every) for table in circuit),
         _SENSOR.name: max(_value(table, every) for table in sensor),
     }
     none, most = _value(circuit[0], every), max(gains[name] for name in candidates)
     least = most - max(LEAST_NATS, _ALTERNATIVE_SHARE * (most - none))
-    best = next(estimate for name, estimate in candidates.items() if gains[name] >= least)
-    others = tuple(name for name in gains if name != best.name and gains[name] >= least)
-    return replace(best, alternatives=others)
+    chosen = next(estimate for name, estimate in candidates.items() if gains[name] >= least)
+    others = tuple(name for name in gains if name != chosen.name and gains[name] >= least)
+    value = chosen.value.value
+    if chosen.name == _SENSOR.name:
+        delayed = tuple(replace(segment, lag=value) for segment in segments)
+    else:
+        pairs = zip(segments, smooth, strict=True)
+        delayed = tuple(behind_circuit(segment, own, value) for segment, own in pairs)
+    return delayed, replace(chosen, alternatives=others)
 
 
-def behind_circuit(segment: Segment, compliance: float) -> Segment:
-    """The segment with flow and volume of the lung behind a circuit of ``compliance`` mL/cmH2O."""
-    if compliance == 0.0:
+def predicted(
+    segments: Sequence[Segment], table: CrossProducts, lag: float
+) -> list[tuple[Floats, Floats]]:
+    """Pressures of the lung that fits best if its sensor lags, and their derivatives, ``(m,)``.
+
+    Args:
+        segments: pieces of the recording.
+        table: their cross products with that lag.
+        lag: time constant of the sensor, s.
+    """
+    fitted = fit(table, np.ones(len(table), bool), range(len(_COLUMNS)))
+    columns = [COLUMNS[c] for c in _COLUMNS]
+    delayed = [not column.of_pressure for column in columns]
+    result = []
+    for segment in segments:
+        late = course(replace(segment, lag=lag), columns)
+        rises = np.gradient(late, segment.time, axis=0)
+        since = segment.time - segment.time[0]
+        own, own_rises = [np.ones(len(since)), since], [np.zeros(len(since)), np.ones(len(since))]
+        if lag > 0.0:  # then the derivative is known: it drives the lag
+            rises[:, delayed] = ((course(segment, columns) - late) / lag)[:, delayed]
+            own.append(np.exp(-since / lag))
+            own_rises.append(-own[-1] / lag)
+        lung, nuisance = late @ fitted.coefficients, np.stack(own, axis=1)
+        left = segment.pressure - lung[segment.rows]
+        size = np.linalg.lstsq(nuisance[segment.rows], left)[0]
+        rise = rises @ fitted.coefficients + np.stack(own_rises, axis=1) @ size
+        result.append((lung + nuisance @ size, rise))
+    return result
+
+
+def behind_circuit(segment: Segment, smooth: tuple[Floats, Floats], compliance: float) -> Segment:
+    """The segment with flow and volume of the lung behind a circuit.
+
+    Args:
+        segment: piece of the recording.
+        smooth: its pressure without noise, cmH2O, and the derivative of it, cmH2O/s, ``(m,)``.
+        compliance: of the circuit, mL/cmH2O.
+    """
+    if compliance == 0.0 or len(segment.time) < 2:
         return segment
-    c = compliance / 1000.0
+    c, (pressure, rise) = compliance / 1000.0, smooth
     return replace(
         segment,
-        flow=segment.flow - c * segment.rise,
-        slope=segment.slope - c * segment.bend,
-        volume=segment.volume - c * (segment.pressure - segment.pressure[0]),
+        flow=segment.flow - c * rise,
+        slope=segment.slope - c * np.gradient(rise, segment.time),
+        volume=segment.volume - c * (pressure - pressure[0]),
     )
 
 
-def before_sensor(segment: Segment, lag: float) -> Segment:
-    """The segment with the pressure in front of a sensor of time constant ``lag``, s."""
-    if lag == 0.0:
-        return segment
-    return replace(
-        segment,
-        pressure=segment.pressure + lag * segment.rise,
-        rise=segment.rise + lag * segment.bend,
-        dose=segment.dose + lag * (segment.pressure - segment.pressure[0]),
-    )
+#: A segment, by its number, with a delay of some strength.
+_Change = Callable[[int, float], Segment]
+
+#: Relaxation times of the creep that may be there beside a delay, s: columns of two times make up
+#: for all of the others.
+_CREEP = (0.4, 1.5)
+
+#: Columns with which delays are estimated: R, C, and slow effects that are left out would look like
+#: delays otherwise.
+_COLUMNS = (
+    *range(len(BASE)),
+    *columns_of("turbulent_resistance"),
+    *columns_of("leak"),
+    *(
+        min(columns_of("viscoelasticity"), key=lambda c: abs((COLUMNS[c].time or np.inf) - time))
+        for time in _CREEP
+    ),
+)
 
 
 @dataclass(frozen=True)
 class _DelayFamily:
-    """A cause of a delay: the strengths to choose from, and what it does to the signals.
+    """A cause of a delay, and the strengths to choose from.
 
     Attributes:
         name: name of the effect.
         unit: unit of its strength.
         grid: strengths, equally spaced from zero on.
-        undo: the signals without a delay of some strength.
         least: least strength that is reported.
         deviation: least standard deviation of a strength.
     """
@@ -286,7 +358,6 @@ class _DelayFamily:
     name: str
     unit: str
     grid: tuple[float, ...]
-    undo: Callable[[Segment, float], Segment]
     least: float
     deviation: float
 
@@ -294,34 +365,12 @@ class _DelayFamily:
 #: Circuits from 0 to 4 mL/cmH2O, and sensors from 0 to 150 ms. A lag shorter than a sample at
 #: 100 Hz cannot be told from clocks that differ, so that it is not reported.
 _CIRCUIT = _DelayFamily(
-    "circuit_compliance", "mL/cmH2O", tuple(np.arange(0.0, 4.01, 0.25).tolist()), behind_circuit,
+    "circuit_compliance", "mL/cmH2O", tuple(np.arange(0.0, 4.01, 0.25).tolist()),
     least=0.1, deviation=0.02,
 )  # fmt: skip
 _SENSOR = _DelayFamily(
-    "sensor_lag", "s", tuple(np.arange(0.0, 0.1501, 0.01).tolist()), before_sensor,
-    least=0.01, deviation=0.001,
-)  # fmt: skip
-
-
-def without_delay(segment: Segment, estimate: DelayEstimate | None) -> Segment:
-    """The segment as it would be without the delay."""
-    if estimate is None:
-        return segment
-    undo = _CIRCUIT.undo if estimate.name == _CIRCUIT.name else _SENSOR.undo
-    return undo(segment, estimate.value.value)
-
-
-def _likelihoods(
-    segments: Sequence[Segment], family: _DelayFamily, step: Callable[[], None]
-) -> list[CrossProducts]:
-    """Cross products of R, C and the quadratic part of the resistance, for each strength."""
-    columns = (*range(len(BASE)), *columns_of("turbulent_resistance"))
-    tables = []
-    for strength in family.grid:
-        undone = [family.undo(segment, strength) for segment in segments]
-        tables.append(cross_products(undone, columns))
-        step()
-    return tables
+    "sensor_lag", "s", tuple(np.arange(0.0, 0.1501, 0.01).tolist()), least=0.01, deviation=0.001
+)
 
 
 def _delay(family: _DelayFamily, tables: Sequence[CrossProducts]) -> DelayEstimate | None:
@@ -332,8 +381,9 @@ def _delay(family: _DelayFamily, tables: Sequence[CrossProducts]) -> DelayEstima
     for train in splits(count):
         best = max(tables, key=lambda table: _value(table, train))
         ratio = log_likelihood(best, fit(best, train, columns))
-        ratio = ratio - log_likelihood(null, fit(null, ~train, columns))
-        ratios.append(float(ratio[~train].sum()))
+        without = fit(null, ~train, columns)
+        ratio = ratio - log_likelihood(null, without)
+        ratios.append(float(ratio[~train].sum()) - without.log_prior)
     nats = float(np.logaddexp.reduce(ratios) - np.log(len(ratios)))
     every = np.ones(count, bool)
     value = _peak(family, tables, every)
@@ -351,25 +401,13 @@ def _delay(family: _DelayFamily, tables: Sequence[CrossProducts]) -> DelayEstima
 
 def _value(table: CrossProducts, which: NDArray[np.bool_]) -> float:
     fitted = fit(table, which, range(table.products.shape[-1] - 1))
-    return float(log_likelihood(table, fitted)[which].sum())
-
-
-def _scaled_value(table: CrossProducts, compliance: float) -> float:
-    """Log-likelihood behind a circuit, for residuals of the measured pressure.
-
-    The residuals of a lung behind a circuit are larger by ``1 + c / C``, which says nothing about
-    the circuit, but would decide between it and a sensor.
-    """
-    every = np.ones(len(table), bool)
-    elastance = fit(table, every, range(table.products.shape[-1] - 1)).coefficients[1]
-    scale = 1.0 + max(elastance, 0.0) * compliance / 1000.0
-    return _value(table, every) + float(table.freedom.sum() * np.log(scale))
+    return float(log_likelihood(table, fitted)[which].sum()) + fitted.log_prior
 
 
 def _residual_variance(table: CrossProducts, which: NDArray[np.bool_]) -> float:
     """Variance of the residual, autocorrelation included, cmH2O2."""
     fitted = fit(table, which, range(table.products.shape[-1] - 1))
-    return fitted.sigma**2 / (1.0 - GRID[fitted.grid] ** 2)
+    return fitted.sigma**2 / (1.0 - fitted.autocorrelation**2)
 
 
 def _peak(family: _DelayFamily, tables: Sequence[CrossProducts], which: NDArray[np.bool_]) -> float:

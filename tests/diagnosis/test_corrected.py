@@ -56,6 +56,21 @@ def fake(monkeypatch) -> None:
     monkeypatch.setattr(module.estimates, "plants_of", lambda fitted, evaluator: plants(R=25.0))
 
 
+def test_strengths_of_rigs_stand_only_where_no_error_rises():
+    one = made.breaths(n=24, samples=30)
+    both = dataclasses.replace(one, R=np.where(np.arange(24) % 2, 20.0, 5.0))
+    off = {"R5C50": {"refit": 1.0, "rigs": 0.5}, "R20C50": {"refit": 1.0, "rigs": 1.5}}
+    sizes = {
+        stage: np.array([off[lung][stage] for lung in both.lung_ids])[:, None]
+        for stage in ("refit", "rigs")
+    }
+    pressures = {stage: both.pressure + size for stage, size in sizes.items()}
+    lungs = dict.fromkeys(off, "refit")
+    assert set(both.lung_ids) == set(off)
+    chosen = module._with_rigs(both, split(both), pressures, lungs)
+    assert chosen == {"R5C50": "rigs", "R20C50": "refit"}
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.floats(0.0, 3.0), min_size=2, max_size=2),

@@ -63,8 +63,9 @@ class Diagnoses:
         self.names = names
         self.asked: list[dict[str, Any]] = []
 
-    def __call__(self, breaths, *, simulator, patient, progress) -> Diagnosis:
+    def __call__(self, breaths, *, simulator, patient, progress, rigs=None) -> Diagnosis:
         assert not patient  # nobody breathed on the rig
+        assert (rigs is not None) == (simulator == "physics")  # strengths of rigs: part rc
         self.asked.append({"breaths": breaths, "plant": simulator})
         progress("fitting", 0.5)
         one = made.diagnosis(12)
@@ -262,6 +263,10 @@ def test_claims_are_computed():
     start = "not named; named: valve_lag (or sensor_lag); without injection tau 0.1 s"
     assert injected.value.startswith(start)
     assert [claim.met for claim in claims({"rc": {"cut_percent": None}}, {})] == [False]
+    for after, met in ((0.7, True), (0.8, False)):
+        lungs = {"lung R5C10": {"refit": {"mae": 0.7}, "after": {"mae": after}}, "expiration": {}}
+        _, worse = claims({"rc": {"cut_percent": 60.0, "groups": lungs}}, {})
+        assert (worse.met, "R5C10" in worse.value) == (met, not met)
     assert claims({}, {}) == []
     assert cut(5.0, 2.0) == pytest.approx(60.0)
     assert cut(None, 2.0) is None

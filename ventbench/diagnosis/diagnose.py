@@ -51,6 +51,7 @@ from ventbench.lungs import lung as parse_lung
 from ventbench.mechanics.labels import LungMatch
 from ventbench.physics.catalogue import parameter
 from ventbench.plants.catalog import Given, load_simulators
+from ventbench.plants.sessions import Sessions
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.decimation import decimate, is_fast
@@ -81,6 +82,7 @@ def diagnose(
     patient: bool = False,
     passive: bool | None = None,
     drive: Drive = "auto",
+    rigs: Sessions | None = None,
     progress: Progress | None = None,
     settings: SelectionConfig = DEFAULT,
 ) -> Diagnosis:
@@ -106,6 +108,8 @@ def diagnose(
         drive: what the model follows: ``"valve"``, the recorded commands; ``"flow"``, the recorded
             flow, which says nothing of the valves; ``"auto"``, the flow only if ``u_in`` is zero
             throughout, so that no command was recorded.
+        rigs: the rigs of the recording, told by the clocks of their breaths, if there are several;
+            strengths are then fitted to each rig. Only for the base model.
         progress: receives the current step in words, and the share that is done.
         settings: every threshold.
 
@@ -182,7 +186,10 @@ def diagnose(
             (recording_model, kept), notes_on_simulator = steady, []
             missing = {name: changed for name, changed in missing.items() if name in kept}
     conclusion = recording_model.conclusion
-    correction = correct(breaths, data, uses, before, recording_model, simulator_model, simulators)
+    correction = correct(
+        breaths, data, uses, before, recording_model, simulator_model, simulators,
+        None if rigs is None or by_flow else rigs.assign(recorded),
+    )  # fmt: skip
     term = estimates.nonparametric_term(conclusion)
     own = simulator_model.conclusion.unnamed if simulator_model is not None else None
     if own is not None and term is not None and own.name == term.name:
@@ -237,6 +244,7 @@ def diagnose(
                       pressures["after"], flow, volume),
         split=_ids(breaths, uses),
         chosen=correction.chosen,
+        rigs=correction.rigs,
         gain_scatter=conclusion.gain_sd,
         detection_limits=limits,
         plants=correction.plants,

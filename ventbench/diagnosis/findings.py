@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 Verdict = Literal["named", "nothing_missing", "unnamed"]
 
 #: A simulator as given, with R, C, R_ex and PEEP refitted, and corrected.
-Stage = Literal["before", "refit", "after"]
+Stage = Literal["before", "refit", "after", "rigs"]
 
 
 @dataclass(frozen=True)
@@ -194,6 +194,23 @@ class BreathRequest:
         return "\n".join(["breath_id,time_step,u_in,u_out", *rows]) + "\n"
 
 
+@dataclass(frozen=True)
+class RigParameters:
+    """Parameters of one rig of the recording.
+
+    Attributes:
+        lung: label of its lung.
+        rig: number of the rig.
+        breaths: ids of its breaths that were fitted.
+        parameters: by path, such as ``R`` or ``sensor_lag.tau``.
+    """
+
+    lung: str
+    rig: int
+    breaths: tuple[int, ...]
+    parameters: dict[str, float]
+
+
 @dataclass(frozen=True, eq=False)
 class Findings:
     """Everything that a diagnosis establishes.
@@ -220,11 +237,13 @@ class Findings:
         split: ids of the breaths by use: ``training``, ``testing`` and ``judging``; few breaths of
             a lung have both of the last two uses.
         chosen: what the corrected simulator of each lung is, by label: the simulator as given,
-            refitted or corrected, whichever errs least on the judging breaths.
+            refitted, corrected, or corrected with strengths of each rig, whichever errs least on
+            the judging breaths.
         gain_scatter: standard deviation of the logarithm of the breaths' valve gains; 0 if all
             breaths have the same gain.
         detection_limits: if nothing is missing: smallest strength of each mechanism that would have
             been seen, in the unit of the strength, by name; infinite if none would.
+        rigs: parameters of each rig where the correction has them; empty otherwise.
     """
 
     verdict: Verdict
@@ -247,3 +266,4 @@ class Findings:
     chosen: dict[str, Stage] = field(default_factory=dict)
     gain_scatter: float = 0.0
     detection_limits: dict[str, float] = field(default_factory=dict)
+    rigs: tuple[RigParameters, ...] = ()

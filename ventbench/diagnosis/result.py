@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -191,6 +191,7 @@ class Diagnosis(Findings):
             "plant": self.simulator,
             "split": {name: list(ids) for name, ids in self.split.items()},
             "chosen": dict(self.chosen),
+            "rigs": [asdict(rig) for rig in self.rigs],
             "gain_scatter": self.gain_scatter,
             "detection_limits": {
                 name: {"strength": limit, "unit": mechanism(name).description.strength.unit}

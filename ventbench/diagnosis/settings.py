@@ -346,6 +346,27 @@ class CorrectionSettings:
 
 
 @dataclass(frozen=True)
+class RigSettings:
+    """Parameters of each rig, where a recording has several.
+
+    Attributes:
+        scatter: standard deviation between rigs to start with: of the logarithm, or as a share of a
+            mild effect.
+        least: least standard deviation of a logarithm between rigs; a smaller one would end the
+            search for it.
+        rounds: rounds in which parameters and their scatter are estimated in turn.
+        tolerance: expected fall of the cost, nats, at which a search ends.
+        iterations: most steps of a search.
+    """
+
+    scatter: float = 0.3
+    least: float = 0.01
+    rounds: int = 4
+    tolerance: float = 0.05
+    iterations: int = 15
+
+
+@dataclass(frozen=True)
 class SimulatorSettings:
     """Comparison of the recording with the simulator under diagnosis.
 
@@ -458,6 +479,7 @@ class SelectionConfig:
     patient_effort: PatientEffortSettings = field(default_factory=PatientEffortSettings)
     latent_inputs: LatentInputSettings = field(default_factory=LatentInputSettings)
     correction: CorrectionSettings = field(default_factory=CorrectionSettings)
+    rigs: RigSettings = field(default_factory=RigSettings)
     detection: DetectionSettings = field(default_factory=DetectionSettings)
     simulator: SimulatorSettings = field(default_factory=SimulatorSettings)
     residuals: ResidualSettings = field(default_factory=ResidualSettings)

@@ -337,11 +337,8 @@ def covariance(table: CrossProducts, fitted: RegressionFit) -> Floats:
 
 
 def effect_size(table: CrossProducts, fitted: RegressionFit, column: int) -> float:
-    """Root mean square of what a column explains beyond the others, cmH2O.
-
-    The zero of the flow sensor is not among the others, since its prior bounds what it explains.
-    """
-    others = [c for c in fitted.columns if c not in (column, _FLOW_ZERO)]
+    """Root mean square of what a column explains beyond the others, cmH2O."""
+    others = [c for c in fitted.columns if c != column]
     total = table.products[:, 0].sum(axis=0)
     square = total[column, column]
     if others:

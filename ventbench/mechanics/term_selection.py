@@ -45,6 +45,10 @@ _LEAST_AGREEMENT = 0.6
 #: Least effect of a term, cmH2O, and as a share of the noise.
 _LEAST_EFFECT, _LEAST_EFFECT_SHARE = 0.03, 0.1
 
+#: Least strengths that are named: tubes and airways have an inertance of 0.01 to 0.02 cmH2O s2/L,
+#: and a flow sensor that is a thousandth of a second late looks like 0.02 in an R20.
+_LEAST_STRENGTH = {"inertance": 0.03}
+
 #: Share of the best term's gain by which another term may fall short and still be an alternative.
 _ALTERNATIVE_SHARE = 0.1
 
@@ -143,6 +147,7 @@ def _trial(table: CrossProducts, columns: tuple[int, ...], name: str) -> _Trial:
         and float(np.mean(by_breath > 0)) >= _LEAST_AGREEMENT
         and size > max(_LEAST_EFFECT, _LEAST_EFFECT_SHARE * whole.sigma)
         and _allowed(name, whole)
+        and abs(whole.coefficients[-1]) >= _LEAST_STRENGTH.get(name, 0.0)
         and _plausible(table, whole)
     )
     return _Trial(name, column, nats, gain, passes)

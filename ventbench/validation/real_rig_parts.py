@@ -22,9 +22,11 @@ from ventbench.interfaces import Plant
 from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter
 from ventbench.physics.model import Physics
+from ventbench.plants import frozen
 from ventbench.plants.catalog import Given
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.plant_files import load_plants
+from ventbench.plants.sessions import Sessions
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.recordings.breaths import Breaths
 
@@ -48,6 +50,7 @@ class Setting:
         plant_name: name of the simulator in reports.
         wanted: mechanism that must be named, or None.
         about: JSON values: what was injected or removed.
+        rigs: the rigs of the recording, if strengths are fitted to each of them.
     """
 
     breaths: Breaths
@@ -55,6 +58,7 @@ class Setting:
     plant_name: str
     wanted: str | None = None
     about: dict[str, Any] = field(default_factory=dict)
+    rigs: Sessions | None = None
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,8 @@ class Part:
 
 
 def _rc(breaths: Breaths, out: Path) -> Setting:
-    return Setting(breaths, "physics", "physics")
+    # The clocks of the simulators' training tell the ventilators apart.
+    return Setting(breaths, "physics", "physics", rigs=frozen.load(version=1).sessions)
 
 
 def _two_balloon(breaths: Breaths, out: Path) -> Setting:

@@ -167,7 +167,10 @@ def _run(
             progress(part.name, step, share)
 
     # The ventilator was connected to a test lung.
-    diagnosis = diagnose(setting.breaths, simulator=setting.plant, patient=False, progress=tell)
+    own = {} if setting.rigs is None else {"rigs": setting.rigs}
+    diagnosis = diagnose(
+        setting.breaths, simulator=setting.plant, patient=False, progress=tell, **own
+    )
     diagnosis = dataclasses.replace(diagnosis, simulator=setting.plant_name)
     out.mkdir(parents=True, exist_ok=True)
     (out / DONE).unlink(missing_ok=True)
@@ -268,6 +271,15 @@ def claims(
         value = "not known" if percent is None else f"{percent:.0f} %"
         what = f"held-out error cut by at least {CUT:g} % by named physics alone"
         judged.append(Claim("rc", what, value, percent is not None and percent >= CUT))
+        by_lung = {
+            name: error
+            for name, error in parts["rc"].get("groups", {}).items()
+            if name.startswith("lung ")
+        }
+        if by_lung:
+            worse = [n for n, e in by_lung.items() if e["after"]["mae"] > e["refit"]["mae"]]
+            value = f"worse: {', '.join(worse)}" if worse else f"{len(by_lung)} lungs"
+            judged.append(Claim("rc", "no lung is worse than refitted", value, not worse))
     for name in ("removed", "injected"):
         if name in parts:
             judged.append(_wanted_is_named(name, parts))

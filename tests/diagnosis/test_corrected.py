@@ -15,6 +15,7 @@ from ventbench import precision
 from ventbench.diagnosis import corrected as module
 from ventbench.diagnosis.corrected import choose, correct, fit_open_loop
 from ventbench.diagnosis.evaluator import make_evaluator
+from ventbench.diagnosis.findings import Stage
 from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.identification import split
 from ventbench.diagnosis.residual_analysis import compare_open_loop
@@ -65,7 +66,7 @@ def test_strengths_of_rigs_stand_only_where_no_error_rises():
         for stage in ("refit", "rigs")
     }
     pressures = {stage: both.pressure + size for stage, size in sizes.items()}
-    lungs = dict.fromkeys(off, "refit")
+    lungs: dict[str, Stage] = dict.fromkeys(off, "refit")
     assert set(both.lung_ids) == set(off)
     chosen = module._with_rigs(both, split(both), pressures, lungs)
     assert chosen == {"R5C50": "rigs", "R20C50": "refit"}

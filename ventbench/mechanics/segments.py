@@ -8,6 +8,7 @@ readings that are clipped at an end of the sensor's range are left out.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from ventbench.errors import InputError
 from ventbench.recordings.breaths import Breaths
 
 Floats = NDArray[np.float64]
+
+#: Pressure at the compared samples; time, volume, flow, its slope, and dose.
+_Signals: TypeAlias = tuple[Floats, Floats, Floats, Floats, Floats, Floats]
 
 #: Half the width of the window, s.
 WINDOW = 0.04
@@ -113,7 +117,7 @@ def clipped_share(breaths: Breaths) -> float:
 
 def _smoothed(
     time: Floats, pressure: Floats, flow: Floats | None, volume: Floats | None
-) -> tuple[NDArray[np.int64], NDArray[np.bool_], *tuple[Floats, ...]] | None:
+) -> tuple[NDArray[np.int64], NDArray[np.bool_], *_Signals] | None:
     """Fields of a segment from ``rows`` on; None if the segment would be too short."""
     if len(time) < 3:
         return None

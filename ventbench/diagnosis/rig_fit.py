@@ -90,7 +90,6 @@ def fit_rigs(
     known, place = np.unique(rigs, return_inverse=True)
     if len(known) < 2 or any(varies_by_breath(name) for name in fitted.names):
         return None
-    evaluator = replace(evaluator, gain_sd=0.0)
     data, names = partition.data, partition.predictor.names
     paths = tuple(path for path in fitted.hypothesis.paths if path != START)
     # White noise of the same information: coloured noise would excuse slow errors.

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ventbench.diagnosis import identification
 from ventbench.diagnosis.identification import held_out, split, usable
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.errors import InputError
@@ -101,3 +103,20 @@ def test_breaths_that_judged_an_earlier_correction_judge_again():
     assert not uses.reused.any()
     everything = tuple(breaths.breath_id.tolist())
     assert np.array_equal(split(breaths, never_fitted=everything).judging, split(breaths).judging)
+
+
+@pytest.mark.parametrize(
+    ("term", "nats", "idle"),
+    [
+        ("supply_memory", 5.0, True),
+        ("supply_memory", 50.0, False),
+        ("leak_shape", 5.0, False),
+        (None, 5.0, False),
+    ],
+)
+def test_a_term_that_adds_little_to_a_mechanism_it_contains_is_idle(term, nats, idle):
+    unnamed = SimpleNamespace(term=term, nats=nats)
+    conclusion = SimpleNamespace(unnamed=unnamed, held_out_gains={"supply_droop": 100.0})
+    assert identification._is_idle_form(conclusion, "supply_droop", DEFAULT) is idle
+    nothing = SimpleNamespace(unnamed=None, held_out_gains={})
+    assert not identification._is_idle_form(nothing, "supply_droop", DEFAULT)

@@ -196,6 +196,12 @@ def without_name(
     )
 
 
+def without_term(conclusion: Conclusion) -> Conclusion:
+    """The conclusion with its mechanisms alone, without a nonparametric term beside them."""
+    named = conclusion.named
+    return replace(conclusion, full=named, unnamed=None, noise=named.noise)
+
+
 def is_unresolved(evaluator: Evaluator, comparisons: Sequence[Comparison]) -> bool:
     """Whether a candidate explains much of the training breaths but was not accepted.
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.diagnosis import estimates
-from ventbench.diagnosis.conclusion import Conclusion, conclude, without_name
+from ventbench.diagnosis.conclusion import Conclusion, conclude, without_name, without_term
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
 from ventbench.diagnosis.hypothesis import (
     FittedModel,
@@ -27,7 +27,7 @@ from ventbench.diagnosis.screening import all_parameter_paths, library_paths
 from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
-from ventbench.physics.catalogue import mechanism
+from ventbench.physics.catalogue import mechanism, special_cases
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit
@@ -211,21 +211,36 @@ def identify(
 
     conclusion = conclude(narrow, widened, tell)
     # Gains that differ between breaths are parameters of each breath, unknown of held-out ones.
-    gain_sd = conclusion.gain_sd
-    has_term = conclusion.unnamed is not None and conclusion.unnamed.term is not None
-    evaluator = replace(wide[0] if has_term else narrow, gain_sd=gain_sd)
-    final = evaluator.training
-    if not has_term:  # a nonparametric term is fitted to the training breaths alone, to save time
-        chosen = ~held if fitted is None else fitted
-        final = make_partition(data.select(chosen), names, settings)
+    gain_sd, chosen = conclusion.gain_sd, ~held if fitted is None else fitted
     while True:
+        has_term = conclusion.unnamed is not None and conclusion.unnamed.term is not None
+        evaluator = replace(wide[0] if has_term else narrow, gain_sd=gain_sd)
+        # A nonparametric term is fitted to the training breaths alone, to save time.
+        final = evaluator.training
+        if not has_term:
+            final = make_partition(data.select(chosen), names, settings)
         fit = estimates.final_fit(conclusion.full, final, evaluator)
         vague = [name for name in conclusion.names if not _is_definite(fit, name)]
         if not vague:
             return IdentifiedModel(evaluator, conclusion, fit, final)
         # The least needed one first: the intervals of others may shrink once it has gone.
         name = min(vague, key=lambda name: conclusion.held_out_gains.get(name, 0.0))
-        conclusion = without_name(conclusion, name, narrow, evaluator)
+        if _is_idle_form(conclusion, name, settings):
+            conclusion = without_term(conclusion)
+        else:
+            conclusion = without_name(conclusion, name, narrow, evaluator)
+
+
+def _is_idle_form(conclusion: Conclusion, name: str, settings: SelectionConfig) -> bool:
+    """Whether a nonparametric term contains a mechanism and adds little to it.
+
+    Beside such a term, the mechanism's strength may be anything: the term can do all that it does.
+    """
+    unnamed = conclusion.unnamed
+    if unnamed is None or unnamed.term is None or name not in special_cases(unnamed.term):
+        return False
+    share = settings.held_out_test.negligible_share
+    return unnamed.nats < share * conclusion.held_out_gains.get(name, 0.0)
 
 
 def _is_definite(fit: Fit, name: str) -> bool:

@@ -232,8 +232,11 @@ def backward_elimination(
             by_name = selected.log_likelihood_at(full.noise) - without
             if by_name >= settings.related_share * (full.log_likelihood - without):
                 continue
-        share = (full.log_likelihood - left.log_likelihood) / max(whole, 1e-9)
-        if not is_needed(wide, full, left) or share < settings.compensating_share:
+        # A name that explains more than the term does is no correction of the term's form, however
+        # much an effect beside both explains.
+        by_term = full.log_likelihood - selected.log_likelihood_at(full.noise)
+        enough = min(settings.compensating_share * whole, by_term)
+        if not is_needed(wide, full, left) or full.log_likelihood - left.log_likelihood < enough:
             full, kept = fit_with_noise(wide, left.hypothesis, left), kept.without(name)
     if kept != selected.hypothesis:
         selected = fit_with_noise(evaluator, kept, selected)

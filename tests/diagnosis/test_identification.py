@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -116,7 +117,7 @@ def test_breaths_that_judged_an_earlier_correction_judge_again():
 )
 def test_a_term_that_adds_little_to_a_mechanism_it_contains_is_idle(term, nats, idle):
     unnamed = SimpleNamespace(term=term, nats=nats)
-    conclusion = SimpleNamespace(unnamed=unnamed, held_out_gains={"supply_droop": 100.0})
+    conclusion: Any = SimpleNamespace(unnamed=unnamed, held_out_gains={"supply_droop": 100.0})
     assert identification._is_idle_form(conclusion, "supply_droop", DEFAULT) is idle
-    nothing = SimpleNamespace(unnamed=None, held_out_gains={})
+    nothing: Any = SimpleNamespace(unnamed=None, held_out_gains={})
     assert not identification._is_idle_form(nothing, "supply_droop", DEFAULT)

@@ -301,7 +301,7 @@ def app(monkeypatch: pytest.MonkeyPatch, diagnoses: Diagnoses) -> typer.Typer:
 
 
 def test_the_command(app, recordings, tmp_path, diagnoses):
-    arguments = ["--recordings", str(recordings), "--out", str(tmp_path), "--only", "rc"]
+    arguments = ["proof", "--recordings", str(recordings), "--out", str(tmp_path), "--only", "rc"]
     ran = CliRunner().invoke(app, [*arguments, "--json", "-"])
     plain = json.loads(ran.stdout)
     met = plain["parts"]["rc"]["cut_percent"] >= 60.0
@@ -315,7 +315,8 @@ def test_the_command(app, recordings, tmp_path, diagnoses):
 
 
 def test_exit_codes_follow_the_claims(app, recordings, tmp_path, diagnoses, monkeypatch):
-    arguments = ["--recordings", str(recordings), "--out", str(tmp_path), "--only", "frozen"]
+    own = ["proof", "--recordings", str(recordings), "--out", str(tmp_path)]
+    arguments = [*own, "--only", "frozen"]
     ran = CliRunner().invoke(app, arguments)
     assert ran.exit_code == 0, ran.output
     assert "held-out real breaths" in ran.stdout
@@ -324,6 +325,6 @@ def test_exit_codes_follow_the_claims(app, recordings, tmp_path, diagnoses, monk
     assert "sensor_lag is named: missed (not named; named: valve_delay" in ran.stdout
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("ventbench.recordings.recordings_dir", lambda: None)
-    ran = CliRunner().invoke(app, ["--out", "proof"])
+    ran = CliRunner().invoke(app, ["proof", "--out", "proof"])
     assert isinstance(ran.exception, InputError)
     assert "give --recordings DIR" in str(ran.exception)

@@ -17,6 +17,9 @@ from ventbench.plants import frozen
 from ventbench.recordings import load
 from ventbench.system_id import Noise, make_data
 from ventbench.system_id.noise import robust_noise
+from ventbench.system_id.problem import parameter_of
+
+from . import small
 
 #: What the public rig lacks, as ``ventbench proof --only rc`` names it.
 NAMES = ("exhalation_valve_delay", "circuit_compliance", "valve_curve", "sensor_lag")
@@ -63,3 +66,20 @@ def test_strengths_a_rig_on_the_public_recordings(public_recordings):
     # A rig of which nothing is known has what its lung's other rigs have.
     unknown = own.pressures(data, np.full(len(breaths), 10_000), first)
     np.testing.assert_allclose(unknown, pressures(shared), atol=1e-6)
+
+
+def test_rigs_may_differ_in_a_shape_parameter():
+    """A shape parameter has no mild effect that could say how much rigs differ."""
+    name, shape = "exhalation_valve_delay", "exhalation_valve_delay.closing"
+    evaluator = small.split(small.made(small.effect(name, opening=0.06)))
+    terms, start = Hypothesis((name,), (shape,)), {f"{name}.opening": 0.05}
+    fitted = evaluator.fit(terms, Noise((0.2,), (0.0, 0.0)), start=start)
+    rigs = np.arange(len(evaluator.training.data)) % 2
+    own = fit_rigs(evaluator, fitted, evaluator.training, rigs, RigSettings())
+    assert own is not None
+    about = parameter_of(shape)
+    assert np.all((own.values[shape] >= about.low) & (own.values[shape] <= about.high))
+    assert 0 < own.scatter[shape] < 0.1 * (about.high - about.low)
+    # Readings are 75 ms apart, so that R_ex and the delay of the one rig are known together alone.
+    shared = fitted.column(f"{name}.opening")[0]
+    np.testing.assert_allclose(own.values[f"{name}.opening"], shared, atol=0.01)

@@ -111,7 +111,9 @@ def fit_rigs(
     mean, scatter = x.copy(), {}
     for path in (*paths, _GAIN):
         about = parameter_of(path)
-        scatter[path] = settings.scatter * (1.0 if about.scale == "log" else abs(about.mild))
+        # A shape parameter may have no mild effect; it is of the size of its range.
+        size = 1.0 if about.scale == "log" else abs(about.mild) or about.high - about.low
+        scatter[path] = settings.scatter * size
     for _ in range(settings.rounds):
         precision = np.zeros(len(x))
         for path in scatter:

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from ventbench.diagnosis.candidate_comparison import estimate_noise, fit_with_noise
 from ventbench.diagnosis.evaluator import (
     Evaluator,
     cross_validated_gain,
@@ -15,7 +16,6 @@ from ventbench.diagnosis.evaluator import (
     make_evaluator,
 )
 from ventbench.diagnosis.hypothesis import Hypothesis, Partition
-from ventbench.diagnosis.selection import estimate_noise, fit_with_noise
 from ventbench.diagnosis.settings import PatientEffortSettings
 from ventbench.physics import paths
 from ventbench.system_id import START, Data, Noise, make_data, parameter_values

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from ventbench.diagnosis.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.hypothesis import Hypothesis, Partition
 from ventbench.diagnosis.latent_inputs import (
     ALVEOLUS,
@@ -20,7 +21,6 @@ from ventbench.diagnosis.latent_inputs import (
     log_likelihood_without_input,
 )
 from ventbench.diagnosis.linearisation import linearise
-from ventbench.diagnosis.selection import fit_with_noise
 from ventbench.system_id import Predictor
 
 from . import small

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ventbench.diagnosis import refinement
+from ventbench.diagnosis.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.refinement import (
     NonparametricFit,
@@ -17,7 +18,7 @@ from ventbench.diagnosis.refinement import (
     find_alternatives,
     special_case_of,
 )
-from ventbench.diagnosis.selection import fit_with_noise, forward_selection
+from ventbench.diagnosis.selection import forward_selection
 
 from . import small
 

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from ventbench.diagnosis.candidate_comparison import fit_with_noise, fit_with_white_noise
 from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.screening import (
     all_parameter_paths,
@@ -14,7 +15,6 @@ from ventbench.diagnosis.screening import (
     score_nonparametric_terms,
     screen_mechanisms,
 )
-from ventbench.diagnosis.selection import fit_with_noise, fit_with_white_noise
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.physics import library, parameter
 from ventbench.physics.catalogue import basis_terms

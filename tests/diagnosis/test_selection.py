@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 from ventbench.diagnosis import selection
-from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.screening import screen_mechanisms
-from ventbench.diagnosis.selection import (
+from ventbench.diagnosis.candidate_comparison import (
     compare_candidates,
-    drop_redundant_terms,
     estimate_noise,
     fit_with_noise,
     fit_with_white_noise,
+)
+from ventbench.diagnosis.hypothesis import Hypothesis
+from ventbench.diagnosis.screening import screen_mechanisms
+from ventbench.diagnosis.selection import (
+    drop_redundant_terms,
     forward_selection,
     passes_heldout_test,
 )

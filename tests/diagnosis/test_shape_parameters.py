@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from ventbench.diagnosis.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.selection import fit_with_noise
 from ventbench.diagnosis.shape_parameters import (
     fit_with_shape,
     free_shape_parameters,

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
+from ventbench.diagnosis.candidate_comparison import Comparison, fit_with_noise
 from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.latent_inputs import (
@@ -38,9 +39,7 @@ from ventbench.diagnosis.refinement import (
 )
 from ventbench.diagnosis.screening import component_of
 from ventbench.diagnosis.selection import (
-    Comparison,
     Progress,
-    fit_with_noise,
     forward_selection,
     passes_heldout_test,
 )

@@ -23,6 +23,13 @@ from operator import itemgetter
 
 import numpy as np
 
+from ventbench.diagnosis.candidate_comparison import (
+    Comparison,
+    RankedModel,
+    compare_candidates,
+    fit_with_noise,
+    fit_with_white_noise,
+)
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.latent_inputs import (
@@ -33,16 +40,7 @@ from ventbench.diagnosis.latent_inputs import (
 )
 from ventbench.diagnosis.plausibility import is_plausible
 from ventbench.diagnosis.screening import score_nonparametric_terms, screen_mechanisms
-from ventbench.diagnosis.selection import (
-    Comparison,
-    Progress,
-    RankedModel,
-    compare_candidates,
-    fit_with_noise,
-    fit_with_white_noise,
-    is_needed,
-    passes_heldout_test,
-)
+from ventbench.diagnosis.selection import Progress, is_needed, passes_heldout_test
 from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import mechanism, special_cases
 from ventbench.system_id.data import Floats

@@ -12,12 +12,15 @@ import pytest
 from ventbench.diagnosis.conclusion import (
     UnnamedEffect,
     _best_input,
+    _better_selection,
     _is_negligible_input,
+    _needed_terms,
     conclude,
     is_unresolved,
 )
 from ventbench.diagnosis.estimates import nonparametric_term, split_form
 from ventbench.diagnosis.findings import NonparametricTerm
+from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.latent_inputs import ALVEOLUS, GAIN_SCATTER, MEASUREMENT, SUPPLY
 from ventbench.recordings import join
 
@@ -42,6 +45,18 @@ def test_nothing_is_missing():
     assert (found.held_out_gains, found.alternatives, found.gain_sd) == ({}, {}, 0.0)
     assert found.noise.sigma[0] == pytest.approx(0.2, rel=0.15)
     assert nonparametric_term(found) is None
+
+
+def test_mechanisms_selected_with_one_gain_are_started_from_where_gains_scatter(turbulent, both):
+    scattered = dataclasses.replace(turbulent, gain_sd=0.05)
+    named, without = both
+    idle = turbulent.fit(Hypothesis(("leak", "turbulent_resistance")), named.noise, named)
+    needed = _needed_terms(scattered, idle)
+    assert needed.names == ("turbulent_resistance",)
+    assert set(needed.problem.unknowns.paths) >= {"gain"}
+    usual = (scattered.fit(Hypothesis(), without.noise), [])
+    assert _better_selection(scattered, usual, (needed, []))[0] is needed
+    assert _better_selection(scattered, (needed, []), usual)[0] is needed
 
 
 def compared(gains: dict[str, tuple[float, float]]) -> tuple[Any, list[Any]]:

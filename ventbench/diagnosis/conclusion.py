@@ -41,6 +41,7 @@ from ventbench.diagnosis.screening import component_of
 from ventbench.diagnosis.selection import (
     Progress,
     forward_selection,
+    is_needed,
     passes_heldout_test,
 )
 from ventbench.diagnosis.settings import SelectionConfig
@@ -100,18 +101,31 @@ class Conclusion:
         return self.named.names
 
 
-def conclude(evaluator: Evaluator, wider: Callable[[], Evaluator], tell: Progress) -> Conclusion:
+def conclude(
+    evaluator: Evaluator,
+    wider: Callable[[], Evaluator],
+    tell: Progress,
+    earlier: FittedModel | None = None,
+) -> Conclusion:
     """Find what a recording needs beyond the base model.
 
     Args:
         evaluator: evaluator with the library's parameters.
         wider: makes the evaluator with the parameters of the nonparametric terms as well.
         tell: called with a description of each step before it runs.
+        earlier: mechanisms that were selected with the same gain in all breaths, to start from too.
     """
     base = fit_with_noise(evaluator, Hypothesis())
     wider = cache(wider)
     single = SingleTermAlternative(evaluator, wider, base)
     selected, comparisons = forward_selection(evaluator, base, tell, single)
+    if earlier is not None and not set(earlier.names) <= set(selected.names):
+        # Gains of the breaths' own can stand for a bent valve in the first rounds of a selection.
+        selected, comparisons = _better_selection(
+            evaluator,
+            (selected, comparisons),
+            forward_selection(evaluator, _needed_terms(evaluator, earlier), tell, single),
+        )
     tell("looking for effects that no mechanism explains")
     wide = wider()
     reduced = drop_compensating_terms(evaluator, wide, selected, tell)
@@ -123,7 +137,8 @@ def conclude(evaluator: Evaluator, wider: Callable[[], Evaluator], tell: Progres
         selected = reduced
     if not evaluator.gain_sd and remaining.gain_sd:
         sd = remaining.gain_sd
-        return conclude(replace(evaluator, gain_sd=sd), lambda: replace(wide, gain_sd=sd), tell)
+        scattered = replace(evaluator, gain_sd=sd)
+        return conclude(scattered, lambda: replace(wide, gain_sd=sd), tell, selected)
     unnamed, full = None, selected
     if remaining.latent is not None and not remaining.prefers_term:
         unnamed = remaining.latent
@@ -164,6 +179,31 @@ def conclude(evaluator: Evaluator, wider: Callable[[], Evaluator], tell: Progres
         {name: alternatives[name] for name in selected.names if name in alternatives},
         evaluator.gain_sd,
         unnamed is None and not selected.names and is_unresolved(evaluator, comparisons),
+    )
+
+
+def _needed_terms(evaluator: Evaluator, earlier: FittedModel) -> FittedModel:
+    """A model fitted by another evaluator, fitted with this one, without terms not needed there."""
+    current = fit_with_noise(evaluator, earlier.hypothesis, earlier)
+    for name in earlier.names:
+        without = evaluator.fit(current.hypothesis.without(name), current.noise, current)
+        if not is_needed(evaluator, current, without):
+            current = fit_with_noise(evaluator, without.hypothesis, without)
+    return current
+
+
+def _better_selection(
+    evaluator: Evaluator,
+    usual: tuple[FittedModel, list[Comparison]],
+    other: tuple[FittedModel, list[Comparison]],
+) -> tuple[FittedModel, list[Comparison]]:
+    """The other selection if BIC, at the noise that it leaves, and held-out breaths prefer it."""
+    model, noise = other[0], other[0].noise
+    against = evaluator.fit(usual[0].hypothesis, noise, usual[0])
+    gains = evaluator.held_out_log_likelihood(model) - evaluator.held_out_log_likelihood(against)
+    better = evaluator.criterion(model) < evaluator.criterion(against)
+    return (
+        other if better and passes_heldout_test(gains, evaluator.settings.held_out_test) else usual
     )
 
 

@@ -148,6 +148,7 @@ def test_an_input_must_explain_more_than_every_nuisance(nats, noise, scatter, ac
     assert (best is not None) is accepted
     if best is not None:
         assert best.name == ALVEOLUS
+        assert best.places[0][0] == ALVEOLUS
 
 
 @pytest.mark.parametrize(

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy import integrate
 
 from ventbench.diagnosis.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.hypothesis import Hypothesis, Partition
@@ -19,6 +22,7 @@ from ventbench.diagnosis.latent_inputs import (
     fit_latent_inputs,
     input_responses,
     log_likelihood_without_input,
+    place_weights,
 )
 from ventbench.diagnosis.linearisation import linearise
 from ventbench.system_id import Predictor
@@ -26,6 +30,35 @@ from ventbench.system_id import Predictor
 from . import small
 
 INSPIRED = 30
+
+
+def likelihoods(**nats: float | list[float]) -> list[Any]:
+    """Inputs by their held-out log-likelihoods in ten breaths."""
+    return [
+        SimpleNamespace(place=place, held_out_log_likelihood=np.broadcast_to(gains, 10))
+        for place, gains in nats.items()
+    ]
+
+
+def test_weights_of_places_are_those_of_a_bayesian_bootstrap():
+    """The share of one breath among ten is distributed as Beta(1, 9)."""
+    ahead = 2.0
+    gains = [ahead, *[0.0] * 9]
+    weights = place_weights(likelihoods(supply=0.0, alveolus=gains))
+    expected, _ = integrate.quad(
+        lambda share: 9.0 * (1.0 - share) ** 8 / (1.0 + np.exp(-10.0 * share * ahead)), 0.0, 1.0
+    )
+    assert list(weights) == ["alveolus", "supply"]
+    assert weights["alveolus"] == pytest.approx(expected, abs=0.01)
+    assert sum(weights.values()) == pytest.approx(1.0)
+
+
+def test_a_place_that_one_breath_alone_prefers_is_not_certain():
+    every = place_weights(likelihoods(supply=3.0, alveolus=0.0))
+    one = place_weights(likelihoods(supply=[39.0, *[-1.0] * 9], alveolus=0.0))
+    assert every["supply"] > 0.999
+    assert one["supply"] < 0.9
+    assert place_weights(likelihoods(a=1.0, b=1.0, c=1.0))["b"] == pytest.approx(1.0 / 3.0)
 
 
 @pytest.fixture(scope="module")

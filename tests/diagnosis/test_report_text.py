@@ -153,6 +153,15 @@ def test_other_verdicts():
     )
     term = made.unnamed(12).nonparametric
     assert term is not None
+    places = (("f(t) at the supply", 0.7), ("f(t) at the alveolus", 0.29), ("measurement", 0.01))
+    timed = dataclasses.replace(term, places=places)
+    assert report_text.nonparametric_term(dataclasses.replace(both, nonparametric=timed)).endswith(
+        "where it acts: f(t) at the supply 70 % or f(t) at the alveolus 29 %."
+    )
+    sure = dataclasses.replace(term, places=(places[0], places[2]))
+    assert report_text.nonparametric_term(dataclasses.replace(both, nonparametric=sure)).endswith(
+        "Held-out breaths leave no other place for it."
+    )
     own = dataclasses.replace(term, name="f(u)", form_of=("valve_delay",))
     bent = dataclasses.replace(made.diagnosis(12), form=own)
     assert "inspiratory valve, in another form than the library's (odds" in report_text.verdict(

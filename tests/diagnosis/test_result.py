@@ -63,6 +63,7 @@ def test_a_slot_and_nothing():
     slot = made.unnamed(12).as_dict()["slot"]
     assert (slot["name"], slot["explains"]) == ("R(V)", 0.83)
     assert len(slot["shape"]["x"]) == len(slot["shape"]["y"]) == 25
+    assert slot["places"] == {}
     plain = made.nothing(12).as_dict()
     assert (plain["mechanisms"], plain["location"], plain["request"]) == ([], [], None)
 

@@ -23,6 +23,7 @@ from ventbench.diagnosis.latent_inputs import (
     LatentInput,
     fit_latent_inputs,
     log_likelihood_without_input,
+    place_weights,
 )
 from ventbench.diagnosis.plausibility import is_consistent, is_plausible
 from ventbench.diagnosis.refinement import (
@@ -60,12 +61,15 @@ class UnnamedEffect:
         term: the component's basis term, or None for a latent input.
         latent_input: the input, or None for a basis term.
         nats: held-out log-likelihood that it gains.
+        places: weight of each place where a latent input may act, the largest first; empty for a
+            basis term.
     """
 
     name: str
     term: str | None
     latent_input: LatentInput | None
     nats: float
+    places: tuple[tuple[str, float], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -356,7 +360,7 @@ def _best_input(
     test, limits = settings.held_out_test, settings.latent_inputs
     physical = dict(inputs)
     nuisances = physical.pop(MEASUREMENT), physical.pop(GAIN_SCATTER)
-    sensor = nuisances[0]
+    sensor, places = nuisances[0], tuple(place_weights(inputs.values()).items())
     best = max(physical.values(), key=lambda latent: latent.training_log_likelihood)
     gained = best.held_out_log_likelihood - reference
     ahead = min(
@@ -364,11 +368,11 @@ def _best_input(
         for other in nuisances
     )
     if passes_heldout_test(gained, test, limits.threshold) and ahead > limits.threshold:
-        return UnnamedEffect(best.place, None, best, float(gained.sum()))
+        return UnnamedEffect(best.place, None, best, float(gained.sum()), places)
     gained = sensor.held_out_log_likelihood - reference
     hum = sensor.periodic and sensor.size >= limits.sensor_amplitude
     if passes_heldout_test(gained, test) and hum:
-        return UnnamedEffect(MEASUREMENT, None, sensor, float(gained.sum()))
+        return UnnamedEffect(MEASUREMENT, None, sensor, float(gained.sum()), places)
     return None
 
 

@@ -261,7 +261,7 @@ def _latent_input(place: UnnamedEffect, source: LatentInput, explains: float) ->
     x = np.arange(len(course), dtype=float)
     return NonparametricTerm(
         place.name, meaning, explains, place.nats, x, "sample of the breath where it is largest",
-        course, unit,
+        course, unit, places=place.places,
     )  # fmt: skip
 
 

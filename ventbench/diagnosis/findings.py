@@ -62,6 +62,8 @@ class NonparametricTerm:
         y_unit: name and unit of ``y``.
         form_of: missing mechanisms that the term contains. If there are any, the term is no further
             effect: it shows how their form differs from the library's.
+        places: where a course in time may act and the weight of each place by held-out breaths, the
+            largest first; empty if the term has a curve.
     """
 
     name: str
@@ -73,6 +75,7 @@ class NonparametricTerm:
     y: Floats
     y_unit: str
     form_of: tuple[str, ...] = ()
+    places: tuple[tuple[str, float], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,9 @@ _NUMBERS = {3: "Three", 4: "Four", 5: "Five", 6: "Six"}
 #: Fewer judging breaths than these leave the worth of a correction vague.
 _FEW_BREATHS = 10
 
+#: Places of less weight than this are not listed.
+_LEAST_WEIGHT = 0.02
+
 #: A mean error below this share of the noise says nothing about its sign.
 _NO_SIGN = 0.25
 
@@ -362,8 +365,19 @@ def nonparametric_term(findings: Findings) -> str:
     start = "In addition to these mechanisms, a" if findings.verdict == "named" else "A"
     return (
         f"{start} nonparametric term for {place(term)} explains {100 * term.explains:.0f} % of "
-        "the squared error above the noise."
+        f"the squared error above the noise.{_certainty(term)}"
     )
+
+
+def _certainty(term: NonparametricTerm) -> str:
+    """Sentence on how certain the place of a course in time is; empty for a curve."""
+    listed = [(name, share) for name, share in term.places if share >= _LEAST_WEIGHT]
+    if not listed:
+        return ""
+    if len(listed) == 1:
+        return " Held-out breaths leave no other place for it."
+    weights = _listed([f"{name} {100 * share:.0f} %" for name, share in listed], "or")
+    return f" Held-out breaths do not settle where it acts: {weights}."
 
 
 def place(term: NonparametricTerm) -> str:

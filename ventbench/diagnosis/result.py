@@ -231,6 +231,7 @@ def _nonparametric(term: NonparametricTerm) -> dict[str, Any]:
         "meaning": term.meaning,
         "explains": term.explains,
         "nats": term.nats,
+        "places": dict(term.places),
         "shape": {
             "x": term.x.tolist(),
             "x_unit": term.x_unit,

@@ -29,9 +29,9 @@ _SINGLE_THREAD = {
     "VENTBENCH_THREADS": "1",
 }
 
-#: Mean number of cases after which a new process replaces an old one, whose memory grows by a MiB
-#: or two a case.
-_CASES_PER_PROCESS = 25
+#: Mean number of cases after which a new process replaces an old one. That one keeps what was
+#: compiled for each number of samples: tens of MiB a case where laboratories differ.
+_CASES_PER_PROCESS = 8
 
 #: Number of cases that this process has answered.
 _answered = 0

@@ -10,7 +10,9 @@ import pytest
 
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.physics.catalogue import paths
+from ventbench.diagnosis.settings import EstimateSettings
+from ventbench.mechanics.labels import Estimate
+from ventbench.physics.catalogue import parameter, paths
 from ventbench.system_id import make_data, parameter_values
 from ventbench.system_id.predictor import START, Predictor
 
@@ -46,3 +48,24 @@ def test_two_lags_may_change_places():
     np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)
     off = simulator.predict(parameter_values(data, simulator.names, {}))
     assert np.abs(one - off).max() > 1.0
+
+
+def test_reported_intervals_contain_an_error_of_the_form():
+    settings = EstimateSettings(form_error=0.02)
+    sharp = Estimate(0.1, "s", (0.0999, 0.1001))
+    wide = Estimate(0.1, "s", (0.05, 0.15))
+    unknown = Estimate(0.1, "s", (-np.inf, np.inf))
+    for own, low, high in (
+        (sharp, 0.1 - 1.96 * 0.002, 0.1 + 1.96 * 0.002),
+        (wide, 0.05, 0.15),
+        (unknown, -np.inf, np.inf),
+    ):
+        widened = estimates.with_form_error({"tau": own}, "sensor_lag", settings)["tau"]
+        assert (widened.value, widened.unit) == (0.1, "s")
+        assert widened.ci95 == pytest.approx((low, high), rel=0.01)
+    low, _ = estimates.with_form_error(
+        {"tau": Estimate(0.001, "s", (0.0, 0.002))}, "sensor_lag", EstimateSettings(form_error=5.0)
+    )["tau"].ci95
+    assert low == parameter("sensor_lag.tau").low  # not beyond what is possible
+    breath = {"amplitude": Estimate(2.0, "cmH2O", (1.9, 2.1))}
+    assert estimates.with_form_error(breath, "patient_effort", settings) == breath

@@ -374,7 +374,11 @@ def _missing_mechanism(
         own = estimates.parameter_estimates(simulator_model.fit, name)
     return MissingMechanism(
         name=name,
-        parameters=estimates.parameter_estimates(recording_model.fit, name),
+        parameters=estimates.with_form_error(
+            estimates.parameter_estimates(recording_model.fit, name),
+            name,
+            recording_model.evaluator.settings.estimates,
+        ),
         confidence=alternatives.confidence,
         alternatives=alternatives.names,
         nats=conclusion.held_out_gains.get(name, 0.0),

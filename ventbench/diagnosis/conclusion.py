@@ -3,7 +3,8 @@
 :func:`conclude` selects mechanisms (:mod:`ventbench.diagnosis.selection`), looks for what they
 leave unexplained with nonparametric terms and latent inputs, drops the mechanisms that this makes
 idle (:mod:`ventbench.diagnosis.refinement`), and compares the remaining ones with alternatives. If
-the valve's gain scatters between breaths, all is repeated with a gain of each breath's own.
+the valve's gain scatters between breaths, all is repeated with a gain of each breath's own, from
+the base model and from the mechanisms that were selected with one gain.
 """
 
 from __future__ import annotations

@@ -152,9 +152,9 @@ def test_simulate_refuses_bad_input(commands, tmp_path):
 
 def test_train_needs_recordings(tmp_path, monkeypatch):
     message = run("train", "simulator", "--recordings", tmp_path / "nowhere", code=2)
-    assert "nowhere contains no recordings; give --recordings DIR" in message
+    assert "nowhere is no folder; give --recordings DIR" in message
     monkeypatch.setenv("VENTBENCH_RECORDINGS", str(tmp_path / "gone"))
-    assert "no folder contains no recordings" in run("train", "simulator", code=2)
+    assert "no folder of the public recordings; give" in run("train", "simulator", code=2)
     to_train = ("train", "simulator", "--recordings", tmp_path, "--out", tmp_path / "x")
     assert "holds no recording in the public schema" in run(*to_train, code=2)
     message = run(*to_train, "--version", 1, code=2)
@@ -185,7 +185,7 @@ def test_the_program_ends_with_2_and_one_line(tmp_path):
         (("open-loop", tmp_path / "none.csv"), "no such file"),
         (
             ("train", "simulator", "--recordings", tmp_path / "nowhere", "--out", tmp_path / "out"),
-            "contains no recordings",
+            "is no folder; give --recordings DIR",
         ),
     ):
         found = program(*arguments)

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ventbench.diagnosis.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.conclusion import (
     UnnamedEffect,
     _best_input,
     _better_selection,
     _is_negligible_input,
-    _needed_terms,
     conclude,
     is_unresolved,
 )
@@ -22,6 +22,7 @@ from ventbench.diagnosis.estimates import nonparametric_term, split_form
 from ventbench.diagnosis.findings import NonparametricTerm
 from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.latent_inputs import ALVEOLUS, GAIN_SCATTER, MEASUREMENT, SUPPLY
+from ventbench.diagnosis.selection import drop_redundant_terms
 from ventbench.recordings import join
 
 from . import small
@@ -51,7 +52,8 @@ def test_mechanisms_selected_with_one_gain_are_started_from_where_gains_scatter(
     scattered = dataclasses.replace(turbulent, gain_sd=0.05)
     named, without = both
     idle = turbulent.fit(Hypothesis(("leak", "turbulent_resistance")), named.noise, named)
-    needed = _needed_terms(scattered, idle)
+    start = fit_with_noise(scattered, idle.hypothesis, idle)
+    needed = drop_redundant_terms(scattered, start, start.names)
     assert needed.names == ("turbulent_resistance",)
     assert set(needed.problem.unknowns.paths) >= {"gain"}
     usual = (scattered.fit(Hypothesis(), without.noise), [])

@@ -117,10 +117,8 @@ def recordings_folder(given: Path | None) -> Path:
 
     folder = given or recordings_dir()
     if folder is None or not folder.is_dir():
-        raise InputError(
-            f"{folder or 'no folder'} contains no recordings; give --recordings DIR or set "
-            "VENTBENCH_RECORDINGS"
-        )
+        what = "no folder of the public recordings" if folder is None else f"{folder} is no folder"
+        raise InputError(f"{what}; give --recordings DIR or set VENTBENCH_RECORDINGS")
     return folder
 
 

@@ -45,7 +45,7 @@ def proof(
     against the recordings of the six lungs; removed, the corrected R-C lungs without their most
     important mechanism, which must be named; frozen, the frozen simulators against the recordings;
     and injected, the frozen simulators against recordings with an added sensor lag of 80 ms, which
-    must be named. Takes about a quarter of an hour. Ctrl-C keeps the finished parts; the same
+    must be named. Takes about half an hour. Ctrl-C keeps the finished parts; the same
     command continues.
 
     The exit code is 1 if a claim fails.
@@ -55,12 +55,12 @@ def proof(
     from rich.console import Console
 
     from ventbench import compilation, errors
-    from ventbench.cli.options import bars
+    from ventbench.cli.options import bars, recordings_folder
     from ventbench.validation.real_rig_proof import prove
     from ventbench.validation.results_page import proof_section, write_section
 
     errors.require("jinja2", "rerun")
-    folder = _folder(recordings)
+    folder = recordings_folder(recordings)
     compilation.keep()
     with bars() as shown:
         tasks: dict[str, Any] = {}
@@ -77,16 +77,6 @@ def proof(
     _show(Console(stderr=str(json) == "-"), result)
     if not result.met:
         raise typer.Exit(1)
-
-
-def _folder(given: Path | None) -> Path:
-    from ventbench import recordings
-    from ventbench.errors import InputError
-
-    folder = given or recordings.recordings_dir()
-    if folder is None:
-        raise InputError("no folder of recordings: give --recordings DIR, with pvp_quicklung.csv")
-    return folder
 
 
 def _show(console: Any, result: Proof) -> None:

@@ -42,8 +42,8 @@ from ventbench.diagnosis.refinement import (
 from ventbench.diagnosis.screening import component_of
 from ventbench.diagnosis.selection import (
     Progress,
+    drop_redundant_terms,
     forward_selection,
-    is_needed,
     passes_heldout_test,
 )
 from ventbench.diagnosis.settings import SelectionConfig
@@ -126,11 +126,10 @@ def conclude(
     selected, comparisons = forward_selection(evaluator, base, tell, single)
     if earlier is not None and not set(earlier.names) <= set(selected.names):
         # Gains of the breaths' own can stand for a bent valve in the first rounds of a selection.
-        selected, comparisons = _better_selection(
-            evaluator,
-            (selected, comparisons),
-            forward_selection(evaluator, _needed_terms(evaluator, earlier), tell, single),
-        )
+        start = fit_with_noise(evaluator, earlier.hypothesis, earlier)
+        start = drop_redundant_terms(evaluator, start, start.names)
+        other = forward_selection(evaluator, start, tell, single)
+        selected, comparisons = _better_selection(evaluator, (selected, comparisons), other)
     tell("looking for effects that no mechanism explains")
     wide = wider()
     reduced = drop_compensating_terms(evaluator, wide, selected, tell)
@@ -185,16 +184,6 @@ def conclude(
         evaluator.gain_sd,
         unnamed is None and not selected.names and is_unresolved(evaluator, comparisons),
     )
-
-
-def _needed_terms(evaluator: Evaluator, earlier: FittedModel) -> FittedModel:
-    """A model fitted by another evaluator, fitted with this one, without terms not needed there."""
-    current = fit_with_noise(evaluator, earlier.hypothesis, earlier)
-    for name in earlier.names:
-        without = evaluator.fit(current.hypothesis.without(name), current.noise, current)
-        if not is_needed(evaluator, current, without):
-            current = fit_with_noise(evaluator, without.hypothesis, without)
-    return current
 
 
 def _better_selection(
@@ -361,7 +350,12 @@ def _best_input(
     test, limits = settings.held_out_test, settings.latent_inputs
     physical = dict(inputs)
     nuisances = physical.pop(MEASUREMENT), physical.pop(GAIN_SCATTER)
-    sensor, places = nuisances[0], tuple(place_weights(inputs.values()).items())
+    sensor = nuisances[0]
+
+    def unnamed(latent: LatentInput, gained: Floats) -> UnnamedEffect:
+        places = tuple(place_weights(inputs.values()).items())
+        return UnnamedEffect(latent.place, None, latent, float(gained.sum()), places)
+
     best = max(physical.values(), key=lambda latent: latent.training_log_likelihood)
     gained = best.held_out_log_likelihood - reference
     ahead = min(
@@ -369,11 +363,11 @@ def _best_input(
         for other in nuisances
     )
     if passes_heldout_test(gained, test, limits.threshold) and ahead > limits.threshold:
-        return UnnamedEffect(best.place, None, best, float(gained.sum()), places)
+        return unnamed(best, gained)
     gained = sensor.held_out_log_likelihood - reference
     hum = sensor.periodic and sensor.size >= limits.sensor_amplitude
     if passes_heldout_test(gained, test) and hum:
-        return UnnamedEffect(MEASUREMENT, None, sensor, float(gained.sum()), places)
+        return unnamed(sensor, gained)
     return None
 
 

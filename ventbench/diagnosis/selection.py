@@ -17,7 +17,7 @@ no pair of terms can be exchanged for one mechanism.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import combinations, product
 
@@ -249,9 +249,17 @@ def _fallback(evaluator: Evaluator, comparison: Comparison) -> FittedModel | Non
     return None
 
 
-def drop_redundant_terms(evaluator: Evaluator, current: FittedModel) -> FittedModel:
-    """Drop earlier terms that are no longer needed, or have become negligible."""
-    for name in current.hypothesis.names[:-1]:
+def drop_redundant_terms(
+    evaluator: Evaluator, current: FittedModel, names: Sequence[str] | None = None
+) -> FittedModel:
+    """Drop terms that are not needed, or negligible.
+
+    Args:
+        evaluator: evaluator of the recording.
+        current: the model.
+        names: the terms to judge; all but the newest if None.
+    """
+    for name in current.names[:-1] if names is None else names:
         without = evaluator.fit(current.hypothesis.without(name), current.noise, current)
         needed = is_needed(evaluator, current, without)
         if not needed or is_negligible(evaluator, current, without, name):

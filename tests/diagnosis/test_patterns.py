@@ -99,8 +99,15 @@ def test_a_gas_that_rings_is_named():
     ringing = effect("inertance", "library", inertance=0.13, circuit=0.9)
     named = selected("R20C50", ringing, noise=0.05)
     assert named.names == ("inertance",)
-    assert named.column("inertance.inertance")[0] == pytest.approx(0.13, rel=0.2)
-    assert named.column("inertance.tubing")[0] == pytest.approx(0.93, rel=0.2)
+    assert named.column("inertance.inertance")[0] == pytest.approx(0.13, rel=0.05)
+    assert named.column("inertance.tubing")[0] == pytest.approx(0.93, rel=0.05)
+
+
+def test_a_sensor_of_second_order_has_two_lags():
+    named = selected("R20C20", effect("sensor_lag", "second order", tau=0.1))
+    assert named.names == ("sensor_lag",)
+    assert named.column("sensor_lag.tau")[0] == pytest.approx(0.05, rel=0.3)
+    assert named.column("sensor_lag.second")[0] == pytest.approx(0.05, rel=0.3)
 
 
 def test_an_expiratory_valve_that_opens_slowly():

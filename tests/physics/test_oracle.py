@@ -18,7 +18,9 @@ from . import cases
 TOLERANCE = {
     "circuit_compliance": (0.04, 0.004),
     "exhalation_valve_delay": (0.04, 0.008),
-    "inertance": (0.1, 0.02),
+    "inertance": (0.01, 0.002),
+    # Rings at 30 Hz; without smaller steps the error is 0.1 in the mean.
+    "inertance.tubing": (0.05, 0.01),
     # The power is rounded off at small flow, where one below 1.75 is steep.
     "exhalation_valve_delay.slow": (0.04, 0.008),
     "turbulent_resistance.exponent": (0.008, 0.003),
@@ -44,6 +46,8 @@ def test_each_mechanism(name, level, predicted):
     ("path", "value"),
     [
         ("valve_lag.second", 0.06),
+        ("sensor_lag.second", 0.06),
+        ("inertance.tubing", 0.5),
         ("turbulent_resistance.exponent", 1.75),
         ("turbulent_resistance.exponent", 1.5),
         ("valve_hysteresis.give", 1.0),

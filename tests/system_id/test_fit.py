@@ -53,6 +53,16 @@ def test_recovers_its_parameters(name):
     assert without.bic > found.bic + 6.0
 
 
+def test_gas_that_rings_is_found_in_full():
+    """At 7 ms a step the integrator damps the ringing, and a fit finds 15 % too little."""
+    m = {"inertance": {"inertance": 0.06, "tubing": 0.5}}
+    data = make_data(cases.recording(BREATHS, m, R=5.0, C=50.0, noise=0.05, seed=7))
+    near = {"inertance.inertance": 0.05, "inertance.tubing": 0.45}
+    fitted = fit(data, m, start=near)
+    assert fitted.value("inertance.inertance")[0] == pytest.approx(0.06, rel=0.03)
+    assert fitted.value("inertance.tubing")[0] == pytest.approx(0.5, rel=0.03)
+
+
 def test_dead_time_has_a_profile():
     """Two and a half samples: flat between walls, where the curvature would promise too much."""
     m = cases.strengths("valve_delay")

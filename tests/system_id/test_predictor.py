@@ -10,6 +10,7 @@ import pytest
 from tests.physics import cases
 from ventbench.physics import parameter, paths
 from ventbench.precision import float64
+from ventbench.rollouts import open_loop
 from ventbench.system_id import START, Predictor, make_data, parameter_values
 from ventbench.system_id import predictor as predictor_module
 
@@ -58,7 +59,8 @@ def exact(predictor):
     def slope(values, direction):
         def run(values):
             static = predictor._static | {"skip_idle": False}
-            return predictor_module._run(values, commands, **static)
+            divisions = 4  # an inertance acts
+            return predictor_module._run(values, commands, divisions, **static)
 
         return jax.jvp(run, (values,), (jnp.broadcast_to(direction, values.shape),))[1]
 
@@ -124,3 +126,26 @@ def test_several_points_are_each_by_itself(predictor, values, count):
     alone = np.stack([predictor.predict(point) for point in points])
     np.testing.assert_allclose(predictor.predict_all(points), alone, rtol=0, atol=1e-10)
     assert count == 1 or np.abs(np.diff(alone, axis=0)).max() > 0.01
+
+
+def test_points_that_ring_are_each_by_themselves(predictor, values):
+    """They take smaller steps, and the others of the same call do not."""
+    points = np.repeat(values[None], 3, axis=0)
+    points[::2, :, ORDER.index("inertance.inertance")] = 0.0
+    points[:, 0, ORDER.index("inertance.inertance")] = 0.0  # one breath of each
+    alone = np.stack([predictor.predict(point) for point in points])
+    np.testing.assert_allclose(predictor.predict_all(points), alone, rtol=0, atol=1e-10)
+    assert np.abs(alone[1] - alone[0]).max() > 0.01
+
+
+def test_a_plant_predicts_what_the_predictor_does(predictor, values, data):
+    """Of a rig that rings, too."""
+    row = values[0].copy()
+    row[ORDER.index("inertance.tubing")] = 0.5
+    plant = predictor.plant(dict(zip(ORDER[:-1], row[:-1], strict=True)))
+    assert plant.divisions > 1
+    with float64():
+        commands = (data.u_in[:1], data.u_out[:1], data.dt[:1])
+        pressure = open_loop(plant, *(jnp.asarray(x) for x in (row[-1:], *commands)))
+    seen = predictor.predict(np.repeat(row[None], len(data), axis=0))[0, 0]
+    np.testing.assert_allclose(np.asarray(pressure)[0], seen, rtol=0, atol=1e-9)

@@ -27,9 +27,7 @@ from ventbench.physics.catalogue import (
     strength_path,
 )
 from ventbench.physics.component_curves import component_curves, without_absorbed
-from ventbench.physics.model import Physics
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
-from ventbench.precision import float64
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import ConfidenceInterval, Fit, fit, interval, profile_interval
 from ventbench.system_id.data import Data, Floats
@@ -224,10 +222,8 @@ def _by_label(
     result: dict[str, Plant] = {}
     for R, C in np.unique(np.stack([data.R, data.C], axis=1), axis=0):
         breath = int(np.flatnonzero((data.R == R) & (data.C == C))[0])
-        with float64():
-            given = dict(zip(names, values[breath, columns], strict=True))
-            plant = Physics((), (), predictor.substeps, predictor.memory).having(**given)
-        result[f"R{R:g}C{C:g}"] = plant
+        given = dict(zip(names, values[breath, columns], strict=True))
+        result[f"R{R:g}C{C:g}"] = predictor.plant(given)
     return result
 
 

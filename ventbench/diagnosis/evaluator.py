@@ -81,19 +81,19 @@ def fit(
     if restart:
         x = delay_restarts(problem, x, settings)
     x = breath_term(hypothesis.names, settings).start(problem, x, before, refit=restart)
+    tolerance = settings.fit.tolerance if tolerance is None else tolerance
+    iterations = settings.fit.iterations if iterations is None else iterations
+    x = problem.smoothed_start(x, tolerance=tolerance, iterations=iterations)
     minimum = minimise(
-        problem.cost, problem.normal, x, low, high,
-        tolerance=settings.fit.tolerance if tolerance is None else tolerance,
-        iterations=settings.fit.iterations if iterations is None else iterations,
-    )  # fmt: skip
+        problem.cost, problem.normal, x, low, high, tolerance=tolerance, iterations=iterations
+    )
     for _ in range(settings.fit.delay_rounds if delay_rounds is None else delay_rounds):
         beyond = _beyond_the_cliff(problem, minimum, settings)
         if beyond is None:
             break
         other = minimise(
-            problem.cost, problem.normal, beyond, low, high,
-            tolerance=settings.fit.tolerance if tolerance is None else tolerance,
-            iterations=settings.fit.iterations if iterations is None else iterations,
+            problem.cost, problem.normal, beyond, low, high, tolerance=tolerance,
+            iterations=iterations,
         )  # fmt: skip
         if other.cost >= minimum.cost:
             break

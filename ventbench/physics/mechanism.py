@@ -96,6 +96,9 @@ class Mechanism:
     stateful: bool = False
     #: True if it keeps a memory from sample to sample, which starts as the resting command.
     has_memory: bool = False
+    #: Steps of the integrator in a substep that a fit needs where the mechanism acts. One that
+    #: rings needs several, or the method damps what the rig does not.
+    divisions: int = 1
     #: True if its effect depends on the position of the breath in the recording.
     uses_position: bool = False
 

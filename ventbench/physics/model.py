@@ -63,6 +63,7 @@ class Physics:
             if any of its parameters is named; at its neutral strength it changes nothing.
         substeps: number of substeps in a sample.
         memory: number of past samples that a dead time can reach back over.
+        divisions: steps of the integrator in a substep.
         skip_idle: skip mechanisms whose parameters are neutral in all elements. This is much faster
             where few of many are active; derivatives by the parameters of the others are zero.
     """
@@ -72,6 +73,7 @@ class Physics:
     substeps: int = flax.struct.field(pytree_node=False, default=dead_time.SUBSTEPS)
     memory: int = flax.struct.field(pytree_node=False, default=dead_time.MEMORY)
     skip_idle: bool = flax.struct.field(pytree_node=False, default=False)
+    divisions: int = flax.struct.field(pytree_node=False, default=1)
 
     def init(self, pressure: Array, peep: Array | None = None) -> PhysicsState:
         """Lung at rest, expiratory valve open; see :class:`~ventbench.interfaces.Plant`.
@@ -104,7 +106,12 @@ class Physics:
         return after, seen[0]
 
     def observe(
-        self, state: PhysicsState, u_in: Array, u_out: Array, dt: Array
+        self,
+        state: PhysicsState,
+        u_in: Array,
+        u_out: Array,
+        dt: Array,
+        divisions: int | Array | None = None,
     ) -> tuple[PhysicsState, tuple[Array, Array, Array]]:
         """Hold one command, and return flow and volume besides pressure.
 
@@ -113,12 +120,14 @@ class Physics:
             u_in: inspiratory valve, 0..100 %.
             u_out: expiratory valve, 0 closed, 1 open.
             dt: time for which the command is held, s.
+            divisions: steps of the integrator in a substep; the model's own if not given.
 
         Returns:
             The next state; measured airway pressure, cmH2O, flow into the lung, mL/s, and volume
             above that of the first sample, mL, all at the end of ``dt``.
         """
         assembly = self._assembly()
+        divisions = self.divisions if divisions is None else divisions
         zero = jnp.zeros_like(state.time)
         flow, memory = solver.commanded(assembly, u_in + zero, state.memory)
         commanded = _push(flow, state.commanded)
@@ -134,14 +143,18 @@ class Physics:
             self.skip_idle,
         )
 
-        def substep(carry: tuple[Any, Array], held: tuple[Array, ...]) -> tuple[Any, None]:
-            (now, time), (commanded_flow, opened, h) = carry, held
-            now = solver.substep(assembly, now, commanded_flow, opened, time, h, state.peep)
-            return (now, time + h), None
+        held = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), (commanded_flow, open_for, lengths))
+
+        def advance(k: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:
+            now, time = carry
+            commanded_flow, opened, h = jax.tree.map(lambda x: x[k // divisions], held)
+            part = h / divisions
+            now = solver.substep(assembly, now, commanded_flow, opened, time, part, state.peep)
+            return now, time + part
 
         # As a loop: unrolled, XLA compiles for minutes and repeats computations.
-        held = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), (commanded_flow, open_for, lengths))
-        (now, time), _ = jax.lax.scan(substep, (state.continuous, state.time), held)
+        count = divisions * len(held[0])
+        now, time = jax.lax.fori_loop(0, count, advance, (state.continuous, state.time))
         after = PhysicsState(
             now, memory, commanded[..., :-1], opened[..., :-1],
             _push(dt + zero, state.past)[..., :-1], time, state.first, state.peep,

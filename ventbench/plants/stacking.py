@@ -98,6 +98,7 @@ def _physics_with_equal_parameters(plants: list[Physics]) -> list[Physics]:
     names = list(dict.fromkeys(name for plant in plants for name in plant.names))
     substeps = max(plant.substeps for plant in plants)
     memory = max(plant.memory for plant in plants)
+    divisions = max(plant.divisions for plant in plants)
     completed = []
     for plant in plants:
         # One that has no PEEP takes the pressure that it starts from, which no number can say.
@@ -107,7 +108,11 @@ def _physics_with_equal_parameters(plants: list[Physics]) -> list[Physics]:
         with precision.float64():
             full = plant.having(**{name: plant.get(name) for name in missing})
         values = tuple(np.asarray(value) for value in full.values)
-        completed.append(dataclasses.replace(full, values=values, substeps=substeps, memory=memory))
+        completed.append(
+            dataclasses.replace(
+                full, values=values, substeps=substeps, memory=memory, divisions=divisions
+            )
+        )
     return completed
 
 

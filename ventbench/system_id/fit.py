@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from ventbench.physics.catalogue import library, mechanism, paths
 from ventbench.physics.model import Physics
-from ventbench.precision import float64
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
 from ventbench.system_id.noise import Noise, robust_noise
@@ -98,11 +97,7 @@ class Fit:
         """The fitted model as a plant in float64: of one breath, or stacked over breaths."""
         names = [name for name in paths(self.mechanisms) if name != "position"]
         names += ["position"] if any(mechanism(m).uses_position for m in self.mechanisms) else []
-        predictor = self.problem.predictor
-        with float64():
-            given = {name: self.column(name)[breath] for name in names}
-            plant = Physics((), (), predictor.substeps, predictor.memory).having(**given)
-        return plant
+        return self.problem.predictor.plant({name: self.column(name)[breath] for name in names})
 
 
 def fit(
@@ -190,6 +185,7 @@ def _label_mean(fitted: Fit, data: Data, path: str) -> Floats:
 def _descend(problem: Problem, x: Floats, iterations: int) -> Minimum:
     """Search from one start."""
     low, high = problem.unknowns.bounds()
+    x = problem.smoothed_start(x, iterations=iterations)
     return minimise(problem.cost, problem.normal, x, low, high, iterations=iterations)
 
 

@@ -6,12 +6,15 @@ has its neutral value where a hypothesis leaves it out.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from copy import copy
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike, NDArray
 
 from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import mechanism, parameter
@@ -20,6 +23,8 @@ from ventbench.physics.mechanism import Mechanism
 from ventbench.physics.model import Physics
 from ventbench.precision import float64
 from ventbench.system_id.data import Data, Floats
+
+Ints = NDArray[np.int_]
 
 #: Path of the reading that a breath starts from, cmH2O; it is no parameter of the model.
 START = "start"
@@ -46,6 +51,10 @@ _STEP_START = 1e-6
 #: edge. That changes the integration error by up to 0.03 cmH2O, which must not make a slope.
 _STEP_DEAD_TIME = 1e-3
 
+#: Strength from which a mechanism counts as acting: above the step of a difference quotient from
+#: zero, both ends of which must be integrated alike.
+_ACTS = 1e-6
+
 _STATIC = ("names", "substeps", "memory", "flow", "skip_idle")
 
 #: Both valves, %, 0/1, and the time for which they are held, s, each ``(n, T)``.
@@ -53,7 +62,7 @@ Commands = tuple[Array, Array, Array]
 
 
 def _run(
-    values: Array, commands: Commands, names: tuple[str, ...], substeps: int,
+    values: Array, commands: Commands, divisions: Array, names: tuple[str, ...], substeps: int,
     memory: int, flow: bool, skip_idle: bool,
 ) -> Array:  # fmt: skip
     plant = Physics(
@@ -61,7 +70,7 @@ def _run(
     )
 
     def step(state: object, command: tuple[Array, Array, Array]) -> tuple[object, Array]:
-        state, (pressure, flow_in, _) = plant.observe(state, *command)  # type: ignore[arg-type]
+        state, (pressure, flow_in, _) = plant.observe(state, *command, divisions)  # type: ignore[arg-type]
         return state, jnp.stack([pressure, flow_in] if flow else [pressure])
 
     start = values[..., -1]
@@ -72,8 +81,14 @@ def _run(
 
 
 @partial(jax.jit, static_argnames=_STATIC)
-def _predict(points: Array, commands: Commands, **static: object) -> Array:
-    return _run(points, commands, **static)  # type: ignore[arg-type]
+def _predict(points: Array, commands: Commands, divisions: Array, **static: object) -> Array:
+    return _run(points, commands, divisions, **static)  # type: ignore[arg-type]
+
+
+def needs_small_steps(path: str) -> bool:
+    """Whether a parameter belongs to a mechanism that needs several steps in a substep."""
+    owner = path.rpartition(".")[0]
+    return bool(owner) and mechanism(owner).divisions > 1
 
 
 class Predictor:
@@ -107,7 +122,7 @@ class Predictor:
                 last are divided into blocks of that size.
         """
         self.names = names
-        self._count = len(data)
+        self._count, self._large_steps = len(data), False
         self._part = next((size for size in sizes if size >= len(data)), sizes[-1])
         parts = max(-(-len(data) // self._part), 1)
         padded = data.padded(parts * self._part)
@@ -127,6 +142,13 @@ class Predictor:
             )
         self._commands: list[Commands] = list(zip(u_in, u_out, dt, strict=True))
 
+    @property
+    def with_large_steps(self) -> Predictor:
+        """The same with one step of the integrator in each substep, whatever acts."""
+        other = copy(self)
+        other._large_steps = True
+        return other
+
     def predict(self, values: Floats) -> Floats:
         """Predicted measurements, ``(n, c, T)``, at physical values ``(n, P + 1)``."""
         return self.predict_all(values[None])[0]
@@ -136,23 +158,39 @@ class Predictor:
         parts = len(self._commands)
         extra = parts * self._part - self._count  # padding breaths
         points = np.concatenate([points, np.repeat(points[:, :1], extra, axis=1)], axis=1)
-        groups = _groups(len(points))
+        divisions = self._divisions(points)
+        groups = [
+            (np.flatnonzero(divisions == count)[first:last], width, count)
+            for count in np.unique(divisions)
+            for first, last, width in _groups(int((divisions == count).sum()))
+        ]
         work = [
-            (np.resize(some, (width, *some.shape[1:])), commands)
-            for first, last, width in groups
+            (np.resize(some, (width, *some.shape[1:])), commands, count)
+            for where, width, count in groups
             for some, commands in zip(
-                np.split(points[first:last], parts, axis=1), self._commands, strict=True
+                np.split(points[where], parts, axis=1), self._commands, strict=True
             )
         ]
 
-        def predicted(place: tuple[Floats, Commands]) -> Floats:
+        def predicted(place: tuple[Floats, Commands, int]) -> Floats:
             with float64():
-                return np.asarray(_predict(jnp.asarray(place[0]), place[1], **self._static))
+                return np.asarray(
+                    _predict(jnp.asarray(place[0]), place[1], jnp.asarray(place[2]), **self._static)
+                )
 
         seen = parallel_map(predicted, work)
         rows = [np.concatenate(seen[k : k + parts], axis=1) for k in range(0, len(seen), parts)]
-        kept = [row[: last - first] for row, (first, last, _) in zip(rows, groups, strict=True)]
-        return np.concatenate(kept)[:, : self._count]
+        answers = np.empty((len(points), *rows[0].shape[1:]))
+        for row, (where, _, _) in zip(rows, groups, strict=True):
+            answers[where] = row[: len(where)]
+        return answers[:, : self._count]
+
+    def plant(self, values: Mapping[str, ArrayLike]) -> Physics:
+        """The model at values by path, as a plant in float64 that predicts what this one does."""
+        acting = [_divisions_at(path, np.asarray(value)) for path, value in values.items()]
+        with float64():
+            plant = Physics((), (), self.substeps, self.memory, divisions=max([1, *acting]))
+            return plant.having(**values)
 
     def derivatives(self, values: Floats, columns: tuple[int, ...]) -> tuple[Floats, Floats]:
         """Predictions, and their derivatives with respect to k columns, ``(n, k, c, T)``.
@@ -176,6 +214,16 @@ class Predictor:
         changes[off] = 0.5 * (ahead[off] - behind)
         return seen[0], np.moveaxis(changes / moves[:, :, None, None], 0, 1)
 
+    def _divisions(self, points: Floats) -> Ints:
+        """Steps of the integrator in a substep that each point needs, ``(m,)``."""
+        if self._large_steps:
+            return np.ones(len(points), int)
+        needed = [
+            [_divisions_at(name, point[:, k]) for k, name in enumerate(self.names)]
+            for point in points
+        ]
+        return np.max(needed, axis=1, initial=1)
+
     def _is_off(self, values: Floats, column: int) -> bool:
         """Whether a parameter of a mechanism that may have either sign is at its neutral value."""
         if column == len(self.names) or "." not in self.names[column]:
@@ -197,6 +245,16 @@ class Predictor:
         if definition.kinked:
             move = np.where(values == definition.neutral, _STEP_DEAD_TIME, move)
         return np.where(values + move > definition.high, -move, move)
+
+
+def _divisions_at(path: str, values: Floats) -> int:
+    """Steps of the integrator in a substep that a parameter needs at these values."""
+    if not needs_small_steps(path):
+        return 1
+    owner, _, short = path.rpartition(".")
+    strength = mechanism(owner).description.parameters[0]
+    acts = short == strength.name and np.any(np.abs(values - strength.neutral) > _ACTS)
+    return mechanism(owner).divisions if acts else 1
 
 
 def _has_dead_time(path: str) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,8 +13,9 @@ from ventbench.errors import InputError
 from ventbench.physics.catalogue import mechanism, parameter, paths, strength_path
 from ventbench.physics.parameters import REFITTED, Parameter
 from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.levenberg_marquardt import minimise
 from ventbench.system_id.noise import Noise
-from ventbench.system_id.predictor import START, Predictor
+from ventbench.system_id.predictor import START, Predictor, needs_small_steps
 
 #: The starting pressure of a breath as a parameter.
 _START = Parameter(
@@ -242,6 +243,26 @@ class Problem:
         hessian = np.diag(self.precision)
         np.add.at(hessian, (index[:, :, None], index[:, None, :]), curvature)
         return cost, gradient, hessian
+
+    def smoothed_start(self, x: Floats, *, tolerance: float = 1e-3, iterations: int = 40) -> Floats:
+        """Where a search should start: ``x``, or a better point that larger steps lead to.
+
+        The cost of a model that rings has many local minima. With larger steps the integrator damps
+        the ringing, and most of these minima are gone.
+
+        Args:
+            x: start, ``(U,)``.
+            tolerance: see :func:`~ventbench.system_id.levenberg_marquardt.minimise`.
+            iterations: most evaluations of the normal equations.
+        """
+        if not any(needs_small_steps(path) for path in self.unknowns.paths):
+            return x
+        smooth = replace(self, predictor=self.predictor.with_large_steps)
+        low, high = self.unknowns.bounds()
+        other = minimise(
+            smooth.cost, smooth.normal, x, low, high, tolerance=tolerance, iterations=iterations
+        ).x
+        return other if self.cost(other) < self.cost(x) else x
 
     def _residual(self, seen: Floats) -> Floats:
         return np.where(self.data.weight > 0, seen - self.data.measured, 0.0)

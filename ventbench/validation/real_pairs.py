@@ -411,16 +411,11 @@ def _diagnosed(pair: Pair, material: Material) -> Answered:
 def fitted_plant(breaths: Breaths) -> Physics:
     """The plant of one lung, fitted with what the PVP rigs are known to have."""
     from ventbench.physics.catalogue import paths
-    from ventbench.precision import float64
     from ventbench.system_id import fit, make_data
 
     fitted = fit(make_data(breaths), list(_KNOWN))
     names = [path for path in paths(_KNOWN) if path != "position"]
-    predictor = fitted.problem.predictor
-    with float64():
-        return Physics((), (), predictor.substeps, predictor.memory).having(
-            **{name: float(fitted.column(name)[0]) for name in names}
-        )
+    return fitted.problem.predictor.plant({name: float(fitted.column(name)[0]) for name in names})
 
 
 def _lung_of(breaths: Breaths) -> Lung:

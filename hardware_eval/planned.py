@@ -182,8 +182,8 @@ def plan_controller(plant: Plant, pips: tuple[float, ...]) -> PlannedController:
     with precision.float64():
         cells = env.nominal_scenario(np.asarray(pips))
         cells = cells.replace(noise=np.zeros((n, 1, 1)))  # type: ignore[attr-defined]
-        one = jax.tree.map(lambda leaf: np.asarray(leaf, float), plant)
-        stacked = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (n, *np.shape(leaf))), one)
+        wide = jax.tree.map(lambda leaf: np.asarray(leaf, float), plant)
+        stacked = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (n, *np.shape(leaf))), wide)
         state = jax.vmap(type(plant).init)(stacked, cells.start, cells.peep)
         for turn in range(1 + BREATHS):
             breathing = _Breathing(stacked, state)
@@ -197,7 +197,7 @@ def plan_controller(plant: Plant, pips: tuple[float, ...]) -> PlannedController:
                 cells = cells.replace(start=start)  # type: ignore[attr-defined]
         gains = np.array(list(itertools.product(P_GAINS, I_GAINS)))
         departing = _departing(pips, np.asarray(cells.start), np.array(DEPARTURES))
-        error = np.asarray(_errors(one, state, departing, commands, pressures, gains))
+        error = np.asarray(_errors(wide, state, departing, commands, pressures, gains))
     # An error that is not finite is that of a loop that has blown up.
     mean = np.where(np.isfinite(error), error, np.inf).mean(axis=(1, 2))
     chosen = int(np.argmin(mean))

@@ -59,9 +59,9 @@ def headroom(
     plants, cells = rigs.cells(drawn, protocol.PIPS)
     about = references.settings(rigs.about, drawn.about())
     if check is not None:
-        found = references.load(check)
-        references.reference_of(rigs.about, drawn.about(), found)
-        result = references.checked(found, plants, cells, every=_EVERY)
+        computed = references.load(check)
+        references.reference_of(rigs.about, drawn.about(), computed)
+        result = references.checked(computed, plants, cells, every=_EVERY)
         emit(result, json)
         for key, value in result.items():
             console.print(f"{key}: {value}", highlight=False)
@@ -79,7 +79,7 @@ def headroom(
             gains = references.published().gains
         task = progress.add_task("best attainable", total=None)
         with executor(workers, scheduler) as pool:
-            found = references.compute(
+            computed = references.compute(
                 plants,
                 cells,
                 gains,
@@ -88,16 +88,16 @@ def headroom(
                 pool=pool,
                 progress=lambda done, all_: progress.update(task, completed=done, total=all_),
             )
-    sha256 = found.save(out)
+    sha256 = computed.save(out)
     shutil.rmtree(parts)  # they are in the file now
     summary = {
         "file": str(out),
         "sha256": sha256,
-        "gains": found.gains.tolist(),
-        "attainable": float(found.attainable.mean()),
-        "lower": float(found.lower.mean()),
-        "pid": float(found.pid.mean()),
-        "largest_gap": float(np.max(found.attainable - found.lower)),
+        "gains": computed.gains.tolist(),
+        "attainable": float(computed.attainable.mean()),
+        "lower": float(computed.lower.mean()),
+        "pid": float(computed.pid.mean()),
+        "largest_gap": float(np.max(computed.attainable - computed.lower)),
     }
     emit(summary, json)
     console.print(

@@ -213,7 +213,7 @@ def without_name(
         wide: evaluator of ``conclusion.full``.
     """
     named = conclusion.named
-    evaluator, wide = (replace(one, gain_sd=conclusion.gain_sd) for one in (evaluator, wide))
+    evaluator, wide = (replace(each, gain_sd=conclusion.gain_sd) for each in (evaluator, wide))
     left = fit_with_noise(evaluator, named.hypothesis.without(name), named)
     full = left
     if conclusion.unnamed is not None and conclusion.unnamed.term is not None:

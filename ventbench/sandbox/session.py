@@ -148,8 +148,8 @@ class SandboxSession:
     ) -> tuple[dict[int, Outcome], set[int]]:
         self._pipes.send(frames)
         late = set(self._live)
-        found = self._pipes.collect(late, self._sequence, kind, patience_s, self._deadline)
-        return found, late
+        outcomes = self._pipes.collect(late, self._sequence, kind, patience_s, self._deadline)
+        return outcomes, late
 
     def _judge(self, cell: int, outcome: Outcome) -> Failure | None:
         """End a cell that has failed."""

@@ -197,8 +197,8 @@ def step_through(
     count = draws.nominal_pip.shape[1]
     parts, failures = [], {}
     for draw in range(count):
-        one = _only(draws, draw)
-        arrays, failed = _batch(one, conditions, runner, submission)
+        drawn = _only(draws, draw)
+        arrays, failed = _batch(drawn, conditions, runner, submission)
         parts.append(arrays)
         for cell, failure in failed.items():
             condition, lung = divmod(cell, len(draws.lungs))

@@ -204,11 +204,11 @@ def _each_apart(folder: Path) -> tuple[Finding, ...]:
     for check in _CHECKS:
         try:
             function = "ventbench.submissions.review:findings_as_json"
-            found = read_apart(function, folder, [check])
+            answer = read_apart(function, folder, [check])
         except UnreadableError as error:
             group = check if check in ("manifest", "files") else "source"
             advice = "make its files smaller and plainer"
             findings.append(Finding(group, "the folder", str(error), advice))  # type: ignore[arg-type]
             continue
-        findings += [Finding(**finding) for finding in found]
+        findings += [Finding(**finding) for finding in answer]
     return tuple(findings)

@@ -301,10 +301,10 @@ def _added(pair: Pair, material: Material) -> Answered:
     given = breaths
     if pair.strength:
         given = (with_leak if pair.kind == "leak" else slower_sensor)(breaths, pair.strength)
-    found = identify(given)[0]
+    lung = identify(given)[0]
     wanted = _NAMES[pair.kind]
     before = {term.name: term for term in material.mechanics(pair.first).terms}
-    terms = {term.name: term for term in found.terms}
+    terms = {term.name: term for term in lung.terms}
     value, interval = None, None
     if wanted in terms:
         estimate = next(iter(terms[wanted].parameters.values()))

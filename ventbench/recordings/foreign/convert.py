@@ -299,13 +299,13 @@ def _time(
 ) -> tuple[Floats, str]:
     """Time of each row, s; NaN where the file leaves it blank."""
     if rate is None and time is None:
-        found = {k: v for k, v in table.scalars.items() if k.lower().split(".")[-1] in _RATES}
-        if not found:
+        rates = {k: v for k, v in table.scalars.items() if k.lower().split(".")[-1] in _RATES}
+        if not rates:
             raise InputError(
                 f"{table.file}: no column is the time; say which with --map NAME=time, or give "
                 "the sampling rate with --rate 50"
             )
-        name, rate = next(iter(found.items()))
+        name, rate = next(iter(rates.items()))
         return np.arange(len(table)) / rate, f"Sampling rate {rate:g} Hz, from {name}."
     if rate is not None:
         if rate <= 0:

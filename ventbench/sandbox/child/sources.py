@@ -136,9 +136,10 @@ def imported_packages(folder: str) -> list[str]:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                found = list(imports(ast.parse(path.read_bytes(), name).body))
+                statements = list(imports(ast.parse(path.read_bytes(), name).body))
         except (SyntaxError, ValueError, RecursionError, MemoryError, OSError):
             continue
-        packages |= {one.module.partition(".")[0] for one in found if not one.level}
-        waiting += [file for one in found for file in module_files(one, name)]
+        absolute = [statement.module for statement in statements if not statement.level]
+        packages |= {module.partition(".")[0] for module in absolute}
+        waiting += [file for statement in statements for file in module_files(statement, name)]
     return sorted(packages)

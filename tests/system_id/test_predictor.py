@@ -59,19 +59,19 @@ def exact(predictor):
     def slope(values, direction):
         def run(values):
             static = predictor._static | {"skip_idle": False}
-            divisions = 4  # an inertance acts
+            divisions = jnp.asarray(4)  # an inertance acts
             return predictor_module._run(values, commands, divisions, **static)
 
         return jax.jvp(run, (values,), (jnp.broadcast_to(direction, values.shape),))[1]
 
-    def found(values, column):
+    def slopes(values, column):
         direction = np.zeros(len(ORDER))
         direction[column] = 1.0
         padded = np.resize(values, (predictor._part, len(ORDER)))
         with float64():
             return np.asarray(slope(jnp.asarray(padded), jnp.asarray(direction)))[: len(values)]
 
-    return found
+    return slopes
 
 
 @pytest.mark.slow

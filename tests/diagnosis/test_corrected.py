@@ -54,6 +54,7 @@ def something(pressure: np.ndarray, plant: dict[str, Plant]) -> Any:
 def fake(monkeypatch) -> None:
     """No fits: the refitted model is the simulator's own."""
     monkeypatch.setattr(module, "refit_base_parameters", lambda *_: None)
+    monkeypatch.setattr(module, "_least_error_model", lambda *_: None)
     monkeypatch.setattr(module.estimates, "plants_of", lambda fitted, evaluator: plants(R=25.0))
 
 
@@ -140,6 +141,27 @@ def test_a_simulator_that_would_err_more_is_left_as_it_is(breaths, fake, worse):
         np.testing.assert_allclose(
             load_simulators(one.plants).pressures(breaths), before, atol=1e-9
         )
+
+
+@pytest.mark.parametrize("share", [0.5, 0.99])
+def test_any_simulator_is_corrected_for_the_least_error(breaths, fake, monkeypatch, share):
+    given, own, other = plants(R=10.0), plants(R=20.0), plants(R=30.0)
+    before = load_simulators(given).pressures(breaths)
+    error = breaths.pressure - before
+    reported, least = before + 0.8 * error, before + (1.0 - 0.2 * share) * error
+    identified = something(reported, other)
+    identified.evaluator.settings = DEFAULT
+    identified.pressures = lambda fitted, data, first: least if fitted == "again" else reported
+    monkeypatch.setattr(module, "_least_error_model", lambda *_: "again")
+    correction = correct(
+        breaths, make_data(breaths), split(breaths), before, identified,
+        something(before, own), load_simulators(given),
+    )  # fmt: skip
+    again = share < DEFAULT.correction.drift_ratio
+    np.testing.assert_allclose(correction.pressures["after"], least if again else reported)
+    plant: Any = correction.plants[small.LABEL]
+    assert float(plant.with_mechanisms.get("R")) == (25.0 if again else 30.0)
+    assert any("least open-loop error" in note for note in correction.notes) is again
 
 
 def test_a_correction_that_helps_its_own_breaths_alone_is_not_chosen(breaths, fake):

@@ -103,6 +103,13 @@ def test_a_gas_that_rings_is_named():
     assert named.column("inertance.tubing")[0] == pytest.approx(0.93, rel=0.05)
 
 
+def test_a_sensor_of_second_order_has_two_lags():
+    named = selected("R20C20", effect("sensor_lag", "second order", tau=0.1))
+    assert named.names == ("sensor_lag",)
+    assert named.column("sensor_lag.tau")[0] == pytest.approx(0.05, rel=0.3)
+    assert named.column("sensor_lag.second")[0] == pytest.approx(0.05, rel=0.3)
+
+
 def test_an_expiratory_valve_that_opens_slowly():
     """Not a dead time, and no ringing gas either."""
     named = selected("R20C50", effect("exhalation_valve_delay", "slow opening", opening=0.09))

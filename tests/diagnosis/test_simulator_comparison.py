@@ -11,13 +11,17 @@ import pytest
 
 from ventbench import precision
 from ventbench.diagnosis import estimates
-from ventbench.diagnosis.identification import held_out, identify
+from ventbench.diagnosis.candidate_comparison import fit_with_noise
+from ventbench.diagnosis.conclusion import Conclusion
+from ventbench.diagnosis.hypothesis import Hypothesis
+from ventbench.diagnosis.identification import IdentifiedModel, held_out, identify
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.diagnosis.simulator_comparison import (
     identify_both,
     missing_mechanisms,
     refit_at_simulator_parameters,
     refit_base_parameters,
+    with_mechanisms_of,
     with_sensor_noise,
 )
 from ventbench.lungs import lung
@@ -123,6 +127,29 @@ def strange(breaths: Breaths) -> np.ndarray:
     return 1.5 * (np.sin(6.0 * breaths.time + phase) - np.sin(phase))
 
 
+def test_a_simulator_is_described_by_the_recordings_mechanisms_that_it_needs():
+    valve = small.effect("valve_curve", loss=0.4)
+    both = [small.effect(NAME, quadratic=10.0), valve]
+    evaluator = small.split(small.made(*both, seed=1))
+
+    def identified(*names: str) -> Any:
+        full = fit_with_noise(evaluator, Hypothesis(names))
+        conclusion = Conclusion(full, full, full, None, full.noise, {}, {})
+        return IdentifiedModel(evaluator, conclusion, None, evaluator.training)  # type: ignore[arg-type]
+
+    stopped_short, recording = identified(), identified(NAME, "valve_curve", "sensor_lag")
+    simulator = with_mechanisms_of(stopped_short, recording)
+    assert set(simulator.conclusion.names) == {NAME, "valve_curve"}
+    assert simulator.conclusion.full is simulator.conclusion.named
+    fitted = simulator.conclusion.full
+    assert fitted.column(f"{NAME}.quadratic")[0] == pytest.approx(10.0, rel=0.2)
+    assert fitted.column("valve_curve.loss")[0] == pytest.approx(0.4, rel=0.2)
+    assert simulator.fit.problem.unknowns.paths
+    # Nothing is added that the simulator has, or that it does not need.
+    assert with_mechanisms_of(simulator, simulator) is simulator
+    assert with_mechanisms_of(simulator, identified("sensor_lag")) is simulator
+
+
 @pytest.mark.slow  # three conclusions
 def test_what_recording_and_simulator_share_is_no_mismatch():
     effect = small.made(small.effect(NAME, quadratic=10.0))
@@ -147,7 +174,7 @@ def test_what_recording_and_simulator_share_is_no_mismatch():
     assert recording_model.conclusion.noise.sigma[0] < 0.5 * alone.conclusion.noise.sigma[0]
     assert recording_model.conclusion.noise.sigma[0] == pytest.approx(0.2, rel=0.2)
     steady = refit_at_simulator_parameters(
-        recording_model, simulator_model, [NAME, "circuit_compliance"]
+        data, held, before, recording_model, simulator_model, [NAME, "circuit_compliance"]
     )
     assert steady is not None, "nothing but the effect asks for another lung"
     recording_model, names = steady

@@ -57,7 +57,7 @@ class Breath:
         loss = self.get("supply_pressure", "loss")
         self.source = 30 / (1 - (1 - loss) ** 2) if loss else np.inf
         self.lag, self.second = self.get("valve_lag", "tau"), self.get("valve_lag", "second")
-        self.slow = self.get("sensor_lag", "tau")
+        self.slow, self.filter = self.get("sensor_lag", "tau"), self.get("sensor_lag", "second")
         self.opening, self.opened_at = 0.0, 0.0  # lag of the expiratory valve, and when it opens
         self.ratio, self.relax = self.get("viscoelasticity", "ratio"), 1.0
         if self.ratio:
@@ -80,7 +80,7 @@ class Breath:
 
     def balance(self, t, y, wanted, opened):
         """Flow of the valve against the airway and against none, into the lung, out; pressures."""
-        volume, valve, supply, stress, airway, flow, _, behind = y
+        volume, valve, supply, stress, airway, flow, _, behind, _ = y
         q = behind if self.second else valve if self.lag else wanted
         d = self.get("supply_droop", "drop")
         q = q / (1 + d / (1 - d) * supply / 0.5)
@@ -121,7 +121,7 @@ class Breath:
         return fed(airway), q, into(airway), out(airway), airway, inside
 
     def slope(self, t, y, wanted, opened):
-        _, valve, supply, stress, _, _, sensor, behind = y
+        _, valve, supply, stress, _, _, sensor, behind, filtered = y
         q, drawn, flow, out, p, inside = self.balance(t, y, wanted, opened)
         drop = self.R * flow + self.K2 * flow * abs(flow) ** (self.power - 1)
         return [
@@ -133,6 +133,7 @@ class Breath:
             (p - inside - drop) / self.mass if self.mass else 0.0,
             (p - sensor) / self.slow if self.slow else 0.0,
             (valve - behind) / self.second if self.second else 0.0,
+            (sensor - filtered) / self.filter if self.filter else 0.0,
         ]
 
 
@@ -169,7 +170,7 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
         i = int(np.searchsorted(times, t, side="right")) - 1
         return before if i < 0 else values[i]
 
-    y = np.array([v0, 0.0, 0.0, 0.0, p0, 0.0, p0, 0.0])
+    y = np.array([v0, 0.0, 0.0, 0.0, p0, 0.0, p0, 0.0, p0])
     rows = [(start, 0.0, 0.0)]
     for a, b in pairwise(edges):
         if b - a < 1e-12:
@@ -185,6 +186,6 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
         y = found.y[:, -1]
         if np.any(np.abs(times - b) < 1e-12):
             _, _, flow, _, p, _ = rig.balance(b, y, wanted, opened)
-            reading = y[6] if rig.slow else p
+            reading = y[8] if rig.filter else y[6] if rig.slow else p
             rows.append((shown(reading), 1000 * flow, 1000 * (y[0] - v0)))
     return np.array(rows).T

@@ -46,6 +46,7 @@ def test_each_mechanism(name, level, predicted):
     ("path", "value"),
     [
         ("valve_lag.second", 0.06),
+        ("sensor_lag.second", 0.06),
         ("inertance.tubing", 0.5),
         ("turbulent_resistance.exponent", 1.75),
         ("turbulent_resistance.exponent", 1.5),

@@ -30,7 +30,7 @@ from ventbench.diagnosis.identification import IdentifiedModel, Split
 from ventbench.diagnosis.residual_analysis import open_loop_error
 from ventbench.diagnosis.rig_fit import RigFit, fit_rigs
 from ventbench.diagnosis.settings import CorrectionSettings
-from ventbench.diagnosis.simulator_comparison import refit_base_parameters
+from ventbench.diagnosis.simulator_comparison import less_unmodelled, refit_base_parameters
 from ventbench.interfaces import Plant
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.simulators import Simulators
@@ -98,7 +98,7 @@ def correct(
         pressures, plants, notes = _base_model(breaths, data, split, before, recording_model)
     else:
         pressures, plants, notes = _any_model(
-            breaths, data, before, recording_model, simulator_model
+            breaths, data, split, before, recording_model, simulator_model
         )
     fitted = breaths.valid & (breaths.time > 0) & split.fitted[:, None]
     errors = (
@@ -146,6 +146,11 @@ def correct(
             result[name] = Corrected(given[name], plants[stage][name], own)
     return Correction(final, errors, result, chosen, unchanged, tuple(notes), by_rig)
 
+
+_NOTE_ON_DRIFT = (
+    "The corrected simulator is fitted for the least open-loop error: with the reported "
+    "parameters, which allow for slow noise and for valve gains that scatter, it would err more."
+)
 
 _NOTE_ON_RIGS = (
     "The recording is of several rigs: which mechanisms are missing is decided by all breaths, the "
@@ -270,11 +275,7 @@ def _base_model(
         pressure = recording_model.pressures(again, data, first)
         if error(pressure) < settings.drift_ratio * error(after):
             model, after = again, pressure
-            notes.append(
-                "The corrected simulator is fitted for the least open-loop error: with the "
-                "reported parameters, which allow for slow noise and for valve gains that scatter, "
-                "it would err more."
-            )
+            notes.append(_NOTE_ON_DRIFT)
         named = conclusion.named
         if conclusion.unnamed is not None and named.names and error(after) > error(refit):
             pressure = recording_model.pressures(named, data, first)
@@ -292,30 +293,59 @@ def _base_model(
 
 
 def _any_model(
-    breaths: Breaths, data: Data, before: Floats, recording_model: IdentifiedModel,
+    breaths: Breaths, data: Data, split: Split, before: Floats, recording_model: IdentifiedModel,
     simulator_model: IdentifiedModel,
 ) -> tuple[dict[str, Floats], dict[str, Plants], list[str]]:  # fmt: skip
-    """Candidates for any simulator: itself plus differences of the physics of both models."""
+    """Candidates for any simulator: itself plus differences of the physics of both models.
+
+    The correction has the reported parameters, unless it errs less with those that are fitted for
+    the least error of the corrected simulator.
+    """
     first = breaths.pressure[:, 0]
-    conclusion = recording_model.conclusion
+    conclusion, evaluator = recording_model.conclusion, recording_model.evaluator
     # The simulator's own model, and the same with the recording's R, C, R_ex and PEEP.
     own = simulator_model.conclusion.full
     noise = replace(conclusion.noise, ar=(0.0, 0.0))
-    refitted = refit_base_parameters(
-        simulator_model, recording_model.evaluator.training.data, noise
-    )
+    refitted = refit_base_parameters(simulator_model, evaluator.training.data, noise)
     identified = simulator_model.pressures(own, data, first)
+    after = before + recording_model.pressures(conclusion.full, data, first) - identified
+    plants_after, notes = recording_model.plants(), []
+    again = _least_error_model(data, split, before, recording_model, simulator_model)
+    if again is not None:
+        of_fits = breaths.valid & (breaths.time > 0) & split.fitted[:, None]
+        pressure = before + recording_model.pressures(again, data, first) - identified
+        errors = [open_loop_error(breaths.pressure, p, of_fits).rmse for p in (pressure, after)]
+        if errors[0] < evaluator.settings.correction.drift_ratio * errors[1]:
+            after, plants_after = pressure, estimates.plants_of(again, evaluator)
+            notes.append(_NOTE_ON_DRIFT)
     pressures = {
         "before": before,
         "refit": before + simulator_model.pressures(refitted, data, first) - identified,
-        "after": before + recording_model.pressures(conclusion.full, data, first) - identified,
+        "after": after,
     }
     plants = {
         "before": simulator_model.plants(),
         "refit": estimates.plants_of(refitted, simulator_model.evaluator),
-        "after": recording_model.plants(),
+        "after": plants_after,
     }
-    return pressures, plants, []
+    return pressures, plants, notes
+
+
+def _least_error_model(
+    data: Data, split: Split, before: Floats, recording_model: IdentifiedModel,
+    simulator_model: IdentifiedModel,
+) -> FittedModel | None:  # fmt: skip
+    """The recording's model, fitted for the least error of the simulator that it corrects.
+
+    None if it has parameters of each breath, which nobody knows of breaths to come.
+    """
+    evaluator, full = recording_model.evaluator, recording_model.conclusion.full
+    if any(varies_by_breath(name) for name in full.names):
+        return None
+    reduced = less_unmodelled(data, before, simulator_model).select(split.fitted)
+    names, settings = evaluator.training.predictor.names, evaluator.settings
+    partition = make_partition(reduced, names, settings)
+    return fit_open_loop(evaluator, full, partition, settings.correction)
 
 
 def fit_open_loop(

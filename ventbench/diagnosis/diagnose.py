@@ -181,7 +181,9 @@ def diagnose(
     tell("drawing conclusions", _IDENTIFIED)
     missing, notes_on_simulator = missing_mechanisms(recording_model, simulator_model)
     if simulator_model is not None:
-        steady = refit_at_simulator_parameters(recording_model, simulator_model, tuple(missing))
+        steady = refit_at_simulator_parameters(
+            data.select(seen), held, before[seen], recording_model, simulator_model, tuple(missing)
+        )
         if steady is not None:  # the simulator keeps its mechanisms, shown by the recording or not
             (recording_model, kept), notes_on_simulator = steady, []
             missing = {name: changed for name, changed in missing.items() if name in kept}

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ventbench.diagnosis import estimates
+from ventbench.diagnosis.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.evaluator import Evaluator, groups_by_label
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, varies_by_breath
 from ventbench.diagnosis.identification import IdentifiedModel, identify
-from ventbench.diagnosis.selection import passes_heldout_test
+from ventbench.diagnosis.selection import drop_redundant_terms, passes_heldout_test
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id import Fit, fit
@@ -37,6 +38,9 @@ def identify_both(
     the part is subtracted from the recording, and the recording is identified anew: what is then
     found is what the simulator lacks.
 
+    The simulator's response is described by the recording's mechanisms where held-out breaths do
+    not object: the difference of two models that describe one rig by other names corrects nothing.
+
     Args:
         data: n recorded breaths.
         held: which of them are held out, ``(n,)``.
@@ -54,10 +58,11 @@ def identify_both(
     simulator_model = identify(
         measured, held, excluded, lambda what: tell(f"simulator: {what}"), settings, fitted
     )
+    simulator_model = with_mechanisms_of(simulator_model, recording_only_model)
     first = response[:, 0]
     own = simulator_model.pressures(simulator_model.conclusion.full, data, first)
     unmodelled = np.nan_to_num(response - own)
-    reduced = data.with_pressure(data.measured[:, 0] - unmodelled)
+    reduced = less_unmodelled(data, response, simulator_model)
     refitted = refit_base_parameters(simulator_model, reduced.select(~held))
     refit = simulator_model.pressures(refitted, data, first) + unmodelled
     # Predicted as breaths to come: parameters of each breath are not known of them.
@@ -77,6 +82,62 @@ def identify_both(
     )
     fit = _noiseless_fit(simulator_model, data.with_pressure(own), held, recording_model)
     return recording_model, replace(simulator_model, fit=fit)
+
+
+def with_mechanisms_of(
+    simulator_model: IdentifiedModel, recording_model: IdentifiedModel
+) -> IdentifiedModel:
+    """Describe a simulator's response by the mechanisms of its recording too, if that is better.
+
+    A selection takes one mechanism at a time and may stop short of several that act together, such
+    as a bent valve behind tubing; what the recording showed would then seem to be missing.
+
+    Args:
+        simulator_model: identified from the simulator's response.
+        recording_model: identified from the recording.
+
+    Returns:
+        The simulator's model with those mechanisms of the recording that it needs, or as it was if
+        BIC or held-out breaths do not prefer that.
+    """
+    evaluator, conclusion = simulator_model.evaluator, simulator_model.conclusion
+    wanted, own = recording_model.conclusion.named, conclusion.full
+    added = tuple(name for name in wanted.names if name not in own.names)
+    if not added:
+        return simulator_model
+    joint = own.hypothesis.plus(wanted.hypothesis.without(*own.names))
+    # From the values of the base model: those of a poor description lie in a minimum of their own.
+    fitted = fit_with_noise(evaluator, joint)
+    fitted = drop_redundant_terms(evaluator, fitted, added)
+    full = fit_with_noise(evaluator, fitted.hypothesis, fitted)
+    against = evaluator.fit(own.hypothesis, full.noise, own)
+    gains = evaluator.held_out_log_likelihood(full) - evaluator.held_out_log_likelihood(against)
+    if evaluator.criterion(full) >= evaluator.criterion(against) or not passes_heldout_test(
+        gains, evaluator.settings.held_out_test
+    ):
+        return simulator_model
+    named, unnamed = full, conclusion.unnamed
+    if unnamed is not None and unnamed.term is not None:
+        named = evaluator.fit(full.hypothesis.without(unnamed.term), full.noise, full)
+    else:
+        unnamed = None  # an input that varied in time beside the mechanisms of before
+    conclusion = replace(conclusion, named=named, full=full, unnamed=unnamed, noise=full.noise)
+    fit = estimates.final_fit(full, simulator_model.final, evaluator)
+    return replace(simulator_model, conclusion=conclusion, fit=fit)
+
+
+def less_unmodelled(data: Data, response: Floats, simulator_model: IdentifiedModel) -> Data:
+    """Recorded breaths less what the simulator's model does not describe of the simulator.
+
+    Physics that is fitted to these makes the least error when the simulator is corrected by it.
+
+    Args:
+        data: n recorded breaths.
+        response: pressures of the simulator for the recorded commands, cmH2O, ``(n, T)``.
+        simulator_model: identified from the simulator's response.
+    """
+    own = simulator_model.pressures(simulator_model.conclusion.full, data, response[:, 0])
+    return data.with_pressure(data.measured[:, 0] - np.nan_to_num(response - own))
 
 
 def with_sensor_noise(
@@ -151,8 +212,9 @@ def missing_mechanisms(
 
 
 def refit_at_simulator_parameters(
-    recording_model: IdentifiedModel, simulator_model: IdentifiedModel, missing: Sequence[str]
-) -> tuple[IdentifiedModel, tuple[str, ...]] | None:
+    data: Data, held: NDArray[np.bool_], response: Floats, recording_model: IdentifiedModel,
+    simulator_model: IdentifiedModel, missing: Sequence[str],
+) -> tuple[IdentifiedModel, tuple[str, ...]] | None:  # fmt: skip
     """Fit what a simulator lacks with the rest of its physics held at the simulator's own values.
 
     The base parameters are refitted in every hypothesis so that mechanisms can be trusted, but they
@@ -160,6 +222,9 @@ def refit_at_simulator_parameters(
     correction by them costs accuracy on held-out breaths.
 
     Args:
+        data: n recorded breaths.
+        held: which of them are held out, ``(n,)``.
+        response: pressures of the simulator for the recorded commands, cmH2O, ``(n, T)``.
         recording_model: identified from the recording.
         simulator_model: identified from the simulator's response.
         missing: mechanisms that the simulator lacks, or has with other parameters.
@@ -174,6 +239,14 @@ def refit_at_simulator_parameters(
     place = recording_model.conclusion.unnamed
     term = (place.term,) if place is not None and place.term else ()
     evaluator = _wider(recording_model.evaluator, simulator_model.evaluator)
+    # What the simulator's model does not describe is in the corrected simulator: here as well.
+    reduced = less_unmodelled(data, response, simulator_model)
+    training, held_out = evaluator.training.predictor, evaluator.held_out.predictor
+    evaluator = replace(
+        evaluator,
+        training=Partition(reduced.select(~held), training),
+        held_out=Partition(reduced.select(held), held_out),
+    )
     test = evaluator.settings.held_out_test
 
     def fit_with(names: Sequence[str]) -> tuple[Fit, FittedModel]:
@@ -185,8 +258,8 @@ def refit_at_simulator_parameters(
 
     score = evaluator.held_out_log_likelihood
     names, (result, fitted) = tuple(missing), fit_with(missing)
-    refitted = recording_model.evaluator.held_out_log_likelihood(full)
-    if passes_heldout_test(refitted - score(fitted), test):
+    refitted = evaluator.fit(full.hypothesis, full.noise, full)
+    if passes_heldout_test(score(refitted) - score(fitted), test):
         return None
     nothing = score(fit_with(())[1])
     while names:

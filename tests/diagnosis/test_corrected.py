@@ -163,6 +163,15 @@ def test_any_simulator_is_corrected_for_the_least_error(breaths, fake, monkeypat
     assert float(plant.with_mechanisms.get("R")) == (25.0 if again else 30.0)
     assert any("least open-loop error" in note for note in correction.notes) is again
 
+    # A simulator that is left as it is has no note on a correction.
+    reported, least = before - 2.0 * error, before - error
+    correction = correct(
+        breaths, make_data(breaths), split(breaths), before, identified,
+        something(before, own), load_simulators(given),
+    )  # fmt: skip
+    assert correction.unchanged
+    assert correction.notes == ()
+
 
 def test_a_correction_that_helps_its_own_breaths_alone_is_not_chosen(breaths, fake):
     given = plants(R=10.0)

@@ -107,7 +107,7 @@ def correct(
     )
     unchanged = simulator_model is not None and bool(errors[1] >= errors[0])
     if unchanged:
-        pressures = dict.fromkeys(pressures, before)
+        pressures, notes = dict.fromkeys(pressures, before), []  # notes on the correction
     refitted, chosen = choose(breaths, split, pressures)
     if unchanged:
         given_everywhere: dict[str, Stage] = dict.fromkeys(chosen, "before")

@@ -71,12 +71,6 @@ def test_stable_at_any_parameter_in_range(data):
         share = np.round(share) if extreme else share
         between = item.coordinate(item.low) * (1 - share) + item.coordinate(item.high) * share
         values[name] = float(np.clip(item.physical(between), item.low, item.high))
-    # Both change the slope of the recoil, each from that of the linear lung: a compliance that
-    # grows to three times its value takes two thirds of it, and where the curve of the other is
-    # flatter than a third, in a lung that softens or below its rest, the sum falls as the lung
-    # fills. No lung does, and no step can bound it.
-    if values["compliance_drift.change"] > 0.0:
-        values["nonlinear_compliance.stiffening"] = 0.0
     dt = data.draw(st.sampled_from([0.002, 0.03, 0.1]))
     with precision.float64():
         plant = physics(Lung(1.0, 1.0)).having(**values)
@@ -86,9 +80,8 @@ def test_stable_at_any_parameter_in_range(data):
     # All gas ever given, in the stiffest lung, and the largest drop of the airway.
     gas = values["gain"] * 100 * dt * T / values["C"]
     flow = values["gain"] * 0.1
-    # Gas with mass in a stiff circuit rings, and a bent sensor shows that larger; softening and the
-    # sensor's gain are in range too. What is not stable exceeds this by many powers of ten.
-    assert np.abs(p).max() < 100.0 * (gas + flow * (values["R"] + 80 * flow + 200) + 100.0)
+    # Gas with mass in a stiff circuit rings; softening and the sensor's gain are in range too.
+    assert np.abs(p).max() < 50.0 * (gas + flow * (values["R"] + 80 * flow + 200) + 100.0)
 
 
 @pytest.mark.slow

@@ -62,7 +62,7 @@ def identify_both(
     first = response[:, 0]
     own = simulator_model.pressures(simulator_model.conclusion.full, data, first)
     unmodelled = np.nan_to_num(response - own)
-    reduced = less_unmodelled(data, response, simulator_model)
+    reduced = data.with_pressure(data.measured[:, 0] - unmodelled)
     refitted = refit_base_parameters(simulator_model, reduced.select(~held))
     refit = simulator_model.pressures(refitted, data, first) + unmodelled
     # Predicted as breaths to come: parameters of each breath are not known of them.

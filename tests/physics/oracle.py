@@ -45,8 +45,8 @@ def recoil(volume, C, m):
 class Breath:
     """Right-hand side; states: volume, valve, supply, stress, airway, flow, sensor, second lag."""
 
-    def __init__(self, R, C, m, R_ex, peep, stiffer):
-        self.stiffer = stiffer
+    def __init__(self, R, C, m, R_ex, peep, changed):
+        self.changed = changed  # C at this breath, of the recoil's curve
         self.R, self.C, self.m, self.R_ex, self.peep = R, C, m, R_ex, peep
         self.K2 = self.get("turbulent_resistance", "quadratic")
         self.power = m.get("turbulent_resistance", {}).get("exponent", 2.0)
@@ -89,7 +89,7 @@ class Breath:
         def fed(p):
             return through * np.sqrt(max(1 - p / self.source, 1e-9))
 
-        inside = recoil(volume, self.C, self.m) + self.stiffer * volume
+        inside = recoil(volume, self.changed, self.m)
         inside += stress - self.muscle(t)
 
         def into(p):
@@ -150,10 +150,9 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
 
     R = R * (1 + m.get("resistance_drift", {}).get("change", 0.0) * position)
     changed = C * (1 + m.get("compliance_drift", {}).get("change", 0.0) * position)
-    stiffer = 1000 / changed - 1000 / C  # of the linear part of the recoil
-    rig = Breath(R, C, m, R_ex, peep, stiffer)
+    rig = Breath(R, C, m, R_ex, peep, changed)
     p0 = brentq(lambda p: shown(p) - start, -20.0, 60.0, xtol=1e-13) if bend else start - drift
-    v0 = brentq(lambda v: recoil(v, C, m) + stiffer * v - p0, -0.01, 0.0239 * C, xtol=1e-14)
+    v0 = brentq(lambda v: recoil(v, changed, m) - p0, -0.01, 0.0239 * changed, xtol=1e-14)
     times = np.concatenate([[0.0], np.cumsum(dt[:-1])])
     asked = [gain / 1000 * u for u in valve_positions(u_in, m)]
     late, late_out = rig.get("valve_delay", "delay"), rig.get("exhalation_valve_delay", "opening")

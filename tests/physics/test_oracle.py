@@ -64,6 +64,13 @@ def test_each_shape(path, value, predicted):
     assert_close(predicted(breaths, m), breaths.pressure, TOLERANCE.get(path, EXACT))
 
 
+def test_a_lung_that_stiffens_and_becomes_softer_by_the_breath(predicted):
+    """The curve is that of the lung as it has become."""
+    m = cases.strengths("compliance_drift") | cases.strengths("nonlinear_compliance")
+    breaths = cases.recording(2, m)
+    assert_close(predicted(breaths, m), breaths.pressure, EXACT)
+
+
 @pytest.mark.parametrize(("R", "C"), [(5.0, 10.0), (20.0, 50.0), (50.0, 20.0)])
 def test_base(R, C, predicted):
     breaths = cases.recording(2, {}, R=R, C=C, gain=15.0, R_ex=8.0)

@@ -50,15 +50,20 @@ class NonlinearCompliance(Mechanism):
     )
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
-        """Tangent of the curve at the last volume, less the linear lung's."""
+        """Tangent of the curve at the last volume, less the linear lung's.
+
+        The curve is that of the lung as it has become: mechanisms come in the order of their names,
+        and `compliance_drift` has changed the network's elastance before. Two changes of one linear
+        lung could add up to a recoil that falls as the lung fills.
+        """
         k = values["stiffening"]
-        linear = view.elastance * view.volume  # cmH2O
+        linear = network.elastance * view.volume  # cmH2O
         full = k * linear > _FULL  # from here on the curve goes on as its tangent
         within = jnp.where(full, _FULL / jnp.where(full, k, 1.0), linear)
         x = k * within
         slope = 1.0 / (1.0 - x)
         recoil = within * _log_ratio(x) + (linear - within) * slope
-        return network.plus(recoil=recoil - linear, elastance=(slope - 1.0) * view.elastance)
+        return network.plus(recoil=recoil - linear, elastance=(slope - 1.0) * network.elastance)
 
 
 def _log_ratio(x: Array) -> Array:

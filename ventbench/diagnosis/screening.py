@@ -99,7 +99,7 @@ def _screen(
     """
     order = predictor.names
     first, *others = library()[name].description.parameters
-    best, start = np.zeros(len(linear)), {}
+    best, start, simulated = np.zeros(len(linear)), {}, {}
     own = [f"{name}.{first.name}", *(f"{name}.{p.name}" for p in others)]
     grids = [first.screening_strengths(), *(other.grid or (None,) for other in others)]
     shapes = {f"{name}.{p.name}": p.neutral for p in others if p.shape and not p.discrete}
@@ -132,13 +132,15 @@ def _screen(
         if nats <= best[k]:
             continue
         if nats > best.max():
-            start = given | {own[0]: strength}
+            start, simulated = given | {own[0]: strength}, given
         best[k] = nats
     fixed = {p: v for p, v in start.items() if parameter(p).discrete and v != parameter(p).neutral}
     asked = float(best.max() - usual.max()) > settings.shape_promise
     free = tuple(p for p in shapes if asked and start.get(p, shapes[p]) != shapes[p])
     added = Hypothesis((name,), free, tuple(fixed.items()))
     rest = tuple(trial for _, trial in starts.values() if trial != start) if several else ()
+    if free and simulated != start:  # a threshold is where it is: no multiple of it says anything
+        rest = (*rest, simulated)
     return Candidate(name, added, start, float(best[0]), float(best[1]), rest)
 
 

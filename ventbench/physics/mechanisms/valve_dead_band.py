@@ -8,6 +8,13 @@ from jax import Array
 from ventbench.physics.mechanism import Description, Mechanism, Values
 from ventbench.physics.parameters import Parameter
 
+#: Travel in which a stuck seat lets go, as a share of the band: short, but with a slope by which a
+#: fit finds the width.
+_LETS_GO = 0.2
+
+#: Width, %, so that none is no division by zero.
+_THIN = 1e-6
+
 
 class ValveDeadBand(Mechanism):
     """The first part of the stroke gives no flow."""
@@ -16,13 +23,25 @@ class ValveDeadBand(Mechanism):
         name="valve_dead_band",
         title="dead band of the inspiratory valve",
         site="inspiratory valve",
-        equation="u_effective = 0 below width, u - width above",
+        equation="u_effective = 0 below width, u - (1 - crack) width above",
         parameters=(
             Parameter("width", "%", "command at which flow begins", 0.0, 10.0, 0.0, 1.5, 3.5),
+            Parameter(
+                "crack",
+                "1",
+                "0 for overlap, which every command loses; 1 for a stuck seat that cracks open",
+                0.0,
+                1.0,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+                grid=(0.0, 1.0),
+            ),
         ),
         source=(
-            "Overlap of the spool and friction of the seat; 0 to 5 % of the stroke is usual "
-            "without linearisation."
+            "Overlap of the spool or friction of the seat; 0 to 5 % of the stroke is usual "
+            "without linearisation (ISA-75.25: dead band and resolution of control valves)."
         ),
         signature=(
             "Too little flow at every small command, none at the smallest: late in "
@@ -40,7 +59,11 @@ class ValveDeadBand(Mechanism):
 
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
         """Remainder of the command; a negative one is not a valve's and passes."""
-        return u_in - jnp.minimum(jnp.maximum(u_in, 0.0), values["width"]), memory
+        width, positive = values["width"], jnp.maximum(u_in, 0.0)
+        lost = jnp.minimum(positive, width)
+        free = jnp.clip(0.5 + (positive - width) / (_LETS_GO * width + _THIN), 0.0, 1.0)
+        stuck = positive * (1.0 - free)
+        return u_in - lost - values["crack"] * (stuck - lost), memory
 
 
 MECHANISM = ValveDeadBand()

@@ -29,7 +29,10 @@ def valve_positions(u_in, m):
                 stands = u + play
             u = stands = give * soft + (1 - give) * stands
         if "valve_dead_band" in m:
-            u = max(0.0, u - m["valve_dead_band"]["width"])
+            width, crack = m["valve_dead_band"]["width"], m["valve_dead_band"].get("crack", 0.0)
+            overlap = max(0.0, u - width)
+            stuck = u * np.clip(0.5 + (u - width) / (0.2 * width), 0.0, 1.0)  # lets go
+            u = (1 - crack) * overlap + crack * stuck
         if "valve_curve" in m:
             u = u / (1 + u / 100 * m["valve_curve"]["loss"] / (1 - m["valve_curve"]["loss"]))
         out.append(u)
@@ -39,7 +42,9 @@ def valve_positions(u_in, m):
 def recoil(volume, C, m):
     linear = volume / (C / 1000)
     k = m.get("nonlinear_compliance", {}).get("stiffening", 0.0)
-    return -np.log(1 - k * linear) / k if k else linear
+    share = m.get("nonlinear_compliance", {}).get("sigmoid", 0.0)
+    x = k * linear
+    return (share * np.arctanh(x) - (1 - share) * np.log(1 - x)) / k if k else linear
 
 
 class Breath:

@@ -20,7 +20,10 @@ class NonlinearCompliance(Mechanism):
         name="nonlinear_compliance",
         title="lung that stiffens as it fills",
         site="alveolus",
-        equation="P_elastic = -ln(1 - stiffening V / C) / stiffening",
+        equation=(
+            "P_elastic = (-(1 - sigmoid) ln(1 - x) + sigmoid artanh x) / stiffening, "
+            "x = stiffening V / C"
+        ),
         parameters=(
             Parameter(
                 "stiffening",
@@ -32,10 +35,22 @@ class NonlinearCompliance(Mechanism):
                 1 / 40,
                 1 / 24,
             ),
+            Parameter(
+                "sigmoid",
+                "1",
+                "0 for an exponential curve, 1 for the upper half of a sigmoid",
+                0.0,
+                1.0,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+                grid=(0.0, 1.0),
+            ),
         ),
         source=(
             "Exponential pressure-volume curve of Salazar and Knowles (J. Appl. Physiol. "
-            "19, 1964, 97), the upper half of the sigmoid of Venegas, Harris and Simon (J. "
+            "19, 1964, 97), or the upper half of the sigmoid of Venegas, Harris and Simon (J. "
             "Appl. Physiol. 84, 1998, 389). 5 to 50 % of the volume missing at 30 cmH2O."
         ),
         signature=(
@@ -60,9 +75,11 @@ class NonlinearCompliance(Mechanism):
         linear = network.elastance * view.volume  # cmH2O
         full = k * linear > _FULL  # from here on the curve goes on as its tangent
         within = jnp.where(full, _FULL / jnp.where(full, k, 1.0), linear)
-        x = k * within
-        slope = 1.0 / (1.0 - x)
-        recoil = within * _log_ratio(x) + (linear - within) * slope
+        x, share = k * within, jnp.where(k > 0.0, values["sigmoid"], 0.0)  # none softens
+        rising = jnp.maximum(x, 0.0)
+        slope = (1.0 - share) / (1.0 - x) + share / (1.0 - rising**2)
+        ratio = (1.0 - share) * _log_ratio(x) + share * _artanh_ratio(rising)
+        recoil = within * ratio + (linear - within) * slope
         return network.plus(recoil=recoil - linear, elastance=(slope - 1.0) * network.elastance)
 
 
@@ -72,6 +89,14 @@ def _log_ratio(x: Array) -> Array:
     safe = jnp.where(small, 0.5, x)
     series = 1.0 + x * (1 / 2 + x * (1 / 3 + x * (1 / 4 + x * (1 / 5 + x * (1 / 6 + x / 7)))))
     return jnp.where(small, series, -jnp.log1p(-safe) / safe)
+
+
+def _artanh_ratio(x: Array) -> Array:
+    """Return ``artanh(x) / x``, for any ``x`` within -1..1 and with its derivatives at zero."""
+    small = jnp.abs(x) < 1e-2
+    safe = jnp.where(small, 0.5, x)
+    series = 1.0 + x**2 * (1 / 3 + x**2 * (1 / 5 + x**2 / 7))
+    return jnp.where(small, series, jnp.arctanh(safe) / safe)
 
 
 MECHANISM = NonlinearCompliance()

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from ventbench.recordings.breaths import Breaths
 from ventbench.validation.challenge.cases import Base, Case, Effect
@@ -24,6 +25,10 @@ LIMIT = 25.0
 #: pressure in cmH2O, the others in their logarithm).
 _REFITTED = ("R", "C", "R_ex", "peep")
 _STEP = 1e-3
+
+#: Largest circuit that is left when an inertance is taken out, and the step of its refit, in units
+#: of the circuit that came with it.
+_LARGEST_CIRCUIT, _CIRCUIT_STEP = 2.0, 0.01
 
 #: Gauss-Newton iterations at most, the shares of a step that are tried, and the relative decrease
 #: of the squared error below which they end.
@@ -55,20 +60,32 @@ def log_likelihood_loss(case: Case, breaths: Breaths, index: int) -> float:
     chosen = breaths.select(np.linspace(0, len(breaths) - 1, count).astype(int))
     start = np.full(count, case.base.peep)
     response = generator_of(case).replay(case, chosen, start, seed=index)
-    rest = replace(
-        case,
-        effects=(*case.effects[:index], *_left(case.effects[index]), *case.effects[index + 1 :]),
-    )
-    error = _refitted(rest, case.base, chosen, start, response, seed=index)
+    before, after = case.effects[:index], case.effects[index + 1 :]
+
+    def squared_error(*left: Effect) -> float:
+        rest = replace(case, effects=(*before, *left, *after))
+        return float(np.sum(_refitted(rest, base, chosen, start, response, seed=index) ** 2))
+
+    base, effect = case.base, case.effects[index]
+    before, after = case.effects[:index], case.effects[index + 1 :]
+    if effect.name == "inertance" and "circuit" in effect.parameters:
+        # The circuit that came with it stays, and is refitted: behind a high resistance, a little
+        # less of it does most of what the mass does.
+        massless = effect.parameters | {"inertance": 0.0}
+        left = float(
+            minimize_scalar(
+                lambda size: squared_error(
+                    replace(effect, parameters=massless | {"circuit": float(size)})
+                ),
+                bounds=(0.0, _LARGEST_CIRCUIT * effect.parameters["circuit"]),
+                method="bounded",
+                options={"xatol": _CIRCUIT_STEP * effect.parameters["circuit"]},
+            ).fun  # type: ignore[attr-defined]
+        )
+    else:
+        left = squared_error()
     noise = max(case.noise**2 + case.step**2 / 12.0, _LEAST_VARIANCE)
-    return float(0.5 * np.sum(error**2) / noise * len(breaths) / count)
-
-
-def _left(effect: Effect) -> tuple[Effect, ...]:
-    """What stays of a rig without an effect: of an inertance, the circuit that came with it."""
-    if effect.name != "inertance" or "circuit" not in effect.parameters:
-        return ()
-    return (replace(effect, parameters=effect.parameters | {"inertance": 0.0}),)
+    return 0.5 * left / noise * len(breaths) / count
 
 
 def _refitted(

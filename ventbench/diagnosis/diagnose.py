@@ -200,7 +200,7 @@ def diagnose(
     noise, pressures = conclusion.noise, correction.pressures
     open_loop = compare_open_loop(
         breaths, uses.judging, pressures, noise_floor(breaths, float(noise.sigma[0])),
-        settings.residuals,
+        settings.residuals, recording_model.gain_error(data),
     )  # fmt: skip
     is_input = conclusion.unnamed is not None and conclusion.unnamed.latent_input is not None
     rejected = (bool(missing) or term is not None) and not _helps(

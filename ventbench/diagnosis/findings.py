@@ -125,6 +125,10 @@ class OpenLoopComparison:
         noise_floor: root-mean-square error of a perfect simulator, cmH2O.
         groups: errors of parts of the breath and of lungs, by group and stage, such as
             ``{"lung R5C10": {"before": OpenLoopError(...), ...}}``.
+        gain_error: root-mean-square error, cmH2O, that a breath to come has because the valve's
+            gain differs from breath to breath; 0 if it does not.
+        usual: root-mean-square error of the corrected simulator, cmH2O, without the tenth of the
+            breaths that err most; NaN if unknown.
     """
 
     held_out_breaths: tuple[int, ...]
@@ -133,11 +137,19 @@ class OpenLoopComparison:
     after: OpenLoopError
     noise_floor: float
     groups: dict[str, dict[str, OpenLoopError]]
+    gain_error: float = 0.0
+    usual: float = float("nan")
+
+    @property
+    def least_error(self) -> float:
+        """Root-mean-square error of a simulator that lacks nothing, cmH2O."""
+        return float(np.hypot(self.noise_floor, self.gain_error))
 
     @property
     def unexplained(self) -> float:
-        """Root-mean-square error of the corrected simulator beyond the noise, cmH2O."""
-        beyond = self.after.rmse**2 - self.noise_floor**2
+        """Usual error of the corrected simulator beyond the noise and the gain's scatter, cmH2O."""
+        usual = self.usual if np.isfinite(self.usual) else self.after.rmse
+        beyond = usual**2 - self.least_error**2
         return float(np.sqrt(max(beyond, 0.0))) if np.isfinite(beyond) else float("nan")
 
 

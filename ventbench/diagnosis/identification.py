@@ -22,6 +22,7 @@ from ventbench.diagnosis.hypothesis import (
     make_partition,
     varies_by_breath,
 )
+from ventbench.diagnosis.latent_inputs import GAIN_SCATTER, input_responses
 from ventbench.diagnosis.plausibility import excludes_neutral
 from ventbench.diagnosis.screening import all_parameter_paths, library_paths
 from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
@@ -176,6 +177,23 @@ class IdentifiedModel:
         names = self.evaluator.training.predictor.names
         partition = make_partition(data, names, self.evaluator.settings)
         return self.evaluator.predict(fitted, partition, first)[:, 0]
+
+    def gain_error(self, data: Data) -> Floats | None:
+        """Standard deviation of the pressures of n breaths because gains differ between breaths.
+
+        Args:
+            data: breaths of the model's lungs.
+
+        Returns:
+            cmH2O, ``(n, T)``; None if all breaths have one gain.
+        """
+        sd = self.conclusion.gain_sd
+        if not sd:
+            return None
+        evaluator, model = self.evaluator, self.conclusion.full
+        partition = make_partition(data, evaluator.training.predictor.names, evaluator.settings)
+        values = evaluator.transferred_values(model, partition)
+        return sd * np.abs(input_responses(partition, values, GAIN_SCATTER)[:, 0])
 
     def plants(self) -> dict[str, Plant]:
         """The identified plant of each lung, by label; it answers as :meth:`pressures` does."""

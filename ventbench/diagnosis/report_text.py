@@ -136,11 +136,13 @@ def worth(findings: Findings) -> str:
     """
     errors = findings.open_loop
     after, noise = rounded(errors.after.rmse, 2), rounded(errors.noise_floor, 2)
+    if errors.gain_error:
+        noise = f"{noise} and the {rounded(errors.gain_error, 2)} of the valve's scattering gain"
     beyond = rounded(errors.unexplained, 2)
     left = f"{beyond} cmH2O stay unexplained beyond the noise of {noise}"
     if not math.isfinite(errors.unexplained):
         left = f"the noise is {noise}"
-    elif errors.unexplained < 0.5 * errors.noise_floor:
+    elif errors.unexplained < 0.5 * errors.least_error:
         left = f"hardly more than the noise of {noise} is left"
     count = len(errors.held_out_breaths)
     if findings.verdict == "nothing_missing":
@@ -191,7 +193,7 @@ def would_change(findings: Findings) -> list[str]:
             "Breaths of another kind, such as short pulses, long holds or a second lung, may show "
             "what these cannot."
         )
-    elif findings.open_loop.unexplained > findings.open_loop.noise_floor:
+    elif findings.open_loop.unexplained > findings.open_loop.least_error:
         texts.append(
             "More than the noise is unexplained: a further effect may act, and with it the "
             "strengths given here may move."

@@ -8,6 +8,7 @@ makes it (Westfall and Young, Resampling-Based Multiple Testing, 1993).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +54,7 @@ def compare_open_loop(
     pressures: dict[str, Floats],
     noise_floor: float,
     settings: ResidualSettings = DEFAULT.residuals,
+    gain_error: Floats | None = None,
 ) -> OpenLoopComparison:
     """Open-loop errors of a simulator before and after its correction.
 
@@ -63,6 +65,8 @@ def compare_open_loop(
             T)``.
         noise_floor: standard deviation of the noise, cmH2O.
         settings: length of the beginning of inspiration.
+        gain_error: standard deviation of the pressure because gains differ from breath to breath,
+            cmH2O, ``(n, T)``; None if they do not.
     """
     # The first sample is where every simulation starts.
     inspiration = breaths.inspiratory & (breaths.time > 0) & held_out[:, None]
@@ -87,17 +91,29 @@ def compare_open_loop(
             parts[f"lung {name}"] = inspiration & of_lung[:, None]
     ids = tuple(int(i) for i in breaths.breath_id[held_out])
     groups = {name: by_stage(mask) for name, mask in parts.items() if mask.any()}
+    scatter = 0.0 if gain_error is None else float(np.sqrt(np.mean(gain_error[inspiration] ** 2)))
+    error = np.where(inspiration, breaths.pressure - pressures["after"], np.nan)[held_out]
+    usual = _usual_error(error, settings.set_aside)
     return OpenLoopComparison(
-        ids, whole["before"], whole["refit"], whole["after"], noise_floor, groups
+        ids, whole["before"], whole["refit"], whole["after"], noise_floor, groups, scatter, usual
     )
+
+
+def _usual_error(error: Floats, set_aside: float) -> float:
+    """Root mean square of errors ``(n, T)`` without the breaths that err most."""
+    squares, counts = np.nansum(error**2, axis=1), np.isfinite(error).sum(axis=1)
+    order = np.argsort(squares / np.maximum(counts, 1))
+    kept = order[: len(order) - math.ceil(set_aside * len(order))] if len(order) > 2 else order
+    total = counts[kept].sum()
+    return float(np.sqrt(squares[kept].sum() / total)) if total else float("nan")
 
 
 def is_unexplained(
     errors: OpenLoopComparison, settings: CorrectionSettings = DEFAULT.correction
 ) -> bool:
-    """Whether the corrected simulator errs far more than the measurement scatters."""
+    """Whether the corrected simulator errs far more than the measurement and gains scatter."""
     return bool(
-        errors.after.rmse > settings.unexplained_ratio * errors.noise_floor
+        min(errors.after.rmse, errors.usual) > settings.unexplained_ratio * errors.least_error
         and errors.unexplained > settings.unexplained_error
     )
 

@@ -264,6 +264,8 @@ def _open_loop(comparison: OpenLoopComparison) -> dict[str, Any]:
         "refit": _error(comparison.refit),
         "after": _error(comparison.after),
         "noise_floor": comparison.noise_floor,
+        "gain_error": comparison.gain_error,
+        "usual": comparison.usual,
         "unexplained": comparison.unexplained,
         "groups": {
             name: {stage: _error(value) for stage, value in group.items()}

@@ -426,6 +426,9 @@ class ResidualSettings:
         quiet_factor: times that scatter that the noise may have; it is coloured, and a converter
             rounds a quiet signal more than a moving one.
         least_noise: least scatter that is taken seriously, cmH2O: a converter hides less.
+        set_aside: share of the breaths, those that err most, without which it is asked whether
+            more than the noise is left. A wrong first reading puts a whole breath off, since every
+            simulation starts there.
     """
 
     phase_step: float = 0.1
@@ -447,6 +450,7 @@ class ResidualSettings:
     quiet_samples: int = 10
     quiet_factor: float = 3.0
     least_noise: float = 0.05
+    set_aside: float = 0.1
 
 
 @dataclass(frozen=True)

@@ -102,6 +102,8 @@ def facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
         worth = f"{_number(errors.refit.rmse)} → {after} cmH2O"
         told.append(("What is mending it worth?", worth, f"error on {count} breaths set aside"))
     noise = f"beyond the measurement's noise of {_number(errors.noise_floor)}"
+    if errors.gain_error:
+        noise += f" and the {_number(errors.gain_error)} of the valve's scattering gain"
     told.append(("What stays unexplained?", f"{_number(errors.unexplained)} cmH2O", noise))
     return told
 

@@ -77,7 +77,10 @@ class Breath:
             return 0.0
         e = self.m["patient_effort"]
         x = (t - e["onset"]) / e["duration"]
-        return e["amplitude"] * np.sin(np.pi * x) if 0 < x < 1 else 0.0
+        sine = np.sin(np.pi * x) if 0 < x < 1 else 0.0
+        relaxing = e.get("relaxing", 0.0)
+        course = (1 - relaxing) * sine + relaxing * np.exp(-8 * (x - 0.5)) if x > 0.5 else sine
+        return e["amplitude"] * course
 
     def lost(self, p):
         """Leak, L/s: by an orifice that is rounded off at 0.2 cmH2O."""
@@ -167,7 +170,7 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
     edges = set(times) | set(times + late) | set(times + late_out)
     if "patient_effort" in m:
         e = m["patient_effort"]
-        edges |= {e["onset"], e["onset"] + e["duration"]}
+        edges |= {e["onset"] + share * e["duration"] for share in (0.0, 0.5, 1.0)}
     edges = sorted(t for t in edges if t <= times[-1])
 
     def held(values, before, t):

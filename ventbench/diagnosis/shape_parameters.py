@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ventbench.diagnosis.evaluator import Evaluator
-from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id.noise import Noise
@@ -36,6 +36,8 @@ def free_shape_parameters(evaluator: Evaluator, current: FittedModel) -> FittedM
                 current = usual
             continue
         freer = fit_with_shape(evaluator, current, path, current.noise)
+        if np.all(freer.column(path) == about.neutral):
+            continue  # another start may have found a better fit, but no other shape
         if evaluator.criterion(freer) > evaluator.criterion(current):
             continue
         before = evaluator.held_out_log_likelihood(current)
@@ -53,17 +55,24 @@ def fit_with_shape(
     A lag that was fitted alone is as long as the two that it stands for, and a dead time before it
     makes up for what is left: neither moves by itself. A parameter that can be exchanged with
     another one therefore also starts at half of it, with each dead time as it is and one sample
-    off.
+    off. A shape that a small change cannot reach, such as that of an effort whose onset is fitted
+    to another one, starts from the values of its grid as well.
     """
     name, _, short = path.rpartition(".")
     freed = model.hypothesis.plus(Hypothesis((name,), (path,)))
-    starts: list[dict[str, Any]] = [{}]
+    about = parameter_of(path)
+    starts: list[dict[str, Any]] = [{}, *({path: v} for v in about.grid if v != about.neutral)]
     for pair in mechanism(name).description.interchangeable:
         if short in pair:
             other = f"{name}.{pair[1 - pair.index(short)]}"
             halves = dict.fromkeys((path, other), 0.5 * model.column(other))
             starts += [halves | shift for shift in ({}, *other_dead_times(model))]
-    fits = parallel_map(lambda start: evaluator.fit(freed, noise, model, start), starts)
+    fits = parallel_map(
+        lambda start: evaluator.fit(
+            freed, noise, model, start, restart=bool(start) and varies_by_breath(name)
+        ),
+        starts,
+    )
     return min(fits, key=lambda fitted: fitted.minimum.cost)
 
 

@@ -9,14 +9,21 @@ from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import Parameter
 
 
+#: Time constant of the muscles' relaxation, as a share of the duration: 0.1 s of 0.8 s.
+_RELAXING = 0.125
+
+
 class PatientEffort(Mechanism):
-    """A pressure source at the alveolus, half a sine long."""
+    """A pressure source at the alveolus: half a sine, or a muscle that relaxes after its peak."""
 
     description = Description(
         name="patient_effort",
         title="effort of the patient's muscles",
         site="alveolus",
-        equation="P_alveolus = ... - amplitude sin(pi (t - onset) / duration) during the effort",
+        equation=(
+            "P_alveolus = ... - amplitude s(x), x = (t - onset) / duration; s = sin(pi x) to its "
+            "peak, then (1 - relaxing) sin(pi x) + relaxing exp(-8 (x - 1/2))"
+        ),
         parameters=(
             Parameter(
                 "amplitude",
@@ -43,10 +50,23 @@ class PatientEffort(Mechanism):
                 scan=(0.05, 0.3, 0.6, 0.9, 1.2, 1.6),
             ),
             Parameter("duration", "s", "of the effort", 0.2, 2.0, 0.8, 0.8, 0.8),
+            Parameter(
+                "relaxing",
+                "1",
+                "0 for half a sine, 1 for a muscle that relaxes exponentially after its peak",
+                0.0,
+                1.0,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+                grid=(0.0, 1.0),
+            ),
         ),
         source=(
-            "Half-sine muscle pressure, as active lung simulators "
-            "take it: 1 to 15 cmH2O for 0.4 to 1.2 s."
+            "Half-sine muscle pressure, as active lung simulators take it: 1 to 15 cmH2O for 0.4 "
+            "to 1.2 s; inspiratory muscles relax exponentially, with time constants of 0.05 to "
+            "0.2 s (S. A. Esau et al., J. Appl. Physiol. 55, 1983, 731)."
         ),
         signature=(
             "A dent in pressure that the commands do not explain and that differs from "
@@ -61,8 +81,11 @@ class PatientEffort(Mechanism):
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Subtract the pressure of the muscles from the recoil."""
         phase = (view.time - values["onset"]) / values["duration"]
-        pull = values["amplitude"] * jnp.sin(jnp.pi * jnp.clip(phase, 0.0, 1.0))
-        return network.plus(recoil=-pull)
+        sine = jnp.sin(jnp.pi * jnp.clip(phase, 0.0, 1.0))
+        since = jnp.maximum(phase - 0.5, 0.0)
+        left = jnp.where(since > 0.0, jnp.exp(-since / _RELAXING), sine)
+        course = sine + values["relaxing"] * (left - sine)
+        return network.plus(recoil=-values["amplitude"] * course)
 
 
 MECHANISM = PatientEffort()

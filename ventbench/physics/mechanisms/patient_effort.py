@@ -8,7 +8,6 @@ from ventbench.physics.mechanism import Description, Mechanism, Values
 from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import Parameter
 
-
 #: Time constant of the muscles' relaxation, as a share of the duration: 0.1 s of 0.8 s.
 _RELAXING = 0.125
 

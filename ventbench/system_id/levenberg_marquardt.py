@@ -43,7 +43,7 @@ class Minimum:
 
 def minimise(
     cost: Cost, normal: Normal, x: Floats, low: Floats, high: Floats, *, tolerance: float = 1e-3,
-    iterations: int = 40,
+    iterations: int = 40, known: Minimum | None = None,
 ) -> Minimum:  # fmt: skip
     """Search for a local minimum within bounds, starting from ``x``.
 
@@ -64,9 +64,14 @@ def minimise(
             the cost is a negative log-likelihood), or after four steps that each gain less than ten
             times the tolerance.
         iterations: most evaluations of ``normal``.
+        known: where an earlier search for the same cost ended, if this one starts there; it need
+            not be evaluated again.
     """
-    x = np.clip(x, low, high)
-    value, gradient, hessian = normal(x)
+    if known is None:
+        x = np.clip(x, low, high)
+        value, gradient, hessian = normal(x)
+    else:
+        x, value, gradient, hessian = known.x, known.cost, known.gradient, known.hessian
     damping, slow = 1e-3, 0
     for iteration in range(1, iterations):
         pinned = ((x <= low) & (gradient > 0)) | ((x >= high) & (gradient < 0))

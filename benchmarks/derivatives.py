@@ -46,7 +46,7 @@ def breaths() -> Breaths:
 
 def exact(predictor: Predictor, values: np.ndarray, columns: int) -> Callable[[], object]:
     """Return a call that differentiates along columns of ``values`` in forward mode."""
-    ((u_in, u_out, dt),) = predictor._commands
+    u_in, u_out, dt = predictor._commands
     basis = np.eye(values.shape[1])[:columns]
 
     @jax.jit

@@ -7,7 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.candidate_comparison import estimate_noise, fit_with_noise
+from ventbench.diagnosis.candidate_comparison import (
+    estimate_noise,
+    fit_with_noise,
+    hopeless_above,
+)
 from ventbench.diagnosis.evaluator import (
     Evaluator,
     cross_validated_gain,
@@ -16,7 +20,7 @@ from ventbench.diagnosis.evaluator import (
     make_evaluator,
 )
 from ventbench.diagnosis.hypothesis import Hypothesis, Partition
-from ventbench.diagnosis.settings import PatientEffortSettings
+from ventbench.diagnosis.settings import ForwardSelectionSettings, PatientEffortSettings
 from ventbench.physics import paths
 from ventbench.system_id import START, Data, Noise, make_data, parameter_values
 
@@ -300,3 +304,10 @@ def test_one_batch_of_a_long_recording_ranks_candidates(turbulent, both):
     values = {tuple(row) for row in less.values.round(9).tolist()}
     assert values < {tuple(row) for row in named.values.round(9).tolist()}
     assert less.log_likelihood < named.log_likelihood
+
+
+def test_a_candidate_is_hopeless_far_behind_alone():
+    settings = ForwardSelectionSettings(large_gain=100.0, hopeless_share=0.5)
+    assert hopeless_above(1000.0, 900.0, settings) == 1000.0  # few nats tell nothing
+    assert hopeless_above(5000.0, 1000.0, settings) == 3000.0
+    assert hopeless_above(5000.0, np.inf, settings) == np.inf  # nothing to compare with

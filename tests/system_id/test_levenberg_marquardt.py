@@ -86,3 +86,23 @@ def test_infinite_costs_are_steps_too_far():
 
     found = minimise(cost, normal, np.array([5.0]), np.array([-10.0]), np.array([10.0]))
     assert found.x[0] == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_search_that_goes_on_does_not_ask_again_where_it_starts():
+    asked = []
+
+    def cost(x):
+        return 0.5 * float(decay(x) @ decay(x))
+
+    def normal(x):
+        asked.append(x.copy())
+        slopes = decay_jacobian(x)
+        return cost(x), slopes.T @ decay(x), slopes.T @ slopes
+
+    low, high = np.zeros(3), np.full(3, 9.0)
+    first = minimise(cost, normal, np.array([1.0, 0.1, 0.0]), low, high, iterations=3)
+    asked.clear()
+    other = minimise(cost, normal, first.x, low, high, known=first)
+    assert not any(np.array_equal(x, first.x) for x in asked)
+    again = minimise(cost, normal, first.x, low, high)
+    np.testing.assert_array_equal(other.x, again.x)

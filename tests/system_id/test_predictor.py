@@ -53,7 +53,7 @@ def columns(names):
 @pytest.fixture(scope="module")
 def exact(predictor):
     """Slopes along a direction, by automatic differentiation of the same model."""
-    (commands,) = predictor._commands
+    commands = predictor._commands
 
     @jax.jit
     def slope(values, direction):
@@ -67,9 +67,8 @@ def exact(predictor):
     def slopes(values, column):
         direction = np.zeros(len(ORDER))
         direction[column] = 1.0
-        padded = np.resize(values, (predictor._part, len(ORDER)))
         with float64():
-            return np.asarray(slope(jnp.asarray(padded), jnp.asarray(direction)))[: len(values)]
+            return np.asarray(slope(jnp.asarray(values), jnp.asarray(direction)))
 
     return slopes
 
@@ -149,3 +148,14 @@ def test_a_plant_predicts_what_the_predictor_does(predictor, values, data):
         pressure = open_loop(plant, *(jnp.asarray(x) for x in (row[-1:], *commands)))
     seen = predictor.predict(np.repeat(row[None], len(data), axis=0))[0, 0]
     np.testing.assert_allclose(np.asarray(pressure)[0], seen, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 39, 40, 119, 120, 320, 321, 700, 1300])
+def test_blocks_hold_every_simulation_once(count):
+    blocks = predictor_module._blocks(count, 40)
+    ends = [0, *(last for _, last, _ in blocks)]
+    assert [first for first, _, _ in blocks] == ends[:-1]
+    assert ends[-1] == count
+    assert all(width in (40, 320) and last - first <= width for first, last, width in blocks)
+    # None computes more than eight times the small size for less than three of it.
+    assert all(last - first >= 120 for first, last, width in blocks if width == 320)

@@ -16,6 +16,7 @@ import numpy as np
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.screening import Candidate
+from ventbench.diagnosis.settings import ForwardSelectionSettings
 from ventbench.diagnosis.shape_parameters import (
     fit_with_shape,
     other_dead_times,
@@ -135,7 +136,8 @@ def _quick_fits(
 
     Where a fit may have to go far (``far``), the templates of the screening extrapolate badly, and
     the refit's R and C make up for the effect: a mild effect is tried too, with these and with the
-    label's. A few steps from every start show which two are worth going on from.
+    label's. A few steps from every start show which two are worth going on from, and which
+    candidates are: the others stay as they are, far behind.
 
     Of a long recording, one batch of its breaths ranks them, and those that may win are fitted to
     all of its training breaths.
@@ -150,7 +152,7 @@ def _quick_fits(
     shifts: list[Start] = [{}, *other_dead_times(warm_start)]
     label: Start = {"R": data.R, "C": data.C}
 
-    def quick_fit(candidate: Candidate) -> FittedModel:
+    def begun(candidate: Candidate) -> list[FittedModel]:
         hypothesis = current.hypothesis.plus(candidate.hypothesis)
         starts: list[Start] = [candidate.start, *candidate.other_starts]
         if not varies_by_breath(candidate.name):
@@ -158,18 +160,26 @@ def _quick_fits(
             starts += [{}, label] if far else []
         if len(starts) <= settings.fit.continued_starts:
             fits = [quick(small, hypothesis, noise, first, start) for start in starts]
-        else:
-            steps = settings.fit.start_iterations
-            raced = [
-                small.fit(hypothesis, noise, first, start, iterations=steps, delay_rounds=0)
-                for start in starts
-            ]
-            raced.sort(key=lambda model: model.minimum.cost)
-            ahead = raced[: settings.fit.continued_starts]
-            fits = [quick(small, hypothesis, noise, model) for model in ahead]
-        return min(fits, key=lambda model: model.minimum.cost)
+            return [min(fits, key=cost_of)]
+        steps = settings.fit.start_iterations
+        raced = [
+            small.fit(hypothesis, noise, first, start, iterations=steps, delay_rounds=0)
+            for start in starts
+        ]
+        return sorted(raced, key=cost_of)[: settings.fit.continued_starts]
 
-    models = parallel_map(quick_fit, candidates)
+    raced = parallel_map(begun, candidates)
+    # What differs from breath to breath is no measure of others: it may explain the most, and fail.
+    rivals = [models[0] for models in raced if not varies_by_breath(models[0].names[-1])]
+    best = min(map(cost_of, rivals), default=np.inf)
+    limit = hopeless_above(cost_at(first, noise), best, evaluator.settings.forward)
+
+    def ended(models: list[FittedModel]) -> FittedModel:
+        if len(models) > 1 and cost_of(models[0]) < limit:
+            models = [quick(small, model.hypothesis, noise, model) for model in models]
+        return min(models, key=cost_of)
+
+    models = parallel_map(ended, raced)
     if small is evaluator:
         return models
     criteria = _Criteria(small)
@@ -180,6 +190,28 @@ def _quick_fits(
     count = settings.forward.fitted_candidates
     kept = [m for k, m in enumerate(models) if k < count or criteria(m, noise_left) < limit]
     return parallel_map(partial(fit_to_all, evaluator, warm_start=warm_start), kept)
+
+
+def cost_of(model: FittedModel) -> float:
+    """Cost at which the fit of a model has ended, nats."""
+    return model.minimum.cost
+
+
+def cost_at(model: FittedModel, noise: Noise) -> float:
+    """Cost of a model under another noise, without priors, nats."""
+    white = noise.whiten(model.residual, model.problem.data.weight)
+    return float(noise.loss(white).sum())
+
+
+def hopeless_above(without: float, best: float, settings: ForwardSelectionSettings) -> float:
+    """Cost from which on, after a few steps, no further step can make a candidate win, nats.
+
+    Args:
+        without: cost of the model without any candidate.
+        best: cost of the best candidate, or of the model that it must beat.
+        settings: settings of the comparison.
+    """
+    return best + max(settings.large_gain, settings.hopeless_share * (without - best))
 
 
 def fit_to_all(evaluator: Evaluator, model: FittedModel, warm_start: FittedModel) -> FittedModel:

@@ -85,8 +85,9 @@ def fit(
     iterations = settings.fit.iterations if iterations is None else iterations
     x = problem.smoothed_start(x, tolerance=tolerance, iterations=iterations)
     minimum = minimise(
-        problem.cost, problem.normal, x, low, high, tolerance=tolerance, iterations=iterations
-    )
+        problem.cost, problem.normal, x, low, high, tolerance=tolerance, iterations=iterations,
+        known=_known_minimum(problem, x, warm_start),
+    )  # fmt: skip
     for _ in range(settings.fit.delay_rounds if delay_rounds is None else delay_rounds):
         beyond = _beyond_the_cliff(problem, minimum, settings)
         if beyond is None:
@@ -159,6 +160,30 @@ def delay_restarts(problem: Problem, x: Floats, settings: SelectionConfig = DEFA
         if parameter.kinked and parameter.scan:
             x = _best_delay(problem, x, path, settings)
     return x
+
+
+def _known_minimum(problem: Problem, x: Floats, earlier: FittedModel | None) -> Minimum | None:
+    """The minimum of an earlier fit to the same problem that ended at ``x``; None if there is none.
+
+    A model whose parameters were taken over and not fitted has no normal equations.
+    """
+    if earlier is None or earlier.minimum.iterations == 0:
+        return None
+    known, layout = earlier.problem, problem.unknowns
+    if known.predictor is not problem.predictor or known.noise != problem.noise:
+        return None
+    if known.unknowns.paths != layout.paths or len(earlier.minimum.x) != len(x):
+        return None
+    pairs = (
+        (known.unknowns.index, layout.index),
+        (known.fixed, problem.fixed),
+        (known.mean, problem.mean),
+        (known.precision, problem.precision),
+    )
+    if not all(np.array_equal(before, now) for before, now in pairs):
+        return None
+    # A value and its logarithm differ in the last digit.
+    return earlier.minimum if np.allclose(earlier.minimum.x, x, rtol=1e-12, atol=1e-12) else None
 
 
 def _beyond_the_cliff(

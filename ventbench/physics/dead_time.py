@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from functools import partial
+from functools import partial, reduce
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -51,23 +52,26 @@ def resolution_of(dt: NDArray[np.float64]) -> tuple[int, int]:
 
 
 def windows(
-    dt: Array, past: Array, dead_times: tuple[Array | float, ...], held: tuple[Array, ...],
-    count: int, skip_idle: bool = False,
+    dt: Array, past: tuple[Array, ...], dead_times: tuple[Array | float, ...],
+    held: tuple[tuple[Array, ...], ...], count: int, skip_idle: bool = False,
 ) -> tuple[Array, ...]:  # fmt: skip
     """Cut a sample into substeps, and average delayed commands over each of them.
 
+    Samples, substeps and cuts are arrays of their own, or the first axis: an operation on a whole
+    batch becomes vector code, one along a last axis of six does not.
+
     Args:
         dt: length of the sample, s, ``(...)``.
-        past: durations of the samples before, the latest first, s, ``(..., P)``.
+        past: durations of the P samples before, the latest first, s, ``(...)`` each.
         dead_times: dead times, s, the most important first; numbers where no mechanism has one.
-        held: the command that each of them delays, the latest first, ``(..., P + 1)``.
+        held: the P + 2 last commands that each of them delays, the latest first, ``(...)`` each.
         count: number of substeps, at least 3.
         skip_idle: skip the computation of dead times that are zero in all elements.
 
     Returns:
-        Lengths, s, and the mean of each command, ``(..., count)`` each.
+        Lengths, s, and the mean of each command, ``(count, ...)`` each.
     """
-    dt = dt + 0.0 * held[0][..., 0]
+    dt = dt + 0.0 * held[0][0]
     delays = [delay for delay in dead_times if isinstance(delay, jax.Array)]
     cut = substep_lengths(dt, past, (), count)
     if delays:
@@ -77,15 +81,17 @@ def windows(
         )
     means = []
     for delay, values in zip(dead_times, held, strict=True):
-        mean = values[..., :1] + 0.0 * cut
+        mean = tuple(values[0] + 0.0 * length for length in cut)
         if isinstance(delay, jax.Array):
             delayed = partial(_mean, delay=delay, lengths=cut, past=past, values=values)
             mean = apply_if_active(_any_active([delay]) if skip_idle else None, delayed, mean)
         means.append(mean)
-    return cut, *means
+    return tuple(jnp.stack(rows) for rows in (cut, *means))
 
 
-def substep_lengths(dt: Array, past: Array, dead_times: tuple[Array, ...], count: int) -> Array:
+def substep_lengths(
+    dt: Array, past: tuple[Array, ...], dead_times: tuple[Array, ...], count: int
+) -> tuple[Array, ...]:
     """Cut a sample into substeps.
 
     A valve that opens within a substep is not the same as one that is half open throughout, so that
@@ -94,60 +100,77 @@ def substep_lengths(dt: Array, past: Array, dead_times: tuple[Array, ...], count
 
     Args:
         dt: length of the sample, s, ``(...)``.
-        past: durations of the samples before, the latest first, s, ``(..., P)``.
+        past: durations of the P samples before, the latest first, s, ``(...)`` each.
         dead_times: dead times, s, the most important first.
         count: number of substeps, at least 3.
 
     Returns:
-        Lengths, s, ``(..., count)``.
+        The length of each, s, ``(...)``.
     """
     short = jnp.minimum(LAST_SUBSTEP, dt / count)
-    room = (dt - short)[..., None]
-    cuts = room * (jnp.arange(1, count - 1) / (count - 1)).astype(dt.dtype)
-    free = jnp.ones_like(cuts)
+    room, zero = dt - short, jnp.zeros_like(dt)
+    cuts = [room * (k / (count - 1)) for k in range(1, count - 1)]
+    free = [jnp.ones_like(dt, bool) for _ in cuts]
     for delay in dead_times[: count - 2]:
-        behind = jnp.concatenate([jnp.zeros_like(room), _sums(past)], axis=-1)
-        arrives = (delay + 0.0 * dt)[..., None] - behind
-        inside = (arrives > 0.0) & (arrives < room)
-        edge = jnp.sum(jnp.where(inside, arrives, 0.0) * _first(inside), axis=-1, keepdims=True)
-        away = jnp.where(free > 0, jnp.abs(cuts - edge), jnp.inf)
+        edge, found = zero, jnp.zeros_like(dt, bool)
+        for begin in _begins(past):
+            arrives = delay + begin + zero
+            inside = (arrives > 0.0) & (arrives < room) & ~found
+            edge, found = jnp.where(inside, arrives, edge), found | inside
+        away = [
+            jnp.where(is_free, jnp.abs(cut - edge), jnp.inf)
+            for cut, is_free in zip(cuts, free, strict=True)
+        ]
         # With a tolerance: compilers may round a difference in two ways, and no cut would match.
-        nearest = _first(away <= jnp.min(away, axis=-1, keepdims=True) + 1e-9 * dt[..., None])
-        nearest = nearest * jnp.any(inside, axis=-1, keepdims=True)
-        cuts = jnp.where(nearest > 0, edge, cuts)
-        free = free * (1.0 - nearest)
-    ends = jnp.concatenate([jnp.zeros_like(room), _sorted(cuts), room, dt[..., None]], -1)
+        least = reduce(jnp.minimum, away) + 1e-9 * dt
+        for k, distance in enumerate(away):
+            nearest = found & (distance <= least)
+            cuts[k], free[k] = jnp.where(nearest, edge, cuts[k]), free[k] & ~nearest
+            found = found & ~nearest
+    ends = [zero, *_sorted(cuts), room, dt]
     # Two cuts may coincide; nothing may be divided by zero.
-    return jnp.maximum(jnp.diff(ends, axis=-1), 1e-6 * dt[..., None])
+    return tuple(jnp.maximum(end - begin, 1e-6 * dt) for begin, end in pairwise(ends))
 
 
-def window_weights(start: Array, length: Array, past: Array) -> Array:
+def window_weights(start: Array, length: Array, past: tuple[Array, ...]) -> list[Array]:
     """Shares of a window in this sample, in each of P samples before, and in all earlier ones.
 
     Args:
         start: start of the window, s after the start of this sample; negative reaches back;
             ``(...)``.
         length: length of the window, s, positive, ``(...)``.
-        past: durations of the P samples before, the latest first, s, ``(..., P)``.
+        past: durations of the P samples before, the latest first, s, ``(...)`` each.
 
     Returns:
-        Weights that add up to one, in that order, ``(..., P + 2)``.
+        P + 2 weights that add up to one, in that order, ``(...)`` each.
     """
-    begins = -jnp.cumsum(past, axis=-1)
-    infinite = jnp.full_like(begins[..., :1], jnp.inf)
-    zero = jnp.zeros_like(infinite)
-    upper = jnp.concatenate([infinite, zero, begins], axis=-1)
-    lower = jnp.concatenate([zero, begins, -infinite], axis=-1)
-    first, last = start[..., None], (start + length)[..., None]
-    inside = jnp.minimum(last, upper) - jnp.maximum(first, lower)
-    return jnp.maximum(inside, 0.0) / length[..., None]
+    last = start + length
+    edges = [jnp.inf, *_begins(past), -jnp.inf]
+    return [
+        jnp.maximum(jnp.minimum(last, upper) - jnp.maximum(start, lower), 0.0) / length
+        for upper, lower in pairwise(edges)
+    ]
 
 
-def _mean(_: Array, delay: Array, lengths: Array, past: Array, values: Array) -> Array:
-    """Mean over each substep of what was commanded ``delay`` seconds before, ``(..., K)``."""
-    starts = _sums(lengths) - lengths - (delay + 0.0 * lengths[..., 0])[..., None]
-    weights = window_weights(starts, lengths, past[..., None, :])
-    return jnp.sum(weights * values[..., None, :], axis=-1)
+def _mean(
+    _: object, delay: Array, lengths: tuple[Array, ...], past: tuple[Array, ...],
+    values: tuple[Array, ...],
+) -> tuple[Array, ...]:  # fmt: skip
+    """Mean over each substep of what was commanded ``delay`` seconds before, ``(...)`` each."""
+    means, start = [], 0.0 - delay
+    for length in lengths:
+        weights = window_weights(start, length, past)
+        means.append(sum(map(jnp.multiply, weights, values), start=jnp.zeros_like(length)))
+        start = start + length
+    return tuple(means)
+
+
+def _begins(past: tuple[Array, ...]) -> list[Array | float]:
+    """Starts of this sample and of those before, s after the start of this one, ``(...)`` each."""
+    begins: list[Array | float] = [0.0]
+    for before in past:
+        begins.append(begins[-1] - before)
+    return begins
 
 
 def _any_active(delays: list[Array]) -> Array:
@@ -155,27 +178,13 @@ def _any_active(delays: list[Array]) -> Array:
     return jnp.any(jnp.stack([jnp.any(delay != 0.0) for delay in delays]))
 
 
-def _first(mask: Array) -> Array:
-    """One at the first True along the last axis, zero elsewhere."""
-    return (mask & (_sums(mask.astype(float)) == 1.0)).astype(float)
-
-
-def _sums(values: Array) -> Array:
-    """Running sums along a short last axis."""
-    total, sums = jnp.zeros_like(values[..., 0]), []
-    for k in range(values.shape[-1]):
-        total = total + values[..., k]
-        sums.append(total)
-    return jnp.stack(sums, axis=-1)
-
-
-def _sorted(values: Array) -> Array:
-    """Sorted along a short last axis, by exchanges of neighbours."""
-    rows = [values[..., k] for k in range(values.shape[-1])]
+def _sorted(rows: list[Array]) -> list[Array]:
+    """A few arrays, sorted element by element, by exchanges of neighbours."""
+    rows = list(rows)
     for end in range(len(rows) - 1, 0, -1):
         for k in range(end):
             rows[k], rows[k + 1] = (
                 jnp.minimum(rows[k], rows[k + 1]),
                 jnp.maximum(rows[k], rows[k + 1]),
             )
-    return jnp.stack(rows, axis=-1)
+    return rows

@@ -28,16 +28,14 @@ from ventbench.physics.solver import ContinuousState
 
 @flax.struct.dataclass
 class PhysicsState:
-    """State between two samples; every array has shape ``(...)`` unless it says otherwise.
+    """State between two samples; every array has shape ``(...)``.
 
     Attributes:
         continuous: see :class:`~ventbench.physics.solver.ContinuousState`.
         memory: memories of mechanisms from sample to sample, by name.
-        commanded: flows that the last commands ask for, the latest first, L/s,
-            ``(..., memory + 1)``.
-        opened: expiratory valve during the last samples, the latest first, 0/1,
-            ``(..., memory + 1)``.
-        past: durations of the last samples, the latest first, s, ``(..., memory)``.
+        commanded: flows that the last ``memory + 1`` commands ask for, the latest first, L/s.
+        opened: expiratory valve during the last ``memory + 1`` samples, the latest first, 0/1.
+        past: durations of the last ``memory`` samples, the latest first, s.
         time: time since the start of the breath, s.
         first: volume of the lung at the start of the breath, L.
         peep: pressure behind the expiratory valve, cmH2O.
@@ -45,9 +43,9 @@ class PhysicsState:
 
     continuous: ContinuousState
     memory: dict[str, Array]
-    commanded: Array
-    opened: Array
-    past: Array
+    commanded: tuple[Array, ...]
+    opened: tuple[Array, ...]
+    past: tuple[Array, ...]
     time: Array
     first: Array
     peep: Array
@@ -94,8 +92,8 @@ class Physics:
         flow, memory = solver.commanded(replace(assembly, active={}), u_in, memory)
         rest, ones = solver.at_rest(assembly, shown, flow), jnp.ones_like(flow)
         return PhysicsState(
-            rest, memory, _repeat(flow, self.memory + 1), _repeat(ones, self.memory + 1),
-            _repeat(0.03 * ones, self.memory), 0.0 * ones, rest.volume, peep * ones,
+            rest, memory, (flow,) * (self.memory + 1), (ones,) * (self.memory + 1),
+            (0.03 * ones,) * self.memory, 0.0 * ones, rest.volume, peep * ones,
         )  # fmt: skip
 
     def step(
@@ -130,8 +128,8 @@ class Physics:
         divisions = self.divisions if divisions is None else divisions
         zero = jnp.zeros_like(state.time)
         flow, memory = solver.commanded(assembly, u_in + zero, state.memory)
-        commanded = _push(flow, state.commanded)
-        opened = _push(u_out + zero, state.opened)
+        commanded = (flow, *state.commanded)
+        opened = (u_out + zero, *state.opened)
         delay = assembly.total(lambda mechanism, own: mechanism.dead_time(own))
         outlet_delay = assembly.total(lambda mechanism, own: mechanism.outlet_dead_time(own, u_out))
         lengths, open_for, commanded_flow = dead_time.windows(
@@ -143,7 +141,7 @@ class Physics:
             self.skip_idle,
         )
 
-        held = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), (commanded_flow, open_for, lengths))
+        held = (commanded_flow, open_for, lengths)
 
         def advance(k: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:
             now, time = carry
@@ -156,8 +154,8 @@ class Physics:
         count = divisions * len(held[0])
         now, time = jax.lax.fori_loop(0, count, advance, (state.continuous, state.time))
         after = PhysicsState(
-            now, memory, commanded[..., :-1], opened[..., :-1],
-            _push(dt + zero, state.past)[..., :-1], time, state.first, state.peep,
+            now, memory, commanded[:-1], opened[:-1],
+            (dt + zero, *state.past)[:-1], time, state.first, state.peep,
         )  # fmt: skip
         volume = 1000.0 * (now.volume - state.first)
         return after, (solver.sensor_output(assembly, now.reading), 1000.0 * now.flow, volume)
@@ -224,11 +222,3 @@ def physics(
     """
     own = {f"{m}.{p}": x for m, given in (mechanisms or {}).items() for p, x in given.items()}
     return Physics((), ()).having(R=lung.R, C=lung.C, **base, **own)
-
-
-def _repeat(value: Array, count: int) -> Array:
-    return jnp.repeat(value[..., None], count, axis=-1)
-
-
-def _push(value: Array, before: Array) -> Array:
-    return jnp.concatenate([value[..., None], before], axis=-1)

@@ -71,14 +71,6 @@ class Data:
         measured = np.where(weight > 0, pressure[:, None], 0.0)
         return replace(self, measured=measured, weight=weight)
 
-    def padded(self, count: int) -> Data:
-        """Append breaths of weight zero up to ``count``, so that compiled sizes recur."""
-        index = np.concatenate([np.arange(len(self)), np.zeros(count - len(self), int)])
-        longer = self.select(index)
-        weight = longer.weight.copy()
-        weight[len(self) :] = 0.0
-        return replace(longer, weight=weight)
-
     def _arrays(self) -> dict[str, Floats]:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 

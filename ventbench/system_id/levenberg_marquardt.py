@@ -43,7 +43,7 @@ class Minimum:
 
 def minimise(
     cost: Cost, normal: Normal, x: Floats, low: Floats, high: Floats, *, tolerance: float = 1e-3,
-    iterations: int = 40,
+    iterations: int = 40, known: Minimum | None = None,
 ) -> Minimum:  # fmt: skip
     """Search for a local minimum within bounds, starting from ``x``.
 
@@ -51,9 +51,12 @@ def minimise(
     that would cross its bound ends at the bound, and the rest of the step is solved for again.
     Damping multiplies the diagonal of the Hessian (Marquardt), so that scales do not matter.
 
+    Most steps are accepted, and ``normal`` tells the cost as well. It is therefore asked at once,
+    and ``cost`` only after a step has been rejected.
+
     Args:
         cost: cost at a point; infinity or nan rejects the step.
-        normal: cost, gradient and Gauss-Newton Hessian at a point.
+        normal: the same cost, its gradient and its Gauss-Newton Hessian at a point.
         x: start, ``(U,)``; it is moved into the bounds.
         low: lower bounds, ``(U,)``.
         high: upper bounds, ``(U,)``.
@@ -61,31 +64,37 @@ def minimise(
             the cost is a negative log-likelihood), or after four steps that each gain less than ten
             times the tolerance.
         iterations: most evaluations of ``normal``.
+        known: where an earlier search for the same cost ended, if this one starts there; it need
+            not be evaluated again.
     """
-    x = np.clip(x, low, high)
-    value, gradient, hessian = normal(x)
+    if known is None:
+        x = np.clip(x, low, high)
+        value, gradient, hessian = normal(x)
+    else:
+        x, value, gradient, hessian = known.x, known.cost, known.gradient, known.hessian
     damping, slow = 1e-3, 0
     for iteration in range(1, iterations):
         pinned = ((x <= low) & (gradient > 0)) | ((x >= high) & (gradient < 0))
-        moved = False
+        moved, rejected = False, False
         while damping < 1e10:
             step = _step(gradient, hessian, damping, pinned, low - x, high - x)
             trial = np.clip(x + step, low, high)
             expected = -float(gradient @ step + 0.5 * step @ hessian @ step)
             if expected < tolerance and damping <= 1e-2:
                 return Minimum(x, value, gradient, hessian, iteration, True)
-            reached = cost(trial)
+            reached, *slopes = (cost(trial),) if rejected else normal(trial)
             if reached < value:
                 gain = (value - reached) / max(expected, 1e-12)
                 damping = max(damping * (0.1 if gain > 0.5 else 1.0 if gain > 0.1 else 3.0), 1e-9)
                 moved = True
                 break
             damping *= 8.0
+            rejected = True
         if not moved:  # no smaller value within rounding errors
             return Minimum(x, value, gradient, hessian, iteration, True)
         slow = slow + 1 if value - reached < 10.0 * tolerance else 0
-        x = trial
-        value, gradient, hessian = normal(x)
+        x, value = trial, reached
+        gradient, hessian = slopes or normal(x)[1:]
         if slow == _SLOW:
             return Minimum(x, value, gradient, hessian, iteration, True)
     return Minimum(x, value, gradient, hessian, iterations, False)

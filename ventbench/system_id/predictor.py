@@ -29,15 +29,16 @@ Ints = NDArray[np.int_]
 #: Path of the reading that a breath starts from, cmH2O; it is no parameter of the model.
 START = "start"
 
-#: Numbers of breaths to compile for, unless told otherwise; larger data are divided.
+#: Numbers of simulations to compile for, unless told otherwise: the least that holds all breaths,
+#: or the last.
 SIZES = (4, 8, 16, 32, 64)
 
-#: Numbers of points to compile for, each for all breaths; a larger number is divided. A third size
-#: would take as long to compile as a diagnosis takes.
+#: Multiples of that number to compile for; more simulations are divided. A third size would take as
+#: long to compile as a diagnosis takes.
 _WIDTHS = (1, 8)
 
-#: Least share of the points of a compiled size that must be asked for: eight points take as long as
-#: three one by one.
+#: Least share of a compiled size that must be asked for: eight times as many simulations take as
+#: long as three of the small size.
 _FILLED = 0.375
 
 #: Step of a difference quotient, as a share of a parameter's range or, on a log scale, of its
@@ -94,7 +95,10 @@ def needs_small_steps(path: str) -> bool:
 class Predictor:
     """Predictions for all breaths of some data, at any parameters; compiled once for each size.
 
-    Blocks of breaths and points are computed in parallel; see :func:`~.parallel.parallel_map`.
+    A simulation is one breath at one point. Those of all points are lined up, and computed in
+    blocks of a compiled size, whatever breath or point a block begins with: few breaths at many
+    points fill it as well as many breaths do. Blocks are computed in parallel; see
+    :func:`~ventbench.executor.parallel_map`.
 
     Attributes:
         names: paths of the parameters in the order of the columns of ``values``, whose last column
@@ -110,7 +114,7 @@ class Predictor:
         substeps: int | None = None,
         sizes: tuple[int, ...] = SIZES,
     ) -> None:
-        """Pad the data to a compiled size.
+        """Choose the sizes to compile for.
 
         Args:
             data: breaths to predict.
@@ -118,14 +122,12 @@ class Predictor:
             substeps: number of substeps in a sample; enough for most purposes if not given. An edge
                 that a dead time shifts is smoothed over one substep, and the dead time is uncertain
                 by part of it.
-            sizes: numbers of breaths to pad to, each compiled once; data with more breaths than the
-                last are divided into blocks of that size.
+            sizes: numbers of simulations to compile for; the least that holds all breaths, or the
+                last, and eight times as many are used.
         """
         self.names = names
-        self._count, self._large_steps = len(data), False
-        self._part = next((size for size in sizes if size >= len(data)), sizes[-1])
-        parts = max(-(-len(data) // self._part), 1)
-        padded = data.padded(parts * self._part)
+        self._large_steps = False
+        self._size = next((size for size in sizes if size >= len(data)), sizes[-1])
         enough, memory = resolution_of(data.dt)
         if not any(_has_dead_time(name) for name in names):
             memory = 1
@@ -135,12 +137,10 @@ class Predictor:
             "names": names, "substeps": self.substeps, "memory": memory, "flow": flow,
             "skip_idle": True,
         }  # fmt: skip
-        with float64():
-            u_in, u_out, dt = (
-                [jnp.asarray(part) for part in np.split(x, parts)]
-                for x in (padded.u_in, padded.u_out, padded.dt)
-            )
-        self._commands: list[Commands] = list(zip(u_in, u_out, dt, strict=True))
+        self._commands = (data.u_in, data.u_out, data.dt)
+        self._stiff = [
+            (column, *stiff) for column, name in enumerate(names) if (stiff := _small_steps(name))
+        ]
 
     @property
     def with_large_steps(self) -> Predictor:
@@ -155,35 +155,33 @@ class Predictor:
 
     def predict_all(self, points: Floats) -> Floats:
         """Predicted measurements, ``(m, n, c, T)``, at several points ``(m, n, P + 1)``."""
-        parts = len(self._commands)
-        extra = parts * self._part - self._count  # padding breaths
-        points = np.concatenate([points, np.repeat(points[:, :1], extra, axis=1)], axis=1)
-        divisions = self._divisions(points)
-        groups = [
-            (np.flatnonzero(divisions == count)[first:last], width, count)
-            for count in np.unique(divisions)
-            for first, last, width in _groups(int((divisions == count).sum()))
-        ]
-        work = [
-            (np.resize(some, (width, *some.shape[1:])), commands, count)
-            for where, width, count in groups
-            for some, commands in zip(
-                np.split(points[where], parts, axis=1), self._commands, strict=True
-            )
-        ]
+        count, breaths, width = points.shape
+        lanes = points.reshape(-1, width)
+        divisions = np.repeat(self._divisions(points), breaths)
+        work = []
+        for steps in np.unique(divisions):
+            alike = np.flatnonzero(divisions == steps)
+            work += [
+                (alike[first:last], size, int(steps))
+                for first, last, size in _blocks(len(alike), self._size)
+            ]
 
-        def predicted(place: tuple[Floats, Commands, int]) -> Floats:
+        def predicted(block: tuple[Ints, int, int]) -> Floats:
+            where, size, steps = block
+            filled = np.resize(where, size)
+            breath = filled % breaths
             with float64():
-                return np.asarray(
-                    _predict(jnp.asarray(place[0]), place[1], jnp.asarray(place[2]), **self._static)
+                commands = tuple(jnp.asarray(command[breath]) for command in self._commands)
+                seen = _predict(
+                    jnp.asarray(lanes[filled]), commands, jnp.asarray(steps), **self._static
                 )
+                return np.asarray(seen)[: len(where)]
 
         seen = parallel_map(predicted, work)
-        rows = [np.concatenate(seen[k : k + parts], axis=1) for k in range(0, len(seen), parts)]
-        answers = np.empty((len(points), *rows[0].shape[1:]))
-        for row, (where, _, _) in zip(rows, groups, strict=True):
-            answers[where] = row[: len(where)]
-        return answers[:, : self._count]
+        answers = np.empty((len(lanes), *seen[0].shape[1:]))
+        for rows, (where, _, _) in zip(seen, work, strict=True):
+            answers[where] = rows
+        return answers.reshape(count, breaths, *answers.shape[1:])
 
     def plant(self, values: Mapping[str, ArrayLike]) -> Physics:
         """The model at values by path, as a plant in float64 that predicts what this one does."""
@@ -216,13 +214,11 @@ class Predictor:
 
     def _divisions(self, points: Floats) -> Ints:
         """Steps of the integrator in a substep that each point needs, ``(m,)``."""
-        if self._large_steps:
-            return np.ones(len(points), int)
-        needed = [
-            [_divisions_at(name, point[:, k]) for k, name in enumerate(self.names)]
-            for point in points
-        ]
-        return np.max(needed, axis=1, initial=1)
+        needed = np.ones(len(points), int)
+        for column, neutral, divisions in () if self._large_steps else self._stiff:
+            acts = np.any(np.abs(points[:, :, column] - neutral) > _ACTS, axis=1)
+            needed[acts] = np.maximum(needed[acts], divisions)
+        return needed
 
     def _is_off(self, values: Floats, column: int) -> bool:
         """Whether a parameter of a mechanism that may have either sign is at its neutral value."""
@@ -247,14 +243,22 @@ class Predictor:
         return np.where(values + move > definition.high, -move, move)
 
 
+def _small_steps(path: str) -> tuple[float, int] | None:
+    """Where a strength is neutral, and the steps of the integrator in a substep beyond; or None.
+
+    None for all parameters of mechanisms that need no small steps, and for all but the strength.
+    """
+    if not needs_small_steps(path):
+        return None
+    owner, _, short = path.rpartition(".")
+    strength = mechanism(owner).description.strength
+    return (strength.neutral, mechanism(owner).divisions) if short == strength.name else None
+
+
 def _divisions_at(path: str, values: Floats) -> int:
     """Steps of the integrator in a substep that a parameter needs at these values."""
-    if not needs_small_steps(path):
-        return 1
-    owner, _, short = path.rpartition(".")
-    strength = mechanism(owner).description.parameters[0]
-    acts = short == strength.name and np.any(np.abs(values - strength.neutral) > _ACTS)
-    return mechanism(owner).divisions if acts else 1
+    stiff = _small_steps(path)
+    return stiff[1] if stiff and np.any(np.abs(values - stiff[0]) > _ACTS) else 1
 
 
 def _has_dead_time(path: str) -> bool:
@@ -269,15 +273,15 @@ def _has_dead_time(path: str) -> bool:
     )
 
 
-def _groups(count: int) -> list[tuple[int, int, int]]:
-    """First and last of the points that are computed at once, and the compiled number of points.
+def _blocks(count: int, size: int) -> list[tuple[int, int, int]]:
+    """First and last of the simulations that are computed at once, and the compiled number.
 
-    A group may lack up to five of eight.
+    A block may lack up to five eighths of a larger size than the smallest.
     """
-    groups, first = [], 0
+    blocks, first = [], 0
     while first < count:
-        width = max(width for width in _WIDTHS if _FILLED * width <= count - first)
+        width = size * max(w for w in _WIDTHS if w == 1 or _FILLED * w * size <= count - first)
         last = min(first + width, count)
-        groups.append((first, last, width))
+        blocks.append((first, last, width))
         first = last
-    return groups
+    return blocks

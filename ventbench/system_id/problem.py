@@ -236,7 +236,8 @@ class Problem:
 
     def normal(self, x: Floats) -> tuple[float, Floats, Floats]:
         """Cost, its gradient ``(U,)`` and its Gauss-Newton Hessian ``(U, U)``."""
-        cost, by_breath, curvature = self.scores(x)
+        with np.errstate(over="ignore", invalid="ignore"):  # where a step leads to instability
+            cost, by_breath, curvature = self.scores(x)
         index = self.unknowns.index
         gradient = self.precision * (x - self.mean)
         np.add.at(gradient, index, by_breath)

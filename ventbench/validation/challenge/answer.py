@@ -29,12 +29,11 @@ _SINGLE_THREAD = {
     "VENTBENCH_THREADS": "1",
 }
 
-#: Mean number of cases after which a new process replaces an old one. That one keeps what was
-#: compiled for each number of samples: tens of MiB a case where laboratories differ.
+#: Mean number of cases after which a new process replaces an old one.
 _CASES_PER_PROCESS = 8
 
-#: Number of cases that this process has answered.
-_answered = 0
+#: Number of cases that this process has answered, and the grid that its compiled functions are for.
+_answered, _grid = 0, None
 
 
 class Answer(Protocol):
@@ -150,8 +149,25 @@ def _ventbench_diagnosis(breaths: Breaths, lung: str) -> Answer:
     from ventbench.diagnosis.diagnose import diagnose
 
     compilation.keep()
+    _forget_other_grids(breaths)
     # Whether somebody breathes is part of the question.
     return diagnose(breaths, simulator="physics", lung=lung, patient=True)
+
+
+def _forget_other_grids(breaths: Breaths) -> None:
+    """Free what was compiled for recordings of another grid of samples: 100 to 200 MiB each.
+
+    Laboratories differ in their grids. To read the functions back from the disk takes two seconds.
+    """
+    global _grid
+    import jax
+
+    from ventbench.physics.dead_time import resolution_of
+
+    grid = (breaths.dt.shape[1], *resolution_of(breaths.dt))
+    if _grid not in (None, grid):
+        jax.clear_caches()
+    _grid = grid
 
 
 def _peak_memory() -> float:

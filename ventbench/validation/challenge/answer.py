@@ -155,18 +155,17 @@ def _ventbench_diagnosis(breaths: Breaths, lung: str) -> Answer:
 
 
 def _forget_other_grids(breaths: Breaths) -> None:
-    """Free what was compiled for recordings of another grid of samples: 100 to 200 MiB each.
+    """Free what was compiled for recordings of another grid of samples: 200 MiB each.
 
-    Laboratories differ in their grids. To read the functions back from the disk takes two seconds.
+    Laboratories differ in their grids. To read the functions back from the disk takes two to four
+    seconds.
     """
     global _grid
-    import jax
-
     from ventbench.physics.dead_time import resolution_of
 
     grid = (breaths.dt.shape[1], *resolution_of(breaths.dt))
     if _grid not in (None, grid):
-        jax.clear_caches()
+        compilation.forget()
     _grid = grid
 
 

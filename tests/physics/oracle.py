@@ -79,8 +79,8 @@ class Breath:
         x = (t - e["onset"]) / e["duration"]
         sine = np.sin(np.pi * x) if 0 < x < 1 else 0.0
         relaxing = e.get("relaxing", 0.0)
-        course = (1 - relaxing) * sine + relaxing * np.exp(-8 * (x - 0.5)) if x > 0.5 else sine
-        return e["amplitude"] * course
+        muscle = 0.0 if x < 0 else np.sin(0.75 * np.pi * x) if x < 2 / 3 else np.exp(4 - 6 * x)
+        return e["amplitude"] * ((1 - relaxing) * sine + relaxing * muscle)
 
     def lost(self, p):
         """Leak, L/s: by an orifice that is rounded off at 0.2 cmH2O."""
@@ -170,7 +170,7 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
     edges = set(times) | set(times + late) | set(times + late_out)
     if "patient_effort" in m:
         e = m["patient_effort"]
-        edges |= {e["onset"] + share * e["duration"] for share in (0.0, 0.5, 1.0)}
+        edges |= {e["onset"] + share * e["duration"] for share in (0.0, 2 / 3, 1.0)}
     edges = sorted(t for t in edges if t <= times[-1])
 
     def held(values, before, t):

@@ -8,8 +8,9 @@ from ventbench.physics.mechanism import Description, Mechanism, Values
 from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import Parameter
 
-#: Time constant of the muscles' relaxation, as a share of the duration: 0.1 s of 0.8 s.
-_RELAXING = 0.125
+#: Where a muscle that relaxes has its peak, and its time constant after it, as shares of the
+#: duration: with these, the best duration is hardly another one than that of half a sine.
+_PEAK, _RELAXING = 2 / 3, 1 / 6
 
 
 class PatientEffort(Mechanism):
@@ -20,8 +21,8 @@ class PatientEffort(Mechanism):
         title="effort of the patient's muscles",
         site="alveolus",
         equation=(
-            "P_alveolus = ... - amplitude s(x), x = (t - onset) / duration; s = sin(pi x) to its "
-            "peak, then (1 - relaxing) sin(pi x) + relaxing exp(-8 (x - 1/2))"
+            "P_alveolus = ... - amplitude ((1 - relaxing) sin(pi x) + relaxing m(x)), "
+            "x = (t - onset) / duration, m = sin(3 pi x / 4) up to x = 2/3, then exp(4 - 6 x)"
         ),
         parameters=(
             Parameter(
@@ -81,9 +82,9 @@ class PatientEffort(Mechanism):
         """Subtract the pressure of the muscles from the recoil."""
         phase = (view.time - values["onset"]) / values["duration"]
         sine = jnp.sin(jnp.pi * jnp.clip(phase, 0.0, 1.0))
-        since = jnp.maximum(phase - 0.5, 0.0)
-        left = jnp.where(since > 0.0, jnp.exp(-since / _RELAXING), sine)
-        course = sine + values["relaxing"] * (left - sine)
+        rise = jnp.sin(0.5 * jnp.pi / _PEAK * jnp.clip(phase, 0.0, _PEAK))
+        muscle = rise * jnp.exp(-jnp.maximum(phase - _PEAK, 0.0) / _RELAXING)
+        course = sine + values["relaxing"] * (muscle - sine)
         return network.plus(recoil=-values["amplitude"] * course)
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import Noise
@@ -83,11 +84,22 @@ class LinearBreaths:
 
     @classmethod
     def of(cls, problem: Problem, x: Floats) -> LinearBreaths:
-        """Breaths of a problem whose unknowns ``(U,)`` all differ from breath to breath."""
+        """Breaths of a problem at its unknowns ``(U,)``.
+
+        Parameters that breaths share count among the own ones of each, which bears its part of
+        their prior; :meth:`only` takes them out.
+        """
         residual, slopes = problem.jacobian(x)
-        index = problem.unknowns.index
-        moved = (x - problem.mean)[index]
-        return cls(residual, slopes, problem.precision[index], moved, problem.data.weight)
+        index, moved = problem.unknowns.index, x - problem.mean
+        precision = problem.precision[index] / uses(problem)
+        return cls(residual, slopes, precision, moved[index], problem.data.weight)
+
+    def only(self, columns: NDArray[np.bool_]) -> LinearBreaths:
+        """The breaths with some of the parameters alone, bool, ``(j,)``."""
+        return replace(
+            self, slopes=self.slopes[:, columns], precision=self.precision[:, columns],
+            displacement=self.displacement[:, columns],
+        )  # fmt: skip
 
     def whitened(self, noise: Noise, responses: Floats | None = None) -> WhitenedBreaths:
         """The breaths and a process's responses, whitened by a noise.
@@ -247,7 +259,19 @@ class WhitenedBreaths:
         return _RIDGE * (1.0 + np.sum(self.rows[:, self.count :] ** 2, axis=2))
 
 
-def likeliest_beside(problem: Problem, x: Floats, responses: Floats, size: float) -> Floats:
+def uses(problem: Problem) -> NDArray[np.int64]:
+    """Number of breaths that share the unknown behind each parameter of a breath, ``(n, k)``."""
+    index = problem.unknowns.index
+    return np.bincount(index.ravel(), minlength=len(problem.unknowns.path_of))[index]
+
+
+def likeliest_beside(
+    problem: Problem,
+    x: Floats,
+    breaths: LinearBreaths,
+    responses: Floats | None = None,
+    size: float = 1.0,
+) -> Floats:
     """Unknowns of a problem that are the likeliest beside a process, to first order, ``(U,)``.
 
     Parameters that were fitted without the process have made up for it. Those that breaths share
@@ -256,47 +280,39 @@ def likeliest_beside(problem: Problem, x: Floats, responses: Floats, size: float
     Args:
         problem: breaths, noise and unknowns.
         x: unknowns in coordinates, ``(U,)``.
+        breaths: the problem's at ``x``, with all parameters.
         responses: see :meth:`LinearBreaths.whitened`.
         size: standard deviation of the process.
     """
-    index, count = problem.unknowns.index, responses.shape[1]
-    uses = np.bincount(index.ravel(), minlength=len(x))[index]
-    shared = np.flatnonzero((uses > 1).any(axis=0))
-    if not len(shared):
-        return x
-    # Each breath bears its part of the prior of what it shares.
-    breaths = LinearBreaths.of(problem, x)
-    breaths = replace(breaths, precision=breaths.precision / uses)
-    whitened = breaths.whitened(problem.noise, responses)
+    index, whitened = problem.unknowns.index, breaths.whitened(problem.noise, responses)
+    is_shared = (uses(problem) > 1).any(axis=0)
+    columns = whitened.count + np.flatnonzero(is_shared)
+    others = np.r_[: whitened.count, whitened.count + np.flatnonzero(~is_shared)]
+    place = index[:, is_shared]
+    used = np.unique(place)
     prior, moved = whitened.prior(size)
-    place = index[:, shared]
-    which = np.concatenate(
-        [np.arange(count), count + np.setdiff1d(np.arange(uses.shape[1]), shared)]
-    )
-    used, columns = np.unique(place), count + shared
     best, left = np.zeros_like(prior), whitened.white
     for _ in range(_STEPS):
         influence = whitened.noise.influence(left)
         curvature = whitened.curvature(influence, prior)
         slope = whitened.slope(influence * left, prior * (best + moved))
-        across = curvature[:, which[:, None], columns]
-        right = np.concatenate([across, slope[:, which, None]], axis=2)
-        solved = np.linalg.solve(curvature[:, which[:, None], which], right)
+        # What differs from breath to breath is eliminated first.
+        across = curvature[:, others[:, None], columns]
+        right = np.concatenate([across, slope[:, others, None]], axis=2)
+        solved = np.linalg.solve(curvature[:, others[:, None], others], right)
         rest = np.matmul(across.swapaxes(1, 2), solved)
-        total, force = np.zeros((len(x), len(x))), np.zeros(len(x))
+        total, force, step = np.zeros((len(x), len(x))), np.zeros(len(x)), np.zeros(len(x))
         inner = curvature[:, columns[:, None], columns] - rest[:, :, :-1]
         np.add.at(total, (place[:, :, None], place[:, None, :]), inner)
         np.add.at(force, place, slope[:, columns] - rest[:, :, -1])
-        step = np.zeros(len(x))
         step[used] = np.linalg.solve(total[np.ix_(used, used)], force[used])
-        best[:, columns] -= step[place]
         own = solved[:, :, -1] - np.matmul(solved[:, :, :-1], step[place][:, :, None])[:, :, 0]
-        best[:, which] -= own
+        best[:, columns] -= step[place]
+        best[:, others] -= own
         left = whitened.left(best)
-        fall = np.sum(force * step) + np.sum(slope[:, which] * own)
-        if 0.5 * abs(float(fall)) < _TOLERANCE:
+        if 0.5 * float(force @ step + np.sum(slope[:, others] * own)) < _TOLERANCE:
             break
     low, high = problem.unknowns.bounds()
     found = x.copy()
-    found[index] += best[:, count:]
+    found[index] += best[:, whitened.count :]
     return np.clip(found, low, high)

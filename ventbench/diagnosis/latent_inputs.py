@@ -12,14 +12,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from scipy import optimize
 
 from ventbench.diagnosis.evaluator import Evaluator
-from ventbench.diagnosis.gaussian_process import Kernel, LinearBreaths, components, likeliest_beside
+from ventbench.diagnosis.gaussian_process import (
+    Kernel,
+    LinearBreaths,
+    components,
+    likeliest_beside,
+    uses,
+)
 from ventbench.diagnosis.hypothesis import FittedModel, Partition
 from ventbench.diagnosis.settings import LatentInputSettings
 from ventbench.executor import parallel_map
@@ -48,6 +53,9 @@ _TOLERANCE = 0.01
 
 #: Size of an input, as a share of that it starts from, below which it is none.
 _LEAST_SIZE = 0.1
+
+#: Correlation of neighbouring samples from which a climb also starts from white noise.
+_COLOURED = 0.2
 
 #: How far a climb may move the logarithm of a frequency: to the next one of the grid.
 _FREQUENCY_SPAN = 0.1
@@ -97,10 +105,13 @@ def fit_latent_inputs(
         fitted: the model whose residuals inputs may explain, without patient effort.
         places: places to test.
     """
-    model = at_best_noise(evaluator, fitted)
+    model, dt = at_best_noise(evaluator, fitted), evaluator.training.data.dt
+    linear, settings = _Linear.of(model), evaluator.settings.latent_inputs
+    every = () if places == (GAIN_SCATTER,) else _kernels(settings)
+    parts = {kernel: components(dt, kernel, settings.min_variance) for kernel in every}
 
     def best(place: str) -> LatentInput:
-        return _fit_input(evaluator, model, place)
+        return _fit_input(evaluator, linear, place, parts)
 
     return dict(zip(places, parallel_map(best, places), strict=True))
 
@@ -162,10 +173,17 @@ def at_best_noise(evaluator: Evaluator, fitted: FittedModel) -> FittedModel:
 
         start = _noise_point(fitted.noise)
         noise = _noise_at(fitted.noise, _climb(fall, start, _NOISE_LIMITS, settings.latent_inputs))
-        climbed = _with_noise(fitted, noise)
-        if evaluator.training_log_likelihood(climbed) < before + settings.fit.noise_gain:
-            return climbed
-        fitted = evaluator.fit(fitted.hypothesis, noise, fitted)
+        climbed = evaluator.training_log_likelihood(fitted, noise)
+        fitted = _updated(fitted, fitted.minimum.x, noise)
+        if climbed < before + settings.fit.noise_gain:
+            break
+        problem, x = fitted.problem, fitted.minimum.x
+        refitted = _updated(
+            fitted, likeliest_beside(problem, x, LinearBreaths.of(problem, x)), noise
+        )
+        if evaluator.training_log_likelihood(refitted) < climbed:
+            break
+        fitted = refitted
     return fitted
 
 
@@ -245,74 +263,100 @@ class _Process:
     components: Floats
     responses: Floats
 
+    @classmethod
+    def of(cls, kernel: Kernel, parts: Floats, responses: Floats) -> _Process:
+        """A process by its components and the ``responses`` of :func:`input_responses`."""
+        return cls(kernel, parts, np.matmul(parts, responses)[:, :, None])
+
+
+@dataclass(frozen=True, eq=False)
+class _Linear:
+    """A model of the training breaths to first order.
+
+    Attributes:
+        model: the model.
+        breaths: its breaths, with all parameters.
+        own: its breaths with the parameters that differ from breath to breath.
+    """
+
+    model: FittedModel
+    breaths: LinearBreaths
+    own: LinearBreaths
+
+    @classmethod
+    def of(cls, model: FittedModel) -> _Linear:
+        breaths = LinearBreaths.of(model.problem, model.minimum.x)
+        return cls(model, breaths, breaths.only((uses(model.problem) == 1).all(axis=0)))
+
 
 class _Fit(NamedTuple):
     """A process with its size and the noise beside it.
 
     Attributes:
         nats: log marginal likelihood of the training breaths.
-        model: the model whose residuals it explains, with the noise beside it.
         process: the process.
         size: its standard deviation.
+        noise: model of the measurement noise.
         coefficients: see :class:`~ventbench.diagnosis.gaussian_process.Marginal`.
     """
 
     nats: float
-    model: FittedModel
     process: _Process
     size: float
-    coefficients: Floats
+    noise: Noise
+    coefficients: Floats | None
 
 
-def _fit_input(evaluator: Evaluator, model: FittedModel, place: str) -> LatentInput:
+def _fit_input(
+    evaluator: Evaluator, linear: _Linear, place: str, parts: dict[Kernel, Floats]
+) -> LatentInput:
     """Climb the training likelihood of an input at one place, then evaluate the held-out breaths.
 
     The best kernel at one noise is climbed in size and noise. Beside that input, other parameters
     of the model may be better, and then another kernel, and so on until nothing gains.
+
+    Args:
+        evaluator: evaluator of the recording.
+        linear: the model whose residuals the input may explain.
+        place: where it acts.
+        parts: components of the kernels that are compared.
     """
-    settings, training = evaluator.settings.latent_inputs, evaluator.training
-    least = evaluator.log_likelihood(model, training).sum() + settings.gain
-    best, process = None, None
-    for _ in range(settings.rounds):
-        breaths, responses = _linearised(evaluator, model, training, place)
-        process_of = partial(_process, training, responses, settings)
-        trial = _best_kernel(breaths, process_of, model, place, best, settings)
-        trial = _climb_process(breaths, process_of, trial, settings)
-        if best is not None and trial.nats < best.nats + settings.gain:
+    settings, model = evaluator.settings.latent_inputs, linear.model
+    responses = input_responses(evaluator.training, model.values, place)
+    if place == GAIN_SCATTER:
+        parts = {Kernel(False, 1.0): np.ones((len(responses), 1, 1))}
+    processes = [_Process.of(kernel, each, responses) for kernel, each in parts.items()]
+
+    def climbed(noise: Noise, known: _Fit | None = None) -> _Fit:
+        first = _best_kernel(linear.own, processes, noise, _unit(place, settings), known, settings)
+        return _climb_process(linear.own, first, responses, evaluator.training.data.dt, settings)
+
+    best = max(map(climbed, _first_noises(model.noise)), key=lambda fit: fit.nats)
+    least = float(linear.own.whitened(model.noise).marginal(1.0).nats.sum()) + settings.gain
+    for _ in range(settings.rounds if best.nats > least else 0):
+        problem = replace(linear.model.problem, noise=best.noise)
+        x = linear.model.minimum.x
+        x = likeliest_beside(problem, x, linear.breaths, best.process.responses, best.size)
+        linear = _Linear.of(_updated(linear.model, x, best.noise))
+        trial = climbed(best.noise, best)
+        if trial.nats < best.nats + settings.gain:
             break
-        best = trial
-        if best.nats < least:
-            break
-        model = _refitted_beside(best)
-    assert best is not None
-    process, count = best.process, best.process.responses.shape[1]
-    course = np.einsum("nk,nkt->nt", best.coefficients[:, :count], process.components)
-    breaths, responses = _linearised(evaluator, best.model, evaluator.held_out, place)
-    held_out = _process(evaluator.held_out, responses, settings, process.kernel)
-    whitened = breaths.whitened(best.model.noise, held_out.responses)
+        best, model = trial, linear.model
+    model = _updated(model, model.minimum.x, best.noise)
+    kernel, count = best.process.kernel, best.process.responses.shape[1]
+    assert best.coefficients is not None
+    course = np.einsum("nk,nkt->nt", best.coefficients[:, :count], best.process.components)
+    problem, x = evaluator.refit_breath_parameters(model)
+    responses = input_responses(evaluator.held_out, problem.values(x), place)
+    each = np.ones((len(responses), 1, 1))
+    if place != GAIN_SCATTER:
+        each = components(problem.data.dt, kernel, settings.min_variance)
+    process = _Process.of(kernel, each, responses)
+    whitened = LinearBreaths.of(problem, x).whitened(best.noise, process.responses)
     return LatentInput(
-        place, process.kernel.periodic, process.kernel.scale, best.size, best.model,
-        best.nats, whitened.marginal(best.size).nats, course,
+        place, kernel.periodic, kernel.scale, best.size, model, best.nats,
+        whitened.marginal(best.size).nats, course,
     )  # fmt: skip
-
-
-def _linearised(
-    evaluator: Evaluator, model: FittedModel, partition: Partition, place: str
-) -> tuple[LinearBreaths, Floats]:
-    """Breaths to first order, and the responses of :func:`input_responses`."""
-    problem, x = evaluator.refit_breath_parameters(model, partition)
-    return LinearBreaths.of(problem, x), input_responses(partition, problem.values(x), place)
-
-
-def _refitted_beside(fit: _Fit) -> FittedModel:
-    """The model with the parameters that are the likeliest beside an input, to first order."""
-    model = fit.model
-    x = likeliest_beside(model.problem, model.minimum.x, fit.process.responses, fit.size)
-    return _updated(model, x, model.noise)
-
-
-def _with_noise(model: FittedModel, noise: Noise) -> FittedModel:
-    return _updated(model, model.minimum.x, noise)
 
 
 def _updated(model: FittedModel, x: Floats, noise: Noise) -> FittedModel:
@@ -323,61 +367,63 @@ def _updated(model: FittedModel, x: Floats, noise: Noise) -> FittedModel:
     return FittedModel(model.hypothesis, problem, minimum, likelihood)
 
 
-def _kernels(place: str, settings: LatentInputSettings) -> list[Kernel]:
+def _first_noises(noise: Noise) -> list[Noise]:
+    """Noises from which a likelihood is climbed: as it is, and white if it is coloured.
+
+    Coloured noise excuses slow errors, and beside it a slow input may be a lower maximum.
+    """
+    ar = noise.ar[0]
+    if abs(ar) < _COLOURED:
+        return [noise]
+    sigma = (noise.sigma[0] * float(np.sqrt(1.0 - ar**2)), *noise.sigma[1:])
+    return [noise, replace(noise, sigma=sigma, ar=(0.0, *noise.ar[1:]))]
+
+
+def _kernels(settings: LatentInputSettings) -> list[Kernel]:
     """Kinds and scales that are compared."""
-    if place == GAIN_SCATTER:
-        return [Kernel(False, 1.0)]
     kernels = [Kernel(True, float(scale)) for scale in settings.frequencies]
     return kernels + [Kernel(False, float(scale)) for scale in settings.correlation_times]
 
 
-def _process(
-    partition: Partition, responses: Floats, settings: LatentInputSettings, kernel: Kernel
-) -> _Process:
-    """A process by the ``responses`` of :func:`input_responses`."""
-    if responses.shape[1] == 1:  # one number for each breath
-        parts = np.ones((len(responses), 1, 1))
-    else:
-        parts = components(partition.data.dt, kernel, settings.min_variance)
-    return _Process(kernel, parts, np.matmul(parts, responses)[:, :, None])
-
-
 def _best_kernel(
     breaths: LinearBreaths,
-    process_of: Callable[[Kernel], _Process],
-    model: FittedModel,
-    place: str,
+    processes: list[_Process],
+    noise: Noise,
+    unit: float,
     known: _Fit | None,
     settings: LatentInputSettings,
 ) -> _Fit:
-    """The kernel and the size of the largest likelihood at the noise of a model.
+    """The process and the size of the largest likelihood at one noise.
 
-    Samples have the weights that they have beside the input that is known, if there is one.
+    Samples have the weights that they have beside the input that is known, if there is one. Sizes
+    are multiples of ``unit``.
     """
-    sizes, kernels = np.asarray(settings.sizes) * _unit(place, settings), _kernels(place, settings)
-    size, responses = 1.0, None
-    if known is not None:
-        sizes, kernels = np.append(sizes, known.size), [known.process.kernel, *kernels]
-        size, responses = known.size, process_of(known.process.kernel).responses
-    whitened = breaths.whitened(model.noise, responses)
+    sizes = np.asarray(settings.sizes) * unit
+    if known is None:
+        whitened, size = breaths.whitened(noise), 1.0
+    else:
+        sizes, size, processes = (
+            np.append(sizes, known.size),
+            known.size,
+            [known.process, *processes],
+        )
+        whitened = breaths.whitened(noise, known.process.responses)
     left = whitened.left(whitened.marginal(size).coefficients)
     best = None
-    for kernel in kernels:
-        process = process_of(kernel)
-        whitened = breaths.whitened(model.noise, process.responses)
-        bounds = whitened.bounds(sizes, left)
+    for process in processes:
+        bounds = breaths.whitened(noise, process.responses).bounds(sizes, left)
         top = int(np.argmax(bounds))
         if best is None or bounds[top] > best.nats:
-            none = np.zeros(whitened.rows.shape[:2])
-            best = _Fit(float(bounds[top]), model, process, float(sizes[top]), none)
+            best = _Fit(float(bounds[top]), process, float(sizes[top]), noise, None)
     assert best is not None
     return best
 
 
 def _climb_process(
     breaths: LinearBreaths,
-    process_of: Callable[[Kernel], _Process],
     first: _Fit,
+    responses: Floats,
+    dt: Floats,
     settings: LatentInputSettings,
 ) -> _Fit:
     """Maximise the likelihood by the size of an input, its frequency and the noise beside it.
@@ -385,29 +431,28 @@ def _climb_process(
     Correlation times stay on their grid: each has components of its own, which cost as much as the
     rest of a climb.
     """
-    best, noise, kernel = first._replace(nats=-np.inf), first.model.noise, first.process.kernel
-    likeliest = noise
+    best, kernel = first._replace(nats=-np.inf), first.process.kernel
 
     def fall(point: Floats) -> float:
-        nonlocal best, likeliest
-        now, size, process = _noise_at(noise, point), float(np.exp(point[2])), first.process
+        nonlocal best
+        noise, size, process = _noise_at(first.noise, point), float(np.exp(point[2])), first.process
         if kernel.periodic:
-            process = process_of(kernel._replace(scale=float(np.exp(point[3]))))
-        whitened = breaths.whitened(now, process.responses)
-        marginal = whitened.marginal(size, best.coefficients)
+            moved = kernel._replace(scale=float(np.exp(point[3])))
+            parts = components(dt, moved, settings.min_variance)
+            process = _Process.of(moved, parts, responses)
+        marginal = breaths.whitened(noise, process.responses).marginal(size, best.coefficients)
         nats = float(marginal.nats.sum())
         if nats > best.nats:
-            best = _Fit(nats, first.model, process, size, marginal.coefficients)
-            likeliest = now
+            best = _Fit(nats, process, size, noise, marginal.coefficients)
         return -nats
 
-    start = [*_noise_point(noise), np.log(first.size)]
+    start = [*_noise_point(first.noise), np.log(first.size)]
     limits = [*_NOISE_LIMITS, (start[2] + np.log(_LEAST_SIZE), start[2] - np.log(_LEAST_SIZE))]
     if kernel.periodic:
         start.append(np.log(kernel.scale))
         limits.append((start[3] - _FREQUENCY_SPAN, start[3] + _FREQUENCY_SPAN))
     _climb(fall, np.array(start), limits, settings)
-    return best._replace(model=_with_noise(first.model, likeliest))
+    return best
 
 
 def _climb(

@@ -272,7 +272,8 @@ class LatentInputSettings:
         sizes: standard deviations, cmH2O.
         relative_size: factor from ``sizes`` to those of a flow or of the valve's gain, which are
             shares, 1/cmH2O.
-        rounds: most times that the kernel is chosen, and then size and noise are climbed.
+        rounds: most times that the model's parameters beside an input, its kernel, and its size and
+            noise are found in turn.
         gain: log-likelihood, nats, that another round must gain.
         climb_tolerance: log-likelihood, nats, to which size and noise are climbed.
         min_variance: components of a unit covariance with less variance are left out.
@@ -294,7 +295,7 @@ class LatentInputSettings:
     frequencies: tuple[float, ...] = tuple(
         float(f) for f in (*np.arange(0.6, 2.0, 0.1), *np.arange(2.0, 9.1, 0.25))
     )
-    correlation_times: tuple[float, ...] = (0.08, 0.2, 0.5)
+    correlation_times: tuple[float, ...] = (0.08, 0.12, 0.2, 0.3, 0.5, 0.8, 1.2)
     sizes: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
     relative_size: float = 0.1
     rounds: int = 3

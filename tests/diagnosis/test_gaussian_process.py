@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from ventbench.diagnosis.gaussian_process import Kernel, LinearBreaths, components
+from ventbench.diagnosis.gaussian_process import (
+    Kernel,
+    LinearBreaths,
+    components,
+    likeliest_beside,
+)
 from ventbench.system_id import Noise
 
 BREATHS, SAMPLES = 3, 24
@@ -129,3 +136,31 @@ def test_bounds_at_several_sizes_are_exact_under_gaussian_noise_and_below_it_und
             assert np.all(far < exact)
             assert own[1] > far[1] + 1.0
             assert own[1] > exact[1] - 2.0
+
+
+def test_shared_parameters_beside_a_process_are_those_of_generalised_least_squares():
+    rng = np.random.default_rng(3)
+    given, parts, size = breaths(seed=5), components(DT, Kernel(False, 0.2), 1e-9), 0.8
+    slopes = rng.standard_normal((BREATHS, 2, 1, SAMPLES)) * given.weight[:, None]
+    none = np.zeros((BREATHS, 2))
+    given = dataclasses.replace(given, slopes=slopes, precision=none, displacement=none)
+    # The first parameter is shared by all breaths, the second is each breath's own.
+    index = np.stack([np.zeros(BREATHS, int), 1 + np.arange(BREATHS)], axis=1)
+    far = np.full(1 + BREATHS, 50.0)
+    problem: Any = SimpleNamespace(
+        noise=GAUSSIAN,
+        unknowns=SimpleNamespace(index=index, path_of=far, bounds=lambda: (-far, far)),
+    )
+    x = np.zeros(1 + BREATHS)
+    found = likeliest_beside(problem, x, given, acting(parts), size)
+    normal, right = np.zeros((len(x), len(x))), np.zeros(len(x))
+    for i in range(BREATHS):
+        seen = given.weight[i, 0] > 0
+        total = covariance(GAUSSIAN, given.weight[i, 0]) + size**2 * parts[i].T @ parts[i]
+        inverse = np.linalg.inv(total[np.ix_(seen, seen)])
+        rows = slopes[i, :, 0, seen]  # samples first
+        normal[np.ix_(index[i], index[i])] += rows.T @ inverse @ rows
+        right[index[i]] += rows.T @ inverse @ given.residual[i, 0, seen]
+    np.testing.assert_allclose(found, -np.linalg.solve(normal, right), atol=1e-6)
+    # Without the process, the same parameters are others.
+    assert np.abs(likeliest_beside(problem, x, given) - found).max() > 0.01

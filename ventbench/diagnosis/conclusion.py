@@ -294,10 +294,27 @@ def _explain_remaining_error(
     scatter, settings = inputs.pop(GAIN_SCATTER), evaluator.settings
     scattered = _gain_scatters(scatter, inputs, reference, term, settings)
     gain_sd = scatter.size if scattered else 0.0
+    if term is not None and not _exceeds_noise(term, inputs[MEASUREMENT], reference, settings):
+        term = None
     latent = _best_input({GAIN_SCATTER: scatter, **inputs}, reference, settings)
     if latent is not None and _is_negligible_input(evaluator, selected, latent):
         latent = None
     return _Unexplained(term, latent, gain_sd)
+
+
+def _exceeds_noise(
+    term: NonparametricFit, sensor: LatentInput, reference: Floats, settings: SelectionConfig
+) -> bool:
+    """Whether a nonparametric term explains as much as slow noise of the sensor does.
+
+    Beside noise of one correlation, a curve that is the same in all breaths may gain by what slow
+    errors have in common. One that is there gains more than the noise, which has to be found anew
+    in each breath.
+    """
+    by_noise = sensor.held_out_log_likelihood - reference
+    if not passes_heldout_test(by_noise, settings.held_out_test):
+        return True
+    return term.nats >= float(by_noise.sum())
 
 
 def _best_term(wide: Evaluator, selected: FittedModel) -> NonparametricFit | None:

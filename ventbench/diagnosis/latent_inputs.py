@@ -2,10 +2,10 @@
 
 A latent input is a Gaussian process, smooth or of one frequency, independent from breath to breath.
 It acts on the pressure at the alveolus, on the flow of the supply, or on the reading of the sensor.
-Its course is integrated out; only its size and its scale are fitted. Its response is linearised, so
-that the marginal likelihood is that of a Gaussian. Coloured noise is such an input at the sensor,
-and an input that acts in the physics has to explain more than that. Scatter of the valve's gain
-between breaths is treated as an input that is one number for each breath.
+Its course is integrated out; its size, its scale and the noise beside it are those that make the
+recording likeliest (:mod:`ventbench.diagnosis.gaussian_process`). Coloured noise is such an input
+at the sensor, and an input that acts in the physics has to explain more than that. Scatter of the
+valve's gain between breaths is treated as an input that is one number for each breath.
 """
 
 from __future__ import annotations
@@ -53,12 +53,6 @@ _TOLERANCE = 0.01
 
 #: Size of an input, as a share of that it starts from, below which it is none.
 _LEAST_SIZE = 0.1
-
-#: Correlation of neighbouring samples from which a climb also starts from white noise.
-_COLOURED = 0.2
-
-#: How far a climb may move the logarithm of a frequency: to the next one of the grid.
-_FREQUENCY_SPAN = 0.1
 
 #: Scatter of the valve's gain between breaths, which is fitted as if it were an input.
 GAIN_SCATTER = "gain of each breath"
@@ -321,24 +315,28 @@ def _fit_input(
         place: where it acts.
         parts: components of the kernels that are compared.
     """
-    settings, model = evaluator.settings.latent_inputs, linear.model
-    responses = input_responses(evaluator.training, model.values, place)
+    settings, training = evaluator.settings.latent_inputs, evaluator.training
     if place == GAIN_SCATTER:
-        parts = {Kernel(False, 1.0): np.ones((len(responses), 1, 1))}
-    processes = [_Process.of(kernel, each, responses) for kernel, each in parts.items()]
+        parts = {Kernel(False, 1.0): np.ones((len(training.data), 1, 1))}
 
-    def climbed(noise: Noise, known: _Fit | None = None) -> _Fit:
+    def climbed(linear: _Linear, noise: Noise, known: _Fit | None = None) -> _Fit:
+        responses = input_responses(training, linear.model.values, place)
+        processes = [_Process.of(kernel, each, responses) for kernel, each in parts.items()]
+        if known is not None:
+            process = _Process.of(known.process.kernel, known.process.components, responses)
+            known = known._replace(process=process)
         first = _best_kernel(linear.own, processes, noise, _unit(place, settings), known, settings)
-        return _climb_process(linear.own, first, responses, evaluator.training.data.dt, settings)
+        return _climb_process(linear.own, first, responses, training.data.dt, settings)
 
-    best = max(map(climbed, _first_noises(model.noise)), key=lambda fit: fit.nats)
+    model = linear.model
+    starts = _first_noises(model.noise, settings.coloured)
+    best = max((climbed(linear, noise) for noise in starts), key=lambda fit: fit.nats)
     least = float(linear.own.whitened(model.noise).marginal(1.0).nats.sum()) + settings.gain
     for _ in range(settings.rounds if best.nats > least else 0):
-        problem = replace(linear.model.problem, noise=best.noise)
-        x = linear.model.minimum.x
+        problem, x = replace(linear.model.problem, noise=best.noise), linear.model.minimum.x
         x = likeliest_beside(problem, x, linear.breaths, best.process.responses, best.size)
         linear = _Linear.of(_updated(linear.model, x, best.noise))
-        trial = climbed(best.noise, best)
+        trial = climbed(linear, best.noise, best)
         if trial.nats < best.nats + settings.gain:
             break
         best, model = trial, linear.model
@@ -367,13 +365,14 @@ def _updated(model: FittedModel, x: Floats, noise: Noise) -> FittedModel:
     return FittedModel(model.hypothesis, problem, minimum, likelihood)
 
 
-def _first_noises(noise: Noise) -> list[Noise]:
-    """Noises from which a likelihood is climbed: as it is, and white if it is coloured.
+def _first_noises(noise: Noise, least: float) -> list[Noise]:
+    """Noises that a climb starts from: the given one, and white noise if it is coloured.
 
-    Coloured noise excuses slow errors, and beside it a slow input may be a lower maximum.
+    Noise is coloured if the correlation of neighbouring samples exceeds ``least``.
+    Coloured noise excuses slow errors, and beside it a slow input may be at a lower maximum.
     """
     ar = noise.ar[0]
-    if abs(ar) < _COLOURED:
+    if abs(ar) < least:
         return [noise]
     sigma = (noise.sigma[0] * float(np.sqrt(1.0 - ar**2)), *noise.sigma[1:])
     return [noise, replace(noise, sigma=sigma, ar=(0.0, *noise.ar[1:]))]
@@ -450,7 +449,7 @@ def _climb_process(
     limits = [*_NOISE_LIMITS, (start[2] + np.log(_LEAST_SIZE), start[2] - np.log(_LEAST_SIZE))]
     if kernel.periodic:
         start.append(np.log(kernel.scale))
-        limits.append((start[3] - _FREQUENCY_SPAN, start[3] + _FREQUENCY_SPAN))
+        limits.append((start[3] - settings.frequency_span, start[3] + settings.frequency_span))
     _climb(fall, np.array(start), limits, settings)
     return best
 

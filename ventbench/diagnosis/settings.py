@@ -276,6 +276,10 @@ class LatentInputSettings:
             noise are found in turn.
         gain: log-likelihood, nats, that another round must gain.
         climb_tolerance: log-likelihood, nats, to which size and noise are climbed.
+        frequency_span: how far a climb may move the logarithm of a frequency: to the next one of
+            the grid.
+        coloured: correlation of neighbouring samples from which a climb also starts from white
+            noise; below it, both starts are one.
         min_variance: components of a unit covariance with less variance are left out.
         threshold: held-out log-likelihood, nats, from which an input is accepted: more than for a
             term, since places, scales and sizes are searched. It must also be this far ahead of
@@ -301,6 +305,8 @@ class LatentInputSettings:
     rounds: int = 3
     gain: float = 1.0
     climb_tolerance: float = 0.2
+    frequency_span: float = 0.1
+    coloured: float = 0.2
     min_variance: float = 1e-2
     threshold: float = 8.0
     least_size: float = 0.4

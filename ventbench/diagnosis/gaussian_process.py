@@ -111,18 +111,16 @@ class LinearBreaths:
         """
         n, j = self.precision.shape
         count = 0 if responses is None else responses.shape[1]
-        rows = np.zeros((n, count + j, *self.residual.shape[1:]))
-        rows[:, count:] = noise.whiten(self.slopes, self.weight)
+        stack = np.zeros((n, count + j + 1, *self.residual.shape[1:]))
         if responses is not None:
-            channels = responses.shape[2]
-            rows[:, :count, :channels] = noise.whiten(responses, self.weight[:, :channels])
+            stack[:, :count, : responses.shape[2]] = responses
+        stack[:, count:-1], stack[:, -1] = self.slopes, self.residual
+        white = noise.whiten(stack, self.weight).reshape(n, count + j + 1, -1)
         constant = -noise.log_scale(self.weight)
         constant = constant - noise.log_norm() * self.weight.sum(axis=(1, 2))
-        white = noise.whiten(self.residual, self.weight).reshape(n, -1)
         return WhitenedBreaths(
-            noise, white, rows.reshape(n, count + j, white.shape[1]), constant, count,
-            self.precision, self.displacement,
-        )  # fmt: skip
+            noise, white[:, -1], white[:, :-1], constant, count, self.precision, self.displacement
+        )
 
 
 class Marginal(NamedTuple):

@@ -291,9 +291,10 @@ class LatentInputSettings:
         scatter_share: share of what inputs explain from which scatter of the valve's gain between
             breaths is the explanation. A course within each breath imitates the scatter and
             explains some noise as well (a quarter more where gains of a stranger's valve scattered
-            by 1.5 %). Where it explains half as much again, as on the public rig, which is several
-            rigs with gains of their own, the gain cannot be all, and a gain for each breath would
-            hide the curve of the valve.
+            by 1.5 %). Where an input, or slow noise of the sensor, explains half as much again, the
+            gain cannot be all. On the public rig, which is several rigs with gains of their own,
+            slow noise explains three times as much, and a gain for each breath would hide the curve
+            of the valve.
     """
 
     frequencies: tuple[float, ...] = tuple(

@@ -15,6 +15,7 @@ from ventbench.diagnosis.conclusion import (
     _best_input,
     _better_selection,
     _is_negligible_input,
+    _slow_noise,
     conclude,
     is_unresolved,
 )
@@ -151,6 +152,16 @@ def test_an_input_must_explain_more_than_every_nuisance(nats, noise, scatter, ac
     if best is not None:
         assert best.name == ALVEOLUS
         assert best.places[0][0] == ALVEOLUS
+
+
+@pytest.mark.parametrize(("nats", "asked"), [(30.0, True), (3.0, False), (-30.0, False)])
+def test_slow_noise_counts_if_held_out_breaths_ask_for_it(nats, asked):
+    sensor = latent(MEASUREMENT, nats)
+    found = _slow_noise(sensor, np.zeros(6), small.SETTINGS)
+    assert (found is not None) is asked
+    if found is not None:
+        assert found[0] is sensor
+        assert found[1] == pytest.approx(nats)
 
 
 @pytest.mark.parametrize(

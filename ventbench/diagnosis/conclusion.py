@@ -160,6 +160,11 @@ def conclude(
             place = component_of(beside.term)
             unnamed = UnnamedEffect(place, beside.term, None, beside.nats)
             full = beside.full
+    elif remaining.slow_noise is not None and not selected.hypothesis.breath_terms:
+        # Efforts have been compared with slow noise when they were selected.
+        noise, nats = remaining.slow_noise
+        selected = eliminate_beside_input(evaluator, selected, noise, nats)
+        full = selected
     tell("comparing alternatives")
     selected, alternatives = find_alternatives(
         evaluator, selected, comparisons, swap=unnamed is None
@@ -271,11 +276,14 @@ class _Unexplained:
         term: best nonparametric term, or None.
         latent: best latent input, or None.
         gain_sd: standard deviation of the logarithm of the breaths' gains; 0 if it does not matter.
+        slow_noise: slow noise of the sensor and the held-out log-likelihood that it gains, nats;
+            None if it gains nothing.
     """
 
     term: NonparametricFit | None
     latent: UnnamedEffect | None
     gain_sd: float
+    slow_noise: tuple[LatentInput, float] | None
 
     @property
     def prefers_term(self) -> bool:
@@ -294,10 +302,25 @@ def _explain_remaining_error(
     scatter, settings = inputs.pop(GAIN_SCATTER), evaluator.settings
     scattered = _gain_scatters(scatter, inputs, reference, term, settings)
     gain_sd = scatter.size if scattered else 0.0
+    slow_noise = _slow_noise(inputs[MEASUREMENT], reference, settings)
+    if term is not None and slow_noise is not None and term.nats < slow_noise[1]:
+        # A curve that is the same in all breaths may gain by what slow errors have in common. One
+        # that is there gains more than noise, which has to be found anew in each breath.
+        term = None
     latent = _best_input({GAIN_SCATTER: scatter, **inputs}, reference, settings)
     if latent is not None and _is_negligible_input(evaluator, selected, latent):
         latent = None
-    return _Unexplained(term, latent, gain_sd)
+    return _Unexplained(term, latent, gain_sd, slow_noise)
+
+
+def _slow_noise(
+    sensor: LatentInput, reference: Floats, settings: SelectionConfig
+) -> tuple[LatentInput, float] | None:
+    """Slow noise of the sensor and the nats that it gains, if held-out breaths ask for it."""
+    gained = sensor.held_out_log_likelihood - reference
+    if not passes_heldout_test(gained, settings.held_out_test):
+        return None
+    return sensor, float(gained.sum())
 
 
 def _best_term(wide: Evaluator, selected: FittedModel) -> NonparametricFit | None:

@@ -2,28 +2,34 @@
 
 A latent input is a Gaussian process, smooth or of one frequency, independent from breath to breath.
 It acts on the pressure at the alveolus, on the flow of the supply, or on the reading of the sensor.
-Its course is integrated out; only its size and its scale are fitted. Its response is linearised, so
-that the marginal likelihood is that of a Gaussian. Coloured noise is such an input at the sensor,
-and an input that acts in the physics has to explain more than that. Scatter of the valve's gain
-between breaths is treated as an input that is one number for each breath.
+Its course is integrated out; its size, its scale and the noise beside it are those that make the
+recording likeliest (:mod:`ventbench.diagnosis.gaussian_process`). Coloured noise is such an input
+at the sensor, and an input that acts in the physics has to explain more than that. Scatter of the
+valve's gain between breaths is treated as an input that is one number for each breath.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy import optimize
 
 from ventbench.diagnosis.evaluator import Evaluator
+from ventbench.diagnosis.gaussian_process import (
+    Kernel,
+    LinearBreaths,
+    components,
+    likeliest_beside,
+    uses,
+)
 from ventbench.diagnosis.hypothesis import FittedModel, Partition
-from ventbench.diagnosis.linearisation import Linearisation, linearise
 from ventbench.diagnosis.settings import LatentInputSettings
 from ventbench.executor import parallel_map
 from ventbench.system_id.data import Floats
-from ventbench.system_id.noise import Noise, robust_noise
-from ventbench.system_id.problem import Problem
+from ventbench.system_id.noise import LEAST_SIGMA, MOST_AR, Noise
 
 #: Public names of the places where an input may act.
 ALVEOLUS, SUPPLY, MEASUREMENT = "f(t) at the alveolus", "f(t) at the supply", "measurement"
@@ -32,6 +38,21 @@ PLACES = (ALVEOLUS, SUPPLY, MEASUREMENT)
 #: Replicates of the Bayesian bootstrap of :func:`place_weights`, and its seed: a weight of 10 % is
 #: known to half a percent, and the same recording always gets the same weights.
 _REPLICATES, _SEED = 4000, 0
+
+#: Limits of the coordinates of :func:`_noise_point`.
+_NOISE_LIMITS = (
+    (np.log(LEAST_SIGMA), np.log(100.0)),
+    (-np.arctanh(MOST_AR), np.arctanh(MOST_AR)),
+)
+
+#: First steps of a climb: in these coordinates, and in the logarithms of size and frequency.
+_STEPS = (0.2, 0.2, 0.2, 0.02)
+
+#: Accuracy of all these coordinates at the end of a climb.
+_TOLERANCE = 0.01
+
+#: Size of an input, as a share of that it starts from, below which it is none.
+_LEAST_SIZE = 0.1
 
 #: Scatter of the valve's gain between breaths, which is fitted as if it were an input.
 GAIN_SCATTER = "gain of each breath"
@@ -46,7 +67,8 @@ class LatentInput:
         periodic: whether it has one frequency; else it is smooth.
         scale: frequency in Hz if periodic, else correlation time in s.
         size: standard deviation, cmH2O, or a share of the flow or of the gain.
-        noise: model of the measurement noise, estimated beside the input.
+        beside: the model whose residuals it explains, with the parameters and the noise that are
+            the likeliest beside it.
         training_log_likelihood: log-likelihood of all training breaths, nats.
         held_out_log_likelihood: log-likelihood of each held-out breath, nats, ``(n,)``.
         course: expected course in each training breath, ``(n, T)``.
@@ -56,36 +78,34 @@ class LatentInput:
     periodic: bool
     scale: float
     size: float
-    noise: Noise
+    beside: FittedModel
     training_log_likelihood: float
     held_out_log_likelihood: Floats
     course: Floats
 
-
-class _Kernel(NamedTuple):
-    """Kind, scale and standard deviation of a Gaussian process; see :class:`LatentInput`."""
-
-    periodic: bool
-    scale: float
-    size: float
+    @property
+    def noise(self) -> Noise:
+        """Model of the measurement noise beside the input."""
+        return self.beside.noise
 
 
 def fit_latent_inputs(
     evaluator: Evaluator, fitted: FittedModel, places: tuple[str, ...] = PLACES
 ) -> dict[str, LatentInput]:
-    """Find the best input at each place; the training breaths choose its size and scale.
+    """Find the best input at each place; the training breaths choose its size, scale and noise.
 
     Args:
         evaluator: evaluator of the recording.
         fitted: the model whose residuals inputs may explain, without patient effort.
         places: places to test.
     """
-    problem, x = evaluator.refit_breath_parameters(fitted, evaluator.training)
-    values = problem.values(x)
+    model, dt = at_best_noise(evaluator, fitted), evaluator.training.data.dt
+    linear, settings = _Linear.of(model), evaluator.settings.latent_inputs
+    every = () if places == (GAIN_SCATTER,) else _kernels(settings)
+    parts = {kernel: components(dt, kernel, settings.min_variance) for kernel in every}
 
     def best(place: str) -> LatentInput:
-        responses = input_responses(evaluator.training, values, place)
-        return _fit_input(evaluator, fitted, problem, x, place, responses)
+        return _fit_input(evaluator, linear, place, parts)
 
     return dict(zip(places, parallel_map(best, places), strict=True))
 
@@ -117,18 +137,48 @@ def place_weights(inputs: Iterable[LatentInput]) -> dict[str, float]:
 def log_likelihood_without_input(evaluator: Evaluator, fitted: FittedModel) -> tuple[float, Floats]:
     """Log-likelihoods to compare those of a :class:`LatentInput` with, nats.
 
-    Patient effort is integrated out, if the model has it.
+    They are those of the model at the noise that is likeliest without an input. Patient effort is
+    integrated out, if the model has it.
 
     Returns:
         Of all training breaths, and of each held-out breath, ``(n,)``.
     """
-    likelihoods = []
-    for partition in (evaluator.training, evaluator.held_out):
-        problem, x = evaluator.refit_breath_parameters(fitted, partition)
-        linear = _linearise(evaluator, problem, x)
-        gain = evaluator.breath_term(fitted).linear_gain(linear, fitted)
-        likelihoods.append(_gaussian_log_likelihood(linear, fitted.noise) + gain)
-    return float(likelihoods[0].sum()), likelihoods[1]
+    model = at_best_noise(evaluator, fitted)
+    training = float(evaluator.log_likelihood(model, evaluator.training).sum())
+    return training, evaluator.held_out_log_likelihood(model)
+
+
+def at_best_noise(evaluator: Evaluator, fitted: FittedModel) -> FittedModel:
+    """A model with the noise of the pressure that makes the training breaths likeliest.
+
+    Other noises are estimated by robust moments, which do not climb the likelihood. Compared with
+    an input whose noise does, they would credit the input with the difference.
+
+    Args:
+        evaluator: evaluator of the recording.
+        fitted: a model of the training breaths.
+    """
+    settings = evaluator.settings
+    for _ in range(settings.fit.noise_rounds):
+        before = evaluator.training_log_likelihood(fitted)
+
+        def fall(point: Floats, fitted: FittedModel = fitted) -> float:
+            return -evaluator.training_log_likelihood(fitted, _noise_at(fitted.noise, point))
+
+        start = _noise_point(fitted.noise)
+        noise = _noise_at(fitted.noise, _climb(fall, start, _NOISE_LIMITS, settings.latent_inputs))
+        climbed = evaluator.training_log_likelihood(fitted, noise)
+        fitted = _updated(fitted, fitted.minimum.x, noise)
+        if climbed < before + settings.fit.noise_gain:
+            break
+        problem, x = fitted.problem, fitted.minimum.x
+        refitted = _updated(
+            fitted, likeliest_beside(problem, x, LinearBreaths.of(problem, x)), noise
+        )
+        if evaluator.training_log_likelihood(refitted) < climbed:
+            break
+        fitted = refitted
+    return fitted
 
 
 def exceeds_sensor_noise(evaluator: Evaluator, with_effort: FittedModel) -> bool:
@@ -143,12 +193,9 @@ def exceeds_sensor_noise(evaluator: Evaluator, with_effort: FittedModel) -> bool
         hypothesis.without(*hypothesis.breath_terms), with_effort.noise, with_effort
     )
     sensor = fit_latent_inputs(evaluator, passive, (MEASUREMENT,))[MEASUREMENT]
-    # An input's likelihood leaves out the noise's norm, which does not depend on residuals.
-    weight = evaluator.held_out.data.weight
-    constant = sensor.noise.log_likelihood(np.zeros_like(weight), weight)
-    constant += sensor.noise.log_scale(weight)
-    ahead = evaluator.held_out_log_likelihood(with_effort) - sensor.held_out_log_likelihood
-    return float((ahead - constant).sum()) > evaluator.settings.held_out_test.threshold
+    by_effort = log_likelihood_without_input(evaluator, with_effort)[1]
+    ahead = float((by_effort - sensor.held_out_log_likelihood).sum())
+    return ahead > evaluator.settings.held_out_test.threshold
 
 
 def input_responses(partition: Partition, values: Floats, place: str) -> Floats:
@@ -196,138 +243,249 @@ def input_responses(partition: Partition, values: Floats, place: str) -> Floats:
     return responses
 
 
+@dataclass(frozen=True, eq=False)
+class _Process:
+    """A process at a place, as it acts on the training breaths.
+
+    Attributes:
+        kernel: kind and scale.
+        components: its components, ``(n, K, T)``.
+        responses: change of the pressure by each of them, cmH2O, ``(n, K, 1, T)``.
+    """
+
+    kernel: Kernel
+    components: Floats
+    responses: Floats
+
+    @classmethod
+    def of(cls, kernel: Kernel, parts: Floats, responses: Floats) -> _Process:
+        """A process by its components and the ``responses`` of :func:`input_responses`."""
+        return cls(kernel, parts, np.matmul(parts, responses)[:, :, None])
+
+
+@dataclass(frozen=True, eq=False)
+class _Linear:
+    """A model of the training breaths to first order.
+
+    Attributes:
+        model: the model.
+        breaths: its breaths, with all parameters.
+        own: its breaths with the parameters that differ from breath to breath.
+    """
+
+    model: FittedModel
+    breaths: LinearBreaths
+    own: LinearBreaths
+
+    @classmethod
+    def of(cls, model: FittedModel) -> _Linear:
+        breaths = LinearBreaths.of(model.problem, model.minimum.x)
+        return cls(model, breaths, breaths.only((uses(model.problem) == 1).all(axis=0)))
+
+
+class _Fit(NamedTuple):
+    """A process with its size and the noise beside it.
+
+    Attributes:
+        nats: log marginal likelihood of the training breaths.
+        process: the process.
+        size: its standard deviation.
+        noise: model of the measurement noise.
+        coefficients: see :class:`~ventbench.diagnosis.gaussian_process.Marginal`.
+    """
+
+    nats: float
+    process: _Process
+    size: float
+    noise: Noise
+    coefficients: Floats | None
+
+
 def _fit_input(
-    evaluator: Evaluator,
-    fitted: FittedModel,
-    problem: Problem,
-    x: Floats,
-    place: str,
-    responses: Floats,
+    evaluator: Evaluator, linear: _Linear, place: str, parts: dict[Kernel, Floats]
 ) -> LatentInput:
-    """Estimate an input and the noise beside it in turn, then evaluate the held-out breaths."""
+    """Climb the training likelihood of an input at one place, then evaluate the held-out breaths.
+
+    The best kernel at one noise is climbed in size and noise. Beside that input, other parameters
+    of the model may be better, and then another kernel, and so on until nothing gains.
+
+    Args:
+        evaluator: evaluator of the recording.
+        linear: the model whose residuals the input may explain.
+        place: where it acts.
+        parts: components of the kernels that are compared.
+    """
     settings, training = evaluator.settings.latent_inputs, evaluator.training
-    noise, best = fitted.noise, None
-    for _ in range(settings.noise_rounds):
-        linear = _linearise(evaluator, replace(problem, noise=noise), x)
-        gained, kernel = _best_kernel(linear, training, place, responses, settings)
-        total = float(_gaussian_log_likelihood(linear, noise).sum()) + gained
-        if best is not None and total < best[0] + settings.noise_gain:
+    if place == GAIN_SCATTER:
+        parts = {Kernel(False, 1.0): np.ones((len(training.data), 1, 1))}
+
+    def climbed(linear: _Linear, noise: Noise, known: _Fit | None = None) -> _Fit:
+        responses = input_responses(training, linear.model.values, place)
+        processes = [_Process.of(kernel, each, responses) for kernel, each in parts.items()]
+        if known is not None:
+            process = _Process.of(known.process.kernel, known.process.components, responses)
+            known = known._replace(process=process)
+        first = _best_kernel(linear.own, processes, noise, _unit(place, settings), known, settings)
+        return _climb_process(linear.own, first, responses, training.data.dt, settings)
+
+    model = linear.model
+    starts = _first_noises(model.noise, settings.coloured)
+    best = max((climbed(linear, noise) for noise in starts), key=lambda fit: fit.nats)
+    least = float(linear.own.whitened(model.noise).marginal(1.0).nats.sum()) + settings.gain
+    for _ in range(settings.rounds if best.nats > least else 0):
+        problem, x = replace(linear.model.problem, noise=best.noise), linear.model.minimum.x
+        x = likeliest_beside(problem, x, linear.breaths, best.process.responses, best.size)
+        linear = _Linear.of(_updated(linear.model, x, best.noise))
+        trial = climbed(linear, best.noise, best)
+        if trial.nats < best.nats + settings.gain:
             break
-        best = (total, noise, kernel)
-        if gained < settings.min_gain:
-            break
-        process = _GaussianProcess(linear, training, responses, kernel, settings)
-        noise = _noise_beside(process, linear, responses, settings)
-    assert best is not None
-    total, noise, kernel = best
-    linear = _linearise(evaluator, replace(problem, noise=noise), x)
-    course = -_GaussianProcess(linear, training, responses, kernel, settings).expected()[0]
-    problem, x = evaluator.refit_breath_parameters(fitted)
-    linear = _linearise(evaluator, replace(problem, noise=noise), x)
-    responses = input_responses(evaluator.held_out, linear.values, place)
-    process = _GaussianProcess(linear, evaluator.held_out, responses, kernel, settings)
-    held_out = _gaussian_log_likelihood(linear, noise) + process.gained()
+        best, model = trial, linear.model
+    model = _updated(model, model.minimum.x, best.noise)
+    kernel, count = best.process.kernel, best.process.responses.shape[1]
+    assert best.coefficients is not None
+    course = np.einsum("nk,nkt->nt", best.coefficients[:, :count], best.process.components)
+    problem, x = evaluator.refit_breath_parameters(model)
+    responses = input_responses(evaluator.held_out, problem.values(x), place)
+    each = np.ones((len(responses), 1, 1))
+    if place != GAIN_SCATTER:
+        each = components(problem.data.dt, kernel, settings.min_variance)
+    process = _Process.of(kernel, each, responses)
+    whitened = LinearBreaths.of(problem, x).whitened(best.noise, process.responses)
     return LatentInput(
-        place, kernel.periodic, kernel.scale, kernel.size, noise, total, held_out, course
-    )
+        place, kernel.periodic, kernel.scale, best.size, model, best.nats,
+        whitened.marginal(best.size).nats, course,
+    )  # fmt: skip
+
+
+def _updated(model: FittedModel, x: Floats, noise: Noise) -> FittedModel:
+    """A model at other unknowns ``(U,)`` and another noise."""
+    problem = replace(model.problem, noise=noise)
+    minimum = replace(model.minimum, x=x, cost=problem.cost(x))
+    likelihood = float(problem.log_likelihood(x).sum())
+    return FittedModel(model.hypothesis, problem, minimum, likelihood)
+
+
+def _first_noises(noise: Noise, least: float) -> list[Noise]:
+    """Noises that a climb starts from: the given one, and white noise if it is coloured.
+
+    Noise is coloured if the correlation of neighbouring samples exceeds ``least``.
+    Coloured noise excuses slow errors, and beside it a slow input may be at a lower maximum.
+    """
+    ar = noise.ar[0]
+    if abs(ar) < least:
+        return [noise]
+    sigma = (noise.sigma[0] * float(np.sqrt(1.0 - ar**2)), *noise.sigma[1:])
+    return [noise, replace(noise, sigma=sigma, ar=(0.0, *noise.ar[1:]))]
+
+
+def _kernels(settings: LatentInputSettings) -> list[Kernel]:
+    """Kinds and scales that are compared."""
+    kernels = [Kernel(True, float(scale)) for scale in settings.frequencies]
+    return kernels + [Kernel(False, float(scale)) for scale in settings.correlation_times]
 
 
 def _best_kernel(
-    linear: Linearisation,
-    partition: Partition,
-    place: str,
-    responses: Floats,
+    breaths: LinearBreaths,
+    processes: list[_Process],
+    noise: Noise,
+    unit: float,
+    known: _Fit | None,
     settings: LatentInputSettings,
-) -> tuple[float, _Kernel]:
-    """The kernel of the largest likelihood, and its gain, nats."""
-    relative = place in (SUPPLY, GAIN_SCATTER)
-    sizes = [settings.relative_size * size if relative else size for size in settings.sizes]
-    best = (-np.inf, _Kernel(False, 1.0, 1.0))
-    kinds = ((True, settings.frequencies), (False, settings.correlation_times))
-    for periodic, scales in ((False, (1.0,)),) if place == GAIN_SCATTER else kinds:
-        for scale in scales:
-            process = _GaussianProcess(
-                linear, partition, responses, _Kernel(periodic, float(scale), 1.0), settings
-            )
-            for size in sizes:
-                gained = float(process.gained(size).sum())
-                best = max(best, (gained, _Kernel(periodic, float(scale), size)))
+) -> _Fit:
+    """The process and the size of the largest likelihood at one noise.
+
+    Samples have the weights that they have beside the input that is known, if there is one. Sizes
+    are multiples of ``unit``.
+    """
+    sizes = np.asarray(settings.sizes) * unit
+    if known is None:
+        whitened, size = breaths.whitened(noise), 1.0
+    else:
+        sizes, size, processes = (
+            np.append(sizes, known.size),
+            known.size,
+            [known.process, *processes],
+        )
+        whitened = breaths.whitened(noise, known.process.responses)
+    left = whitened.left(whitened.marginal(size).coefficients)
+    best = None
+    for process in processes:
+        bounds = breaths.whitened(noise, process.responses).bounds(sizes, left)
+        top = int(np.argmax(bounds))
+        if best is None or bounds[top] > best.nats:
+            best = _Fit(float(bounds[top]), process, float(sizes[top]), noise, None)
+    assert best is not None
     return best
 
 
-class _GaussianProcess:
-    """An input's process, seen through the whitened recording."""
-
-    def __init__(
-        self,
-        linear: Linearisation,
-        partition: Partition,
-        responses: Floats,
-        kernel: _Kernel,
-        settings: LatentInputSettings,
-    ) -> None:
-        """Factorise the covariance of unit size; ``responses`` as of :func:`input_responses`."""
-        self._size = kernel.size
-        dt = partition.data.dt
-        time = np.cumsum(dt, axis=1) - dt
-        if responses.shape[1] == 1:  # one number for each breath
-            self._root = np.ones((len(time), 1, 1))
-        elif kernel.periodic:
-            angle = 2.0 * np.pi * kernel.scale * time
-            self._root = np.stack([np.cos(angle), np.sin(angle)], axis=1)  # (n, 2, K)
-        else:
-            # Breaths of about equal intervals share a root; jitter is far below the scale.
-            interval = np.round(dt.mean(axis=1), 4)
-            steps, which = np.unique(interval, return_inverse=True)
-            lag = np.subtract.outer(*[np.arange(time.shape[1])] * 2)[None] * steps[:, None, None]
-            values, vectors = np.linalg.eigh(np.exp(-0.5 * (lag / kernel.scale) ** 2))
-            kept = int(np.max(np.sum(values > settings.min_variance, axis=1)))
-            scaled = vectors[:, :, -kept:] * np.sqrt(np.maximum(values[:, None, -kept:], 0.0))
-            self._root = scaled.swapaxes(1, 2)[which.reshape(-1)]
-        rows = np.matmul(self._root, responses)[:, :, None, :]
-        rows = linear.without_own(linear.whiten(rows))
-        self._power, self._axes = np.linalg.eigh(np.matmul(rows, rows.swapaxes(1, 2)))
-        self._power = np.maximum(self._power, 0.0)
-        force = np.matmul(rows, linear.residual[:, :, None])[:, :, 0]
-        self._force = np.einsum("nij,ni->nj", self._axes, force)
-
-    def gained(self, size: float | None = None) -> Floats:
-        """Log-likelihood that an input of a size gains in each breath, nats, ``(n,)``."""
-        size = self._size if size is None else size
-        grown = 1.0 + size**2 * self._power
-        return 0.5 * np.sum(size**2 * self._force**2 / grown - np.log(grown), axis=1)
-
-    def expected(self) -> tuple[Floats, Floats]:
-        """Posterior mean of minus the input, ``(n, K)``, and its degrees of freedom, ``(n,)``."""
-        size = self._size
-        grown = 1.0 + size**2 * self._power
-        weights = np.einsum("nij,nj->ni", self._axes, size**2 * self._force / grown)
-        course = np.einsum("ni,nik->nk", weights, self._root)
-        return course, np.sum(1.0 - 1.0 / grown, axis=1)
-
-
-def _noise_beside(
-    process: _GaussianProcess,
-    linear: Linearisation,
+def _climb_process(
+    breaths: LinearBreaths,
+    first: _Fit,
     responses: Floats,
+    dt: Floats,
     settings: LatentInputSettings,
-) -> Noise:
-    """Noise that is left once the expected input is taken out."""
-    course, freedom = process.expected()
-    data = linear.problem.data
-    residual = (linear.prediction - data.measured) * data.weight
-    residual[:, 0] -= np.einsum("nk,nkt->nt", course, responses) * data.weight[:, 0]
-    noise = robust_noise(residual, data.weight)
-    share = 1.0 - float(freedom.sum()) / float(data.weight[:, 0].sum())
-    sigma = noise.sigma[0] / np.sqrt(max(share, settings.min_noise_share))
-    return replace(noise, sigma=(sigma, *noise.sigma[1:]))
+) -> _Fit:
+    """Maximise the likelihood by the size of an input, its frequency and the noise beside it.
+
+    Correlation times stay on their grid: each has components of its own, which cost as much as the
+    rest of a climb.
+    """
+    best, kernel = first._replace(nats=-np.inf), first.process.kernel
+
+    def fall(point: Floats) -> float:
+        nonlocal best
+        noise, size, process = _noise_at(first.noise, point), float(np.exp(point[2])), first.process
+        if kernel.periodic:
+            moved = kernel._replace(scale=float(np.exp(point[3])))
+            parts = components(dt, moved, settings.min_variance)
+            process = _Process.of(moved, parts, responses)
+        marginal = breaths.whitened(noise, process.responses).marginal(size, best.coefficients)
+        nats = float(marginal.nats.sum())
+        if nats > best.nats:
+            best = _Fit(nats, process, size, noise, marginal.coefficients)
+        return -nats
+
+    start = [*_noise_point(first.noise), np.log(first.size)]
+    limits = [*_NOISE_LIMITS, (start[2] + np.log(_LEAST_SIZE), start[2] - np.log(_LEAST_SIZE))]
+    if kernel.periodic:
+        start.append(np.log(kernel.scale))
+        limits.append((start[3] - settings.frequency_span, start[3] + settings.frequency_span))
+    _climb(fall, np.array(start), limits, settings)
+    return best
 
 
-def _gaussian_log_likelihood(linear: Linearisation, noise: Noise) -> Floats:
-    """Log-likelihood of each breath without any input, up to the noise's norm, ``(n,)``."""
-    return -0.5 * np.sum(linear.residual**2, axis=1) - noise.log_scale(linear.problem.data.weight)
+def _climb(
+    fall: Callable[[Floats], float],
+    start: Floats,
+    limits: Sequence[tuple[float, float]],
+    settings: LatentInputSettings,
+) -> Floats:
+    """Where a function of the coordinates of a climb is least, near a start (Nelder and Mead)."""
+    low, high = np.transpose(limits)
+    start = np.clip(start, low, high)
+    steps = np.array(_STEPS[: len(start)])
+    steps = np.where(start + steps > high, -steps, steps)
+    return optimize.minimize(
+        fall, start, method="Nelder-Mead", bounds=list(limits),
+        options={
+            "initial_simplex": np.vstack([start, start + np.diag(steps)]),
+            "xatol": _TOLERANCE,
+            "fatol": settings.climb_tolerance,
+        },
+    ).x  # fmt: skip
 
 
-def _linearise(evaluator: Evaluator, problem: Problem, x: Floats) -> Linearisation:
-    settings = evaluator.settings
-    return linearise(problem, x, settings.screening, clip=settings.latent_inputs.clip)
+def _noise_point(noise: Noise) -> Floats:
+    """Coordinates of the pressure's noise: log sigma, and the inverse tanh of its correlation."""
+    return np.array([np.log(noise.sigma[0]), np.arctanh(noise.ar[0])])
+
+
+def _noise_at(noise: Noise, point: Floats) -> Noise:
+    """The noise at other coordinates."""
+    sigma, ar = float(np.exp(point[0])), float(np.tanh(point[1]))
+    return replace(noise, sigma=(sigma, *noise.sigma[1:]), ar=(ar, *noise.ar[1:]))
+
+
+def _unit(place: str, settings: LatentInputSettings) -> float:
+    """Factor from sizes in cmH2O to those of a place."""
+    return settings.relative_size if place in (SUPPLY, GAIN_SCATTER) else 1.0

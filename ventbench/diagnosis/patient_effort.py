@@ -20,6 +20,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from ventbench.diagnosis.gaussian_process import LinearBreaths
 from ventbench.diagnosis.hypothesis import FittedModel
 from ventbench.diagnosis.linearisation import Linearisation, linearise
 from ventbench.diagnosis.settings import PatientEffortSettings, SelectionConfig
@@ -79,10 +80,6 @@ class BreathTerm(Protocol):
         """
         ...
 
-    def linear_gain(self, linearisation: Linearisation, fitted: FittedModel) -> Floats:
-        """Log-likelihood that the term gains to first order, ``(n,)``."""
-        ...
-
     def predict(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
         """Expected readings of breaths to come, ``(n, c, T)``, at values ``(n, P + 1)``."""
         ...
@@ -113,10 +110,6 @@ class NoBreathTerm:
     def log_likelihood_gain(self, problem: Problem, x: Floats, fitted: FittedModel) -> Floats:
         """Return zeros, ``(n,)``."""
         return np.zeros(len(problem.data))
-
-    def linear_gain(self, linearisation: Linearisation, fitted: FittedModel) -> Floats:
-        """Return zeros, ``(n,)``."""
-        return np.zeros(len(linearisation.values))
 
     def predict(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
         """Simulate the values as they are."""
@@ -189,8 +182,8 @@ class PatientEffortTerm:
     def log_likelihood_gain(self, problem: Problem, x: Floats, fitted: FittedModel) -> Floats:
         """Integrate efforts out of breaths without any, at the fitted duration, ``(n,)``."""
         duration = float(fitted.column(DURATION)[0])
-        clipped = self._linearise(problem, x, None)
-        grid, start = self.evidence([clipped, self._linearise(problem, x, np.inf)], duration)
+        linear = self._linearise(problem, x, np.inf)
+        start = self.evidence([linear], duration)[0]
         breathwise, minimum = self._fit_each_breath(problem, x, start)
         curvature = minimum.hessian[
             breathwise.unknowns.index[:, :, None], breathwise.unknowns.index[:, None, :]
@@ -201,7 +194,18 @@ class PatientEffortTerm:
         share = self.prior.probability
         laplace = np.logaddexp(np.log(1.0 - share), np.log(share) + gained)
         # A weak effort's onset is free, as on the grid; for a strong one that is too coarse.
-        return np.maximum(grid.nats, laplace)
+        return np.maximum(self._faint_gain(problem, x, self._effects(linear, duration)), laplace)
+
+    def _faint_gain(self, problem: Problem, x: Floats, effects: list[Floats]) -> Floats:
+        """Log-likelihood that faint efforts gain, as a sum over the grid of onsets, ``(n,)``."""
+        breaths, noise, prior = LinearBreaths.of(problem, x), problem.noise, self.prior
+        size = prior.amplitude_sd / prior.template
+        active = [
+            breaths.whitened(noise, effect[:, None]).marginal(size).nats for effect in effects
+        ]
+        mixed = np.logaddexp.reduce(active, axis=0) - np.log(len(effects))
+        gained = mixed - breaths.whitened(noise).marginal(size).nats
+        return np.logaddexp(np.log(1.0 - prior.probability), np.log(prior.probability) + gained)
 
     def marginal_log_likelihood(self, fitted: FittedModel, noise: Noise) -> Floats:
         """Integrate efforts out around the efforts that the fit found, ``(n,)``."""
@@ -225,10 +229,6 @@ class PatientEffortTerm:
         passive = noise.log_likelihood(fitted.residual_without(EFFORT), data.weight)
         share = self.prior.probability
         return np.logaddexp(np.log(1.0 - share) + passive, np.log(share) + active)
-
-    def linear_gain(self, linearisation: Linearisation, fitted: FittedModel) -> Floats:
-        """Sums over the grid of onsets at the fitted duration, ``(n,)``."""
-        return self.evidence([linearisation], float(fitted.column(DURATION)[0]))[0].nats
 
     def predict(self, fitted: FittedModel, predictor: Predictor, values: Floats) -> Floats:
         """Mean over the efforts of the fitted breaths: nobody knows the effort of a new breath."""

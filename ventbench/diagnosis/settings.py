@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 #: Raised when a value or the meaning of a setting changes.
-VERSION = "selection-6"
+VERSION = "selection-7"
 
 
 @dataclass(frozen=True)
@@ -277,13 +277,15 @@ class LatentInputSettings:
         sizes: standard deviations, cmH2O.
         relative_size: factor from ``sizes`` to those of a flow or of the valve's gain, which are
             shares, 1/cmH2O.
-        clip: whitened residuals are cut off here, in standard deviations; wider than in screening,
-            since an input may be large in a few breaths.
-        noise_rounds: most times that the input and the noise beside it are estimated in turn.
-        noise_gain: log-likelihood, nats, that another round must gain.
-        min_gain: training log-likelihood, nats, below which an input is not refined.
-        min_variance: eigenvalues of a unit covariance below this are left out.
-        min_noise_share: least share of the samples that the noise is taken to be estimated from.
+        rounds: most times that the model's parameters beside an input, its kernel, and its size and
+            noise are found in turn.
+        gain: log-likelihood, nats, that another round must gain.
+        climb_tolerance: log-likelihood, nats, to which size and noise are climbed.
+        frequency_span: how far a climb may move the logarithm of a frequency: to the next one of
+            the grid.
+        coloured: correlation of neighbouring samples from which a climb also starts from white
+            noise; below it, both starts are one.
+        min_variance: components of a unit covariance with less variance are left out.
         threshold: held-out log-likelihood, nats, from which an input is accepted: more than for a
             term, since places, scales and sizes are searched. It must also be this far ahead of
             coloured noise and of scatter of the valve's gain.
@@ -294,23 +296,24 @@ class LatentInputSettings:
         scatter_share: share of what inputs explain from which scatter of the valve's gain between
             breaths is the explanation. A course within each breath imitates the scatter and
             explains some noise as well (a quarter more where gains of a stranger's valve scattered
-            by 1.5 %). Where it explains half as much again, as on the public rig, which is several
-            rigs with gains of their own, the gain cannot be all, and a gain for each breath would
-            hide the curve of the valve.
+            by 1.5 %). Where an input, or slow noise of the sensor, explains half as much again, the
+            gain cannot be all. On the public rig, which is several rigs with gains of their own,
+            slow noise explains three times as much, and a gain for each breath would hide the curve
+            of the valve.
     """
 
     frequencies: tuple[float, ...] = tuple(
         float(f) for f in (*np.arange(0.6, 2.0, 0.1), *np.arange(2.0, 9.1, 0.25))
     )
-    correlation_times: tuple[float, ...] = (0.08, 0.2, 0.5)
+    correlation_times: tuple[float, ...] = (0.08, 0.12, 0.2, 0.3, 0.5, 0.8, 1.2)
     sizes: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
     relative_size: float = 0.1
-    clip: float = 8.0
-    noise_rounds: int = 3
-    noise_gain: float = 1.0
-    min_gain: float = 8.0
+    rounds: int = 3
+    gain: float = 1.0
+    climb_tolerance: float = 0.2
+    frequency_span: float = 0.1
+    coloured: float = 0.2
     min_variance: float = 1e-2
-    min_noise_share: float = 0.2
     threshold: float = 8.0
     least_size: float = 0.4
     sensor_amplitude: float = 0.3

@@ -10,7 +10,10 @@ import numpy as np
 from ventbench.system_id.data import Floats
 
 #: Highest autocorrelation of noise: above it, the model is taken to fit badly.
-_MOST_AR = 0.95
+MOST_AR = 0.95
+
+#: Least standard deviation of the noise of pressure that is believed, cmH2O.
+LEAST_SIGMA = 0.02
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ class Noise:
 
 
 def robust_noise(
-    residual: Floats, weight: Floats, *, floor: float = 0.02, tail: float = Noise.tail
+    residual: Floats, weight: Floats, *, floor: float = LEAST_SIGMA, tail: float = Noise.tail
 ) -> Noise:
     """Estimate the noise from residuals, robust against outliers.
 
@@ -99,5 +102,5 @@ def robust_noise(
         power = np.sum(clipped[:, 1:][both] ** 2) + np.sum(clipped[:, :-1][both] ** 2)
         product = np.sum((clipped[:, 1:] * clipped[:, :-1])[both])
         sigma.append(max(float(size), floor * (20.0 if channel else 1.0)))
-        ar.append(float(np.clip(2.0 * product / power, -_MOST_AR, _MOST_AR)) if power > 0 else 0.0)
+        ar.append(float(np.clip(2.0 * product / power, -MOST_AR, MOST_AR)) if power > 0 else 0.0)
     return Noise(tuple(sigma), tuple(ar), tail)

@@ -167,7 +167,7 @@ def conclude(
         full = selected
     tell("comparing alternatives")
     selected, alternatives = find_alternatives(
-        evaluator, selected, comparisons, swap=unnamed is None
+        evaluator, selected, comparisons, swap=unnamed is None and remaining.slow_noise is None
     )
     has_term = unnamed is not None and unnamed.term is not None
     selected, gains = _supported(evaluator, selected, (wide, full) if has_term else None)

@@ -23,6 +23,8 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import make_data
 from ventbench.validation.challenge.cases import Base, Case, Effect
 from ventbench.validation.challenge.rig import record
+from ventbench.validation.challenge.stranger import laboratory
+from ventbench.validation.challenge.stranger.effects import StrangerCase
 
 #: The lung as it is labelled, and the rig as it is.
 LABEL, RIG = "R20C20", Base(21.0, 19.5)
@@ -55,6 +57,14 @@ def made(*effects: Effect, seed: int = 0, **changed: Any) -> Breaths:
     given = {"base": RIG, "breaths": BREATHS, "samples": SAMPLES, "noise": 0.2} | changed
     one = Case("", 20.0, 20.0, effects, **given)
     return record(one, np.random.default_rng(seed), steps=16)
+
+
+def strange(*effects: Effect, seed: int = 0, **changed: Any) -> Breaths:
+    """Breaths that the second generator recorded, of the same size; ``changed`` as above."""
+    given = {"base": dataclasses.replace(RIG, gain=22.8), "breaths": BREATHS, "samples": SAMPLES}
+    given |= {"noise": 0.1, "step": 0.01, "jitter": 1e-4, "inspiration": 0.8} | changed
+    case = StrangerCase("", 20.0, 20.0, effects, **given)
+    return laboratory.record(case, np.random.default_rng(seed))
 
 
 def split(breaths: Breaths, settings: SelectionConfig = SETTINGS) -> Evaluator:

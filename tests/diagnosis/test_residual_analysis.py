@@ -9,6 +9,7 @@ import pytest
 
 from ventbench.diagnosis.residual_analysis import (
     compare_open_loop,
+    is_unexplained,
     locate,
     noise_floor,
     open_loop_error,
@@ -265,6 +266,32 @@ def test_only_inspiration_of_held_out_breaths_counts(breaths):
     assert (found.refit.mae, found.after.rmse) == pytest.approx((2.0, 1.0))
     assert found.noise_floor == 0.2
     assert found.groups["expiration"]["refit"].mae == pytest.approx(4.0)
+
+
+def test_one_breath_that_starts_wrong_is_not_what_stays_unexplained(breaths):
+    held = np.ones(8, bool)
+    given = answers(breaths)
+    given["after"] = breaths.pressure + 0.1
+    assert not is_unexplained(compare_open_loop(breaths, held, given, 0.1))
+    given["after"][3] += 8.0  # a wrong first reading
+    off = compare_open_loop(breaths, held, given, 0.1)
+    assert off.after.rmse > 2.0
+    assert off.usual == pytest.approx(0.1)
+    assert not is_unexplained(off)
+    given["after"][5] += 8.0
+    assert is_unexplained(compare_open_loop(breaths, held, given, 0.1)), "two of eight are more"
+
+
+def test_what_gains_scatter_is_not_unexplained(breaths):
+    held = np.ones(8, bool)
+    given = answers(breaths)
+    assert is_unexplained(compare_open_loop(breaths, held, given, 0.1))
+    scatter = np.full(breaths.pressure.shape, 0.9)
+    known = compare_open_loop(breaths, held, given, 0.1, gain_error=scatter)
+    assert known.gain_error == pytest.approx(0.9)
+    assert known.least_error == pytest.approx(np.hypot(0.1, 0.9))
+    assert known.unexplained == pytest.approx(np.sqrt(1.0 - 0.82))
+    assert not is_unexplained(known)
 
 
 def test_parts_of_the_breath_and_lungs(breaths):

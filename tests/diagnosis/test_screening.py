@@ -7,7 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.candidate_comparison import fit_with_noise, fit_with_white_noise
+from ventbench.diagnosis.candidate_comparison import (
+    compare_candidates,
+    fit_with_noise,
+    fit_with_white_noise,
+)
 from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.screening import (
     all_parameter_paths,
@@ -116,6 +120,23 @@ def test_screening_ranks_a_mild_effect_among_the_first(name):
     for path, value in candidate.start.items():
         item = parameter(path)
         assert item.low <= value <= item.high
+
+
+def test_a_threshold_starts_where_it_was_simulated_too():
+    """A seat that lets go at 3.3 % is no multiple of one that lets go at 0.7 %."""
+    stuck = small.effect("valve_dead_band", "cracking", width=3.3)
+    evaluator = small.split(small.strange(stuck, seed=5))
+    base = fit_with_noise(evaluator, Hypothesis())
+    white = fit_with_white_noise(evaluator, base)
+    (band,) = screen_mechanisms(base, white, small.SETTINGS, ("valve_dead_band",))
+    assert band.hypothesis.free == ("valve_dead_band.crack",)
+    starts = [start["valve_dead_band.width"] for start in (band.start, *band.other_starts)]
+    assert 3.5 in starts
+    comparison = compare_candidates(evaluator, base, [band])
+    assert comparison is not None
+    fitted = comparison.ranked[0].fitted
+    assert fitted.column("valve_dead_band.width")[0] == pytest.approx(3.3, abs=0.15)
+    assert fitted.column("valve_dead_band.crack")[0] > 0.8
 
 
 def test_screening_ranks_only_the_allowed_mechanisms_that_are_missing(plain):

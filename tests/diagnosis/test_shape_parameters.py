@@ -50,6 +50,32 @@ def test_another_form_is_found_by_a_shape_parameter(effect, path, wanted):
     assert found.column(path)[0] == pytest.approx(wanted, rel=0.15)
 
 
+def test_a_sigmoid_of_a_stranger_is_found_by_a_shape_parameter():
+    effect = small.effect("nonlinear_compliance", "Venegas", capacity=22.0)
+    evaluator = small.split(small.strange(effect, seed=5))
+    found = free_shape_parameters(evaluator, fit_with_noise(evaluator, Hypothesis((effect.name,))))
+    assert found.hypothesis.free == ("nonlinear_compliance.sigmoid",)
+    assert found.column("nonlinear_compliance.sigmoid")[0] > 0.8
+    assert found.column("nonlinear_compliance.stiffening")[0] == pytest.approx(1 / 22.0, rel=0.12)
+
+
+def test_an_effort_that_relaxes_is_found_from_the_other_end_of_its_grid():
+    """Half a sine is fitted to other onsets, from which no small change leads on."""
+    effort = small.effect("patient_effort", "exponential", amplitude=5.0, duration=0.7)
+    evaluator = small.split(small.strange(effort, seed=4))
+    sine = fit_with_noise(evaluator, Hypothesis(("patient_effort",)))
+    found = free_shape_parameters(evaluator, sine)
+    assert found.hypothesis.free == ("patient_effort.relaxing",)
+    assert found.column("patient_effort.relaxing")[0] > 0.5
+
+
+def test_a_better_fit_of_the_default_frees_no_shape():
+    effort = small.effect("patient_effort", "half sine", amplitude=5.0, duration=0.7)
+    evaluator = small.split(small.strange(effort, seed=4))
+    sine = fit_with_noise(evaluator, Hypothesis(("patient_effort",)))
+    assert free_shape_parameters(evaluator, sine).hypothesis.free == ()
+
+
 def test_a_second_lag_behind_a_dead_time_is_found_from_half_of_the_first():
     late = small.effect("valve_delay", delay=0.05)
     slow = small.effect("valve_lag", "two lags", tau=0.1)

@@ -187,13 +187,15 @@ def test_an_inertance_is_judged_beside_its_circuit():
     """What is detectable is the mass of the gas, not the tubing that came with it."""
     from ventbench.validation.challenge.detectability import LIMIT, log_likelihood_loss
 
-    def loss(inertance: float) -> float:
-        effect = Effect("inertance", "strong", SAME, {"inertance": inertance, "circuit": 0.7})
-        case = replace(QUIET, effects=(effect,), breaths=12, noise=0.1)
+    def loss(inertance: float, rig: StrangerCase = QUIET, circuit: float = 0.7) -> float:
+        effect = Effect("inertance", "strong", SAME, {"inertance": inertance, "circuit": circuit})
+        case = replace(rig, effects=(effect,), breaths=12, noise=0.1)
         return log_likelihood_loss(case, record(case, np.random.default_rng(2)), 0)
 
     assert loss(1e-4) < 1.0
     assert loss(0.13) > LIMIT
+    behind = replace(QUIET, base=replace(QUIET.base, R=45.0, C=10.0))
+    assert loss(0.14, behind, circuit=0.35) < LIMIT, "a little less circuit does what the mass does"
     heavy = replace(
         QUIET, effects=(Effect("inertance", "strong", SAME, {"inertance": 0.1, "circuit": 0.8}),)
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import subprocess
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -75,6 +76,43 @@ def test_an_interrupt_of_this_process_alone_ends_its_workers(tmp_path):
             time.sleep(0.01)
         raise KeyboardInterrupt
     assert set(multiprocessing.active_children()) == before
+
+
+def _waits_with_its_number(begun: str) -> None:
+    Path(begun).with_suffix(".new").write_text(str(os.getpid()))
+    Path(begun).with_suffix(".new").rename(begun)
+    threading.Event().wait()
+
+
+def _opens_an_executor(begun: str) -> None:
+    with executor(1) as pool:
+        pool.submit(_waits_with_its_number, begun).result()
+
+
+def _runs(process: int) -> bool:
+    """Whether a process is there and no zombie that nobody has asked after."""
+    shown = subprocess.run(
+        ["ps", "-o", "stat=", "-p", str(process)], capture_output=True, text=True, check=False
+    )
+    return bool(shown.stdout.strip()) and not shown.stdout.startswith("Z")
+
+
+@pytest.mark.slow
+def test_a_worker_ends_with_a_parent_that_is_killed(tmp_path):
+    begun = tmp_path / "begun"
+    parent = multiprocessing.get_context("spawn").Process(
+        target=_opens_an_executor, args=(str(begun),)
+    )
+    parent.start()
+    while not begun.exists():
+        assert parent.is_alive()
+        time.sleep(0.01)
+    worker = int(begun.read_text())
+    assert _runs(worker)
+    parent.kill()
+    parent.join()
+    while _runs(worker):  # else the test's own time limit ends it
+        time.sleep(0.01)
 
 
 def _slowly(plant, gains):

@@ -9,7 +9,9 @@ jobs must be functions of a module with small arguments made of numpy arrays.
 from __future__ import annotations
 
 import multiprocessing
+import multiprocessing.connection
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent import futures
 from contextlib import contextmanager
@@ -74,7 +76,9 @@ def executor(workers: int = 0, scheduler: str | None = None) -> Iterator[futures
         return
     others = set(multiprocessing.active_children())
     # Not forked: JAX has threads, whose locks a fork would leave closed.
-    pool = futures.ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+    pool = futures.ProcessPoolExecutor(
+        workers, multiprocessing.get_context("spawn"), initializer=_end_with_parent
+    )
     try:
         yield pool
     except KeyboardInterrupt:
@@ -84,6 +88,19 @@ def executor(workers: int = 0, scheduler: str | None = None) -> Iterator[futures
         raise
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """End this worker when its parent ends, however that ends: nobody would take the results."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch(sentinel: int) -> None:
+        multiprocessing.connection.wait([sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, args=(parent.sentinel,), daemon=True).start()
 
 
 @contextmanager

@@ -122,7 +122,7 @@ def diagnosis(n: int = 40) -> Diagnosis:
         location=locate(recorded, refit, NOISE, flow, volume),
         open_loop=OpenLoopComparison(
             tuple(recorded.breath_id[held].tolist()),
-            **stages(True),
+            *(stages(True)[stage] for stage in ("before", "refit", "after")),
             noise_floor=NOISE,
             groups={
                 "first 0.2 s": stages(recorded.time < 0.2),

@@ -25,7 +25,9 @@ def counted(start, length, past):
 
 def found(start, length, past):
     with float64():
-        return np.asarray(window_weights(*(jnp.asarray(x, float) for x in (start, length)), past))
+        durations = tuple(jnp.asarray(x, float) for x in past)
+        weights = window_weights(jnp.asarray(start, float), jnp.asarray(length, float), durations)
+        return np.asarray(weights)
 
 
 @settings(max_examples=60, deadline=None)
@@ -62,7 +64,8 @@ def test_batches_and_gradients():
     past = (jnp.full(2, 0.03), jnp.full(2, 0.02))
     batch = jnp.stack(window_weights(starts, jnp.full(2, 0.01), past))
     assert batch.shape == (4, 2)
-    slope = jax.jacobian(lambda s: jnp.stack(window_weights(s, jnp.asarray(0.01), (0.03, 0.02))))(
+    single = (jnp.asarray(0.03), jnp.asarray(0.02))
+    slope = jax.jacobian(lambda s: jnp.stack(window_weights(s, jnp.asarray(0.01), single)))(
         starts[0]
     )
     np.testing.assert_allclose(slope, [100.0, -100.0, 0.0, 0.0], atol=1e-3)

@@ -194,7 +194,7 @@ def test_an_inertance_is_judged_beside_its_circuit():
 
     assert loss(1e-4) < 1.0
     assert loss(0.13) > LIMIT
-    behind = replace(QUIET, base=replace(QUIET.base, R=45.0, C=10.0))
+    behind = replace(QUIET, base=Base(45.0, 10.0, 5.0, 5.0, 22.8))
     assert loss(0.14, behind, circuit=0.35) < LIMIT, "a little less circuit does what the mass does"
     heavy = replace(
         QUIET, effects=(Effect("inertance", "strong", SAME, {"inertance": 0.1, "circuit": 0.8}),)

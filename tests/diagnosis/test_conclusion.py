@@ -19,6 +19,7 @@ from ventbench.diagnosis.conclusion import (
     conclude,
     is_unresolved,
 )
+from ventbench.diagnosis.diagnose import _note_on_slow_noise
 from ventbench.diagnosis.estimates import nonparametric_term, split_form
 from ventbench.diagnosis.findings import NonparametricTerm
 from ventbench.diagnosis.hypothesis import Hypothesis
@@ -156,12 +157,27 @@ def test_an_input_must_explain_more_than_every_nuisance(nats, noise, scatter, ac
 
 @pytest.mark.parametrize(("nats", "asked"), [(30.0, True), (3.0, False), (-30.0, False)])
 def test_slow_noise_counts_if_held_out_breaths_ask_for_it(nats, asked):
-    sensor = latent(MEASUREMENT, nats)
-    found = _slow_noise(sensor, np.zeros(6), small.SETTINGS)
-    assert (found is not None) is asked
-    if found is not None:
-        assert found[0] is sensor
-        assert found[1] == pytest.approx(nats)
+    inputs = {place: latent(place, nats - 10.0) for place in (ALVEOLUS, SUPPLY, GAIN_SCATTER)}
+    inputs[MEASUREMENT] = latent(MEASUREMENT, nats)
+    slow = _slow_noise(inputs, np.zeros(6), small.SETTINGS)
+    assert (slow is not None) is asked
+    if slow is not None:
+        assert slow.latent_input is inputs[MEASUREMENT]
+        assert slow.nats == pytest.approx(nats)
+        assert slow.places[0][0] == MEASUREMENT
+        assert sum(weight for _, weight in slow.places) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("size", "told"), [(0.8, True), (0.1, False)])
+def test_slow_errors_that_are_left_are_told_if_they_are_large(size, told):
+    sensor = latent(MEASUREMENT, 30.0, size)
+    slow = UnnamedEffect(MEASUREMENT, None, sensor, 30.0, ((MEASUREMENT, 0.985), (SUPPLY, 0.015)))
+    notes = _note_on_slow_noise(SimpleNamespace(slow_noise=slow), small.SETTINGS)  # type: ignore[arg-type]
+    assert bool(notes) is told
+    if notes:
+        assert "0.8 cmH2O" in notes[0]
+        assert "measurement 98.5 %" in notes[0]
+    assert _note_on_slow_noise(SimpleNamespace(slow_noise=None), small.SETTINGS) == []  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

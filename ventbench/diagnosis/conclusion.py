@@ -88,6 +88,8 @@ class Conclusion:
         gain_sd: standard deviation of the logarithm of the breaths' valve gains; 0 if all breaths
             have the same gain.
         unresolved: whether much is missing, and neither mechanism nor unnamed effect is accepted.
+        slow_noise: what is left as slow noise of the sensor, with the weight of each place where a
+            course in time may act; None if nothing slow is left, or an unnamed effect is it.
     """
 
     base: FittedModel
@@ -99,6 +101,7 @@ class Conclusion:
     alternatives: dict[str, Alternatives]
     gain_sd: float = 0.0
     unresolved: bool = False
+    slow_noise: UnnamedEffect | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -162,8 +165,9 @@ def conclude(
             full = beside.full
     elif remaining.slow_noise is not None and not selected.hypothesis.breath_terms:
         # Efforts have been compared with slow noise when they were selected.
-        noise, nats = remaining.slow_noise
-        selected = eliminate_beside_input(evaluator, selected, noise, nats)
+        slow = remaining.slow_noise
+        assert slow.latent_input is not None
+        selected = eliminate_beside_input(evaluator, selected, slow.latent_input, slow.nats)
         full = selected
     tell("comparing alternatives")
     selected, alternatives = find_alternatives(
@@ -188,6 +192,7 @@ def conclude(
         {name: alternatives[name] for name in selected.names if name in alternatives},
         evaluator.gain_sd,
         unnamed is None and not selected.names and is_unresolved(evaluator, comparisons),
+        remaining.slow_noise if unnamed is None else None,
     )
 
 
@@ -276,14 +281,13 @@ class _Unexplained:
         term: best nonparametric term, or None.
         latent: best latent input, or None.
         gain_sd: standard deviation of the logarithm of the breaths' gains; 0 if it does not matter.
-        slow_noise: slow noise of the sensor and the held-out log-likelihood that it gains, nats;
-            None if it gains nothing.
+        slow_noise: slow noise of the sensor; None if it gains nothing.
     """
 
     term: NonparametricFit | None
     latent: UnnamedEffect | None
     gain_sd: float
-    slow_noise: tuple[LatentInput, float] | None
+    slow_noise: UnnamedEffect | None
 
     @property
     def prefers_term(self) -> bool:
@@ -302,25 +306,28 @@ def _explain_remaining_error(
     scatter, settings = inputs.pop(GAIN_SCATTER), evaluator.settings
     scattered = _gain_scatters(scatter, inputs, reference, term, settings)
     gain_sd = scatter.size if scattered else 0.0
-    slow_noise = _slow_noise(inputs[MEASUREMENT], reference, settings)
-    if term is not None and slow_noise is not None and term.nats < slow_noise[1]:
+    inputs[GAIN_SCATTER] = scatter
+    slow_noise = _slow_noise(inputs, reference, settings)
+    if term is not None and slow_noise is not None and term.nats < slow_noise.nats:
         # A curve that is the same in all breaths may gain by what slow errors have in common. One
         # that is there gains more than noise, which has to be found anew in each breath.
         term = None
-    latent = _best_input({GAIN_SCATTER: scatter, **inputs}, reference, settings)
+    latent = _best_input(inputs, reference, settings)
     if latent is not None and _is_negligible_input(evaluator, selected, latent):
         latent = None
     return _Unexplained(term, latent, gain_sd, slow_noise)
 
 
 def _slow_noise(
-    sensor: LatentInput, reference: Floats, settings: SelectionConfig
-) -> tuple[LatentInput, float] | None:
-    """Slow noise of the sensor and the nats that it gains, if held-out breaths ask for it."""
+    inputs: dict[str, LatentInput], reference: Floats, settings: SelectionConfig
+) -> UnnamedEffect | None:
+    """Slow noise of the sensor, if held-out breaths ask for it, with its rivals' weights."""
+    sensor = inputs[MEASUREMENT]
     gained = sensor.held_out_log_likelihood - reference
     if not passes_heldout_test(gained, settings.held_out_test):
         return None
-    return sensor, float(gained.sum())
+    places = tuple(place_weights(inputs.values()).items())
+    return UnnamedEffect(MEASUREMENT, None, sensor, float(gained.sum()), places)
 
 
 def _best_term(wide: Evaluator, selected: FittedModel) -> NonparametricFit | None:

@@ -252,7 +252,10 @@ def diagnose(
         plants=correction.plants,
         simulator=_name(simulator, simulators),
         noise=(float(noise.sigma[0]), float(noise.ar[0])),
-        notes=(*notes, *notes_on_simulator, *correction.notes, *notes_on_lungs),
+        notes=(
+            *notes, *notes_on_simulator, *correction.notes, *notes_on_lungs,
+            *_note_on_slow_noise(conclusion, settings),
+        ),
         settings=settings,
         seconds=time.perf_counter() - began,
     )  # fmt: skip
@@ -274,6 +277,22 @@ def steps_between(tell: Progress, low: float, high: float) -> Callable[[str], No
         share += _STEP * (high - share)
 
     return step
+
+
+def _note_on_slow_noise(conclusion: Conclusion, settings: SelectionConfig) -> list[str]:
+    """Note on slow errors that are left, if they are more than a sensor's usual wandering."""
+    slow = conclusion.slow_noise
+    if slow is None or slow.latent_input is None:
+        return []
+    size = slow.latent_input.size
+    if size < settings.latent_inputs.sensor_amplitude:
+        return []
+    weights = ", ".join(f"{place} {100.0 * weight:.1f} %" for place, weight in slow.places)
+    return [
+        f"Slow errors of {size:.1f} cmH2O are left that differ from breath to breath. Held-out "
+        "breaths take them for noise of the sensor rather than for a source in the physics "
+        f"(weights: {weights})."
+    ]
 
 
 def _note_on_rate(rate: float, breaths: Breaths) -> str:

@@ -198,9 +198,11 @@ def diagnose(
         notes_on_simulator.append(f"The simulator needs a nonparametric term at {term.name} too.")
     lungs, notes_on_lungs = _lungs(recorded, recording_only_model.fit)
     noise, pressures = conclusion.noise, correction.pressures
+    # A simulator that is more than a lung and a valve may know the gains of its rigs.
+    gain_error = recording_model.gain_error(data) if simulators.is_base_physics else None
     open_loop = compare_open_loop(
         breaths, uses.judging, pressures, noise_floor(breaths, float(noise.sigma[0])),
-        settings.residuals, recording_model.gain_error(data),
+        settings.residuals, gain_error,
     )  # fmt: skip
     is_input = conclusion.unnamed is not None and conclusion.unnamed.latent_input is not None
     rejected = (bool(missing) or term is not None) and not _helps(

@@ -158,8 +158,17 @@ def _quick_fits(
         if not varies_by_breath(candidate.name):
             starts = [start | shift for start in starts for shift in shifts]
             starts += [{}, label] if far else []
+        elif far:
+            # What all efforts have in common, a refitted R and C make up for.
+            starts.append(candidate.start | label)
         if len(starts) <= settings.fit.continued_starts:
-            fits = [quick(small, hypothesis, noise, first, start) for start in starts]
+            fits = [
+                quick(
+                    small, hypothesis, noise, first, start,
+                    restart=len(start) > len(candidate.start) and varies_by_breath(candidate.name),
+                )
+                for start in starts
+            ]  # fmt: skip
             return [min(fits, key=cost_of)]
         steps = settings.fit.start_iterations
         raced = [

@@ -30,11 +30,13 @@ from ventbench.diagnosis.plausibility import is_consistent, is_plausible
 from ventbench.diagnosis.refinement import (
     Alternatives,
     NonparametricFit,
+    Replacements,
     SingleTermAlternative,
     backward_elimination,
     compare_nonparametric_terms,
     drop_compensating_terms,
     eliminate_beside_input,
+    exchange,
     find_alternatives,
     special_case_of,
     without_breath_terms,
@@ -133,6 +135,15 @@ def conclude(
         start = drop_redundant_terms(evaluator, start, start.names)
         other = forward_selection(evaluator, start, tell, single)
         selected, comparisons = _better_selection(evaluator, (selected, comparisons), other)
+    known: Replacements = {}
+    for _ in range(evaluator.settings.refinement.exchanges):
+        if len(selected.names) < 2:  # nothing came after the first
+            break
+        tell("exchanging mechanisms")
+        other = exchange(evaluator, selected, comparisons, known)
+        if other is None:
+            break
+        selected, comparisons = forward_selection(evaluator, other, tell, single)
     tell("looking for effects that no mechanism explains")
     wide = wider()
     reduced = drop_compensating_terms(evaluator, wide, selected, tell)
@@ -171,8 +182,9 @@ def conclude(
         full = selected
     tell("comparing alternatives")
     selected, alternatives = find_alternatives(
-        evaluator, selected, comparisons, swap=unnamed is None and remaining.slow_noise is None
-    )
+        evaluator, selected, comparisons, known=known,
+        swap=unnamed is None and remaining.slow_noise is None,
+    )  # fmt: skip
     has_term = unnamed is not None and unnamed.term is not None
     selected, gains = _supported(evaluator, selected, (wide, full) if has_term else None)
     if unnamed is None or unnamed.term is None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 #: Raised when a value or the meaning of a setting changes.
-VERSION = "selection-7"
+VERSION = "selection-8"
 
 
 @dataclass(frozen=True)
@@ -152,6 +152,8 @@ class ForwardSelectionSettings:
             same in all breaths is preferred to it.
         fallback_candidates: candidates that are tried where the best one fails its test.
         shape_gain: held-out log-likelihood, nats, from which a shape parameter is freed.
+        exchanged_firsts: rivals of a pair, the best first, to which each other one is added.
+        exchanged_twos: such twos, the best first, that are fitted to the end.
     """
 
     min_expected_gain: float = 3.0
@@ -167,6 +169,8 @@ class ForwardSelectionSettings:
     shared_effect_share: float = 0.5
     fallback_candidates: int = 3
     shape_gain: float = 2.0
+    exchanged_firsts: int = 3
+    exchanged_twos: int = 2
 
 
 @dataclass(frozen=True)
@@ -197,6 +201,7 @@ class RefinementSettings:
             probability of 1 : 150.
         listed_alternatives: most alternatives that are listed.
         compared_alternatives: most alternatives that are compared again at one noise.
+        exchanges: most mechanisms that are exchanged before what they leave is explained.
     """
 
     fitted_terms: int = 5
@@ -212,6 +217,7 @@ class RefinementSettings:
     close_criterion: float = 10.0
     listed_alternatives: int = 2
     compared_alternatives: int = 3
+    exchanges: int = 2
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from ventbench.validation.challenge.stranger.rig import Floats, Rig
 Command = Callable[[int, Floats, NDArray[np.bool_]], tuple[Floats, Floats]]
 
 #: Step of the integration of recordings and of noise-free replays, s.
-STEP, REPLAY_STEP = 2.5e-4, 1e-3
+STEP, REPLAY_STEP = 1e-4, 1e-3
 
 #: Pressure at which the ventilator shuts its valve, cmH2O.
 _RELIEF = 55.0

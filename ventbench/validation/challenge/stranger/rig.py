@@ -4,7 +4,7 @@ The states are the pressure of the circuit's node, the flow through the airway (
 its gas), the volume of each compartment, the stress of the tissue, the position of the inspiratory
 valve, the pressure deficit of the supply, the position of the expiratory valve, and the sensor's.
 Stiff terms are implicit and nonlinear ones are linearised at the step before, at a fixed step of a
-quarter of a millisecond, so that no step depends on where commands change.
+tenth of a millisecond, so that no step depends on where commands change.
 """
 
 from __future__ import annotations
@@ -184,7 +184,9 @@ class Rig:
             self.valve = opening + (self.valve - opening) * decay
         flow = self.gain * self.valve
         if (droop := self.effects.get("supply_droop")) is not None:
-            full = droop.parameters["drop"] * flow / _SUPPLY_FLOW
+            # What leaves the reservoir empties it, not what the valve asks for.
+            drawn = flow * np.clip(1.0 - self.deficit, 0.05, 1.0)
+            full = droop.parameters["drop"] * drawn / _SUPPLY_FLOW
             rate = np.exp(-h / droop.parameters["recovery"])
             self.deficit = full + (self.deficit - full) * rate
             flow = flow * np.clip(1.0 - self.deficit, 0.05, 1.0)

@@ -114,8 +114,14 @@ def compare_candidates(
         order = criteria.order(freer, noise)
         noise = criteria.better_noise(order[0], noise)
         order = criteria.order(order, noise)
+    base = current
     if noise is not current.noise:
         current = evaluator.fit(current.hypothesis, noise, current)
+    worse = criteria(current, noise) + settings.contender_criterion
+    shared = [model for model in order if not varies_by_breath(model.names[-1])]
+    if shared and first is not base and criteria(shared[0], noise) > worse:
+        # The fit at white noise is beyond a dead time from which no candidate finds back.
+        return compare_candidates(evaluator, base, candidates, base, restarts=restarts)
     ranked = tuple(
         RankedModel(model.hypothesis.names[-1], model, criteria(model, noise)) for model in order
     )

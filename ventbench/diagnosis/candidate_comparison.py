@@ -157,6 +157,10 @@ def _quick_fits(
     )
     shifts: list[Start] = [{}, *other_dead_times(warm_start)]
     label: Start = {"R": data.R, "C": data.C}
+    # A lag of 0.1 s lets R fall to nothing before the lag itself is found, unless R is held at
+    # first.
+    alike = len(np.unique(data.R)) == len(np.unique(data.C)) == 1
+    held = Hypothesis(fixed=(("R", float(data.R[0])), ("C", float(data.C[0])))) if alike else None
 
     def begun(candidate: Candidate) -> list[FittedModel]:
         hypothesis = current.hypothesis.plus(candidate.hypothesis)
@@ -177,10 +181,13 @@ def _quick_fits(
             ]  # fmt: skip
             return [min(fits, key=cost_of)]
         steps = settings.fit.start_iterations
-        raced = [
-            small.fit(hypothesis, noise, first, start, iterations=steps, delay_rounds=0)
-            for start in starts
-        ]
+        race = partial(small.fit, hypothesis, noise, iterations=steps, delay_rounds=0)
+        raced = [race(first, start) for start in starts]
+        if far and held is not None:
+            near = small.fit(
+                hypothesis.plus(held), noise, first, label, iterations=2 * steps, delay_rounds=0
+            )
+            raced.append(race(near, label))
         return sorted(raced, key=cost_of)[: settings.fit.continued_starts]
 
     raced = parallel_map(begun, candidates)

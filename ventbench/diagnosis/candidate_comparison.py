@@ -209,7 +209,7 @@ def _quick_fits(
     noise_left = estimate_noise(models[int(np.argmin(own))])
     models = criteria.order(models, noise_left)
     limit = _contention(evaluator, criteria, evaluator.restricted(current), models[0], noise_left)
-    count = settings.forward.fitted_candidates
+    count = settings.forward.fitted_to_all
     kept = [m for k, m in enumerate(models) if k < count or criteria(m, noise_left) < limit]
     return parallel_map(partial(fit_to_all, evaluator, warm_start=warm_start), kept)
 

@@ -128,7 +128,10 @@ def conclude(
     base = fit_with_noise(evaluator, Hypothesis())
     wider = cache(wider)
     single = SingleTermAlternative(evaluator, wider, base)
-    selected, comparisons = forward_selection(evaluator, base, tell, single)
+    if earlier is None or len(earlier.names) < evaluator.settings.forward.kept_terms:
+        selected, comparisons = forward_selection(evaluator, base, tell, single)
+    else:
+        selected, comparisons = base, []
     if earlier is not None and not set(earlier.names) <= set(selected.names):
         # Gains of the breaths' own can stand for a bent valve in the first rounds of a selection.
         start = fit_with_noise(evaluator, earlier.hypothesis, earlier)

@@ -138,6 +138,8 @@ class ForwardSelectionSettings:
         large_gain: nats (and criterion) from which much is missing: first order then ranks badly,
             and all candidates are fitted.
         fitted_candidates: candidates that are fitted otherwise.
+        fitted_to_all: candidates that are fitted to all training breaths in any case, where one
+            batch of them ranks the candidates: as many as may be tried when the best one fails.
         contender_criterion: criterion within which a candidate may still win and is fitted on.
         contender_share: share of the best candidate's gain within which a candidate may still win.
         hopeless_share: share of what the best candidate explains by which another one may be
@@ -147,6 +149,8 @@ class ForwardSelectionSettings:
         noise_rounds: most times that the winner and the noise are chosen in turn.
         max_terms: most terms of a hypothesis.
         max_rounds: most comparisons; a term that was dropped may come back, but not for ever.
+        kept_terms: terms of a selection with one gain from which a selection with a gain for each
+            breath only goes on from it, and does not begin anew.
         replacement_terms: terms from which a single nonparametric term is tried in their place.
         shared_effect_share: share of what patient effort explains from which an effect that is the
             same in all breaths is preferred to it.
@@ -159,12 +163,14 @@ class ForwardSelectionSettings:
     min_expected_gain: float = 3.0
     large_gain: float = 100.0
     fitted_candidates: int = 6
+    fitted_to_all: int = 4
     contender_criterion: float = 60.0
     contender_share: float = 0.1
     hopeless_share: float = 0.5
     noise_rounds: int = 3
     max_terms: int = 6
     max_rounds: int = 14
+    kept_terms: int = 3
     replacement_terms: int = 4
     shared_effect_share: float = 0.5
     fallback_candidates: int = 3

@@ -15,6 +15,7 @@ from ventbench.diagnosis.refinement import (
     NonparametricFit,
     SingleTermAlternative,
     drop_compensating_terms,
+    exchange,
     find_alternatives,
     special_case_of,
 )
@@ -187,3 +188,14 @@ def test_an_effect_like_no_other_has_no_alternative():
     assert other["viscoelasticity"].names == ("second_compartment",)
     assert other["viscoelasticity"].confidence > 0.99
     assert other["viscoelasticity"].models == ()
+
+
+def test_an_exchange_needs_bic_and_held_out_breaths(alike):
+    evaluator, named, _ = alike
+    wrong = fit_with_noise(evaluator, Hypothesis(("viscoelasticity",)))
+    known: dict = {}
+    better = exchange(evaluator, wrong, [], known)
+    assert better is not None
+    assert set(better.names) <= {"valve_lag", "circuit_compliance"}
+    assert list(known) == [(Hypothesis(), "viscoelasticity")], "what was fitted is kept"
+    assert exchange(evaluator, named, [], {}) is None, "rivals that tie stay alternatives"

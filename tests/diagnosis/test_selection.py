@@ -9,6 +9,8 @@ import pytest
 
 from ventbench.diagnosis import selection
 from ventbench.diagnosis.candidate_comparison import (
+    Comparison,
+    RankedModel,
     compare_candidates,
     estimate_noise,
     fit_with_noise,
@@ -202,3 +204,54 @@ def test_one_mechanism_takes_the_place_of_two_that_imitate_it():
 
 def test_a_single_mechanism_has_no_pair_to_replace(turbulent, both):
     assert selection.replace_pair(turbulent, both[0]) is None
+
+
+@pytest.mark.slow  # seconds a pair: all twos of the rivals
+def test_two_mechanisms_take_the_place_of_two_that_imitate_them():
+    acting = (
+        small.effect("circuit_compliance", compliance=3.0),
+        small.effect("exhalation_valve_delay", "slow opening", opening=0.09),
+    )
+    evaluator = small.split(small.strange(*acting, noise=0.2, seed=3))
+    wrong = Hypothesis(("sensor_lag", "inertance"), ("sensor_lag.second",))
+    instead = selection.replace_pair(evaluator, fit_with_noise(evaluator, wrong))
+    assert instead is not None
+    assert set(instead.names) == {"circuit_compliance", "exhalation_valve_delay"}
+
+
+def test_a_term_too_small_to_be_named_gives_way_to_one_that_explains_as_much(turbulent, both):
+    """The second candidate is taken where the first is negligible, if it is as good."""
+    named, without = both
+    tiny = turbulent.fit(Hypothesis(("sensor_drift",)), named.noise, without)
+    level = turbulent.criterion(named)
+    ranked = (RankedModel("sensor_drift", tiny, level - 1.0),
+              RankedModel("turbulent_resistance", named, level))  # fmt: skip
+    gains = turbulent.held_out_log_likelihood(named) - turbulent.held_out_log_likelihood(without)
+    taken = selection._accepted(turbulent, Comparison(without, ranked, gains))
+    assert taken is not None
+    assert taken.names == ("turbulent_resistance",)
+
+
+@pytest.mark.slow  # four rounds and the exchanges, 20 s
+def test_a_small_term_that_hides_others_is_judged_at_the_end_of_the_search():
+    """A few hundredths of a millilitre before 50 cmH2O/(L/s), and a bent valve behind a delay."""
+    acting = (
+        small.effect("valve_delay", delay=0.0625),
+        small.effect("valve_curve", "rational saturation", loss=0.43),
+    )
+    breaths = small.strange(
+        *acting, noise=0.15, seed=5, dead_space=0.05,
+        base=dataclasses.replace(small.RIG, R=52.8, C=9.5, gain=22.8), proportional=1.3,
+    )  # fmt: skip
+    evaluator = small.split(breaths)
+    named, _ = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
+    assert set(named.names) == {"valve_delay", "valve_curve"}
+
+
+def test_an_effort_that_all_breaths_have_is_not_taken_for_compliance():
+    """R and C of the base model make up for the efforts' mean; fits start at the label too."""
+    effect = small.effect("patient_effort", "half sine", amplitude=2.5, duration=0.9)
+    evaluator = small.split(small.strange(effect, noise=0.1, seed=7))
+    named, _ = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
+    assert named.names == ("patient_effort",)
+    assert np.median(named.column("patient_effort.amplitude")) > 1.0

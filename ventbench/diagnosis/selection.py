@@ -412,14 +412,32 @@ def _twos(
     order = sorted(best, key=lambda name: cost_of(best[name][1]))
     count = small.settings.forward.exchanged_firsts
     work = [
-        (best[one][1], Hypothesis((other,)), best[other][0])
+        (best[one][1], added, best[other][0] | start)
         for k, one in enumerate(order[:count])
         for other in order[k + 1 :]
+        for added, start in _forms(other)
     ]
-    models = parallel_map(lambda job: _begun(small, rest.plus(job[0].hypothesis).plus(job[1]),
-                                             job[0], job[2]), work)  # fmt: skip
+
+    def begun(job: tuple[FittedModel, Hypothesis, dict[str, float]]) -> FittedModel:
+        first, added, start = job
+        return _begun(small, rest.plus(first.hypothesis).plus(added), first, start)
+
+    models = parallel_map(begun, work)
     near = sorted((model for model in models if cost_of(model) < limit), key=cost_of)
     return near[: small.settings.forward.exchanged_twos]
+
+
+def _forms(name: str) -> list[tuple[Hypothesis, dict[str, float]]]:
+    """A mechanism in its usual form and in the others of its grids: a valve that opens slowly."""
+    usual = Hypothesis((name,))
+    shapes = [p for p in mechanism(name).description.parameters if p.shape and not p.discrete]
+    return [(usual, {})] + [
+        (Hypothesis((name,), (path,)), {path: value})
+        for about in shapes
+        for path in [f"{name}.{about.name}"]
+        for value in about.grid
+        if value != about.neutral
+    ]
 
 
 def _rivals(evaluator: Evaluator, current: FittedModel, pair: tuple[str, ...]) -> list[str]:

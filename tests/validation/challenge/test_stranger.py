@@ -84,6 +84,26 @@ def test_a_leak_and_a_circuit_against_solve_ivp():
     np.testing.assert_allclose(found, exact.y[0], atol=0.25)
 
 
+def test_what_leaves_the_reservoir_empties_it():
+    """The deficit of the supply follows the flow that is drawn, so that more is never less."""
+    drop, recovery, R, C, asked = 0.3, 1.0, 20.0, 0.02, 1.14
+    effect = Effect("supply_droop", "strong", "regulator and reservoir",
+                    {"drop": drop, "recovery": recovery})  # fmt: skip
+    given = held(np.full(25, 50.0), np.zeros(25, np.int8))
+    case = replace(QUIET, effects=(effect,), breaths=1)
+    shown = replay(case, given, np.array([5.0]), 0)[0]
+
+    def slope(t, y):
+        deficit, _ = y
+        drawn = asked * (1.0 - deficit)
+        return (drop * drawn / 0.5 - deficit) / recovery, drawn
+
+    at = given.time[0]
+    exact = solve_ivp(slope, (0.0, at[-1]), (0.0, 0.0), t_eval=at, rtol=1e-8)
+    pressure = 5.0 + exact.y[1] / C + R * asked * (1.0 - exact.y[0])
+    np.testing.assert_allclose(shown[2:], pressure[2:], rtol=0.01)
+
+
 def test_every_effect_acts_and_a_strong_one_more():
     quiet = replayed(None, 37.4)
     for name, family in stranger.EFFECTS.items():
@@ -155,6 +175,11 @@ def test_judged_by_what_pressure_can_tell():
         "sensor_lag.tau": 0.05
     }
     assert true_values(case(Effect("sensor_lag", "mild", "second order", {"tau": 0.05}))) == {}
+    # The circuit that every rig has is part of the circuit that a fit sees.
+    tube = Effect("circuit_compliance", "mild", SAME, {"compliance": 1.2})
+    assert true_values(replace(case(tube), dead_space=0.05)) == {
+        "circuit_compliance.compliance": pytest.approx(1.25)
+    }
     assert true_values(case(Effect("resistance_change", "mild", "secretions", {"c": 0.3}))) == {}
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
-from ventbench.diagnosis.screening import all_parameter_paths
+from ventbench.diagnosis.selection.screening import all_parameter_paths
 from ventbench.diagnosis.settings import (
     DataSettings,
     ScreeningSettings,

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.conclusion import (
     UnnamedEffect,
     _best_input,
@@ -24,7 +23,8 @@ from ventbench.diagnosis.estimates import nonparametric_term, split_form
 from ventbench.diagnosis.findings import NonparametricTerm
 from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.latent_inputs import ALVEOLUS, GAIN_SCATTER, MEASUREMENT, SUPPLY
-from ventbench.diagnosis.selection import drop_redundant_terms
+from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
+from ventbench.diagnosis.selection.forward import drop_redundant_terms
 from ventbench.recordings import join
 
 from . import small

@@ -7,11 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.candidate_comparison import (
-    estimate_noise,
-    fit_with_noise,
-    hopeless_above,
-)
 from ventbench.diagnosis.evaluator import (
     Evaluator,
     cross_validated_gain,
@@ -20,6 +15,11 @@ from ventbench.diagnosis.evaluator import (
     make_evaluator,
 )
 from ventbench.diagnosis.hypothesis import Hypothesis, Partition
+from ventbench.diagnosis.selection.candidate_comparison import (
+    estimate_noise,
+    fit_with_noise,
+    hopeless_above,
+)
 from ventbench.diagnosis.settings import ForwardSelectionSettings, PatientEffortSettings
 from ventbench.physics import paths
 from ventbench.system_id import START, Data, Noise, make_data, parameter_values

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy import integrate
 
-from ventbench.diagnosis.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.gaussian_process import Kernel, LinearBreaths, components
 from ventbench.diagnosis.hypothesis import Hypothesis
@@ -25,6 +24,7 @@ from ventbench.diagnosis.latent_inputs import (
     log_likelihood_without_input,
     place_weights,
 )
+from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
 from ventbench.system_id import Predictor
 
 from . import small

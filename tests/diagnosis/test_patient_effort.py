@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
 from ventbench.diagnosis.latent_inputs import exceeds_sensor_noise
@@ -19,6 +18,7 @@ from ventbench.diagnosis.patient_effort import (
     PatientEffortTerm,
     breath_term,
 )
+from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
 from ventbench.system_id import Noise
 
 from . import small

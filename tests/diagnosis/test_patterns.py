@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
-from ventbench.diagnosis.selection import forward_selection
+from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
+from ventbench.diagnosis.selection.forward import forward_selection
 from ventbench.lungs import lung
 from ventbench.validation.challenge.cases import Base, Effect
 from ventbench.validation.challenge.stranger.effects import StrangerCase

@@ -8,18 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.diagnosis import refinement
-from ventbench.diagnosis.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.refinement import (
+from ventbench.diagnosis.selection import refinement
+from ventbench.diagnosis.selection.alternatives import exchange, find_alternatives
+from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
+from ventbench.diagnosis.selection.forward import forward_selection
+from ventbench.diagnosis.selection.refinement import (
     NonparametricFit,
     SingleTermAlternative,
     drop_compensating_terms,
-    exchange,
-    find_alternatives,
     special_case_of,
 )
-from ventbench.diagnosis.selection import forward_selection
 
 from . import small
 

@@ -7,13 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.candidate_comparison import (
+from ventbench.diagnosis.hypothesis import Hypothesis
+from ventbench.diagnosis.selection.candidate_comparison import (
     compare_candidates,
     fit_with_noise,
     fit_with_white_noise,
 )
-from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.screening import (
+from ventbench.diagnosis.selection.screening import (
     all_parameter_paths,
     component_of,
     score_nonparametric_terms,

@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis import selection
-from ventbench.diagnosis.candidate_comparison import (
+from ventbench.diagnosis.hypothesis import Hypothesis
+from ventbench.diagnosis.selection import forward, held_out_test
+from ventbench.diagnosis.selection.candidate_comparison import (
     Comparison,
     RankedModel,
     compare_candidates,
@@ -16,13 +17,10 @@ from ventbench.diagnosis.candidate_comparison import (
     fit_with_noise,
     fit_with_white_noise,
 )
-from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.screening import screen_mechanisms
-from ventbench.diagnosis.selection import (
-    drop_redundant_terms,
-    forward_selection,
-    passes_heldout_test,
-)
+from ventbench.diagnosis.selection.forward import drop_redundant_terms, forward_selection
+from ventbench.diagnosis.selection.held_out_test import passes_heldout_test
+from ventbench.diagnosis.selection.pair_exchange import replace_pair
+from ventbench.diagnosis.selection.screening import screen_mechanisms
 from ventbench.diagnosis.settings import HeldOutTestSettings
 from ventbench.system_id import Noise
 
@@ -31,9 +29,9 @@ from . import small
 
 def test_a_mechanism_is_needed_if_and_only_if_it_acts(turbulent, both):
     named, without = both
-    assert selection.is_needed(turbulent, named, without)
+    assert held_out_test.is_needed(turbulent, named, without)
     idle = turbulent.fit(Hypothesis(("turbulent_resistance", "leak")), named.noise, named)
-    assert not selection.is_needed(turbulent, idle, named)
+    assert not held_out_test.is_needed(turbulent, idle, named)
 
 
 def test_cross_validation_runs_only_where_the_training_breaths_clearly_ask(
@@ -45,11 +43,11 @@ def test_cross_validation_runs_only_where_the_training_breaths_clearly_ask(
         asked.append(given)
         return np.full(small.BREATHS, 1.0)
 
-    monkeypatch.setattr(selection, "cross_validated_gain", of_all)
-    monkeypatch.setattr(selection, "passes_heldout_test", lambda gained, *_: len(gained) > 8)
-    assert selection.is_needed(turbulent, *both)
+    monkeypatch.setattr(held_out_test, "cross_validated_gain", of_all)
+    monkeypatch.setattr(held_out_test, "passes_heldout_test", lambda gained, *_: len(gained) > 8)
+    assert held_out_test.is_needed(turbulent, *both)
     assert len(asked) == 1
-    assert not selection.is_needed(turbulent, *reversed(both))
+    assert not held_out_test.is_needed(turbulent, *reversed(both))
     assert len(asked) == 1
 
 
@@ -57,9 +55,9 @@ def test_a_negligible_term_is_far_weaker_than_mild_and_explains_little(turbulent
     named, _ = both
     two = turbulent.fit(Hypothesis(("turbulent_resistance", "sensor_drift")), named.noise, named)
     assert abs(two.column("sensor_drift.drift")[0]) < 0.2 * 1.2
-    assert selection.is_negligible(turbulent, two, named, "sensor_drift")
+    assert held_out_test.is_negligible(turbulent, two, named, "sensor_drift")
     without = turbulent.fit(two.hypothesis.without("turbulent_resistance"), two.noise, two)
-    assert not selection.is_negligible(turbulent, two, without, "turbulent_resistance")
+    assert not held_out_test.is_negligible(turbulent, two, without, "turbulent_resistance")
 
 
 def test_a_weak_term_that_explains_nearly_all_is_not_negligible():
@@ -68,7 +66,7 @@ def test_a_weak_term_that_explains_nearly_all_is_not_negligible():
     assert weak.column("valve_dead_band.width")[0] < 0.2 * 1.5
     without = evaluator.fit(Hypothesis(), weak.noise, weak)
     assert evaluator.criterion(without) - evaluator.criterion(weak) > 100.0
-    assert not selection.is_negligible(evaluator, weak, without, "valve_dead_band")
+    assert not held_out_test.is_negligible(evaluator, weak, without, "valve_dead_band")
 
 
 THRESHOLD = HeldOutTestSettings().threshold
@@ -197,13 +195,13 @@ def test_one_mechanism_takes_the_place_of_two_that_imitate_it():
     effect = small.effect("supply_droop", drop=0.3, recovery=0.8)
     evaluator = small.split(small.made(effect, noise=0.1, seed=3))
     two = fit_with_noise(evaluator, Hypothesis(("supply_pressure", "valve_curve")))
-    instead = selection.replace_pair(evaluator, two)
+    instead = replace_pair(evaluator, two)
     assert instead is not None
     assert instead.names == ("supply_droop",)
 
 
 def test_a_single_mechanism_has_no_pair_to_replace(turbulent, both):
-    assert selection.replace_pair(turbulent, both[0]) is None
+    assert replace_pair(turbulent, both[0]) is None
 
 
 @pytest.mark.slow  # seconds a pair: all twos of the rivals
@@ -214,7 +212,7 @@ def test_two_mechanisms_take_the_place_of_two_that_imitate_them():
     )
     evaluator = small.split(small.strange(*acting, noise=0.2, seed=3))
     wrong = Hypothesis(("sensor_lag", "inertance"), ("sensor_lag.second",))
-    instead = selection.replace_pair(evaluator, fit_with_noise(evaluator, wrong))
+    instead = replace_pair(evaluator, fit_with_noise(evaluator, wrong))
     assert instead is not None
     assert set(instead.names) == {"circuit_compliance", "exhalation_valve_delay"}
 
@@ -227,7 +225,7 @@ def test_a_term_too_small_to_be_named_gives_way_to_one_that_explains_as_much(tur
     ranked = (RankedModel("sensor_drift", tiny, level - 1.0),
               RankedModel("turbulent_resistance", named, level))  # fmt: skip
     gains = turbulent.held_out_log_likelihood(named) - turbulent.held_out_log_likelihood(without)
-    taken = selection._accepted(turbulent, Comparison(without, ranked, gains))
+    taken = forward._accepted(turbulent, Comparison(without, ranked, gains))
     assert taken is not None
     assert taken.names == ("turbulent_resistance",)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from ventbench.diagnosis.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.shape_parameters import (
+from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
+from ventbench.diagnosis.selection.shape_parameters import (
     fit_with_shape,
     free_shape_parameters,
     other_dead_times,

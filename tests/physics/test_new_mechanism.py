@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.candidate_comparison import fit_with_noise, fit_with_white_noise
 from ventbench.diagnosis.evaluator import make_evaluator
 from ventbench.diagnosis.hypothesis import Hypothesis
-from ventbench.diagnosis.screening import screen_mechanisms
+from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise, fit_with_white_noise
+from ventbench.diagnosis.selection.screening import screen_mechanisms
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.errors import InputError
 from ventbench.lungs import Lung

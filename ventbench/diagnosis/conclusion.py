@@ -1,10 +1,11 @@
 """The model that a recording needs: mechanisms, an unnamed effect beside them, or neither.
 
-:func:`conclude` selects mechanisms (:mod:`ventbench.diagnosis.selection`), looks for what they
-leave unexplained with nonparametric terms and latent inputs, drops the mechanisms that this makes
-idle (:mod:`ventbench.diagnosis.refinement`), and compares the remaining ones with alternatives. If
-the valve's gain scatters between breaths, all is repeated with a gain of each breath's own, from
-the base model and from the mechanisms that were selected with one gain.
+:func:`conclude` selects mechanisms (:mod:`ventbench.diagnosis.selection.forward`), looks for what
+they leave unexplained with nonparametric terms and latent inputs, drops the mechanisms that this
+makes idle (:mod:`ventbench.diagnosis.selection.refinement`), and compares the remaining ones with
+alternatives (:mod:`ventbench.diagnosis.selection.alternatives`). If the valve's gain scatters
+between breaths, all is repeated with a gain of each breath's own, from the mechanisms that were
+selected with one gain and, if these are few, from the base model.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
-from ventbench.diagnosis.candidate_comparison import Comparison, fit_with_noise
 from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.latent_inputs import (
@@ -27,29 +27,28 @@ from ventbench.diagnosis.latent_inputs import (
     place_weights,
 )
 from ventbench.diagnosis.plausibility import is_consistent, is_plausible
-from ventbench.diagnosis.refinement import (
+from ventbench.diagnosis.selection.alternatives import (
     Alternatives,
-    NonparametricFit,
     Replacements,
+    exchange,
+    find_alternatives,
+)
+from ventbench.diagnosis.selection.candidate_comparison import Comparison, fit_with_noise
+from ventbench.diagnosis.selection.forward import Progress, drop_redundant_terms, forward_selection
+from ventbench.diagnosis.selection.held_out_test import passes_heldout_test
+from ventbench.diagnosis.selection.refinement import (
+    NonparametricFit,
     SingleTermAlternative,
     backward_elimination,
     compare_nonparametric_terms,
     drop_compensating_terms,
     eliminate_beside_input,
-    exchange,
-    find_alternatives,
     special_case_of,
     without_breath_terms,
 )
-from ventbench.diagnosis.screening import component_of
-from ventbench.diagnosis.selection import (
-    Progress,
-    drop_redundant_terms,
-    forward_selection,
-    passes_heldout_test,
-)
+from ventbench.diagnosis.selection.screening import component_of
+from ventbench.diagnosis.selection.shape_parameters import free_shape_parameters
 from ventbench.diagnosis.settings import SelectionConfig
-from ventbench.diagnosis.shape_parameters import free_shape_parameters
 from ventbench.executor import parallel_map
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import Noise
@@ -422,8 +421,8 @@ def _is_negligible_input(
     """Whether an input is far weaker than a mild effect and explains little beside the mechanisms.
 
     With many breaths, the least difference between the form of a mechanism and the library's passes
-    the held-out test; :func:`~ventbench.diagnosis.selection.is_negligible` is the same question
-    asked of mechanisms.
+    the held-out test; :func:`~ventbench.diagnosis.selection.held_out_test.is_negligible` asks the
+    same of mechanisms.
     """
     latent, settings = unnamed.latent_input, evaluator.settings
     if latent is None or not selected.names:

@@ -31,7 +31,6 @@ from ventbench.diagnosis.identification import (
     split,
     usable,
 )
-from ventbench.diagnosis.refinement import Alternatives
 from ventbench.diagnosis.residual_analysis import (
     compare_open_loop,
     flow_and_volume,
@@ -40,6 +39,7 @@ from ventbench.diagnosis.residual_analysis import (
     noise_floor,
 )
 from ventbench.diagnosis.result import Diagnosis
+from ventbench.diagnosis.selection.alternatives import Alternatives
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.diagnosis.simulator_comparison import (
     identify_both,

@@ -14,7 +14,7 @@ from ventbench.diagnosis.evaluator import Evaluator, groups_by_label
 from ventbench.diagnosis.findings import NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
 from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY, LatentInput
-from ventbench.diagnosis.screening import component_of
+from ventbench.diagnosis.selection.screening import component_of
 from ventbench.diagnosis.settings import EstimateSettings
 from ventbench.interfaces import Plant
 from ventbench.mechanics.labels import Estimate, LungMatch

@@ -24,7 +24,7 @@ from ventbench.diagnosis.hypothesis import (
 )
 from ventbench.diagnosis.latent_inputs import GAIN_SCATTER, input_responses
 from ventbench.diagnosis.plausibility import excludes_neutral
-from ventbench.diagnosis.screening import all_parameter_paths, library_paths
+from ventbench.diagnosis.selection.screening import all_parameter_paths, library_paths
 from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant

@@ -15,13 +15,13 @@ import numpy as np
 
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
-from ventbench.diagnosis.screening import Candidate
-from ventbench.diagnosis.settings import ForwardSelectionSettings
-from ventbench.diagnosis.shape_parameters import (
+from ventbench.diagnosis.selection.screening import Candidate
+from ventbench.diagnosis.selection.shape_parameters import (
     fit_with_shape,
     other_dead_times,
     shapes_at_default,
 )
+from ventbench.diagnosis.settings import ForwardSelectionSettings
 from ventbench.executor import parallel_map
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import Noise, robust_noise

@@ -1,14 +1,13 @@
 """Selected terms beside effects that the library has no mechanism for: keep, drop or replace.
 
 Forward selection can only choose mechanisms of the library. Where the recording contains something
-else, a sum of mechanisms may imitate it. Four questions separate the two:
+else, a sum of mechanisms may imitate it. Three questions separate the two:
 
 - :class:`SingleTermAlternative`: does one nonparametric term alone do better than many mechanisms?
 - :func:`drop_compensating_terms`: does a nonparametric term related to one mechanism explain a
   second mechanism away, which then only compensated for the first one's form?
 - :func:`backward_elimination`: which mechanisms are needed beside a nonparametric term or a latent
   input that explains what is left?
-- :func:`find_alternatives`: which other mechanism could take the place of a selected one?
 
 The ``evaluator`` has predictors with the library's parameters; ``wide`` is the same recording with
 the parameters of the nonparametric terms as well, which take longer to compile.
@@ -21,15 +20,6 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from operator import itemgetter
 
-import numpy as np
-
-from ventbench.diagnosis.candidate_comparison import (
-    Comparison,
-    RankedModel,
-    compare_candidates,
-    fit_with_noise,
-    fit_with_white_noise,
-)
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.latent_inputs import (
@@ -39,11 +29,18 @@ from ventbench.diagnosis.latent_inputs import (
     log_likelihood_without_input,
 )
 from ventbench.diagnosis.plausibility import is_plausible
-from ventbench.diagnosis.screening import score_nonparametric_terms, screen_mechanisms
-from ventbench.diagnosis.selection import Progress, is_needed, passes_heldout_test
+from ventbench.diagnosis.selection.candidate_comparison import (
+    Comparison,
+    RankedModel,
+    compare_candidates,
+    fit_with_noise,
+    fit_with_white_noise,
+)
+from ventbench.diagnosis.selection.forward import Progress
+from ventbench.diagnosis.selection.held_out_test import is_needed, passes_heldout_test
+from ventbench.diagnosis.selection.screening import score_nonparametric_terms, screen_mechanisms
 from ventbench.executor import parallel_map
-from ventbench.physics.catalogue import mechanism, special_cases
-from ventbench.system_id.data import Floats
+from ventbench.physics.catalogue import special_cases
 
 
 @dataclass(frozen=True, eq=False)
@@ -386,158 +383,3 @@ def _is_effort(
     by_effort = log_likelihood_without_input(evaluator, selected)[1].sum() - none
     by_input = latent.held_out_log_likelihood.sum() - none
     return bool(by_effort >= evaluator.settings.refinement.related_share * by_input)
-
-
-@dataclass(frozen=True, eq=False)
-class Alternatives:
-    """Alternative explanations of the effect of a selected mechanism.
-
-    Attributes:
-        names: other mechanisms, the likeliest first.
-        confidence: posterior probability of the selected mechanism, with equal priors.
-        models: the fitted alternatives among the library's mechanisms.
-    """
-
-    names: tuple[str, ...]
-    confidence: float
-    models: tuple[RankedModel, ...]
-
-
-#: Alternatives that have been fitted, the best first, by the rest of a hypothesis and the name that
-#: they replace.
-Replacements = dict[tuple[Hypothesis, str], list[RankedModel]]
-
-
-def exchange(
-    evaluator: Evaluator,
-    selected: FittedModel,
-    comparisons: list[Comparison],
-    known: Replacements,
-) -> FittedModel | None:
-    """The model with one mechanism exchanged, if BIC and held-out breaths prefer it; else None.
-
-    A mechanism that tied with the right one in its round may be worse beside the later ones.
-
-    Args:
-        evaluator: evaluator of the recording.
-        selected: the selected mechanisms.
-        comparisons: comparisons of the forward selection, which answer part of the question.
-        known: receives what is fitted.
-    """
-    held_out = evaluator.held_out_log_likelihood(selected)
-    for model in _better(
-        evaluator, selected, _replacements(evaluator, selected, comparisons, known)
-    ):
-        fitted = evaluator.fit(model.hypothesis, selected.noise, model)
-        gained = evaluator.held_out_log_likelihood(fitted) - held_out
-        if passes_heldout_test(gained, evaluator.settings.held_out_test):
-            return fit_with_noise(evaluator, fitted.hypothesis, fitted)
-    return None
-
-
-def find_alternatives(
-    evaluator: Evaluator,
-    selected: FittedModel,
-    comparisons: list[Comparison],
-    *,
-    swap: bool = True,
-    known: Replacements | None = None,
-) -> tuple[FittedModel, dict[str, Alternatives]]:
-    """Replace each mechanism by every other one.
-
-    Args:
-        evaluator: evaluator of the recording.
-        selected: the selected mechanisms.
-        comparisons: comparisons of the forward selection, which answer part of the question.
-        swap: whether a better mechanism takes the place of a selected one.
-        known: what :func:`exchange` has fitted.
-
-    Returns:
-        The best model, and the alternatives to each of its mechanisms.
-    """
-    known = {} if known is None else known
-    for last in (False, False, True):
-        ranked = _replacements(evaluator, selected, comparisons, known)
-        better = _better(evaluator, selected, ranked)
-        if last or not swap or not better:
-            break
-        selected, comparisons = better[0], []
-    criterion = evaluator.criterion(selected)
-    return selected, {
-        name: _alternatives(evaluator, name, models, criterion) for name, models in ranked.items()
-    }
-
-
-def _replacements(
-    evaluator: Evaluator,
-    selected: FittedModel,
-    comparisons: list[Comparison],
-    known: Replacements,
-) -> dict[str, list[RankedModel]]:
-    """Alternatives to each mechanism at the noise of the selected model, the best first."""
-    rest = {name: selected.hypothesis.without(name) for name in selected.names}
-    asked = [name for name in selected.names if (rest[name], name) not in known]
-    fitted = parallel_map(partial(_fitted_instead, evaluator, selected, comparisons), asked)
-    known |= {(rest[name], name): models for name, models in zip(asked, fitted, strict=True)}
-
-    def at_noise(model: RankedModel) -> RankedModel:
-        criterion = evaluator.criterion(model.fitted, selected.noise)
-        return RankedModel(model.name, model.fitted, criterion)
-
-    return {
-        name: sorted(map(at_noise, known[rest[name], name]), key=lambda model: model.criterion)
-        for name in selected.names
-    }
-
-
-def _better(
-    evaluator: Evaluator, selected: FittedModel, ranked: dict[str, list[RankedModel]]
-) -> list[FittedModel]:
-    """Models with one mechanism exchanged that BIC prefers, if it is large enough to be named."""
-    criterion, settings = evaluator.criterion(selected), evaluator.settings.plausibility
-    firsts = (models[0] for models in ranked.values() if models)
-    return [
-        first.fitted
-        for first in sorted(firsts, key=lambda first: first.criterion)
-        if first.criterion < criterion and is_plausible(first.fitted, first.name, settings)
-    ]
-
-
-def _fitted_instead(
-    evaluator: Evaluator, selected: FittedModel, comparisons: list[Comparison], name: str
-) -> list[RankedModel]:
-    """Models with another mechanism in the place of one."""
-    count = evaluator.settings.refinement.compared_alternatives
-    rest = selected.hypothesis.without(name)
-    known = [
-        comparison
-        for comparison in comparisons
-        if comparison.base.hypothesis == rest and comparison.ranked[0].name == name
-    ]
-    if known:
-        # Those that stayed far behind were not fitted to the end.
-        return list(known[-1].ranked[1 : count + 1])
-    base = evaluator.fit(rest, selected.noise, selected)
-    white = fit_with_white_noise(evaluator, base)
-    candidates = screen_mechanisms(base, white, evaluator.settings, evaluator.allowed_mechanisms)
-    others = [candidate for candidate in candidates if candidate.name != name]
-    comparison = compare_candidates(evaluator, base, others, white, restarts=False)
-    if comparison is None or not passes_heldout_test(
-        comparison.held_out_gain, evaluator.settings.held_out_test
-    ):
-        return []
-    return list(comparison.ranked[:count])
-
-
-def _alternatives(
-    evaluator: Evaluator, name: str, models: list[RankedModel], criterion: float
-) -> Alternatives:
-    settings = evaluator.settings.refinement
-    limit = criterion + settings.close_criterion
-    close = [model for model in models if model.criterion < limit]
-    close = close[: settings.listed_alternatives]
-    behind = np.array([max(model.criterion - criterion, 0.0) for model in close])
-    odds: Floats = np.exp(-0.5 * behind)
-    names = tuple(model.name for model in close) + mechanism(name).description.equivalents
-    confidence = float(1.0 / (1.0 + odds.sum()))
-    return Alternatives(names[: settings.listed_alternatives], confidence, tuple(close))

@@ -1,0 +1,1 @@
+"""Selection of the mechanisms that a recording needs."""

@@ -19,6 +19,7 @@ from ventbench.diagnosis.selection.candidate_comparison import (
 )
 from ventbench.diagnosis.selection.forward import drop_redundant_terms, forward_selection
 from ventbench.diagnosis.selection.held_out_test import passes_heldout_test
+from ventbench.diagnosis.selection.label_search import is_far_from_label, selection_at_label
 from ventbench.diagnosis.selection.pair_exchange import replace_pair
 from ventbench.diagnosis.selection.screening import screen_mechanisms
 from ventbench.diagnosis.settings import HeldOutTestSettings
@@ -253,3 +254,38 @@ def test_an_effort_that_all_breaths_have_is_not_taken_for_compliance():
     named, _ = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
     assert named.names == ("patient_effort",)
     assert np.median(named.column("patient_effort.amplitude")) > 1.0
+
+
+@pytest.mark.slow  # searches from the base model, and at the label, half a minute
+def test_strong_lags_are_told_from_a_lung_without_resistance():
+    """Lags of 0.1 s take R to nothing, where other terms imitate them; at the label, none can."""
+    acting = (
+        small.effect("sensor_lag", "second order", tau=0.116),
+        small.effect("valve_delay", delay=0.0728),
+    )
+    breaths = small.strange(
+        *acting, noise=0.2, seed=3,
+        base=dataclasses.replace(small.RIG, R=51.3, C=9.8, gain=22.8),
+    )  # fmt: skip
+    labelled = dataclasses.replace(breaths, R=50.0 + 0.0 * breaths.R, C=10.0 + 0.0 * breaths.C)
+    evaluator = small.split(labelled)
+    usual, _ = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
+    if not is_far_from_label(evaluator, usual):
+        pytest.skip("the usual search finds the lags")
+    named, _ = selection_at_label(evaluator, quiet, lambda _: None)
+    assert set(named.names) == {"sensor_lag", "valve_delay"}
+    assert named.column("R")[0] == pytest.approx(51.3, rel=0.1)
+    assert "R" not in dict(named.hypothesis.fixed)
+    assert not is_far_from_label(evaluator, named)
+
+
+def test_only_one_label_can_be_held(turbulent, both):
+    label = turbulent.at_label
+    assert label is not None
+    assert dict(label.fixed) == {"R": 20.0, "C": 20.0}
+    data = turbulent.training.data
+    mixed = dataclasses.replace(data, R=np.where(np.arange(len(data)) < 2, 5.0, data.R))
+    partition = dataclasses.replace(turbulent.training, data=mixed)
+    several = dataclasses.replace(turbulent, training=partition)
+    assert several.at_label is None
+    assert not is_far_from_label(several, both[0])

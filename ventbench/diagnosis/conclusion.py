@@ -36,6 +36,7 @@ from ventbench.diagnosis.selection.alternatives import (
 from ventbench.diagnosis.selection.candidate_comparison import Comparison, fit_with_noise
 from ventbench.diagnosis.selection.forward import Progress, drop_redundant_terms, forward_selection
 from ventbench.diagnosis.selection.held_out_test import passes_heldout_test
+from ventbench.diagnosis.selection.label_search import is_far_from_label, selection_at_label
 from ventbench.diagnosis.selection.refinement import (
     NonparametricFit,
     SingleTermAlternative,
@@ -136,6 +137,9 @@ def conclude(
         start = fit_with_noise(evaluator, earlier.hypothesis, earlier)
         start = drop_redundant_terms(evaluator, start, start.names)
         other = forward_selection(evaluator, start, tell, single)
+        selected, comparisons = _better_selection(evaluator, (selected, comparisons), other)
+    if is_far_from_label(evaluator, selected):
+        other = selection_at_label(evaluator, tell, single)
         selected, comparisons = _better_selection(evaluator, (selected, comparisons), other)
     known: Replacements = {}
     for _ in range(evaluator.settings.refinement.exchanges):

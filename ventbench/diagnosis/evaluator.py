@@ -275,6 +275,14 @@ class Evaluator:
             delay_rounds=delay_rounds, settings=self.settings,
         )  # fmt: skip
 
+    @property
+    def at_label(self) -> Hypothesis | None:
+        """The base model with R and C held at the label; None if there are several labels."""
+        data = self.training.data
+        if len(np.unique(data.R)) > 1 or len(np.unique(data.C)) > 1:
+            return None
+        return Hypothesis(fixed=(("R", float(data.R[0])), ("C", float(data.C[0]))))
+
     @cached_property
     def for_ranking(self) -> Evaluator:
         """Evaluator with as many training breaths as rank candidates: one batch of simulations.

@@ -149,6 +149,8 @@ class ForwardSelectionSettings:
         noise_rounds: most times that the winner and the noise are chosen in turn.
         max_terms: most terms of a hypothesis.
         max_rounds: most comparisons; a term that was dropped may come back, but not for ever.
+        label_factor: factor between a lung's R or C and its label beyond which the search is
+            repeated with R and C at the label. Labels that are wrong by less move none.
         kept_terms: terms of a selection with one gain from which a selection with a gain for each
             breath only goes on from it, and does not begin anew.
         replacement_terms: terms from which a single nonparametric term is tried in their place.
@@ -170,6 +172,7 @@ class ForwardSelectionSettings:
     noise_rounds: int = 3
     max_terms: int = 6
     max_rounds: int = 14
+    label_factor: float = 3.0
     kept_terms: int = 3
     replacement_terms: int = 4
     shared_effect_share: float = 0.5

@@ -159,8 +159,7 @@ def _quick_fits(
     label: Start = {"R": data.R, "C": data.C}
     # A lag of 0.1 s lets R fall to nothing before the lag itself is found, unless R is held at
     # first.
-    alike = len(np.unique(data.R)) == len(np.unique(data.C)) == 1
-    held = Hypothesis(fixed=(("R", float(data.R[0])), ("C", float(data.C[0])))) if alike else None
+    held = small.at_label
 
     def begun(candidate: Candidate) -> list[FittedModel]:
         hypothesis = current.hypothesis.plus(candidate.hypothesis)

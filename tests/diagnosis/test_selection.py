@@ -17,9 +17,13 @@ from ventbench.diagnosis.selection.candidate_comparison import (
     fit_with_noise,
     fit_with_white_noise,
 )
-from ventbench.diagnosis.selection.forward import drop_redundant_terms, forward_selection
+from ventbench.diagnosis.selection.forward import (
+    drop_redundant_terms,
+    forward_selection,
+    is_far_from_label,
+    selection_at_label,
+)
 from ventbench.diagnosis.selection.held_out_test import passes_heldout_test
-from ventbench.diagnosis.selection.label_search import is_far_from_label, selection_at_label
 from ventbench.diagnosis.selection.pair_exchange import replace_pair
 from ventbench.diagnosis.selection.screening import screen_mechanisms
 from ventbench.diagnosis.settings import HeldOutTestSettings

@@ -34,9 +34,14 @@ from ventbench.diagnosis.selection.alternatives import (
     find_alternatives,
 )
 from ventbench.diagnosis.selection.candidate_comparison import Comparison, fit_with_noise
-from ventbench.diagnosis.selection.forward import Progress, drop_redundant_terms, forward_selection
+from ventbench.diagnosis.selection.forward import (
+    Progress,
+    drop_redundant_terms,
+    forward_selection,
+    is_far_from_label,
+    selection_at_label,
+)
 from ventbench.diagnosis.selection.held_out_test import passes_heldout_test
-from ventbench.diagnosis.selection.label_search import is_far_from_label, selection_at_label
 from ventbench.diagnosis.selection.refinement import (
     NonparametricFit,
     SingleTermAlternative,

@@ -21,6 +21,9 @@ would. The search ends when no candidate passes and no pair of terms can be exch
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
 
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, varies_by_breath
@@ -40,9 +43,10 @@ from ventbench.diagnosis.selection.held_out_test import (
 )
 from ventbench.diagnosis.selection.pair_exchange import replace_pair
 from ventbench.diagnosis.selection.screening import screen_mechanisms
-from ventbench.diagnosis.selection.shape_parameters import (
-    free_shape_parameters,
-)
+from ventbench.diagnosis.selection.shape_parameters import free_shape_parameters
+
+#: Values of the lung that a search may hold at the label.
+_LUNG = ("R", "C")
 
 #: Is told what is being done.
 Progress = Callable[[str], None]
@@ -164,9 +168,8 @@ def _trim(
 ) -> FittedModel | None:
     """The best candidate, if it is needed and explains much, however small it is.
 
-    A few tenths of a millilitre of gas before a high resistance decide what is read 2 ms after an
-    edge, and hide what else is missing. Such a term is part of the search, and is judged at its
-    end.
+    Some hundredths of 1 mL/cmH2O before a high resistance decide what is read 2 ms after an edge,
+    and hide what else is missing. Such a term is part of the search, and is judged at its end.
     """
     first, settings = comparison.ranked[0], evaluator.settings.forward
     gained = evaluator.criterion(comparison.base, first.fitted.noise) - first.criterion
@@ -216,3 +219,37 @@ def drop_redundant_terms(
         if not needed or is_negligible(evaluator, current, without, name):
             current = without
     return current
+
+
+def is_far_from_label(evaluator: Evaluator, selected: FittedModel) -> bool:
+    """Whether R or C of a recording of one lung is a large factor away from its label."""
+    if evaluator.at_label is None:
+        return False
+    data, factor = evaluator.training.data, evaluator.settings.forward.label_factor
+    ratios = np.concatenate([selected.column("R") / data.R, selected.column("C") / data.C])
+    return bool(np.any(np.abs(np.log(ratios)) > np.log(factor)))
+
+
+def selection_at_label(
+    evaluator: Evaluator, tell: Progress, replacement: Replacement
+) -> tuple[FittedModel, list[Comparison]]:
+    """Select terms with R and C at the label, free R and C, and go on.
+
+    Strong lags let a refit take R to nothing, and three or four terms then imitate what the lags do
+    in a lung without resistance. No step from there leads back. At the label the lags are found at
+    once; the caller chooses between the two results.
+
+    Args:
+        evaluator: evaluator of a recording of one lung.
+        tell: called with a description of each step before it runs.
+        replacement: see :func:`forward_selection`.
+    """
+    label = evaluator.at_label
+    assert label is not None, "a recording of several labels is not searched at one"
+    tell("searching with the labelled lung")
+    held, _ = forward_selection(evaluator, fit_with_noise(evaluator, label), tell)
+    fixed = tuple((path, value) for path, value in held.hypothesis.fixed if path not in _LUNG)
+    free = fit_with_noise(evaluator, replace(held.hypothesis, fixed=fixed), held)
+    return forward_selection(
+        evaluator, drop_redundant_terms(evaluator, free, free.names), tell, replacement
+    )

@@ -16,13 +16,15 @@ from scipy.optimize import brentq
 
 def valve_positions(u_in, m):
     """What reaches the valve's orifice, as the command of a linear valve, %."""
-    out, stands = [], 0.0
+    out, stands, asked = [], 0.0, 0.0
     for u in u_in:
         if "command_rounding" in m:
             u = float(np.floor(u))
         if "valve_hysteresis" in m:
             play, give = m["valve_hysteresis"]["width"] / 2, m["valve_hysteresis"].get("give", 0.0)
-            soft = u - play * np.tanh((u - stands) / play)
+            up = 1.0 if u > asked else -1.0
+            soft = u - play * (up + ((asked - stands) / play - up) * np.exp(-abs(u - asked) / play))
+            asked = u
             if u - stands > play:
                 stands = u - play
             elif stands - u > play:

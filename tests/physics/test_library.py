@@ -77,6 +77,35 @@ def test_screening_strengths_are_possible(name):
     assert all(strength.low <= value <= strength.high for value in tried)
 
 
+@pytest.mark.parametrize("give", [0.0, 0.5, 1.0])
+def test_play_knows_the_travel_and_no_time(give):
+    """Two samples with one command, or a sample halfway, leave the valve where it is without."""
+    play, own = mechanism("valve_hysteresis"), {"width": jnp.array(6.0), "give": jnp.array(give)}
+
+    def position(commands):
+        memory = jnp.array(0.0)
+        for u in commands:
+            now, memory = play.command(own, jnp.array(u), memory)
+        return float(now)
+
+    once = position([0.0, 2.0, 30.0, 27.0])
+    assert position([0.0, 2.0, 2.0, 30.0, 30.0, 30.0, 27.0, 27.0]) == pytest.approx(once, abs=1e-4)
+    halves = position([0.0, 1.0, 2.0, 16.0, 30.0, 28.5, 27.0])
+    assert halves == pytest.approx(once, abs=0.25 * give * (1.0 - give) * 6.0 + 1e-4)
+
+
+def test_smooth_play_is_that_of_bouc_and_wen():
+    """After a reversal, it goes from one side to the other exponentially with the travel."""
+    play, own = mechanism("valve_hysteresis"), {"width": jnp.array(6.0), "give": jnp.array(1.0)}
+    memory, behind = jnp.array(0.0), []
+    for u in [*np.linspace(0.0, 60.0, 61), *np.linspace(60.0, 50.0, 11)[1:]]:
+        now, memory = play.command(own, jnp.array(u), memory)
+        behind.append(u - float(now))
+    travel = np.arange(11.0)
+    expected = -3.0 + 6.0 * np.exp(-travel / 3.0)
+    np.testing.assert_allclose(behind[60:], expected, atol=1e-4)
+
+
 def test_special_cases_differ_between_the_terms_of_a_component():
     assert special_cases("sensor_memory") == ("sensor_lag",)
     assert special_cases("drift_shape") == ("sensor_drift",)

@@ -14,6 +14,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
+import numpy as np
+
 from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.latent_inputs import (
@@ -366,7 +368,30 @@ def _best_term(wide: Evaluator, selected: FittedModel) -> NonparametricFit | Non
     if wide.criterion(best.fitted) > wide.criterion(comparison.base):
         return None
     gained = wide.held_out_log_likelihood(best.fitted) - wide.held_out_log_likelihood(start)
-    return NonparametricFit(best.name, best.fitted, float(gained.sum()))
+    nats = float(gained.sum())
+    if _is_negligible_term(wide, start, best.fitted, nats):
+        return None
+    return NonparametricFit(best.name, best.fitted, nats)
+
+
+def _is_negligible_term(
+    wide: Evaluator, selected: FittedModel, with_term: FittedModel, nats: float
+) -> bool:
+    """Whether a nonparametric term moves the pressure a little and explains little beside names."""
+    if not selected.names or nats >= _least_beside_names(wide, selected):
+        return False
+    partition = wide.held_out
+    moved = wide.predict(with_term, partition) - wide.predict(selected, partition)
+    seen = partition.data.weight > 0.0
+    return bool(np.sqrt(np.mean(np.square(moved[seen]))) < wide.settings.refinement.least_change)
+
+
+def _least_beside_names(evaluator: Evaluator, selected: FittedModel) -> float:
+    """Held-out log-likelihood, nats, below which an unnamed effect explains little beside names."""
+    base = evaluator.fit(Hypothesis(), selected.noise, selected)
+    held_out = evaluator.held_out_log_likelihood(selected)
+    by_names = float((held_out - evaluator.held_out_log_likelihood(base)).sum())
+    return evaluator.settings.held_out_test.negligible_share * by_names
 
 
 def _gain_scatters(
@@ -440,10 +465,7 @@ def _is_negligible_input(
     least = limits.least_size * (limits.relative_size if latent.place == SUPPLY else 1.0)
     if latent.size >= least:
         return False
-    base = evaluator.fit(Hypothesis(), selected.noise, selected)
-    held_out = evaluator.held_out_log_likelihood(selected)
-    by_names = float((held_out - evaluator.held_out_log_likelihood(base)).sum())
-    return unnamed.nats < settings.held_out_test.negligible_share * by_names
+    return unnamed.nats < _least_beside_names(evaluator, selected)
 
 
 def _supported(

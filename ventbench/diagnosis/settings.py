@@ -197,6 +197,9 @@ class RefinementSettings:
             nonparametric term only compensates for its form.
         max_compensating_share: share of what is explained up to which a mechanism may only
             compensate for another one's form.
+        least_change: root mean square, cmH2O, by which a nonparametric term beside mechanisms must
+            move the pressure, or explain more than little beside them: less is their form, or what
+            every rig has.
         shortfall_share: share of a mechanism's held-out gain by which a nonparametric term may fall
             short and still replace it.
         shortfall_nats: nats by which a nonparametric term may fall short and still replace a
@@ -218,6 +221,7 @@ class RefinementSettings:
     beside_related_share: float = 0.9
     compensating_share: float = 0.1
     max_compensating_share: float = 0.5
+    least_change: float = 0.1
     shortfall_share: float = 0.05
     shortfall_nats: float = 3.0 * 4.6
     remaining_share: float = 0.1

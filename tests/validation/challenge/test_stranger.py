@@ -20,6 +20,7 @@ from ventbench.validation.challenge.make import make
 from ventbench.validation.challenge.stranger import effects as stranger
 from ventbench.validation.challenge.stranger.effects import SAME, StrangerCase, draw
 from ventbench.validation.challenge.stranger.laboratory import record, replay
+from ventbench.validation.challenge.stranger.rig import Rig
 
 QUIET = StrangerCase(
     "", 20.0, 20.0, (), Base(20.0, 20.0, 5.0, 5.0, 22.8), noise=0.0, step=0.0, jitter=3e-4,
@@ -82,6 +83,22 @@ def test_a_leak_and_a_circuit_against_solve_ivp():
 
     exact = solve_ivp(slope, (0.0, 1.4), (5.0, 0.0), t_eval=given.time[0], rtol=1e-8, method="BDF")
     np.testing.assert_allclose(found, exact.y[0], atol=0.25)
+
+
+@pytest.mark.parametrize("form", ["Salazar-Knowles", "Venegas"])
+def test_a_full_lung_takes_no_more_at_the_same_pressure(form):
+    """Its recoil goes on rising beyond what the curve is followed to."""
+    stiff = Effect("nonlinear_compliance", "strong", form, {"capacity": 10.0})
+    three = np.zeros(3)
+    assert QUIET.base is not None
+    full = Rig(QUIET.base, {stiff.name: stiff}, three, 0.05, three, np.zeros((2, 3)))
+    full.start(three)
+    full.v = np.array([0.9, 1.2, 1.5]) * full.C * 10.0
+    recoil, slope = full._recoil()
+    least = 10.0 * (1.47 if form == "Venegas" else 2.30)  # at 0.9 of the capacity
+    assert recoil[0] == pytest.approx(full.rest + least, abs=0.1)
+    assert np.all(np.diff(recoil) > 0.3 * 10.0 * 15.0)
+    assert slope[1] == slope[2] > slope[0]
 
 
 def test_what_leaves_the_reservoir_empties_it():

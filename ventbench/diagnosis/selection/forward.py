@@ -94,7 +94,10 @@ def forward_selection(
                 break
             current = best
             continue
-        best = free_shape_parameters(evaluator, best)
+        shaped = free_shape_parameters(evaluator, best)
+        if shaped.hypothesis != best.hypothesis:
+            # What another shape explains is not in the noise either.
+            best = fit_with_noise(evaluator, shaped.hypothesis, shaped)
         judged = [name for name in best.names[:-1] if name not in trims]
         current = drop_redundant_terms(evaluator, best, judged)
         if len(current.names) < settings.forward.replacement_terms:

@@ -10,7 +10,7 @@ from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import Parameter
 
 #: Share of the capacity up to which the curve is followed.
-_FULL = 0.9
+_FULL = 0.97
 
 
 class NonlinearCompliance(Mechanism):

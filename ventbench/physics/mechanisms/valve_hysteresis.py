@@ -20,8 +20,8 @@ class ValveHysteresis(Mechanism):
         title="play of the inspiratory valve",
         site="inspiratory valve",
         equation=(
-            "u_effective = u - h ((1 - give) clip(x, -1, 1) + give tanh x), h = width / 2, "
-            "x = (u - u_effective before) / h"
+            "u_effective = u - h z, h = width / 2; after a travel d of the command: z = (1 - give) "
+            "clip(z + d / h, -1, 1) + give (s + (z - s) exp(-|d| / h)), s = sign d"
         ),
         parameters=(
             Parameter("width", "%", "command lost at every reversal", 0.0, 15.0, 0.0, 2.0, 5.0),
@@ -35,12 +35,14 @@ class ValveHysteresis(Mechanism):
                 0.0,
                 0.0,
                 shape=True,
+                grid=(0.0, 1.0),
             ),
         ),
         source=(
             "Play (backlash) operator: friction and slack between driver and seat, or "
             "opening and closing tables that differ. 3.8 % of full scale was measured on "
-            "the PVP's valve."
+            "the PVP's valve. With give 1 the smooth hysteresis of Bouc (1967) and Wen (J. Eng. "
+            "Mech. 102, 1976, 249), whose memory is that of the travel, not of time."
         ),
         signature=(
             "After each reversal of the command flow stays where it was; error of one sign "
@@ -57,12 +59,16 @@ class ValveHysteresis(Mechanism):
     has_memory = True
 
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
-        """Position of the valve, %, which is also its memory."""
+        """Position of the valve, %; the memory is that and the command, ``(2, ...)``."""
         half = 0.5 * values["width"]
-        hard = jnp.minimum(jnp.maximum(memory, u_in - half), u_in + half)
-        soft = u_in - half * jnp.tanh((u_in - memory) / (half + _THIN))
+        position, before = jnp.broadcast_to(memory, (2, *u_in.shape))
+        hard = jnp.minimum(jnp.maximum(position, u_in - half), u_in + half)
+        travel = u_in - before
+        full = half * jnp.sign(travel)
+        left = jnp.exp(-jnp.abs(travel) / (half + _THIN))
+        soft = u_in - full - (before - position - full) * left
         position = hard + values["give"] * (soft - hard)
-        return position, position
+        return position, jnp.stack([position, u_in])
 
 
 MECHANISM = ValveHysteresis()

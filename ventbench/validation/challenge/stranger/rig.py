@@ -31,6 +31,10 @@ _SUPPLY_FLOW = 0.5
 #: compliance times cmH2O.
 _BEAT_HARMONIC = 0.35
 
+#: Share of a stiffening lung's capacity up to which its curve is followed. Beyond, gas and walls
+#: still give a little.
+_FULL = 0.97
+
 #: Time constant of a slowly opening expiratory valve, as a share of its dead time's strength.
 _SLOW = 0.7
 
@@ -246,12 +250,14 @@ class Rig:
         if stiff is None:
             return self.rest + self.v / self.C, 1.0 / self.C
         capacity = stiff.parameters["capacity"]  # cmH2O: volume of the lung over its compliance
+        # A full lung takes no more at the same pressure: the curve goes on as its tangent.
+        x = self.v / (self.C * capacity)
+        within = np.clip(x, -_FULL, _FULL)
         if stiff.form == "Salazar-Knowles":  # V = Vmax (1 - exp(-p / capacity))
-            left = np.maximum(1.0 - self.v / (self.C * capacity), 0.03)
-            return self.rest - capacity * np.log(left), 1.0 / (self.C * left)
-        # Venegas: a logistic of volume, here from its middle upwards.
-        x = np.clip(self.v / (self.C * capacity), -0.97, 0.97)
-        return self.rest + capacity * np.arctanh(x), 1.0 / (self.C * (1.0 - x * x))
+            curve, slope = -np.log1p(-within), 1.0 / (1.0 - within)
+        else:  # Venegas: a logistic of volume, here from its middle upwards
+            curve, slope = np.arctanh(within), 1.0 / (1.0 - within**2)
+        return self.rest + capacity * (curve + slope * (x - within)), slope / self.C
 
     def _tissue(self, h: float) -> tuple[float | Floats, float | Floats]:
         """Slope of the stress of the tissue after a step, cmH2O/L, and stress at zero flow."""

@@ -28,7 +28,7 @@ from ventbench.diagnosis.latent_inputs import (
     log_likelihood_without_input,
     place_weights,
 )
-from ventbench.diagnosis.plausibility import is_consistent, is_plausible
+from ventbench.diagnosis.plausibility import is_consistent
 from ventbench.diagnosis.selection.alternatives import (
     Alternatives,
     Replacements,
@@ -43,7 +43,7 @@ from ventbench.diagnosis.selection.forward import (
     is_far_from_label,
     selection_at_label,
 )
-from ventbench.diagnosis.selection.held_out_test import passes_heldout_test
+from ventbench.diagnosis.selection.held_out_test import is_negligible, passes_heldout_test
 from ventbench.diagnosis.selection.refinement import (
     NonparametricFit,
     SingleTermAlternative,
@@ -130,7 +130,8 @@ def conclude(
         evaluator: evaluator with the library's parameters.
         wider: makes the evaluator with the parameters of the nonparametric terms as well.
         tell: called with a description of each step before it runs.
-        earlier: mechanisms that were selected with the same gain in all breaths, to start from too.
+        earlier: mechanisms that were selected otherwise, to start from too: with the same gain in
+            all breaths, or from what a simulator of these breaths answers.
     """
     base = fit_with_noise(evaluator, Hypothesis())
     wider = cache(wider)
@@ -490,7 +491,7 @@ def _supported(
 
     def compared(name: str) -> tuple[Floats, bool]:
         gains, left = gains_in(evaluator, selected, name)
-        if not is_plausible(selected, name, settings):
+        if is_negligible(evaluator, selected, left, name):
             return gains, False
         if is_consistent(gains, settings):
             return gains, True

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ventbench.diagnosis import estimates, flow_drive
 from ventbench.diagnosis.conclusion import Conclusion
@@ -42,6 +43,7 @@ from ventbench.diagnosis.result import Diagnosis
 from ventbench.diagnosis.selection.alternatives import Alternatives
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.diagnosis.simulator_comparison import (
+    describe_otherwise,
     identify_both,
     missing_mechanisms,
     refit_at_simulator_parameters,
@@ -179,19 +181,40 @@ def diagnose(
             steps_between(tell, halfway, _IDENTIFIED), fitted,
         )  # fmt: skip
     tell("drawing conclusions", _IDENTIFIED)
-    missing, notes_on_simulator = missing_mechanisms(recording_model, simulator_model)
-    if simulator_model is not None:
-        steady = refit_at_simulator_parameters(
-            data.select(seen), held, before[seen], recording_model, simulator_model, tuple(missing)
+
+    def compared(recording_model: IdentifiedModel) -> _Comparison:
+        missing, notes = missing_mechanisms(recording_model, simulator_model)
+        if simulator_model is not None:
+            steady = refit_at_simulator_parameters(
+                data.select(seen), held, before[seen], recording_model, simulator_model,
+                tuple(missing),
+            )  # fmt: skip
+            if steady is not None:  # the simulator keeps its mechanisms, shown or not
+                (recording_model, kept), notes = steady, []
+                missing = {name: changed for name, changed in missing.items() if name in kept}
+        correction = correct(
+            breaths, data, uses, before, recording_model, simulator_model, simulators,
+            None if rigs is None or by_flow else rigs.assign(recorded),
+        )  # fmt: skip
+        return _Comparison(recording_model, missing, notes, correction)
+
+    comparison = compared(recording_model)
+    if (
+        simulator_model is not None
+        and recording_model is recording_only_model
+        and describe_otherwise(recording_model, simulator_model)
+    ):
+        tell("describing the recording by what the simulator has", _IDENTIFIED)
+        in_its_terms = identify(
+            data.select(seen), held, excluded, steps_between(tell, _IDENTIFIED, 1.0), settings,
+            fitted, simulator_model.conclusion.named,
+        )  # fmt: skip
+        comparison = min(
+            comparison, compared(in_its_terms), key=lambda each: each.error(data, uses.testing)
         )
-        if steady is not None:  # the simulator keeps its mechanisms, shown by the recording or not
-            (recording_model, kept), notes_on_simulator = steady, []
-            missing = {name: changed for name, changed in missing.items() if name in kept}
+    recording_model, correction = comparison.recording_model, comparison.correction
+    missing, notes_on_simulator = comparison.missing, comparison.notes
     conclusion = recording_model.conclusion
-    correction = correct(
-        breaths, data, uses, before, recording_model, simulator_model, simulators,
-        None if rigs is None or by_flow else rigs.assign(recorded),
-    )  # fmt: skip
     term = estimates.nonparametric_term(conclusion)
     own = simulator_model.conclusion.unnamed if simulator_model is not None else None
     if own is not None and term is not None and own.name == term.name:
@@ -261,6 +284,29 @@ def diagnose(
         settings=settings,
         seconds=time.perf_counter() - began,
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """A model of the recording compared with the simulator's.
+
+    Attributes:
+        recording_model: the model, with the simulator's own parameters where breaths allow.
+        missing: what the simulator lacks, and whether it has it with other parameters.
+        notes: on what the simulator has and the recording does not show.
+        correction: the simulator corrected.
+    """
+
+    recording_model: IdentifiedModel
+    missing: dict[str, bool]
+    notes: list[str]
+    correction: Correction
+
+    def error(self, data: Data, testing: NDArray[np.bool_]) -> float:
+        """Mean absolute error of the corrected simulator on the testing breaths, cmH2O."""
+        weight = data.weight[testing, 0]
+        wrong = np.nan_to_num(self.correction.pressures["after"]) - data.measured[:, 0]
+        return float(np.sum(np.abs(wrong[testing]) * weight) / np.sum(weight))
 
 
 def steps_between(tell: Progress, low: float, high: float) -> Callable[[str], None]:

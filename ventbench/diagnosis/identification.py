@@ -207,6 +207,7 @@ def identify(
     tell: Callable[[str], None],
     settings: SelectionConfig = DEFAULT,
     fitted: NDArray[np.bool_] | None = None,
+    earlier: FittedModel | None = None,
 ) -> IdentifiedModel:
     """Find the mechanisms that breaths need, and fit them.
 
@@ -217,6 +218,7 @@ def identify(
         tell: receives the current step, in words.
         settings: every threshold.
         fitted: which breaths the final fit may use, ``(n,)``; all but the testing ones if None.
+        earlier: mechanisms to start from too, fitted to the same lungs.
     """
     names = library_paths(excluded)
     narrow = make_evaluator(data, held, names, excluded, settings)
@@ -227,7 +229,7 @@ def identify(
         wide.append(make_evaluator(data, held, every, excluded, settings))
         return wide[0]
 
-    conclusion = conclude(narrow, widened, tell)
+    conclusion = conclude(narrow, widened, tell, earlier)
     # Gains that differ between breaths are parameters of each breath, unknown of held-out ones.
     gain_sd, chosen = conclusion.gain_sd, ~held if fitted is None else fitted
     while True:

@@ -127,6 +127,17 @@ def with_mechanisms_of(
     return replace(simulator_model, conclusion=conclusion, fit=fit)
 
 
+def describe_otherwise(recording_model: IdentifiedModel, simulator_model: IdentifiedModel) -> bool:
+    """Whether each of two models has mechanisms that the other one has not.
+
+    A learned simulator and its recording may then be described by different names for one rig, and
+    all of those names seem to be missing. The recording should be described by the simulator's
+    names too; held-out breaths tell which description corrects the simulator.
+    """
+    recorded, own = set(recording_model.conclusion.names), set(simulator_model.conclusion.names)
+    return bool(recorded - own) and bool(own - recorded)
+
+
 def less_unmodelled(data: Data, response: Floats, simulator_model: IdentifiedModel) -> Data:
     """Recorded breaths less what the simulator's model does not describe of the simulator.
 

@@ -352,7 +352,7 @@ class Evaluator:
         """Bayesian information criterion (BIC) on the training breaths; less is better.
 
         Only shared unknowns count: each breath's own are integrated out, or the same in all
-        hypotheses.
+        hypotheses. What the labels say of R and C counts too (see :meth:`label_log_density`).
 
         Args:
             fitted: a model of the training breaths.
@@ -360,7 +360,21 @@ class Evaluator:
         """
         count = float(self.training.data.weight.sum())
         penalty = fitted.shared_count * float(np.log(count))
-        return -2.0 * self.training_log_likelihood(fitted, noise) + penalty
+        evidence = self.training_log_likelihood(fitted, noise) + self.label_log_density(fitted)
+        return penalty - 2.0 * evidence
+
+    def label_log_density(self, fitted: FittedModel) -> float:
+        """Logarithm of the prior density of each lung's R and C, less its largest value, nats.
+
+        The labels are right within a tolerance, and sometimes wrong altogether: a Cauchy density of
+        the logarithm. Mechanisms that make up for each other, such as a circuit and a slow valve
+        behind a low resistance, may describe the breaths equally well with different lungs.
+        """
+        data, tolerance = self.training.data, self.settings.data.label_tolerance
+        lungs = np.unique(np.stack([data.R, data.C]), axis=1, return_index=True)[1]
+        ratios = (fitted.column("R") / data.R, fitted.column("C") / data.C)
+        off = np.log(np.stack(ratios)[:, lungs]) / tolerance
+        return -float(np.log1p(off**2).sum())
 
     def predict(
         self, fitted: FittedModel, partition: Partition, first: Floats | None = None

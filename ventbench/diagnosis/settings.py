@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 #: Raised when a value or the meaning of a setting changes.
-VERSION = "selection-8"
+VERSION = "selection-9"
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,8 @@ class DataSettings:
             that test terms judge as well, and fits never see them.
         batch_size: breaths that are simulated at once. One size means one compilation; two thirds
             of 60 breaths are one batch.
+        label_tolerance: scale, as a share, of the differences between a lung's R and C and its
+            label: tolerances of test lungs, and of the valve's gain, which scales both.
     """
 
     min_breaths: int = 4
@@ -36,6 +38,7 @@ class DataSettings:
     judging_every: int = 6
     judging_from: int = 18
     batch_size: int = 40
+    label_tolerance: float = 0.15
 
 
 @dataclass(frozen=True)

@@ -101,6 +101,19 @@ def test_a_full_lung_takes_no_more_at_the_same_pressure(form):
     assert slope[1] == slope[2] > slope[0]
 
 
+@pytest.mark.parametrize("form", ["Salazar-Knowles", "Venegas"])
+def test_a_breath_starts_on_the_curve_of_the_lung(form):
+    """From another pressure than PEEP, the curve is the same and the volume another."""
+    stiff = Effect("nonlinear_compliance", "strong", form, {"capacity": 25.0})
+    zero = np.zeros(3)
+    assert QUIET.base is not None
+    rig = Rig(QUIET.base, {stiff.name: stiff}, zero, 0.05, zero, np.zeros((2, 3)))
+    rig.start(np.array([4.0, 5.0, 9.0]))
+    np.testing.assert_allclose(rig._recoil()[0], [4.0, 5.0, 9.0])
+    if form == "Salazar-Knowles":  # it stiffens from PEEP on
+        assert np.all(np.diff(rig._recoil()[1]) > 0.0)
+
+
 def test_what_leaves_the_reservoir_empties_it():
     """The deficit of the supply follows the flow that is drawn, so that more is never less."""
     drop, recovery, R, C, asked = 0.3, 1.0, 20.0, 0.02, 1.14
@@ -198,6 +211,17 @@ def test_judged_by_what_pressure_can_tell():
         "circuit_compliance.compliance": pytest.approx(1.25)
     }
     assert true_values(case(Effect("resistance_change", "mild", "secretions", {"c": 0.3}))) == {}
+    # A ratio to the lung's elastance, which the library states at zero pressure: of an exponential
+    # curve from PEEP, C there is exp(PEEP / capacity) times C at PEEP.
+    creep = Effect("viscoelasticity", "mild", SAME, {"ratio": 0.3, "time": 1.0})
+    stiff = Effect("nonlinear_compliance", "strong", "Salazar-Knowles", {"capacity": 25.0})
+    assert true_values(case(stiff, creep)) == {
+        "viscoelasticity.ratio": pytest.approx(0.3 * np.exp(5.0 / 25.0)),
+        "viscoelasticity.time": 1.0,
+    }
+    assert true_values(case(replace(stiff, form="Venegas"), creep)) == {
+        "viscoelasticity.time": 1.0
+    }
 
 
 def test_a_challenge_of_strangers_keeps_its_seal(tmp_path, monkeypatch):

@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from ventbench.validation.challenge.cases import (
     NOMINAL_GAIN,
     Case,
@@ -116,7 +118,24 @@ def true_values(case: Case) -> dict[str, float]:
             effect = replace(effect, parameters={"compliance": whole})
         if same:
             values |= _values_of(effect, ratio)
+    if isinstance(case, stranger.StrangerCase):
+        _refer_to_zero_pressure(values, case)
     return values
+
+
+def _refer_to_zero_pressure(values: dict[str, float], case: stranger.StrangerCase) -> None:
+    """Convert a ratio to the elastance of a stiffening lung, which the generator states at PEEP.
+
+    The library states it at zero pressure. An exponential curve is the same from any pressure, with
+    another compliance; half a sigmoid is not, and has no such ratio.
+    """
+    path = "viscoelasticity.ratio"
+    for effect in case.effects:
+        if effect.name == "nonlinear_compliance" and path in values:
+            assert case.base is not None
+            ratio = values.pop(path)
+            if effect.form == "Salazar-Knowles":
+                values[path] = ratio * np.exp(case.base.peep / effect.parameters["capacity"])
 
 
 def _values_of(effect: Effect, ratio: float) -> dict[str, float]:

@@ -74,10 +74,9 @@ class Rig:
         """Rest at airway pressures, cmH2O."""
         n = self.n
         self.p = pressure.astype(float).copy()
-        self.rest = pressure.astype(float).copy()
+        self.rest = np.full(n, self.base.peep)
         self.q = np.zeros(n)
-        self.v = np.zeros(n)  # beyond rest
-        self.v2 = np.zeros(n)
+        self.v, self.v2 = self._volumes(self.p - self.rest)  # beyond those at PEEP
         self.stress = np.zeros(n)
         self.held = np.zeros(n)  # hysteresis
         self.valve = np.zeros(n)
@@ -258,6 +257,19 @@ class Rig:
         else:  # Venegas: a logistic of volume, here from its middle upwards
             curve, slope = np.arctanh(within), 1.0 / (1.0 - within**2)
         return self.rest + capacity * (curve + slope * (x - within)), slope / self.C
+
+    def _volumes(self, above: Floats) -> tuple[Floats, Floats]:
+        """Volumes of the lung, and of the second compartment, at rest above PEEP, L."""
+        if "second_compartment" in self.effects:
+            share = self._strength("second_compartment", "share")
+            return (1.0 - share) * self.C * above, share * self.C * above
+        stiff, zero = self.effects.get("nonlinear_compliance"), np.zeros(self.n)
+        if stiff is None:
+            return self.C * above, zero
+        capacity = stiff.parameters["capacity"]
+        x = above / capacity
+        exponential = stiff.form == "Salazar-Knowles"
+        return self.C * capacity * (-np.expm1(-x) if exponential else np.tanh(x)), zero
 
     def _tissue(self, h: float) -> tuple[float | Floats, float | Floats]:
         """Slope of the stress of the tissue after a step, cmH2O/L, and stress at zero flow."""

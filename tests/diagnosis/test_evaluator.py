@@ -134,6 +134,7 @@ def test_a_better_hypothesis_is_likelier_on_other_breaths(late):
     more = late.fit(DELAY.plus(Hypothesis(("sensor_drift",))), GAUSSIAN, named)
     lost = late.criterion(more) - late.criterion(named)
     fallen = 2.0 * (more.log_likelihood - named.log_likelihood)
+    fallen += 2.0 * (late.label_log_density(more) - late.label_log_density(named))
     assert lost == pytest.approx(np.log(8 * small.SAMPLES) - fallen, abs=1e-6)
 
 
@@ -144,9 +145,23 @@ def test_criterion_at_another_noise(late):
     square = np.sum(fitted.residual**2)
     want = -0.5 * square / 0.16 - size * (np.log(0.4) + 0.5 * np.log(2 * np.pi))
     assert fitted.log_likelihood_at(loud) == pytest.approx(want, rel=1e-9)
-    penalty = fitted.shared_count * np.log(size)
+    penalty = fitted.shared_count * np.log(size) - 2.0 * late.label_log_density(fitted)
     assert fitted.shared_count == 5
     assert late.criterion(fitted, loud) == pytest.approx(-2 * want + penalty, rel=1e-9)
+
+
+def test_labels_count_once_for_each_lung(late):
+    """Twice the label is unlikely, but not much less so than three times it."""
+    data = late.training.data
+    held = [
+        late.fit(Hypothesis(DELAY.names, (), (("R", k * data.R[0]), ("C", data.C[0]))), GAUSSIAN)
+        for k in (1.0, 2.0, 3.0)
+    ]
+    nats = [late.label_log_density(each) for each in held]
+    tolerance = late.settings.data.label_tolerance
+    assert nats[0] == pytest.approx(0.0, abs=1e-12)
+    assert nats[1] == pytest.approx(-np.log1p((np.log(2.0) / tolerance) ** 2))
+    assert nats[1] - 1.0 < nats[2] < nats[1]
 
 
 def brute_force(made: Evaluator, values: np.ndarray, duration: float, which: int) -> float:

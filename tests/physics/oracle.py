@@ -21,15 +21,18 @@ def valve_positions(u_in, m):
         if "command_rounding" in m:
             u = float(np.floor(u))
         if "valve_hysteresis" in m:
-            play, give = m["valve_hysteresis"]["width"] / 2, m["valve_hysteresis"].get("give", 0.0)
+            m_play = {"give": 0.0, "smooth": 0.0} | m["valve_hysteresis"]
+            play, give, smooth = m_play["width"] / 2, m_play["give"], m_play["smooth"]
+            soft = u - play * np.tanh((u - stands) / play)
             up = 1.0 if u > asked else -1.0
-            soft = u - play * (up + ((asked - stands) / play - up) * np.exp(-abs(u - asked) / play))
+            slow = u - play * (up + ((asked - stands) / play - up) * np.exp(-abs(u - asked) / play))
             asked = u
             if u - stands > play:
                 stands = u - play
             elif stands - u > play:
                 stands = u + play
-            u = stands = give * soft + (1 - give) * stands
+            yielding = give * soft + (1 - give) * stands
+            u = stands = smooth * slow + (1 - smooth) * yielding
         if "valve_dead_band" in m:
             width, crack = m["valve_dead_band"]["width"], m["valve_dead_band"].get("crack", 0.0)
             overlap = max(0.0, u - width)

@@ -77,10 +77,15 @@ def test_screening_strengths_are_possible(name):
     assert all(strength.low <= value <= strength.high for value in tried)
 
 
-@pytest.mark.parametrize("give", [0.0, 0.5, 1.0])
-def test_play_knows_the_travel_and_no_time(give):
+def play_of(width, smooth):
+    given = {"width": width, "give": 0.0, "smooth": smooth}
+    return {name: jnp.array(value) for name, value in given.items()}
+
+
+@pytest.mark.parametrize("smooth", [0.0, 0.5, 1.0])
+def test_play_knows_the_travel_and_no_time(smooth):
     """Two samples with one command, or a sample halfway, leave the valve where it is without."""
-    play, own = mechanism("valve_hysteresis"), {"width": jnp.array(6.0), "give": jnp.array(give)}
+    play, own = mechanism("valve_hysteresis"), play_of(6.0, smooth)
 
     def position(commands):
         memory = jnp.array(0.0)
@@ -91,12 +96,12 @@ def test_play_knows_the_travel_and_no_time(give):
     once = position([0.0, 2.0, 30.0, 27.0])
     assert position([0.0, 2.0, 2.0, 30.0, 30.0, 30.0, 27.0, 27.0]) == pytest.approx(once, abs=1e-4)
     halves = position([0.0, 1.0, 2.0, 16.0, 30.0, 28.5, 27.0])
-    assert halves == pytest.approx(once, abs=0.25 * give * (1.0 - give) * 6.0 + 1e-4)
+    assert halves == pytest.approx(once, abs=0.25 * smooth * (1.0 - smooth) * 6.0 + 1e-4)
 
 
 def test_smooth_play_is_that_of_bouc_and_wen():
     """After a reversal, it goes from one side to the other exponentially with the travel."""
-    play, own = mechanism("valve_hysteresis"), {"width": jnp.array(6.0), "give": jnp.array(1.0)}
+    play, own = mechanism("valve_hysteresis"), play_of(6.0, 1.0)
     memory, behind = jnp.array(0.0), []
     for u in [*np.linspace(0.0, 60.0, 61), *np.linspace(60.0, 50.0, 11)[1:]]:
         now, memory = play.command(own, jnp.array(u), memory)

@@ -52,6 +52,8 @@ def test_each_mechanism(name, level, predicted):
         ("turbulent_resistance.exponent", 1.5),
         ("valve_hysteresis.give", 1.0),
         ("valve_hysteresis.give", 0.4),
+        ("valve_hysteresis.smooth", 1.0),
+        ("valve_hysteresis.smooth", 0.4),
         ("valve_dead_band.crack", 1.0),
         ("valve_dead_band.crack", 0.3),
         ("nonlinear_compliance.sigmoid", 1.0),

@@ -219,9 +219,7 @@ def test_judged_by_what_pressure_can_tell():
         "viscoelasticity.ratio": pytest.approx(0.3 * np.exp(5.0 / 25.0)),
         "viscoelasticity.time": 1.0,
     }
-    assert true_values(case(replace(stiff, form="Venegas"), creep)) == {
-        "viscoelasticity.time": 1.0
-    }
+    assert true_values(case(replace(stiff, form="Venegas"), creep)) == {"viscoelasticity.time": 1.0}
 
 
 def test_a_challenge_of_strangers_keeps_its_seal(tmp_path, monkeypatch):

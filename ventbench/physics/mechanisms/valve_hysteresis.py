@@ -20,8 +20,9 @@ class ValveHysteresis(Mechanism):
         title="play of the inspiratory valve",
         site="inspiratory valve",
         equation=(
-            "u_effective = u - h z, h = width / 2; after a travel d of the command: z = (1 - give) "
-            "clip(z + d / h, -1, 1) + give (s + (z - s) exp(-|d| / h)), s = sign d"
+            "u_effective = u - h z, h = width / 2; after a travel d of the command: z = (1 - "
+            "smooth) ((1 - give) clip(x, -1, 1) + give tanh x) + smooth (s + (z - s) exp(-|d| / "
+            "h)), x = z + d / h, s = sign d"
         ),
         parameters=(
             Parameter("width", "%", "command lost at every reversal", 0.0, 15.0, 0.0, 2.0, 5.0),
@@ -35,13 +36,24 @@ class ValveHysteresis(Mechanism):
                 0.0,
                 0.0,
                 shape=True,
+            ),
+            Parameter(
+                "smooth",
+                "1",
+                "1 for a lag that nears its width exponentially with the travel",
+                0.0,
+                1.0,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
                 grid=(0.0, 1.0),
             ),
         ),
         source=(
             "Play (backlash) operator: friction and slack between driver and seat, or "
             "opening and closing tables that differ. 3.8 % of full scale was measured on "
-            "the PVP's valve. With give 1 the smooth hysteresis of Bouc (1967) and Wen (J. Eng. "
+            "the PVP's valve. With smooth 1 the hysteresis of Bouc (1967) and Wen (J. Eng. "
             "Mech. 102, 1976, 249), whose memory is that of the travel, not of time."
         ),
         signature=(
@@ -63,11 +75,13 @@ class ValveHysteresis(Mechanism):
         half = 0.5 * values["width"]
         position, before = jnp.broadcast_to(memory, (2, *u_in.shape))
         hard = jnp.minimum(jnp.maximum(position, u_in - half), u_in + half)
+        soft = u_in - half * jnp.tanh((u_in - position) / (half + _THIN))
+        yielding = hard + values["give"] * (soft - hard)
         travel = u_in - before
         full = half * jnp.sign(travel)
         left = jnp.exp(-jnp.abs(travel) / (half + _THIN))
-        soft = u_in - full - (before - position - full) * left
-        position = hard + values["give"] * (soft - hard)
+        gradual = u_in - full - (before - position - full) * left
+        position = yielding + values["smooth"] * (gradual - yielding)
         return position, jnp.stack([position, u_in])
 
 

@@ -447,6 +447,7 @@ def _missing_mechanism(
             estimates.parameter_estimates(recording_model.fit, name),
             name,
             recording_model.evaluator.settings.estimates,
+            alone=len(conclusion.names) == 1,
         ),
         confidence=alternatives.confidence,
         alternatives=alternatives.names,

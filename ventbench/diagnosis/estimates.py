@@ -114,7 +114,11 @@ def parameter_estimates(fitted: Fit, name: str) -> dict[str, Estimate]:
 
 
 def with_form_error(
-    estimates: Mapping[str, Estimate], name: str, settings: EstimateSettings
+    estimates: Mapping[str, Estimate],
+    name: str,
+    settings: EstimateSettings,
+    *,
+    alone: bool = True,
 ) -> dict[str, Estimate]:
     """Estimates whose intervals also contain what the library's equations miss.
 
@@ -126,14 +130,18 @@ def with_form_error(
         estimates: estimates of a mechanism's parameters, by short name.
         name: name of the mechanism.
         settings: share of a parameter that the equations miss.
+        alone: False if the mechanism acts beside others, whose forms shift its parameters too.
     """
-    widened = {}
-    for about in mechanism(name).description.parameters:
+    widened, description = {}, mechanism(name).description
+    share = np.hypot(settings.form_error, 0.0 if alone else description.beside_error)
+    for about in description.parameters:
         if about.name not in estimates:
             continue
         own = estimates[about.name]
         if about.scope != "breath":
-            size = 1.96 * settings.form_error * abs(own.value - about.neutral)
+            # A time that is written as 1 s when it does not matter is not off there.
+            off = about.neutral if about is description.strength else 0.0
+            size = 1.96 * share * abs(own.value - off)
             low, high = (float(np.hypot(end - own.value, size)) for end in own.ci95)
             if np.isfinite(low) and np.isfinite(high):
                 low, high = max(own.value - low, about.low), min(own.value + high, about.high)

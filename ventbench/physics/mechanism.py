@@ -52,6 +52,8 @@ class Description:
             impedance, so that pressure alone can never tell them from this mechanism.
         interchangeable: pairs of parameters whose values can be exchanged without any effect, such
             as the time constants of two lags in series. Reports give the larger value first.
+        beside_error: standard deviation, as a share of a parameter, of what the forms of other
+            mechanisms shift where it acts beside them.
         special_case_of: basis terms (of ``ventbench.physics.nonparametric``) that contain this
             mechanism, exactly or nearly.
     """
@@ -70,6 +72,7 @@ class Description:
     equivalents: tuple[str, ...] = ()
     interchangeable: tuple[tuple[str, str], ...] = ()
     special_case_of: tuple[str, ...] = ()
+    beside_error: float = 0.0
 
     @property
     def strength(self) -> Parameter:

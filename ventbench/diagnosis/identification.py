@@ -240,7 +240,11 @@ def identify(
         if not has_term:
             final = make_partition(data.select(chosen), names, settings)
         fit = estimates.final_fit(conclusion.full, final, evaluator)
-        vague = [name for name in conclusion.names if not _is_definite(fit, name)]
+        vague = [
+            name
+            for name in conclusion.names
+            if not _is_definite(fit, name) or _is_negligible(fit, conclusion, name, settings)
+        ]
         if not vague:
             return IdentifiedModel(evaluator, conclusion, fit, final)
         # The least needed one first: the intervals of others may shrink once it has gone.
@@ -261,6 +265,23 @@ def _is_idle_form(conclusion: Conclusion, name: str, settings: SelectionConfig) 
         return False
     share = settings.held_out_test.negligible_share
     return unnamed.nats < share * conclusion.held_out_gains.get(name, 0.0)
+
+
+def _is_negligible(fit: Fit, conclusion: Conclusion, name: str, settings: SelectionConfig) -> bool:
+    """Whether the final fit leaves a mechanism far weaker than a mild one, that explains little.
+
+    Gas that rings has several minima; a fit to more breaths may end in that of a much smaller
+    inertance than the selection weighed.
+    """
+    strength, limits = mechanism(name).description.strength, settings.held_out_test
+    path = f"{name}.{strength.name}"
+    if varies_by_breath(name) or path not in fit.problem.unknowns.paths:
+        return False
+    beyond = float(np.max(np.abs(np.asarray(fit.value(path)) - strength.neutral)))
+    gains = conclusion.held_out_gains
+    little = gains.get(name, 0.0) < limits.negligible_share * sum(gains.values())
+    weak = limits.negligible_strength * abs(strength.mild - strength.neutral)
+    return little and beyond < weak
 
 
 def _is_definite(fit: Fit, name: str) -> bool:

@@ -141,13 +141,27 @@ def with_form_error(
         if about.scope != "breath":
             # A time that is written as 1 s when it does not matter is not off there.
             off = about.neutral if about is description.strength else 0.0
-            size = 1.96 * share * abs(own.value - off)
-            low, high = (float(np.hypot(end - own.value, size)) for end in own.ci95)
+            low, high = _wider(own.value - off, own.ci95[0] - off, own.ci95[1] - off, share)
             if np.isfinite(low) and np.isfinite(high):
-                low, high = max(own.value - low, about.low), min(own.value + high, about.high)
+                low, high = max(off + low, about.low), min(off + high, about.high)
                 own = replace(own, ci95=(low, high))
         widened[about.name] = own
     return widened
+
+
+def _wider(value: float, low: float, high: float, share: float) -> tuple[float, float]:
+    """Ends of an interval with an error of so much of the value, as a standard deviation.
+
+    Positive values err by factors; an interval that reaches zero errs by a sum.
+    """
+    if value < 0.0:
+        upper, lower = _wider(-value, -high, -low, share)
+        return -lower, -upper
+    if low > 0.0 and np.isfinite(high):
+        down, up = np.hypot(np.log([value / low, high / value]), 1.96 * share)
+        return float(value * np.exp(-down)), float(value * np.exp(up))
+    down, up = np.hypot([value - low, high - value], 1.96 * share * value)
+    return float(value - down), float(value + up)
 
 
 def _interval(fitted: Fit, path: str, group: int) -> ConfidenceInterval:

@@ -14,6 +14,7 @@ from ventbench.diagnosis.conclusion import (
     _best_input,
     _better_selection,
     _is_negligible_input,
+    _is_negligible_term,
     _slow_noise,
     conclude,
     is_unresolved,
@@ -198,6 +199,32 @@ def test_a_small_input_beside_strong_mechanisms_is_negligible(nats, size, names,
     selected: Any = SimpleNamespace(names=names, noise=None, nats=3000.0)
     unnamed = UnnamedEffect(ALVEOLUS, None, latent(ALVEOLUS, nats, size), nats)
     assert _is_negligible_input(evaluator, selected, unnamed) is negligible
+
+
+@pytest.mark.parametrize(
+    ("nats", "moved", "names", "negligible"),
+    [
+        (40.0, 0.05, ("valve_hysteresis",), True),
+        (40.0, 0.3, ("valve_hysteresis",), False),  # moves the pressure
+        (400.0, 0.05, ("valve_hysteresis",), False),  # explains much
+        (40.0, 0.05, (), False),  # nothing else is missing
+    ],
+)
+def test_a_term_that_moves_little_beside_strong_mechanisms_is_negligible(
+    nats, moved, names, negligible
+):
+    weight = np.ones((4, 1, 10))
+    weight[0] = 0.0  # a breath that nobody measured
+    wide: Any = SimpleNamespace(
+        fit=lambda hypothesis, noise, start: SimpleNamespace(nats=0.0),
+        held_out_log_likelihood=lambda fitted: np.full(4, fitted.nats / 4),
+        held_out=SimpleNamespace(data=SimpleNamespace(weight=weight)),
+        predict=lambda fitted, partition: np.where(weight > 0.0, fitted.level, 100.0 * fitted.nats),
+        settings=small.SETTINGS,
+    )
+    selected: Any = SimpleNamespace(names=names, noise=None, nats=3000.0, level=5.0)
+    with_term: Any = SimpleNamespace(nats=3000.0 + nats, level=5.0 + moved)
+    assert _is_negligible_term(wide, selected, with_term, nats) is negligible
 
 
 def test_a_mechanism_is_enough():

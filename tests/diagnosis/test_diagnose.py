@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from ventbench import precision
-from ventbench.diagnosis.diagnose import diagnose
+from ventbench.diagnosis.diagnose import _Comparison, diagnose
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
@@ -253,3 +255,16 @@ def test_simulated_pressures_are_diagnosed_as_their_simulator_is(own, breaths):
     np.testing.assert_allclose(found.corrected_pressures, own.traces.after, rtol=0, atol=1e-9)
     with pytest.raises(InputError, match=r"array of simulated pressures, shape \(1, 40\)"):
         diagnose(breaths, simulator=own.traces.before[:1], settings=small.SETTINGS)
+
+
+def test_a_description_is_judged_by_what_it_corrects():
+    """By the testing breaths, where pressure was measured."""
+    measured = np.zeros((3, 1, 2))
+    weight = np.ones_like(measured)
+    weight[1, 0, 1] = 0.0
+    data: Any = SimpleNamespace(measured=measured, weight=weight)
+    after = np.array([[9.0, 9.0], [1.0, np.nan], [2.0, -3.0]])
+    correction: Any = SimpleNamespace(pressures={"after": after})
+    nothing: Any = None
+    comparison = _Comparison(nothing, {}, [], correction)
+    assert comparison.error(data, np.array([False, True, True])) == pytest.approx(2.0)

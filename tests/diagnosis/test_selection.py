@@ -160,6 +160,16 @@ def test_one_strong_effect_is_selected_and_nothing_else(name):
     assert estimate_noise(named).ar[0] == pytest.approx(0.0, abs=0.2)
 
 
+def test_the_noise_is_that_of_the_shape_that_is_freed():
+    """What a drift of another form leaves is no noise, and no other effect either."""
+    drift = small.effect("sensor_drift", "warming", drift=4.0)
+    evaluator = small.split(small.made(drift, noise=0.05, seed=4))
+    named, _ = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
+    assert named.hypothesis == Hypothesis(("sensor_drift",), ("sensor_drift.warming",))
+    assert named.noise.sigma[0] == pytest.approx(0.05, rel=0.2)
+    assert named.noise.sigma[0] == pytest.approx(estimate_noise(named).sigma[0], rel=0.05)
+
+
 @pytest.mark.slow  # every refit has each breath's own effort
 def test_strong_efforts_are_selected_and_nothing_else():
     effect = small.effect("patient_effort", amplitude=5.0, duration=0.8)

@@ -17,6 +17,7 @@ from ventbench.diagnosis.identification import IdentifiedModel, held_out, identi
 from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.diagnosis.simulator_comparison import (
+    describe_otherwise,
     identify_both,
     missing_mechanisms,
     refit_at_simulator_parameters,
@@ -57,6 +58,19 @@ def strengths_of_models(request: pytest.FixtureRequest, monkeypatch: pytest.Monk
 
     if "slow" not in request.keywords:
         monkeypatch.setattr(estimates, "parameter_estimates", parameters)
+
+
+@pytest.mark.parametrize(
+    ("recorded", "simulated", "otherwise"),
+    [
+        ({"sensor_lag": 9.0, "circuit_compliance": 9.0}, {"valve_lag": 9.0}, True),
+        ({"sensor_lag": 9.0, "valve_lag": 9.0}, {"valve_lag": 9.0}, False),  # one is missing
+        ({"valve_lag": 9.0}, {"sensor_lag": 9.0, "valve_lag": 9.0}, False),  # nothing is
+        ({"valve_lag": 9.0}, {}, False),
+    ],
+)
+def test_two_descriptions_of_one_rig(recorded, simulated, otherwise):
+    assert describe_otherwise(model({}, **recorded), model({}, **simulated)) is otherwise
 
 
 def test_the_base_model_lacks_all_of_it_the_most_important_first():

@@ -20,9 +20,9 @@ class ValveHysteresis(Mechanism):
         title="play of the inspiratory valve",
         site="inspiratory valve",
         equation=(
-            "u_effective = u - h z, h = width / 2; after a travel d of the command: z = (1 - "
-            "smooth) ((1 - give) clip(x, -1, 1) + give tanh x) + smooth (s + (z - s) exp(-|d| / "
-            "h)), x = z + d / h, s = sign d"
+            "u_effective = u - h z, h = width / 2, z = (1 - smooth) ((1 - give) clip(x, -1, 1) + "
+            "give tanh x) + smooth (s + (z before - s) exp(-|d| / h)), x = z before + d / h, "
+            "d = u - u before, s = sign d"
         ),
         parameters=(
             Parameter("width", "%", "command lost at every reversal", 0.0, 15.0, 0.0, 2.0, 5.0),

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from ventbench import mechanics
-from ventbench.diagnosis.conclusion import Conclusion, UnnamedEffect
+from ventbench.diagnosis.conclusion import Conclusion
 from ventbench.diagnosis.evaluator import Evaluator, groups_by_label
 from ventbench.diagnosis.findings import NonparametricTerm
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, varies_by_breath
 from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY, LatentInput
+from ventbench.diagnosis.remaining_error import UnnamedEffect
 from ventbench.diagnosis.selection.screening import component_of
 from ventbench.diagnosis.settings import EstimateSettings
 from ventbench.interfaces import Plant

@@ -262,7 +262,9 @@ def test_a_description_is_judged_by_what_it_corrects():
     measured = np.zeros((3, 1, 2))
     weight = np.ones_like(measured)
     weight[1, 0, 1] = 0.0
-    data: Any = SimpleNamespace(measured=measured, weight=weight)
+    given = SimpleNamespace(measured=measured, weight=weight)
+    given.select = lambda mask: SimpleNamespace(measured=measured[mask], weight=weight[mask])
+    data: Any = given
     after = np.array([[9.0, 9.0], [1.0, np.nan], [2.0, -3.0]])
     correction: Any = SimpleNamespace(pressures={"after": after})
     nothing: Any = None

@@ -45,6 +45,7 @@ from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.diagnosis.simulator_comparison import (
     describe_otherwise,
     identify_both,
+    mean_error,
     missing_mechanisms,
     refit_at_simulator_parameters,
 )
@@ -304,9 +305,8 @@ class _Comparison:
 
     def error(self, data: Data, testing: NDArray[np.bool_]) -> float:
         """Mean absolute error of the corrected simulator on the testing breaths, cmH2O."""
-        weight = data.weight[testing, 0]
-        wrong = np.nan_to_num(self.correction.pressures["after"]) - data.measured[:, 0]
-        return float(np.sum(np.abs(wrong[testing]) * weight) / np.sum(weight))
+        corrected = np.nan_to_num(self.correction.pressures["after"])
+        return mean_error(data.select(testing), corrected[testing])
 
 
 def steps_between(tell: Progress, low: float, high: float) -> Callable[[str], None]:

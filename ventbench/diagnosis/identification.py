@@ -23,7 +23,7 @@ from ventbench.diagnosis.hypothesis import (
     varies_by_breath,
 )
 from ventbench.diagnosis.latent_inputs import GAIN_SCATTER, input_responses
-from ventbench.diagnosis.plausibility import excludes_neutral
+from ventbench.diagnosis.plausibility import excludes_neutral, is_weak
 from ventbench.diagnosis.selection.screening import all_parameter_paths, library_paths
 from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
 from ventbench.errors import InputError
@@ -277,11 +277,9 @@ def _is_negligible(fit: Fit, conclusion: Conclusion, name: str, settings: Select
     path = f"{name}.{strength.name}"
     if varies_by_breath(name) or path not in fit.problem.unknowns.paths:
         return False
-    beyond = float(np.max(np.abs(np.asarray(fit.value(path)) - strength.neutral)))
-    gains = conclusion.held_out_gains
+    beyond, gains = fit.value(path) - strength.neutral, conclusion.held_out_gains
     little = gains.get(name, 0.0) < limits.negligible_share * sum(gains.values())
-    weak = limits.negligible_strength * abs(strength.mild - strength.neutral)
-    return little and beyond < weak
+    return little and is_weak(name, beyond, limits.negligible_strength)
 
 
 def _is_definite(fit: Fit, name: str) -> bool:

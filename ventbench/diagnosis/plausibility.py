@@ -14,6 +14,7 @@ from ventbench.diagnosis.hypothesis import FittedModel, varies_by_breath
 from ventbench.diagnosis.settings import PlausibilitySettings
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import mechanism, strength_path
+from ventbench.system_id.data import Floats
 
 
 def is_plausible(fitted: FittedModel, name: str, settings: PlausibilitySettings) -> bool:
@@ -47,6 +48,18 @@ def excludes_neutral(estimate: Estimate, name: str) -> bool:
     low, high = estimate.ci95
     neutral = mechanism(name).description.strength.neutral
     return not (np.isfinite(low) and np.isfinite(high)) or not low <= neutral <= high
+
+
+def is_weak(name: str, beyond: Floats, share: float) -> bool:
+    """Whether a mechanism's strengths are at most a share of what a mild one is beyond none.
+
+    Args:
+        name: name of the mechanism.
+        beyond: by how much strengths differ from none, or from others, in their unit.
+        share: the share.
+    """
+    strength = mechanism(name).description.strength
+    return bool(np.max(np.abs(beyond)) <= share * abs(strength.mild - strength.neutral))
 
 
 def is_consistent(gains: np.ndarray, settings: PlausibilitySettings) -> bool:

@@ -16,11 +16,12 @@ from ventbench.diagnosis import estimates
 from ventbench.diagnosis.evaluator import Evaluator, groups_by_label
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, varies_by_breath
 from ventbench.diagnosis.identification import IdentifiedModel, identify
+from ventbench.diagnosis.plausibility import is_weak
 from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.selection.forward import drop_redundant_terms
 from ventbench.diagnosis.selection.held_out_test import passes_heldout_test
 from ventbench.diagnosis.settings import DEFAULT
-from ventbench.physics.catalogue import mechanism
+from ventbench.physics.catalogue import mechanism, strength_path
 from ventbench.system_id import Fit, fit
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.noise import Noise
@@ -69,9 +70,9 @@ def identify_both(
     # Predicted as breaths to come: parameters of each breath are not known of them.
     predicted = recording_only_model.pressures(recording_only_model.conclusion.full, data, first)
     seen = data.select(~held)
-    error = min(_mean_error(seen, response[~held]), _mean_error(seen, refit[~held]))
+    error = min(mean_error(seen, response[~held]), mean_error(seen, refit[~held]))
     share = settings.simulator.residual_model_share
-    if error >= share * _mean_error(seen, predicted[~held]):
+    if error >= share * mean_error(seen, predicted[~held]):
         return recording_only_model, simulator_model
     recording_model = identify(
         reduced,
@@ -136,6 +137,17 @@ def describe_otherwise(recording_model: IdentifiedModel, simulator_model: Identi
     """
     recorded, own = set(recording_model.conclusion.names), set(simulator_model.conclusion.names)
     return bool(recorded - own) and bool(own - recorded)
+
+
+def mean_error(data: Data, pressure: Floats) -> float:
+    """Mean absolute error where pressure was measured, cmH2O.
+
+    Args:
+        data: n recorded breaths.
+        pressure: simulated pressures, cmH2O, ``(n, T)``.
+    """
+    weight = data.weight[:, 0]
+    return float(np.sum(np.abs(pressure - data.measured[:, 0]) * weight) / np.sum(weight))
 
 
 def less_unmodelled(data: Data, response: Floats, simulator_model: IdentifiedModel) -> Data:
@@ -293,10 +305,8 @@ def refit_at_simulator_parameters(
 
 def is_faint(fitted: FittedModel, own: FittedModel, name: str, share: float) -> bool:
     """Whether a mechanism differs from the simulator's by less than a share of a mild strength."""
-    strength = mechanism(name).description.strength
-    path = f"{name}.{strength.name}"
-    beyond = np.abs(fitted.column(path) - own.column(path)[0])
-    return bool(beyond.max() < share * abs(strength.mild - strength.neutral))
+    path = strength_path(name)
+    return is_weak(name, fitted.column(path) - own.column(path)[0], share)
 
 
 def _noiseless_fit(
@@ -311,12 +321,6 @@ def _noiseless_fit(
     partition = Partition(own.select(~held), evaluator.training.predictor)
     problem = replace(fitted.problem, noise=recording_model.conclusion.noise)
     return estimates.final_fit(replace(fitted, problem=problem), partition, evaluator)
-
-
-def _mean_error(data: Data, pressure: Floats) -> float:
-    """Mean absolute error where pressure was measured, cmH2O."""
-    weight = data.weight[:, 0]
-    return float(np.sum(np.abs(pressure - data.measured[:, 0]) * weight) / np.sum(weight))
 
 
 def _differs(recording_model: IdentifiedModel, simulator_model: IdentifiedModel, name: str) -> bool:

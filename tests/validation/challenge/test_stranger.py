@@ -85,14 +85,20 @@ def test_a_leak_and_a_circuit_against_solve_ivp():
     np.testing.assert_allclose(found, exact.y[0], atol=0.25)
 
 
+def stiffening(form: str, capacity: float, *pressures: float) -> Rig:
+    """Breaths of a stiffening lung, at rest at airway pressures, cmH2O."""
+    stiff = Effect("nonlinear_compliance", "strong", form, {"capacity": capacity})
+    zero = np.zeros(len(pressures))
+    assert QUIET.base is not None
+    rig = Rig(QUIET.base, {stiff.name: stiff}, zero, 0.05, zero, np.stack([zero, zero]))
+    rig.start(np.array(pressures))
+    return rig
+
+
 @pytest.mark.parametrize("form", ["Salazar-Knowles", "Venegas"])
 def test_a_full_lung_takes_no_more_at_the_same_pressure(form):
     """Its recoil goes on rising beyond what the curve is followed to."""
-    stiff = Effect("nonlinear_compliance", "strong", form, {"capacity": 10.0})
-    three = np.zeros(3)
-    assert QUIET.base is not None
-    full = Rig(QUIET.base, {stiff.name: stiff}, three, 0.05, three, np.zeros((2, 3)))
-    full.start(three)
+    full = stiffening(form, 10.0, 5.0, 5.0, 5.0)
     full.v = np.array([0.9, 1.2, 1.5]) * full.C * 10.0
     recoil, slope = full._recoil()
     least = 10.0 * (1.47 if form == "Venegas" else 2.30)  # at 0.9 of the capacity
@@ -104,11 +110,7 @@ def test_a_full_lung_takes_no_more_at_the_same_pressure(form):
 @pytest.mark.parametrize("form", ["Salazar-Knowles", "Venegas"])
 def test_a_breath_starts_on_the_curve_of_the_lung(form):
     """From another pressure than PEEP, the curve is the same and the volume another."""
-    stiff = Effect("nonlinear_compliance", "strong", form, {"capacity": 25.0})
-    zero = np.zeros(3)
-    assert QUIET.base is not None
-    rig = Rig(QUIET.base, {stiff.name: stiff}, zero, 0.05, zero, np.zeros((2, 3)))
-    rig.start(np.array([4.0, 5.0, 9.0]))
+    rig = stiffening(form, 25.0, 4.0, 5.0, 9.0)
     np.testing.assert_allclose(rig._recoil()[0], [4.0, 5.0, 9.0])
     if form == "Salazar-Knowles":  # it stiffens from PEEP on
         assert np.all(np.diff(rig._recoil()[1]) > 0.0)

@@ -6,7 +6,7 @@ import numpy as np
 
 from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
-from ventbench.diagnosis.plausibility import is_plausible
+from ventbench.diagnosis.plausibility import is_plausible, is_weak
 from ventbench.diagnosis.settings import DEFAULT, HeldOutTestSettings
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id.data import Floats
@@ -84,9 +84,8 @@ def is_negligible(
         return True
     settings = evaluator.settings.held_out_test
     about = mechanism(name).description.strength
-    strength = float(np.max(np.abs(with_term.column(f"{name}.{about.name}") - about.neutral)))
-    weak = settings.negligible_strength * abs(about.mild - about.neutral)
-    if varies_by_breath(name) or strength > weak:
+    beyond = with_term.column(f"{name}.{about.name}") - about.neutral
+    if varies_by_breath(name) or not is_weak(name, beyond, settings.negligible_strength):
         return False
     criterion = evaluator.criterion(with_term)
     base = evaluator.criterion(evaluator.fit(Hypothesis(), with_term.noise, with_term))

@@ -97,26 +97,33 @@ def test_a_small_input_beside_strong_mechanisms_is_negligible(nats, size, names,
 
 
 @pytest.mark.parametrize(
-    ("nats", "moved", "names", "negligible"),
+    ("nats", "explained", "noise", "names", "negligible"),
     [
-        (40.0, 0.05, ("valve_hysteresis",), True),
-        (40.0, 0.3, ("valve_hysteresis",), False),  # moves the pressure
-        (400.0, 0.05, ("valve_hysteresis",), False),  # explains much
-        (40.0, 0.05, (), False),  # nothing else is missing
+        (40.0, 0.05, 0.2, ("valve_hysteresis",), True),
+        (40.0, 0.3, 0.2, ("valve_hysteresis",), False),  # explains an error that is seen
+        (400.0, 0.05, 0.2, ("valve_hysteresis",), True),  # less than half of the noise
+        (400.0, 0.05, 0.02, ("valve_hysteresis",), False),  # explains much
+        (40.0, 0.05, 0.02, ("valve_hysteresis",), True),
+        (40.0, 0.05, 0.2, (), False),  # nothing else is missing
     ],
 )
-def test_a_term_that_moves_little_beside_strong_mechanisms_is_negligible(
-    nats, moved, names, negligible
+def test_a_term_that_explains_little_beside_strong_mechanisms_is_negligible(
+    nats, explained, noise, names, negligible
 ):
     weight = np.ones((4, 1, 10))
     weight[0] = 0.0  # a breath that nobody measured
     wide: Any = SimpleNamespace(
         fit=lambda hypothesis, noise, start: SimpleNamespace(nats=0.0),
         held_out_log_likelihood=lambda fitted: np.full(4, fitted.nats / 4),
-        held_out=SimpleNamespace(data=SimpleNamespace(weight=weight)),
-        predict=lambda fitted, partition: np.where(weight > 0.0, fitted.level, 100.0 * fitted.nats),
+        held_out=SimpleNamespace(
+            data=SimpleNamespace(weight=weight, measured=np.zeros((4, 1, 10)))
+        ),
+        predict=lambda fitted, partition: np.where(weight > 0.0, fitted.error, 100.0 * fitted.nats),
         settings=small.SETTINGS,
     )
-    selected: Any = SimpleNamespace(names=names, noise=None, nats=3000.0, level=5.0)
-    with_term: Any = SimpleNamespace(nats=3000.0 + nats, level=5.0 + moved)
+    model_noise = SimpleNamespace(sigma=(noise,))
+    selected: Any = SimpleNamespace(
+        names=names, noise=model_noise, nats=3000.0, error=np.hypot(1.0, explained)
+    )
+    with_term: Any = SimpleNamespace(nats=3000.0 + nats, noise=model_noise, error=1.0)
     assert _is_negligible_term(wide, selected, with_term, nats) is negligible

@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.hypothesis import Hypothesis
+from ventbench.diagnosis.conclusion import _supported
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
 from ventbench.diagnosis.selection import forward, held_out_test
 from ventbench.diagnosis.selection.candidate_comparison import (
     Comparison,
@@ -18,6 +19,7 @@ from ventbench.diagnosis.selection.candidate_comparison import (
     fit_with_white_noise,
 )
 from ventbench.diagnosis.selection.forward import (
+    _free_earlier_shapes,
     drop_redundant_terms,
     forward_selection,
     is_far_from_label,
@@ -28,6 +30,7 @@ from ventbench.diagnosis.selection.pair_exchange import replace_pair
 from ventbench.diagnosis.selection.screening import screen_mechanisms
 from ventbench.diagnosis.settings import HeldOutTestSettings
 from ventbench.system_id import Noise
+from ventbench.validation.challenge.cases import Base
 
 from . import small
 
@@ -168,6 +171,47 @@ def test_the_noise_is_that_of_the_shape_that_is_freed():
     assert named.hypothesis == Hypothesis(("sensor_drift",), ("sensor_drift.warming",))
     assert named.noise.sigma[0] == pytest.approx(0.05, rel=0.2)
     assert named.noise.sigma[0] == pytest.approx(estimate_noise(named).sigma[0], rel=0.05)
+
+
+def test_a_little_of_what_every_rig_has_is_compared_with_but_not_named():
+    """A little circuit before a high resistance explains much; gas with inertia looks like it."""
+    turbulent = small.effect("turbulent_resistance", quadratic=10.0)
+    little = small.effect("circuit_compliance", compliance=0.15)
+    rig = Base(50.0, 19.5)
+    evaluator = small.split(small.made(turbulent, little, base=rig, noise=0.1, seed=3))
+    selected, _ = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
+    assert selected.names == ("turbulent_resistance", "circuit_compliance")
+    named, gains = _supported(evaluator, selected, None)
+    assert named.names == tuple(gains) == ("turbulent_resistance",)
+
+
+def test_shapes_of_earlier_terms_are_freed_once_others_are_known():
+    drift = small.effect("sensor_drift", "warming", drift=4.0)
+    lag = small.effect("sensor_lag", tau=0.1)
+    evaluator = small.split(small.made(drift, lag, noise=0.05, seed=4))
+    both = fit_with_noise(evaluator, Hypothesis(("sensor_drift", "sensor_lag")))
+    freed = _free_earlier_shapes(evaluator, both)
+    assert freed is not None
+    assert freed.hypothesis.free == ("sensor_drift.warming",)
+    assert freed.noise.sigma[0] == pytest.approx(0.05, rel=0.2)
+    assert _free_earlier_shapes(evaluator, freed) is None
+
+
+def test_a_search_can_be_ended_before_terms_are_exchanged():
+    two = (
+        small.effect("turbulent_resistance", quadratic=10.0), small.effect("sensor_lag", tau=0.12)
+    )  # fmt: skip
+    evaluator = small.split(small.made(*two))
+    asked = []
+
+    def interrupt(selected: FittedModel) -> bool:
+        asked.append(selected)
+        return True
+
+    start = fit_with_noise(evaluator, Hypothesis())
+    selected, _ = forward_selection(evaluator, start, quiet, interrupt=interrupt)
+    assert asked == [selected]
+    assert set(selected.names) == {"turbulent_resistance", "sensor_lag"}
 
 
 @pytest.mark.slow  # every refit has each breath's own effort

@@ -49,7 +49,7 @@ def recoil(volume, C, m):
     k = m.get("nonlinear_compliance", {}).get("stiffening", 0.0)
     share = m.get("nonlinear_compliance", {}).get("sigmoid", 0.0)
     x = k * linear
-    return (share * np.arctanh(x) - (1 - share) * np.log(1 - x)) / k if k else linear
+    return np.log((1 + share * x) / (1 - x)) / (1 + share) / k if k else linear
 
 
 class Breath:

@@ -58,6 +58,7 @@ def test_each_mechanism(name, level, predicted):
         ("valve_dead_band.crack", 0.3),
         ("nonlinear_compliance.sigmoid", 1.0),
         ("nonlinear_compliance.sigmoid", 0.4),
+        ("nonlinear_compliance.sigmoid", 2.5),
         ("patient_effort.relaxing", 1.0),
         ("patient_effort.relaxing", 0.3),
         ("sensor_drift.warming", 3.0),

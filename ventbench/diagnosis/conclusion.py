@@ -17,7 +17,12 @@ from functools import cache
 from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.plausibility import is_consistent
-from ventbench.diagnosis.remaining_error import UnnamedEffect, best_term, explain_remaining_error
+from ventbench.diagnosis.remaining_error import (
+    UnnamedEffect,
+    best_term,
+    explain_remaining_error,
+    gain_scatter,
+)
 from ventbench.diagnosis.selection.alternatives import (
     Alternatives,
     Replacements,
@@ -100,11 +105,14 @@ def conclude(
     """
     base = fit_with_noise(evaluator, Hypothesis())
     wider = cache(wider)
-    single = SingleTermAlternative(evaluator, wider, base)
+    single, scatter = SingleTermAlternative(evaluator, wider, base), _GainScatter(evaluator)
     if earlier is None or len(earlier.names) < evaluator.settings.forward.kept_terms:
-        selected, comparisons = forward_selection(evaluator, base, tell, single)
+        selected, comparisons = forward_selection(evaluator, base, tell, single, scatter)
     else:
         selected, comparisons = base, []
+    if scatter.sd:
+        # Exchanges are many fits; those at gains that are no gains would be lost.
+        return _with_gains(evaluator, wider, scatter.sd, tell, selected)
     if earlier is not None and not set(earlier.names) <= set(selected.names):
         # Gains of the breaths' own can stand for a bent valve in the first rounds of a selection.
         start = fit_with_noise(evaluator, earlier.hypothesis, earlier)
@@ -133,9 +141,7 @@ def conclude(
     else:
         selected = reduced
     if not evaluator.gain_sd and remaining.gain_sd:
-        sd = remaining.gain_sd
-        scattered = replace(evaluator, gain_sd=sd)
-        return conclude(scattered, lambda: replace(wide, gain_sd=sd), tell, selected)
+        return _with_gains(evaluator, wider, remaining.gain_sd, tell, selected)
     unnamed, full = None, selected
     if remaining.latent is not None and not remaining.prefers_term:
         unnamed = remaining.latent
@@ -185,6 +191,40 @@ def conclude(
         unnamed is None and not selected.names and is_unresolved(evaluator, comparisons),
         remaining.slow_noise if unnamed is None else None,
     )
+
+
+class _GainScatter:
+    """Asks whether gains scatter between breaths, and keeps the answer."""
+
+    def __init__(self, evaluator: Evaluator) -> None:
+        self._evaluator = evaluator
+        self.sd = 0.0  # standard deviation of the logarithm of the gains
+
+    def __call__(self, selected: FittedModel) -> bool:
+        """Whether the gains scatter, if all breaths have had the same one so far."""
+        if not self._evaluator.gain_sd:
+            self.sd = gain_scatter(self._evaluator, selected)
+        return bool(self.sd)
+
+
+def _with_gains(
+    evaluator: Evaluator,
+    wider: Callable[[], Evaluator],
+    sd: float,
+    tell: Progress,
+    selected: FittedModel,
+) -> Conclusion:
+    """The conclusion with a gain of each breath's own, from mechanisms selected without.
+
+    Args:
+        evaluator: see :func:`conclude`.
+        wider: see :func:`conclude`.
+        sd: standard deviation of the logarithm of the gains.
+        tell: see :func:`conclude`.
+        selected: the mechanisms.
+    """
+    scattered = replace(evaluator, gain_sd=sd)
+    return conclude(scattered, lambda: replace(wider(), gain_sd=sd), tell, selected)
 
 
 def _better_selection(

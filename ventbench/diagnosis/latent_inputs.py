@@ -193,6 +193,8 @@ def exceeds_sensor_noise(evaluator: Evaluator, with_effort: FittedModel) -> bool
         hypothesis.without(*hypothesis.breath_terms), with_effort.noise, with_effort
     )
     sensor = fit_latent_inputs(evaluator, passive, (MEASUREMENT,))[MEASUREMENT]
+    if sensor.size > evaluator.settings.latent_inputs.sensor_noise:
+        return True  # no sensor is that noisy, and an input can be all that is missing
     by_effort = log_likelihood_without_input(evaluator, with_effort)[1]
     ahead = float((by_effort - sensor.held_out_log_likelihood).sum())
     return ahead > evaluator.settings.held_out_test.threshold

@@ -2,7 +2,7 @@
 
 The best term of each kind and the best input are compared by what they gain on held-out breaths.
 Coloured noise of the sensor and a valve gain that differs from breath to breath are nuisances that
-an input must outdo. Beside mechanisms that explain much, a term that moves the pressure by little,
+an input must outdo. Beside mechanisms that explain much, a term that explains little of the error,
 or a faint input, is negligible.
 """
 
@@ -106,6 +106,26 @@ def explain_remaining_error(
     return UnexplainedError(term, latent, gain_sd, slow_noise)
 
 
+def gain_scatter(evaluator: Evaluator, selected: FittedModel) -> float:
+    """Standard deviation of the logarithm of the breaths' gains; 0 if it does not matter.
+
+    The same as in :func:`explain_remaining_error` but for a nonparametric term that explains more.
+
+    Args:
+        evaluator: evaluator with the same gain in all breaths.
+        selected: the mechanisms.
+    """
+    passive = without_breath_terms(evaluator, selected)
+    reference = log_likelihood_without_input(evaluator, selected)[1]
+    scatter = fit_latent_inputs(evaluator, passive, (GAIN_SCATTER,))[GAIN_SCATTER]
+    gained = scatter.held_out_log_likelihood - reference
+    if not passes_heldout_test(gained, evaluator.settings.held_out_test):
+        return 0.0
+    inputs = fit_latent_inputs(evaluator, passive)
+    scattered = _gain_scatters(scatter, inputs, reference, None, evaluator.settings)
+    return scatter.size if scattered else 0.0
+
+
 def _slow_noise(
     inputs: dict[str, LatentInput], reference: Floats, settings: SelectionConfig
 ) -> UnnamedEffect | None:
@@ -140,13 +160,24 @@ def best_term(wide: Evaluator, selected: FittedModel) -> NonparametricFit | None
 def _is_negligible_term(
     wide: Evaluator, selected: FittedModel, with_term: FittedModel, nats: float
 ) -> bool:
-    """Whether a nonparametric term moves the pressure a little and explains little beside names."""
-    if not selected.names or nats >= _least_beside_names(wide, selected):
+    """Whether a nonparametric term beside names explains little of the error.
+
+    It does if it explains less than half of the noise, and where it explains little beside names.
+    """
+    if not selected.names:
         return False
-    partition = wide.held_out
-    moved = wide.predict(with_term, partition) - wide.predict(selected, partition)
-    seen = partition.data.weight > 0.0
-    return bool(np.sqrt(np.mean(np.square(moved[seen]))) < wide.settings.refinement.least_change)
+    data, settings = wide.held_out.data, wide.settings.refinement
+    seen = data.weight > 0.0
+
+    def square(fitted: FittedModel) -> float:
+        error = wide.predict(fitted, wide.held_out) - data.measured
+        return float(np.mean(np.square(error[seen])))
+
+    explained = square(selected) - square(with_term)
+    if explained >= settings.least_change**2:
+        return False
+    noise = settings.least_noise_share * with_term.noise.sigma[0]
+    return explained < noise**2 or nats < _least_beside_names(wide, selected)
 
 
 def _least_beside_names(evaluator: Evaluator, selected: FittedModel) -> float:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 #: Raised when a value or the meaning of a setting changes.
-VERSION = "selection-9"
+VERSION = "selection-10"
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,9 @@ class ForwardSelectionSettings:
         fallback_candidates: candidates that are tried where the best one fails its test.
         shape_gain: held-out log-likelihood, nats, from which a shape parameter is freed.
         exchanged_firsts: rivals of a pair, the best first, to which each other one is added.
-        exchanged_twos: such twos, the best first, that are fitted to the end.
+        exchanged_twos: such twos, the best first, that are kept for each pair.
+        exchanged_pairs: twos, and single terms of another form, that are fitted to the end in the
+            place of pairs.
     """
 
     min_expected_gain: float = 3.0
@@ -175,14 +177,15 @@ class ForwardSelectionSettings:
     noise_rounds: int = 3
     max_terms: int = 6
     max_rounds: int = 14
-    label_factor: float = 3.0
-    kept_terms: int = 3
+    label_factor: float = 1.5
+    kept_terms: int = 2
     replacement_terms: int = 4
     shared_effect_share: float = 0.5
     fallback_candidates: int = 3
     shape_gain: float = 2.0
     exchanged_firsts: int = 3
     exchanged_twos: int = 2
+    exchanged_pairs: int = 4
 
 
 @dataclass(frozen=True)
@@ -200,9 +203,10 @@ class RefinementSettings:
             nonparametric term only compensates for its form.
         max_compensating_share: share of what is explained up to which a mechanism may only
             compensate for another one's form.
-        least_change: root mean square, cmH2O, by which a nonparametric term beside mechanisms must
-            move the pressure, or explain more than little beside them: less is their form, or what
-            every rig has.
+        least_change: root mean square, cmH2O, of the error that a nonparametric term beside
+            mechanisms explains in any case, to be kept: less may be their form, or what every rig
+            has.
+        least_noise_share: share of the noise's standard deviation that it must explain otherwise.
         shortfall_share: share of a mechanism's held-out gain by which a nonparametric term may fall
             short and still replace it.
         shortfall_nats: nats by which a nonparametric term may fall short and still replace a
@@ -225,6 +229,7 @@ class RefinementSettings:
     compensating_share: float = 0.1
     max_compensating_share: float = 0.5
     least_change: float = 0.1
+    least_noise_share: float = 0.5
     shortfall_share: float = 0.05
     shortfall_nats: float = 3.0 * 4.6
     remaining_share: float = 0.1
@@ -315,6 +320,8 @@ class LatentInputSettings:
             if it explains little of what they do: a fifth of a mild effort.
         sensor_amplitude: standard deviation, cmH2O, from which a periodic input at the sensor is
             told; less is noise.
+        sensor_noise: largest standard deviation, cmH2O, of slow noise of a sensor that patient
+            effort must outdo; more is physics.
         scatter_share: share of what inputs explain from which scatter of the valve's gain between
             breaths is the explanation. A course within each breath imitates the scatter and
             explains some noise as well (up to 1.6 times as much where gains of a stranger's valve
@@ -339,6 +346,7 @@ class LatentInputSettings:
     threshold: float = 8.0
     least_size: float = 0.4
     sensor_amplitude: float = 0.3
+    sensor_noise: float = 1.0
     scatter_share: float = 0.5
 
 

@@ -54,6 +54,7 @@ class Description:
             as the time constants of two lags in series. Reports give the larger value first.
         beside_error: standard deviation, as a share of a parameter, of what the forms of other
             mechanisms shift where it acts beside them.
+        ubiquitous: whether every rig has a little of it, which is no finding.
         special_case_of: basis terms (of ``ventbench.physics.nonparametric``) that contain this
             mechanism, exactly or nearly.
     """
@@ -73,6 +74,7 @@ class Description:
     interchangeable: tuple[tuple[str, str], ...] = ()
     special_case_of: tuple[str, ...] = ()
     beside_error: float = 0.0
+    ubiquitous: bool = False
 
     @property
     def strength(self) -> Parameter:

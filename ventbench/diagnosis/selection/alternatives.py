@@ -157,7 +157,7 @@ def _fitted_instead(
     white = fit_with_white_noise(evaluator, base)
     candidates = screen_mechanisms(base, white, evaluator.settings, evaluator.allowed_mechanisms)
     others = [candidate for candidate in candidates if candidate.name != name]
-    comparison = compare_candidates(evaluator, base, others, white, restarts=False)
+    comparison = compare_candidates(evaluator, base, others, white, restarts=False, rival=selected)
     if comparison is None or not passes_heldout_test(
         comparison.held_out_gain, evaluator.settings.held_out_test
     ):

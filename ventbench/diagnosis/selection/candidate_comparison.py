@@ -67,6 +67,7 @@ def compare_candidates(
     warm_start: FittedModel | None = None,
     *,
     restarts: bool = True,
+    rival: FittedModel | None = None,
 ) -> Comparison | None:
     """Fit the candidates and rank them by BIC at one noise; None if none is promising.
 
@@ -77,6 +78,7 @@ def compare_candidates(
         warm_start: the model that fits start from; ``current`` if None.
         restarts: whether fits may have to go far where much is missing; not where the start has the
             R and C of a better model.
+        rival: a model that candidates must come near; others are not fitted to the end.
     """
     settings = evaluator.settings.forward
     chosen = [
@@ -94,7 +96,7 @@ def compare_candidates(
         chosen = candidates
     # Noise that was estimated with an effect in the residual would hide the effect from its fit.
     white, first = replace(current.noise, ar=(0.0, 0.0)), warm_start or current
-    models = _quick_fits(evaluator, current, chosen, white, first, far=much and restarts)
+    models = _quick_fits(evaluator, current, chosen, white, first, rival, far=much and restarts)
     criteria = _Criteria(evaluator)
     own = parallel_map(lambda model: criteria(model, estimate_noise(model)), models)
     noise = criteria.better_noise(models[int(np.argmin(own))], current.noise)
@@ -104,11 +106,11 @@ def compare_candidates(
         order[0] = evaluator.fit(order[0].hypothesis, noise, order[0])
         noise = criteria.better_noise(order[0], noise)
         order = criteria.order(order, noise)
-        limit = _contention(evaluator, criteria, current, order[0], noise)
+        limit = _contention(evaluator, criteria, current, order[0], noise, rival)
         order = criteria.order(_fit_contenders(evaluator, order, noise, criteria, limit), noise)
         if criteria.better_noise(order[0], noise) is noise:
             break
-    limit = _contention(evaluator, criteria, current, order[0], noise)
+    limit = _contention(evaluator, criteria, current, order[0], noise, rival)
     if len(order) > 1 and criteria(order[1], noise) < limit:
         freer = _free_contenders(evaluator, order, noise, criteria, limit)
         order = criteria.order(freer, noise)
@@ -121,7 +123,7 @@ def compare_candidates(
     shared = [model for model in order if not varies_by_breath(model.names[-1])]
     if shared and first is not base and criteria(shared[0], noise) > worse:
         # The fit at white noise is beyond a dead time from which no candidate finds back.
-        return compare_candidates(evaluator, base, candidates, base, restarts=restarts)
+        return compare_candidates(evaluator, base, candidates, base, restarts=restarts, rival=rival)
     ranked = tuple(
         RankedModel(model.hypothesis.names[-1], model, criteria(model, noise)) for model in order
     )
@@ -135,6 +137,7 @@ def _quick_fits(
     candidates: list[Candidate],
     noise: Noise,
     warm_start: FittedModel,
+    rival: FittedModel | None,
     *,
     far: bool,
 ) -> list[FittedModel]:
@@ -193,6 +196,8 @@ def _quick_fits(
     # What differs from breath to breath is no measure of others: it may explain the most, and fail.
     rivals = [models[0] for models in raced if not varies_by_breath(models[0].names[-1])]
     best = min(map(cost_of, rivals), default=np.inf)
+    if rival is not None:
+        best = min(best, cost_at(evaluator.restricted(rival), noise))
     limit = hopeless_above(cost_at(first, noise), best, evaluator.settings.forward)
 
     def ended(models: list[FittedModel]) -> FittedModel:
@@ -207,7 +212,10 @@ def _quick_fits(
     own = parallel_map(lambda model: criteria(model, estimate_noise(model)), models)
     noise_left = estimate_noise(models[int(np.argmin(own))])
     models = criteria.order(models, noise_left)
-    limit = _contention(evaluator, criteria, evaluator.restricted(current), models[0], noise_left)
+    limit = _contention(
+        small, criteria, evaluator.restricted(current), models[0], noise_left,
+        None if rival is None else evaluator.restricted(rival),
+    )  # fmt: skip
     count = settings.forward.fitted_to_all
     kept = [m for k, m in enumerate(models) if k < count or criteria(m, noise_left) < limit]
     return parallel_map(partial(fit_to_all, evaluator, warm_start=warm_start), kept)
@@ -264,9 +272,12 @@ def _contention(
     current: FittedModel,
     best: FittedModel,
     noise: Noise,
+    rival: FittedModel | None,
 ) -> float:
     """Criterion below which a candidate may still win."""
     settings, least = evaluator.settings.forward, criteria(best, noise)
+    if rival is not None:
+        least = min(least, criteria(rival, noise))
     gained = criteria(current, noise) - least
     return least + max(settings.contender_criterion, settings.contender_share * gained)
 

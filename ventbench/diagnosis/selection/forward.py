@@ -10,12 +10,12 @@ there must pass a test that chance passes in at most 1 % of recordings
 (:func:`~ventbench.diagnosis.selection.held_out_test.passes_heldout_test`), or, where the training
 breaths ask for it clearly, a cross-validated one; and it must not be a negligible strength that
 trims other terms. If it is, and nothing else explains as much, a term that explains much is part of
-the search and is judged at its end. Shape parameters of the new term are freed if both criteria ask
-for it, and earlier terms that the new one makes redundant are dropped. Patient effort has
-parameters of its own in each breath and can imitate any sum of effects, so effects that are the
-same in all breaths come first, and effort has to explain more than slowly varying sensor noise
-would. The search ends when no candidate passes and no pair of terms can be exchanged for others
-(:mod:`ventbench.diagnosis.selection.pair_exchange`).
+the models that are compared from then on, and is not named in the end. Shape parameters of the new
+term are freed if both criteria ask for it, and earlier terms that the new one makes redundant are
+dropped. Patient effort has parameters of its own in each breath and can imitate any sum of effects,
+so effects that are the same in all breaths come first, and effort has to explain more than slowly
+varying sensor noise would. The search ends when no candidate passes and no pair of terms can be
+exchanged for others (:mod:`ventbench.diagnosis.selection.pair_exchange`).
 """
 
 from __future__ import annotations
@@ -43,7 +43,11 @@ from ventbench.diagnosis.selection.held_out_test import (
 )
 from ventbench.diagnosis.selection.pair_exchange import replace_pair
 from ventbench.diagnosis.selection.screening import screen_mechanisms
-from ventbench.diagnosis.selection.shape_parameters import free_shape_parameters
+from ventbench.diagnosis.selection.shape_parameters import (
+    free_shape_parameters,
+    shapes_at_default,
+)
+from ventbench.physics.catalogue import mechanism
 
 #: Values of the lung that a search may hold at the label.
 _LUNG = ("R", "C")
@@ -60,6 +64,7 @@ def forward_selection(
     start: FittedModel,
     tell: Progress,
     replacement: Replacement = lambda _: None,
+    interrupt: Callable[[FittedModel], bool] = lambda _: False,
 ) -> tuple[FittedModel, list[Comparison]]:
     """Add terms while held-out breaths ask for them, and drop terms that become redundant.
 
@@ -69,6 +74,7 @@ def forward_selection(
         tell: called with a description of each step before it runs.
         replacement: returns, if there is one, a simpler model once there are several terms, and at
             the end.
+        interrupt: is asked before terms are exchanged, and ends the search if it returns True.
 
     Returns:
         The selected model and all comparisons; no comparisons if the model is a replacement.
@@ -89,10 +95,14 @@ def forward_selection(
             best = _trim(evaluator, comparison, trims)
             trims |= set(best.names[-1:]) if best is not None else set()
         if best is None:
-            best = replace_pair(evaluator, current)
-            if best is None:
+            if len(current.names) > 1 and interrupt(current):
                 break
-            current = best
+            other = _free_earlier_shapes(evaluator, current) or replace_pair(evaluator, current)
+            if other is None:
+                break
+            current = drop_redundant_terms(
+                evaluator, other, [name for name in other.names if name not in trims]
+            )
             continue
         shaped = free_shape_parameters(evaluator, best)
         if shaped.hypothesis != best.hypothesis:
@@ -105,12 +115,23 @@ def forward_selection(
         instead = replacement(current)
         if instead is not None:
             return instead, []
-    if trims & set(current.names):
-        trimmed = [name for name in current.names if name in trims]
-        others = [name for name in current.names if name not in trims]
-        current = drop_redundant_terms(evaluator, current, [*trimmed, *others])
+    current = _drop_idle_trims(evaluator, current, trims)
     instead = replacement(current)
     return (current, comparisons) if instead is None else (instead, [])
+
+
+def _free_earlier_shapes(evaluator: Evaluator, current: FittedModel) -> FittedModel | None:
+    """The model with shapes of its earlier terms free; None if the recording asks for none.
+
+    While much else was missing, another shape of an earlier term may have explained nothing.
+    """
+    shaped = current
+    for name in current.names[:-1]:
+        if shapes_at_default(shaped, name):
+            shaped = free_shape_parameters(evaluator, shaped, name)
+    if shaped.hypothesis == current.hypothesis:
+        return None
+    return fit_with_noise(evaluator, shaped.hypothesis, shaped)
 
 
 def _accepted(evaluator: Evaluator, comparison: Comparison) -> FittedModel | None:
@@ -131,6 +152,8 @@ def _accepted(evaluator: Evaluator, comparison: Comparison) -> FittedModel | Non
     best = _refit(evaluator, first)
     without = _without(evaluator, comparison, best)
     if is_negligible(evaluator, best, without, first.name):
+        if mechanism(first.name).description.ubiquitous:
+            return None  # what acts alike explains the same little
         return _fallback(evaluator, comparison)
     if not varies_by_breath(first.name) or exceeds_sensor_noise(evaluator, best):
         return best
@@ -172,13 +195,28 @@ def _trim(
     """The best candidate, if it is needed and explains much, however small it is.
 
     Some hundredths of 1 mL/cmH2O before a high resistance decide what is read 2 ms after an edge,
-    and hide what else is missing. Such a term is part of the search, and is judged at its end.
+    and hide what else is missing. Such a term is part of the models that are compared, and is not
+    named in the end.
     """
     first, settings = comparison.ranked[0], evaluator.settings.forward
     gained = evaluator.criterion(comparison.base, first.fitted.noise) - first.criterion
     if varies_by_breath(first.name) or first.name in known or gained < settings.large_gain:
         return None
     return _if_needed(evaluator, comparison, first, least=False)
+
+
+def _drop_idle_trims(
+    evaluator: Evaluator, current: FittedModel, trims: Collection[str]
+) -> FittedModel:
+    """Drop small terms that later ones have made idle, and judge the others without them."""
+    before = current
+    for name in (name for name in before.names if name in trims):
+        without = evaluator.fit(current.hypothesis.without(name), current.noise, current)
+        if not is_needed(evaluator, current, without):
+            current = without
+    if current is before:
+        return current
+    return drop_redundant_terms(evaluator, current, [n for n in current.names if n not in trims])
 
 
 def _fallback(evaluator: Evaluator, comparison: Comparison) -> FittedModel | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from functools import partial
 from itertools import combinations, product
+from typing import Any
 
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
@@ -20,7 +21,11 @@ from ventbench.diagnosis.selection.candidate_comparison import (
     hopeless_above,
 )
 from ventbench.diagnosis.selection.held_out_test import passes_heldout_test
-from ventbench.diagnosis.selection.shape_parameters import fit_with_shape, shapes_at_default
+from ventbench.diagnosis.selection.shape_parameters import (
+    fit_with_shape,
+    shape_starts,
+    shapes_at_default,
+)
 from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import mechanism
 
@@ -36,7 +41,9 @@ def replace_pair(evaluator: Evaluator, current: FittedModel) -> FittedModel | No
     shape free or from its grid: a valve with a second lag instead of a circuit behind a valve with
     one, or an inertance with more tubing before it.
     """
+    small, first = evaluator.for_ranking, evaluator.restricted(current)
     names = [name for name in current.names if not varies_by_breath(name)]
+    settings = evaluator.settings
     pairs = list(combinations(names, 2))
     work = [
         (current.hypothesis.without(*pair), name, start)
@@ -45,18 +52,15 @@ def replace_pair(evaluator: Evaluator, current: FittedModel) -> FittedModel | No
         for start in _grid_starts(name)
     ]
     alone = [
-        (current.hypothesis.without(*pair), name, start)
+        (current.hypothesis.without(*pair), dropped, form, start)
         for pair in pairs
-        for name in pair
-        for start in _grid_starts(name)
-        if start or shapes_at_default(current, name)
+        for dropped, kept in (pair, pair[::-1])
+        for form, start in _other_forms(first, kept)
     ]
     if not work and not alone:
         return None
 
-    small, first = evaluator.for_ranking, evaluator.restricted(current)
-    settings, reached = evaluator.settings, cost_at(first, current.noise)
-    limits = {}
+    reached, limits = cost_at(first, current.noise), {}
     for pair in pairs:
         rest = current.hypothesis.without(*pair)
         without = small.fit(rest, current.noise, first, tolerance=settings.fit.quick_tolerance)
@@ -67,9 +71,9 @@ def replace_pair(evaluator: Evaluator, current: FittedModel) -> FittedModel | No
         rest, name, start = job
         return _begun(small, rest.plus(Hypothesis((name,))), first, start)
 
-    def fitted(job: tuple[Hypothesis, str, dict[str, float]]) -> FittedModel:
-        rest, name, start = job
-        return small.fit(rest.plus(Hypothesis((name,))), current.noise, first, start)
+    def begun_alone(job: tuple[Hypothesis, str, Hypothesis, dict[str, Any]]) -> FittedModel:
+        _, dropped, form, start = job
+        return _begun(small, current.hypothesis.without(dropped).plus(form), first, start)
 
     def freest(model: FittedModel) -> FittedModel:
         for path in (path for name in model.names for path in shapes_at_default(model, name)):
@@ -84,17 +88,35 @@ def replace_pair(evaluator: Evaluator, current: FittedModel) -> FittedModel | No
     joined = [
         model for rest in limits for model in _joined_rivals(small, rest, singles, limits[rest])
     ]
-    ended = parallel_map(lambda m: small.fit(m.hypothesis, current.noise, m), [*rivals, *joined])
+    formed = [
+        model
+        for (rest, *_), model in zip(alone, parallel_map(begun_alone, alone), strict=True)
+        if cost_of(model) < limits[rest]
+    ]
+    count = settings.forward.exchanged_pairs
+    best_twos = sorted(joined, key=cost_of)[:count] + sorted(formed, key=cost_of)[:count]
+    ended = parallel_map(
+        lambda model: small.fit(model.hypothesis, current.noise, model), [*rivals, *best_twos]
+    )
     close = [model for model in ended[: len(rivals)] if small.criterion(model) < limit]
     # Two rivals may need a shape before they come close: a valve that opens slowly, and a circuit.
-    freer = parallel_map(freest, close + ended[len(rivals) :] + parallel_map(fitted, alone))
+    far = limit + settings.forward.large_gain
+    shaped = [model for model in ended[len(rivals) :] if small.criterion(model) < far]
+    freer = parallel_map(freest, close + shaped)
     close = [model for model in freer if small.criterion(model) < limit]
     models = parallel_map(partial(fit_to_all, evaluator, warm_start=current), close)
     criterion = evaluator.criterion(current)
     best = min(models, key=evaluator.criterion, default=None)
     if best is None or evaluator.criterion(best) >= criterion:
         return None
-    if not all(is_plausible(best, name, settings.plausibility) for name in best.names):
+    small_before = {
+        name for name in names if not is_plausible(current, name, settings.plausibility)
+    }
+    if not all(
+        is_plausible(best, name, settings.plausibility)
+        for name in best.names
+        if name not in small_before
+    ):
         return None
     held_out = evaluator.held_out_log_likelihood(current)
     lost = held_out - evaluator.held_out_log_likelihood(best)
@@ -104,7 +126,7 @@ def replace_pair(evaluator: Evaluator, current: FittedModel) -> FittedModel | No
 
 
 def _begun(
-    small: Evaluator, hypothesis: Hypothesis, first: FittedModel, start: dict[str, float]
+    small: Evaluator, hypothesis: Hypothesis, first: FittedModel, start: dict[str, Any]
 ) -> FittedModel:
     """A few steps of a fit."""
     steps = small.settings.fit.start_iterations
@@ -158,6 +180,17 @@ def _forms(name: str) -> list[tuple[Hypothesis, dict[str, float]]]:
         for value in about.grid
         if value != about.neutral
     ]
+
+
+def _other_forms(current: FittedModel, name: str) -> list[tuple[Hypothesis, dict[str, Any]]]:
+    """A selected mechanism with a shape free, or from other settings of its grids."""
+    own = Hypothesis((name,))
+    shaped = [
+        (Hypothesis((name,), (path,)), start)
+        for path in shapes_at_default(current, name)
+        for start in shape_starts(current, path)
+    ]
+    return shaped + [(own, start) for start in _grid_starts(name) if start]
 
 
 def _rivals(evaluator: Evaluator, current: FittedModel, pair: tuple[str, ...]) -> list[str]:

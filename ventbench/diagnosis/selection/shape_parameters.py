@@ -1,4 +1,4 @@
-"""Shape parameters of a hypothesis's newest term, and other starts of dead times.
+"""Shape parameters of a hypothesis's terms, and other starts of dead times.
 
 An exponent, a recovery time or a second lag stays at its default unless the recording asks for
 another value. Mechanisms that act alike may differ by their shape alone, so that rivals are
@@ -19,13 +19,20 @@ from ventbench.system_id.noise import Noise
 from ventbench.system_id.problem import parameter_of
 
 
-def free_shape_parameters(evaluator: Evaluator, current: FittedModel) -> FittedModel:
-    """Free the shape parameters of the newest term that the recording asks for, and no others.
+def free_shape_parameters(
+    evaluator: Evaluator, current: FittedModel, name: str | None = None
+) -> FittedModel:
+    """Free the shape parameters of a term that the recording asks for, and no others.
 
     Screening frees a shape that promises more than the default one. Where the fit needs no such
     freedom, the default returns.
+
+    Args:
+        evaluator: evaluator of the recording.
+        current: the model.
+        name: the term; the newest one if None.
     """
-    name = current.hypothesis.names[-1]
+    name = name or current.hypothesis.names[-1]
     for about in mechanism(name).description.parameters:
         path = f"{name}.{about.name}"
         if not about.shape or about.discrete:
@@ -50,7 +57,20 @@ def free_shape_parameters(evaluator: Evaluator, current: FittedModel) -> FittedM
 def fit_with_shape(
     evaluator: Evaluator, model: FittedModel, path: str, noise: Noise
 ) -> FittedModel:
-    """Fit a model with a shape parameter of its newest term free as well.
+    """Fit a model with a shape parameter free as well, from the best of :func:`shape_starts`."""
+    name = path.rpartition(".")[0]
+    freed = model.hypothesis.plus(Hypothesis((name,), (path,)))
+    fits = parallel_map(
+        lambda start: evaluator.fit(
+            freed, noise, model, start, restart=bool(start) and varies_by_breath(name)
+        ),
+        shape_starts(model, path),
+    )
+    return min(fits, key=lambda fitted: fitted.minimum.cost)
+
+
+def shape_starts(model: FittedModel, path: str) -> list[dict[str, Any]]:
+    """Values that the fit of a shape parameter starts from, by path.
 
     A lag that was fitted alone is as long as the two that it stands for, and a dead time before it
     makes up for what is left: neither moves by itself. A parameter that can be exchanged with
@@ -59,7 +79,6 @@ def fit_with_shape(
     to another one, starts from the values of its grid as well.
     """
     name, _, short = path.rpartition(".")
-    freed = model.hypothesis.plus(Hypothesis((name,), (path,)))
     about = parameter_of(path)
     starts: list[dict[str, Any]] = [{}, *({path: v} for v in about.grid if v != about.neutral)]
     for pair in mechanism(name).description.interchangeable:
@@ -67,13 +86,7 @@ def fit_with_shape(
             other = f"{name}.{pair[1 - pair.index(short)]}"
             halves = dict.fromkeys((path, other), 0.5 * model.column(other))
             starts += [halves | shift for shift in ({}, *other_dead_times(model))]
-    fits = parallel_map(
-        lambda start: evaluator.fit(
-            freed, noise, model, start, restart=bool(start) and varies_by_breath(name)
-        ),
-        starts,
-    )
-    return min(fits, key=lambda fitted: fitted.minimum.cost)
+    return starts
 
 
 def shapes_at_default(model: FittedModel, name: str | None = None) -> list[str]:

@@ -38,6 +38,7 @@ class CircuitCompliance(Mechanism):
         detectable=0.4,
         least=0.3,
         least_reason="a syringe's worth of tubing; less moves no edge of 30 samples a second",
+        ubiquitous=True,
     )
 
     # Behind 5 cmH2O/(L/s) it fills within 15 ms: at 7 ms a step, a fit finds 3 % too much of it.

@@ -12,6 +12,9 @@ from ventbench.physics.parameters import Parameter
 #: Share of the capacity up to which the curve is followed.
 _FULL = 0.97
 
+#: Order of the recoil's series near zero, whose next term is below 1e-10.
+_ORDER = 6
+
 
 class NonlinearCompliance(Mechanism):
     """A recoil that rises faster than volume."""
@@ -21,7 +24,7 @@ class NonlinearCompliance(Mechanism):
         title="lung that stiffens as it fills",
         site="alveolus",
         equation=(
-            "P_elastic = (-(1 - sigmoid) ln(1 - x) + sigmoid artanh x) / stiffening, "
+            "P_elastic = (ln(1 + sigmoid x) - ln(1 - x)) / (1 + sigmoid) / stiffening, "
             "x = stiffening V / C"
         ),
         parameters=(
@@ -38,9 +41,10 @@ class NonlinearCompliance(Mechanism):
             Parameter(
                 "sigmoid",
                 "1",
-                "0 for an exponential curve, 1 for the upper half of a sigmoid",
+                "0 for an exponential curve, 1 for the upper half of a sigmoid, more for one whose "
+                "middle lies above zero pressure",
                 0.0,
-                1.0,
+                4.0,
                 0.0,
                 0.0,
                 0.0,
@@ -50,8 +54,9 @@ class NonlinearCompliance(Mechanism):
         ),
         source=(
             "Exponential pressure-volume curve of Salazar and Knowles (J. Appl. Physiol. "
-            "19, 1964, 97), or the upper half of the sigmoid of Venegas, Harris and Simon (J. "
-            "Appl. Physiol. 84, 1998, 389). 5 to 50 % of the volume missing at 30 cmH2O."
+            "19, 1964, 97), or the sigmoid of Venegas, Harris and Simon (J. Appl. Physiol. 84, "
+            "1998, 389), as a function of the volume above that at zero pressure. 5 to 50 % of the "
+            "volume missing at 30 cmH2O."
         ),
         signature=(
             "Pressure rises faster at high volume: end of inspiration of big breaths; "
@@ -75,28 +80,28 @@ class NonlinearCompliance(Mechanism):
         linear = network.elastance * view.volume  # cmH2O
         full = k * linear > _FULL  # from here on the curve goes on as its tangent
         within = jnp.where(full, _FULL / jnp.where(full, k, 1.0), linear)
-        x, share = k * within, jnp.where(k > 0.0, values["sigmoid"], 0.0)  # none softens
-        rising = jnp.maximum(x, 0.0)
-        slope = (1.0 - share) / (1.0 - x) + share / (1.0 - rising**2)
-        ratio = (1.0 - share) * _log_ratio(x) + share * _artanh_ratio(rising)
-        recoil = within * ratio + (linear - within) * slope
+        x = k * within
+        # Below the volume at zero pressure, and where the lung softens, the curve is exponential.
+        sigmoid = jnp.where(x > 0.0, jnp.where(k > 0.0, values["sigmoid"], 0.0), 0.0)
+        slope = 1.0 / ((1.0 - x) * (1.0 + sigmoid * x))
+        recoil = within * _recoil_ratio(x, sigmoid) + (linear - within) * slope
         return network.plus(recoil=recoil - linear, elastance=(slope - 1.0) * network.elastance)
 
 
-def _log_ratio(x: Array) -> Array:
-    """Return ``-ln(1 - x) / x``, for any ``x`` below 1 and with its derivatives at zero."""
+def _recoil_ratio(x: Array, sigmoid: Array) -> Array:
+    """Recoil over the linear lung's, for any ``x`` below 1 and with its derivatives at zero.
+
+    The slope ``1 / ((1 - x)(1 + sigmoid x))`` is the series of ``c_n x^n`` with
+    ``c_n = 1 - sigmoid c_(n - 1)``.
+    """
     small = jnp.abs(x) < 1e-2
     safe = jnp.where(small, 0.5, x)
-    series = 1.0 + x * (1 / 2 + x * (1 / 3 + x * (1 / 4 + x * (1 / 5 + x * (1 / 6 + x / 7)))))
-    return jnp.where(small, series, -jnp.log1p(-safe) / safe)
-
-
-def _artanh_ratio(x: Array) -> Array:
-    """Return ``artanh(x) / x``, for any ``x`` within -1..1 and with its derivatives at zero."""
-    small = jnp.abs(x) < 1e-2
-    safe = jnp.where(small, 0.5, x)
-    series = 1.0 + x**2 * (1 / 3 + x**2 * (1 / 5 + x**2 / 7))
-    return jnp.where(small, series, jnp.arctanh(safe) / safe)
+    c, series = jnp.ones_like(x), jnp.ones_like(x)
+    for power in range(1, _ORDER + 1):
+        c = 1.0 - sigmoid * c
+        series = series + c * x**power / (power + 1)
+    exact = (jnp.log1p(sigmoid * safe) - jnp.log1p(-safe)) / ((1.0 + sigmoid) * safe)
+    return jnp.where(small, series, exact)
 
 
 MECHANISM = NonlinearCompliance()

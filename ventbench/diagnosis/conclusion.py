@@ -202,8 +202,10 @@ class _GainScatter:
 
     def __call__(self, selected: FittedModel) -> bool:
         """Whether the gains scatter, if all breaths have had the same one so far."""
-        if not self._evaluator.gain_sd:
-            self.sd = gain_scatter(self._evaluator, selected)
+        evaluator = self._evaluator
+        if not evaluator.gain_sd:
+            sd = gain_scatter(evaluator, selected)
+            self.sd = sd if sd <= evaluator.settings.latent_inputs.early_scatter else 0.0
         return bool(self.sd)
 
 

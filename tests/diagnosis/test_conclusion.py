@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ventbench.diagnosis import conclusion
 from ventbench.diagnosis.conclusion import (
     _better_selection,
     conclude,
@@ -220,3 +221,15 @@ def test_a_mechanism_or_nothing_is_enough_among_all_terms():
     nothing = concluded(small.made(seed=1), small.ALL_TERMS)
     assert nothing.names == ()
     assert nothing.unnamed is None
+
+
+@pytest.mark.parametrize(("sd", "early"), [(0.02, True), (0.2, False), (0.0, False)])
+def test_gains_that_scatter_as_those_of_one_valve_do_end_the_first_search(sd, early, monkeypatch):
+    """More may be several rigs, or a name that is not right yet."""
+    monkeypatch.setattr(conclusion, "gain_scatter", lambda evaluator, selected: sd)
+    selected: Any = None
+    scatter = conclusion._GainScatter(SimpleNamespace(gain_sd=0.0, settings=small.SETTINGS))  # type: ignore[arg-type]
+    assert scatter(selected) is early
+    assert scatter.sd == (sd if early else 0.0)
+    found = conclusion._GainScatter(SimpleNamespace(gain_sd=0.05, settings=small.SETTINGS))  # type: ignore[arg-type]
+    assert not found(selected)  # each breath has its gain already

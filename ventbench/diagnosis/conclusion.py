@@ -111,7 +111,7 @@ def conclude(
     else:
         selected, comparisons = base, []
     if scatter.sd:
-        # Exchanges are many fits; those at gains that are no gains would be lost.
+        # Exchanges are many fits, and would be repeated with the gains.
         return _with_gains(evaluator, wider, scatter.sd, tell, selected)
     if earlier is not None and not set(earlier.names) <= set(selected.names):
         # Gains of the breaths' own can stand for a bent valve in the first rounds of a selection.

@@ -160,9 +160,9 @@ def best_term(wide: Evaluator, selected: FittedModel) -> NonparametricFit | None
 def _is_negligible_term(
     wide: Evaluator, selected: FittedModel, with_term: FittedModel, nats: float
 ) -> bool:
-    """Whether a nonparametric term beside names explains little of the error.
+    """Whether a nonparametric term beside names explains a small error, and little of it.
 
-    It does if it explains less than half of the noise, and where it explains little beside names.
+    A small error is little if it is less than half of the noise, or if the names explain far more.
     """
     if not selected.names:
         return False

@@ -109,13 +109,13 @@ def replace_pair(evaluator: Evaluator, current: FittedModel) -> FittedModel | No
     best = min(models, key=evaluator.criterion, default=None)
     if best is None or evaluator.criterion(best) >= criterion:
         return None
-    small_before = {
+    already_small = {
         name for name in names if not is_plausible(current, name, settings.plausibility)
     }
     if not all(
         is_plausible(best, name, settings.plausibility)
         for name in best.names
-        if name not in small_before
+        if name not in already_small
     ):
         return None
     held_out = evaluator.held_out_log_likelihood(current)

@@ -332,11 +332,33 @@ def test_strong_lags_are_told_from_a_lung_without_resistance():
     refitted = fit_with_noise(evaluator, Hypothesis())
     assert refitted.column("R")[0] < 2.0
     assert is_far_from_label(evaluator, refitted)
-    named, _ = selection_at_label(evaluator, quiet, lambda _: None)
+    better = selection_at_label(evaluator, refitted, quiet, lambda _: None)
+    assert better is not None
+    named, _ = better
     assert set(named.names) == {"sensor_lag", "valve_delay"}
     assert named.column("R")[0] == pytest.approx(51.3, rel=0.1)
     assert "R" not in dict(named.hypothesis.fixed)
     assert not is_far_from_label(evaluator, named)
+
+
+@pytest.mark.parametrize(("name", "goes_on"), [("leak", False), ("turbulent_resistance", True)])
+def test_the_search_at_the_label_is_left_where_more_terms_do_no_better(
+    turbulent, both, monkeypatch, name, goes_on
+):
+    searches = []
+
+    def search(evaluator, start, *rest, max_terms=None):
+        searches.append(max_terms)
+        return evaluator.fit(start.hypothesis.plus(Hypothesis((name,))), start.noise, start), []
+
+    monkeypatch.setattr(forward, "forward_selection", search)
+    selected = both[0] if name == "leak" else both[1]
+    limits = dataclasses.replace(turbulent.settings.forward, more_at_label=1 - len(selected.names))
+    settings = dataclasses.replace(turbulent.settings, forward=limits)
+    evaluator = dataclasses.replace(turbulent, settings=settings)
+    better = selection_at_label(evaluator, selected, quiet, lambda _: None)
+    assert searches == ([1, None] if goes_on else [1])
+    assert (better is not None) == goes_on
 
 
 def test_only_one_label_can_be_held(turbulent, both):

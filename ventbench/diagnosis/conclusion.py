@@ -120,8 +120,9 @@ def conclude(
         other = forward_selection(evaluator, start, tell, single)
         selected, comparisons = _better_selection(evaluator, (selected, comparisons), other)
     if is_far_from_label(evaluator, selected):
-        other = selection_at_label(evaluator, tell, single)
-        selected, comparisons = _better_selection(evaluator, (selected, comparisons), other)
+        other = selection_at_label(evaluator, selected, tell, single)
+        if other is not None:
+            selected, comparisons = _better_selection(evaluator, (selected, comparisons), other)
     known: Replacements = {}
     for _ in range(evaluator.settings.refinement.exchanges):
         if len(selected.names) < 2:  # nothing came after the first

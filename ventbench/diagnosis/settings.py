@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 #: Raised when a value or the meaning of a setting changes.
-VERSION = "selection-10"
+VERSION = "selection-11"
 
 
 @dataclass(frozen=True)
@@ -154,6 +154,8 @@ class ForwardSelectionSettings:
         max_rounds: most comparisons; a term that was dropped may come back, but not for ever.
         label_factor: factor between a lung's R or C and its label beyond which the search is
             repeated with R and C at the label. Labels that are wrong by less move none.
+        more_at_label: terms that the search at the label may have more than the one with R and C
+            free before it must do better: three effects have been missed for one.
         kept_terms: terms of a selection with one gain from which a selection with a gain for each
             breath only goes on from it, and does not begin anew.
         replacement_terms: terms from which a single nonparametric term is tried in their place.
@@ -178,6 +180,7 @@ class ForwardSelectionSettings:
     max_terms: int = 6
     max_rounds: int = 14
     label_factor: float = 1.5
+    more_at_label: int = 2
     kept_terms: int = 3
     replacement_terms: int = 4
     shared_effect_share: float = 0.5

@@ -65,6 +65,7 @@ def forward_selection(
     tell: Progress,
     replacement: Replacement = lambda _: None,
     interrupt: Callable[[FittedModel], bool] = lambda _: False,
+    max_terms: int | None = None,
 ) -> tuple[FittedModel, list[Comparison]]:
     """Add terms while held-out breaths ask for them, and drop terms that become redundant.
 
@@ -75,14 +76,16 @@ def forward_selection(
         replacement: returns, if there is one, a simpler model once there are several terms, and at
             the end.
         interrupt: is asked before terms are exchanged, and ends the search if it returns True.
+        max_terms: number of terms at which the search ends; that of the settings if None.
 
     Returns:
         The selected model and all comparisons; no comparisons if the model is a replacement.
     """
     current, comparisons = start, []
     settings, trims = evaluator.settings, set[str]()
+    most = settings.forward.max_terms if max_terms is None else max_terms
     for _ in range(settings.forward.max_rounds):
-        if len(current.names) == settings.forward.max_terms:
+        if len(current.names) >= most:
             break
         tell(f"comparing mechanisms ({len(current.names)} selected)")
         white = fit_with_white_noise(evaluator, current)
@@ -272,25 +275,33 @@ def is_far_from_label(evaluator: Evaluator, selected: FittedModel) -> bool:
 
 
 def selection_at_label(
-    evaluator: Evaluator, tell: Progress, replacement: Replacement
-) -> tuple[FittedModel, list[Comparison]]:
-    """Select terms with R and C at the label, free R and C, and go on.
+    evaluator: Evaluator, selected: FittedModel, tell: Progress, replacement: Replacement
+) -> tuple[FittedModel, list[Comparison]] | None:
+    """Select terms with R and C at the label, free R and C, and go on; None if that is no better.
 
     Strong lags let a refit take R to nothing, and three or four terms then imitate what the lags do
     in a lung without resistance. No step from there leads back. At the label the lags are found at
     once; the caller chooses between the two results.
 
+    Where R or C is far from its label because it depends on volume, or the label is wrong, the
+    search at the label adds term after term. It ends once it has a few more than the selected ones,
+    and is left if they do no better.
+
     Args:
         evaluator: evaluator of a recording of one lung.
+        selected: the terms that were selected with R and C free.
         tell: called with a description of each step before it runs.
         replacement: see :func:`forward_selection`.
     """
-    label = evaluator.at_label
+    label, settings = evaluator.at_label, evaluator.settings.forward
     assert label is not None, "a recording of several labels is not searched at one"
     tell("searching with the labelled lung")
-    held, _ = forward_selection(evaluator, fit_with_noise(evaluator, label), tell)
+    most = min(settings.max_terms, len(selected.names) + settings.more_at_label)
+    held, _ = forward_selection(evaluator, fit_with_noise(evaluator, label), tell, max_terms=most)
     fixed = tuple((path, value) for path, value in held.hypothesis.fixed if path not in _LUNG)
     free = fit_with_noise(evaluator, replace(held.hypothesis, fixed=fixed), held)
-    return forward_selection(
-        evaluator, drop_redundant_terms(evaluator, free, free.names), tell, replacement
-    )
+    free = drop_redundant_terms(evaluator, free, free.names)
+    against = evaluator.fit(selected.hypothesis, free.noise, selected)
+    if len(held.names) >= most and evaluator.criterion(free) > evaluator.criterion(against):
+        return None
+    return forward_selection(evaluator, free, tell, replacement)

@@ -11,7 +11,7 @@ from ventbench.errors import InputError
 from ventbench.validation.challenge.cases import Effect
 from ventbench.validation.challenge.figures import Figure
 from ventbench.validation.challenge.judge import judge
-from ventbench.validation.challenge.reveal import ChallengeResult
+from ventbench.validation.challenge.reveal import ChallengeResult, Draw
 from ventbench.validation.code_version import code_version
 from ventbench.validation.real_rig_proof import Claim, Proof
 from ventbench.validation.results_page import (
@@ -43,17 +43,21 @@ def test_a_challenge_tells_its_seed_its_commitment_and_its_code() -> None:
         drawn("single", leak), [0.1], answer("named", mechanism("valve_lag"), slot="f(V)")
     )
     result = ChallengeResult(
-        "abc123", ("case_0003",), (right, wrong), (
+        (Draw("abc123", 40, 1), Draw("def456", 8, 1)), ("case_0003",), (right, wrong), (
             Figure("strong: right name", 0.9, ">= 98%", 20, (0.7, 0.97), False),
             Figure("seconds a case, median", 5.25, "", 20, None, None),
             Figure("nothing missing: false names", None, "<= 0%", 0, None, None),
         ),
         {"leak": {"leak": 5, **{f"name {k}": 1 for k in range(8)}}}, {}, ("1a2b3c",), "stranger",
     )  # fmt: skip
-    text = challenge_section(result, seed="words", total=48)
-    assert "ventbench challenge make --generator stranger --seed words --cases 48" in text
-    assert "Generator `stranger`, code 1a2b3c, seed `words`, commitment\n`abc123`" in text
-    assert "2 of 48 cases answered" in text
+    text = challenge_section(result, ["words", "-more"])
+    make = "ventbench challenge make --generator stranger"
+    assert f"{make} --seed=words --cases 40 --out runs/strangers\n" in text
+    assert f"{make} --seed=-more --cases 8 --out runs/strangers2\n" in text
+    both = "runs/strangers runs/strangers2 --seed=words --seed=-more"
+    assert f"ventbench challenge reveal {both}\n" in text
+    assert "Generator `stranger`, code 1a2b3c:\n" in text
+    assert "| `words` | `abc123` | 1 of 40 |\n| `-more` | `def456` | 1 of 8 |" in text
     assert "Answers that are not right (1 of 2):" in text
     assert (
         "| single | R10C20 | leak (strong, below the detection limit) | valve_lag + f(V) | "

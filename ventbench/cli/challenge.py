@@ -128,8 +128,13 @@ def record(folder: Folder, seed: Seed) -> None:
 
 @challenge.command()
 def reveal(
-    folder: Folder,
-    seed: Seed,
+    folders: Annotated[
+        list[Path],
+        typer.Argument(metavar="DIR...", help="Folders of challenges from one generator."),
+    ],
+    seed: Annotated[
+        list[str], typer.Option(help="Secret seed of each folder, in the folders' order.")
+    ],
     round_: Round = 1,
     oracle: Annotated[
         bool, typer.Option("--oracle", help="Compare with fits that know the true effects; slow.")
@@ -143,14 +148,23 @@ def reveal(
 ) -> None:
     """Open the sealed answers, check all hashes, and score the diagnoses.
 
-    The exit code is 1 if a goal is missed.
+    Several draws are scored together. The exit code is 1 if a goal is missed.
 
     Example: `ventbench challenge reveal runs/challenge --seed "$SECRET" --json scores.json`
     """
+    if len(seed) != len(folders):
+        raise typer.BadParameter(
+            f"{len(folders)} folders and {len(seed)} seeds were given; give --seed once a folder",
+            param_hint="--seed",
+        )
+    if len(folders) > 1 and (oracle or round_ == 2):
+        raise typer.BadParameter("--oracle and --round 2 take one folder", param_hint="DIR")
+
     from rich.console import Console
 
     from ventbench.cli.options import bars
     from ventbench.validation.challenge.folder import ChallengeFolder
+    from ventbench.validation.challenge.reveal import pool
     from ventbench.validation.challenge.reveal import reveal as work
     from ventbench.validation.results_page import challenge_section, write_section
 
@@ -160,16 +174,18 @@ def reveal(
         def progress(done: int, total: int) -> None:
             shown.update(task, completed=done, total=total)
 
-        place = folder if scheduler is None else folder.resolve()
-        result = work(
-            ChallengeFolder(place, round_), seed, with_oracle=oracle, jobs=jobs,
-            scheduler=scheduler, progress=progress,
-        )  # fmt: skip
+        results = []
+        for folder, secret in zip(folders, seed, strict=True):
+            place = folder if scheduler is None else folder.resolve()
+            opened = work(
+                ChallengeFolder(place, round_), secret, with_oracle=oracle, jobs=jobs,
+                scheduler=scheduler, progress=progress,
+            )  # fmt: skip
+            results.append(opened)
+        result = pool(results)
     emit(result.as_dict(), json)
     if page is not None:
-        total = len(ChallengeFolder(folder).cases())
-        text = challenge_section(result, seed=seed, total=total)
-        write_section(page, f"challenge {result.generator}", text)
+        write_section(page, f"challenge {result.generator}", challenge_section(result, seed))
     console = Console(stderr=str(json) == "-")
     _show(result, console)
     if any(figure.met is False for figure in result.figures):
@@ -177,7 +193,8 @@ def reveal(
 
 
 def _show(result: Any, console: Any) -> None:
-    console.print(f"commitment {result.commitment}: kept", highlight=False)
+    for draw in result.draws:
+        console.print(f"commitment {draw.commitment}: kept", highlight=False)
     console.print(_confusion(result))
     console.print(_figures(result))
     if result.unanswered:

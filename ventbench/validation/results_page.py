@@ -6,7 +6,7 @@ what is written replaces what stood there, so that no figure is copied by hand.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,27 +49,38 @@ def write_section(path: Path, name: str, text: str) -> None:
     files.write_text(path, before[:start] + section + before[end + len(last) :])
 
 
-def challenge_section(result: ChallengeResult, *, seed: str, total: int) -> str:
+def challenge_section(result: ChallengeResult, seeds: Sequence[str]) -> str:
     """Figures of a challenge as Markdown, with the commands and what was committed.
 
     Args:
-        result: opened challenge.
-        seed: its seed.
-        total: number of its cases, answered or not.
+        result: opened challenge, of one or more draws.
+        seeds: seed of each draw.
     """
     source = result.generator
     folder = "runs/strangers" if source == "stranger" else "runs/challenge"
+    draws = dict(zip(seeds, result.draws, strict=True))
+    folders = {s: f"{folder}{k}" if k > 1 else folder for k, s in enumerate(draws, start=1)}
     versions = ", ".join(result.versions) or "unknown"
-    lines = [
-        "```sh",
-        f"ventbench challenge make --generator {source} --seed {seed} --cases {total} "
-        f"--out {folder}",
-        f"ventbench challenge answer {folder} --jobs 1",
-        f"ventbench challenge reveal {folder} --seed {seed}",
+    lines = ["```sh"]
+    for seed, draw in draws.items():
+        lines += [
+            f"ventbench challenge make --generator {source} --seed={seed} --cases {draw.total} "
+            f"--out {folders[seed]}",
+            f"ventbench challenge answer {folders[seed]} --jobs 1",
+        ]
+    given = " ".join(f"--seed={seed}" for seed in draws)
+    lines += [
+        f"ventbench challenge reveal {' '.join(folders.values())} {given}",
         "```",
         "",
-        f"Generator `{source}`, code {versions}, seed `{seed}`, commitment",
-        f"`{result.commitment}`; {len(result.cases)} of {total} cases answered.",
+        f"Generator `{source}`, code {versions}:",
+        "",
+        "| seed | commitment | answered |",
+        "|---|---|---|",
+        *(
+            f"| `{seed}` | `{draw.commitment}` | {draw.answered} of {draw.total} |"
+            for seed, draw in draws.items()
+        ),
         "",
         "| figure | measured | 95 % | cases | goal | met |",
         "|---|---|---|---|---|---|",

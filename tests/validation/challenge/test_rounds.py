@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -20,7 +21,7 @@ from ventbench.validation.challenge import reveal as reveal_module
 from ventbench.validation.challenge.answer import answer
 from ventbench.validation.challenge.folder import ChallengeFolder
 from ventbench.validation.challenge.make import make
-from ventbench.validation.challenge.reveal import reveal
+from ventbench.validation.challenge.reveal import pool, reveal
 from ventbench.validation.challenge.rig import record
 
 from .truths import GivenDiagnosis, mechanism, request, sees_nothing
@@ -260,10 +261,48 @@ def test_commands(answered):
     )
     assert done.exit_code in (0, 1)
     value = json.loads(done.stdout)
-    assert value["commitment"] == (answered.path / "commitment.txt").read_text().strip()
+    published = (answered.path / "commitment.txt").read_text().strip()
+    assert value["draws"] == [{"commitment": published, "total": 3, "answered": 3}]
     assert len(value["cases"]) == 3
     helped = CliRunner().invoke(app(), ["challenge", "--help"])
     assert all(name in helped.stdout for name in ("make", "answer", "record", "reveal"))
+
+
+def test_draws_are_scored_together(answered, tmp_path):
+    other = ChallengeFolder(tmp_path / "c")
+    make("other words", other.path, "null", 2, record=coarsely)
+    assert answer(other, jobs=0, diagnose=sees_nothing) == {}
+    other.answer("case_0002").unlink()
+    together = pool([reveal(answered, SECRET), reveal(other, "other words")])
+    assert [(draw.total, draw.answered) for draw in together.draws] == [(3, 3), (2, 1)]
+    assert together.unanswered == ("case_0002",)
+    assert [case.kind for case in together.cases] == ["masked"] * 3 + ["null"]
+    shares = {figure.what: figure for figure in together.figures}
+    assert shares["masked: right name and nothing else"].count <= 3
+    assert shares["nothing missing: said so"].count == 1
+    folders, seeds = (str(answered.path), str(other.path)), ("--seed", SECRET)
+    page = tmp_path / "page.md"
+    done = CliRunner().invoke(
+        app(),
+        ["challenge", "reveal", *folders, *seeds, "--seed", "other words", "--page", str(page)],
+    )
+    assert done.exit_code in (0, 1)
+    assert "| 3 of 3 |" in page.read_text()
+    assert "| 1 of 2 |" in page.read_text()
+    missing = CliRunner().invoke(app(), ["challenge", "reveal", *folders, *seeds])
+    assert missing.exit_code == 2
+    assert "2 folders and 1 seeds" in missing.output
+
+
+def test_a_draw_counts_once_and_generators_apart(answered):
+    opened = reveal(answered, SECRET)
+    with pytest.raises(InputError, match="given twice"):
+        pool([opened, opened])
+    foreign = dataclasses.replace(
+        opened, draws=(dataclasses.replace(opened.draws[0], commitment="0"),), generator="stranger"
+    )
+    with pytest.raises(InputError, match="first and stranger have figures of their own"):
+        pool([opened, foreign])
 
 
 def test_command_with_another_seed(answered):

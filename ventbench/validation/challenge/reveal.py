@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -33,11 +33,26 @@ _EFFORT = ("patient_effort.amplitude", "patient_effort.onset")
 
 
 @dataclass(frozen=True)
-class ChallengeResult:
-    """Scores of a challenge.
+class Draw:
+    """Cases that were made with one seed.
 
     Attributes:
         commitment: hash of the true answers, checked.
+        total: number of its cases that should have an answer.
+        answered: number of those that have one.
+    """
+
+    commitment: str
+    total: int
+    answered: int
+
+
+@dataclass(frozen=True)
+class ChallengeResult:
+    """Scores of a challenge, or of several draws from one generator together.
+
+    Attributes:
+        draws: where the cases are from.
         unanswered: cases without an answer; in the second round only those with a request.
         cases: the answered cases.
         figures: measured values with their goals.
@@ -47,7 +62,7 @@ class ChallengeResult:
         generator: name of the generator.
     """
 
-    commitment: str
+    draws: tuple[Draw, ...]
     unanswered: tuple[str, ...]
     cases: tuple[JudgedCase, ...]
     figures: tuple[Figure, ...]
@@ -59,7 +74,7 @@ class ChallengeResult:
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""
         return {
-            "commitment": self.commitment,
+            "draws": [asdict(draw) for draw in self.draws],
             "unanswered": list(self.unanswered),
             "figures": [asdict(figure) for figure in self.figures],
             "confusion": self.confusion,
@@ -97,15 +112,51 @@ def reveal(
         measured.append(second_round(_judged(ChallengeFolder(folder.path), truth), cases))
     if with_oracle:
         measured += _against_oracle(folder, truth, cases, (jobs, scheduler), progress)
+    expected = _expected(folder)
+    published = folder.commitment.read_text().split()[0]
     return ChallengeResult(
-        folder.commitment.read_text().split()[0],
-        tuple(name for name in _expected(folder) if name not in cases),
+        (Draw(published, len(expected), len(cases)),),
+        tuple(name for name in expected if name not in cases),
         tuple(cases.values()),
         tuple(measured),
         confusion(list(cases.values())),
         by_parameter(list(cases.values())),
         tuple(sorted({given["code"] for given in folder.answers().values() if "code" in given})),
         "stranger" if any(isinstance(d.case, StrangerCase) for d, _ in truth) else "first",
+    )
+
+
+def pool(results: Sequence[ChallengeResult]) -> ChallengeResult:
+    """Figures of several draws from one generator together, without those of an oracle.
+
+    Args:
+        results: one or more opened challenges, first rounds.
+
+    Raises:
+        InputError: if the generators differ, or a draw is given twice.
+    """
+    commitments = [draw.commitment for result in results for draw in result.draws]
+    twice = next((each for each in commitments if commitments.count(each) > 1), None)
+    if twice is not None:
+        raise InputError(f"the draw with commitment {twice} is given twice; give each draw once")
+    generators = sorted({result.generator for result in results})
+    if len(generators) > 1:
+        raise InputError(
+            f"draws from the generators {' and '.join(generators)} have figures of their own; "
+            "reveal them one at a time"
+        )
+    if len(results) == 1:
+        return results[0]
+    cases = [case for result in results for case in result.cases]
+    return ChallengeResult(
+        tuple(draw for result in results for draw in result.draws),
+        tuple(name for result in results for name in result.unanswered),
+        tuple(cases),
+        tuple(figures(cases)),
+        confusion(cases),
+        by_parameter(cases),
+        tuple(sorted({version for result in results for version in result.versions})),
+        generators[0],
     )
 
 

@@ -171,10 +171,10 @@ class Predictor:
             filled = np.resize(where, size)
             breath = filled % breaths
             with float64():
-                commands = tuple(jnp.asarray(command[breath]) for command in self._commands)
-                seen = _predict(
-                    jnp.asarray(lanes[filled]), commands, jnp.asarray(steps), **self._static
-                )
+                # The compiled function takes NumPy's arrays as they are; making JAX's of them first
+                # took a tenth of a diagnosis.
+                commands = tuple(command[breath] for command in self._commands)
+                seen = _predict(lanes[filled], commands, np.asarray(steps), **self._static)
                 return np.asarray(seen)[: len(where)]
 
         seen = parallel_map(predicted, work)

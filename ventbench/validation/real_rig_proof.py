@@ -222,6 +222,7 @@ def figures(diagnosis: Mapping[str, Any], summary: Mapping[str, Any]) -> dict[st
     loop = diagnosis["open_loop"]
     stages = {name: loop[name] for name in ("before", "refit", "after")}
     mechanisms = diagnosis["mechanisms"]
+    named_alone = summary["mae_by_names_alone"] if mechanisms else None
     wanted = summary["wanted"]
     return {
         "title": summary["title"],
@@ -231,7 +232,7 @@ def figures(diagnosis: Mapping[str, Any], summary: Mapping[str, Any]) -> dict[st
         "mae": {name: stage["mae"] for name, stage in stages.items()},
         "rmse": {name: stage["rmse"] for name, stage in stages.items()},
         "mae_by_names_alone": summary["mae_by_names_alone"],
-        "cut_percent": cut(loop["before"]["mae"], summary["mae_by_names_alone"]),
+        "cut_percent": cut(loop["before"]["mae"], named_alone),
         "noise_floor": loop["noise_floor"],
         "groups": loop["groups"],
         "verdict": diagnosis["verdict"],

@@ -35,7 +35,7 @@ from ventbench.validation.real_rig_parts import (
     slower_sensor,
     without,
 )
-from ventbench.validation.real_rig_proof import RECORDING, claims, cut, prove
+from ventbench.validation.real_rig_proof import RECORDING, claims, cut, figures, prove
 
 
 def keep(out: Path, found: Diagnosis) -> list[Path]:
@@ -287,6 +287,10 @@ def test_the_unnamed_part_does_not_count_for_the_cut(recordings, tmp_path):
     assert part["mae_by_names_alone"] == pytest.approx(one.open_loop.before.mae, rel=0.1)
     assert abs(part["cut_percent"]) < 10.0
     assert not found.met
+    kept, summary = (json.loads((tmp_path / "rc" / f"{name}.json").read_text())
+                     for name in ("diagnosis", "part"))  # fmt: skip
+    assert figures(kept, summary)["cut_percent"] == part["cut_percent"]
+    assert figures(kept | {"mechanisms": []}, summary)["cut_percent"] is None  # names do nothing
 
 
 @pytest.fixture

@@ -58,6 +58,8 @@ def test_a_challenge_tells_its_seed_its_commitment_and_its_code() -> None:
     assert f"ventbench challenge reveal {both}\n" in text
     assert "Generator `stranger`, code 1a2b3c:\n" in text
     assert "| `words` | `abc123` | 1 of 40 |\n| `-more` | `def456` | 1 of 8 |" in text
+    same = challenge_section(result, ["words", "words"])  # with other numbers of cases
+    assert "| `words` | `abc123` | 1 of 40 |\n| `words` | `def456` | 1 of 8 |" in same
     assert "Answers that are not right (1 of 2):" in text
     assert (
         "| single | R10C20 | leak (strong, below the detection limit) | valve_lag + f(V) | "

@@ -58,19 +58,22 @@ def challenge_section(result: ChallengeResult, seeds: Sequence[str]) -> str:
     """
     source = result.generator
     folder = "runs/strangers" if source == "stranger" else "runs/challenge"
-    draws = dict(zip(seeds, result.draws, strict=True))
-    folders = {s: f"{folder}{k}" if k > 1 else folder for k, s in enumerate(draws, start=1)}
     versions = ", ".join(result.versions) or "unknown"
+    draws = [
+        (seed, f"{folder}{k}" if k > 1 else folder, draw)
+        for k, (seed, draw) in enumerate(zip(seeds, result.draws, strict=True), start=1)
+    ]
     lines = ["```sh"]
-    for seed, draw in draws.items():
+    for seed, where, draw in draws:
         lines += [
             f"ventbench challenge make --generator {source} --seed={seed} --cases {draw.total} "
-            f"--out {folders[seed]}",
-            f"ventbench challenge answer {folders[seed]} --jobs 1",
+            f"--out {where}",
+            f"ventbench challenge answer {where} --jobs 1",
         ]
-    given = " ".join(f"--seed={seed}" for seed in draws)
+    folders = " ".join(where for _, where, _ in draws)
+    given = " ".join(f"--seed={seed}" for seed, _, _ in draws)
     lines += [
-        f"ventbench challenge reveal {' '.join(folders.values())} {given}",
+        f"ventbench challenge reveal {folders} {given}",
         "```",
         "",
         f"Generator `{source}`, code {versions}:",
@@ -79,7 +82,7 @@ def challenge_section(result: ChallengeResult, seeds: Sequence[str]) -> str:
         "|---|---|---|",
         *(
             f"| `{seed}` | `{draw.commitment}` | {draw.answered} of {draw.total} |"
-            for seed, draw in draws.items()
+            for seed, _, draw in draws
         ),
         "",
         "| figure | measured | 95 % | cases | goal | met |",

@@ -301,7 +301,8 @@ def selection_at_label(
     fixed = tuple((path, value) for path, value in held.hypothesis.fixed if path not in _LUNG)
     free = fit_with_noise(evaluator, replace(held.hypothesis, fixed=fixed), held)
     free = drop_redundant_terms(evaluator, free, free.names)
-    against = evaluator.fit(selected.hypothesis, free.noise, selected)
-    if len(held.names) >= most and evaluator.criterion(free) > evaluator.criterion(against):
-        return None
+    if len(held.names) >= most:
+        against = evaluator.fit(selected.hypothesis, free.noise, selected)
+        if evaluator.criterion(free) > evaluator.criterion(against):
+            return None
     return forward_selection(evaluator, free, tell, replacement)

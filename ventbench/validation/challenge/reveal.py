@@ -38,8 +38,8 @@ class Draw:
 
     Attributes:
         commitment: hash of the true answers, checked.
-        total: number of its cases that should have an answer.
-        answered: number of those that have one.
+        total: number of its cases.
+        answered: number of those that have an answer.
     """
 
     commitment: str
@@ -72,7 +72,8 @@ class ChallengeResult:
     generator: str = "first"
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON values."""
+        """JSON values; names of cases are those within a draw, which is given by its place."""
+        of_draw = [k for k, draw in enumerate(self.draws) for _ in range(draw.answered)]
         return {
             "draws": [asdict(draw) for draw in self.draws],
             "unanswered": list(self.unanswered),
@@ -80,7 +81,10 @@ class ChallengeResult:
             "confusion": self.confusion,
             "parameters": self.parameters,
             "versions": list(self.versions),
-            "cases": [_as_dict(case) for case in self.cases],
+            "cases": [
+                _as_dict(case) | {"draw": draw}
+                for case, draw in zip(self.cases, of_draw, strict=True)
+            ],
         }
 
 
@@ -112,11 +116,10 @@ def reveal(
         measured.append(second_round(_judged(ChallengeFolder(folder.path), truth), cases))
     if with_oracle:
         measured += _against_oracle(folder, truth, cases, (jobs, scheduler), progress)
-    expected = _expected(folder)
     published = folder.commitment.read_text().split()[0]
     return ChallengeResult(
-        (Draw(published, len(expected), len(cases)),),
-        tuple(name for name in expected if name not in cases),
+        (Draw(published, len(folder.cases()), len(cases)),),
+        tuple(name for name in _expected(folder) if name not in cases),
         tuple(cases.values()),
         tuple(measured),
         confusion(list(cases.values())),

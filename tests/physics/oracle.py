@@ -95,8 +95,9 @@ class Breath:
         """Flow of the valve against the airway and against none, into the lung, out; pressures."""
         volume, valve, supply, stress, airway, flow, _, behind, _ = y
         q = behind if self.second else valve if self.lag else wanted
-        d = self.get("supply_droop", "drop")
-        q = q / (1 + d / (1 - d) * supply / 0.5)
+        d, linear = self.get("supply_droop", "drop"), self.get("supply_droop", "linear")
+        levelling = 1 / (1 + d / (1 - d) * supply / 0.5)
+        q = q * ((1 - linear) * levelling + linear * max(1 - d * supply / 0.5, 0.02))
         through = q
 
         def fed(p):

@@ -56,6 +56,8 @@ def test_each_mechanism(name, level, predicted):
         ("valve_hysteresis.smooth", 0.4),
         ("valve_dead_band.crack", 1.0),
         ("valve_dead_band.crack", 0.3),
+        ("supply_droop.linear", 1.0),
+        ("supply_droop.linear", 0.4),
         ("nonlinear_compliance.sigmoid", 1.0),
         ("nonlinear_compliance.sigmoid", 0.4),
         ("nonlinear_compliance.sigmoid", 2.5),

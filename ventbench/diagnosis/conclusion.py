@@ -93,6 +93,8 @@ def conclude(
     wider: Callable[[], Evaluator],
     tell: Progress,
     earlier: FittedModel | None = None,
+    *,
+    at_label: bool = True,
 ) -> Conclusion:
     """Find what a recording needs beyond the base model.
 
@@ -102,6 +104,7 @@ def conclude(
         tell: called with a description of each step before it runs.
         earlier: mechanisms that were selected otherwise, to start from too: with the same gain in
             all breaths, or from what a simulator of these breaths answers.
+        at_label: whether to search at the labelled lung too, where R or C is far from it.
     """
     base = fit_with_noise(evaluator, Hypothesis())
     wider = cache(wider)
@@ -119,7 +122,7 @@ def conclude(
         start = drop_redundant_terms(evaluator, start, start.names)
         other = forward_selection(evaluator, start, tell, single)
         selected, comparisons = _better_selection(evaluator, (selected, comparisons), other)
-    if is_far_from_label(evaluator, selected):
+    if at_label and is_far_from_label(evaluator, selected):
         other = selection_at_label(evaluator, selected, tell, single)
         if other is not None:
             selected, comparisons = _better_selection(evaluator, (selected, comparisons), other)
@@ -142,7 +145,8 @@ def conclude(
     else:
         selected = reduced
     if not evaluator.gain_sd and remaining.gain_sd:
-        return _with_gains(evaluator, wider, remaining.gain_sd, tell, selected)
+        # Gains of the breaths' own move no lung: what was found at the label is selected already.
+        return _with_gains(evaluator, wider, remaining.gain_sd, tell, selected, at_label=False)
     unnamed, full = None, selected
     if remaining.latent is not None and not remaining.prefers_term:
         unnamed = remaining.latent
@@ -216,6 +220,8 @@ def _with_gains(
     sd: float,
     tell: Progress,
     selected: FittedModel,
+    *,
+    at_label: bool = True,
 ) -> Conclusion:
     """The conclusion with a gain of each breath's own, from mechanisms selected without.
 
@@ -225,9 +231,12 @@ def _with_gains(
         sd: standard deviation of the logarithm of the gains.
         tell: see :func:`conclude`.
         selected: the mechanisms.
+        at_label: see :func:`conclude`.
     """
     scattered = replace(evaluator, gain_sd=sd)
-    return conclude(scattered, lambda: replace(wider(), gain_sd=sd), tell, selected)
+    return conclude(
+        scattered, lambda: replace(wider(), gain_sd=sd), tell, selected, at_label=at_label
+    )
 
 
 def _better_selection(

@@ -83,7 +83,8 @@ def fit(
     x = breath_term(hypothesis.names, settings).start(problem, x, before, refit=restart)
     tolerance = settings.fit.tolerance if tolerance is None else tolerance
     iterations = settings.fit.iterations if iterations is None else iterations
-    x = problem.smoothed_start(x, tolerance=tolerance, iterations=iterations)
+    if start or warm_start is None or warm_start.hypothesis != hypothesis:  # else it was smoothed
+        x = problem.smoothed_start(x, tolerance=tolerance, iterations=iterations)
     minimum = minimise(
         problem.cost, problem.normal, x, low, high, tolerance=tolerance, iterations=iterations,
         known=_known_minimum(problem, x, warm_start),

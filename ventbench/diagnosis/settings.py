@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 #: Raised when a value or the meaning of a setting changes.
-VERSION = "selection-11"
+VERSION = "selection-12"
 
 
 @dataclass(frozen=True)

@@ -145,7 +145,9 @@ class Physics:
 
         def advance(k: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:
             now, time = carry
-            commanded_flow, opened, h = jax.tree.map(lambda x: x[k // divisions], held)
+            # Both are positive: Python's rounding of a quotient would be done for each element.
+            place = jax.lax.div(k, jnp.asarray(divisions, k.dtype))
+            commanded_flow, opened, h = jax.tree.map(lambda x: x[place], held)
             part = h / divisions
             now = solver.substep(assembly, now, commanded_flow, opened, time, part, state.peep)
             return now, time + part

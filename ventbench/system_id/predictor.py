@@ -56,6 +56,16 @@ _STEP_DEAD_TIME = 1e-3
 #: zero, both ends of which must be integrated alike.
 _ACTS = 1e-6
 
+#: How XLA compiles for a processor. Loops of many small operations spend their time between these:
+#: an analysis of regions saves copies of a loop's state, and the older emitters compile and run
+#: faster here. Together they save a third of the time of a prediction and of compiling it
+#: (``benchmarks/derivatives.py``).
+_COMPILER = {
+    "xla_cpu_copy_insertion_use_region_analysis": True,
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
+}
+
 _STATIC = ("names", "substeps", "memory", "flow", "skip_idle")
 
 #: Both valves, %, 0/1, and the time for which they are held, s, each ``(n, T)``.
@@ -81,7 +91,7 @@ def _run(
     return jnp.moveaxis(jnp.concatenate([first[None], seen]), (0, 1), (-1, -2))
 
 
-@partial(jax.jit, static_argnames=_STATIC)
+@partial(jax.jit, static_argnames=_STATIC, compiler_options=_COMPILER)
 def _predict(points: Array, commands: Commands, divisions: Array, **static: object) -> Array:
     return _run(points, commands, divisions, **static)  # type: ignore[arg-type]
 

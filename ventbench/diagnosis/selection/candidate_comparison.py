@@ -158,17 +158,23 @@ def _quick_fits(
         iterations=settings.fit.quick_iterations,
         tolerance=settings.fit.quick_tolerance,
     )
-    shifts: list[Start] = [{}, *other_dead_times(warm_start)]
+    shifts: list[Start] = other_dead_times(warm_start)
     label: Start = {"R": data.R, "C": data.C}
     # A lag of 0.1 s lets R fall to nothing before the lag itself is found, unless R is held at
     # first.
     held = small.at_label
 
+    without, beaten = cost_at(first, noise), np.inf
+    if rival is not None:
+        beaten = cost_at(evaluator.restricted(rival), noise)
+    # No other start brings one that is far behind the model to beat before it.
+    out_of_reach = np.inf if rival is None else hopeless_above(without, beaten, settings.forward)
+
     def begun(candidate: Candidate) -> list[FittedModel]:
         hypothesis = current.hypothesis.plus(candidate.hypothesis)
         starts: list[Start] = [candidate.start, *candidate.other_starts]
         if not varies_by_breath(candidate.name):
-            starts = [start | shift for start in starts for shift in shifts]
+            starts += [candidate.start | shift for shift in shifts]
             starts += [{}, label] if far else []
         elif far:
             # What all efforts have in common, a refitted R and C make up for.
@@ -184,7 +190,10 @@ def _quick_fits(
             return [min(fits, key=cost_of)]
         steps = settings.fit.start_iterations
         race = partial(small.fit, hypothesis, noise, iterations=steps, delay_rounds=0)
-        raced = [race(first, start) for start in starts]
+        raced = [race(first, starts[0])]
+        if cost_of(raced[0]) > out_of_reach:
+            return raced
+        raced += [race(first, start) for start in starts[1:]]
         if far and held is not None:
             near = small.fit(
                 hypothesis.plus(held), noise, first, label, iterations=2 * steps, delay_rounds=0
@@ -195,10 +204,8 @@ def _quick_fits(
     raced = parallel_map(begun, candidates)
     # What differs from breath to breath is no measure of others: it may explain the most, and fail.
     rivals = [models[0] for models in raced if not varies_by_breath(models[0].names[-1])]
-    best = min(map(cost_of, rivals), default=np.inf)
-    if rival is not None:
-        best = min(best, cost_at(evaluator.restricted(rival), noise))
-    limit = hopeless_above(cost_at(first, noise), best, evaluator.settings.forward)
+    best = min([beaten, *map(cost_of, rivals)])
+    limit = hopeless_above(without, best, settings.forward)
 
     def ended(models: list[FittedModel]) -> FittedModel:
         if len(models) > 1 and cost_of(models[0]) < limit:

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Mechanism, Values
 from ventbench.physics.parameters import Parameter
 
+#: Flow for which the lost share is given, L/s.
+REFERENCE = 0.5
+
+#: Least share of the flow that a supply gives.
+_LEAST = 0.02
+
 
 class SupplyDroop(Mechanism):
-    """Flow is divided by what recent flow has cost the supply."""
+    """Flow is reduced by what recent flow has cost the supply."""
 
     description = Description(
         name="supply_droop",
         title="supply that sags with recent flow",
         site="supply",
-        equation="q = q_valve / (1 + k s), recovery ds/dt = q - s, k = drop / (1 - drop) / 0.5",
+        equation=(
+            "q = q_valve ((1 - linear) / (1 + k s) + linear (1 - drop s / 0.5)), "
+            "recovery ds/dt = q - s, k = drop / (1 - drop) / 0.5"
+        ),
         parameters=(
             Parameter(
                 "drop",
@@ -41,10 +51,25 @@ class SupplyDroop(Mechanism):
                 shape=True,
                 uncertain=True,
             ),
+            Parameter(
+                "linear",
+                "1",
+                "1 where the loss grows with recent flow as a regulator's does, 0 where it levels "
+                "off",
+                0.0,
+                1.0,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+                grid=(0.0, 1.0),
+            ),
         ),
         source=(
             "Reservoir behind a regulator or blower: its pressure falls with the flow drawn "
-            "from it and recovers in about a second."
+            "from it and recovers in about a second. A regulator's pressure falls in proportion "
+            "to the flow (ISO 6953), and the flow of a sonic valve in proportion to that pressure "
+            "(ISO 6358)."
         ),
         signature="Flow is lost late in inspiration and in big breaths; after a pause it is back.",
         confusable=("valve_curve", "leak", "viscoelasticity"),
@@ -65,11 +90,18 @@ class SupplyDroop(Mechanism):
         self, values: Values, flow: Array, state: Array, length: Array
     ) -> tuple[Array, Array]:
         """Flow that the supply can give; recent flow is predicted, then corrected."""
-        sag = values["drop"] / (1.0 - values["drop"]) / 0.5
         time = values["recovery"]
-        ahead = (time * state + length * flow / (1.0 + sag * state)) / (time + length)
-        given = flow / (1.0 + sag * ahead)
+        ahead = (time * state + _given(values, length * flow, state)) / (time + length)
+        given = _given(values, flow, ahead)
         return given, (time * state + length * given) / (time + length)
+
+
+def _given(values: Values, flow: Array, recent: Array) -> Array:
+    """What a supply gives of a flow, L/s, after a recent flow, L/s."""
+    drop, linear = values["drop"], values["linear"]
+    levelling = flow / (1.0 + drop / (1.0 - drop) / REFERENCE * recent)
+    proportional = flow * jnp.maximum(1.0 - drop / REFERENCE * recent, _LEAST)
+    return (1.0 - linear) * levelling + linear * proportional
 
 
 MECHANISM = SupplyDroop()

@@ -20,6 +20,9 @@ def valve_positions(u_in, m):
     for u in u_in:
         if "command_rounding" in m:
             u = float(np.floor(u))
+        dead = {"crack": 0.0, "driver": 0.0} | m.get("valve_dead_band", {})
+        if dead["driver"]:
+            u = remainder(u, dead["driver"] * dead["width"], dead["crack"])
         if "valve_hysteresis" in m:
             m_play = {"give": 0.0, "smooth": 0.0} | m["valve_hysteresis"]
             play, give, smooth = m_play["width"] / 2, m_play["give"], m_play["smooth"]
@@ -33,15 +36,18 @@ def valve_positions(u_in, m):
                 stands = u + play
             yielding = give * soft + (1 - give) * stands
             u = stands = smooth * slow + (1 - smooth) * yielding
-        if "valve_dead_band" in m:
-            width, crack = m["valve_dead_band"]["width"], m["valve_dead_band"].get("crack", 0.0)
-            overlap = max(0.0, u - width)
-            stuck = u * np.clip(0.5 + (u - width) / (0.2 * width), 0.0, 1.0)  # lets go
-            u = (1 - crack) * overlap + crack * stuck
+        if dead["driver"] < 1 and "valve_dead_band" in m:
+            u = remainder(u, (1 - dead["driver"]) * dead["width"], dead["crack"])
         if "valve_curve" in m:
             u = u / (1 + u / 100 * m["valve_curve"]["loss"] / (1 - m["valve_curve"]["loss"]))
         out.append(u)
     return out
+
+
+def remainder(u, width, crack):
+    """What a dead band leaves of a command."""
+    stuck = u * np.clip(0.5 + (u - width) / (0.2 * width), 0.0, 1.0)  # lets go
+    return (1 - crack) * max(0.0, u - width) + crack * stuck
 
 
 def recoil(volume, C, m):

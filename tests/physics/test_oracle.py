@@ -56,6 +56,8 @@ def test_each_mechanism(name, level, predicted):
         ("valve_hysteresis.smooth", 0.4),
         ("valve_dead_band.crack", 1.0),
         ("valve_dead_band.crack", 0.3),
+        ("valve_dead_band.driver", 1.0),
+        ("valve_dead_band.driver", 0.4),
         ("supply_droop.linear", 1.0),
         ("supply_droop.linear", 0.4),
         ("nonlinear_compliance.sigmoid", 1.0),
@@ -73,6 +75,14 @@ def test_each_shape(path, value, predicted):
     m = {name: cases.strengths(name)[name] | {parameter: value}}
     breaths = cases.recording(2, m)
     assert_close(predicted(breaths, m), breaths.pressure, TOLERANCE.get(path, EXACT))
+
+
+@pytest.mark.parametrize("driver", [0.0, 0.5, 1.0])
+def test_a_dead_band_before_and_behind_the_play(driver, predicted):
+    m = cases.strengths("valve_hysteresis", "strong") | cases.strengths("valve_dead_band", "strong")
+    m["valve_dead_band"] |= {"driver": driver}
+    breaths = cases.recording(2, m)
+    assert_close(predicted(breaths, m), breaths.pressure, EXACT)
 
 
 def test_a_lung_that_stiffens_and_becomes_softer_by_the_breath(predicted):

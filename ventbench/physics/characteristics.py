@@ -77,7 +77,7 @@ def characteristic(
         neutral = {p.name: jnp.asarray(float(p.neutral)) for p in about}
         times = [float(own[p.name]) for p in about if p.unit == "s"]
         end = float(np.clip(_TIMES * max(times, default=0.0), _SHORTEST, _LONGEST))
-        if _has(shown, "command"):
+        if _has(shown, "command") or _has(shown, "driven"):
             return _command(shown, own, largest_command)
         if _has(shown, "dead_time"):
             return _late(float(jnp.asarray(shown.dead_time(own))), end)
@@ -108,14 +108,17 @@ def _floats(values: Array) -> Floats:
 def _command(shown: Mechanism, own: Values, largest: float) -> Characteristic:
     """The command that takes effect, as it rises and, if the mechanism remembers, falls again."""
 
+    def step(u_in: Array, memory: Array) -> tuple[Array, Array]:
+        return shown.command(own, shown.driven(own, u_in), memory)
+
     def effective(top: float) -> tuple[Floats, Floats]:
         rising = np.linspace(0.0, top, _STATIC)
         if not shown.has_memory:
-            return rising, _floats(shown.command(own, jnp.asarray(rising), jnp.asarray(rising))[0])
+            return rising, _floats(step(jnp.asarray(rising), jnp.asarray(rising))[0])
         both = np.concatenate([rising[::2], rising[::-2]])
         memory, after = jnp.asarray(0.0), []
         for command in both:
-            now, memory = shown.command(own, jnp.asarray(command), memory)
+            now, memory = step(jnp.asarray(command), memory)
             after.append(float(now))
         return both, np.array(after)
 

@@ -107,6 +107,10 @@ class Mechanism:
     #: True if its effect depends on the position of the breath in the recording.
     uses_position: bool = False
 
+    def driven(self, values: Values, u_in: Array) -> Array:
+        """What a valve's driver makes of a command, %, before any part of the valve moves."""
+        return u_in
+
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
         """Effective command of the inspiratory valve, %, and the new memory, once a sample."""
         return u_in, memory

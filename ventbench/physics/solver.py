@@ -48,6 +48,9 @@ def commanded(
     """Steady-state flow of the inspiratory valve at a command, L/s, and the new memory."""
     memory = dict(memory)
     for name, mechanism in assembly.mechanisms.items():
+        if _has(mechanism, "driven"):
+            u_in = assembly.change(name, _driven, u_in)
+    for name, mechanism in assembly.mechanisms.items():
         u_in, new_memory = assembly.change(name, _command, (u_in, memory.get(name, u_in)))
         if mechanism.has_memory:
             memory[name] = new_memory
@@ -195,6 +198,10 @@ def _view(
         time, start.volume, guess.pressure, guess.flow, jnp.zeros_like(start.volume), length,
         1e3 / base["C"], peep, base["position"], base["R"], 1.0 / base["R_ex"], opened,
     )  # fmt: skip
+
+
+def _driven(mechanism: Mechanism, own: Values, u_in: Array) -> Array:
+    return mechanism.driven(own, u_in)
 
 
 def _command(mechanism: Mechanism, own: Values, before: Pair) -> Pair:

@@ -55,10 +55,10 @@ class CommandRounding(Mechanism):
         special_case_of=("valve_shape",),
     )
 
-    def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
+    def driven(self, values: Values, u_in: Array) -> Array:
         """The command, moved towards a whole number."""
         whole = jnp.floor(u_in + values["bias"])
-        return u_in + values["amount"] * (whole - u_in), memory
+        return u_in + values["amount"] * (whole - u_in)
 
 
 MECHANISM = CommandRounding()

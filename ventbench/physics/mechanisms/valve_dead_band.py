@@ -23,13 +23,29 @@ class ValveDeadBand(Mechanism):
         name="valve_dead_band",
         title="dead band of the inspiratory valve",
         site="inspiratory valve",
-        equation="u_effective = 0 below width, u - (1 - crack) width above",
+        equation=(
+            "u_effective = 0 below width, u - (1 - crack) width above; driver width before the "
+            "play, the rest of it behind"
+        ),
         parameters=(
             Parameter("width", "%", "command at which flow begins", 0.0, 10.0, 0.0, 1.5, 3.5),
             Parameter(
                 "crack",
                 "1",
                 "0 for overlap, which every command loses; 1 for a stuck seat that cracks open",
+                0.0,
+                1.0,
+                0.0,
+                0.0,
+                0.0,
+                shape=True,
+                grid=(0.0, 1.0),
+            ),
+            Parameter(
+                "driver",
+                "1",
+                "share of the width that the driver takes before the valve's play: 0 for overlap "
+                "of the seat, 1 for a least command",
                 0.0,
                 1.0,
                 0.0,
@@ -57,13 +73,22 @@ class ValveDeadBand(Mechanism):
 
     rank = 2
 
+    def driven(self, values: Values, u_in: Array) -> Array:
+        """Remainder of the command behind the driver."""
+        return _remainder(values, u_in, values["driver"] * values["width"])
+
     def command(self, values: Values, u_in: Array, memory: Array) -> tuple[Array, Array]:
         """Remainder of the command; a negative one is not a valve's and passes."""
-        width, positive = values["width"], jnp.maximum(u_in, 0.0)
-        lost = jnp.minimum(positive, width)
-        free = jnp.clip(0.5 + (positive - width) / (_LETS_GO * width + _THIN), 0.0, 1.0)
-        stuck = positive * (1.0 - free)
-        return u_in - lost - values["crack"] * (stuck - lost), memory
+        return _remainder(values, u_in, (1.0 - values["driver"]) * values["width"]), memory
+
+
+def _remainder(values: Values, u_in: Array, width: Array) -> Array:
+    """What a dead band of some width, %, leaves of a command, %."""
+    positive = jnp.maximum(u_in, 0.0)
+    lost = jnp.minimum(positive, width)
+    free = jnp.clip(0.5 + (positive - width) / (_LETS_GO * width + _THIN), 0.0, 1.0)
+    stuck = positive * (1.0 - free)
+    return u_in - lost - values["crack"] * (stuck - lost)
 
 
 MECHANISM = ValveDeadBand()

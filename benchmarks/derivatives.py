@@ -1,11 +1,12 @@
 """Time of the derivatives of a fit, by finite differences and by forward-mode differentiation.
 
 Fits use finite differences. The benchmark differentiates 40 breaths of 80 samples by the first
-parameters of the model, on one core: with all mechanisms, and with all mechanisms and basis terms.
-Differences skip mechanisms that are off; forward mode cannot, because their slopes are not zero.
+parameters of the model: with all mechanisms, and with all mechanisms and basis terms. Differences
+skip mechanisms that are off; forward mode cannot, because their slopes are not zero. Predictions
+are also compiled with XLA's own options, to show what ours are worth. Run it on one core.
 Usage:
 
-    python benchmarks/derivatives.py [--columns 8] [--repeats 5]
+    taskset -c 0 python benchmarks/derivatives.py [--columns 8] [--repeats 5]
 """
 
 from __future__ import annotations
@@ -44,15 +45,29 @@ def breaths() -> Breaths:
     )  # fmt: skip
 
 
+def with_usual_options(predictor: Predictor, values: np.ndarray) -> Callable[[], object]:
+    """Return a call that predicts as ``predictor`` does, compiled with XLA's own options."""
+    run = jax.jit(predictor_module._run, static_argnames=predictor_module._STATIC)
+    steps = predictor._divisions(values[None])[0]
+
+    def call() -> object:
+        with float64():
+            return np.asarray(run(values, predictor._commands, steps, **predictor._static))
+
+    return call
+
+
 def exact(predictor: Predictor, values: np.ndarray, columns: int) -> Callable[[], object]:
     """Return a call that differentiates along columns of ``values`` in forward mode."""
-    u_in, u_out, dt = predictor._commands
+    steps = predictor._divisions(values[None])[0]
     basis = np.eye(values.shape[1])[:columns]
 
     @jax.jit
     def slopes(values: jax.Array, basis: jax.Array) -> jax.Array:
         static = predictor._static | {"skip_idle": False}
-        run = partial(predictor_module._run, commands=(u_in, u_out, dt), **static)
+        run = partial(
+            predictor_module._run, commands=predictor._commands, divisions=steps, **static
+        )
 
         def along(direction: jax.Array) -> jax.Array:
             return jax.jvp(run, (values,), (jnp.broadcast_to(direction, values.shape),))[1]
@@ -83,21 +98,27 @@ def compare(names: tuple[str, ...], columns: int, repeats: int) -> None:
     mild = {name: parameter(name).mild for name in names if "." in name}
     off = {"command_rounding.amount": 0.0}  # has no slope
     print(f"{BREATHS} breaths, {columns} of {len(names)} parameters, ms")
-    print(f"  {'':12}{'pressures':>12}{'differences':>14}{'forward mode':>14}{'ratio':>8}")
+    print(
+        f"  {'':12}{'pressures':>12}{'usual options':>15}{'ratio':>8}{'differences':>14}"
+        f"{'forward mode':>14}{'ratio':>8}"
+    )
     firsts = []
     for label, given in (("none acts", {}), ("two act", few), ("all act", mild | off)):
         values = parameter_values(make_data(breaths()), names, given)
         ways = (
             partial(predictor.predict, values),
+            with_usual_options(predictor, values),
             partial(predictor.derivatives, values, tuple(range(columns))),
             exact(predictor, values, columns),
         )
         found = [seconds(way, repeats) for way in ways]
-        alone, differences, forward = (1e3 * least for _, least in found)
-        ratio = differences / forward
-        print(f"  {label:12}{alone:12.1f}{differences:14.1f}{forward:14.1f}{ratio:8.2f}")
+        alone, usual, differences, forward = (1e3 * least for _, least in found)
+        print(
+            f"  {label:12}{alone:12.1f}{usual:15.1f}{alone / usual:8.2f}{differences:14.1f}"
+            f"{forward:14.1f}{differences / forward:8.2f}"
+        )
         firsts.append([first for first, _ in found])
-    print("  to compile, s: {:.1f}, {:.1f}, {:.1f}".format(*firsts[0]))
+    print("  to compile, s: {:.1f}, {:.1f}, {:.1f}, {:.1f}".format(*firsts[0]))
 
 
 def main() -> None:

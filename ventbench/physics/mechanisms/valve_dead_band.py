@@ -23,10 +23,7 @@ class ValveDeadBand(Mechanism):
         name="valve_dead_band",
         title="dead band of the inspiratory valve",
         site="inspiratory valve",
-        equation=(
-            "u_effective = 0 below width, u - (1 - crack) width above; driver width before the "
-            "play, the rest of it behind"
-        ),
+        equation="u_effective = 0 below width, u - (1 - crack) width above",
         parameters=(
             Parameter("width", "%", "command at which flow begins", 0.0, 10.0, 0.0, 1.5, 3.5),
             Parameter(
@@ -44,8 +41,8 @@ class ValveDeadBand(Mechanism):
             Parameter(
                 "driver",
                 "1",
-                "share of the width that the driver takes before the valve's play: 0 for overlap "
-                "of the seat, 1 for a least command",
+                "share of the width that is lost before the valve's play, not behind it: 0 for "
+                "overlap of the seat, 1 for a driver with a least command",
                 0.0,
                 1.0,
                 0.0,

@@ -164,11 +164,10 @@ def _quick_fits(
     # first.
     held = small.at_label
 
-    without, beaten = cost_at(first, noise), np.inf
-    if rival is not None:
-        beaten = cost_at(evaluator.restricted(rival), noise)
-    # No other start brings one that is far behind the model to beat before it.
-    out_of_reach = np.inf if rival is None else hopeless_above(without, beaten, settings.forward)
+    without = cost_at(first, noise)
+    to_beat = np.inf if rival is None else cost_at(evaluator.restricted(rival), noise)
+    # A candidate that is far behind the model to beat from its first start is from others too.
+    out_of_reach = hopeless_above(without, to_beat, settings.forward)
 
     def begun(candidate: Candidate) -> list[FittedModel]:
         hypothesis = current.hypothesis.plus(candidate.hypothesis)
@@ -204,7 +203,7 @@ def _quick_fits(
     raced = parallel_map(begun, candidates)
     # What differs from breath to breath is no measure of others: it may explain the most, and fail.
     rivals = [models[0] for models in raced if not varies_by_breath(models[0].names[-1])]
-    best = min([beaten, *map(cost_of, rivals)])
+    best = min([to_beat, *map(cost_of, rivals)])
     limit = hopeless_above(without, best, settings.forward)
 
     def ended(models: list[FittedModel]) -> FittedModel:

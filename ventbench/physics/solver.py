@@ -108,8 +108,10 @@ def substep(
         ), None
 
     places = jnp.asarray([[0.0, _GAMMA], [(1.0 - _GAMMA) / _GAMMA, 1.0]], h.dtype)
-    # Unrolled, both stages take less time than the loop's bookkeeping would add to them.
-    return jax.lax.scan(advance, now, (places[:, 0], places[:, 1]), unroll=True)[0]
+    # Where idle mechanisms are skipped, a loop's bookkeeping takes longer than what it repeats.
+    # Where all are computed, two copies would take much longer to compile, above all with slopes.
+    unroll = bool(assembly.active)
+    return jax.lax.scan(advance, now, (places[:, 0], places[:, 1]), unroll=unroll)[0]
 
 
 def sensor_output(assembly: Assembly, reading: Array) -> Array:

@@ -58,7 +58,7 @@ _ACTS = 1e-6
 
 #: How XLA compiles for a processor. Loops of many small operations spend their time between these:
 #: an analysis of regions saves copies of a loop's state, and the older emitters compile and run
-#: faster here: 15 % of 40 breaths, 25 % of a full block (``benchmarks/derivatives.py``).
+#: faster here, by 15 % for 40 breaths (``benchmarks/derivatives.py``).
 _COMPILER = {
     "xla_cpu_copy_insertion_use_region_analysis": True,
     "xla_cpu_use_fusion_emitters": False,

@@ -20,7 +20,9 @@ from ventbench import draws
 from ventbench.board import build, canonical, create, layout, record, store
 from ventbench.board.replay import ReplayPlants, replay
 from ventbench.board.verify import verify
+from ventbench.lungs import LUNGS
 from ventbench.plants import frozen
+from ventbench.plants.rigs import Rigs
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.scoring import run_protocol
 
@@ -33,7 +35,9 @@ FACTORS = (1.0, 0.99, 0.98, 0.97, 0.96, 0.95, 0.94, 0.93)
 
 def drafts(plants: ReplayPlants) -> list[create.Draft]:
     """Return real records whose commands are those of the PID times a factor."""
-    result = run_protocol(open_submission("pid_best"), plants.plants, draws=draws.COUNT)
+    result = run_protocol(
+        open_submission("pid_best"), Rigs(LUNGS, plants.plants), draws=draws.COUNT
+    )
     made = []
     for factor in FACTORS:
         requested = result.requested * factor

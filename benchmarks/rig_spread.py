@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import protocol, rig_draws
+from ventbench import draws, protocol
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import VALVE_KNOTS
-from ventbench.submissions.rig_scoring import rigs_of
+from ventbench.plants.rigs import rigs_of
 from ventbench.training.rigs.label_test import resistance_and_compliance
 
 Floats = NDArray[np.float64]
@@ -44,7 +44,7 @@ def pooled(groups: Sequence[Floats]) -> float:
 def main() -> None:
     official = frozen.load(version=2)
     members: Any = official.members
-    drawn = rigs_of(official).draws(rig_draws.COUNT)
+    drawn = rigs_of(official).draws(draws.COUNT)
     resistance, compliance = resistance_and_compliance(members)
     interval = np.array([session.interval_ms for session in official.sessions.table])
     dead = 1e3 * (np.asarray(members.valve_delay) + np.asarray(members.valve_lag))

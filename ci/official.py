@@ -17,6 +17,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from ventbench.submissions.rig_scoring import rigs_of, run_on_rigs
+
 from ci import seed as seeds
 from ci import workflow
 from ci.take import TakeError, Taken, take
@@ -30,7 +32,6 @@ from ventbench.submissions import contract
 from ventbench.submissions.folder import Submission, open_submission
 from ventbench.submissions.manifest import TRACKS
 from ventbench.submissions.result import Score
-from ventbench.submissions.rig_scoring import rigs_of, run_on_rigs
 from ventbench.submissions.runner import Runner
 from ventbench.submissions.scoring import run_protocol
 

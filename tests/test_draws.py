@@ -1,52 +1,134 @@
-import sys
-import zipfile
+"""Draws on rigs: what they are, that they are the same everywhere, and what a lung gets of them."""
+
+import hashlib
+import hmac
+from fractions import Fraction
 
 import jax
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from ventbench import draws, files, precision, protocol
+from ventbench import draws, protocol
 from ventbench.errors import InputError
+from ventbench.plants import frozen
+
+SEED = bytes(range(32))
+
+RIGS = ((2, 0, 1), (5,), (7, 8))
 
 
-@pytest.fixture
-def cells():
-    with precision.float64():
-        return jax.tree.map(np.asarray, draws.scenarios())
+@pytest.fixture(scope="module")
+def drawn():
+    return draws.build(RIGS, 5)
 
 
-def test_build_gives_what_is_frozen():
-    with np.load(files.data_path(draws.FILE)) as npz:
-        frozen = {name: npz[name] for name in npz.files}
-    built = draws.build()
-    assert built.keys() == frozen.keys()
-    for name, values in built.items():
-        np.testing.assert_array_equal(values, frozen[name], err_msg=name)
-
-
-def test_file_is_the_published_one():
-    assert files.sha256(files.data_path(draws.FILE)) == draws.SHA256
-
-
-def test_cells(cells):
-    assert all(
-        leaf.shape == (20, 6) and leaf.dtype == np.float64
-        for name, leaf in vars(cells).items()
-        if name != "noise"
+def test_shapes_and_ranges(drawn):
+    cells = drawn.cells
+    for name, (low, high) in draws.RANGES.items():
+        assert low < high, name
+    assert cells.pip.shape == (3, draws.COUNT, 6)
+    assert cells.noise.shape == (
+        3,
+        draws.COUNT,
+        6,
+        protocol.BREATHS,
+        protocol.INSPIRATION_STEPS,
     )
-    assert cells.noise.shape == (20, 6, protocol.BREATHS, protocol.INSPIRATION_STEPS)
+    assert all(leaf.dtype == np.float64 for leaf in jax.tree.leaves(cells))
+    for value, name in ((cells.r_scale, "r_scale"), (cells.c_scale, "c_scale")):
+        low, high = draws.RANGES[name]
+        assert np.all((low <= value) & (value <= high))
+        assert np.ptp(value) > 0.9 * (high - low)
     assert np.all(np.abs(cells.pip - np.array(protocol.PIPS)) <= 1.0)
-    assert np.all(np.abs(cells.peep - 5.0) <= 0.5)
-    assert np.all(np.abs(cells.start - cells.peep) <= 0.5)
-    assert np.all(np.abs(cells.dt / 0.03 - 1.0) <= 0.03)
-    for scale in (cells.r_scale, cells.c_scale):
-        assert np.all(np.abs(scale - 1.0) <= 0.05)
-    assert np.all((cells.delay >= 0.0) & (cells.delay <= 0.5))
-    np.testing.assert_array_equal(cells.quantum, 0.0703)
 
 
-def test_noise_is_white_and_as_large_as_the_sensors(cells):
-    noise = cells.noise.reshape(20 * 6, -1)
+def test_noise_differs_from_lung_to_lung(drawn):
+    noise = drawn.cells.noise.reshape(3, -1)
+    assert np.all(np.abs(np.corrcoef(noise)[np.triu_indices(3, 1)]) < 0.03)
+    assert 0.21 < noise.std() < 0.24
+
+
+def test_rigs_and_members_are_drawn_equally_often(drawn):
+    for own, rig, member in zip(RIGS, drawn.rig, drawn.member, strict=True):
+        counts = [np.sum(rig == session) for session in own]
+        assert sum(counts) == draws.COUNT
+        assert max(counts) - min(counts) <= 1
+        assert np.bincount(member, minlength=5).tolist() == [4] * 5
+
+
+def test_a_seed_gives_the_same_draws_and_another_seed_others(drawn):
+    again = draws.build(RIGS, 5, seed=draws.DEVELOPMENT_SEED)
+    other = draws.build(RIGS, 5, seed=bytes(32), name="2027-spring")
+    np.testing.assert_array_equal(again.cells.noise, drawn.cells.noise)
+    np.testing.assert_array_equal(again.rig, drawn.rig)
+    assert not np.array_equal(other.cells.pip, drawn.cells.pip)
+    assert drawn.about()["season"] == "development"
+    assert other.about() == {
+        "version": 2,
+        "sha256": draws.commitment(bytes(32)),
+        "count": 20,
+        "season": "2027-spring",
+    }
+
+
+def test_published_numbers_stay(drawn):
+    # The first shift of PIP by the definition in ventbench.draws, by hand.
+    import hashlib
+    import hmac
+
+    block = hmac.new(
+        hashlib.sha256(b"ventbench development draws").digest(),
+        b"ventbench uniforms 1\ndraws 2, pip_shift" + bytes(8),
+        "sha256",
+    ).digest()
+    uniform = ((int.from_bytes(block[:8], "big") >> 12) + 0.5) / 2**52
+    assert drawn.cells.pip[0, 0, 0] == pytest.approx(
+        10.0 + round(2.0 * uniform - 1.0, 4), abs=1e-12
+    )
+
+
+def test_first_draws_are_those_of_all(drawn):
+    few = drawn.first(3)
+    np.testing.assert_array_equal(few.cells.noise, drawn.cells.noise[:, :3])
+    assert few.count == 3
+    with pytest.raises(InputError, match=r"has 20 draws; 21 is outside 1\.\.20"):
+        drawn.first(21)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"n": 0}, "there must be at least one"),
+        ({"pips": (12.0,)}, "no draws for PIP 12 cmH2O"),
+        ({"rigs": ((1,), ())}, "a lung has no rig"),
+        ({"seed": b"short"}, "32 bytes"),
+    ],
+)
+def test_wrong_requests_are_named(change, message):
+    with pytest.raises(InputError, match=message):
+        draws.build(**({"rigs": RIGS, "members": 2} | change))
+
+
+def test_plants_of_cells_are_those_of_rig_and_member():
+    official = frozen.load()
+    drawn = draws.build(official.rigs, 5, n=4)
+    reference = [own[0] for own in official.rigs]
+    cells, rig, member = draws.with_nominal(drawn, reference, protocol.PIPS)
+    plants = draws.plants_of(official.sessions_plants, rig, member)
+    assert cells.pip.shape == (6, 5, 6)
+    np.testing.assert_array_equal(cells.dt[:, 0], protocol.DT)
+    assert plants.R.shape == (6, 5, 1)
+    assert plants.slopes.shape[:3] == (6, 5, 1)
+    np.testing.assert_array_equal(plants.R[:, 0, 0], official.plants.R)
+    k = 2
+    expected = official.sessions_plants.E[drawn.member[3, k], drawn.rig[3, k]]
+    assert plants.E[3, 1 + k, 0] == expected
+
+
+def test_noise_is_white_and_as_large_as_the_sensors():
+    noise = draws.build(RIGS, 1).cells.noise.reshape(3 * 20 * 6, -1)
     assert np.all((noise.std(axis=1) > 0.15) & (noise.std(axis=1) < 0.31))
     assert 0.21 < noise.std() < 0.24
     assert abs(noise.mean()) < 0.01
@@ -56,61 +138,57 @@ def test_noise_is_white_and_as_large_as_the_sensors(cells):
     assert np.mean(np.abs(scaled) > 2) == pytest.approx(0.0455, abs=0.01)
 
 
-def test_parts_are_parts(cells):
-    with precision.float64():
-        few = draws.scenarios((35.0, 10.0), 3)
-    np.testing.assert_array_equal(few.noise, cells.noise[:3, [5, 0]])
-    np.testing.assert_array_equal(few.pip, cells.pip[:3, [5, 0]])
+def exact(seed: bytes, label: str, count: int) -> list[Fraction]:
+    """The stream once more, number by number and without floating point."""
+    numbers: list[Fraction] = []
+    block = 0
+    while len(numbers) < count:
+        mac = hmac.new(seed, digestmod=hashlib.sha256)
+        mac.update(b"ventbench uniforms 1\n")
+        mac.update(label.encode("utf-8"))
+        mac.update(bytes([(block >> shift) & 255 for shift in range(56, -1, -8)]))
+        digest = mac.digest()
+        for first in range(0, 32, 8):
+            upper = int(digest[first : first + 8].hex(), 16) >> 12
+            numbers.append(Fraction(2 * upper + 1, 2**53))
+        block += 1
+    return numbers[:count]
 
 
-@pytest.mark.parametrize("n", [-1, 0, 21])
-def test_so_many_draws_do_not_exist(n):
-    with pytest.raises(InputError, match=r"20 published draws; -?\d+ is outside 1..20"):
-        draws.scenarios(n=n)
+def test_numbers_are_those_of_openssl() -> None:
+    # printf 'ventbench uniforms 1\nnoise\0\0\0\0\0\0\0\0' |
+    #   openssl dgst -sha256 -mac HMAC -macopt hexkey:000102...1f
+    digest = "8ff88f2dee034a714d2738560e332b85696d921ae9e19b3b29767d937dde5b85"
+    words = [int(digest[first : first + 16], 16) for first in range(0, 64, 16)]
+    expected = [((word >> 12) + 0.5) / 2**52 for word in words]
+    assert draws.uniforms(SEED, "noise", 4).tolist() == expected
 
 
-def test_no_draws_for_other_pips():
-    with pytest.raises(InputError, match="no draws for PIP 12 cmH2O; they exist for 10, 15"):
-        draws.scenarios((10.0, 12.0))
+@given(st.binary(min_size=32, max_size=32), st.text(max_size=8), st.integers(0, 23))
+def test_numbers_are_those_of_another_implementation(seed: bytes, label: str, count: int) -> None:
+    numbers = draws.uniforms(seed, label, count)
+    assert [Fraction(number) for number in numbers.tolist()] == exact(seed, label, count)
 
 
-def test_changed_file_is_refused(tmp_path, monkeypatch):
-    path = tmp_path / draws.FILE
-    content = bytearray(files.data_path(draws.FILE).read_bytes())
-    content[5000] ^= 1
-    path.write_bytes(content)
-    monkeypatch.setattr(draws.files, "data_path", lambda name: path)
-    draws._frozen.cache_clear()
-    with pytest.raises(InputError, match="not the published draws version 1: its SHA-256 is"):
-        draws.scenarios()
-    draws._frozen.cache_clear()
+def test_extremes_stay_between_0_and_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    for byte, expected in ((b"\x00", 2.0**-53), (b"\xff", 1.0 - 2.0**-53)):
+        monkeypatch.setattr(hmac, "digest", lambda *_, byte=byte: 32 * byte)
+        assert draws.uniforms(SEED, "x", 4).tolist() == 4 * [expected]
 
 
-def test_missing_file_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr(files, "_PACKAGE", tmp_path / "ventbench")
-    with pytest.raises(InputError, match=r"data/draws-v1.npz is missing"):
-        files.data_path(draws.FILE)
+def test_shapes_and_labels() -> None:
+    flat = draws.uniforms(SEED, "a", 30)
+    assert np.array_equal(draws.uniforms(SEED, "a", (2, 3, 5)), flat.reshape(2, 3, 5))
+    assert np.array_equal(draws.uniforms(SEED, "a", 7), flat[:7])
+    assert draws.uniforms(SEED, "a", ()).shape == ()
+    assert draws.uniforms(SEED, "a", 0).shape == (0,)
+    assert not np.intersect1d(flat, draws.uniforms(SEED, "b", 30)).size
+    assert not np.intersect1d(flat, draws.uniforms(SEED[::-1], "a", 30)).size
 
 
-def test_wheel_comes_before_a_folder_beside_it(tmp_path, monkeypatch):
-    package = tmp_path / "ventbench"
-    (package / "_data").mkdir(parents=True)
-    (package / "_data" / "x").touch()
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data" / "x").touch()
-    monkeypatch.setattr(files, "_PACKAGE", package)
-    assert files.data_path("x") == package / "_data" / "x"
-
-
-def test_script_writes_the_file_again(tmp_path):
-    again = tmp_path / "again.npz"
-    digest = draws.write(again)
-    assert members(again) == members(files.data_path(draws.FILE))
-    if sys.version_info >= (3, 11, 4):  # before, zipfile wrote other headers around the arrays
-        assert digest == draws.SHA256
-
-
-def members(path):
-    """Name and bytes of each file in an archive, in order."""
-    with zipfile.ZipFile(path) as archive:
-        return [(name, archive.read(name)) for name in archive.namelist()]
+def test_numbers_are_uniform_and_independent() -> None:
+    numbers = draws.uniforms(draws.DEVELOPMENT_SEED, "statistics", 20_000)
+    counts, _ = np.histogram(numbers, bins=20, range=(0.0, 1.0))
+    # Chi-squared with 19 degrees of freedom: 45 is exceeded once in a thousand seeds.
+    assert np.sum((counts - 1000.0) ** 2) / 1000.0 < 45.0
+    assert abs(np.corrcoef(numbers[:-1], numbers[1:])[0, 1]) < 4.0 / np.sqrt(20_000)

@@ -180,3 +180,19 @@ def test_trajectories_that_are_none(run, tmp_path):
             load(path)
     with pytest.raises(FileNotFoundError):
         load(tmp_path / "none.npz")
+
+
+def test_missing_file_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "_PACKAGE", tmp_path / "ventbench")
+    with pytest.raises(InputError, match=r"data/bounds-v2.npz is missing"):
+        files.data_path("bounds-v2.npz")
+
+
+def test_wheel_comes_before_a_folder_beside_it(tmp_path, monkeypatch):
+    package = tmp_path / "ventbench"
+    (package / "_data").mkdir(parents=True)
+    (package / "_data" / "x").touch()
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "x").touch()
+    monkeypatch.setattr(files, "_PACKAGE", package)
+    assert files.data_path("x") == package / "_data" / "x"

@@ -12,13 +12,13 @@ from jax import Array
 
 from ventbench import precision
 from ventbench.lungs import LUNGS, Lung
+from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import (
     SingleCompartment,
     SingleCompartmentState,
     single_compartment,
 )
 from ventbench.plants.stacking import stack
-from ventbench.submissions.rig_scoring import Rigs
 
 #: What the sensor shows above the airway pressure, cmH2O.
 OFFSET = 0.4

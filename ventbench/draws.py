@@ -1,20 +1,20 @@
-"""Deviations of the ventilator from nominal: the published paired draws, and new random ones.
+"""Deviations of the ventilator and the lung from nominal: every draw is on some rig.
 
-One published draw is one deviation for each PIP, common to all lungs and entries: sensor noise and
-converter, pressure at the start of the inspiration, R, C, dead time, control step, PIP and PEEP.
-They are frozen in ``data/draws-v1.npz``; ``python -m ventbench.draws FILE`` makes that file again.
+One draw gives each lung one of its rigs and one member of the ensemble, and each PIP of it sensor
+noise and converter, pressure at the start of the inspiration, R, C, dead time, control step, PIP
+and PEEP. All numbers follow from a seed of 32 bytes by :func:`uniforms`. The development draws,
+common to all entries, come from a published seed; training draws anew with JAX keys.
 """
 
 from __future__ import annotations
 
-import functools
+import dataclasses
 import hashlib
-import io
-import sys
+import hmac
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from dataclasses import dataclass
 from statistics import NormalDist
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,17 +22,21 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from ventbench import files, protocol
-from ventbench.environment import Scenario
+from ventbench import precision, protocol
+from ventbench.environment import Scenario, nominal_scenario
 from ventbench.errors import InputError
 
-#: Version of the draws, how many there are, their file and its SHA-256.
-VERSION = 1
+#: How many draws a ranked score has.
 COUNT = 20
-FILE = "draws-v1.npz"
-SHA256 = "114cb9c7e553cb7de26159760e25af60a59f331c25129134b81bfe41c63e3d92"
 
-_SEED = 20210215  # the paper's date
+#: Bytes of a seed: as many as the hash has, so that guessing is hopeless.
+SEED_BYTES = 32
+
+#: Seed of the development draws. It is published, so nobody can have chosen it: a hash of its name.
+DEVELOPMENT_SEED = hashlib.sha256(b"ventbench development draws").digest()
+
+#: Name of the draws of :data:`DEVELOPMENT_SEED`.
+DEVELOPMENT = "development"
 
 #: Step of the pressure sensor's converter, cmH2O (PVP).
 QUANTUM = 0.0703
@@ -41,106 +45,242 @@ QUANTUM = 0.0703
 NOISE_SD = (0.20, 0.25)
 
 #: Every other deviation is uniform in its range: shifts in cmH2O, scales as true over nominal, the
-#: delay as a share of one step.
+#: delay as a share of one step. A uniform range reaches sqrt(3) standard deviations to each side of
+#: its middle. Those of R, C, delay and step were measured between the label-true rigs of one
+#: lung: resistance at 0.5 L/s 11 %, compliance 8 %, control interval 3.7 %, dead time and lag of
+#: the valve 4.6 ms. The fitted simulators have 5.3 %, 3.6 % and, for dead time and lag, 1.6 ms. A
+#: fit shrinks rigs of few breaths towards their lung: the true spread is larger than that.
 RANGES = {
     "pip_shift": (-1.0, 1.0),
     "peep_shift": (-0.5, 0.5),
     "start_shift": (-0.5, 0.5),
-    "dt_scale": (0.97, 1.03),
-    "r_scale": (0.95, 1.05),
-    "c_scale": (0.95, 1.05),
-    "delay": (0.0, 0.5),
+    "dt_scale": (0.936, 1.064),
+    "r_scale": (0.81, 1.19),
+    "c_scale": (0.86, 1.14),
+    "delay": (0.0, 0.53),
 }
 
+# They stand before what is hashed, so that no hash of one use is also one of another use.
+_STREAM = b"ventbench uniforms 1\n"
+_COMMITMENT = b"ventbench season 1\n"
+
+# It is part of the labels of the streams and of what records say of draws.
+_FORMAT = 2
+
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+PlantT = TypeVar("PlantT")
 
 
-def build() -> dict[str, Floats]:
-    """Draw all deviations anew; the result is the same everywhere.
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Cells of L lungs, n draws and P PIPs, and the plant of each.
 
-    Uniform numbers come from the raw stream of PCG64, which no numpy version changes; the rounding
-    to 4 decimals removes what differs between mathematical libraries.
-
-    Returns:
-        For each key of :data:`RANGES` an array of shape ``(COUNT, P)`` with P nominal PIPs, and
-        ``noise``, cmH2O, shape ``(COUNT, P, BREATHS, INSPIRATION_STEPS)``.
+    Attributes:
+        name: ``"development"`` for the published draws.
+        commitment: of the seed, 64 hexadecimal digits.
+        cells: batch shape ``(L, n, P)``, float64 numpy leaves.
+        rig: session of each lung in each draw, shape ``(L, n)``.
+        member: member of the ensemble, shape ``(L, n)``.
     """
-    bits = np.random.PCG64(_SEED)
 
-    def uniform(*shape: int) -> Floats:
-        # The upper 53 bits, centred so that neither 0 nor 1 occurs.
-        return ((bits.random_raw(shape) >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53
+    name: str
+    commitment: str
+    cells: Scenario
+    rig: Ints
+    member: Ints
 
-    cells = (COUNT, len(protocol.PIPS))
-    drawn = {name: low + (high - low) * uniform(*cells) for name, (low, high) in RANGES.items()}
-    sd = NOISE_SD[0] + (NOISE_SD[1] - NOISE_SD[0]) * uniform(*cells)
-    normal = np.vectorize(NormalDist().inv_cdf, otypes=[float])
-    noise = normal(uniform(*cells, protocol.BREATHS, protocol.INSPIRATION_STEPS))
-    drawn["noise"] = sd[..., None, None] * noise
-    return {name: np.round(values, 4) for name, values in drawn.items()}
+    @property
+    def count(self) -> int:
+        """Number of draws."""
+        return self.rig.shape[1]
 
+    def first(self, n: int) -> Draws:
+        """Return the first n draws.
 
-def write(path: Path) -> str:
-    """Write the file of :func:`build` and return its SHA-256.
-
-    It is :data:`SHA256` from Python 3.11.4 on. Older versions write the same arrays, with other
-    headers of the archive around them.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
-    # Not compressed: the bytes then depend on no version of zlib.
-    arrays: dict[str, Any] = dict(build())
-    files.write_atomically(path, lambda file: np.savez(file, **arrays))
-    return files.sha256(path)
-
-
-def about() -> dict[str, Any]:
-    """Version, hash and number of the draws, for records."""
-    return {"version": VERSION, "sha256": SHA256, "count": COUNT}
-
-
-@functools.cache
-def _frozen() -> dict[str, Floats]:
-    path = files.data_path(FILE)
-    content = path.read_bytes()
-    sha256 = hashlib.sha256(content).hexdigest()
-    if sha256 != SHA256:
-        raise InputError(
-            f"{path} is not the published draws version {VERSION}: its SHA-256 is {sha256}, "
-            f"expected {SHA256}; restore the file"
+        Raises:
+            InputError: if there are not so many.
+        """
+        if not 1 <= n <= self.count:
+            raise InputError(
+                f"there are {self.count} {self.name} draws; {n} is outside 1..{self.count}"
+            )
+        cells = jax.tree.map(lambda x: x[:, :n], self.cells)
+        return dataclasses.replace(
+            self, cells=cells, rig=self.rig[:, :n], member=self.member[:, :n]
         )
-    with np.load(io.BytesIO(content), allow_pickle=False) as npz:
-        return {name: npz[name] for name in npz.files}
+
+    def about(self) -> dict[str, Any]:
+        """Commitment, number and name of the draws, with the keys that records have."""
+        return {
+            "version": _FORMAT,
+            "sha256": self.commitment,
+            "count": self.count,
+            "season": self.name,
+        }
 
 
-def scenarios(pips: Sequence[float] = protocol.PIPS, n: int = COUNT) -> Scenario:
-    """Return the first draws as cells.
+def build(
+    rigs: Sequence[Sequence[int]],
+    members: int,
+    *,
+    seed: bytes = DEVELOPMENT_SEED,
+    name: str = DEVELOPMENT,
+    n: int = COUNT,
+    pips: Sequence[float] = protocol.PIPS,
+) -> Draws:
+    """Make the draws of a seed; the result is the same everywhere.
+
+    The rigs of a lung are drawn equally often, up to one, and so are the members. The rounding to 4
+    decimals removes what differs between mathematical libraries.
 
     Args:
+        rigs: sessions of each lung that may be drawn; L of them.
+        members: number of members of the ensemble.
+        seed: 32 bytes.
+        name: of the draws.
+        n: number of draws.
         pips: nominal PIPs, cmH2O, each one of the protocol's; length P.
-        n: number of draws, 1..20.
-
-    Returns:
-        Cells with batch shape ``(n, P)``.
 
     Raises:
-        InputError: if ``n`` or a PIP has no draws, or the file is missing or not the published one.
+        InputError: if ``n`` is not positive, a PIP is not one of the protocol's, a lung has no rig,
+            or the seed does not have 32 bytes.
     """
-    if not 1 <= n <= COUNT:
-        raise InputError(f"there are {COUNT} published draws; {n} is outside 1..{COUNT}")
+    if n < 1:
+        raise InputError(f"{n} draws: there must be at least one")
     unknown = [pip for pip in pips if pip not in protocol.PIPS]
     if unknown:
         raise InputError(
             f"no draws for PIP {unknown[0]:g} cmH2O; they exist for "
             f"{', '.join(f'{pip:g}' for pip in protocol.PIPS)}"
         )
+    if not all(rigs):
+        raise InputError("a lung has no rig to draw; every lung needs at least one")
+    cells = (len(rigs), n, len(protocol.PIPS))
+
+    def uniform(label: str, shape: tuple[int, ...]) -> Floats:
+        return uniforms(seed, f"draws {_FORMAT}, {label}", shape)
+
+    drawn = {
+        name: low + (high - low) * uniform(name, cells) for name, (low, high) in RANGES.items()
+    }
+    low, high = NOISE_SD
+    sd = low + (high - low) * uniform("noise_sd", cells)
+    normal = np.vectorize(NormalDist().inv_cdf, otypes=[float])
+    steps = (protocol.BREATHS, protocol.INSPIRATION_STEPS)
+    drawn["noise"] = sd[..., None, None] * normal(uniform("noise", (*cells, *steps)))
     columns = [protocol.PIPS.index(pip) for pip in pips]
-    drawn = {name: values[:n, columns] for name, values in _frozen().items()}
-    pip = np.asarray(pips, float)
+    drawn = {name: np.round(values[:, :, columns], 4) for name, values in drawn.items()}
+    pip = np.broadcast_to(np.asarray(pips, float), drawn["pip_shift"].shape)
     noise = drawn.pop("noise")
-    cells = deviate(pip, drawn, np.full((n, len(pips)), QUANTUM), noise)
-    return jax.tree.map(jnp.asarray, cells)
+    quantum = np.full(pip.shape, QUANTUM)
+    places = [_balanced(uniform(f"rig {k}", (n + 1,)), len(own)) for k, own in enumerate(rigs)]
+    turns = [_balanced(uniform(f"member {k}", (n + 1,)), members) for k in range(len(rigs))]
+    return Draws(
+        name=name,
+        commitment=commitment(seed),
+        cells=deviate(pip, drawn, quantum, noise),
+        rig=np.array([np.array(own)[at] for own, at in zip(rigs, places, strict=True)]),
+        member=np.array(turns),
+    )
+
+
+def _balanced(numbers: Floats, choices: int) -> Ints:
+    """Deal choices to draws equally often, up to one, in random order.
+
+    Args:
+        numbers: uniform; the first says which choice is dealt first.
+        choices: how many there are.
+
+    Returns:
+        ``0..choices - 1``, shape of ``numbers`` but for the first.
+    """
+    order = np.argsort(np.argsort(numbers[1:], kind="stable"), kind="stable")
+    return (order + int(numbers[0] * choices)) % choices
+
+
+def with_nominal(
+    drawn: Draws | None, reference: Sequence[int], pips: Sequence[float]
+) -> tuple[Scenario, Ints, Ints]:
+    """Nominal cells of the reference rigs in front of the draws.
+
+    Args:
+        drawn: n draws of L lungs; None for none.
+        reference: session of each lung's reference rig, length L; its member is 0.
+        pips: cmH2O, length P.
+
+    Returns:
+        Cells of batch shape ``(L, 1 + n, P)`` with numpy leaves, and the session and the member of
+        each lung, both of shape ``(L, 1 + n)``.
+    """
+    count = len(reference)
+    with precision.float64():
+        cells = jax.tree.map(np.asarray, nominal_scenario(np.asarray(pips, float)))
+    nominal = jax.tree.map(lambda x: np.broadcast_to(x, (count, 1, *x.shape)), cells)
+    rig, member = np.asarray(reference)[:, None], np.zeros((count, 1), np.int64)
+    if drawn is None:
+        return nominal, rig, member
+    cells = jax.tree.map(lambda *x: np.concatenate(x, axis=1), nominal, drawn.cells)
+    return cells, np.hstack([rig, drawn.rig]), np.hstack([member, drawn.member])
+
+
+def plants_of(plants: PlantT, rig: Ints, member: Ints) -> PlantT:
+    """Plants of cells.
+
+    Args:
+        plants: of every member and session, leaves ``(members, sessions, ...)``.
+        rig: sessions, shape ``(L, n)``.
+        member: members, shape ``(L, n)``.
+
+    Returns:
+        Leaves ``(L, n, 1, ...)``, float64: the axis of length 1 stands for the PIPs.
+    """
+    return jax.tree.map(
+        lambda leaf: np.asarray(leaf)[member, rig][:, :, None].astype(np.float64), plants
+    )
+
+
+def uniforms(seed: bytes, label: str, shape: int | tuple[int, ...]) -> NDArray[np.float64]:
+    r"""Uniform numbers that follow from a seed and a label, the same on every machine.
+
+    Block ``k = 0, 1, ...`` of the stream is HMAC-SHA256, with the seed as its key, of
+    ``b"ventbench uniforms 1\n"``, the label in UTF-8, and ``k`` in 8 bytes, most significant first.
+    A block gives four numbers of 8 bytes, most significant first. The upper 52 bits ``n`` of one
+    give ``(n + 1/2) / 2**52``, which float64 represents exactly. Numbers of different labels tell
+    nothing about each other, and none of them about the seed.
+
+    Args:
+        seed: 32 bytes.
+        label: what the numbers are for.
+        shape: of the result; a longer shape begins with the same numbers.
+
+    Returns:
+        Numbers greater than 0 and less than 1 in row-major order, all multiples of 2**-53.
+
+    Raises:
+        InputError: if the seed does not have 32 bytes.
+    """
+    _check_length(seed)
+    lengths = (shape,) if isinstance(shape, int) else tuple(shape)
+    size = int(np.prod(lengths, dtype=np.int64))
+    prefix = _STREAM + label.encode()
+    blocks = b"".join(
+        hmac.digest(seed, prefix + k.to_bytes(8, "big"), "sha256") for k in range(-(-size // 4))
+    )
+    words = np.frombuffer(blocks, ">u8", count=size).astype(np.uint64)
+    return ((words >> np.uint64(12)).astype(np.float64) + 0.5).reshape(lengths) * 2.0**-52
+
+
+def commitment(seed: bytes) -> str:
+    r"""Hash that binds whoever publishes it to a seed without telling the seed.
+
+    It is SHA-256 of ``b"ventbench season 1\n"`` and the seed, as 64 hexadecimal digits.
+
+    Raises:
+        InputError: if the seed does not have 32 bytes.
+    """
+    _check_length(seed)
+    return hashlib.sha256(_COMMITMENT + seed).hexdigest()
 
 
 def random_scenarios(
@@ -150,11 +290,10 @@ def random_scenarios(
     spread: Array | float | None = None,
     breaths: int = protocol.BREATHS,
     smooth: bool = False,
-    ranges: Mapping[str, tuple[float, float]] = RANGES,
 ) -> Scenario:
-    """Draw new cells from the distributions of the published draws, for training.
+    """Draw new cells from the distributions of the development draws, for training.
 
-    The published draws themselves are never among them. Pure, so that it can be compiled.
+    The development draws themselves are never among them. Pure, so that it can be compiled.
 
     Args:
         key: JAX key of all random numbers.
@@ -165,15 +304,14 @@ def random_scenarios(
         breaths: number of breaths with noise.
         smooth: represent the converter by noise of one step's width, since rounding has no
             derivative; else the cells round.
-        ranges: of the deviations, those of this version of the draws or of another.
 
     Returns:
         Cells of batch shape ``(n,)``.
     """
     n = pip.shape[0]
-    keys = jax.random.split(key, len(ranges) + 3)
+    keys = jax.random.split(key, len(RANGES) + 3)
     drawn = {}
-    for deviation_key, (name, (low, high)) in zip(keys, ranges.items(), strict=False):
+    for deviation_key, (name, (low, high)) in zip(keys, RANGES.items(), strict=False):
         if spread is None:
             drawn[name] = jax.random.uniform(deviation_key, (n,), minval=low, maxval=high)
         else:
@@ -225,5 +363,6 @@ def deviate(pip: Any, deviations: Mapping[str, Any], quantum: Any, noise: Any) -
     )
 
 
-if __name__ == "__main__":
-    print(write(Path(sys.argv[1])))
+def _check_length(seed: bytes) -> None:
+    if len(seed) != SEED_BYTES:
+        raise InputError(f"a seed has {SEED_BYTES} bytes; this one has {len(seed)}")

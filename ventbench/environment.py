@@ -138,7 +138,7 @@ def observe(
 
 
 def airway_pressure(plant: Plant, loop: LoopState) -> Array:
-    """Airway pressure, cmH2O, shape ``(...)``: what protocol version 2 scores.
+    """Airway pressure, cmH2O, shape ``(...)``: what is scored.
 
     It differs from the reading, ``loop.pressure``, by the lag and the offsets of the sensor. For a
     plant without ``airway_pressure(state)`` it is the reading.

@@ -1,17 +1,11 @@
-"""Scoring protocol, version 1: every number that a score depends on besides the simulators.
+"""Scoring protocol: every number that a score depends on besides simulators, draws and bounds.
 
-Changing any of these needs a new :data:`VERSION`; old boards keep the old one.
+What is scored is the airway pressure; controllers see readings of the sensor. The paper's score is
+the error of the nominal cells on the reference rig of each lung; the ranked score is that of draws
+on all of its rigs (:mod:`ventbench.draws`).
 """
 
 from __future__ import annotations
-
-#: Version of this protocol; written into every score.
-VERSION = 1
-
-#: Versions that this ventbench scores and replays. What differs in version 2 is in
-#: :mod:`ventbench.rig_draws`, :mod:`ventbench.metrics.score` and
-#: :mod:`ventbench.submissions.rig_scoring`.
-VERSIONS = (1, 2)
 
 #: Nominal control step, s (paper, appendix A.2).
 DT = 0.03

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
+from ventbench.submissions.rig_scoring import run_on_rigs
 
 from ventbench import protocol, rig_draws, seasons
 from ventbench.board import (
@@ -31,7 +32,6 @@ from ventbench.stress.results import DRAWS, pip_columns
 from ventbench.stress.score import StressScore
 from ventbench.stress.stressors import conditions
 from ventbench.submissions.folder import open_submission, resolve
-from ventbench.submissions.rig_scoring import run_on_rigs
 
 from ..textbook_rigs import TextbookRigs
 from .conftest import NOW, SANDBOX, accept, entry_folder, opened, put

@@ -20,6 +20,7 @@ from ventbench.controllers.rl_policy import (
     save_weights,
 )
 from ventbench.lungs import LUNG_IDS, LUNGS
+from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.protocol import PIPS
@@ -63,7 +64,9 @@ def test_numpy_and_jax_act_alike(name, track, looks_back, tmp_path):
     save_weights(folder / "weights.npz", made)
     with precision.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS])
-        found = run_protocol(open_submission(str(folder)), plants, track=track, draws=1)
+        found = run_protocol(
+            open_submission(str(folder)), Rigs(LUNGS, plants), track=track, draws=1
+        )
         for i, lung in enumerate(LUNG_IDS):
             policy = made[lung if track == "performance" else "all"]
             policy = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), policy)

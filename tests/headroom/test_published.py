@@ -8,7 +8,7 @@ from ventbench import precision, protocol
 from ventbench.headroom import attainable
 from ventbench.headroom import reference as references
 from ventbench.metrics.score import LEAST_HEADROOM
-from ventbench.submissions.rig_scoring import load_rigs
+from ventbench.plants.rigs import load_rigs
 
 
 @pytest.fixture(scope="module")

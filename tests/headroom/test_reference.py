@@ -7,7 +7,7 @@ from ventbench import protocol
 from ventbench.errors import InputError
 from ventbench.headroom import reference as references
 from ventbench.submissions.folder import submission_of
-from ventbench.submissions.rig_scoring import run_on_rigs
+from ventbench.submissions.scoring import run_protocol
 
 from ..textbook_rigs import TextbookRigs
 
@@ -59,7 +59,7 @@ def test_the_pid_scores_100_and_the_recorded_commands_0(rigs, found):
             p, i, d = self.gains
             return p * error + i * self.integral + d * self.derivative
 
-    score = run_on_rigs(submission_of(BestPID), rigs, draws=2, reference=found)
+    score = run_protocol(submission_of(BestPID), rigs, draws=2, reference=found)
     np.testing.assert_allclose(np.asarray(score.normalised), 100.0, atol=1e-6)
     value = score.to_json()["normalised"]
     assert value["nominal"] == pytest.approx(100.0)
@@ -78,7 +78,7 @@ def test_the_pid_scores_100_and_the_recorded_commands_0(rigs, found):
             self.step += 1
             return float(np.append(self.commands, 0.0)[self.step])
 
-    best = run_on_rigs(submission_of(Witness), rigs, draws=2, reference=found)
+    best = run_protocol(submission_of(Witness), rigs, draws=2, reference=found)
     np.testing.assert_allclose(np.asarray(best.normalised), 0.0, atol=1e-6)
 
 

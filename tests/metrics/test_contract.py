@@ -10,6 +10,7 @@ import pytest
 
 from ventbench.lungs import LUNGS
 from ventbench.metrics.figures import FIGURES, Figure, InspirationSignals, figures
+from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.submissions.folder import submission_of
@@ -76,7 +77,7 @@ def test_one_line_in_the_registry_brings_a_figure_into_scores_and_under_the_cont
     plants = stack([single_compartment(LUNGS[0])])
     score = run_protocol(
         submission_of(lambda seen: 2.0 * (seen.target - seen.pressure)),
-        plants, lungs=LUNGS[:1], pips=(20.0,),
+        Rigs(LUNGS[:1], plants), pips=(20.0,),
     )  # fmt: skip
     assert list(score.figures) == list(FIGURES)
     assert score.figures["peak_cmH2O"].shape == (1, 1, 2)

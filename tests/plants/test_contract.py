@@ -32,6 +32,7 @@ from ventbench.plants.corrected import Corrected
 from ventbench.plants.learned import Architecture, learned
 from ventbench.plants.plant_files import save_plants
 from ventbench.plants.registry import FAMILIES, PlantFamily
+from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.precision import float64
 from ventbench.rollouts import open_loop
@@ -307,5 +308,6 @@ def test_a_new_family_is_one_file_and_one_line(make_recording, tmp_path, monkeyp
         save_plants(tmp_path / name, {x: simulators.plant(x) for x in STIFF_AND_SOFT})
         again = load_simulators(tmp_path / name).pressures(recording)
         np.testing.assert_array_equal(again, answers)
-    score = scoring.run_protocol(open_submission("pid_best"), simulators.stacked, pips=(10.0,))
+    rigs = Rigs(simulators.lungs, simulators.stacked)
+    score = scoring.run_protocol(open_submission("pid_best"), rigs, pips=(10.0,))
     assert np.isfinite(score.score)

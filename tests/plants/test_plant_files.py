@@ -188,6 +188,7 @@ def run(*arguments: object) -> tuple[int, str]:
 
 def test_score_on_the_plants_of_a_file(tmp_path: Path) -> None:
     """Its lungs are those of the file, and the score is that of the same plants elsewhere."""
+    from ventbench.plants.rigs import Rigs
     from ventbench.submissions.folder import open_submission
     from ventbench.submissions.scoring import run_protocol
 
@@ -203,8 +204,7 @@ def test_score_on_the_plants_of_a_file(tmp_path: Path) -> None:
     assert plain["simulators"]["sha256"] == whole_files.sha256(path)
     wanted = run_protocol(
         open_submission("pid_best"),
-        stack_heterogeneous(list(plants.values())),
-        lungs=[lung(name) for name in plants],
+        Rigs(tuple(map(lung, plants)), stack_heterogeneous(list(plants.values()))),
     )
     assert plain["score"] == pytest.approx(wanted.score, abs=1e-12)
     code, text = run(*options)

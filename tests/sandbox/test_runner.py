@@ -13,6 +13,7 @@ import pytest
 from ventbench import precision, protocol
 from ventbench.interfaces import Task
 from ventbench.lungs import LUNGS
+from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.sandbox import runner as runner_module
@@ -42,8 +43,8 @@ def test_scores_are_those_of_the_plain_process():
     for name in ("pid_best", "pid_robust"):
         submission = open_submission(name)
         runner = SandboxRunner(allowance=PATIENT)
-        apart = run_protocol(submission, plants, draws=1, pips=(20.0,), runner=runner)
-        plain = run_protocol(submission, plants, draws=1, pips=(20.0,))
+        apart = run_protocol(submission, Rigs(LUNGS, plants), draws=1, pips=(20.0,), runner=runner)
+        plain = run_protocol(submission, Rigs(LUNGS, plants), draws=1, pips=(20.0,))
         assert not apart.failures
         np.testing.assert_array_equal(apart.nominal, plain.nominal)
         np.testing.assert_array_equal(apart.drawn, plain.drawn)

@@ -12,10 +12,10 @@ from ventbench import precision, protocol
 from ventbench.controllers.pid import PID
 from ventbench.metrics.score import run_error
 from ventbench.plants import frozen
+from ventbench.plants.rigs import load_rigs, rigs_of
 from ventbench.stress.run import StressDraws, closed_loop, draw_cells, flat
 from ventbench.stress.score import StressScore
 from ventbench.stress.stressors import Condition
-from ventbench.submissions.rig_scoring import load_rigs, rigs_of
 
 
 def test_draws_cover_every_pip_on_every_lung_and_are_those_of_the_protocol() -> None:

@@ -15,12 +15,12 @@ from tests.stress.conftest import NAMES, Controller
 from ventbench.cli import app
 from ventbench.errors import InputError
 from ventbench.interfaces import Task
+from ventbench.plants.rigs import load_rigs
 from ventbench.stress.run import StressDraws, StressRun, draw_cells
 from ventbench.stress.score import StressScore, assess, chosen_conditions, run_stress
 from ventbench.stress.stressors import Condition
 from ventbench.submissions.errors import SubmissionError
 from ventbench.submissions.folder import open_submission, submission_of
-from ventbench.submissions.rig_scoring import load_rigs
 
 
 def _made(draws: StressDraws, pressure: np.ndarray) -> StressScore:

@@ -3,17 +3,15 @@
 import dataclasses
 import json
 
-import jax
 import numpy as np
 import pytest
 
-from ventbench import draws, precision
+from ventbench import draws
 from ventbench.lungs import LUNGS
 from ventbench.plants import frozen
-from ventbench.plants.corrected import Corrected
+from ventbench.plants.rigs import Rigs, load_rigs
 from ventbench.submissions.folder import open_submission
-from ventbench.submissions.scoring import _frozen_sha256, run_protocol
-from ventbench.submissions.stepping import as_float64
+from ventbench.submissions.scoring import run_protocol
 from ventbench.trajectories import load
 
 FULL = {"layers": ["landlock", "seccomp"], "official": True}
@@ -36,8 +34,8 @@ class Pretender:
 
 
 def scored(plants, **options):
-    options = {"runner": Pretender(), "simulators": frozen.load().about()} | options
-    return run_protocol(open_submission("pid_robust"), plants, **options)
+    rigs = plants if isinstance(plants, Rigs) else Rigs(LUNGS, plants, about=frozen.load().about())
+    return run_protocol(open_submission("pid_robust"), rigs, **{"runner": Pretender()} | options)
 
 
 @pytest.fixture(scope="module")
@@ -49,12 +47,12 @@ def textbook(plants):
 def official(textbook):
     """The nominal part, as if it had been run on the frozen simulators."""
     frozen_ones = {"frozen_sha256": frozen.MANIFEST_SHA256}
-    return dataclasses.replace(textbook, drawn=textbook.drawn[:0], draws_sha256=None, **frozen_ones)
+    return dataclasses.replace(textbook, drawn=textbook.drawn[:0], rig_draws=None, **frozen_ones)
 
 
 @pytest.mark.slow
 def test_a_score_on_the_frozen_simulators_is_official():
-    result = scored(frozen.load().plants)
+    result = scored(load_rigs())
     assert result.official
     assert not dataclasses.replace(result, sandbox=None).official
 
@@ -81,7 +79,7 @@ def test_official_needs_everything(official):
         ({"lungs": ("R5C10",)}, "not all lungs and PIPs"),
         ({"drawn": np.ones((1, 6, 6))}, "other draws than the published ones"),
         (
-            {"drawn": np.ones((1, 6, 6)), "draws_sha256": "0" * 64},
+            {"drawn": np.ones((1, 6, 6)), "rig_draws": draws.build([[0]], 1, seed=bytes(32))},
             "other draws than the published ones",
         ),
     ],
@@ -93,7 +91,7 @@ def test_lacking_one_thing_it_is_not(official, changed, reason):
 
 
 def test_published_draws_are_official(official):
-    drawn = {"drawn": np.ones((20, 6, 6)), "draws_sha256": draws.SHA256}
+    drawn = {"drawn": np.ones((20, 6, 6)), "rig_draws": draws.build([[0]], 1)}
     assert dataclasses.replace(official, **drawn).official
 
 
@@ -102,28 +100,6 @@ def test_words_of_the_caller_make_no_simulators_frozen(textbook):
     assert textbook.sandbox == FULL
     assert not textbook.official
     assert textbook.to_json()["official"] is False
-
-
-@pytest.fixture(scope="module")
-def hybrids():
-    with precision.float64():
-        return as_float64(frozen.load().plants, len(LUNGS))
-
-
-def test_only_the_frozen_numbers_themselves_count(hybrids):
-    with precision.float64():
-        assert _frozen_sha256(hybrids) == frozen.MANIFEST_SHA256
-        nudged = hybrids.replace(R=hybrids.R.at[3].set(np.nextafter(hybrids.R[3], 1e3)))
-        assert _frozen_sha256(nudged) is None
-        rounded = jax.tree.map(lambda leaf: leaf.astype("float32").astype(float), hybrids)
-        assert _frozen_sha256(rounded) is None
-        assert _frozen_sha256(jax.tree.map(lambda leaf: leaf[:3], hybrids)) is None
-
-
-def test_a_corrected_simulator_is_never_the_frozen_one(hybrids):
-    names = {field.name for field in dataclasses.fields(Corrected)}
-    corrected = Corrected(**dict.fromkeys(names, hybrids))  # type: ignore[arg-type]
-    assert _frozen_sha256(corrected) is None
 
 
 def test_a_frame_has_every_cell(textbook):

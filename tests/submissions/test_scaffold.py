@@ -10,6 +10,7 @@ import pytest
 
 from ventbench.errors import InputError
 from ventbench.lungs import LUNGS
+from ventbench.plants.rigs import Rigs
 from ventbench.submissions import contract
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.manifest import FAMILIES
@@ -38,7 +39,7 @@ def test_is_ready_and_scores(family, tmp_path, one_lung):
     assert report.ok, "\n".join(report.lines())
     assert report.notes[0].what == "key authors still says Your Name"
     result = run_protocol(
-        open_submission(str(folder)), one_lung, lungs=LUNGS[:1], pips=(20.0,), track="robustness"
+        open_submission(str(folder)), Rigs(LUNGS[:1], one_lung), pips=(20.0,), track="robustness"
     )
     assert not result.failures
     # A lung that is left alone at PEEP would be 15 off.
@@ -49,8 +50,7 @@ def test_residual_starts_as_its_pi_controller(tmp_path, one_lung):
     def scored(folder):
         return run_protocol(
             open_submission(str(folder)),
-            one_lung,
-            lungs=LUNGS[:1],
+            Rigs(LUNGS[:1], one_lung),
             pips=(20.0,),
             track="robustness",
         ).requested

@@ -16,6 +16,7 @@ from ventbench.errors import InputError
 from ventbench.interfaces import Task
 from ventbench.lungs import LUNG_IDS, LUNGS, lung
 from ventbench.metrics.score import run_error
+from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import take
 from ventbench.submissions import runner, stepping
@@ -35,18 +36,19 @@ GAINS = {
 
 
 def pure_errors(plants, cells, gains):
-    """Errors of the pure PID in the compiled scan, shape ``(L, ...)``."""
+    """Errors of the pure PID in one scan, shape ``(L, ...)``; cells of all or of each lung."""
     errors = []
     with precision.float64():
         for i, gain in enumerate(gains):
-            found, _ = rollouts.closed_loop(take(plants, i), PID(*gain), cells)
-            errors.append(run_error(found.pressure, np.asarray(cells.pip)[..., None, None]))
+            own = cells if cells.pip.ndim == 1 else jax.tree.map(lambda x, i=i: x[i], cells)
+            found, _ = rollouts.closed_loop(take(plants, i), PID(*gain), own)
+            errors.append(run_error(found.pressure, np.asarray(own.pip)[..., None, None]))
     return np.stack(errors)
 
 
 @pytest.fixture(scope="module")
 def best(plants):
-    return run_protocol(open_submission("pid_best"), plants, draws=20)
+    return run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), draws=20)
 
 
 def test_nominal_is_that_of_the_pure_pid(plants, best):
@@ -58,14 +60,14 @@ def test_nominal_is_that_of_the_pure_pid(plants, best):
 
 def test_draws_are_those_of_the_pure_pid(plants, best):
     with precision.float64():
-        cells = draws.scenarios()
+        cells = Rigs(LUNGS, plants).draws(20).cells
     expected = np.moveaxis(pure_errors(plants, cells, GAINS.values()), 0, 1)
     np.testing.assert_allclose(best.drawn, expected, rtol=0, atol=1e-9)
 
 
 def test_robust_pid(plants):
     for track in ("robustness", "performance"):
-        found = run_protocol(open_submission("pid_robust"), plants, track=track)
+        found = run_protocol(open_submission("pid_robust"), Rigs(LUNGS, plants), track=track)
         with precision.float64():
             cells = environment.nominal_scenario(np.array(protocol.PIPS))
         expected = pure_errors(plants, cells, [(10.0, 2.0, 9.0)] * 6)
@@ -75,7 +77,6 @@ def test_robust_pid(plants):
 def test_json(best):
     found = best.to_json()
     json.dumps(found, allow_nan=False)
-    assert found["protocol"] == 1
     assert list(found["lungs"]) == list(LUNG_IDS)
     for lung_id, result in found["lungs"].items():
         assert list(result["pips"]) == ["10", "15", "20", "25", "30", "35"]
@@ -86,7 +87,7 @@ def test_json(best):
     assert found["score"] == pytest.approx(np.mean([x["score"] for x in found["lungs"].values()]))
     assert len(found["draws"]["values"]) == 20
     assert found["draws"]["values"][3] == pytest.approx(best.drawn[3].mean())
-    assert found["draws"]["sha256"] == draws.SHA256
+    assert found["draws"]["sha256"] == draws.commitment(draws.DEVELOPMENT_SEED)
     assert found["sandbox"] is None
     assert found["official"] is False
     assert found["complete"] is True
@@ -111,7 +112,7 @@ def test_secondary_figures_are_those_of_the_lung(best, plants):
 
 
 def test_deterministic(best, plants):
-    again = run_protocol(open_submission("pid_best"), plants, draws=20)
+    again = run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), draws=20)
     first, second = best.to_json(), again.to_json()
     assert set(first.pop("timing")) == set(second.pop("timing"))
     assert first == second
@@ -157,7 +158,7 @@ def test_parts(best, plants):
 
 
 def test_without_draws(plants):
-    result = run_protocol(open_submission("pid_best"), plants).to_json()
+    result = run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants)).to_json()
     assert result["draws"] is None
     assert result["lungs"]["R5C10"]["draws"] is None
 
@@ -166,8 +167,8 @@ def test_compiles_once(plants):
     compiled: list[Any] = [stepping._inspire, stepping._observe]
     for function in compiled:
         function.clear_cache()
-    run_protocol(open_submission("pid_best"), plants, draws=1)
-    run_protocol(open_submission("pid_robust"), plants, draws=1)
+    run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), draws=1)
+    run_protocol(open_submission("pid_robust"), Rigs(LUNGS, plants), draws=1)
     assert [function._cache_size() for function in compiled] == [1, 1]
 
 
@@ -187,7 +188,7 @@ def test_what_a_submission_is_told(make, plants, track, known):
                 return 2.0 * len(self.seen) - 20.0
         """
     folder = make(source)
-    run_protocol(open_submission(str(folder)), plants, track=track, draws=1)
+    run_protocol(open_submission(str(folder)), Rigs(LUNGS, plants), track=track, draws=1)
     runs = [json.loads(line) for line in (folder.parent / "log").read_text().splitlines()]
     assert len(runs) == 6 * 2 * 6
     for index, (task, seen) in enumerate(runs):
@@ -274,23 +275,23 @@ def test_clipping(make, plants):
 
 def test_wrong_track(plants):
     with pytest.raises(SubmissionError, match="enters performance; it cannot be scored for robus"):
-        run_protocol(open_submission("pid_best"), plants, track="robustness")
+        run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), track="robustness")
 
 
 def test_too_many_draws(plants):
-    with pytest.raises(InputError, match="20 published draws"):
-        run_protocol(open_submission("pid_best"), plants, draws=21)
+    with pytest.raises(InputError, match="20 development draws"):
+        run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), draws=21)
 
 
 def test_plants_of_other_lungs(plants):
     with pytest.raises(ValueError, match="not stacked over 2 lungs"):
-        run_protocol(open_submission("pid_best"), plants, lungs=LUNGS[:2])
+        run_protocol(open_submission("pid_best"), Rigs(LUNGS[:2], plants))
 
 
 def test_broken_simulator_is_no_score(plants):
     broken = dataclasses.replace(plants, C=np.array([10.0, 20.0, np.nan, 10.0, 20.0, 50.0]))
     with pytest.raises(FloatingPointError, match="simulator 2 answered with NaN"):
-        run_protocol(open_submission("pid_best"), broken)
+        run_protocol(open_submission("pid_best"), Rigs(LUNGS, broken))
 
 
 def test_code_that_cannot_be_imported(make, plants):
@@ -320,7 +321,7 @@ class Recorder:
 
 def test_another_runner(plants):
     runner = Recorder()
-    found = run_protocol(open_submission("pid_best"), plants, draws=1, runner=runner)
+    found = run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), draws=1, runner=runner)
     assert len(runner.rows) == 102
     assert all(rows.shape == (72, 15) and rows.dtype == np.float64 for rows in runner.rows)
     assert [task.lung for task in runner.tasks[::12]] == list(LUNG_IDS)
@@ -341,7 +342,7 @@ def test_session_is_closed_when_the_loop_breaks(plants):
 
     runner = Breaks()
     with pytest.raises(KeyboardInterrupt):
-        run_protocol(open_submission("pid_best"), plants, runner=runner)
+        run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), runner=runner)
     assert runner.closed == 1
 
 
@@ -368,13 +369,13 @@ def test_jax_in_a_submission_is_as_elsewhere(make, plants):
         return jnp.asarray(observation.pressure)
         """
     part = jax.tree.map(lambda leaf: leaf[:1], plants)
-    found = run_protocol(open_submission(str(make(act=act))), part, lungs=LUNGS[:1], pips=[10.0])
+    found = run_protocol(open_submission(str(make(act=act))), Rigs(LUNGS[:1], part), pips=[10.0])
     assert found.failures == ()
 
 
 def test_nothing_is_left_on_the_search_path(plants):
     before = list(sys.path)
-    run_protocol(open_submission("pid_best"), plants)
+    run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants))
     assert sys.path == before
 
 

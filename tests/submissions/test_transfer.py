@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from ventbench.errors import InputError
+from ventbench.plants.rigs import load_rigs
 from ventbench.submissions.folder import open_submission
-from ventbench.submissions.rig_scoring import load_rigs, run_on_rigs
+from ventbench.submissions.scoring import run_protocol
 from ventbench.submissions.transfer import GROUPS, transfer
 
 from ..textbook_rigs import TextbookRigs
@@ -27,7 +28,7 @@ def result(rigs):
 
 
 def test_reference_rig_is_the_nominal_score(rigs, result):
-    score = run_on_rigs(open_submission("pid_robust"), rigs)
+    score = run_protocol(open_submission("pid_robust"), rigs)
     np.testing.assert_allclose(result.errors["reference rig"], score.nominal.mean(axis=1))
     assert result.mean("reference rig") == pytest.approx(score.score)
 

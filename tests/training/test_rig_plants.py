@@ -10,13 +10,14 @@ import jax
 import numpy as np
 import pytest
 
-from ventbench import rig_draws, seasons
+from ventbench import draws
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import Hybrid
+from ventbench.plants.rigs import load_rigs
 from ventbench.submissions.folder import submission_of
-from ventbench.submissions.rig_scoring import load_rigs, run_on_rigs
+from ventbench.submissions.scoring import run_protocol
 from ventbench.training import rig_pid
 from ventbench.training.rig_plants import plants_to_train_on
 
@@ -78,7 +79,7 @@ def test_gains_are_tuned_on_draws_of_their_own(official, monkeypatch):
     result = tuned.to_json()
     assert result["lungs"]["R5C10"]["error"] == pytest.approx(tuned.errors[0])
     assert result["simulators"]["manifest_sha256"] == official.manifest_sha256
-    assert rig_pid.TUNING_SEED != seasons.DEVELOPMENT_SEED
+    assert rig_pid.TUNING_SEED != draws.DEVELOPMENT_SEED
 
     asked = []
 
@@ -97,7 +98,7 @@ def test_gains_are_tuned_on_draws_of_their_own(official, monkeypatch):
 @pytest.mark.slow
 def test_an_error_on_draws_is_that_of_the_scorer():
     rigs = load_rigs("single_compartment")
-    drawn = rig_draws.build(tuple((0,) for _ in rigs.lungs), 1, seed=rig_pid.TUNING_SEED, n=1)
+    drawn = draws.build(tuple((0,) for _ in rigs.lungs), 1, seed=rig_pid.TUNING_SEED, n=1)
     found = rig_pid.drawn_errors(rigs, drawn, 2, PIDS[:1])
 
     class Controller:
@@ -112,6 +113,6 @@ def test_an_error_on_draws_is_that_of_the_scorer():
             self.integral += a * (error - self.integral)
             return 2.0 * error + 4.0 * self.integral
 
-    score = run_on_rigs(submission_of(Controller), rigs, drawn=drawn)
+    score = run_protocol(submission_of(Controller), rigs, drawn=drawn)
     assert score.controllable is not None
     np.testing.assert_allclose(found[0], score.controllable[2, 1], atol=1e-9)

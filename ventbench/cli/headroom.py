@@ -18,13 +18,6 @@ def headroom(
     out: Annotated[Path, typer.Option(metavar="FILE", help="File of the reference errors.")] = Path(
         "runs/bounds-v2.npz"
     ),
-    season: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Season whose draws are meant; default: development."),
-    ] = None,
-    seed: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Its secret seed, while it is secret.")
-    ] = None,
     check: Annotated[
         Path | None,
         typer.Option(
@@ -37,7 +30,7 @@ def headroom(
     scheduler: Scheduler = None,
     json: JsonFile = None,
 ) -> None:
-    """Compute the best attainable error and the best PID of every cell of protocol version 2.
+    """Compute the best attainable error and the best PID of every cell of the development draws.
 
     Commands are optimised for each cell with everything known; the best PID of a lung comes from
     the paper's grid on all rigs of the lung. Takes minutes; the same command continues.
@@ -47,15 +40,15 @@ def headroom(
     import numpy as np
     from rich.console import Console
 
-    from ventbench import protocol
+    from ventbench import draws, protocol
     from ventbench.executor import executor
     from ventbench.headroom import reference as references
-    from ventbench.submissions import rig_scoring
+    from ventbench.plants.rigs import load_rigs
     from ventbench.training import rig_pid
 
     console = Console(stderr=str(json) == "-")
-    rigs = rig_scoring.load_rigs()
-    drawn = rig_scoring.season_draws(rigs, season, seed)
+    rigs = load_rigs()
+    drawn = rigs.draws(draws.COUNT)
     plants, cells = rigs.cells(drawn, protocol.PIPS)
     about = references.settings(rigs.about, drawn.about())
     if check is not None:
@@ -71,12 +64,9 @@ def headroom(
     parts = out.with_suffix(".parts")
     with bars() as progress:
         task = progress.add_task("best PID of each lung", total=None)
-        if season is None:
-            gains, _ = rig_pid.best_pids(
-                rigs, progress=lambda done, all_: progress.update(task, completed=done, total=all_)
-            )
-        else:
-            gains = references.published().gains
+        gains, _ = rig_pid.best_pids(
+            rigs, progress=lambda done, all_: progress.update(task, completed=done, total=all_)
+        )
         task = progress.add_task("best attainable", total=None)
         with executor(workers, scheduler) as pool:
             computed = references.compute(

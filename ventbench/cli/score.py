@@ -77,22 +77,13 @@ def score(
         ),
     ] = None,
     plant: PlantName = "frozen",
-    protocol: Annotated[
-        int,
-        typer.Option(
-            min=1,
-            max=2,
-            help="Version of the protocol: 2 scores airway pressure, draws on the rigs of each "
-            "lung.",
-        ),
-    ] = 1,
     stress: Annotated[
-        bool,
+        bool | None,
         typer.Option(
-            help="With --protocol 2: also run entries of the robustness track under missing "
-            "physics; six draws with --draws 6 or more, else one."
+            help="Also run entries of the robustness track under missing physics, six draws of "
+            "each lung; default: with --draws 20."
         ),
-    ] = True,
+    ] = None,
     in_process: Annotated[
         bool,
         typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
@@ -103,15 +94,16 @@ def score(
 ) -> None:
     """Score controllers on the six frozen lung simulators.
 
-    The score is the mean |pressure - target| over the inspirations, cmH2O; lower is better. With
-    `--protocol 2` the normalised score and the score under missing physics stand beside it. Each
+    The paper's score is the mean |pressure - target| over the inspirations, cmH2O, without noise
+    on the reference rig of each lung; lower is better. With `--draws 20` the ranked score stands
+    beside it: normalised, on all rigs of each lung, and the score under missing physics. Each
     controller runs in sandboxed processes that have no access to the simulators. With another
     `--plant` the lungs are those of that plant, and the score is not official. Several controllers
     are scored in turn, or at the same time with `--workers` or `--scheduler`.
 
     Example: `ventbench score submissions/pid_best --json score.json`
 
-    Example: `ventbench score adaptive_pid --protocol 2 --track all --draws 20 --record runs/record`
+    Example: `ventbench score adaptive_pid --track all --draws 20 --record runs/record`
     """
     from functools import partial
 
@@ -148,23 +140,23 @@ def score(
     ]
     jobs = [(entry, each) for entry, own in zip(opened, tracks, strict=True) for each in own]
     # Stress takes longest: beside other work it comes first.
-    under_stress = [(entry, "stress") for entry in opened if protocol == 2 and stress]
+    stress = draws >= 20 if stress is None else stress
+    under_stress = [(entry, "stress") for entry in opened if stress]
     jobs = [job for job in under_stress if _has_stress_score(job[0])] + jobs
-    work = partial(_run, simulator=plant, draws=draws, sandbox=not in_process, protocol=protocol)
+    work = partial(_run, simulator=plant, draws=draws, sandbox=not in_process)
     done = of_each_entry("scoring", work, jobs, workers, scheduler)
     scores = [result for result in done if isinstance(result, Score)]
     stressed = {
         result.submission.manifest.name: result for result in done if not isinstance(result, Score)
     }
     results = [result.to_json() for result in scores]
-    if protocol == 2:
-        for values in results:
-            own = stressed.get(values["name"])
-            values["stress"] = None if own is None else own.to_json()
+    for values in results:
+        own = stressed.get(values["name"])
+        values["stress"] = None if own is None else own.to_json()
     emit(results[0] if len(results) == 1 else {"submissions": results}, json)
     console = Console(stderr=str(json) == "-")
     console.print(_table(results))
-    if protocol == 2:
+    if all(entry["normalised"] is not None for entry in results):
         console.print(_normalised_table(results))
     if stressed:
         from ventbench.cli.stress import stress_table
@@ -185,7 +177,7 @@ def score(
         from ventbench.board import create
         from ventbench.plants import frozen
 
-        for path in create.keep(record, scores, frozen.load(protocol), stressed):
+        for path in create.keep(record, scores, frozen.load(), stressed):
             console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
     if any(result.failures for result in (*scores, *stressed.values())):
         raise typer.Exit(1)
@@ -198,7 +190,6 @@ def _run(
     simulator: str,
     draws: int,
     sandbox: bool,
-    protocol: int,
     progress: Progress | None = None,
 ) -> Score | StressScore:
     """Score an entry on a track, which may be ``"stress"``; in this process or in another one."""
@@ -206,9 +197,8 @@ def _run(
         from ventbench.stress.results import DRAWS
         from ventbench.stress.score import score_stress
 
-        some = DRAWS if draws >= DRAWS else 1
         return score_stress(
-            entry, simulator=simulator, draws=some, sandbox=sandbox, progress=progress
+            entry, simulator=simulator, draws=DRAWS, sandbox=sandbox, progress=progress
         )
     from ventbench.submissions import scoring
 
@@ -218,7 +208,6 @@ def _run(
         track=track,
         draws=draws,
         sandbox=sandbox,
-        protocol=protocol,
         progress=progress,
     )
 
@@ -253,12 +242,9 @@ def _table(scores: list[dict[str, Any]]) -> Table:
     return table
 
 
-def _normalised_table(scores: list[dict[str, Any]]) -> Table | str:
+def _normalised_table(scores: list[dict[str, Any]]) -> Table:
     """Return the normalised scores: a row for each lung, a column for each submission."""
     from rich.table import Table
-
-    if any(entry["normalised"] is None for entry in scores):
-        return "There are no normalised scores: `ventbench headroom` has not computed these cells."
 
     def show(value: float | None) -> str:
         return "failed" if value is None else f"{value:.1f}"
@@ -335,7 +321,7 @@ def transfer(
     from rich.console import Console
     from rich.table import Table
 
-    from ventbench.submissions import rig_scoring
+    from ventbench.plants.rigs import load_rigs
     from ventbench.submissions import transfer as transfers
     from ventbench.submissions.folder import open_submission
     from ventbench.submissions.runner import CountingRunner, InProcessRunner, Runner
@@ -346,7 +332,7 @@ def transfer(
 
         runner = SandboxRunner()
     opened = [open_submission(name) for name in names]
-    rigs = rig_scoring.load_rigs()
+    rigs = load_rigs()
     results = []
     for entry in opened:
         with bars() as shown:

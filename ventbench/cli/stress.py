@@ -126,7 +126,7 @@ def _write_records(
     """Score the robustness track too, and write records with both."""
     from functools import partial
 
-    from ventbench import rig_draws
+    from ventbench import draws
     from ventbench.board import create
     from ventbench.plants import frozen
     from ventbench.submissions import scoring
@@ -134,13 +134,12 @@ def _write_records(
     work = partial(
         scoring.score,
         track="robustness",
-        draws=rig_draws.COUNT,
+        draws=draws.COUNT,
         sandbox=not in_process,
-        protocol=2,
     )
     scores = of_each_entry("scoring", work, [(entry,) for entry in entries], *parallel)
     by_name = {own.submission.manifest.name: own for own in stressed}
-    return create.keep(folder, scores, frozen.load(2), by_name)
+    return create.keep(folder, scores, frozen.load(), by_name)
 
 
 def stress_table(scores: list[dict[str, Any]]) -> Table:

@@ -38,9 +38,9 @@ from scipy.optimize import linprog
 
 from ventbench import environment as env
 from ventbench import precision, protocol
+from ventbench.draws import DEVELOPMENT_SEED, uniforms
 from ventbench.environment import Scenario
 from ventbench.interfaces import Plant
-from ventbench.seasons import DEVELOPMENT_SEED, uniforms
 
 #: Commands that act before the last scored pressure, and pressures that they can change.
 COMMANDS = protocol.INSPIRATION_STEPS - 1

@@ -1,7 +1,7 @@
 """What normalised scores are measured against: best attainable and best PID of every cell.
 
-``data/bounds-v2.npz`` holds both for the nominal cells and the development draws of protocol
-version 2, with the commands that attain the bound: whoever applies them gets the same errors.
+``data/bounds-v2.npz`` holds both for the nominal cells and the development draws,
+with the commands that attain the bound: whoever applies them gets the same errors.
 ``ventbench headroom`` makes the file again, and those of other draws.
 """
 
@@ -61,7 +61,7 @@ class Reference:
     :func:`ventbench.metrics.score.controllable_error`.
 
     Attributes:
-        about: hashes of the simulators, and season, commitment and number of the draws.
+        about: hashes of the simulators, and name, commitment and number of the draws.
         gains: P, I, D of each lung's best PID, %/cmH2O, shape ``(L, 3)``.
         attainable: error that :attr:`commands` attain, cmH2O, shape ``(L, 1 + K, P)``.
         lower: error of the rise alone, below which none can be, cmH2O, shape ``(L, 1 + K, P)``.
@@ -105,7 +105,7 @@ def settings(simulators: Mapping[str, Any], draws: Mapping[str, Any] | None) -> 
 
     Args:
         simulators: version and hashes of the simulators.
-        draws: what :meth:`ventbench.rig_draws.RigDraws.about` says; None for nominal cells alone.
+        draws: what :meth:`ventbench.draws.Draws.about` says; None for nominal cells alone.
     """
     about = {"simulators": simulators.get("manifest_sha256"), "draws": draws}
     return json.loads(json.dumps(about))
@@ -192,7 +192,7 @@ def reference_of(
 @jax.jit
 def _pid_pressures(plants: Plant, gains: Array, cells: Scenario) -> Array:
     def run(plant: Plant, gains: Array, cells: Scenario) -> Array:
-        return rollouts.closed_loop(plant, PID(*gains), cells, airway=True)[0].pressure
+        return rollouts.closed_loop(plant, PID(*gains), cells)[0].pressure
 
     return jax.vmap(run)(plants, gains, cells)
 

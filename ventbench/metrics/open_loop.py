@@ -149,7 +149,7 @@ def by_lung(
 
     Args:
         u_in: commands of each lung, %, by lung id.
-        lungs: what :meth:`ventbench.plants.frozen.Frozen.lungs` of version 2 gives.
+        lungs: what :meth:`ventbench.plants.frozen.Frozen.lungs` gives.
     """
     return {
         name: extrapolation(commands, lungs[name]["recorded_commands"])

@@ -1,6 +1,6 @@
 """Scores: the mean absolute error of the pressure, its safety gate, and the normalised score.
 
-The normalised score of protocol version 2 says how much of what is attainable a controller misses:
+The normalised score says how much of what is attainable a controller misses:
 0 is the best that any commands attain in a cell, everything known; 100 is the best PID of the lung
 in that cell. The first step of an inspiration is left out: no command can change its pressure.
 """

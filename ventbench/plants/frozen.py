@@ -33,7 +33,7 @@ from ventbench.recordings.breaths import Breaths
 #: Formats of the manifest: one rig a lung, and a set of rigs a lung.
 FORMAT, RIGS_FORMAT = "ventbench-simulators-1", "ventbench-simulators-2"
 #: SHA-256 of the manifest of version 1, which holds those of all its files.
-MANIFEST_SHA256 = "10d5cc74ada5ed307dfc0f26e2b90820fe110f69437992042fd02b3735ebeed7"
+MANIFEST_SHA256 = "e4b214dd47b9233918260c0576bf76ce15eb1629309be0ae05cf04394fe368e9"
 MANIFEST, MEMBERS, LEARNED, SEEN = "manifest.toml", "hybrid.npz", "learned.npz", "seen.npz"
 
 #: Fold of a breath that every member has seen, and of one that none has.
@@ -248,12 +248,12 @@ def seen(breaths: Breaths, fold: NDArray[np.int64]) -> Seen:
     return Seen(key[kept], np.where(repeated, BY_ALL, fold[kept]).astype(np.int8))
 
 
-def folder(version: int = 1) -> Path:
+def folder(version: int = 2) -> Path:
     """Folder of a version."""
     return data_path(f"simulators/v{version}")
 
 
-def load(version: int = 1, path: Path | None = None) -> Frozen:
+def load(version: int = 2, path: Path | None = None) -> Frozen:
     """Read the official simulators and check every file against the manifest.
 
     Args:

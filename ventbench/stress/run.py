@@ -16,18 +16,19 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
+from ventbench import draws as draw_tables
 from ventbench import environment as env
-from ventbench import precision, protocol, rig_draws, waveform
+from ventbench import precision, protocol, waveform
+from ventbench.draws import Draws
 from ventbench.environment import Scenario
 from ventbench.interfaces import Controller, Plant, Task
 from ventbench.lungs import Lung
-from ventbench.rig_draws import RigDraws
+from ventbench.plants.rigs import Rigs
 from ventbench.stress.plants import Stressed, stressed_plants
 from ventbench.stress.results import DRAWS, pip_columns
 from ventbench.stress.stressors import Condition
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import Submission
-from ventbench.submissions.rig_scoring import Rigs
 from ventbench.submissions.runner import Runner, pack
 
 Floats = NDArray[np.float64]
@@ -45,25 +46,25 @@ class StressDraws:
         plants: scored plants, leaves ``(L, n, ...)``.
         scenario: deviations, batch shape ``(L, n)``.
         nominal_pip: PIP before its deviation, cmH2O, ``(L, n)``.
-        drawn: the draws of protocol version 2 that they are taken from.
+        drawn: the draws that they are taken from.
     """
 
     lungs: tuple[Lung, ...]
     plants: Plant
     scenario: Scenario
     nominal_pip: Floats
-    drawn: RigDraws
+    drawn: Draws
 
 
-def draw_cells(rigs: Rigs, n: int = DRAWS, *, drawn: RigDraws | None = None) -> StressDraws:
-    """Take cells of the draws of protocol version 2, one PIP of each lung and draw.
+def draw_cells(rigs: Rigs, n: int = DRAWS, *, drawn: Draws | None = None) -> StressDraws:
+    """Take cells of draws, one PIP of each lung and draw.
 
     In each draw the lungs have different PIPs, and over six draws each lung has each PIP once.
 
     Args:
-        rigs: from :func:`ventbench.submissions.rig_scoring.load_rigs`.
+        rigs: from :func:`ventbench.plants.rigs.load_rigs`.
         n: number of draws.
-        drawn: other draws than the development ones, such as those of a season.
+        drawn: other draws than the development ones.
 
     Raises:
         InputError: if there are not so many draws.
@@ -77,7 +78,7 @@ def draw_cells(rigs: Rigs, n: int = DRAWS, *, drawn: RigDraws | None = None) -> 
             lambda leaf: np.repeat(np.asarray(leaf)[:, None], n, axis=1), rigs.plants
         )
     else:
-        each = rig_draws.plants_of(rigs.plants, drawn.rig, drawn.member)
+        each = draw_tables.plants_of(rigs.plants, drawn.rig, drawn.member)
         plants = jax.tree.map(lambda leaf: leaf[:, :, 0], each)
     nominal = np.asarray(protocol.PIPS)[at[2]]
     return StressDraws(rigs.lungs, plants, scenario, nominal, drawn)

@@ -18,18 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench import files, protocol
+from ventbench.draws import Draws
 from ventbench.metrics.figures import time_above_alarm
 from ventbench.metrics.score import passes_safety_gate, run_error
 from ventbench.metrics.step_response import steady_error
 from ventbench.plants.catalog import Given
-from ventbench.rig_draws import RigDraws
+from ventbench.plants.rigs import load_rigs
 from ventbench.stress.results import DRAWS, StressTables
 from ventbench.stress.run import TRACK, StressDraws, StressRun, draw_cells, step_through
 from ventbench.stress.stressors import VERSION, Condition, conditions, stressor
 from ventbench.submissions.errors import Failure, SubmissionError
 from ventbench.submissions.folder import Submission, as_submission
 from ventbench.submissions.result import package_versions
-from ventbench.submissions.rig_scoring import load_rigs
 from ventbench.submissions.runner import (
     CountingRunner,
     InProcessRunner,
@@ -46,9 +46,6 @@ Floats = NDArray[np.float64]
 #: Tolerance of the plateau, cmH2O and share of PIP: "2 cmH2O + 4 % of the actual reading", as data
 #: sheets of intensive-care ventilators declare for airway pressure.
 PLATEAU_TOLERANCE, PLATEAU_SHARE = 2.0, 0.04
-
-#: Version of the protocol that the track belongs to.
-PROTOCOL = 2
 
 #: Conditions that a printed score shows, the worst first.
 _SHOWN = 10
@@ -73,7 +70,7 @@ class StressScore(StressTables):
     """
 
     submission: Submission
-    drawn: RigDraws
+    drawn: Draws
     plateau_error: Floats
     requested: Floats
     failures: Mapping[tuple[int, int, int], Failure]
@@ -113,7 +110,6 @@ class StressScore(StressTables):
         """Return the score as JSON values, in the order in which a person reads it."""
         manifest = self.submission.manifest
         return {
-            "protocol": PROTOCOL,
             "track": TRACK,
             "stressors_version": VERSION,
             "name": manifest.name,
@@ -178,7 +174,7 @@ def score_stress(
     *,
     simulator: Given = "frozen",
     draws: int = DRAWS,
-    drawn: RigDraws | None = None,
+    drawn: Draws | None = None,
     only: Sequence[str] = (),
     sandbox: bool = True,
     progress: Progress | None = None,
@@ -187,10 +183,10 @@ def score_stress(
 
     Args:
         submission: as for :func:`ventbench.score`.
-        simulator: ``"frozen"`` for the official rigs of protocol version 2; else simulators with
+        simulator: ``"frozen"`` for the official rigs; else simulators with
             plants, see :func:`ventbench.load_simulators`.
         draws: cells of each lung under each condition.
-        drawn: other draws than the development ones, such as those of a season.
+        drawn: other draws than the development ones.
         only: stressors to run; all conditions if empty.
         sandbox: run a folder in locked-down processes, as for :func:`ventbench.score`.
         progress: called after each round of commands with rounds done and all rounds.

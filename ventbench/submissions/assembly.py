@@ -1,4 +1,4 @@
-"""From a run of all cells to its score; what both versions of the protocol share."""
+"""From a run of all cells to its score."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def assemble(
         tasks: what it was told of each lung.
         lungs: ids.
         pips: nominal PIPs, cmH2O.
-        cells: nominal cells and draws, batch shape ``(1 + K, P)`` or ``(L, 1 + K, P)``.
+        cells: nominal cells and draws, batch shape ``(L, 1 + K, P)``.
         run: of all cells.
         replayed: the nominal run with its expirations, shape ``(L, P, BREATHS, steps)``.
         seconds: that the run took.

@@ -58,19 +58,11 @@ def bundled() -> list[str]:
     return sorted(path.parent.name for path in folder.glob(f"*/{MANIFEST}"))
 
 
-def archived() -> list[str]:
-    """Names of the bundled submissions as they were scored for earlier protocols: ``v1/NAME``."""
-    folder = files.submissions_folder()
-    paths = (path.parent for path in folder.glob(f"v[0-9]/*/{MANIFEST}"))
-    return sorted(path.relative_to(folder).as_posix() for path in paths)
-
-
 def resolve(name: str) -> Path:
     """Find the folder of a submission.
 
     Args:
-        name: path of a folder, or the name of a bundled submission; ``v1/NAME`` for one as it was
-            scored for version 1 of the protocol.
+        name: path of a folder, or the name of a bundled submission.
 
     Raises:
         SubmissionError: if there is neither.
@@ -80,7 +72,7 @@ def resolve(name: str) -> Path:
         return path.resolve()
     if path.is_file():
         raise SubmissionError(f"{name} is a file; give the folder that holds {CONTROLLER}")
-    if name in bundled() or name in archived():
+    if name in bundled():
         return files.submissions_folder() / name
     close = difflib.get_close_matches(path.name, bundled(), n=1)
     hint = f"did you mean {close[0]}?" if close else f"bundled are {', '.join(bundled())}"

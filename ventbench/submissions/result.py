@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ventbench
-from ventbench import draws, files, protocol
+from ventbench import files, protocol
+from ventbench.draws import DEVELOPMENT_SEED, Draws, commitment
 from ventbench.headroom.reference import Reference
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics import bootstrap
 from ventbench.metrics.score import lung_score
 from ventbench.plants import frozen
-from ventbench.rig_draws import RigDraws
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import Submission
 from ventbench.trajectories import Trajectories
@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Floats = NDArray[np.float64]
+
+#: Commitment of the published draws.
+PUBLISHED = commitment(DEVELOPMENT_SEED)
 
 #: Failures that a printed score names; the JSON has all.
 _FAILURES_SHOWN = 3
@@ -83,15 +86,13 @@ class Score:
         simulators: what the caller says about the plants (version, hashes); goes into the JSON.
         frozen_sha256: hash of the frozen simulators' manifest if the plants that ran are exactly
             those, to the bit; else None, whatever the caller says about them.
-        draws_sha256: hash of the file of the draws; None without draws.
         trajectories: nominal runs with their expirations.
         timing: seconds, by name; the only numbers that differ from run to run.
-        protocol: version of the protocol.
-        rig_draws: the draws of protocol version 2; None without draws, and in version 1.
         controllable: error of each run without the first step of an inspiration, nominal runs
-            first, cmH2O, shape ``(L, 1 + K, P)``; None in version 1.
-        reference: best attainable and best PID of the same runs; None in version 1, and where it
-            was not computed for these simulators and draws.
+            first, cmH2O, shape ``(L, 1 + K, P)``.
+        rig_draws: the draws; None without draws.
+        reference: best attainable and best PID of the same runs; None where it was not computed for
+            these simulators and draws.
     """
 
     submission: Submission
@@ -111,12 +112,10 @@ class Score:
     sandbox: Mapping[str, Any] | None
     simulators: Mapping[str, Any] | None
     frozen_sha256: str | None
-    draws_sha256: str | None
     trajectories: Trajectories
     timing: Mapping[str, float]
-    protocol: int = 1
-    rig_draws: RigDraws | None = None
-    controllable: Floats | None = None
+    controllable: Floats
+    rig_draws: Draws | None = None
     reference: Reference | None = None
 
     @property
@@ -137,7 +136,7 @@ class Score:
         0 is the best that any commands attain, 100 the lung's best PID; NaN where the controller
         failed; None where there is no :attr:`reference`.
         """
-        if self.reference is None or self.controllable is None:
+        if self.reference is None:
             return None
         return self.reference.normalised(self.controllable)
 
@@ -151,12 +150,10 @@ class Score:
         """Everything that an official score needs and this one lacks, in words."""
         reasons = {
             "no full sandbox": (self.sandbox or {}).get("official") is not True,
-            "not on the frozen simulators": self.frozen_sha256
-            != _official_simulators(self.protocol),
+            "not on the frozen simulators": self.frozen_sha256 != frozen.MANIFEST_SHA256,
             "not all lungs and PIPs": not self.complete,
             "other draws than the published ones": len(self.drawn) > 0
-            and self.protocol == 1
-            and self.draws_sha256 != draws.SHA256,
+            and (self.rig_draws is None or self.rig_draws.commitment != PUBLISHED),
         }
         return tuple(reason for reason, holds in reasons.items() if holds)
 
@@ -169,7 +166,6 @@ class Score:
         """Return the score as JSON values, in the order in which a person reads it."""
         manifest = self.submission.manifest
         return {
-            "protocol": self.protocol,
             "score": _number(self.score),
             "name": manifest.name,
             "track": self.track,
@@ -227,8 +223,8 @@ class Score:
 
         Returns:
             Columns ``score_cmH2O`` (nominal), ``draws_cmH2O`` (mean over the draws; only with
-            draws), ``normalised`` (over the draws, or nominal without; only in version 2), ``safe``
-            and ``peak_cmH2O`` (highest pressure of any run).
+            draws), ``normalised`` (over the draws, or nominal without; only with a reference),
+            ``safe`` and ``peak_cmH2O`` (highest pressure of any run).
         """
         import pandas as pd
 
@@ -284,16 +280,12 @@ class Score:
         """Mean over draws, shape ``(K, lungs)``, of all lungs or of those from ``first`` on."""
         if not len(values):
             return None
+        assert self.rig_draws is not None
         means = values.mean(axis=1)
         # A draw that failed must not be left out of a mean.
         finite = bool(np.isfinite(means).all())
-        if self.rig_draws is None:
-            summary = bootstrap.summary(means if finite else [])
-            score, ci95 = summary.mean, summary.ci95
-            about = {"version": draws.VERSION, "sha256": self.draws_sha256}
-        else:
-            score, ci95 = self._over_rigs(values, first) if finite else (math.nan, (math.nan,) * 2)
-            about = self.rig_draws.about()
+        score, ci95 = self._over_rigs(values, first) if finite else (math.nan, (math.nan,) * 2)
+        about = self.rig_draws.about()
         return {
             "score": _number(score),
             "ci95": [_number(limit) for limit in ci95],
@@ -302,9 +294,7 @@ class Score:
         }
 
     def _normalised(self, lung: int | None = None) -> dict[str, Any]:
-        """Normalised score of a lung or of all; no key in version 1, null without a reference."""
-        if self.protocol == 1:
-            return {}
+        """Normalised score of a lung or of all; null without a reference."""
         values = self.normalised
         if values is None or self.reference is None:
             return {"normalised": None}
@@ -355,13 +345,6 @@ def package_versions() -> dict[str, str]:
         "python": platform.python_version(),
         **{name: version(name) for name in ("jax", "jaxlib", "numpy")},
     }
-
-
-def _official_simulators(version: int) -> str:
-    """SHA-256 of the manifest of the simulators that a version of the protocol is scored on."""
-    if version == 1:
-        return frozen.MANIFEST_SHA256
-    return files.sha256(frozen.folder(version) / frozen.MANIFEST)
 
 
 def _number(value: float | np.floating) -> float | None:

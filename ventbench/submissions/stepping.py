@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import jax
@@ -33,7 +32,7 @@ class ProtocolRun:
     L lungs; ``(...)`` is the batch shape of the scenario.
 
     Attributes:
-        pressure: scored pressure at each step, cmH2O.
+        pressure: airway pressure at each step, which is scored, cmH2O.
         requested: what the controllers asked for, %; 0 once a cell has failed.
         u_in: what was applied, %.
         failures: what failed, by cell, index ``(lung, ...)``.
@@ -75,33 +74,25 @@ def _strong(tree: Any) -> Any:
     return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), tree)
 
 
-# Axis of the lungs in the scenario: none where all lungs have the same cells (version 1).
-@partial(jax.jit, static_argnames="axis")
-def _begin(
-    plants: Plant, scenario: Scenario, axis: int | None = None
-) -> tuple[Plant, env.LoopState]:
+@jax.jit
+def _begin(plants: Plant, scenario: Scenario) -> tuple[Plant, env.LoopState]:
     def begin(plant: Plant, scenario: Scenario) -> tuple[Plant, env.LoopState]:
         varied = env.vary(plant, scenario)
         return varied, env.start_breath(varied, scenario)
 
-    return _strong(jax.vmap(begin, in_axes=(0, axis))(plants, scenario))
+    return _strong(jax.vmap(begin)(plants, scenario))
 
 
-@partial(jax.jit, static_argnames="axis")
-def _observe(
-    scenario: Scenario, loop: env.LoopState, breath: Array, step: Array, axis: int | None = None
-) -> Observation:
-    def observe(scenario: Scenario, loop: env.LoopState) -> Observation:
-        return env.observe(scenario, loop, breath, step)
-
-    return jax.vmap(observe, in_axes=(axis, 0))(scenario, loop)
+@jax.jit
+def _observe(scenario: Scenario, loop: env.LoopState, breath: Array, step: Array) -> Observation:
+    return jax.vmap(env.observe, in_axes=(0, 0, None, None))(scenario, loop, breath, step)
 
 
-@partial(jax.jit, static_argnames="axis")
+@jax.jit
 def _inspire(
-    plants: Plant, scenario: Scenario, loop: env.LoopState, u_in: Array, axis: int | None = None
+    plants: Plant, scenario: Scenario, loop: env.LoopState, u_in: Array
 ) -> tuple[env.LoopState, Array]:
-    return _strong(jax.vmap(env.inspire, in_axes=(0, axis, 0, 0))(plants, scenario, loop, u_in))
+    return _strong(jax.vmap(env.inspire)(plants, scenario, loop, u_in))
 
 
 _airway_pressure = jax.jit(jax.vmap(env.airway_pressure))
@@ -113,32 +104,27 @@ def step_through(
     runner: Runner,
     submission: Submission,
     tasks: Sequence[Task],
-    *,
-    version: int = 1,
 ) -> ProtocolRun:
     """Run a submission on every lung and cell. Call it within ``precision.float64()``.
 
     Args:
-        plants: from :func:`as_float64`, L lungs; in version 2 the leaves may have the cells' batch
-            shape too, ``(L, ..., )`` with axes of length 1 where cells share a plant.
-        scenario: cells of each lung, batch shape ``(...)`` in version 1, ``(L, ...)`` in version 2.
+        plants: from :func:`as_float64`, L lungs; leaves may have the cells' batch shape too,
+            ``(L, ..., )`` with axes of length 1 where cells share a plant.
+        scenario: cells of each lung, batch shape ``(L, ...)``.
         runner: runs the controllers.
         submission: whose they are.
         tasks: what is told of each lung, length L.
-        version: of the protocol. Version 1 has the same cells on all lungs and scores the reading
-            of the sensor, version 2 the airway pressure.
 
     Raises:
         SubmissionError: if the submission cannot be run at all.
         FloatingPointError: if a plant answers with NaN or infinity.
     """
-    axis = None if version == 1 else 0
-    batch = np.shape(scenario.pip) if version > 1 else (len(tasks), *scenario.pip.shape)
+    batch = np.shape(scenario.pip)
     cells = int(np.prod(batch))
     shape = (*batch, protocol.BREATHS, protocol.INSPIRATION_STEPS)
     pressure, requested, applied = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     seconds = []
-    varied, rest = _begin(plants, scenario, axis)
+    varied, rest = _begin(plants, scenario)
     each = [task for task in tasks for _ in range(cells // len(tasks))]
     with precision.float32():  # a submission that uses JAX finds it as it is elsewhere
         session = runner.start(submission, each)
@@ -146,7 +132,7 @@ def step_through(
         for breath in range(protocol.BREATHS):
             loop = rest
             for step in range(protocol.INSPIRATION_STEPS):
-                rows = pack(_observe(scenario, loop, breath, step, axis))
+                rows = pack(_observe(scenario, loop, breath, step))
                 live = max(1, cells - len(session.failures))
                 start = time.perf_counter()
                 with precision.float32():
@@ -154,9 +140,8 @@ def step_through(
                 seconds.append((time.perf_counter() - start) / live)
                 commands = commands.reshape(batch)
                 now = (..., breath, step)
-                scored = loop.pressure if version == 1 else _airway_pressure(varied, loop)
-                pressure[now], requested[now] = scored, commands
-                loop, applied[now] = _inspire(varied, scenario, loop, commands, axis)
+                pressure[now], requested[now] = _airway_pressure(varied, loop), commands
+                loop, applied[now] = _inspire(varied, scenario, loop, commands)
         failures = dict(session.failures)
     finally:
         session.close()
@@ -168,7 +153,7 @@ def step_through(
 
 
 def replay(
-    plants: Plant, scenario: Scenario, requested: Floats, *, version: int = 1
+    plants: Plant, scenario: Scenario, requested: Floats
 ) -> tuple[rollouts.Inspirations, rollouts.Expirations]:
     """Apply recorded commands again, with the expirations. Call it within ``float64()``.
 
@@ -176,15 +161,13 @@ def replay(
         plants: from :func:`as_float64`, L lungs.
         scenario: cells, as in :func:`step_through`.
         requested: as in :class:`ProtocolRun`.
-        version: of the protocol, as in :func:`step_through`.
 
     Returns:
         Arrays of shape ``(L, ..., BREATHS, steps)``, cmH2O and %.
     """
 
     def run(plant: Plant, scenario: Scenario, commands: Array) -> Any:
-        airway = version > 1
-        return rollouts.closed_loop(plant, Script(commands), scenario, whole=True, airway=airway)
+        return rollouts.closed_loop(plant, Script(commands), scenario, whole=True)
 
     commands = jnp.asarray(requested.reshape(*requested.shape[:-2], -1))
-    return jax.vmap(run, in_axes=(0, None if version == 1 else 0, 0))(plants, scenario, commands)
+    return jax.vmap(run)(plants, scenario, commands)

@@ -1,6 +1,6 @@
 """How an entry does away from where it was tuned: other members, other rigs, a rig set aside.
 
-Without noise, on every plant of the frozen simulators of version 2: the reference rig of each lung;
+Without noise, on every plant of the frozen simulators: the reference rig of each lung;
 the same rig as the other members of the ensemble have it; the lung's other rigs; and the rig that
 no entry of ours was trained on.
 """
@@ -14,12 +14,12 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import precision, protocol, rig_draws
+from ventbench import draws, precision, protocol
 from ventbench.errors import InputError
 from ventbench.metrics.score import run_error
+from ventbench.plants.rigs import Rigs
 from ventbench.submissions.assembly import enter
 from ventbench.submissions.folder import Submission
-from ventbench.submissions.rig_scoring import Rigs
 from ventbench.submissions.runner import InProcessRunner, Runner
 from ventbench.submissions.stepping import as_float64, step_through
 
@@ -83,7 +83,7 @@ def transfer(
 
     Args:
         submission: from :func:`ventbench.submissions.folder.open_submission`.
-        rigs: from :func:`ventbench.submissions.rig_scoring.load_rigs`.
+        rigs: from :func:`ventbench.plants.rigs.load_rigs`.
         track: ``"performance"`` or ``"robustness"``; the manifest's first if not given.
         runner: runs the controllers; in this process if not given.
 
@@ -103,10 +103,10 @@ def transfer(
     rig = np.array([[place[1] for place in places] for places in padded])
     member = np.array([[place[2] for place in places] for places in padded])
     with precision.float64():
-        cells, _, _ = rig_draws.with_nominal(None, rig[:, 0].tolist(), protocol.PIPS)
+        cells, _, _ = draws.with_nominal(None, rig[:, 0].tolist(), protocol.PIPS)
         cells = jax.tree.map(lambda x: np.repeat(x, most, axis=1), cells)
-        plants = as_float64(rig_draws.plants_of(rigs.plants, rig, member), len(names))
-        run = step_through(plants, cells, runner, submission, tasks, version=2)
+        plants = as_float64(draws.plants_of(rigs.plants, rig, member), len(names))
+        run = step_through(plants, cells, runner, submission, tasks)
     errors = run_error(run.pressure, np.asarray(cells.pip)[..., None, None])
     for cell in run.failures:
         errors[cell] = np.nan

@@ -76,12 +76,11 @@ def png(runs: Sequence[Trajectories]) -> bytes:
 def _head(draw: Drawing, names: Sequence[str], track: str) -> float:
     """Title, how to read the panels, legend; returns where the panels may start."""
     draw.text(MARGIN, MARGIN + 14, names[0], 17, INK, weight="bold")
-    about = f"{draw.known(track)}, protocol {protocol.VERSION}"
     read = (
         f"Breath {graphics.BREATH + 1} on each lung at each PIP. Above: airway pressure, cmH2O; "
         "below: u_in, %; against time, s. Band: scored. Numbers: mean absolute error, cmH2O."
     )
-    draw.text(MARGIN, MARGIN + 34, f"{about}. {read}", 10, QUIET)
+    draw.text(MARGIN, MARGIN + 34, f"{draw.known(track)}. {read}", 10, QUIET)
     x, y = MARGIN, MARGIN + HEAD
     shown = [("target", INK, 1.1), *((n, _color(i), _width(i)) for i, n in enumerate(names))]
     for name, color, width in shown:

@@ -42,7 +42,6 @@ def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None
         run_colors=palette.RUNS,
         shades=SHADES,
         compared=[comparison(runs, names, numbers, k, given) for k in range(1, len(runs))],
-        version_of_protocol=(given or [{}])[0].get("protocol", protocol.VERSION),
         heading=shared_tracks(runs),
         tracks=[run.track for run in runs],
         table=table(runs[0].lungs, numbers),

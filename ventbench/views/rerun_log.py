@@ -295,7 +295,7 @@ def markdown(runs: Sequence[Trajectories], names: Sequence[str]) -> str:
     lines = [
         f"# {names[0]}",
         "",
-        f"{escape_markdown(shared_tracks(runs))}, protocol {protocol.VERSION}",
+        escape_markdown(shared_tracks(runs)),
         "",
         "## Score, cmH2O",
         "",

@@ -29,6 +29,7 @@ from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.metrics.score import run_error
 from ventbench.plants import frozen
+from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, take
 from ventbench.submissions.folder import open_submission
@@ -106,7 +107,7 @@ def test_the_submission_is_the_pure_controller(fields, tmp_path):
             found, _ = rollouts.closed_loop(take(plants, k), one, cells)
             errors.append(run_error(found.pressure, np.asarray(cells.pip)[..., None, None]))
     result = run_protocol(
-        open_submission(str(folder)), plants, draws=2, lungs=LUNGS[:3], pips=(10, 35)
+        open_submission(str(folder)), Rigs(LUNGS[:3], plants), draws=2, pips=(10, 35)
     )
     assert not result.failures
     expected = np.stack(errors)
@@ -392,7 +393,7 @@ def test_the_submissions_score_what_they_say(name):
         "v1/residual_mlp_all": (2.159, 2.255),
     }[name]
     simulators = frozen.load()
-    result = run_protocol(open_submission(name), simulators.plants, draws=20)
+    result = run_protocol(open_submission(name), Rigs(LUNGS, simulators.plants), draws=20)
     assert result.nominal.mean() == pytest.approx(nominal_score, abs=1e-3)
     assert result.drawn.mean() == pytest.approx(drawn_score, abs=1e-3)
     assert result.safe.all()

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import draws, environment, precision, protocol, rig_draws, rollouts
+from ventbench import draws, environment, precision, protocol, rollouts
 from ventbench.controllers import rl_policy
 from ventbench.controllers.pid import PID
 from ventbench.controllers.rl_policy import GaussianPolicy, TanhNetwork, init_parameters
@@ -133,7 +133,7 @@ def test_episodes_on_rigs_have_any_plant_their_weight_and_the_ranges_of_version_
     ratio = np.asarray(drawn.plants.R) / np.array([lung.R for lung in LUNGS[:2]])[lung]
     assert set(np.round(ratio, 3)) == {1.0, 2.0}
     assert abs(np.mean(ratio > 1.5) - 0.5) < 0.1
-    low, high = rig_draws.RANGES["r_scale"]
+    low, high = draws.RANGES["r_scale"]
     assert low <= drawn.cells.r_scale.min() < 0.85
     assert 1.15 < drawn.cells.r_scale.max() <= high
     assert drawn.cells.noise.shape == (480, 3, 34)

@@ -1,4 +1,4 @@
-"""Protocol version 2: airway pressure on rigs, step by step and in a compiled scan alike."""
+"""Airway pressure on rigs, step by step and in a compiled scan alike."""
 
 import json
 
@@ -8,12 +8,11 @@ import pytest
 
 from ventbench import precision, rollouts
 from ventbench.controllers.pid import PID
-from ventbench.errors import InputError
 from ventbench.metrics.score import run_error
 from ventbench.plants import frozen
+from ventbench.plants.rigs import load_rigs, rigs_of
 from ventbench.submissions.folder import open_submission, submission_of
-from ventbench.submissions.rig_scoring import load_rigs, rigs_of, run_on_rigs
-from ventbench.submissions.scoring import score
+from ventbench.submissions.scoring import run_protocol
 
 from ..textbook_rigs import OFFSET, TextbookRigs
 
@@ -30,17 +29,17 @@ def rigs():
 
 @pytest.fixture(scope="module")
 def result(rigs):
-    return run_on_rigs(open_submission("pid_robust"), rigs, draws=4, pips=PIPS)
+    return run_protocol(open_submission("pid_robust"), rigs, draws=4, pips=PIPS)
 
 
-def compiled(rigs, draws, airway=True):
+def compiled(rigs, draws):
     """Errors and requested commands of the same PID in one scan."""
     with precision.float64():
         plants, cells = rigs.cells(rigs.draws(draws, PIPS), PIPS)
         plants, cells = jax.tree.map(jax.numpy.asarray, (plants, cells))
 
         def run(plant, cell):
-            return rollouts.closed_loop(plant, PID(*PID_ROBUST), cell, airway=airway)[0]
+            return rollouts.closed_loop(plant, PID(*PID_ROBUST), cell)[0]
 
         inspired = jax.tree.map(np.asarray, jax.vmap(run)(plants, cells))
     return run_error(inspired.pressure, np.asarray(cells.pip)[..., None, None]), inspired
@@ -54,16 +53,13 @@ def test_equals_a_compiled_scan(rigs, result):
 
 
 def test_scores_the_airway_and_shows_the_reading(rigs):
-    _, airway = compiled(rigs, 1)
-    _, reading = compiled(rigs, 1, airway=False)
-    np.testing.assert_allclose(reading.pressure[..., 1:] - airway.pressure[..., 1:], OFFSET)
     seen = []
 
     def watch(observation):
         seen.append(observation.pressure)
         return 0.0
 
-    quiet = run_on_rigs(submission_of(watch), rigs, pips=(10.0,))
+    quiet = run_protocol(submission_of(watch), rigs, pips=(10.0,))
     # The valve stays closed: the airway stays at PEEP, the sensor shows more.
     np.testing.assert_allclose(quiet.nominal, 5.0)
     assert max(seen) == pytest.approx(5.0 + OFFSET)
@@ -74,18 +70,17 @@ def test_draws_run_on_the_rigs_that_they_name(rigs, result):
     assert sorted(set(drawn.rig[0])) == [0, 1]
     # The second rig of a lung is another plant: the same deviations on the first give other errors.
     forced = drawn.__class__(
-        drawn.season, drawn.commitment, drawn.cells, np.zeros_like(drawn.rig)
+        drawn.name, drawn.commitment, drawn.cells, np.zeros_like(drawn.rig)
         + np.array([own[0] for own in rigs.sessions])[:, None], np.zeros_like(drawn.member),
     )  # fmt: skip
-    again = run_on_rigs(open_submission("pid_robust"), rigs, drawn=forced, pips=PIPS)
+    again = run_protocol(open_submission("pid_robust"), rigs, drawn=forced, pips=PIPS)
     changed = np.any(again.drawn != result.drawn, axis=2).T
     elsewhere = (drawn.rig != forced.rig) | (drawn.member > 0)
     np.testing.assert_array_equal(changed, elsewhere)
 
 
-def test_json_says_which_protocol_and_draws(rigs, result):
+def test_json_says_which_draws(rigs, result):
     value = json.loads(json.dumps(result.to_json()))
-    assert value["protocol"] == 2
     assert value["draws"]["season"] == "development"
     assert value["draws"]["sha256"] == rigs.draws(2).commitment
     low, high = value["draws"]["ci95"]
@@ -99,21 +94,16 @@ def test_trajectories_are_those_of_the_nominal_cells(result):
 
 
 def test_simulators_with_one_rig_can_be_scored():
-    answer = run_on_rigs(submission_of(lambda o: 4.0), load_rigs("physics"), draws=1, pips=(10.0,))
+    answer = run_protocol(submission_of(lambda o: 4.0), load_rigs("physics"), draws=1, pips=(10.0,))
     assert answer.nominal.shape == (6, 1)
     assert answer.rig_draws is not None
     assert not answer.rig_draws.rig.any()
     assert not answer.official
 
 
-def test_unknown_protocol_is_refused():
-    with pytest.raises(InputError, match="protocol 3 is not known"):
-        score("pid_robust", protocol=3)
-
-
 @pytest.mark.slow
 def test_the_frozen_rigs_can_be_scored():
-    official = rigs_of(frozen.load(version=2))
-    result = run_on_rigs(open_submission("pid_robust"), official, draws=2, pips=PIPS)
+    official = rigs_of(frozen.load())
+    result = run_protocol(open_submission("pid_robust"), official, draws=2, pips=PIPS)
     errors, _ = compiled(official, 2)
     np.testing.assert_allclose(result.drawn, np.moveaxis(errors[:, 1:], 1, 0), atol=1e-9)

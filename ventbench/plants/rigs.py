@@ -1,0 +1,99 @@
+"""Rigs of lungs: the plants that draws are on, and where each cell of a score runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+
+from ventbench import draws as draw_tables
+from ventbench import protocol
+from ventbench.draws import Draws
+from ventbench.environment import Scenario
+from ventbench.interfaces import Plant
+from ventbench.lungs import LUNGS, Lung
+from ventbench.plants import frozen
+from ventbench.plants.catalog import Given, load_simulators
+
+
+@dataclass(frozen=True, eq=False)
+class Rigs:
+    """Plants of L lungs, each on one or several rigs; make one with a function of this module.
+
+    Attributes:
+        lungs: L of them.
+        plants: leaves ``(members, sessions, ...)`` where :attr:`sessions` says which are scored;
+            leaves ``(L, ...)`` where each lung has one rig only.
+        sessions: scored sessions of each lung, the reference rig first; None for one rig each.
+        about: version and hashes, for the result.
+        sha256: of the manifest of the frozen simulators; None for others.
+        held_out: for each lung the scored session that no entry of ours was trained on, or None.
+    """
+
+    lungs: tuple[Lung, ...]
+    plants: Plant
+    sessions: tuple[tuple[int, ...], ...] | None = None
+    about: Mapping[str, Any] | None = None
+    sha256: str | None = None
+    held_out: tuple[int | None, ...] = ()
+
+    @property
+    def members(self) -> int:
+        """Number of members of the ensemble."""
+        return 1 if self.sessions is None else jax.tree.leaves(self.plants)[0].shape[0]
+
+    def draws(self, n: int, pips: Sequence[float] = protocol.PIPS) -> Draws:
+        """Return the first n development draws of these rigs at some of the protocol's PIPs.
+
+        Raises:
+            InputError: if there are not so many, or a PIP is not one of the protocol's.
+        """
+        sessions = self.sessions or tuple((0,) for _ in self.lungs)
+        return draw_tables.build(sessions, self.members, pips=pips).first(n)
+
+    def cells(self, drawn: Draws | None, pips: Sequence[float]) -> tuple[Plant, Scenario]:
+        """Nominal cells in front of draws, and their plants.
+
+        Args:
+            drawn: K draws; None for none.
+            pips: cmH2O, length P.
+
+        Returns:
+            Plants with leaves ``(L, 1 + K, 1, ...)``, or ``(L, ...)`` where each lung has one rig;
+            cells of batch shape ``(L, 1 + K, P)``.
+        """
+        reference = [own[0] for own in self.sessions] if self.sessions else [0] * len(self.lungs)
+        cells, rig, member = draw_tables.with_nominal(drawn, reference, pips)
+        if self.sessions is None:
+            return self.plants, cells
+        return draw_tables.plants_of(self.plants, rig, member), cells
+
+
+def load_rigs(simulator: Given = "frozen") -> Rigs:
+    """Load the rigs of simulators.
+
+    Args:
+        simulator: ``"frozen"`` for the official rigs; else see :func:`ventbench.load_simulators`:
+            each lung then has one rig.
+
+    Raises:
+        InputError: if there are no such simulators, or they have no plants.
+    """
+    if isinstance(simulator, str) and simulator == "frozen":
+        return rigs_of(frozen.load())
+    simulators = load_simulators(simulator)
+    return Rigs(simulators.lungs, simulators.stacked, about=simulators.about)
+
+
+def rigs_of(official: Any) -> Rigs:
+    """Rigs of a set of simulators, such as :func:`ventbench.plants.frozen.load` returns."""
+    return Rigs(
+        LUNGS,
+        official.sessions_plants,
+        official.rigs,
+        official.about(),
+        official.manifest_sha256,
+        official.held_out_rigs,
+    )

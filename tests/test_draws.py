@@ -93,7 +93,7 @@ def test_first_draws_are_those_of_all(drawn):
     few = drawn.first(3)
     np.testing.assert_array_equal(few.cells.noise, drawn.cells.noise[:, :3])
     assert few.count == 3
-    with pytest.raises(InputError, match=r"has 20 draws; 21 is outside 1\.\.20"):
+    with pytest.raises(InputError, match=r"20 development draws; 21 is outside 1\.\.20"):
         drawn.first(21)
 
 

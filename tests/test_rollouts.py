@@ -51,7 +51,8 @@ def looped(plant, controller, cells):
 def test_closed_loop_against_python_loop(plants):
     controller = PID(0.5, 5.0, 1.0)
     with precision.float64():
-        cells = draws.scenarios((10.0, 35.0), 2)
+        drawn = draws.build([[0]], 1, n=2, pips=(10.0, 35.0))
+        cells = jax.tree.map(lambda x: jnp.asarray(x[0]), drawn.cells)
         for k in (0, 5):
             inspired, expired = rollouts.closed_loop(take(plants, k), controller, cells, whole=True)
             pressure, requested, applied = looped(take(plants, k), controller, cells)

@@ -69,7 +69,7 @@ def test_nothing_is_changed_without_a_stressor(
         commands = score.requested[0].reshape(6, 1, -1)
         varied: Any = environment.vary(plant, cells)
         assert float(varied.R[0, 0]) != np.asarray(jax.tree.leaves(draws.plants)[0])[0, 0]
-        alone, _ = rollouts.closed_loop(plant, Script(commands), cells, airway=True)
+        alone, _ = rollouts.closed_loop(plant, Script(commands), cells)
     pressure = np.asarray(alone.pressure)
     np.testing.assert_allclose(score.peak[0], pressure.max(axis=(-2, -1)), rtol=0, atol=1e-9)
     error = run_error(pressure, np.asarray(cells.pip)[..., None, None])

@@ -141,14 +141,12 @@ def test_trajectories(best, plants):
 
 def test_parts(best, plants):
     part = jax.tree.map(lambda leaf: leaf[jnp.array([5, 0])], plants)
-    found = run_protocol(
-        open_submission("pid_best"),
-        part,
-        draws=2,
-        lungs=[lung("R20C50"), lung("R5C10")],
-        pips=[35.0, 10.0],
-        simulators={"version": 1},
-    )
+    rigs = Rigs((lung("R20C50"), lung("R5C10")), part, about={"version": 1})
+    # A lung keeps its draws wherever the PIPs are fewer.
+    drawn = Rigs(LUNGS, plants).draws(2, (35.0, 10.0))
+    own = dataclasses.replace(drawn, cells=jax.tree.map(lambda x: x[[5, 0]], drawn.cells))
+    own = dataclasses.replace(own, rig=drawn.rig[[5, 0]], member=drawn.member[[5, 0]])
+    found = run_protocol(open_submission("pid_best"), rigs, drawn=own, pips=[35.0, 10.0])
     np.testing.assert_allclose(found.nominal, best.nominal[[5, 0]][:, [5, 0]], atol=1e-12)
     np.testing.assert_allclose(found.drawn, best.drawn[:2, [5, 0]][:, :, [5, 0]], atol=1e-12)
     result = found.to_json()
@@ -216,7 +214,9 @@ def test_failed_cells(make, plants):
             raise ValueError("no idea")
         return 3.0
         """
-    found = run_protocol(open_submission(str(make(act=act))), plants, track="performance", draws=1)
+    found = run_protocol(
+        open_submission(str(make(act=act))), Rigs(LUNGS, plants), track="performance", draws=1
+    )
     result = found.to_json()
     assert result["score"] is None
     assert result["lungs"]["R5C20"]["score"] is None
@@ -238,7 +238,9 @@ def test_failed_cells(make, plants):
 
 def test_failure_in_a_draw(make, plants):
     act = "return 3.0 if observation.target in (10, 15, 20, 25, 30, 35) else None"
-    result = run_protocol(open_submission(str(make(act=act))), plants, draws=2).to_json()
+    result = run_protocol(
+        open_submission(str(make(act=act))), Rigs(LUNGS, plants), draws=2
+    ).to_json()
     assert result["score"] is None
     assert result["draws"]["score"] is None
     assert result["draws"]["values"] == [None, None]
@@ -250,14 +252,16 @@ def test_failure_in_a_draw(make, plants):
 
 def test_all_cells_fail_before_the_first_step(make, plants):
     source = "class Controller:\n def reset(self): pass\n def act(self, o): return 0.0\n"
-    result = run_protocol(open_submission(str(make(source))), plants).to_json()
+    result = run_protocol(open_submission(str(make(source))), Rigs(LUNGS, plants)).to_json()
     assert len(result["failures"]) == 36
     assert "raised TypeError in reset (lung hidden)" in result["failures"][0]["message"]
 
 
 def test_unsafe_lung(make, plants):
     act = "return 100.0 if self.task.lung == 'R5C10' else 0.0"
-    found = run_protocol(open_submission(str(make(act=act))), plants, track="performance")
+    found = run_protocol(
+        open_submission(str(make(act=act))), Rigs(LUNGS, plants), track="performance"
+    )
     np.testing.assert_array_equal(found.safe, [False] + [True] * 5)
     result = found.to_json()
     assert result["safe"] is False
@@ -266,7 +270,7 @@ def test_unsafe_lung(make, plants):
 
 def test_clipping(make, plants):
     act = "return -1.0 if observation.time == 0 else 101.0 if observation.time > 0.95 else 1.0"
-    result = run_protocol(open_submission(str(make(act=act))), plants).to_json()
+    result = run_protocol(open_submission(str(make(act=act))), Rigs(LUNGS, plants)).to_json()
     assert result["lungs"]["R5C10"]["clipped"] == {
         "below": 18, "above": 36, "commands": 612, "share": 54 / 612,
     }  # fmt: skip
@@ -296,7 +300,7 @@ def test_broken_simulator_is_no_score(plants):
 
 def test_code_that_cannot_be_imported(make, plants):
     with pytest.raises(SubmissionError, match=r"controller.py line 1: "):
-        run_protocol(open_submission(str(make("x = (\n"))), plants)
+        run_protocol(open_submission(str(make("x = (\n"))), Rigs(LUNGS, plants))
 
 
 class Recorder:

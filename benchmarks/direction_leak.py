@@ -63,12 +63,12 @@ def simulated(breaths: Breaths, simulators: frozen.Frozen, seed: int) -> Breaths
         error = target - measured
         integral = integral + dt / (dt + TIME_CONSTANT) * (error - integral)
         u_in = jnp.clip(kp * error + ki * integral, 0.0, 100.0) * (1.0 - u_out) + 5.0 * u_out
-        state, after = plants.step(state, u_in, u_out, dt)
-        return (state, after, integral), (measured, u_in)
+        state, signals = plants.step(state, u_in, u_out, dt)
+        return (state, signals.reading, integral), (measured, u_in)
 
     inputs = [jnp.asarray(x, float).T for x in (noise, breaths.u_out, breaths.dt)]
     begin = jnp.asarray(start)
-    carry = (plants.init(begin), begin, jnp.zeros(n))
+    carry = (plants.init(begin)[0], begin, jnp.zeros(n))
     _, (pressure, u_in) = jax.jit(lambda c, x: jax.lax.scan(step, c, x))(carry, inputs)
     return replace(
         breaths,

@@ -35,7 +35,7 @@ def looped(plant, controller, cells):
     for breath in range(3):
         bench, rows = env.start_breath(plant, cells), []
         for step in range(100):
-            pressure = bench.pressure
+            pressure = bench.signals.reading
             if step < 34:
                 state, u_in = controller.step(state, env.observe(cells, bench, breath, step))
                 bench, applied = env.inspire(plant, cells, bench, u_in)
@@ -134,10 +134,10 @@ def test_open_loop_against_python_loop(plants):
     with precision.float64():
         plant = take(plants, 3)
         found = rollouts.open_loop(plant, *map(jnp.asarray, (start, u_in, u_out, dt)))
-        state, expected = plant.init(jnp.asarray(start)), [start]
+        (state, _), expected = plant.init(jnp.asarray(start)), [start]
         for t in range(49):
-            state, pressure = plant.step(state, *(jnp.asarray(x[:, t]) for x in (u_in, u_out, dt)))
-            expected.append(pressure)
+            state, signals = plant.step(state, *(jnp.asarray(x[:, t]) for x in (u_in, u_out, dt)))
+            expected.append(signals.reading)
     np.testing.assert_allclose(found, np.stack(expected, axis=1), rtol=0, atol=1e-10)
 
 

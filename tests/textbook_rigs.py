@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from ventbench import precision
+from ventbench.interfaces import Signals
 from ventbench.lungs import LUNGS, Lung
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import (
@@ -28,30 +29,21 @@ MEMBERS, RIGS_A_LUNG = 2, 2
 
 
 @flax.struct.dataclass
-class OffsetState:
-    """State of the lung, and its airway pressure, cmH2O."""
-
-    lung: SingleCompartmentState
-    airway: Array
-
-
-@flax.struct.dataclass
 class OffsetLung:
     """A textbook lung whose sensor shows :data:`OFFSET` too much."""
 
     lung: SingleCompartment
 
-    def init(self, pressure: Array, peep: Array | None = None) -> OffsetState:
-        return OffsetState(self.lung.init(pressure, peep), pressure)
+    def init(
+        self, pressure: Array, peep: Array | None = None
+    ) -> tuple[SingleCompartmentState, Signals]:
+        return self.lung.init(pressure, peep)
 
     def step(
-        self, state: OffsetState, u_in: Array, u_out: Array, dt: Array
-    ) -> tuple[OffsetState, Array]:
-        after, pressure = self.lung.step(state.lung, u_in, u_out, dt)
-        return OffsetState(after, pressure), pressure + OFFSET
-
-    def airway_pressure(self, state: OffsetState) -> Array:
-        return state.airway
+        self, state: SingleCompartmentState, u_in: Array, u_out: Array, dt: Array
+    ) -> tuple[SingleCompartmentState, Signals]:
+        after, signals = self.lung.step(state, u_in, u_out, dt)
+        return after, signals._replace(reading=signals.reading + OFFSET)
 
     def vary(self, r_scale: Array, c_scale: Array) -> OffsetLung:
         return OffsetLung(self.lung.vary(r_scale, c_scale))

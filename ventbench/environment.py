@@ -15,7 +15,7 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from ventbench import protocol, waveform
-from ventbench.interfaces import Observation, Plant
+from ventbench.interfaces import Observation, Plant, Signals
 
 # Tables over the step of the breath: two breaths of target, so that looking ahead needs no modulo.
 _TARGET = waveform.shape(np.arange(2 * protocol.BREATH_STEPS))
@@ -81,33 +81,25 @@ class LoopState:
 
     Attributes:
         plant: states of the plants.
-        pressure: reading of the pressure sensor without noise, cmH2O, shape ``(...)``.
+        signals: what the plants show; readings are without noise.
         previous: command of the previous step as applied, %, shape ``(...)``.
     """
 
     plant: Any
-    pressure: Array
+    signals: Signals
     previous: Array
 
 
 def vary(plant: Plant, scenario: Scenario) -> Plant:
-    """Return plants with the resistance and compliance of each cell of a scenario.
-
-    Raises:
-        TypeError: if the plant cannot be varied.
-    """
-    if not hasattr(plant, "vary"):
-        raise TypeError(f"{type(plant).__name__} has no vary(r_scale, c_scale)")
-    return plant.vary(scenario.r_scale, scenario.c_scale)  # type: ignore[attr-defined]
+    """Return plants with the resistance and compliance of each cell of a scenario."""
+    return plant.vary(scenario.r_scale, scenario.c_scale)
 
 
 def start_breath(plant: Plant, scenario: Scenario) -> LoopState:
     """Lungs at rest at the start of an inspiration, the bias flow of the expiration still on."""
     bias = _table(_EXPIRATORY, scenario)[-1]
     return LoopState(
-        plant.init(scenario.start, scenario.peep),
-        scenario.start,
-        jnp.full_like(scenario.start, bias),
+        *plant.init(scenario.start, scenario.peep), jnp.full_like(scenario.start, bias)
     )
 
 
@@ -127,7 +119,7 @@ def observe(
         breath: index of the breath.
         step: index of the step in the breath, below ``INSPIRATION_STEPS``.
     """
-    measured = loop.pressure + scenario.noise[..., breath, step]
+    measured = loop.signals.reading + scenario.noise[..., breath, step]
     quantum = jnp.where(scenario.quantum > 0, scenario.quantum, 1.0)
     measured = jnp.where(scenario.quantum > 0, jnp.round(measured / quantum) * quantum, measured)
     ahead = jnp.stack(
@@ -135,16 +127,6 @@ def observe(
     )
     now = jnp.broadcast_to(target(scenario, step), measured.shape)
     return Observation(step * scenario.dt, scenario.dt, measured, now, ahead, loop.previous)
-
-
-def airway_pressure(plant: Plant, loop: LoopState) -> Array:
-    """Airway pressure, cmH2O, shape ``(...)``: what is scored.
-
-    It differs from the reading, ``loop.pressure``, by the lag and the offsets of the sensor. For a
-    plant without ``airway_pressure(state)`` it is the reading.
-    """
-    method = getattr(plant, "airway_pressure", None)
-    return loop.pressure if method is None else method(loop.plant)
 
 
 def inspire(
@@ -164,14 +146,13 @@ def inspire(
     applied = jnp.clip(u_in, 0.0, protocol.U_MAX)
     # The held command reaches the valve `delay` of a step late: over this step it averages to
     late = (1.0 - scenario.delay) * applied + scenario.delay * loop.previous
-    state, pressure = plant.step(loop.plant, late, jnp.zeros_like(late), scenario.dt)
-    return LoopState(state, pressure, applied), applied
+    after = plant.step(loop.plant, late, jnp.zeros_like(late), scenario.dt)
+    return LoopState(*after, applied), applied
 
 
 def expire(
     plant: Plant, scenario: Scenario, loop: LoopState, step: Array | int
 ) -> tuple[LoopState, Array]:
     """Apply the fixed expiratory command of a step; arguments and results as of :func:`inspire`."""
-    u_in = jnp.broadcast_to(_table(_EXPIRATORY, scenario)[step], loop.pressure.shape)
-    state, pressure = plant.step(loop.plant, u_in, jnp.ones_like(u_in), scenario.dt)
-    return LoopState(state, pressure, u_in), u_in
+    u_in = jnp.broadcast_to(_table(_EXPIRATORY, scenario)[step], loop.previous.shape)
+    return LoopState(*plant.step(loop.plant, u_in, jnp.ones_like(u_in), scenario.dt), u_in), u_in

@@ -17,29 +17,55 @@ State = Any
 PlantT = TypeVar("PlantT")
 
 
+class Signals(NamedTuple):
+    """What a plant shows at one instant; every array has shape ``(...)``.
+
+    A signal that a kind of plant does not have is None, for all of its plants and at all times.
+
+    Attributes:
+        reading: airway pressure as the sensor shows it, cmH2O.
+        airway_pressure: true pressure at the airway, cmH2O; None if only readings were learned.
+        flow: flow into the lung, mL/s.
+        volume: gas in the lung above a level that stays the same within a breath, mL.
+    """
+
+    reading: Any
+    airway_pressure: Any = None
+    flow: Any = None
+    volume: Any = None
+
+    @property
+    def scored(self) -> Any:
+        """Pressure that is scored, cmH2O: the airway's; the reading where nothing else is known."""
+        return self.reading if self.airway_pressure is None else self.airway_pressure
+
+
 @runtime_checkable
 class Plant(Protocol):
     """Answers to valve commands with airway pressures.
 
     A plant is a pytree (its parameters are leaves), so that it can be an argument of ``jit``,
-    stacked over lungs and ensemble members, and differentiated. Both methods are pure; every array
+    stacked over lungs and ensemble members, and differentiated. All methods are pure; every array
     argument may have any leading batch shape ``(...)``, which the parameters must broadcast with.
     Plants contain no ``cond`` or ``switch``: under ``vmap`` those copy weights per element.
 
     Time: the command of a sample is held for ``dt`` after that sample, and ``step`` returns the
-    pressure at the end of that time, which is the next sample.
+    signals at the end of that time, which is the next sample.
     """
 
-    def init(self, pressure: Array, peep: Array | None = None) -> State:
-        """State of a lung at rest.
+    def init(self, pressure: Array, peep: Array | None = None) -> tuple[State, Signals]:
+        """Lung at rest.
 
         Args:
             pressure: airway and alveolar pressure, cmH2O, shape ``(...)``.
             peep: pressure behind the expiratory valve, cmH2O; ``pressure`` if not given.
+
+        Returns:
+            The state, and the signals at rest.
         """
         ...
 
-    def step(self, state: State, u_in: Array, u_out: Array, dt: Array) -> tuple[State, Array]:
+    def step(self, state: State, u_in: Array, u_out: Array, dt: Array) -> tuple[State, Signals]:
         """Hold one command.
 
         Args:
@@ -49,8 +75,12 @@ class Plant(Protocol):
             dt: time for which the command is held, s, shape ``(...)`` or scalar.
 
         Returns:
-            The next state and the measured airway pressure, cmH2O, shape ``(...)``.
+            The next state, and the signals at the end of ``dt``.
         """
+        ...
+
+    def vary(self, r_scale: Array, c_scale: Array) -> Plant:
+        """Return the same lung with resistance and compliance times these factors."""
         ...
 
 

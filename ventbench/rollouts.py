@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ventbench import environment as env
 from ventbench import precision, protocol
-from ventbench.environment import Scenario
+from ventbench.environment import LoopState, Scenario
 from ventbench.interfaces import Controller, Plant
 from ventbench.recordings.breaths import Breaths
 
@@ -23,6 +23,12 @@ BREATHS, INSPIRATION = protocol.BREATHS, protocol.INSPIRATION_STEPS
 
 #: Gives the plants of some breaths: parameters of shape ``(n, ...)``.
 PlantsFor = Callable[[Breaths], Plant]
+
+#: State, observation and inputs of a step, to the next state and ``u_in``, %.
+Policy = Callable[[Any, Any, Any], tuple[Any, Array]]
+
+#: The loop before and after a step, the request and the command as applied, to what is kept.
+Record = Callable[[LoopState, LoopState, Array, Array], Any]
 
 # Breaths rolled out together: bounds memory, and the last batch is padded so that all compile once.
 _BATCH = 4096
@@ -44,10 +50,11 @@ def open_loop(plant: Plant, start: Array, u_in: Array, u_out: Array, dt: Array) 
     """
 
     def step(state: Any, command: tuple[Array, Array, Array]) -> tuple[Any, Array]:
-        return plant.step(state, *command)
+        state, signals = plant.step(state, *command)
+        return state, signals.reading
 
     commands = jax.tree.map(lambda x: jnp.moveaxis(x[:, :-1], 1, 0), (u_in, u_out, dt))
-    _, pressure = jax.lax.scan(step, plant.init(start), commands)
+    _, pressure = jax.lax.scan(step, plant.init(start)[0], commands)
     return jnp.concatenate([start[:, None], jnp.moveaxis(pressure, 0, 1)], axis=1)
 
 
@@ -90,11 +97,14 @@ class Inspirations:
         pressure: airway pressure at each step, which is scored, cmH2O.
         requested: what the controller asked for, %.
         u_in: what was applied, %.
+        volume: gas in the lung, mL, see :class:`~ventbench.interfaces.Signals`; None where the
+            plant has none.
     """
 
     pressure: Array
     requested: Array
     u_in: Array
+    volume: Array | None
 
 
 @flax.struct.dataclass
@@ -112,53 +122,95 @@ class Expirations:
     u_in: Array
 
 
-def _breath(
+def scored_step(before: LoopState, after: LoopState, requested: Array, applied: Array) -> Any:
+    """Record a step as :class:`Inspirations`: what the plant shows before its command acts."""
+    return Inspirations(before.signals.scored, requested, applied, before.signals.volume)
+
+
+def inspiration(
+    plant: Plant,
+    scenario: Scenario,
+    loop: LoopState,
+    policy: Policy,
+    state: Any,
+    *,
+    breath: Array | int = 0,
+    inputs: Any = None,
+    record: Record = scored_step,
+) -> tuple[LoopState, Any, Any]:
+    """Run one inspiration: the only loop over its steps that is compiled.
+
+    Args:
+        plant: plants of the cells, from :func:`ventbench.environment.vary`.
+        scenario: the cells.
+        loop: from :func:`ventbench.environment.start_breath`.
+        policy: takes its state, the observation and the ``inputs`` of a step, and returns its next
+            state and ``u_in``, %.
+        state: of the policy.
+        breath: index of the breath.
+        inputs: what the policy gets besides, with the steps on the leading axis of each leaf.
+        record: what is kept of a step.
+
+    Returns:
+        States of the loop and of the policy afterwards, and the records, steps first.
+    """
+
+    def step(carry: tuple[LoopState, Any], at: tuple[Array, Any]) -> tuple[Any, Any]:
+        loop, state = carry
+        index, given = at
+        state, requested = policy(state, env.observe(scenario, loop, breath, index), given)
+        after, applied = env.inspire(plant, scenario, loop, requested)
+        return (after, state), record(loop, after, requested, applied)
+
+    (loop, state), out = jax.lax.scan(step, (loop, state), (jnp.arange(INSPIRATION), inputs))
+    return loop, state, out
+
+
+def controlled_by(controller: Controller) -> Policy:
+    """Return a pure controller as a policy of :func:`inspiration`."""
+    return lambda state, observation, _: controller.step(state, observation)
+
+
+@partial(jax.jit, static_argnames=("whole", "changing"))
+def closed_loop(
     plant: Plant,
     controller: Controller,
     scenario: Scenario,
-    whole: bool,
-    state: Any,
-    breath: Array,
-) -> tuple[Any, tuple[Inspirations, Expirations | None]]:
-    def scored(loop: env.LoopState) -> Array:
-        return env.airway_pressure(plant, loop)
-
-    def inspire(carry: tuple[env.LoopState, Any], step: Array) -> tuple[Any, Inspirations]:
-        loop, state = carry
-        state, requested = controller.step(state, env.observe(scenario, loop, breath, step))
-        after, applied = env.inspire(plant, scenario, loop, requested)
-        return (after, state), Inspirations(scored(loop), requested, applied)
-
-    def expire(loop: env.LoopState, step: Array) -> tuple[env.LoopState, Expirations]:
-        after, u_in = env.expire(plant, scenario, loop, step)
-        return after, Expirations(scored(loop), u_in)
-
-    steps = jnp.arange(protocol.BREATH_STEPS)
-    start = (env.start_breath(plant, scenario), state)
-    (loop, state), inspirations = jax.lax.scan(inspire, start, steps[:INSPIRATION])
-    expirations = None
-    if whole:
-        _, expirations = jax.lax.scan(expire, loop, steps[INSPIRATION:])
-    return state, (inspirations, expirations)
-
-
-@partial(jax.jit, static_argnames=("whole",))
-def closed_loop(
-    plant: Plant, controller: Controller, scenario: Scenario, *, whole: bool = False
+    *,
+    whole: bool = False,
+    changing: bool = False,
 ) -> tuple[Inspirations, Expirations | None]:
-    """Run a pure controller through the protocol on one lung, all cells at once.
+    """Run a pure controller through the protocol, all cells at once.
 
     Args:
-        plant: any plant that can be varied.
+        plant: any plant.
         controller: parameters broadcast against the cells.
         scenario: the cells, batch shape ``(...)``.
         whole: simulate the expirations too (for pictures; no score depends on them).
+        changing: the plant is another one in each breath: its leaves have a leading axis of
+            ``BREATHS``.
 
     Returns:
         The inspirations, and the expirations if asked for.
     """
-    varied = env.vary(plant, scenario)
-    run = partial(_breath, varied, controller, scenario, whole)
-    _, out = jax.lax.scan(run, controller.init(scenario.pip.shape), jnp.arange(BREATHS))
+    policy = controlled_by(controller)
+
+    def run(state: Any, at: tuple[Array, Any]) -> tuple[Any, Any]:
+        breath, own = at
+        varied = env.vary(own if changing else plant, scenario)
+        start = env.start_breath(varied, scenario)
+        loop, state, inspired = inspiration(varied, scenario, start, policy, state, breath=breath)
+
+        def expire(loop: LoopState, step: Array) -> tuple[LoopState, Expirations]:
+            after, u_in = env.expire(varied, scenario, loop, step)
+            return after, Expirations(loop.signals.scored, u_in)
+
+        expired = None
+        if whole:
+            _, expired = jax.lax.scan(expire, loop, jnp.arange(INSPIRATION, protocol.BREATH_STEPS))
+        return state, (inspired, expired)
+
+    breaths = (jnp.arange(BREATHS), plant if changing else None)
+    _, out = jax.lax.scan(run, controller.init(scenario.pip.shape), breaths)
     # Scans stack time in front: (breath, step, ...) -> (..., breath, step).
     return jax.tree.map(lambda x: jnp.moveaxis(x, (0, 1), (-2, -1)), out)

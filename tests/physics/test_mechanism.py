@@ -93,8 +93,8 @@ def test_without_skipping_idle_strengths_have_slopes():
     def pressure(strength, skip):
         plant = Physics((), (), skip_idle=skip).having(R=20.0, C=20.0)
         plant = plant.having(**{"leak.conductance": strength})
-        state = plant.init(jnp.asarray(5.0), jnp.asarray(5.0))
-        return plant.step(state, jnp.asarray(30.0), jnp.asarray(0), jnp.asarray(0.03))[1]
+        state, _ = plant.init(jnp.asarray(5.0), jnp.asarray(5.0))
+        return plant.step(state, jnp.asarray(30.0), jnp.asarray(0), jnp.asarray(0.03))[1].reading
 
     assert float(jax.grad(pressure)(0.0, False)) < -0.01
     assert float(jax.grad(pressure)(0.0, True)) == 0.0

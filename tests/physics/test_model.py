@@ -49,10 +49,10 @@ def test_nothing_enters_through_the_expiratory_valve():
     with precision.float64():
         plant = physics(Lung(20.0, 20.0))
         start, zero = jnp.full(N, 4.0), jnp.zeros((N, T))
-        state = plant.init(start, jnp.full(N, 9.0))
+        state, _ = plant.init(start, jnp.full(N, 9.0))
         for _ in range(5):
-            state, p = plant.step(state, zero[:, 0], zero[:, 0] + 1.0, jnp.asarray(0.03))
-    np.testing.assert_allclose(p, 4.0, atol=1e-9)
+            state, seen = plant.step(state, zero[:, 0], zero[:, 0] + 1.0, jnp.asarray(0.03))
+    np.testing.assert_allclose(seen.reading, 4.0, atol=1e-9)
 
 
 _RUN = jax.jit(lambda plant, start, *c: open_loop(plant, start, *c))
@@ -147,9 +147,9 @@ def test_end_expiratory_pressure():
     """An explicit one counts most, then the parameter, then the start."""
     with precision.float64():
         plant, start = physics(LUNGS[0], PEEP=7.0), jnp.asarray(5.0)
-        assert float(plant.init(start).peep) == 7.0
-        assert float(plant.init(start, jnp.asarray(3.0)).peep) == 3.0
-        assert float(physics(LUNGS[0]).init(start).peep) == 5.0
+        assert float(plant.init(start)[0].peep) == 7.0
+        assert float(plant.init(start, jnp.asarray(3.0))[0].peep) == 3.0
+        assert float(physics(LUNGS[0]).init(start)[0].peep) == 5.0
 
 
 def test_file_round_trip(tmp_path):

@@ -114,9 +114,9 @@ def test_flow_and_volume():
     with float64():
         plant = physics(Lung(10.0, 25.0), m, PEEP=5.0)
         commands = [jnp.asarray(x.T[:-1] * 1.0) for x in (breaths.u_in, breaths.u_out, breaths.dt)]
-        state = plant.init(jnp.asarray(breaths.pressure[:, 0]))
-        _, seen = jax.lax.scan(lambda s, c: plant.observe(s, *c), state, commands)
-    pressure, flow, volume = (np.asarray(x).T for x in seen)
+        state, _ = plant.init(jnp.asarray(breaths.pressure[:, 0]))
+        _, seen = jax.lax.scan(lambda s, c: plant.step(s, *c), state, commands)
+    pressure, _, flow, volume = (np.asarray(x).T for x in seen)
     np.testing.assert_allclose(pressure, breaths.pressure[:, 1:], atol=0.01)
     np.testing.assert_allclose(flow, breaths.flow[:, 1:], atol=1.0)
     np.testing.assert_allclose(volume, breaths.volume[:, 1:], atol=0.3)

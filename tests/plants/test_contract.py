@@ -126,8 +126,8 @@ def breaths(count: int, u_in: float) -> tuple[np.ndarray, np.ndarray]:
 def expire(plant: Plant, start, u_in):
     """Pressure after 12 s of expiration from ``start`` to a PEEP of 5 cmH2O."""
     step = jnp.asarray(1.0), jnp.asarray(0.03)
-    state = plant.init(start, jnp.asarray(5.0))
-    return jax.lax.scan(lambda s, _: plant.step(s, u_in, *step), state, length=400)[1][-1]
+    state, _ = plant.init(start, jnp.asarray(5.0))
+    return jax.lax.scan(lambda s, _: plant.step(s, u_in, *step), state, length=400)[1].reading[-1]
 
 
 @jax.jit

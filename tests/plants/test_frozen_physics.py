@@ -114,9 +114,11 @@ def test_expiration_returns_to_peep_from_anywhere(six):
         opened, held = jnp.asarray(1.0), jnp.asarray(waveform.expiratory_command(99))
 
         def expire(plant, start):
-            state = plant.init(start, jnp.asarray(protocol.PEEP))
+            state, _ = plant.init(start, jnp.asarray(protocol.PEEP))
             step = (opened, jnp.asarray(protocol.DT))
-            return jax.lax.scan(lambda s, _: plant.step(s, held, *step), state, length=200)[1]
+            return jax.lax.scan(lambda s, _: plant.step(s, held, *step), state, length=200)[
+                1
+            ].reading
 
         all_expire = jax.jit(jax.vmap(expire, (0, None)))
         for start in (0.0, 35.0):

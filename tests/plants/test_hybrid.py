@@ -202,10 +202,10 @@ def run(plant, u_in, u_out=None, dt=0.03, start=5.0):
     """States and readings of single steps, in float64."""
     u_out = np.zeros(len(u_in)) if u_out is None else u_out
     with float64():
-        state, out = plant.init(jnp.asarray(start)), []
+        (state, _), out = plant.init(jnp.asarray(start)), []
         for u, o in zip(u_in, u_out, strict=True):
-            state, pressure = _step(plant, state, *(jnp.asarray(float(x)) for x in (u, o, dt)))
-            out.append((state, float(pressure)))
+            state, signals = _step(plant, state, *(jnp.asarray(float(x)) for x in (u, o, dt)))
+            out.append((state, float(signals.reading)))
     return out
 
 

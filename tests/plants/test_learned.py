@@ -59,14 +59,14 @@ def test_without_boundary_networks():
 
 def test_windows_start_anew_after_an_expiration():
     plant = learned(jax.random.key(0), SMALL)
-    state = plant.init(jnp.full(2, 6.0), jnp.full(2, 5.0))
+    state, _ = plant.init(jnp.full(2, 6.0), jnp.full(2, 5.0))
     for u, opened in ((30.0, 0.0), (20.0, 0.0), (5.0, 1.0)):
-        state, pressure = plant.step(
+        state, signals = plant.step(
             state, jnp.full(2, u), jnp.asarray([opened, 0.0]), jnp.asarray(0.03)
         )
     np.testing.assert_array_equal(state.count, [0, 3])
     np.testing.assert_array_equal(state.controls[0], 0.0)
-    np.testing.assert_array_equal(state.pressures[0], pressure[0])
+    np.testing.assert_array_equal(state.pressures[0], signals.reading[0])
     np.testing.assert_array_equal(state.controls[1], [0.0, 30.0, 20.0, 5.0])
 
 

@@ -43,10 +43,10 @@ def test_against_solve_ivp(lung):
     dt = rng.uniform(0.02, 0.05, size=60)
     with precision.float64():
         plant = single_compartment(lung)
-        state, found = plant.init(jnp.asarray(6.0), jnp.asarray(5.0)), []
+        (state, _), found = plant.init(jnp.asarray(6.0), jnp.asarray(5.0)), []
         for command in zip(u_in, u_out, dt, strict=True):
-            state, pressure = plant.step(state, *map(jnp.asarray, command))
-            found.append(float(pressure))
+            state, signals = plant.step(state, *map(jnp.asarray, command))
+            found.append(float(signals.reading))
     np.testing.assert_allclose(found, solved(lung, u_in, u_out, dt, 6.0, 5.0), rtol=1e-6)
 
 
@@ -54,22 +54,22 @@ def test_two_half_steps_are_a_whole_one():
     with precision.float64():
         plant = single_compartment(Lung(20, 50))
         for u_out in (0.0, 1.0):
-            start, u, out = plant.init(jnp.asarray(9.0)), jnp.asarray(7.0), jnp.asarray(u_out)
+            (start, _), u, out = plant.init(jnp.asarray(9.0)), jnp.asarray(7.0), jnp.asarray(u_out)
             _, whole = plant.step(start, u, out, jnp.asarray(0.06))
             half, _ = plant.step(start, u, out, jnp.asarray(0.03))
             _, twice = plant.step(half, u, out, jnp.asarray(0.03))
-            assert twice == pytest.approx(float(whole), rel=1e-12)
+            assert twice.reading == pytest.approx(float(whole.reading), rel=1e-12)
 
 
 def test_expiration_returns_to_peep():
     with precision.float64():
         plant = single_compartment(Lung(20, 50))
-        state = plant.init(jnp.asarray(40.0), jnp.asarray(5.0))
+        state, _ = plant.init(jnp.asarray(40.0), jnp.asarray(5.0))
         for _ in range(1000):
-            state, pressure = plant.step(
+            state, signals = plant.step(
                 state, jnp.asarray(0.0), jnp.asarray(1.0), jnp.asarray(0.03)
             )
-    assert pressure == pytest.approx(5.0, abs=1e-6)
+    assert signals.reading == pytest.approx(5.0, abs=1e-6)
 
 
 def test_vary_and_gradient():
@@ -79,7 +79,7 @@ def test_vary_and_gradient():
 
     def final(c):
         varied = replace(plant, C=c)
-        return varied.step(varied.init(jnp.asarray(5.0)), *command)[1]
+        return varied.step(varied.init(jnp.asarray(5.0))[0], *command)[1].reading
 
     # p = p0 + R q + q dt / C, so dp/dC = - q dt / C^2 (C in mL: 1000 times)
     expected = -0.228 * 0.03 * 1000 / 45.0**2

@@ -53,13 +53,13 @@ def test_peep_may_differ_from_the_first_pressure():
     plants: SingleCompartment = stack([one, one])
     start, peep = jnp.asarray([10.0, 10.0]), jnp.asarray([5.0, 8.0])
     closed, opened, dt = jnp.zeros(2), jnp.ones(2), jnp.full(2, 0.03)
-    state = VmappedPlant(plants).init(start, peep)
+    state, _ = VmappedPlant(plants).init(start, peep)
     for _ in range(200):
-        state, pressure = VmappedPlant(plants).step(state, closed, opened, dt)
-    np.testing.assert_allclose(pressure, peep, atol=1e-3)
-    state = VmappedPlant(plants).init(start)  # at rest: nothing moves
-    _, pressure = VmappedPlant(plants).step(state, closed, opened, dt)
-    np.testing.assert_allclose(pressure, start, atol=1e-5)
+        state, signals = VmappedPlant(plants).step(state, closed, opened, dt)
+    np.testing.assert_allclose(signals.reading, peep, atol=1e-3)
+    state, _ = VmappedPlant(plants).init(start)  # at rest: nothing moves
+    _, signals = VmappedPlant(plants).step(state, closed, opened, dt)
+    np.testing.assert_allclose(signals.reading, start, atol=1e-5)
 
 
 LABELS = ["R20C50", "R5C10", "R50C20"]

@@ -12,6 +12,7 @@ from ventbench import precision
 from ventbench.lungs import LUNGS
 from ventbench.metrics.score import run_error
 from ventbench.plants import frozen
+from ventbench.plants.corrected import Corrected
 from ventbench.plants.hybrid import VALVE_KNOTS
 from ventbench.stress.plants import reference_physics, stressed_plants
 from ventbench.stress.run import StressDraws
@@ -24,7 +25,7 @@ def _of(score: StressScore, name: str) -> int:
 
 
 def test_reference_physics_has_the_rigs_own_parameters() -> None:
-    rigs = frozen.load(version=2).plants
+    rigs = frozen.load().plants
     reference = reference_physics(rigs, LUNGS)
     np.testing.assert_allclose(reference["C"], 1e3 / np.asarray(rigs.E))
     # The valve at 12 %, by the slopes between its knots.
@@ -35,15 +36,15 @@ def test_reference_physics_has_the_rigs_own_parameters() -> None:
 
 
 def test_a_condition_changes_its_parameters_in_its_breaths_only() -> None:
-    rigs = jax.tree.map(lambda leaf: leaf[:, None], frozen.load(version=2).plants)
+    rigs = jax.tree.map(lambda leaf: leaf[:, None], frozen.load().plants)
     every = conditions()
     stressed = stressed_plants(rigs, LUNGS, every).physics
     names = stressed.names
 
     def change(path: str, name: str) -> np.ndarray:
         at, k = names.index(path), [c.id for c in every].index(name)
-        values = np.asarray(stressed.values[at]).reshape(3, 2, len(every), 6)
-        after, before = values[:, 0, k], values[:, 1, k]
+        values = np.asarray(stressed.values[at]).reshape(len(every), 6, 3, 2)[k]
+        after, before = values[..., 0].T, values[..., 1].T
         return after / before if path in ("R", "C") else after - before
 
     np.testing.assert_allclose(change("leak.conductance", "leak:mild"), 20.0)
@@ -87,14 +88,22 @@ def test_it_is_the_rule_of_the_corrected_simulator(
     with precision.float64():
         plants, cells = flat(draws, [chosen[k] for k in leaks])
         # Of breath 2, in which the tube comes off.
-        own = jax.tree.map(lambda leaf: leaf[1], plants).vary(cells.r_scale, cells.c_scale)
-        corrected = own.corrected
-        a, b = own.init(cells.start, cells.peep), corrected.init(cells.start, cells.peep)
-        for step in range(2):
-            u_in = jax.numpy.full_like(cells.start, 40.0 / (1 + step % 5))
-            a, shown = own.step(a, u_in, 0.0 * u_in, cells.dt)
-            b, expected = corrected.step(b, u_in, 0.0 * u_in, cells.dt)
-            np.testing.assert_allclose(shown, expected, rtol=0, atol=1e-9)
+        own = jax.tree.map(lambda leaf: leaf[:, 1], plants)
+        own = jax.vmap(lambda plant, r, c: plant.vary(r, c))(own, cells.r_scale, cells.c_scale)
+        parts = (jax.tree.map(lambda leaf, k=k: leaf[:, k], own.physics) for k in (0, 1))
+        corrected = Corrected(own.simulator, *parts)
+
+        def shown(plant: Any, cell: Any) -> Any:
+            state, _ = plant.init(cell.start, cell.peep)
+            readings = []
+            for u_in in (40.0, 20.0):
+                held = jax.numpy.full_like(cell.start, u_in)
+                state, signals = plant.step(state, held, 0.0 * held, cell.dt)
+                readings.append(signals.reading)
+            return readings
+
+        stressed, expected = (jax.vmap(shown)(plant, cells) for plant in (own, corrected))
+        np.testing.assert_allclose(stressed, expected, rtol=0, atol=1e-9)
 
 
 def test_stressors_act_as_a_person_expects(score: StressScore) -> None:

@@ -4,22 +4,32 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import precision, protocol
+from ventbench import precision, protocol, rollouts
 from ventbench.controllers.pid import PID
 from ventbench.metrics.score import run_error
 from ventbench.plants import frozen
 from ventbench.plants.rigs import load_rigs, rigs_of
-from ventbench.stress.run import StressDraws, closed_loop, draw_cells, flat
+from ventbench.stress.run import StressDraws, draw_cells, flat
 from ventbench.stress.score import StressScore
 from ventbench.stress.stressors import Condition
 
 
+def scanned(plants: Any, gains: PID, scenario: Any) -> Any:
+    """Inspirations of all cells in one compiled scan."""
+
+    def run(plant: Any, cell: Any) -> Any:
+        return rollouts.closed_loop(plant, gains, cell, changing=True)[0]
+
+    return jax.vmap(run)(plants, scenario)
+
+
 def test_draws_cover_every_pip_on_every_lung_and_are_those_of_the_protocol() -> None:
-    official = frozen.load(version=2)
+    official = frozen.load()
     rigs = rigs_of(official)
     six, two = draw_cells(rigs, 6), draw_cells(rigs, 2)
     for pips in six.nominal_pip:
@@ -41,7 +51,8 @@ def test_the_scan_and_the_steps_give_the_same_score(
     with precision.float64():
         plants, scenario = flat(draws, chosen)
         gains = PID(jnp.asarray(2.0), jnp.asarray(4.0), jnp.asarray(0.0))
-        pressure, requested, _, _ = closed_loop(plants, gains, scenario)
+        run = scanned(plants, gains, scenario)
+        pressure, requested = run.pressure, run.requested
     pip = np.asarray(scenario.pip)[:, None, None]
     error = run_error(np.asarray(pressure), pip).reshape(score.error.shape)
     np.testing.assert_allclose(error, score.error, rtol=0, atol=1e-9)
@@ -58,7 +69,8 @@ def test_every_condition_is_finite_and_differs_from_none() -> None:
     with precision.float64():
         plants, scenario = flat(draws, every)
         gains = PID(*(jnp.asarray(gain) for gain in (6.0, 6.0, 0.3)))
-        pressure, *_, volume = closed_loop(plants, gains, scenario)
+        run = scanned(plants, gains, scenario)
+        pressure, volume = run.pressure, run.volume
     pressure, volume = (np.asarray(x).reshape(len(every), -1) for x in (pressure, volume))
     assert np.isfinite(pressure).all()
     assert np.isfinite(volume).all()

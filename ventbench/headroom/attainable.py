@@ -92,7 +92,7 @@ def _pressures(plant: Plant, cell: Scenario, u_in: Array) -> Array:
 
     def step(loop: env.LoopState, command: Array) -> tuple[env.LoopState, Array]:
         after, _ = env.inspire(varied, cell, loop, command)
-        return after, env.airway_pressure(varied, after)
+        return after, after.signals.scored
 
     return jax.lax.scan(step, env.start_breath(varied, cell), u_in)[1]
 

@@ -19,6 +19,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ventbench.errors import InputError
+from ventbench.interfaces import Signals
 from ventbench.lungs import Lung
 from ventbench.physics import dead_time, solver
 from ventbench.physics.catalogue import everything, parameter, paths
@@ -73,9 +74,10 @@ class Physics:
     skip_idle: bool = flax.struct.field(pytree_node=False, default=False)
     divisions: int = flax.struct.field(pytree_node=False, default=1)
 
-    def init(self, pressure: Array, peep: Array | None = None) -> PhysicsState:
+    def init(self, pressure: Array, peep: Array | None = None) -> tuple[PhysicsState, Signals]:
         """Lung at rest, expiratory valve open; see :class:`~ventbench.interfaces.Plant`.
 
+        ``pressure`` is what the sensor shows; :meth:`reading_of` gives that of an airway pressure.
         Without ``peep``, the parameter ``PEEP`` is taken, and without that the pressure.
         """
         assembly = self._assembly()
@@ -91,38 +93,32 @@ class Physics:
         # Inactive mechanisms as well, because the memories get their shapes here.
         flow, memory = solver.commanded(replace(assembly, active={}), u_in, memory)
         rest, ones = solver.at_rest(assembly, shown, flow), jnp.ones_like(flow)
-        return PhysicsState(
+        state = PhysicsState(
             rest, memory, (flow,) * (self.memory + 1), (ones,) * (self.memory + 1),
             (0.03 * ones,) * self.memory, 0.0 * ones, rest.volume, peep * ones,
         )  # fmt: skip
+        return state, Signals(shown, rest.pressure, 1000.0 * rest.flow, 0.0 * ones)
 
     def step(
-        self, state: PhysicsState, u_in: Array, u_out: Array, dt: Array
-    ) -> tuple[PhysicsState, Array]:
-        """Hold one command; see :class:`~ventbench.interfaces.Plant`."""
-        after, seen = self.observe(state, u_in, u_out, dt)
-        return after, seen[0]
-
-    def observe(
         self,
         state: PhysicsState,
         u_in: Array,
         u_out: Array,
         dt: Array,
         divisions: int | Array | None = None,
-    ) -> tuple[PhysicsState, tuple[Array, Array, Array]]:
-        """Hold one command, and return flow and volume besides pressure.
+    ) -> tuple[PhysicsState, Signals]:
+        """Hold one command; see :class:`~ventbench.interfaces.Plant`.
 
         Args:
-            state: state from ``init``, ``step`` or ``observe``.
+            state: state from ``init`` or ``step``.
             u_in: inspiratory valve, 0..100 %.
             u_out: expiratory valve, 0 closed, 1 open.
             dt: time for which the command is held, s.
             divisions: steps of the integrator in a substep; the model's own if not given.
 
         Returns:
-            The next state; measured airway pressure, cmH2O, flow into the lung, mL/s, and volume
-            above that of the first sample, mL, all at the end of ``dt``.
+            The next state, and the signals at the end of ``dt``; the volume is above that of the
+            first sample.
         """
         assembly = self._assembly()
         divisions = self.divisions if divisions is None else divisions
@@ -160,15 +156,8 @@ class Physics:
             (dt + zero, *state.past)[:-1], time, state.first, state.peep,
         )  # fmt: skip
         volume = 1000.0 * (now.volume - state.first)
-        return after, (solver.sensor_output(assembly, now.reading), 1000.0 * now.flow, volume)
-
-    def airway_pressure(self, state: PhysicsState) -> Array:
-        """True pressure at the airway, cmH2O, which a sensor may show late or shifted."""
-        return state.continuous.pressure
-
-    def reading(self, state: PhysicsState) -> Array:
-        """Pressure that the sensor shows, cmH2O: what the step into this state returned."""
-        return solver.sensor_output(self._assembly(), state.continuous.reading)
+        reading = solver.sensor_output(assembly, now.reading)
+        return after, Signals(reading, now.pressure, 1000.0 * now.flow, volume)
 
     def reading_of(self, pressure: Array) -> Array:
         """What the sensor shows of a pressure that does not change, cmH2O."""

@@ -7,6 +7,8 @@ from typing import Any
 import flax.struct
 from jax import Array
 
+from ventbench.interfaces import Signals
+
 
 @flax.struct.dataclass
 class Corrected:
@@ -26,21 +28,42 @@ class Corrected:
     with_mechanisms: Any
     without_mechanisms: Any
 
-    def init(self, pressure: Array, peep: Array | None = None) -> tuple[Any, Any, Any]:
+    def init(
+        self, pressure: Array, peep: Array | None = None
+    ) -> tuple[tuple[Any, Any, Any], Signals]:
         """All three plants at rest; see :class:`~ventbench.interfaces.Plant`."""
         parts = (self.simulator, self.with_mechanisms, self.without_mechanisms)
-        return tuple(part.init(pressure, peep) for part in parts)  # type: ignore[return-value]
+        states, signals = zip(*(part.init(pressure, peep) for part in parts), strict=True)
+        return states, corrected_signals(*signals)
 
     def step(
         self, state: tuple[Any, Any, Any], u_in: Array, u_out: Array, dt: Array
-    ) -> tuple[tuple[Any, Any, Any], Array]:
+    ) -> tuple[tuple[Any, Any, Any], Signals]:
         """Hold one command; see :class:`~ventbench.interfaces.Plant`."""
-        simulator, pressure = self.simulator.step(state[0], u_in, u_out, dt)
+        simulator, shown = self.simulator.step(state[0], u_in, u_out, dt)
         wanted, more = self.with_mechanisms.step(state[1], u_in, u_out, dt)
         own, less = self.without_mechanisms.step(state[2], u_in, u_out, dt)
-        return (simulator, wanted, own), pressure + more - less
+        return (simulator, wanted, own), corrected_signals(shown, more, less)
 
     def vary(self, r_scale: Array, c_scale: Array) -> Corrected:
         """Return the same lung with another resistance and compliance."""
         parts = (self.simulator, self.with_mechanisms, self.without_mechanisms)
         return Corrected(*(part.vary(r_scale, c_scale) for part in parts))
+
+
+def corrected_signals(simulator: Signals, more: Signals, less: Signals) -> Signals:
+    """Signals of a simulator plus the difference of two physics.
+
+    Flow and volume are None where the simulator has none. A simulator that has readings only is
+    taken to read the airway.
+    """
+
+    def sum_of(base: Any, name: str) -> Any:
+        return None if base is None else base + getattr(more, name) - getattr(less, name)
+
+    return Signals(
+        sum_of(simulator.reading, "reading"),
+        sum_of(simulator.scored, "airway_pressure"),
+        sum_of(simulator.flow, "flow"),
+        sum_of(simulator.volume, "volume"),
+    )

@@ -16,6 +16,8 @@ import flax.struct
 import jax.numpy as jnp
 from jax import Array
 
+from ventbench.interfaces import Signals
+
 #: Knots of the valve's piecewise linear curve, %; the last segment ends at infinity.
 VALVE_KNOTS = (0.0, 1.0, 2.0, 3.5, 5.0, 7.0, 10.0, 14.0, 19.0, 26.0, 36.0, 50.0, 70.0)
 
@@ -133,7 +135,7 @@ class Hybrid:
             slope = slope + change * (elastic > knot)
         return pressure, slope
 
-    def init(self, pressure: Array, peep: Array | None = None) -> HybridState:
+    def init(self, pressure: Array, peep: Array | None = None) -> tuple[HybridState, Signals]:
         """Lung at the end of an expiration; see :class:`~ventbench.interfaces.Plant`.
 
         The expiratory valve is open and the resting command holds the pressure, as before every
@@ -143,7 +145,7 @@ class Hybrid:
         zero = jnp.zeros_like(pressure)
         rest = self.rest + zero
         flow = self.valve(rest)
-        return HybridState(
+        state = HybridState(
             elastic=pressure + self.offset,
             drop=zero - self.offset,
             sensor=pressure,
@@ -156,10 +158,11 @@ class Hybrid:
             peep=pressure if peep is None else peep + zero,
             outlet=None if self.closing_lag is None else zero + 1.0,
         )
+        return state, self._signals(state, pressure)
 
     def step(
         self, state: HybridState, u_in: Array, u_out: Array, dt: Array
-    ) -> tuple[HybridState, Array]:
+    ) -> tuple[HybridState, Signals]:
         """Hold one command; see :class:`~ventbench.interfaces.Plant`.
 
         Each substep is an exponential step of the drop over the airway, with the airway's
@@ -206,15 +209,14 @@ class Hybrid:
             elastic, drop, sensor, flow, commanded[:-1], opened[:-1],
             (dt + 0.0 * drop, *state.past[:-1]), plays, u_in, state.peep, opening,
         )  # fmt: skip
-        return after, reading
+        return after, self._signals(after, reading)
 
-    def airway_pressure(self, state: HybridState) -> Array:
-        """Pressure at the airway, cmH2O, shape ``(...)``.
-
-        What :meth:`step` returns is the sensor's reading: it lags, and shifts while the command
-        changes direction.
-        """
-        return self.recoil(state.elastic)[0] + state.drop
+    def _signals(self, state: HybridState, reading: Array) -> Signals:
+        """Signals of a state; the reading lags, and shifts while the command changes direction."""
+        resistance = 0.5 * (self.R + jnp.sqrt(self.R**2 + 4.0 * self.K2 * jnp.abs(state.drop)))
+        airway = self.recoil(state.elastic)[0] + state.drop
+        flow, volume = 1000.0 * state.drop / resistance, 1000.0 * state.elastic / self.E
+        return Signals(reading, airway, flow, volume)
 
     def _fill(
         self, elastic: Array, drop: Array, inflow: Array, outlet: Array, behind: Array, h: Array

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ventbench import protocol
+from ventbench.interfaces import Signals
 
 #: Interval at which the network's rate output is an increment, s (mean of the recordings').
 REFERENCE_DT = 0.033
@@ -251,11 +252,11 @@ class Learned:
     time_scale: Array
     windows: tuple[int, int] = flax.struct.field(pytree_node=False)
 
-    def init(self, pressure: Array, peep: Array | None = None) -> LearnedState:
+    def init(self, pressure: Array, peep: Array | None = None) -> tuple[LearnedState, Signals]:
         """Lung at rest; see :class:`~ventbench.interfaces.Plant`."""
         pressure = jnp.asarray(pressure) * 1.0
         behind = pressure if peep is None else jnp.broadcast_to(peep, pressure.shape)
-        return self._rest(pressure, behind.astype(pressure.dtype))
+        return self._rest(pressure, behind.astype(pressure.dtype)), Signals(pressure)
 
     def _rest(self, pressure: Array, peep: Array) -> LearnedState:
         pressures, controls = self.windows
@@ -268,7 +269,7 @@ class Learned:
 
     def step(
         self, state: LearnedState, u_in: Array, u_out: Array, dt: Array
-    ) -> tuple[LearnedState, Array]:
+    ) -> tuple[LearnedState, Signals]:
         """One control step; see the class."""
         now = state.pressures[..., -1]
         dt = dt / self.time_scale
@@ -303,7 +304,7 @@ class Learned:
             ),
             rest,
             going,
-        ), pressure
+        ), Signals(pressure)
 
     def vary(self, r_scale: Array, c_scale: Array) -> Learned:
         """Return the plant of a lung with other R and C, through two exact symmetries.

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
+from ventbench.interfaces import Signals
 from ventbench.lungs import Lung
 from ventbench.physics.parameters import EXPIRATORY_RESISTANCE, VALVE_GAIN
 
@@ -40,13 +41,16 @@ class SingleCompartment:
     gain: Array
     R_ex: Array
 
-    def init(self, pressure: Array, peep: Array | None = None) -> SingleCompartmentState:
+    def init(
+        self, pressure: Array, peep: Array | None = None
+    ) -> tuple[SingleCompartmentState, Signals]:
         """Lung at rest; see :class:`~ventbench.interfaces.Plant`."""
-        return SingleCompartmentState(pressure, pressure if peep is None else peep)
+        state = SingleCompartmentState(pressure, pressure if peep is None else peep)
+        return state, Signals(pressure, pressure, 0.0 * pressure, self.C * pressure)
 
     def step(
         self, state: SingleCompartmentState, u_in: Array, u_out: Array, dt: Array
-    ) -> tuple[SingleCompartmentState, Array]:
+    ) -> tuple[SingleCompartmentState, Signals]:
         """Exact solution over one held command; see the class."""
         flow = self.gain * u_in / 1000.0  # L/s
         compliance = self.C / 1000.0  # L/cmH2O
@@ -60,7 +64,9 @@ class SingleCompartment:
         expired = (self.R * rest + self.R_ex * emptied) / (self.R + self.R_ex)
         alveolar = u_out * emptied + (1.0 - u_out) * filled
         pressure = u_out * expired + (1.0 - u_out) * inspired
-        return SingleCompartmentState(alveolar, state.peep), pressure
+        entering = 1000.0 * (pressure - alveolar) / self.R
+        signals = Signals(pressure, pressure, entering, self.C * alveolar)
+        return SingleCompartmentState(alveolar, state.peep), signals
 
     def vary(self, r_scale: Array, c_scale: Array) -> SingleCompartment:
         """Return the same lung with other R and C."""

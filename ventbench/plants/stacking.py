@@ -14,7 +14,7 @@ from jax import Array
 
 from ventbench import precision
 from ventbench.errors import InputError
-from ventbench.interfaces import Plant
+from ventbench.interfaces import Plant, Signals
 from ventbench.lungs import Lung
 from ventbench.physics.model import Physics
 from ventbench.recordings.breaths import Breaths
@@ -128,18 +128,24 @@ class VmappedPlant:
 
     plants: Any
 
-    def init(self, pressure: Array, peep: Array | None = None) -> Any:
-        """State of lungs at rest; see :class:`~ventbench.interfaces.Plant`."""
+    def init(self, pressure: Array, peep: Array | None = None) -> tuple[Any, Signals]:
+        """Lungs at rest; see :class:`~ventbench.interfaces.Plant`."""
 
         def init(plant: Plant, pressure: Array, peep: Array) -> Any:
             return plant.init(pressure, peep)
 
         return jax.vmap(init)(self.plants, pressure, pressure if peep is None else peep)
 
-    def step(self, state: Any, u_in: Array, u_out: Array, dt: Array) -> tuple[Any, Array]:
+    def step(self, state: Any, u_in: Array, u_out: Array, dt: Array) -> tuple[Any, Signals]:
         """Hold one command each."""
 
         def step(plant: Plant, state: Any, u_in: Array, u_out: Array, dt: Array) -> Any:
             return plant.step(state, u_in, u_out, dt)
 
         return jax.vmap(step)(self.plants, state, u_in, u_out, dt)
+
+    def vary(self, r_scale: Array, c_scale: Array) -> VmappedPlant:
+        """Return the same lungs with other resistances and compliances."""
+        return VmappedPlant(
+            jax.vmap(lambda plant, *x: plant.vary(*x))(self.plants, r_scale, c_scale)
+        )

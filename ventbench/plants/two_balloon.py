@@ -10,6 +10,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ventbench import protocol
+from ventbench.interfaces import Signals
 from ventbench.lungs import Lung
 from ventbench.plants.single_compartment import EXPIRATORY_RESISTANCE, VALVE_GAIN
 
@@ -65,7 +66,7 @@ class TwoBalloon:
     K: Array
     supply: Array
 
-    def init(self, pressure: Array, peep: Array | None = None) -> TwoBalloonState:
+    def init(self, pressure: Array, peep: Array | None = None) -> tuple[TwoBalloonState, Signals]:
         """Lung at rest; see :class:`~ventbench.interfaces.Plant`.
 
         Pressures outside -K/2 to 98 % of the balloon's peak become these.
@@ -78,7 +79,9 @@ class TwoBalloon:
             slope = (7.0 * x**-2 - 1.0) * x ** (-4.0 / 3.0) / 3.0
             x = x + (ratio - value) / slope
         behind = pressure if peep is None else jnp.broadcast_to(peep, pressure.shape)
-        return TwoBalloonState(x.astype(pressure.dtype), behind.astype(pressure.dtype))
+        volume = x.astype(pressure.dtype)
+        signals = Signals(pressure, pressure, 0.0 * pressure, 2.0 * self.K * self.C * volume)
+        return TwoBalloonState(volume, behind.astype(pressure.dtype)), signals
 
     def alveolar(self, volume: Array) -> Array:
         """Pressure in the balloon, cmH2O, at a volume over rest volume, shape ``(...)``."""
@@ -86,7 +89,7 @@ class TwoBalloon:
 
     def step(
         self, state: TwoBalloonState, u_in: Array, u_out: Array, dt: Array
-    ) -> tuple[TwoBalloonState, Array]:
+    ) -> tuple[TwoBalloonState, Signals]:
         """Hold one command; see the class."""
         supply = self.gain * jnp.clip(u_in, 0.0, protocol.U_MAX) / 1000.0 / self.supply
         outlet = u_out / self.R_ex  # conductances, L/s per cmH2O
@@ -105,8 +108,10 @@ class TwoBalloon:
             c = flow(x + 0.5 * h * b)
             d = flow(x + h * c)
             x = x + h / 6.0 * (a + 2.0 * b + 2.0 * c + d)
-        pressure = self.alveolar(x) + self.R * flow(x)
-        return TwoBalloonState(x, state.peep), pressure
+        entering = flow(x)
+        pressure = self.alveolar(x) + self.R * entering
+        volume = 1000.0 * rest_volume * x
+        return TwoBalloonState(x, state.peep), Signals(pressure, pressure, 1e3 * entering, volume)
 
     def vary(self, r_scale: Array, c_scale: Array) -> TwoBalloon:
         """Return the same lung with other R and C."""

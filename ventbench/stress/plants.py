@@ -14,17 +14,16 @@ from typing import Any
 
 import flax.struct
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
 from ventbench import protocol
-from ventbench.interfaces import Plant
+from ventbench.interfaces import Plant, Signals
 from ventbench.lungs import Lung
 from ventbench.physics.catalogue import parameter, paths
 from ventbench.physics.model import Physics
-from ventbench.plants.corrected import Corrected
+from ventbench.plants.corrected import corrected_signals
 from ventbench.plants.hybrid import ELASTIC_KNOTS, RELIEF, VALVE_KNOTS, Hybrid
 from ventbench.stress.stressors import Condition, Severity, Stressor, stressor
 
@@ -44,70 +43,41 @@ _RECOILS = np.linspace(2.0, 40.0, 39)
 
 @flax.struct.dataclass
 class Stressed:
-    """A plant under stress, as a plant: :class:`~ventbench.plants.corrected.Corrected`, batched.
+    """A plant under stress: :class:`~ventbench.plants.corrected.Corrected` that starts from truth.
 
     Both physics are one model with an axis of two in front, so that they are compiled once.
 
     Attributes:
-        simulator: the scored plant, leaves ``(N, ...)``.
-        physics: with the stressor, then without, leaves ``(2, N)``.
+        simulator: the scored plant.
+        physics: with the stressor, then without, leaves ``(2,)``.
     """
 
     simulator: Any
     physics: Physics
 
-    @property
-    def corrected(self) -> Corrected:
-        """The same plant from parts; it starts from a reading where this one starts from truth."""
-        parts = (jax.tree.map(lambda leaf, k=k: leaf[k], self.physics) for k in (0, 1))
-        return Corrected(self.simulator, *parts)
-
-    def init(self, pressure: Array, peep: Array | None = None) -> tuple[Any, Any]:
-        """All plants at rest at a true pressure; see :class:`~ventbench.interfaces.Plant`."""
+    def init(self, pressure: Array, peep: Array | None = None) -> tuple[tuple[Any, Any], Signals]:
+        """Lung at rest at a true pressure; see :class:`~ventbench.interfaces.Plant`."""
         behind = pressure if peep is None else peep
-        state = self.physics.init(self.physics.reading_of(pressure), behind)
-        # Mapped over cells: networks do not broadcast.
-        return jax.vmap(lambda plant, *at: plant.init(*at))(self.simulator, pressure, behind), state
+        shown = self.physics.reading_of(pressure)
+        state, _ = self.physics.init(shown, behind)
+        simulator, seen = self.simulator.init(pressure, behind)
+        flow = None if seen.flow is None else 0.0 * seen.flow
+        signals = Signals(shown[0] + 0.0 * pressure, pressure, flow, 0.0 * pressure)
+        return (simulator, state), signals
 
     def step(
         self, state: tuple[Any, Any], u_in: Array, u_out: Array, dt: Array
-    ) -> tuple[tuple[Any, Any], Array]:
-        """Hold one command; see :class:`~ventbench.interfaces.Plant`."""
-        simulator, pressure = jax.vmap(lambda plant, *now: plant.step(*now))(
-            self.simulator, state[0], u_in, u_out, dt
-        )
-        physics, (more, less) = self.physics.step(state[1], u_in, u_out, dt)
-        return (simulator, physics), pressure + more - less
-
-    def first_reading(self, pressure: Array) -> Array:
-        """What the sensor shows at the start of a breath at a true pressure, cmH2O."""
-        return self.physics.reading_of(pressure)[0] + jnp.zeros_like(pressure)
-
-    def airway_pressure(self, state: tuple[Any, Any], reading: Array) -> Array:
-        """True pressure at the airway, cmH2O.
-
-        Args:
-            state: state after a step.
-            reading: what that step returned; a scored plant that does not know its sensor's errors
-                has none.
-        """
-        more, less = self.physics.airway_pressure(state[1])
-        if hasattr(self.simulator, "airway_pressure"):
-            airway = jax.vmap(lambda plant, now: plant.airway_pressure(now))
-            return airway(self.simulator, state[0]) + more - less
-        shown_more, shown_less = self.physics.reading(state[1])
-        return reading - (shown_more - shown_less) + more - less
-
-    def volume(self, state: tuple[Any, Any]) -> Array:
-        """Gas in the lung above that at the start of the breath, mL, of the physics with stress."""
-        return 1e3 * (state[1].continuous.volume - state[1].first)[0]
+    ) -> tuple[tuple[Any, Any], Signals]:
+        """Hold one command; the volume is that of the physics with the stressor."""
+        simulator, seen = self.simulator.step(state[0], u_in, u_out, dt)
+        physics, both = self.physics.step(state[1], u_in, u_out, dt)
+        more, less = (jax.tree.map(lambda leaf, k=k: leaf[k], both) for k in (0, 1))
+        signals = corrected_signals(seen, more, less)._replace(volume=more.volume)
+        return (simulator, physics), signals
 
     def vary(self, r_scale: Array, c_scale: Array) -> Stressed:
         """Return the same lung with another resistance and compliance."""
-        simulator = jax.vmap(lambda plant, *scales: plant.vary(*scales))(
-            self.simulator, r_scale, c_scale
-        )
-        return Stressed(simulator, self.physics.vary(r_scale, c_scale))
+        return Stressed(self.simulator.vary(r_scale, c_scale), self.physics.vary(r_scale, c_scale))
 
 
 def reference_physics(plant: Plant, lungs: Sequence[Lung]) -> dict[str, Floats]:
@@ -178,8 +148,8 @@ def stressed_plants(
         conditions: S of them.
 
     Returns:
-        A plant for each breath of a run: leaves of the scored plants
-        ``(BREATHS, S * L * n, ...)``, of the physics ``(BREATHS, 2, S * L * n)``.
+        A plant for each cell and breath of a run: leaves ``(S * L * n, BREATHS, ...)``, of the
+        physics ``(S * L * n, BREATHS, 2)``.
     """
     leaves = jax.tree.leaves(plant)
     cells = tuple(np.shape(leaves[0])[:2])
@@ -199,14 +169,14 @@ def stressed_plants(
             _apply(stressor(name), condition.severity or "mild", own, labels)
 
     both: Any = tuple(
-        np.stack([x[name].reshape(protocol.BREATHS, -1) for x in (after, before)], axis=1)
+        np.stack([x[name].reshape(protocol.BREATHS, -1).T for x in (after, before)], axis=-1)
         for name in names
     )
 
     def repeated(leaf: Any) -> Any:
         leaf = np.asarray(leaf)
-        every = np.broadcast_to(leaf, (*size[:2], *leaf.shape))
-        return every.reshape(protocol.BREATHS, -1, *leaf.shape[2:])
+        every = np.broadcast_to(leaf[:, :, None], (size[1], *size[2:], size[0], *leaf.shape[2:]))
+        return every.reshape(-1, size[0], *leaf.shape[2:])
 
     return Stressed(jax.tree.map(repeated, plant), Physics(both, names))
 

@@ -35,6 +35,7 @@ class ProtocolRun:
         pressure: airway pressure at each step, which is scored, cmH2O.
         requested: what the controllers asked for, %; 0 once a cell has failed.
         u_in: what was applied, %.
+        volume: gas in the lung, mL; None where the plants have no such signal.
         failures: what failed, by cell, index ``(lung, ...)``.
         act_seconds: time that one ``act`` took on average, s, for each round of all cells, shape
             ``(BREATHS * INSPIRATION_STEPS,)``.
@@ -43,6 +44,7 @@ class ProtocolRun:
     pressure: Floats
     requested: Floats
     u_in: Floats
+    volume: Floats | None
     failures: Mapping[tuple[int, ...], Failure]
     act_seconds: Floats
 
@@ -95,7 +97,16 @@ def _inspire(
     return _strong(jax.vmap(env.inspire)(plants, scenario, loop, u_in))
 
 
-_airway_pressure = jax.jit(jax.vmap(env.airway_pressure))
+class PlantError(FloatingPointError):
+    """A plant answered with NaN or infinity.
+
+    Attributes:
+        index: of the plant on the leading axis.
+    """
+
+    def __init__(self, index: int) -> None:
+        super().__init__(f"simulator {index} answered with NaN or infinity")
+        self.index = index
 
 
 def step_through(
@@ -104,6 +115,8 @@ def step_through(
     runner: Runner,
     submission: Submission,
     tasks: Sequence[Task],
+    *,
+    changing: bool = False,
 ) -> ProtocolRun:
     """Run a submission on every lung and cell. Call it within ``precision.float64()``.
 
@@ -114,22 +127,25 @@ def step_through(
         runner: runs the controllers.
         submission: whose they are.
         tasks: what is told of each lung, length L.
+        changing: the plants are others in each breath: leaves ``(L, BREATHS, ...)``.
 
     Raises:
         SubmissionError: if the submission cannot be run at all.
-        FloatingPointError: if a plant answers with NaN or infinity.
+        PlantError: if a plant answers with NaN or infinity.
     """
     batch = np.shape(scenario.pip)
     cells = int(np.prod(batch))
     shape = (*batch, protocol.BREATHS, protocol.INSPIRATION_STEPS)
-    pressure, requested, applied = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-    seconds = []
-    varied, rest = _begin(plants, scenario)
+    pressure, requested, applied, volume = (np.zeros(shape) for _ in range(4))
+    seconds, has_volume = [], True
     each = [task for task in tasks for _ in range(cells // len(tasks))]
     with precision.float32():  # a submission that uses JAX finds it as it is elsewhere
         session = runner.start(submission, each)
     try:
         for breath in range(protocol.BREATHS):
+            if changing or breath == 0:
+                now = jax.tree.map(lambda x, k=breath: x[:, k], plants) if changing else plants
+                varied, rest = _begin(now, scenario)
             loop = rest
             for step in range(protocol.INSPIRATION_STEPS):
                 rows = pack(_observe(scenario, loop, breath, step))
@@ -139,17 +155,21 @@ def step_through(
                     commands = session.act(rows)
                 seconds.append((time.perf_counter() - start) / live)
                 commands = commands.reshape(batch)
-                now = (..., breath, step)
-                pressure[now], requested[now] = _airway_pressure(varied, loop), commands
-                loop, applied[now] = _inspire(varied, scenario, loop, commands)
+                at = (..., breath, step)
+                pressure[at], requested[at] = loop.signals.scored, commands
+                has_volume = loop.signals.volume is not None
+                if has_volume:
+                    volume[at] = loop.signals.volume
+                loop, applied[at] = _inspire(varied, scenario, loop, commands)
         failures = dict(session.failures)
     finally:
         session.close()
     broken = np.flatnonzero(~np.isfinite(pressure).reshape(len(tasks), -1).all(axis=1))
     if broken.size:
-        raise FloatingPointError(f"simulator {broken[0]} answered with NaN or infinity")
+        raise PlantError(int(broken[0]))
     by_cell = {tuple(int(i) for i in np.unravel_index(k, batch)): v for k, v in failures.items()}
-    return ProtocolRun(pressure, requested, applied, by_cell, np.array(seconds))
+    kept = volume if has_volume else None
+    return ProtocolRun(pressure, requested, applied, kept, by_cell, np.array(seconds))
 
 
 def replay(

@@ -80,12 +80,12 @@ def _run(
     )
 
     def step(state: object, command: tuple[Array, Array, Array]) -> tuple[object, Array]:
-        state, (pressure, flow_in, _) = plant.observe(state, *command, divisions)  # type: ignore[arg-type]
-        return state, jnp.stack([pressure, flow_in] if flow else [pressure])
+        state, seen = plant.step(state, *command, divisions)  # type: ignore[arg-type]
+        return state, jnp.stack([seen.reading, seen.flow] if flow else [seen.reading])
 
     start = values[..., -1]
     held = jax.tree.map(lambda x: jnp.moveaxis(x[:, :-1], 1, 0), commands)
-    _, seen = jax.lax.scan(step, plant.init(start), held)
+    _, seen = jax.lax.scan(step, plant.init(start)[0], held)
     first = jnp.stack([start, 0.0 * start] if flow else [start])
     return jnp.moveaxis(jnp.concatenate([first[None], seen]), (0, 1), (-1, -2))
 

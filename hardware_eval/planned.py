@@ -36,7 +36,7 @@ from ventbench import precision, protocol
 from ventbench.controllers.pid import TIME_CONSTANT
 from ventbench.environment import Scenario
 from ventbench.headroom import attainable as bound
-from ventbench.interfaces import Plant
+from ventbench.interfaces import Plant, Signals
 from ventbench.submissions.scaffold import contents
 
 Floats = NDArray[np.float64]
@@ -155,11 +155,12 @@ class _Breathing:
     plant: Any
     state: Any
 
-    def init(self, pressure: Array, peep: Array | None = None) -> Any:
-        return self.state
+    def init(self, pressure: Array, peep: Array | None = None) -> tuple[Any, Signals]:
+        return self.state, Signals(pressure)
 
-    def step(self, state: Any, u_in: Array, u_out: Array, dt: Array) -> tuple[Any, Array]:
-        return self.plant.step(state, u_in, u_out, dt)
+    def step(self, state: Any, u_in: Array, u_out: Array, dt: Array) -> tuple[Any, Signals]:
+        state, signals = self.plant.step(state, u_in, u_out, dt)
+        return state, Signals(signals.reading)
 
     def vary(self, r_scale: Array, c_scale: Array) -> _Breathing:
         return _Breathing(self.plant.vary(r_scale, c_scale), self.state)
@@ -169,12 +170,11 @@ def plan_controller(plant: Plant, pips: tuple[float, ...]) -> PlannedController:
     """Plan a controller on a simulator.
 
     Args:
-        plant: the simulator of a lung, without a batch shape; it has ``vary``.
+        plant: the simulator of a lung, without a batch shape.
         pips: cmH2O, rising; commands of a PIP between two are interpolated.
 
     Raises:
         ValueError: if the PIPs do not rise.
-        TypeError: if the plant cannot be varied.
     """
     if not pips or any(b <= a for a, b in itertools.pairwise(pips)):
         raise ValueError(f"PIPs {pips} cmH2O must rise")
@@ -184,7 +184,7 @@ def plan_controller(plant: Plant, pips: tuple[float, ...]) -> PlannedController:
         cells = cells.replace(noise=np.zeros((n, 1, 1)))  # type: ignore[attr-defined]
         wide = jax.tree.map(lambda leaf: np.asarray(leaf, float), plant)
         stacked = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (n, *np.shape(leaf))), wide)
-        state = jax.vmap(type(plant).init)(stacked, cells.start, cells.peep)
+        state, _ = jax.vmap(type(plant).init)(stacked, cells.start, cells.peep)
         for turn in range(1 + BREATHS):
             breathing = _Breathing(stacked, state)
             best = bound.attainable(breathing, cells, starts=STARTS)
@@ -217,7 +217,7 @@ def _breath_after(plant: _Breathing, cell: Scenario, commands: Array) -> tuple[A
     loop, _ = jax.lax.scan(
         lambda loop, step: (env.expire(plant, cell, loop, step)[0], None), loop, steps
     )
-    return breath_begun(loop.plant, jnp.ones(())), loop.pressure
+    return breath_begun(loop.plant, jnp.ones(())), loop.signals.reading
 
 
 def _departing(pips: tuple[float, ...], start: Floats, departures: Floats) -> Scenario:
@@ -245,15 +245,15 @@ def _errors(
         def step(carry: tuple[Any, Array, Array], planned: tuple[Array, Array]) -> tuple[Any, None]:
             loop, integral, total = carry
             command, pressure = planned
-            missing = pressure - loop.pressure
+            missing = pressure - loop.signals.reading
             integral = integral + share * (missing - integral)
-            total = total + jnp.abs(loop.pressure - cell.pip)
+            total = total + jnp.abs(loop.signals.reading - cell.pip)
             asked = command + gain[0] * missing + gain[1] * integral
             loop, _ = env.inspire(varied, cell, loop, asked)
             return (loop, integral, total), None
 
         start = env.start_breath(varied, cell)
-        zero = jnp.zeros_like(start.pressure)
+        zero = jnp.zeros_like(start.previous)
         (_, _, total), _ = jax.lax.scan(step, (start, zero, zero), (commands, pressures))
         return total / protocol.INSPIRATION_STEPS
 

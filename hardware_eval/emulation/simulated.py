@@ -25,7 +25,6 @@ from ventbench.errors import InputError
 from ventbench.interfaces import Plant
 from ventbench.physics.model import PhysicsState
 from ventbench.plants.catalog import load_simulators
-from ventbench.plants.hybrid import Hybrid, HybridState
 
 #: A command that does not change is taken into the plant's state after this time, s; above the
 #: control step, so that a loop decides when, and within the dead times that plants remember.
@@ -74,22 +73,22 @@ class SimulatedHal:
         self._noise, self._quantum = noise, quantum
         leaves = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(plant))
         calibration = hashlib.sha256(type(plant).__name__.encode() + leaves).digest()
-        self._flow = hasattr(plant, "observe") or isinstance(plant, Hybrid)
-        capabilities = Capability.SIMULATED | (Capability.FLOW if self._flow else Capability.NONE)
-        self.identity = Identity(name, calibration[:8], calibration, capabilities)
         start = jnp.asarray(protocol.PEEP, jnp.float32)
         plant = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), plant)
-        vector, unravel = ravel_pytree(plant.init(start, start))
-        varies = hasattr(plant, "vary")
-        self._can_pinch = varies
+        rest, signals = plant.init(start, start)
+        vector, unravel = ravel_pytree(rest)
+        self._flow = signals.flow is not None
+        capabilities = Capability.SIMULATED | (Capability.FLOW if self._flow else Capability.NONE)
+        self.identity = Identity(name, calibration[:8], calibration, capabilities)
 
         def advance(vector: jax.Array, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
             u_in, u_out, dt, r_scale, restart = inputs
             state = unravel(vector)
             state = breath_begun(state, restart)
-            own = plant.vary(r_scale, jnp.ones_like(r_scale)) if varies else plant  # type: ignore[attr-defined]
-            after, pressure, flow = _observed(own, state, u_in, u_out, dt)
-            return ravel_pytree(after)[0], jnp.stack([pressure, flow])
+            own = plant.vary(r_scale, jnp.ones_like(r_scale))
+            after, seen = own.step(state, u_in, u_out, dt)
+            flow = jnp.full_like(seen.reading, jnp.nan) if seen.flow is None else seen.flow
+            return ravel_pytree(after)[0], jnp.stack([seen.reading, flow])
 
         inputs = np.array([0.0, 1.0, LONGEST_HOLD, 1.0, 0.0], np.float32)
         self._advance = jax.jit(advance).lower(vector, inputs).compile()
@@ -104,7 +103,7 @@ class SimulatedHal:
         return fresh
 
     def _reset(self, faults: Sequence[LungFault], seed: int) -> None:
-        self.faults = faults
+        self.faults = tuple(faults)
         self._random = np.random.default_rng(seed)
         self._state = self._rest
         self._since: float | None = None
@@ -115,27 +114,11 @@ class SimulatedHal:
         self._ambient_from: tuple[float, float] | None = None
         self._last = Sample(0.0, protocol.PEEP)
 
-    @property
-    def faults(self) -> tuple[LungFault, ...]:
-        """What goes wrong.
-
-        Setting it raises InputError if the plant cannot do what a fault asks.
-        """
-        return self._faults
-
-    @faults.setter
-    def faults(self, faults: Sequence[LungFault]) -> None:
-        narrowed = {fault.kind for fault in faults} & {FaultKind.PINCHED, FaultKind.OCCLUDED}
-        if narrowed and not self._can_pinch:
-            raise InputError("this plant's resistance cannot be changed: it cannot be pinched")
-        self._faults = tuple(faults)
-
     def sample(self, now: float) -> Sample:
         """Pressure and flow by now; see :class:`~hardware_eval.device.hal.Hal`."""
         kinds = active(self.faults, now)
         _, shown = self._by(now, kinds)
         pressure, flow = (float(x) for x in np.asarray(shown))
-        flow = flow if self._flow else math.nan
         if FaultKind.DISCONNECTED in kinds:
             begun, before = self._ambient_from or (now, self._last.pressure)
             self._ambient_from = begun, before
@@ -221,21 +204,6 @@ def breath_begun(state: Any, restart: jax.Array) -> Any:
         return part.replace(time=part.time * (1.0 - restart))  # type: ignore[attr-defined]
 
     return jax.tree.map(restarted, state, is_leaf=lambda part: isinstance(part, PhysicsState))
-
-
-def _observed(
-    plant: Any, state: Any, u_in: jax.Array, u_out: jax.Array, dt: jax.Array
-) -> tuple[Any, jax.Array, jax.Array]:
-    """Next state, pressure, cmH2O, and flow into the lung, mL/s (0 where the plant has none)."""
-    if hasattr(plant, "observe"):
-        after, (pressure, flow, _) = plant.observe(state, u_in, u_out, dt)
-        return after, pressure, flow
-    after, pressure = plant.step(state, u_in, u_out, dt)
-    if isinstance(plant, Hybrid) and isinstance(after, HybridState):
-        drop = after.drop
-        resistance = 0.5 * (plant.R + jnp.sqrt(plant.R**2 + 4.0 * plant.K2 * jnp.abs(drop)))
-        return after, pressure, 1000.0 * drop / resistance
-    return after, pressure, jnp.zeros_like(pressure)
 
 
 def simulated_lung(lung_id: str, simulator: Any = "frozen", **settings: Any) -> SimulatedHal:

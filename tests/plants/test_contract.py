@@ -23,7 +23,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from ventbench import protocol, waveform
-from ventbench.interfaces import Plant
+from ventbench.interfaces import Plant, Signals
 from ventbench.lungs import LUNG_IDS, Lung, lung
 from ventbench.physics import physics
 from ventbench.plants import frozen
@@ -273,15 +273,18 @@ class FirstOrder:
     gain: Array
     tau: Array
 
-    def init(self, pressure: Array, peep: Array | None = None) -> tuple[Array, Array]:
+    def init(
+        self, pressure: Array, peep: Array | None = None
+    ) -> tuple[tuple[Array, Array], Signals]:
         pressure = jnp.asarray(pressure) * 1.0
-        return pressure, pressure if peep is None else peep + 0.0 * pressure
+        behind = pressure if peep is None else peep + 0.0 * pressure
+        return (pressure, behind), Signals(pressure)
 
     def step(self, state, u_in, u_out, dt):
         pressure, peep = state
         goal = peep + (1.0 - u_out) * self.gain * u_in
         pressure = goal + (pressure - goal) * jnp.exp(-dt / self.tau)
-        return (pressure, peep), pressure
+        return (pressure, peep), Signals(pressure)
 
     def vary(self, r_scale, c_scale):
         return FirstOrder(self.gain * r_scale, self.tau * r_scale * c_scale)

@@ -20,10 +20,11 @@ from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import SimulatedHal, simulated_lung
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.errors import DisconnectedError, NoAnswerError
-from hardware_eval.wire.messages import Flag, Mode
+from hardware_eval.wire.messages import Capability, Flag, Mode
 from tests.hardware_eval.stand_in import Bench
 from ventbench import protocol
 from ventbench.errors import InputError
+from ventbench.interfaces import Signals
 from ventbench.lungs import lung
 from ventbench.plants.single_compartment import single_compartment
 
@@ -91,23 +92,25 @@ def test_faults_change_the_pressure_as_they_say(hal_of_a_textbook_lung: Simulate
 
 @flax.struct.dataclass
 class _Rigid:
-    """A plant of one number, which nobody can pinch."""
+    """A plant whose pressure follows the command, and which shows nothing else."""
 
     gain: Any
 
     def init(self, pressure: Any, peep: Any = None) -> Any:
-        return pressure
+        return pressure, Signals(pressure)
 
     def step(self, state: Any, u_in: Any, u_out: Any, dt: Any) -> tuple[Any, Any]:
-        return state + self.gain * u_in * dt, state + self.gain * u_in * dt
+        after = state + self.gain * u_in * dt
+        return after, Signals(after)
+
+    def vary(self, r_scale: Any, c_scale: Any) -> Any:
+        return _Rigid(self.gain * r_scale)
 
 
-def test_what_a_plant_cannot_do_is_told_before_it_runs() -> None:
+def test_a_plant_without_flow_says_so() -> None:
     hal = SimulatedHal(_Rigid(1.0))
     assert math.isnan(hal.sample(0.0).flow)
-    with pytest.raises(InputError, match="cannot be pinched"):
-        hal.faults = (LungFault(FaultKind.PINCHED, 5.0, strength=3.0),)
-    assert hal.faults == ()
+    assert not hal.identity.capabilities & Capability.FLOW
 
 
 def test_a_stuck_valve_keeps_its_position(hal_of_a_textbook_lung: SimulatedHal) -> None:

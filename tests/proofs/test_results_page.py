@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from tests.validation.challenge.truths import answer, drawn, mechanism
 
 from hardware_eval.emulation.cases import Effect
 from proofs import code_version
@@ -18,6 +17,7 @@ from proofs.results_page import (
     proof_section,
     write_section,
 )
+from tests.proofs.challenge.truths import answer, drawn, mechanism
 from ventbench.errors import InputError
 
 

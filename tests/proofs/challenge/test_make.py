@@ -5,13 +5,13 @@ from functools import partial
 
 import numpy as np
 import pytest
-from tests.validation.challenge.truths import drawn
 
 from hardware_eval.emulation.cases import Base, Case, Effect
 from hardware_eval.emulation.seal import random_generator
 from proofs.challenge.first.rig import record as record_finely
 from proofs.challenge.make import PRESSURE, record_within_limits
 from proofs.challenge.questions import DrawnCase
+from tests.proofs.challenge.truths import drawn
 from ventbench.errors import InputError
 
 # The steps need not be fine here.

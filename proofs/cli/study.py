@@ -53,9 +53,9 @@ def samples(
     """
     from rich.console import Console
 
+    from proofs.studies import samples as work
     from ventbench import errors, files
     from ventbench.lungs import scored_lung
-    from ventbench.training import study as work
 
     errors.require("matplotlib")
     with bars() as shown:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import html
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -180,15 +179,6 @@ class Reproduction:
             f"{section.place}: {section.claim} [{section.verdict}] {section.finding}"
             for section in self.sections
         )
-
-    def _repr_html_(self) -> str:
-        table = self.summary()
-        rows = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(text)}</td>" for text in row) + "</tr>"
-            for row in table.texts()
-        )
-        heads = "".join(f"<th>{name}</th>" for name in table.columns)
-        return f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
 
 
 def _markdown(table: Table) -> str:

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from proofs.studies.controllers import score_controllers
 from ventbench import precision
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import load_weights
@@ -27,7 +28,6 @@ from ventbench.metrics import bootstrap
 from ventbench.plants import frozen
 from ventbench.submissions.folder import open_submission
 from ventbench.training import pid_grid
-from ventbench.training.ablation.controllers import score_controllers
 from ventbench.training.residual import bound
 from ventbench.training.trained import ALL
 

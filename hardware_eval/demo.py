@@ -1,6 +1,6 @@
 """The loop closed: a lung that conceals physics, found, corrected for, and controlled better.
 
-An emulated lung conceals physics that the simulators lack, drawn from the challenge and sealed. A
+An emulated lung conceals physics that the simulators lack, drawn from the library and sealed. A
 controller that was planned on a simulator runs on it and does worse than there. The comparison of a
 recording with the simulator names what is missing; the controller is planned again on the corrected
 simulator and runs on the same lung. Only then the seal is opened. Nothing in between reads it.

@@ -113,9 +113,9 @@ def test_without_the_extra_a_report_is_refused_before_anything_is_scored(monkeyp
 
 def test_quiet_stands_before_or_behind_a_command():
     for given in (["--quiet", "score", "a"], ["score", "--quiet", "a"], ["score", "a", "--quiet"]):
-        assert cli._quiet_first(given) == ["--quiet", "score", "a"]
-    assert cli._quiet_first(["score", "a"]) == ["score", "a"]
-    assert cli._quiet_first(["score", "--", "--quiet"]) == ["score", "--", "--quiet"]
+        assert cli.options.quiet_first(given) == ["--quiet", "score", "a"]
+    assert cli.options.quiet_first(["score", "a"]) == ["score", "a"]
+    assert cli.options.quiet_first(["score", "--", "--quiet"]) == ["score", "--", "--quiet"]
 
 
 def test_quiet_says_nothing_but_the_result(tmp_path):

@@ -163,7 +163,7 @@ def test_wheel_content(wheel: Path) -> None:
     assert any(name.startswith("ventbench/_data/") for name in names)
     assert "ventbench/_submissions/pid_best/controller.py" in names
     assert not [name for name in names if "__pycache__" in name or name.endswith((".pyc", ".rrd"))]
-    assert not [name for name in names if name.startswith(("tests/", "runs/", "docs/"))]
+    assert not [name for name in names if name.startswith(("tests/", "runs/", "docs/", "proofs/"))]
 
 
 @pytest.mark.slow

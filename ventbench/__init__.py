@@ -7,8 +7,7 @@ Everything that a notebook needs is an attribute of this package and is imported
 - controllers: ``score``, ``score_stress``, ``rollout``, ``tune_pid``, ``train_residual``,
   ``train_ppo``, ``train_dqn``, the protocol ``Controller``;
 - missing physics: ``diagnose``, ``Diagnosis``;
-- learned simulators: ``train_rigs``, ``train_simulator``; the leaderboard: ``load_board``;
-- the paper's tables and figures beside ours: ``reproduce_paper``.
+- learned simulators: ``train_rigs``, ``train_simulator``; the leaderboard: ``load_board``.
 
 ``help(ventbench.score)`` and so on say types, shapes and units and give an example.
 """
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
     from ventbench.recordings import Breaths as Breaths
     from ventbench.recordings import load as load_recording
     from ventbench.recordings.foreign import import_recording as import_recording
-    from ventbench.reproduction.paper import reproduce_paper as reproduce_paper
     from ventbench.simulation import Simulation as Simulation
     from ventbench.simulation import simulate as simulate
     from ventbench.stress.score import StressScore as StressScore
@@ -79,7 +77,6 @@ _SOURCES = {
     "load_recording": ("recordings", "load"),
     "load_simulators": ("plants.catalog", "load_simulators"),
     "open_loop": ("open_loop_report", "open_loop"),
-    "reproduce_paper": ("reproduction.paper", "reproduce_paper"),
     "rollout": ("trajectories", "rollout"),
     "score": ("submissions.scoring", "score"),
     "score_stress": ("stress.score", "score_stress"),
@@ -116,7 +113,6 @@ __all__ = [
     "load_recording",
     "load_simulators",
     "open_loop",
-    "reproduce_paper",
     "rollout",
     "score",
     "score_stress",

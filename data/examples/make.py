@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import tomli_w
 
+from hardware_eval.emulation.cases import Base, Case, Effect
+from proofs.challenge.first.rig import record
 from ventbench import files
 from ventbench.recordings import Breaths, make_breaths, write
-from ventbench.validation.challenge.cases import Base, Case, Effect
-from ventbench.validation.challenge.rig import record
 
 #: Version of the examples; it changes with any byte of a recording.
 VERSION = 1

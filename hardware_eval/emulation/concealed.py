@@ -1,6 +1,6 @@
 """A lung with concealed physics: drawn from any words, sealed before anybody measures.
 
-The words determine one strong effect of the challenge's library, its strength and its lung. The
+The words determine one strong effect of the library, its strength and its lung. The
 lung is the frozen simulator plus what that physics adds to it. The answer is published encrypted,
 with its hash, when the lung is made; the words open it.
 """
@@ -12,6 +12,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from hardware_eval.emulation.cases import LIBRARY, Effect, draw_case, draw_effect, draw_grid
+from hardware_eval.emulation.seal import commitment, encrypt, random_generator, unseal
 from ventbench import files
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
@@ -19,9 +21,6 @@ from ventbench.lungs import Lung, lung
 from ventbench.physics.model import physics
 from ventbench.plants.catalog import load_simulators
 from ventbench.plants.corrected import Corrected
-from ventbench.validation.challenge.cases import Effect
-from ventbench.validation.challenge.folder import commitment, encrypt, random_generator, unseal
-from ventbench.validation.challenge.plan import draw
 
 _FORMAT = "ventbench-concealed-1"
 
@@ -114,10 +113,13 @@ def reveal(path: Path, words: str) -> tuple[Lung, Effect]:
 def _draw(words: str) -> tuple[Effect, Lung]:
     """One strong effect, and its lung."""
     rng = random_generator(words, "emulator")
-    drawn = [question.case for question in draw("single", _CASES, rng)]
+    drawn = [
+        draw_case(lung, (draw_effect(name, strength, rng, form),), rng)
+        for name, strength, lung, form in draw_grid(LIBRARY, _CASES, rng, other=False)
+    ]
     strong = [
         case
-        for case in drawn
+        for case in (drawn[i] for i in rng.permutation(_CASES))
         if case.effects[0].strength == "strong" and case.effects[0].name not in _LEFT_OUT
     ]
     case = strong[int(rng.integers(len(strong)))]

@@ -10,6 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from hardware_eval.emulation.cases import Base, Case, Effect
+from proofs.challenge.first.rig import record
+from proofs.challenge.stranger import laboratory
+from proofs.challenge.stranger.effects import StrangerCase
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
 from ventbench.diagnosis.selection.screening import all_parameter_paths
 from ventbench.diagnosis.settings import (
@@ -21,10 +25,6 @@ from ventbench.diagnosis.settings import (
 from ventbench.physics import paths
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import make_data
-from ventbench.validation.challenge.cases import Base, Case, Effect
-from ventbench.validation.challenge.rig import record
-from ventbench.validation.challenge.stranger import laboratory
-from ventbench.validation.challenge.stranger.effects import StrangerCase
 
 #: The lung as it is labelled, and the rig as it is.
 LABEL, RIG = "R20C20", Base(21.0, 19.5)

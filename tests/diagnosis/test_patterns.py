@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hardware_eval.emulation.cases import Base, Effect
+from proofs.challenge.stranger.effects import StrangerCase
+from proofs.challenge.stranger.laboratory import record
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
 from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.selection.forward import forward_selection
 from ventbench.lungs import lung
-from ventbench.validation.challenge.cases import Base, Effect
-from ventbench.validation.challenge.stranger.effects import StrangerCase
-from ventbench.validation.challenge.stranger.laboratory import record
 
 from . import small
 

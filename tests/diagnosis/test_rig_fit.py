@@ -21,7 +21,7 @@ from ventbench.system_id.problem import parameter_of
 
 from . import small
 
-#: What the public rig lacks, as ``ventbench proof --only rc`` names it.
+#: What the public rig lacks, as ``python -m proofs rig --only rc`` names it.
 NAMES = ("exhalation_valve_delay", "circuit_compliance", "valve_curve", "sensor_lag")
 
 

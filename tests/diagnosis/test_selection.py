@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from hardware_eval.emulation.cases import Base
 from ventbench.diagnosis.conclusion import _supported
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
 from ventbench.diagnosis.selection import forward, held_out_test
@@ -30,7 +31,6 @@ from ventbench.diagnosis.selection.pair_exchange import replace_pair
 from ventbench.diagnosis.selection.screening import screen_mechanisms
 from ventbench.diagnosis.settings import HeldOutTestSettings
 from ventbench.system_id import Noise
-from ventbench.validation.challenge.cases import Base
 
 from . import small
 

@@ -15,10 +15,13 @@ import pytest
 import typer.main
 from _pytest.mark.structures import ParameterSet
 
+from proofs import __main__ as proofs
 from ventbench.cli import app
 from ventbench.interfaces import Observation, Task
 
 ROOT = Path(__file__).parents[2]
+PROOFS = "python -m proofs"
+PROGRAMS = {"ventbench": app, PROOFS: proofs.app}
 PAGES = sorted(
     page
     for page in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("submissions/*.md"))
@@ -48,19 +51,20 @@ def python_pages() -> list[ParameterSet]:
 
 
 def commands(page: Path) -> Iterator[str]:
-    """Yield the command lines of a page that call ventbench, continuations joined."""
+    """Yield the command lines of a page that call ventbench or proofs, continuations joined."""
     for block in blocks(page, "sh"):
         for line in block.replace("\\\n", " ").splitlines():
             for part in line.split("&&"):
-                if part.strip().startswith("ventbench "):
+                if part.strip().startswith(("ventbench ", f"{PROOFS} ")):
                     yield part.strip()
 
 
 def parse(line: str) -> str:
     """Return why a command line is wrong, or nothing; like the program, without running it."""
-    words = shlex.split(line, comments=True)[1:]
-    command: Any = typer.main.get_command(app)
-    path = ["ventbench"]
+    program = PROOFS if line.startswith(PROOFS) else "ventbench"
+    words = shlex.split(line.removeprefix(program), comments=True)
+    command: Any = typer.main.get_command(PROGRAMS[program])
+    path = [program]
     while hasattr(command, "commands"):
         if not words or words[0] not in command.commands:
             return f"`{' '.join(path)}` has no command {words[:1]}"
@@ -97,11 +101,12 @@ def test_commands_parse(page: Path) -> None:
 
 def test_the_page_of_commands_names_every_command() -> None:
     text = (ROOT / "docs" / "commands.md").read_text("utf-8")
-    top: Any = typer.main.get_command(app)
-    for name, command in top.commands.items():
-        for inner in getattr(command, "commands", ()) or [""]:
-            known = f"ventbench {name} {inner}".rstrip() in text or f"`{inner}`" in text
-            assert known, f"{name} {inner}"
+    for program, its in PROGRAMS.items():
+        top: Any = typer.main.get_command(its)
+        for name, command in top.commands.items():
+            for inner in getattr(command, "commands", ()) or [""]:
+                known = f"{program} {name} {inner}".rstrip() in text or f"`{inner}`" in text
+                assert known, f"{program} {name} {inner}"
 
 
 def test_the_page_of_submissions_names_all_that_a_controller_sees() -> None:
@@ -122,6 +127,7 @@ def test_wrong_commands_do_not_parse() -> None:
     """The check above can fail."""
     assert "no_such_option" in parse("ventbench score mine --no-such-option").replace("-", "_")
     assert "no command" in parse("ventbench board no-such-command")
+    assert "no command" in parse("python -m proofs challenge no-such-command")
     assert not parse("ventbench score mine --draws 20")
 
 

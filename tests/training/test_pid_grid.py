@@ -150,12 +150,12 @@ def test_the_picture_has_a_row_a_lung_and_one_for_all(whole):
     pytest.importorskip("matplotlib", reason="the extra ventbench[view] is missing")
     from matplotlib.image import imread
 
-    from ventbench.views import training_figures
+    from ventbench.views.gain_map import gain_map_png
 
     pictures = [
-        training_figures.gain_map_png(whole),
-        training_figures.gain_map_png(whole),
-        training_figures.gain_map_png(whole, each=False),
+        gain_map_png(whole),
+        gain_map_png(whole),
+        gain_map_png(whole, each=False),
     ]
     assert pictures[0] == pictures[1]
     heights = [imread(io.BytesIO(picture)).shape[0] for picture in pictures]

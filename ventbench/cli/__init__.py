@@ -13,19 +13,15 @@ import typer
 from ventbench import __version__
 from ventbench.cli import (
     board,
-    challenge,
     data,
     diagnose,
     doctor,
     headroom,
     mechanics,
     options,
-    proof,
-    reproduce,
     score,
     simulators,
     stress,
-    study,
     train,
     tune,
     view,
@@ -64,25 +60,14 @@ simulators.register(app)
 tune.register(app)
 train.register(app)
 stress.register(app)
-study.register(app)
 view.register(app)
 board.register(app)
 diagnose.register(app)
-challenge.register(app)
 mechanics.register(app)
 doctor.register(app)
-proof.register(app)
-reproduce.register(app)
 app.add_typer(data.app)
-
-
-def _quiet_first(arguments: list[str]) -> list[str]:
-    """Move ``--quiet`` to the front, where the program takes it whatever the command."""
-    end = arguments.index("--") if "--" in arguments else len(arguments)
-    own = [text for text in arguments[:end] if text != "--quiet"]
-    return ["--quiet"] * (len(own) < end) + own + arguments[end:]
 
 
 def main() -> None:
     """Entry point of the console script."""
-    options.run(lambda: app(_quiet_first(sys.argv[1:])), "ventbench")
+    options.run(lambda: app(options.quiet_first(sys.argv[1:])), "ventbench")

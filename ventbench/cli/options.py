@@ -90,14 +90,6 @@ Scheduler = Annotated[
         "workers must see the same files.",
     ),
 ]
-ResultsPage = Annotated[
-    Path | None,
-    typer.Option(
-        "--page",
-        metavar="FILE",
-        help="Markdown file whose section of these results is written anew; made if missing.",
-    ),
-]
 RecordingsDir = Annotated[
     Path | None,
     typer.Option(
@@ -141,6 +133,13 @@ def be_quiet(value: bool = True) -> None:
     """Switch progress and notes off for the rest of this process: the option ``--quiet``."""
     global _quiet
     _quiet = value
+
+
+def quiet_first(arguments: list[str]) -> list[str]:
+    """Move ``--quiet`` to the front, where the program takes it whatever the command."""
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    own = [text for text in arguments[:end] if text != "--quiet"]
+    return ["--quiet"] * (len(own) < end) + own + arguments[end:]
 
 
 def notes() -> Console:

@@ -134,10 +134,10 @@ def _plot(path: Path, grid: Any, each: bool, single: bool) -> list[str]:
     """Draw the picture if matplotlib is installed."""
     from ventbench import files
     from ventbench.errors import InputError
-    from ventbench.views import training_figures
+    from ventbench.views.gain_map import gain_map_png
 
     try:
-        picture = training_figures.gain_map_png(grid, each=each, single=single)
+        picture = gain_map_png(grid, each=each, single=single)
     except InputError as error:
         typer.echo(f"no plot: {error}", err=True)
         return []

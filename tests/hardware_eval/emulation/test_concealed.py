@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from hardware_eval.emulation.cases import LIBRARY
 from hardware_eval.emulation.concealed import _LEFT_OUT, conceal, reveal
 from ventbench.errors import InputError
 from ventbench.plants.corrected import Corrected
-from ventbench.validation.challenge.cases import LIBRARY
 
 
 def test_the_words_make_the_lung_and_open_the_seal(tmp_path: Path) -> None:

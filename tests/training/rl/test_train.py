@@ -1,11 +1,10 @@
-"""The commands `train ppo`, `train dqn` and `study samples`."""
+"""The commands `train ppo` and `train dqn`."""
 
 from __future__ import annotations
 
 import json
 
 import numpy as np
-import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
@@ -67,20 +66,3 @@ def test_train(method, steps, tmp_path):
         with np.load(folder / "weights.npz") as arrays:
             assert set(arrays) == {f"R20C50.{kind}{k}" for kind in "wb" for k in range(3)}
     assert written[0] == written[1]
-
-
-@pytest.mark.slow
-def test_study_samples(tmp_path):
-    result = run("study", "samples", "--seeds", 2, "--share", 0.01, "--out", tmp_path)
-    assert result.exit_code == 0, result.output
-    summary = pd.read_csv(tmp_path / "summary.csv").set_index("method")
-    assert list(summary.index) == ["policy-gradient-short", "policy-gradient", "ppo", "dqn"]
-    points = pd.read_csv(tmp_path / "samples.csv")
-    start = points[(points.method == "ppo") & (points.episodes == 0)]
-    assert start["iqm"].item() == pytest.approx(2.552, abs=2e-3)
-    assert (tmp_path / "study-samples.png").stat().st_size < 300_000
-    again = run("study", "samples", "--seeds", 2, "--share", 0.01, "--out", tmp_path)
-    assert again.exit_code == 0, again.output
-    pd.testing.assert_frame_equal(
-        summary, pd.read_csv(tmp_path / "summary.csv").set_index("method")
-    )

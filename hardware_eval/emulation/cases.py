@@ -1,0 +1,268 @@
+"""Concealed cases: effects with their forms and strengths, the rig that has them, and draws."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from ventbench.errors import InputError
+from ventbench.lungs import LUNGS, Lung
+
+Strength = Literal["mild", "strong"]
+Style = Literal["pi", "mixed"]
+
+#: Flow of the inspiratory valve that a fit assumes, mL/s per %.
+NOMINAL_GAIN = 22.8
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A piece of physics that the rig has beyond resistance and compliance.
+
+    Attributes:
+        name: name of the library's mechanism, or of an effect that the library does not have.
+        strength: mild or strong, as :data:`EFFECTS` quantifies them.
+        form: form of its equation, one of :attr:`EffectFamily.forms`.
+        parameters: parameters of that form, in the units of :mod:`ventbench.physics`; times in s,
+            lengths of command in %.
+    """
+
+    name: str
+    strength: Strength
+    form: str
+    parameters: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Base:
+    """True values of the rig without any effect.
+
+    Attributes:
+        R: airway resistance, cmH2O/(L/s).
+        C: compliance, mL/cmH2O.
+        R_ex: resistance of the expiratory valve, cmH2O/(L/s).
+        peep: pressure behind the expiratory valve, cmH2O.
+        gain: flow of the inspiratory valve, mL/s per %.
+    """
+
+    R: float
+    C: float
+    R_ex: float = 5.0
+    peep: float = 5.0
+    gain: float = NOMINAL_GAIN
+
+
+@dataclass(frozen=True)
+class Case:
+    """One recording.
+
+    Attributes:
+        name: name of its file, without suffix.
+        lung_R: label of the lung setting, cmH2O/(L/s).
+        lung_C: label of the lung setting, mL/cmH2O.
+        effects: what the recording conceals.
+        base: the rig; each recording draws its own if None.
+        noise: standard deviation of the sensor's noise, cmH2O.
+        coloured: share of the noise variance that is correlated from sample to sample, 0..1.
+        correlation: correlation of the coloured share, from one sample to the next.
+        step: step of the sensor's converter, cmH2O; 0 for none.
+        jitter: standard deviation of the sampling interval, s.
+        breaths: number of breaths.
+        samples: number of samples in a breath.
+        style: ``pi``: closed loop only; ``mixed``: half of the breaths explore.
+        log_step: resolution of the logged commands, %; the rig receives what is logged.
+    """
+
+    name: str
+    lung_R: float
+    lung_C: float
+    effects: tuple[Effect, ...] = ()
+    base: Base | None = None
+    noise: float = 0.2
+    coloured: float = 0.0
+    correlation: float = 0.6
+    step: float = 0.0703
+    jitter: float = 3e-4
+    breaths: int = 60
+    samples: int = 80
+    style: Style = "mixed"
+    log_step: float = 0.01
+
+    @property
+    def lung(self) -> str:
+        """Label of the lung, such as ``R20C50``."""
+        return f"R{self.lung_R:g}C{self.lung_C:g}"
+
+
+@dataclass(frozen=True)
+class EffectFamily:
+    """Strengths, forms and parameter ranges of an effect.
+
+    Attributes:
+        parameter: the parameter that carries the strength.
+        mild: mean of that parameter in a mild effect.
+        strong: mean of that parameter in a strong effect.
+        forms: forms of the equation; the first is the library's if ``inside``.
+        ranges: further parameters, each with the low and high end of a uniform distribution.
+        signs: signs of the strength that are drawn.
+        inside: whether the library has a mechanism of this name.
+    """
+
+    parameter: str
+    mild: float
+    strong: float
+    forms: tuple[str, ...]
+    ranges: tuple[tuple[str, tuple[float, float]], ...] = ()
+    signs: tuple[float, ...] = (1.0,)
+    inside: bool = True
+
+
+_LIBRARY_ONLY = ("library",)
+
+EFFECTS: dict[str, EffectFamily] = {
+    "valve_delay": EffectFamily("delay", 0.04, 0.08, _LIBRARY_ONLY),
+    "valve_lag": EffectFamily("tau", 0.04, 0.1, ("library", "two lags")),
+    "valve_dead_band": EffectFamily("width", 1.5, 3.5, _LIBRARY_ONLY),
+    "valve_curve": EffectFamily(
+        "loss", 0.2, 0.5, ("library", "tanh", "exponential", "power law", "convex")
+    ),
+    "valve_hysteresis": EffectFamily("width", 2.0, 5.0, ("library", "soft play")),
+    "command_rounding": EffectFamily("amount", 1.0, 1.0, ("library", "nearest")),
+    "supply_droop": EffectFamily(
+        "drop", 0.1, 0.3, ("library", "subtractive"), (("recovery", (0.7, 1.5)),)
+    ),
+    "leak": EffectFamily("conductance", 8.0, 20.0, ("library", "linear", "exponent 0.65")),
+    "circuit_compliance": EffectFamily("compliance", 1.2, 3.0, _LIBRARY_ONLY),
+    "inertance": EffectFamily("inertance", 0.04, 0.1, _LIBRARY_ONLY),
+    "turbulent_resistance": EffectFamily("quadratic", 4.0, 10.0, ("library", "exponent 1.75")),
+    "nonlinear_compliance": EffectFamily(
+        "stiffening", 1 / 40, 1 / 24, ("library", "sigmoid", "quadratic")
+    ),
+    "viscoelasticity": EffectFamily("ratio", 0.25, 0.7, _LIBRARY_ONLY, (("time", (0.5, 1.8)),)),
+    "sensor_lag": EffectFamily("tau", 0.05, 0.12, _LIBRARY_ONLY),
+    "sensor_drift": EffectFamily("drift", 1.2, 3.0, ("library", "warming"), signs=(1.0, -1.0)),
+    "exhalation_valve_delay": EffectFamily("opening", 0.05, 0.1, _LIBRARY_ONLY),
+    "patient_effort": EffectFamily(
+        "amplitude",
+        2.0,
+        5.0,
+        ("library", "raised cosine", "trapezoid"),
+        (("duration", (0.5, 1.0)),),
+    ),
+    "volume_resistance": EffectFamily(
+        "change", 0.5, 0.65, ("R(V)",), signs=(1.0, -1.0), inside=False
+    ),
+    "cardiogenic": EffectFamily(
+        "amplitude", 0.7, 1.3, ("oscillation",), (("frequency", (1.0, 1.6)),), inside=False
+    ),
+    "pulsating_supply": EffectFamily(
+        "amplitude", 0.115, 0.175, ("oscillation",), (("frequency", (3.0, 7.0)),), inside=False
+    ),
+    "direction_resistance": EffectFamily("ratio", 1.7, 2.0, ("R(direction)",), inside=False),
+    "second_compartment": EffectFamily(
+        "share", 0.2, 0.4, ("two compartments",), (("time", (0.5, 1.5)),), inside=False
+    ),
+    "sensor_nonlinearity": EffectFamily(
+        "bend", 0.9, 1.3, ("quadratic",), signs=(1.0, -1.0), inside=False
+    ),
+    "expiratory_valve_orifice": EffectFamily("amount", 1.0, 1.0, ("orifice",), inside=False),
+}
+
+#: Mechanisms of the library, in alphabetical order.
+LIBRARY: tuple[str, ...] = tuple(sorted(name for name, e in EFFECTS.items() if e.inside))
+
+#: Largest relative deviation of a strength from its mean.
+_VARIATION = 0.15
+
+#: Parameters whose strength does not vary.
+_FIXED = ("amount", "share")
+
+#: Limits of the ratio of expiratory to inspiratory resistance: what a laboratory would still call
+#: an airway.
+_DIRECTION_RATIO = (1.6, 2.2)
+
+
+def draw_effect(
+    name: str, strength: Strength, rng: np.random.Generator, form: str | None = None
+) -> Effect:
+    """Draw an effect: its strength within 15 % of the mean, its other parameters in their ranges.
+
+    Args:
+        name: name of the effect.
+        strength: ``mild`` or ``strong``.
+        rng: source of random numbers.
+        form: form of its equation; the first of its forms if None, which is the library's if the
+            library has the effect.
+
+    Raises:
+        InputError: if there is no such effect or form.
+    """
+    if name not in EFFECTS:
+        raise InputError(f"there is no effect {name!r}; choose one of {', '.join(EFFECTS)}")
+    family = EFFECTS[name]
+    form = form or family.forms[0]
+    if form not in family.forms:
+        raise InputError(f"{name} has no form {form!r}; choose one of {', '.join(family.forms)}")
+    fixed = family.parameter in _FIXED
+    varied = 1.0 if fixed else rng.uniform(1 - _VARIATION, 1 + _VARIATION)
+    value = getattr(family, strength) * varied * rng.choice(np.array(family.signs))
+    further = {key: float(rng.uniform(*span)) for key, span in family.ranges}
+    if name == "direction_resistance":
+        value = float(np.clip(value, *_DIRECTION_RATIO))
+    return Effect(name, strength, form, {family.parameter: float(value)} | further)
+
+
+def draw_base(lung_R: float, lung_C: float, rng: np.random.Generator) -> Base:
+    """Draw a rig around a lung's label: R off by up to 15 %, C by up to 7 %, and the rest."""
+    return Base(
+        R=float(lung_R * rng.uniform(0.85, 1.15)),
+        C=float(lung_C * rng.uniform(0.93, 1.07)),
+        R_ex=float(rng.uniform(4.0, 7.0)),
+        peep=float(rng.uniform(4.5, 5.5)),
+        gain=float(NOMINAL_GAIN * rng.uniform(0.9, 1.1)),
+    )
+
+
+_STRENGTHS: tuple[Strength, ...] = ("mild", "strong")
+
+
+def draw_grid(
+    names: tuple[str, ...], count: int, rng: np.random.Generator, *, other: bool
+) -> Iterator[tuple[str, Strength, Lung, str]]:
+    """Draw evenly from names x strengths x lungs; ``other``: from all forms but the first."""
+    cells = {}
+    for name in names:
+        mixed = [list(rng.permutation(len(LUNGS))) for _ in _STRENGTHS]
+        first = int(rng.integers(2))
+        order = [(_STRENGTHS[(first + k) % 2], mixed[(first + k) % 2][k // 2]) for k in range(12)]
+        forms = EFFECTS[name].forms[1:] if other else EFFECTS[name].forms[:1]
+        cells[name] = [
+            (strength, LUNGS[int(place)], forms[k % len(forms)])
+            for k, (strength, place) in enumerate(order)
+        ]
+    turns = dict.fromkeys(names, 0)
+    for name in rotate(list(names), count, rng):
+        strength, lung, form = cells[name][turns[name] % 12]
+        turns[name] += 1
+        yield name, strength, lung, form
+
+
+def rotate(values: list, count: int, rng: np.random.Generator) -> Iterator:
+    """Take values in turn, in a new random order each time round."""
+    for k in range(count):
+        if k % len(values) == 0:
+            order = rng.permutation(len(values))
+        yield values[order[k % len(values)]]
+
+
+def draw_case(lung: Lung, effects: tuple[Effect, ...], rng: np.random.Generator) -> Case:
+    """A case with effects; half of the cases have white noise, the others coloured noise."""
+    return Case(
+        "", lung.R, lung.C, effects, draw_base(lung.R, lung.C, rng),
+        coloured=float(rng.uniform(0.1, 0.6)) if rng.uniform() < 0.5 else 0.0,
+        correlation=float(rng.uniform(0.5, 0.9)),
+        noise=float(rng.uniform(0.1, 0.3)),
+    )  # fmt: skip

@@ -1,0 +1,135 @@
+"""Detectability of an effect once R, C, R_ex, PEEP and initial pressures are refitted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from hardware_eval.emulation.cases import Base, Case, Effect
+from proofs.challenge.generators import generator_of
+from ventbench.recordings.breaths import Breaths
+
+Floats = NDArray[np.float64]
+
+#: Breaths that are compared, spread over the recording.
+_BREATHS = 8
+
+#: Detection limit, nats over all breaths of a recording. The fifth of the breaths that a diagnosis
+#: holds out would hardly raise the likelihood of a weaker effect by log 100.
+LIMIT = 25.0
+
+#: Values of the rig that are refitted, and the step of their finite differences (PEEP and initial
+#: pressure in cmH2O, the others in their logarithm).
+_REFITTED = ("R", "C", "R_ex", "peep")
+_STEP = 1e-3
+
+#: Largest circuit that is left when an inertance is taken out, and the step of its refit, in units
+#: of the circuit that came with it.
+_LARGEST_CIRCUIT, _CIRCUIT_STEP = 2.0, 0.01
+
+#: Gauss-Newton iterations at most, the shares of a step that are tried, and the relative decrease
+#: of the squared error below which they end.
+_ITERATIONS = 6
+_STEP_SHARES = (1.0, 0.5, 0.25)
+_LEAST_DECREASE = 0.1
+
+#: Largest change of a value in one step, in the units of its finite difference.
+_LARGEST_STEP = 0.7
+
+#: Least variance of the noise, cmH2O^2, for recordings without any.
+_LEAST_VARIANCE = 1e-6
+
+
+def log_likelihood_loss(case: Case, breaths: Breaths, index: int) -> float:
+    """Expected loss of log-likelihood, nats, without one effect, over all breaths of a recording.
+
+    The rig without the effect is fitted to the noise-free response of the rig with the effect under
+    the recorded commands; the remaining squared error is divided by the noise variance. The
+    patient's efforts are not those of the recording.
+
+    Args:
+        case: case with its base.
+        breaths: recording of the case.
+        index: index of the effect in ``case.effects``.
+    """
+    assert case.base is not None
+    count = min(_BREATHS, len(breaths))
+    chosen = breaths.select(np.linspace(0, len(breaths) - 1, count).astype(int))
+    start = np.full(count, case.base.peep)
+    response = generator_of(case).replay(case, chosen, start, seed=index)
+    before, after = case.effects[:index], case.effects[index + 1 :]
+
+    def squared_error(*left: Effect) -> float:
+        rest = replace(case, effects=(*before, *left, *after))
+        return float(np.sum(_refitted(rest, base, chosen, start, response, seed=index) ** 2))
+
+    base, effect = case.base, case.effects[index]
+    before, after = case.effects[:index], case.effects[index + 1 :]
+    if effect.name == "inertance" and "circuit" in effect.parameters:
+        # The circuit that came with it stays, and is refitted: behind a high resistance, a little
+        # less of it does most of what the mass does.
+        massless = effect.parameters | {"inertance": 0.0}
+        left = float(
+            minimize_scalar(
+                lambda size: squared_error(
+                    replace(effect, parameters=massless | {"circuit": float(size)})
+                ),
+                bounds=(0.0, _LARGEST_CIRCUIT * effect.parameters["circuit"]),
+                method="bounded",
+                options={"xatol": _CIRCUIT_STEP * effect.parameters["circuit"]},
+            ).fun  # type: ignore[attr-defined]
+        )
+    else:
+        left = squared_error()
+    noise = max(case.noise**2 + case.step**2 / 12.0, _LEAST_VARIANCE)
+    return 0.5 * left / noise * len(breaths) / count
+
+
+def _refitted(
+    case: Case, base: Base, breaths: Breaths, start: Floats, response: Floats, seed: int
+) -> Floats:
+    """Residuals of the best rig, by Gauss-Newton steps that are halved until the error falls."""
+    replay = generator_of(case).replay
+
+    def run(at: Base, first: Floats) -> Floats:
+        return response - replay(replace(case, base=at), breaths, first, seed)
+
+    error = run(base, start)
+    for _ in range(_ITERATIONS):
+        stepped = [run(_changed(base, key, _STEP), start) for key in _REFITTED]
+        slopes = np.stack([(error - other) / _STEP for other in stepped])
+        # Initial pressures are projected out, breath by breath; their steps follow afterwards.
+        by_start = (error - run(base, start + _STEP)) / _STEP
+        square = np.sum(by_start**2, axis=1)
+        along = np.einsum("knt,nt->kn", slopes, by_start) / square
+        projected = slopes - along[:, :, None] * by_start
+        remaining = error - (np.sum(error * by_start, axis=1) / square)[:, None] * by_start
+        jacobian = projected.reshape(len(_REFITTED), -1).T
+        step = np.linalg.lstsq(jacobian, remaining.ravel(), rcond=None)[0]
+        shift = np.sum((error - np.tensordot(step, slopes, 1)) * by_start, axis=1) / square
+        limited = np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
+        better = None
+        for share in _STEP_SHARES:
+            tried, first = base, start + share * shift
+            for key, value in zip(_REFITTED, limited, strict=True):
+                tried = _changed(tried, key, share * float(value))
+            tried_error = run(tried, first)
+            if np.sum(tried_error**2) < np.sum(error**2):
+                better = tried, first, tried_error
+                break
+        if better is None:
+            break
+        gain = 1.0 - np.sum(better[2] ** 2) / np.sum(error**2)
+        base, start, error = better
+        if gain < _LEAST_DECREASE:
+            break
+    return error
+
+
+def _changed(base: Base, key: str, by: float) -> Base:
+    """The rig with one value multiplied by exp(by), or PEEP raised by ``by`` cmH2O."""
+    old = getattr(base, key)
+    return replace(base, **{key: old + by if key == "peep" else old * float(np.exp(by))})

@@ -1,0 +1,125 @@
+"""Cases that a challenge draws, for each kind of question."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal
+
+import numpy as np
+
+from hardware_eval.emulation.cases import (
+    EFFECTS,
+    LIBRARY,
+    Case,
+    Effect,
+    draw_base,
+    draw_case,
+    draw_effect,
+    draw_grid,
+    rotate,
+)
+from proofs.challenge.questions import CLASSES, KINDS, DrawnCase, Kind
+from ventbench.errors import InputError
+from ventbench.lungs import LUNGS, Lung
+
+#: Share of each kind in a challenge of all kinds.
+SHARES: dict[Kind, float] = {
+    "single": 0.34,
+    "null": 0.18,
+    "pair": 0.10,
+    "four": 0.07,
+    "outside": 0.13,
+    "form": 0.11,
+    "masked": 0.07,
+}
+
+#: Effects that the library does not have, in alphabetical order.
+OUTSIDE: tuple[str, ...] = tuple(sorted(name for name, e in EFFECTS.items() if not e.inside))
+
+#: Never combined with other effects, among which they are below the detection limit.
+_SINGLE_ONLY = ("inertance", "command_rounding")
+
+
+def draw(kind: Kind | Literal["all"], count: int, rng: np.random.Generator) -> list[DrawnCase]:
+    """Draw cases of one kind or of all kinds, in random order.
+
+    Args:
+        kind: kind of the cases.
+        count: number of cases.
+        rng: source of random numbers.
+
+    Raises:
+        InputError: if there are fewer cases than kinds.
+    """
+    if count < (len(KINDS) if kind == "all" else 1):
+        raise InputError(f"{count} cases are too few for {kind}; ask for at least {len(KINDS)}")
+    sizes: list[tuple[Kind, int]] = _sizes(count) if kind == "all" else [(kind, count)]
+    cases = [DrawnCase(k, case) for k, n in sizes for case in _of_kind(k, n, rng)]
+    return [cases[i] for i in rng.permutation(len(cases))]
+
+
+def _sizes(count: int) -> list[tuple[Kind, int]]:
+    """Whole numbers near the shares, at least one of each; single effects take what is left."""
+    sizes: list[tuple[Kind, int]] = [
+        (kind, max(1, int(share * count))) for kind, share in SHARES.items() if kind != "single"
+    ]
+    return [("single", count - sum(size for _, size in sizes)), *sizes]
+
+
+def _of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[Case]:
+    if kind == "single":
+        for name, strength, lung, form in draw_grid(LIBRARY, count, rng, other=False):
+            yield draw_case(lung, (draw_effect(name, strength, rng, form),), rng)
+    elif kind == "form":
+        names = tuple(name for name in LIBRARY if len(EFFECTS[name].forms) > 1)
+        for name, strength, lung, form in draw_grid(names, count, rng, other=True):
+            yield draw_case(lung, (draw_effect(name, strength, rng, form),), rng)
+    elif kind == "outside":
+        for name, strength, lung, form in draw_grid(OUTSIDE, count, rng, other=False):
+            yield draw_case(lung, (draw_effect(name, strength, rng, form),), rng)
+    elif kind == "masked":
+        for name, strength, lung, form in draw_grid(LIBRARY, count, rng, other=False):
+            yield _masked(lung, draw_effect(name, strength, rng, form), rng)
+    else:
+        for lung in rotate(list(LUNGS), count, rng):
+            if kind == "null":
+                yield _null(lung, rng)
+            else:
+                yield draw_case(lung, _combination(2 if kind == "pair" else 4, rng), rng)
+
+
+def _combination(size: int, rng: np.random.Generator) -> tuple[Effect, ...]:
+    """Strong effects, no two of the same class."""
+    chosen: list[str] = []
+    for index in rng.permutation(len(LIBRARY)):
+        name = LIBRARY[index]
+        if name in _SINGLE_ONLY or any(name in c and c & set(chosen) for c in CLASSES):
+            continue
+        chosen.append(name)
+        if len(chosen) == size:
+            break
+    return tuple(draw_effect(name, "strong", rng) for name in sorted(chosen))
+
+
+def _null(lung: Lung, rng: np.random.Generator) -> Case:
+    """A case without effects, but with noise, gain, jitter and rounding that are no physics."""
+    base = draw_base(lung.R, lung.C, rng)
+    return Case(
+        "", lung.R, lung.C, (), base,
+        noise=float(rng.uniform(0.1, 0.3)),
+        coloured=float(rng.uniform(0.0, 0.6)),
+        correlation=float(rng.uniform(0.5, 0.9)),
+        jitter=float(rng.choice(np.array([3e-4, 1e-3]))),
+        log_step=float(rng.choice(np.array([0.01, 1.0]))),
+        style="mixed" if rng.uniform() < 0.5 else "pi",
+    )  # fmt: skip
+
+
+def _masked(lung: Lung, effect: Effect, rng: np.random.Generator) -> Case:
+    """A case with few breaths, all in closed loop."""
+    return Case(
+        "", lung.R, lung.C, (effect,), draw_base(lung.R, lung.C, rng),
+        noise=float(rng.choice(np.array([0.1, 0.2, 0.3]))),
+        breaths=int(rng.integers(8, 16)),
+        style="pi",
+    )  # fmt: skip

@@ -1,0 +1,150 @@
+"""Files of a challenge: where they are, and the answers under seal.
+
+The answers are encrypted with the secret, and their hash is published before anyone answers.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from hardware_eval.emulation.cases import Base, Case, Effect
+from hardware_eval.emulation.seal import random_generator, unseal
+from proofs.challenge.questions import DrawnCase
+from proofs.challenge.stranger.effects import StrangerCase
+from ventbench import files
+from ventbench.errors import InputError
+
+_FORMAT = "ventbench-challenge-1"
+
+#: Cases, each with the nats of its effects.
+Truth = list[tuple[DrawnCase, list[float]]]
+
+
+def encode_answers(secret: str, drawn: list[DrawnCase], nats: list[list[float]]) -> bytes:
+    """Return the plain text of the answers; a random nonce keeps their hash from being guessed.
+
+    Args:
+        secret: secret of the challenge.
+        drawn: cases of the challenge.
+        nats: log-likelihood that is lost without each effect of each case, nats, from
+            :func:`~proofs.challenge.detectability.log_likelihood_loss`.
+    """
+    cases = [
+        {"kind": question.kind, "nats": of_effects, "case": asdict(question.case)}
+        for question, of_effects in zip(drawn, nats, strict=True)
+    ]
+    nonce = random_generator(secret, "nonce").bytes(32).hex()
+    value = {"format": _FORMAT, "nonce": nonce, "cases": cases}
+    return (json.dumps(value, indent=1, allow_nan=False) + "\n").encode()
+
+
+def decode_answers(text: bytes) -> Truth:
+    """Return the cases and the nats of their effects from the plain text of the answers."""
+    return [
+        (DrawnCase(entry["kind"], _case(entry["case"])), [float(nats) for nats in entry["nats"]])
+        for entry in json.loads(text)["cases"]
+    ]
+
+
+def _case(value: dict[str, Any]) -> Case:
+    effects = tuple(Effect(**effect) for effect in value["effects"])
+    base = None if value["base"] is None else Base(**value["base"])
+    kind = StrangerCase if value.get("generator") == "stranger" else Case
+    return kind(**(value | {"effects": effects, "base": base}))
+
+
+@dataclass(frozen=True)
+class ChallengeFolder:
+    """Paths of a challenge's files.
+
+    Attributes:
+        path: path of the folder.
+        round: 1, or 2 with the breaths that the first answers requested.
+    """
+
+    path: Path
+    round: int = 1
+
+    @property
+    def public(self) -> Path:
+        """Public facts: file, lung and hash of each case."""
+        return self.path / "cases.json"
+
+    @property
+    def sealed(self) -> Path:
+        """The answers, encrypted."""
+        return self.path / "answers.sealed"
+
+    @property
+    def commitment(self) -> Path:
+        """Hash of the plain answers."""
+        return self.path / "commitment.txt"
+
+    @property
+    def _suffix(self) -> str:
+        return "" if self.round == 1 else f"_{self.round}"
+
+    def recording(self, name: str) -> Path:
+        """Recording of a case."""
+        return self.path / f"recordings{self._suffix}" / f"{name}.csv"
+
+    def answer(self, name: str) -> Path:
+        """Answer to a case."""
+        return self.path / f"answers{self._suffix}" / f"{name}.json"
+
+    def request(self, name: str) -> Path:
+        """Breaths that the answer to a case requests."""
+        return self.path / f"requests{self._suffix}" / f"{name}.csv"
+
+    def cases(self) -> dict[str, dict[str, str]]:
+        """Return the public entries by name.
+
+        Raises:
+            InputError: if there is no challenge in the folder.
+        """
+        if not self.public.is_file():
+            raise InputError(
+                f"{self.path} holds no challenge; make one with `python -m proofs challenge make`"
+            )
+        entries = json.loads(self.public.read_text())["cases"]
+        return {Path(entry["file"]).stem: entry for entry in entries}
+
+    def check_recordings(self) -> None:
+        """Compare the recordings of the first round with their hashes.
+
+        Raises:
+            InputError: if a recording is missing or has another hash.
+        """
+        for name, entry in self.cases().items():
+            path = ChallengeFolder(self.path).recording(name)
+            if not path.is_file():
+                raise InputError(f"{path} is missing; make the challenge again in another folder")
+            if files.sha256(path) != entry["sha256"]:
+                raise InputError(
+                    f"{path} is not the recording that the challenge was made with; its hash "
+                    "differs"
+                )
+
+    def answers(self) -> dict[str, dict[str, Any]]:
+        """Return the answers by name; cases without an answer are left out."""
+        paths = {name: self.answer(name) for name in self.cases()}
+        return {
+            name: json.loads(path.read_text()) for name, path in paths.items() if path.is_file()
+        }
+
+    def truth(self, secret: str) -> Truth:
+        """Open the seal; returns the cases with the nats of their effects.
+
+        Raises:
+            InputError: if the secret is not that of the challenge, or files are missing.
+        """
+        self.cases()
+        for path in (self.sealed, self.commitment):
+            if not path.is_file():
+                raise InputError(f"{path} is missing; the challenge cannot be revealed without it")
+        published = self.commitment.read_text().split()[0]
+        text = unseal(self.sealed.read_bytes(), secret, self.public.read_bytes(), published)
+        return decode_answers(text)

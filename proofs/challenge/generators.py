@@ -1,0 +1,64 @@
+"""The generators of concealed recordings, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from hardware_eval.emulation.cases import EFFECTS, Case
+from proofs.challenge.first import plan, rig
+from proofs.challenge.questions import DrawnCase
+from proofs.challenge.stranger import effects as stranger
+from proofs.challenge.stranger import laboratory
+from ventbench.errors import InputError
+from ventbench.recordings.breaths import Breaths
+
+
+@dataclass(frozen=True)
+class Generator:
+    """A generator of recordings.
+
+    Attributes:
+        name: name on the command line.
+        draw: draws cases; see :func:`~proofs.challenge.first.plan.draw`.
+        record: records a case; see :func:`~proofs.challenge.first.rig.record`.
+        record_commands: records requested breaths; see
+            :func:`~proofs.challenge.first.rig.record_commands`.
+        replay: responds without noise; see :func:`~proofs.challenge.first.rig.replay`.
+    """
+
+    name: str
+    draw: Callable[..., list[DrawnCase]]
+    record: Callable[..., Breaths]
+    record_commands: Callable[..., Breaths]
+    replay: Callable[..., rig.Floats]
+
+
+FIRST = Generator("first", plan.draw, rig.record, rig.record_commands, rig.replay)
+STRANGER = Generator(
+    "stranger", stranger.draw, laboratory.record, laboratory.record_commands, laboratory.replay
+)
+GENERATORS: dict[str, Generator] = {entry.name: entry for entry in (FIRST, STRANGER)}
+
+
+def generator(name: str) -> Generator:
+    """Return a generator by name.
+
+    Raises:
+        InputError: if there is none of that name.
+    """
+    if name not in GENERATORS:
+        raise InputError(f"there is no generator {name!r}; choose {' or '.join(GENERATORS)}")
+    return GENERATORS[name]
+
+
+def generator_of(case: Case) -> Generator:
+    """Return the generator of a case."""
+    return STRANGER if isinstance(case, stranger.StrangerCase) else FIRST
+
+
+def in_library(case: Case, name: str) -> bool:
+    """Whether the library has a mechanism of the name of an effect."""
+    if isinstance(case, stranger.StrangerCase):
+        return stranger.EFFECTS[name].inside
+    return EFFECTS[name].inside

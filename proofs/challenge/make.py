@@ -1,0 +1,133 @@
+"""Making a challenge: recordings for everyone, answers under seal, and the hash of the answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from hardware_eval.emulation.seal import commitment, encrypt, random_generator
+from proofs.challenge.detectability import log_likelihood_loss
+from proofs.challenge.folder import ChallengeFolder, encode_answers
+from proofs.challenge.generators import generator, generator_of
+from proofs.challenge.questions import DrawnCase, Kind
+from ventbench import files
+from ventbench.errors import InputError
+from ventbench.executor import executor, results
+from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.schema import COLUMNS
+from ventbench.recordings.write import write
+
+#: Limits of a recorded pressure.
+PRESSURE = COLUMNS["pressure"]
+
+#: Attempts to stay within the limits: with other commands of the usual size first, then with
+#: gentler ones, each this share of the attempt before.
+_USUAL_ATTEMPTS, _GENTLE_ATTEMPTS, _GENTLER = 10, 10, 0.85
+
+#: Records a case; has the arguments of :func:`~proofs.challenge.first.rig.record`. That of
+#: the case's generator if None.
+Record = Callable[..., Breaths] | None
+
+
+def make(
+    secret: str, out: Path, kind: Kind | Literal["all"], count: int, *, jobs: int = 1,
+    scheduler: str | None = None, source: str = "first", record: Record = None,
+    progress: Callable[[int], None] = lambda done: None,
+) -> str:  # fmt: skip
+    """Write a challenge.
+
+    The same secret, kind, count and generator give the same bytes.
+
+    Args:
+        secret: seed of everything that is drawn.
+        out: folder, which must not hold a challenge yet.
+        kind: kind of the cases.
+        count: number of cases.
+        jobs: number of processes.
+        scheduler: address of a Dask scheduler instead, whose workers see the same files; they are
+            told the secret.
+        source: name of the generator, ``"first"`` or ``"stranger"``.
+        record: see :data:`Record`; a function of a module if there are processes.
+        progress: called with the number of finished recordings.
+
+    Returns:
+        The commitment: SHA-256 of the answers.
+
+    Raises:
+        InputError: if the folder holds a challenge, or there are too few cases for all kinds.
+    """
+    folder = ChallengeFolder(out)
+    if folder.sealed.exists():
+        raise InputError(f"{out} holds a challenge already; choose another folder")
+    drawn = [
+        DrawnCase(question.kind, replace(question.case, name=f"case_{k:04d}"))
+        for k, question in enumerate(
+            generator(source).draw(kind, count, random_generator(secret, "plan")), start=1
+        )
+    ]
+    names = [question.case.name for question in drawn]
+    nats: dict[str, list[float]] = {}
+    with executor(jobs if jobs > 1 and scheduler is None else 0, scheduler) as pool:
+        work = {question.case.name: (secret, folder, question, record) for question in drawn}
+        for name, of_effects in results(pool, _make_case, work):
+            nats[name] = of_effects
+            progress(len(nats))
+    text = encode_answers(secret, drawn, [nats[name] for name in names])
+    files.write_text(folder.commitment, commitment(text) + "\n")
+    entries = [
+        {
+            "file": f"recordings/{question.case.name}.csv",
+            "lung": question.case.lung,
+            "sha256": files.sha256(folder.recording(question.case.name)),
+        }
+        for question in drawn
+    ]
+    files.write_json(folder.public, {"cases": entries})
+    sealed = encrypt(text, secret, folder.public.read_bytes())
+    files.write_atomically(folder.sealed, lambda file: file.write(sealed))
+    return commitment(text)
+
+
+def _make_case(
+    secret: str, folder: ChallengeFolder, drawn: DrawnCase, record: Record
+) -> list[float]:
+    """Record one case; returns the nats of each of its effects."""
+    case = drawn.case
+    breaths = record_within_limits(secret, drawn, record=record)
+    write(breaths, folder.recording(case.name))
+    return [round(log_likelihood_loss(case, breaths, k), 1) for k in range(len(case.effects))]
+
+
+def record_within_limits(
+    secret: str, drawn: DrawnCase, *, usual: int = _USUAL_ATTEMPTS, gentle: int = _GENTLE_ATTEMPTS,
+    record: Record = None,
+) -> Breaths:  # fmt: skip
+    """Record a case, repeatedly until the pressures are within the limits of a recording.
+
+    Lungs that stiffen steeply leave the limits under all usual commands.
+
+    Args:
+        secret: secret of the challenge.
+        drawn: the case.
+        usual: number of attempts with commands of the usual size.
+        gentle: number of attempts with smaller and smaller ones after these.
+        record: see :data:`Record`.
+
+    Raises:
+        InputError: if every attempt leaves the limits.
+    """
+    name, take = drawn.case.name, record or generator_of(drawn.case).record
+    for attempt in range(usual + gentle):
+        repeated = () if attempt == 0 else (f"again {attempt}",)
+        share = _GENTLER ** max(attempt - usual + 1, 0)
+        rng = random_generator(secret, "recording", name, *repeated)
+        breaths = take(drawn.case, rng, share=share)
+        pressure = breaths.pressure[np.isfinite(breaths.pressure)]
+        if np.all((pressure >= PRESSURE.low) & (pressure <= PRESSURE.high)):
+            return breaths
+    span = f"{PRESSURE.low:g}..{PRESSURE.high:g} cmH2O"
+    raise InputError(f"{name} leaves {span} at every attempt; take another seed")

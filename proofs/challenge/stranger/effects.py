@@ -1,0 +1,266 @@
+"""Effects of the second generator: forms, strengths, sources; and the draw of its cases.
+
+Sources: F. Rohrer, Pflügers Arch. 162 (1915) 225 (``K1 Q + K2 Q |Q|``); J. Mead, J. Appl. Physiol.
+9 (1956) 208 (inertia of the gas); A. B. Otis et al., J. Appl. Physiol. 8 (1956) 427 (unequal time
+constants); W. A. Briscoe, A. B. DuBois, J. Clin. Invest. 37 (1958) 1279 (conductance grows with
+volume); E. Salazar, J. H. Knowles, J. Appl. Physiol. 19 (1964) 97 (exponential pressure-volume
+curve); J. G. Venegas et al., J. Appl. Physiol. 84 (1998) 389 (sigmoid); E. D'Angelo et al., J.
+Appl. Physiol. 67 (1989) 2556 and J. H. T. Bates, *Lung Mechanics* (Cambridge 2009) (viscoelastic
+tissue); J. S. Mecklenburgh, W. W. Mapleson, Br. J. Anaesth. 60 (1988) 434 (course of muscle
+pressure); H. Blasius (1913) (friction of turbulent flow, exponent 1.75); ISA-75.01 / IEC 60534
+(valve characteristics and flow from a supply); R. Bouc (1967), Y. K. Wen, J. Eng. Mech. 102 (1976)
+249 (smooth hysteresis); M. Lichtwarck-Aschoff et al., Crit. Care 18 (2014) R126 (cardiogenic
+oscillation).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, Effect, EffectFamily, Strength
+from proofs.challenge.questions import DrawnCase, Kind
+from ventbench.errors import InputError
+from ventbench.lungs import Lung
+
+#: Form of an effect whose parameter means the same as the library's of that name.
+SAME = "library"
+
+
+@dataclass(frozen=True)
+class StrangerCase(Case):
+    """A recording of the second generator, with the nuisances of its laboratory.
+
+    Attributes:
+        generator: always ``"stranger"``; the sealed answers tell the two generators apart by it.
+        interval: mean sampling interval, s.
+        inspiration: duration of inspiration, s.
+        clock_step: resolution of the logged times, s; 0 for none.
+        gain_scatter: relative standard deviation of the valve's gain from breath to breath.
+        outliers: share of readings that are far off.
+        missing: share of readings that are blank.
+        proportional: largest proportional gain of the controller, % per cmH2O.
+        explored: share of breaths that explore instead of following a target.
+        dead_space: compliance of the circuit that every rig has, mL/cmH2O.
+    """
+
+    generator: str = "stranger"
+    interval: float = 0.032
+    inspiration: float = 1.0
+    clock_step: float = 0.0
+    gain_scatter: float = 0.0
+    outliers: float = 0.0
+    missing: float = 0.0
+    proportional: float = 2.0
+    explored: float = 0.5
+    dead_space: float = 0.03
+
+
+@dataclass(frozen=True)
+class Family(EffectFamily):
+    """An effect of the second generator.
+
+    Attributes:
+        names: names that are right for it, where the library has one of them.
+        places: places that are right for it without a name.
+    """
+
+    names: tuple[str, ...] = ()
+    places: tuple[str, ...] = ()
+
+
+EFFECTS: dict[str, Family] = {
+    "valve_delay": Family("delay", 0.035, 0.075, (SAME,)),
+    "valve_lag": Family("tau", 0.04, 0.09, (SAME, "second order")),
+    "valve_dead_band": Family("width", 1.5, 3.5, ("spool overlap", "cracking")),
+    "valve_curve": Family(
+        "loss", 0.2, 0.5, ("rational saturation", "equal percentage", "quick opening")
+    ),
+    "valve_hysteresis": Family("width", 2.0, 5.0, ("backlash", "Bouc-Wen")),
+    "command_rounding": Family("amount", 1.0, 1.0, ("truncation",)),
+    "supply_droop": Family(
+        "drop", 0.1, 0.28, ("regulator and reservoir",), (("recovery", (0.6, 1.6)),)
+    ),
+    "leak": Family("conductance", 7.0, 18.0, (SAME, "laminar", "exponent 0.7")),
+    "circuit_compliance": Family("compliance", 1.2, 2.8, (SAME,)),
+    "inertance": Family("inertance", 0.06, 0.13, (SAME,), (("circuit", (0.1, 1.0)),)),
+    "turbulent_resistance": Family("quadratic", 4.0, 10.0, (SAME, "Blasius")),
+    "nonlinear_compliance": Family("capacity", 40.0, 24.0, ("Salazar-Knowles", "Venegas")),
+    "viscoelasticity": Family("ratio", 0.25, 0.65, (SAME,), (("time", (0.4, 2.0)),)),
+    "sensor_lag": Family("tau", 0.045, 0.11, (SAME, "second order")),
+    "sensor_drift": Family("drift", 1.2, 2.8, (SAME, "warming"), signs=(1.0, -1.0)),
+    "exhalation_valve_delay": Family("opening", 0.045, 0.09, (SAME, "slow opening")),
+    "patient_effort": Family(
+        "amplitude", 2.0, 5.0, ("half sine", "exponential"), (("duration", (0.5, 1.1)),)
+    ),
+    "volume_resistance": Family(
+        "capacity", 18.0, 8.0, ("conductance grows with volume",), inside=False, places=("R(V)",),
+        names=("volume_resistance",),
+    ),
+    "direction_resistance": Family(
+        "ratio", 1.6, 2.1, ("expiratory resistance",), inside=False,
+        places=("R(direction)", "f(Q)"), names=("direction_resistance",),
+    ),
+    "cardiogenic": Family(
+        "amplitude", 0.6, 1.2, ("two harmonics",), (("frequency", (0.9, 1.8)),), inside=False,
+        places=("f(t) at the alveolus",),
+    ),
+    "pulsating_supply": Family(
+        "amplitude", 0.12, 0.18, ("piston",), (("frequency", (2.5, 7.0)),), inside=False,
+        places=("f(t) at the supply",),
+    ),
+    "second_compartment": Family(
+        "share", 0.25, 0.45, ("Otis",), (("time", (0.4, 1.6)),), inside=False,
+        places=("memory of p", "memory of V"), names=("viscoelasticity", "second_compartment"),
+    ),
+    "sensor_nonlinearity": Family(
+        "bend", 0.9, 1.4, ("bow",), signs=(1.0, -1.0), inside=False, places=("measurement",),
+        names=("sensor_curve", "sensor_nonlinearity"),
+    ),
+    "expiratory_valve_orifice": Family(
+        "amount", 1.0, 1.0, ("orifice",), inside=False, places=("exhalation path",),
+    ),
+    "supply_back_pressure": Family(
+        "supply", 120.0, 70.0, ("incompressible valve",), inside=False,
+        places=("f(p)", "f(u)", "memory of u"),
+        names=("supply_back_pressure", "valve_back_pressure", "back_pressure", "supply_pressure"),
+    ),
+    "compliance_change": Family(
+        "change", 0.2, 0.4, ("recruitment",), signs=(1.0, -1.0), inside=False,
+        places=("f(V)", "measurement"),
+        names=("compliance_drift", "compliance_change", "lung_drift", "elastance_drift"),
+    ),
+    "resistance_change": Family(
+        "change", 0.3, 0.6, ("secretions",), signs=(1.0, -1.0), inside=False, places=("f(Q)",),
+        names=("resistance_drift", "resistance_change", "lung_drift"),
+    ),
+}  # fmt: skip
+
+INSIDE: tuple[str, ...] = tuple(name for name, family in EFFECTS.items() if family.inside)
+OUTSIDE: tuple[str, ...] = tuple(name for name, family in EFFECTS.items() if not family.inside)
+
+#: All nine settings of the QuickLung.
+SETTINGS = tuple(Lung(R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.0))
+
+#: Shares of the kinds. There is no kind ``form``, since all forms are strangers.
+SHARES: dict[Kind, float] = {
+    "single": 0.40, "null": 0.16, "pair": 0.14, "four": 0.08, "outside": 0.16, "masked": 0.06,
+}  # fmt: skip
+
+#: Effects that are not combined with others: too small beside them, or no size.
+_ALONE = ("inertance", "command_rounding")
+
+#: No two of a set are combined: pressure hardly tells them apart.
+_RIVALS = (
+    {"valve_lag", "sensor_lag", "circuit_compliance"},
+    {"leak", "valve_dead_band", "viscoelasticity"},
+    {"valve_curve", "supply_droop"},
+)
+
+#: Largest relative deviation of a strength from its mean.
+_VARIATION = 0.15
+
+#: Share of the recordings whose label has another R or C by the factor of a forgotten setting, and
+#: that factor's range.
+_GROSS, _FACTOR = 0.08, (1.5, 1.8)
+
+#: Sampling intervals, s, with the number of samples of a breath. Few sizes, so that few compile.
+_SAMPLING = ((0.0319, 80), (0.0340, 80), (0.0250, 100))
+
+
+def draw(kind: Kind | Literal["all"], count: int, rng: np.random.Generator) -> list[DrawnCase]:
+    """Draw cases of one kind or of all kinds, in random order.
+
+    Raises:
+        InputError: if the generator has no such kind, or there are fewer cases than kinds.
+    """
+    if kind == "form":
+        raise InputError("the stranger generator has no kind form: all of its forms are others")
+    if count < (len(SHARES) if kind == "all" else 1):
+        raise InputError(f"{count} cases are too few; ask for at least {len(SHARES)}")
+    sizes = {kind: count}
+    if kind == "all":
+        sizes = {k: max(1, int(share * count)) for k, share in SHARES.items()}
+        sizes["single"] += count - sum(sizes.values())
+    cases = [DrawnCase(k, case) for k, n in sizes.items() for case in _of_kind(k, n, rng)]  # type: ignore[arg-type]
+    return [cases[i] for i in rng.permutation(len(cases))]
+
+
+def _of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[StrangerCase]:
+    lungs = [SETTINGS[i] for _ in range(count // 9 + 1) for i in rng.permutation(9)]
+    pool = OUTSIDE if kind == "outside" else INSIDE
+    names = [pool[i] for _ in range(count // len(pool) + 1) for i in rng.permutation(len(pool))]
+    flip = int(rng.integers(2))
+    for k in range(count):
+        strength: Strength = ("mild", "strong")[(k + flip) % 2]
+        effects: tuple[Effect, ...] = ()
+        if kind in ("pair", "four"):
+            effects = _several(2 if kind == "pair" else 4, rng)
+        elif kind != "null":
+            effects = (_effect(names[k], strength, rng),)
+        yield _laboratory(lungs[k], effects, kind, rng)
+
+
+def _effect(name: str, strength: Strength, rng: np.random.Generator) -> Effect:
+    family = EFFECTS[name]
+    form = family.forms[int(rng.integers(len(family.forms)))]
+    size = getattr(family, strength) * rng.choice(np.array(family.signs))
+    if family.parameter != "amount":
+        size *= rng.uniform(1.0 - _VARIATION, 1.0 + _VARIATION)
+    if family.parameter == "share":
+        size = min(size, 0.5)
+    further = {key: float(rng.uniform(*span)) for key, span in family.ranges}
+    return Effect(name, strength, form, {family.parameter: float(size)} | further)
+
+
+def _several(size: int, rng: np.random.Generator) -> tuple[Effect, ...]:
+    chosen: list[str] = []
+    for name in rng.permutation(np.array(INSIDE)).tolist():
+        clash = any(name in rivals and rivals & set(chosen) for rivals in _RIVALS)
+        if name not in _ALONE and not clash:
+            chosen.append(name)
+        if len(chosen) == size:
+            break
+    return tuple(_effect(name, "strong", rng) for name in sorted(chosen))
+
+
+def _laboratory(
+    label: Lung, effects: tuple[Effect, ...], kind: Kind, rng: np.random.Generator
+) -> StrangerCase:
+    """A rig and its laboratory around a label."""
+    R, C = label.R * np.exp(0.1 * rng.standard_normal()), label.C * np.exp(0.05 * rng.normal())
+    if rng.uniform() < _GROSS:
+        factor = rng.uniform(*_FACTOR) ** rng.choice(np.array([-1.0, 1.0]))
+        R, C = (R * factor, C) if rng.uniform() < 0.5 else (R, C * factor)
+    interval, samples = _SAMPLING[int(rng.integers(len(_SAMPLING)))]
+    few = kind == "masked"
+    breaths = int(np.round(np.exp(rng.uniform(np.log(12), np.log(24 if few else 200)))))
+    base = Base(
+        R=float(R),
+        C=float(C),
+        R_ex=float(rng.uniform(3.0, 9.0)),
+        peep=float(rng.uniform(3.0, 7.0)),
+        gain=float(NOMINAL_GAIN * np.exp(0.06 * rng.standard_normal())),
+    )
+    return StrangerCase(
+        name="", lung_R=label.R, lung_C=label.C, effects=effects, base=base,
+        noise=float(rng.uniform(0.1, 0.3)),
+        coloured=float(rng.uniform(0.0, 0.6)) if rng.uniform() < 0.5 else 0.0,
+        correlation=float(rng.uniform(0.4, 0.9)),
+        step=float(rng.choice(np.array([0.0703, 0.01, 0.1]))),
+        jitter=float(rng.choice(np.array([1e-4, 5e-4, 1.2e-3]))),
+        breaths=breaths, samples=samples, style="pi" if few else "mixed",
+        log_step=float(rng.choice(np.array([0.001, 0.01, 0.1]))),
+        interval=interval,
+        inspiration=float(rng.uniform(0.8, 1.2)),
+        clock_step=float(rng.choice(np.array([0.0, 1e-4]))),
+        gain_scatter=float(rng.choice(np.array([0.0, 0.005, 0.015]))),
+        outliers=float(rng.choice(np.array([0.0, 5e-4, 2e-3]))),
+        missing=float(rng.choice(np.array([0.0, 0.0, 0.01]))),
+        proportional=float(rng.uniform(0.5, 10.0)),
+        explored=0.0 if few else float(rng.choice(np.array([0.0, 0.3, 0.6]))),
+        dead_space=float(rng.uniform(0.01, 0.05)),
+    )  # fmt: skip

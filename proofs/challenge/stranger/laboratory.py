@@ -1,0 +1,264 @@
+"""Recordings of the second generator: controller, clock, sensor, and what a laboratory spoils."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hardware_eval.emulation.cases import Case
+from proofs.challenge.stranger.effects import StrangerCase
+from proofs.challenge.stranger.rig import Floats, Rig
+from ventbench.recordings.breaths import Breaths, make_breaths
+
+#: Takes the number of a sample, what the sensors show and which breaths are due, ``(n,)``; returns
+#: their readings and commands.
+Command = Callable[[int, Floats, NDArray[np.bool_]], tuple[Floats, Floats]]
+
+#: Step of the integration of recordings and of noise-free replays, s.
+STEP, REPLAY_STEP = 1e-4, 1e-3
+
+#: Pressure at which the ventilator shuts its valve, cmH2O.
+_RELIEF = 55.0
+
+#: Pressure that the resistance of the airway may take at the ventilator's largest command, cmH2O.
+_FLOW_LIMIT = 45.0
+
+#: Size of an outlier, in standard deviations of the noise.
+_OUTLIER = (8.0, 40.0)
+
+#: Share of breaths in which a patient tries to breathe, and the scatter of these efforts.
+_EFFORTS, _EFFORT_SCATTER = 0.8, 0.3
+
+#: Time for which a command of an exploring breath stands, s.
+_HOLD = (0.06, 0.3)
+
+
+def record(
+    case: Case, rng: np.random.Generator, *, steps: int | None = None, share: float = 1.0
+) -> Breaths:
+    """Record a case.
+
+    Args:
+        case: a case of this generator.
+        rng: source of everything that varies.
+        steps: not used; the step is fixed.
+        share: scales target pressures above PEEP and explored commands.
+    """
+    assert isinstance(case, StrangerCase)
+    assert case.base is not None
+    n, samples, peep = case.breaths, case.samples, case.base.peep
+    ticks = case.interval * np.arange(samples) + np.concatenate(
+        [np.zeros((n, 1)), case.jitter * rng.standard_normal((n, samples - 1))], axis=1
+    )
+    time = np.maximum.accumulate(ticks + 1e-7 * np.arange(samples), axis=1)
+    u_out = (time >= case.inspiration).astype(np.int8)
+    explores = rng.uniform(size=n) < case.explored
+    target = peep + share * rng.uniform(8.0, 28.0, n)
+    rise = rng.uniform(0.0, 0.25, n)
+    proportional = np.exp(rng.uniform(np.log(0.2), np.log(case.proportional), n))
+    integral = np.exp(rng.uniform(np.log(2.0), np.log(20.0), n))
+    pulses = _explored(case, rng, time, share)
+    noise = _noise(case, rng, (n, samples))
+    summed = np.zeros(n)
+    most = min(100.0, _FLOW_LIMIT / (case.base.R * case.base.gain * 1e-3))
+
+    def command(k: int, shown: Floats, due: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+        """Reading and command at sample k, for the breaths that are due."""
+        nonlocal summed
+        measured = shown + noise[:, k]
+        if case.step > 0:
+            measured = case.step * np.round(measured / case.step)
+        now = time[:, k]
+        wanted = peep + (target - peep) * np.clip((now + 0.03) / (rise + 0.03), 0.0, 1.0)
+        error = wanted - measured
+        ahead = np.clip(summed + integral * case.interval * error, 0.0, 100.0)
+        asked = proportional * error + ahead
+        # No winding up while the command is at an end.
+        summed = np.where(due & (asked > 0.0) & (asked < 100.0), ahead, summed)
+        u = np.where(explores, pulses[:, k], asked)
+        u = np.where((measured > _RELIEF) | (u_out[:, k] == 1), 0.0, u)
+        return measured, np.clip(
+            np.round(np.minimum(u, most) / case.log_step) * case.log_step, 0, 100
+        )
+
+    pressure, u_in = _run(case, rng, time, u_out, command, np.arange(n), STEP)
+    wrong = rng.uniform(size=pressure.shape) < case.outliers
+    size = case.noise * rng.uniform(*_OUTLIER, pressure.shape)
+    sign = rng.choice(np.array([-1.0, 1.0]), pressure.shape)
+    pressure = np.where(wrong, pressure + sign * size, pressure)
+    blank = rng.uniform(size=pressure.shape) < case.missing
+    blank[:, 0] = False
+    pressure = np.where(blank, np.nan, pressure)
+    logged = time
+    if case.clock_step > 0:
+        logged = np.round(time / case.clock_step) * case.clock_step
+    ones = np.ones(n)
+    return make_breaths(
+        np.arange(1, n + 1), case.lung_R * ones, case.lung_C * ones,
+        np.round(logged, 6), np.round(u_in, 6), u_out, np.round(pressure, 6),
+    )  # fmt: skip
+
+
+def record_commands(
+    case: Case, time: Floats, u_in: Floats, u_out: NDArray[np.int8],
+    rng: np.random.Generator, *, steps: int | None = None,
+) -> Breaths:  # fmt: skip
+    """Record given commands on the case's rig, open loop, after the case's own breaths.
+
+    Args:
+        case: a case of this generator.
+        time: times of the samples, s, ``(k, T)``.
+        u_in: %, ``(k, T)``.
+        u_out: 0/1, ``(k, T)``.
+        rng: source of noise and efforts.
+        steps: not used.
+    """
+    assert isinstance(case, StrangerCase)
+    n = len(time)
+    noise = _noise(case, rng, time.shape)
+
+    def command(k: int, shown: Floats, due: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+        measured = shown + noise[:, k]
+        if case.step > 0:
+            measured = case.step * np.round(measured / case.step)
+        return measured, u_in[:, k]
+
+    number = case.breaths + np.arange(n)
+    pressure, _ = _run(case, rng, time, u_out, command, number, STEP)
+    ones = np.ones(n)
+    return make_breaths(
+        number + 1, case.lung_R * ones, case.lung_C * ones, time, u_in, u_out, pressure
+    )
+
+
+def replay(case: Case, breaths: Breaths, start: Floats, seed: int, steps: int = 8) -> Floats:
+    """Pressures without noise under recorded commands, cmH2O, ``(n, T)``.
+
+    Args:
+        case: a case of this generator with its base.
+        breaths: commands and times.
+        start: airway pressure at rest, ``(n,)``.
+        seed: seed of efforts and phases.
+        steps: not used.
+    """
+    assert isinstance(case, StrangerCase)
+    quiet = replace(case, gain_scatter=0.0)
+    rng = np.random.default_rng(seed)
+    number = breaths.breath_id - 1
+
+    def command(k: int, shown: Floats, due: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+        return shown, breaths.u_in[:, k]
+
+    return _run(quiet, rng, breaths.time, breaths.u_out, command, number, REPLAY_STEP, start)[0]
+
+
+def _run(
+    case: StrangerCase, rng: np.random.Generator, time: Floats, u_out: NDArray[np.int8],
+    command: Command, number: NDArray[np.int64],
+    step: float, start: Floats | None = None,
+) -> tuple[Floats, Floats]:  # fmt: skip
+    """Simulate breaths side by side; returns what ``command`` returns at each sample, ``(n, T)``.
+
+    The breaths have clocks of their own: at each step of the integration, every breath whose next
+    sample has come is sampled.
+    """
+    assert case.base is not None
+    n, samples = time.shape
+    effects = {effect.name: effect for effect in case.effects}
+    size = np.zeros(n)
+    onset = rng.uniform(0.0, 0.5, n)
+    if "patient_effort" in effects:
+        acts = rng.uniform(size=n) < _EFFORTS
+        scatter = np.clip(1.0 + _EFFORT_SCATTER * rng.standard_normal(n), 0.3, 1.8)
+        size = np.where(acts, effects["patient_effort"].parameters["amplitude"] * scatter, 0.0)
+    rig = Rig(
+        case.base, effects, number / max(case.breaths - 1, 1), case.dead_space,
+        rng.uniform(0.0, 2.0 * np.pi, n), np.stack([size, onset]),
+    )  # fmt: skip
+    gains = 1.0 + case.gain_scatter * rng.standard_normal(n)
+    spread = 0.2 * rng.standard_normal(n)
+    rig.start(case.base.peep + spread if start is None else start)
+    delay = effects["valve_delay"].parameters["delay"] if "valve_delay" in effects else 0.0
+    late = effects.get("exhalation_valve_delay")
+    opening = late.parameters["opening"] if late is not None and late.form != "slow opening" else 0
+    pressure, u_in = np.zeros((n, samples)), np.zeros((n, samples))
+    asked = np.zeros((n, samples))
+    # Steps at which samples are taken and at which commands reach the valves.
+    sampled = np.round(time / step).astype(int)
+    reaches = np.round((time + delay) / step).astype(int)
+    late_opening = np.round((time + opening) / step).astype(int)
+    count = int(sampled.max())
+    at_sample = _events(sampled, count)
+    at_valve, at_opening = _events(reaches, count), _events(late_opening, count)
+    acting, out_now, out_before = np.zeros(n), np.zeros(n), np.zeros(n)
+    remembers = "valve_hysteresis" in effects
+    for i in range(count + 1):
+        for column, breaths in at_sample.get(i, ()):
+            due = np.zeros(n, bool)
+            due[breaths] = True
+            seen, wanted = command(column, rig.shown(), due)
+            pressure[due, column], u_in[due, column] = seen[due], wanted[due]
+            opening_now = (
+                _with_memory(rig, wanted, due) if remembers else rig.steady_command(wanted)
+            )
+            asked[due, column] = opening_now[due]
+            out_now[due] = u_out[due, column]
+        for column, breaths in at_valve.get(i, ()):
+            acting[breaths] = gains[breaths] * asked[breaths, column]
+        for column, breaths in at_opening.get(i, ()):
+            out_before[breaths] = u_out[breaths, column]
+        rig.advance(acting, out_now * out_before, (i + 1) * step, step)
+    return pressure, u_in
+
+
+def _events(at: NDArray[np.int64], count: int) -> dict[int, list[tuple[int, NDArray[np.int64]]]]:
+    """Samples by the step at which they take place, each with its breaths; ``at`` is ``(n, T)``."""
+    events: dict[int, list[tuple[int, NDArray[np.int64]]]] = {}
+    for column in range(at.shape[1]):
+        for step in np.unique(at[:, column]):
+            if step <= count:
+                breaths = np.flatnonzero(at[:, column] == step)
+                events.setdefault(int(step), []).append((column, breaths))
+    return events
+
+
+def _with_memory(rig: Rig, wanted: Floats, these: NDArray[np.bool_]) -> Floats:
+    """Opening of all breaths; those that are not sampled now keep their hysteresis."""
+    held, before = rig.held.copy(), np.broadcast_to(rig.speed_of_command, wanted.shape).copy()
+    rig.speed_of_command = before
+    opening = rig.steady_command(wanted)
+    rig.held = np.where(these, rig.held, held)
+    rig.speed_of_command = np.where(these, rig.speed_of_command, before)
+    return opening
+
+
+def _noise(case: StrangerCase, rng: np.random.Generator, shape: tuple[int, ...]) -> Floats:
+    """Noise of the sensor: white, and a coloured share."""
+    white = rng.standard_normal(shape) * np.sqrt(1.0 - case.coloured)
+    slow, a = np.zeros(shape), case.correlation
+    fresh = rng.standard_normal(shape)
+    slow[:, 0] = fresh[:, 0]
+    for k in range(1, shape[1]):
+        slow[:, k] = a * slow[:, k - 1] + np.sqrt(1.0 - a * a) * fresh[:, k]
+    return case.noise * (white + np.sqrt(case.coloured) * slow)
+
+
+def _explored(case: StrangerCase, rng: np.random.Generator, time: Floats, share: float) -> Floats:
+    """Commands of exploring breaths: levels of random lengths around what the lung takes, %."""
+    assert case.base is not None
+    n, samples = time.shape
+    # At this flow the lung fills by 20 cmH2O in the time, and its resistance takes 20 at most.
+    base = case.base
+    flow = min(20.0 * base.C * 1e-3 / case.inspiration, 20.0 / base.R) / (base.gain * 1e-3)
+    values = np.zeros((n, samples))
+    for b in range(n):
+        at = 0.0
+        while at < case.inspiration:
+            length = rng.uniform(*_HOLD)
+            level = 0.0 if rng.uniform() < 0.25 else share * flow * rng.uniform(0.2, 2.0)
+            values[b, (time[b] >= at) & (time[b] < at + length)] = level
+            at += length
+    return np.clip(values, 0.0, 100.0)

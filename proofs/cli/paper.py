@@ -1,0 +1,106 @@
+"""``python -m proofs paper``: published results beside ours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ventbench.cli.options import JsonFile, RecordingsDir, Scheduler, Workers, bars, emit
+
+
+def paper(
+    recordings: RecordingsDir = None,
+    full: Annotated[
+        bool,
+        typer.Option(
+            "--full",
+            help="Also run the studies again: learning curves, parts of the controller, and with "
+            "--recordings the shapes of networks. Hours on 2 cores; the same command continues.",
+        ),
+    ] = False,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder in which --full keeps finished trainings.")
+    ] = Path("runs/paper"),
+    seeds: Annotated[
+        int, typer.Option(min=1, max=32, help="Trainings of each method and part with --full.")
+    ] = 5,
+    version: Annotated[
+        int, typer.Option("--protocol", min=1, max=2, help="Version of the protocol.")
+    ] = 2,
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+    page: Annotated[
+        Path | None, typer.Option("--html", metavar="FILE", help="Write the page, with charts.")
+    ] = None,
+    markdown: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the tables below the first lines of this page."),
+    ] = None,
+    store: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write what took minutes, in the form of proofs/paper/stored.json."
+        ),
+    ] = None,
+    json: JsonFile = None,
+) -> None:
+    """Set each table and figure of the paper that needs no hardware beside ours.
+
+    The grid of PIDs and the bundled entries run on the frozen simulators; what takes minutes is
+    read from stored results, unless --full or --recordings measures it again.
+
+    Example: `python -m proofs paper --html paper.html --json paper.json`
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from proofs.paper.paper import reproduce_paper
+    from ventbench import files
+
+    with bars() as shown:
+        task = shown.add_task("paper", total=1.0)
+        result, stored = reproduce_paper(
+            protocol_version=version, recordings=recordings, full=full, out=out, seeds=seeds,
+            workers=workers, scheduler=scheduler,
+            progress=lambda what, share: shown.update(task, completed=share, description=what),
+        )  # fmt: skip
+    emit(result.to_json(), json)
+    console = Console(stderr=str(json) == "-")
+    summary = result.summary()
+    for part in (summary, *(table for section in result.sections for table in section.tables)):
+        table = Table(title=part.caption, show_lines=part is summary)
+        for k, name in enumerate(part.columns):
+            table.add_column(name, justify="left" if k == 0 or part is summary else "right")
+        for row in part.texts():
+            table.add_row(*row)
+        console.print(table)
+    for place, what, why in result.not_reproduced:
+        console.print(f"not reproduced: {place}: {what}; {why}", markup=False, highlight=False)
+    written = []
+    if page is not None:
+        from proofs.paper.page import write_reproduction
+
+        written.append(write_reproduction(page, result))
+    if markdown is not None:
+        files.write_text(markdown, _with_head(markdown, result.to_markdown()))
+        written.append(markdown)
+    if store is not None:
+        files.write_json(store, stored)
+        written.append(store)
+    for path in written:
+        console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
+
+
+#: What separates the hand-written head of a Markdown page from the written tables.
+MARK = "<!-- written by `python -m proofs paper --markdown` -->"
+
+
+def _with_head(path: Path, tables: str) -> str:
+    """Put tables below the mark of an existing page; a page without one is replaced."""
+    head = "# The paper, reproduced\n\n"
+    if path.is_file():
+        before, mark, _ = path.read_text("utf-8").partition(MARK)
+        head = before if mark else head
+    return f"{head}{MARK}\n\n{tables}"

@@ -1,0 +1,228 @@
+"""``python -m proofs study``: compare training methods, and variants of a design."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ventbench.cli.options import (
+    JsonFile,
+    RecordingsDir,
+    Scheduler,
+    Workers,
+    bars,
+    claim_out,
+    emit,
+    recordings_folder,
+)
+
+app = typer.Typer(
+    name="study", help="Compare training methods, and variants of a design.", no_args_is_help=True
+)
+
+
+Only = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME", help="Only this variant and the base; may be repeated."),
+]
+
+
+@app.command()
+def samples(
+    lung: Annotated[str, typer.Option(metavar="ID", help="Lung, such as R20C50.")] = "R20C50",
+    seeds: Annotated[
+        int, typer.Option(min=1, max=32, help="Number of trainings of each method.")
+    ] = 5,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
+    ] = Path("runs/study"),
+    share: Annotated[
+        float,
+        typer.Option(min=0.001, max=1.0, help="Share of the full length of each training to run."),
+    ] = 1.0,
+    json: JsonFile = None,
+) -> None:
+    """Compare how many breaths policy gradient, PPO and DQN need for a score.
+
+    Writes samples.csv (the curves), summary.csv and study-samples.png. Ctrl-C keeps the finished
+    work; the same command continues. The picture needs the extra `view`.
+
+    Example: `python -m proofs study samples --lung R20C50 --seeds 5`
+    """
+    from rich.console import Console
+
+    from proofs.studies import samples as work
+    from ventbench import errors, files
+    from ventbench.lungs import scored_lung
+
+    errors.require("matplotlib")
+    with bars() as shown:
+        tasks: dict[str, Any] = {}
+
+        def progress(method: str, done: float, best: float) -> None:
+            if method not in tasks:
+                tasks[method] = shown.add_task(method, total=1.0)
+            description = f"{method}: {best:.3f} cmH2O"
+            shown.update(tasks[method], completed=done, description=description)
+
+        result = work.sample_efficiency(
+            scored_lung(lung), range(seeds), out, share=share, progress=progress
+        )
+    picture = work.learning_curves_png(result)
+    files.write_atomically(out / "study-samples.png", lambda file: file.write(picture))
+    table = result.summary()
+    emit({"lung": result.lung, "methods": _plain(table)}, json)
+    console = Console(stderr=str(json) == "-")
+    console.print(_summary(result, table))
+    console.print(f"wrote {out}", markup=False, highlight=False)
+
+
+def _plain(table: Any) -> list[dict[str, Any]]:
+    rows = table.to_dict("records")
+    # What is not reached is NaN in the table and null in JSON.
+    return [{k: None if v != v else v for k, v in row.items()} for row in rows]
+
+
+def _summary(result: Any, frame: Any) -> Any:
+    from rich.table import Table
+
+    caption = f"The corrected PID: {result.start:.3f}; best PID of the grid: {result.best_pid:.3f}."
+    table = Table(title=f"{result.lung}: nominal score, cmH2O, and experience", caption=caption)
+    # The file has more columns, and longer names for them.
+    heads = {
+        "method": "method",
+        "final": "final",
+        "episodes": "breaths",
+        "at_100_episodes": "at 100",
+        "episodes_to_best_pid": "to best PID",
+        "episodes_to_2_percent": "to 2 %",
+        "seconds_to_2_percent": "s to 2 %",
+    }
+    for name, head in heads.items():
+        first = name == "method"
+        table.add_column(head, justify="left" if first else "right", no_wrap=first)
+    for row in _plain(frame):
+        table.add_row(*("-" if row[k] is None else str(row[k]) for k in heads))
+    return table
+
+
+@app.command()
+def controllers(
+    seeds: Annotated[
+        int, typer.Option(min=1, max=32, help="Number of trainings of each variant.")
+    ] = 3,
+    updates: Annotated[int, typer.Option(min=1, help="Number of updates of each training.")] = 1000,
+    only: Only = None,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
+    ] = Path("runs/controllers"),
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+    json: JsonFile = None,
+) -> None:
+    """Remove or change one part of the residual controller at a time.
+
+    Each variant is trained with each seed as one network for all six lungs. Reports the nominal
+    score, the score on the 20 published draws and the exploitation index. Writes runs.csv and
+    summary.csv. Ctrl-C keeps the finished trainings; the same command continues.
+
+    Example: `python -m proofs study controllers --seeds 3 --updates 1000`
+    """
+    from proofs.studies import controllers as work
+    from ventbench.plants import frozen
+    from ventbench.training.residual import ResidualConfig
+
+    config = ResidualConfig(updates=updates)
+    known = work.variants(config)
+    _check(only, known)
+    with bars() as shown:
+        task = shown.add_task("controllers", total=1.0)
+        runs = work.compare(
+            frozen.load(), out, range(seeds), config=config, only=only,
+            workers=workers, scheduler=scheduler,
+            progress=lambda what, share: shown.update(task, completed=share, description=what),
+        )  # fmt: skip
+    table = work.summary(runs)
+    emit({"updates": updates, "variants": table.to_dict("records")}, json)
+    meanings = {name: variant.meaning for name, variant in known.items()}
+    rows = [
+        (
+            str(row["variant"]), meanings[str(row["variant"])],
+            *(f"{row[x]:.3f}" for x in work.FIGURES),
+            f"{row['nominal_change_low']:+.3f}..{row['nominal_change_high']:+.3f}",
+        )
+        for row in table.to_dict("records")
+    ]  # fmt: skip
+    heads = ("variant", "what", *work.FIGURES, "difference to base")
+    _print("Mean |pressure - target|, cmH2O, averaged over seeds", heads, rows, 2, out, json)
+
+
+@app.command()
+def networks(
+    recordings: RecordingsDir = None,
+    only: Only = None,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
+    ] = Path("runs/networks"),
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+    json: JsonFile = None,
+) -> None:
+    """Change windows, width, depth and boundary networks of the paper's simulators, one at a time.
+
+    The networks are trained on the public recordings in five folds. Each breath is simulated, open
+    loop, by the network that was not trained on it. Writes breaths.csv and summary.csv. Ctrl-C
+    keeps the finished trainings; the same command continues.
+
+    Example: `python -m proofs study networks --recordings ../shared/recordings`
+    """
+    from proofs.studies import networks as work
+    from ventbench.training import simulator
+
+    folder = recordings_folder(recordings)
+    _check(only, work.variants(simulator.ARCHITECTURE))
+    with bars() as shown:
+        task = shown.add_task("networks", total=1.0)
+        breaths = work.compare(
+            folder, out, only=only, workers=workers, scheduler=scheduler,
+            progress=lambda what, share: shown.update(task, completed=share, description=what),
+        )  # fmt: skip
+    table = work.summary(breaths)
+    emit({"variants": table.to_dict("records")}, json)
+    rows = [
+        (
+            str(row["variant"]), f"{row['mean']:.3f}", f"{row['median']:.3f}",
+            f"{row['change']:+.3f}", f"{row['low95']:+.3f}..{row['high95']:+.3f}",
+        )
+        for row in table.to_dict("records")
+    ]  # fmt: skip
+    heads = ("variant", "mean", "median", "difference to base", "95 %, paired by breath")
+    _print("Held-out open-loop MAE, cmH2O", heads, rows, 1, out, json)
+
+
+def _check(only: list[str] | None, known: dict[str, Any]) -> None:
+    from ventbench.errors import InputError
+
+    for name in only or ():
+        if name not in known:
+            raise InputError(
+                f"--only {name}: there is no such variant; choose from {', '.join(known)}"
+            )
+
+
+def _print(
+    title: str, heads: tuple[str, ...], rows: list[tuple[str, ...]], left: int, out: Path, json: Any
+) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(stderr=str(json) == "-")
+    table = Table(title=title)
+    for k, head in enumerate(heads):
+        table.add_column(head, justify="left" if k < left else "right")
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
+    console.print(f"wrote {out}", markup=False, highlight=False, soft_wrap=True)

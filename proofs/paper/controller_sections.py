@@ -1,0 +1,366 @@
+"""Sections of the paper's page on controllers: PID grid, residual networks, learning."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from proofs.paper import published
+from proofs.paper.report import (
+    Cell,
+    Chart,
+    HeatMap,
+    Line,
+    Section,
+    Table,
+    Verdict,
+)
+from ventbench import environment, precision, protocol, rollouts, waveform
+from ventbench.controllers.pid import PID
+from ventbench.errors import InputError
+from ventbench.lungs import LUNG_IDS
+from ventbench.metrics import step_response
+from ventbench.plants import frozen
+from ventbench.training import pid_grid
+
+Floats = NDArray[np.float64]
+AnyFloats = NDArray[np.floating]
+
+#: Lung and PIP of the example of trajectories; the paper does not name its own.
+EXAMPLE, EXAMPLE_PIP = "R20C20", 20.0
+
+
+def best_gains(grid: pid_grid.PIDGrid) -> Section:
+    """The grid of PIDs (the paper's table 2) and its map over P and I."""
+    rows: list[tuple[Cell, ...]] = []
+    without = grid.gains[:, 2] == 0.0
+    excess = []
+    for index, name in enumerate(grid.lungs):
+        error = grid.error[index].mean(axis=-1, dtype=np.float64)
+        paper = _index(grid.gains, published.BEST_PID[name])
+        best, pi = int(np.argmin(error)), int(np.argmin(np.where(without, error, np.inf)))
+        better = float(np.mean(error[without] < error[paper]))
+        excess.append(error[paper] / error[pi] - 1.0)
+        rows.append(
+            (
+                name, _gains(grid.gains[paper], 2), float(error[paper]), _gains(grid.gains[pi], 2),
+                float(error[pi]), _gains(grid.gains[best]), float(error[best]),
+                f"{100 * better:.1f} %",
+            )
+        )  # fmt: skip
+    maps = tuple(_gain_map(grid, name) for name in grid.lungs)
+    top = sum(value < 0.05 for value in excess)
+    return Section(
+        "pid", "Best PIDs", "table 2",
+        "The best gains are high, several at the end of the grid, and all have D = 0.",
+        "agrees" if top >= 5 else "in part",
+        f"On {top} of {len(excess)} lungs the gains that were best on the physical lung come "
+        "within 5 % of the best P and I on the simulator, which was not fitted to them. With D "
+        "free, the error on simulators is lower.",
+        f"computed: {grid.error.size:,} trajectories without noise (the paper: "
+        f"{published.TRAJECTORIES * len(grid.lungs):,} on the lung)",
+        (
+            Table(
+                "Mean |pressure - PIP|, cmH2O, of the paper's best P, I; of the best with D = 0; "
+                "of the best of the whole grid; share of P, I that beat the paper's",
+                ("lung", "paper P, I", "error here", "best P, I", "error", "best P, I, D", "error",
+                 "better than the paper's"),
+                tuple(rows),
+            ),
+        ),
+        maps=maps,
+    )  # fmt: skip
+
+
+def example(
+    official: frozen.Frozen, grid: pid_grid.PIDGrid, residual: Floats, *, airway: bool
+) -> Section:
+    """Trajectories of P-only, I-only, PID and residual (the paper's figures 2, 4 and 9).
+
+    Args:
+        official: simulators.
+        grid: grid of PIDs.
+        residual: pressures of the residual entry, cmH2O, shape ``(6, 6, 300)``.
+        airway: take airway pressure, not the reading.
+    """
+    at, pip = LUNG_IDS.index(EXAMPLE), protocol.PIPS.index(EXAMPLE_PIP)
+    P, I, D = grid.gains.T  # noqa: E741
+    kinds = {
+        "best P-only": (I == 0) & (D == 0),
+        "best I-only": (P == 0) & (D == 0),
+        "best PI of the paper": np.all(grid.gains == published.BEST_PID[EXAMPLE], axis=1),
+        "best PID of the grid": np.ones(len(P), bool),
+    }
+    error = grid.error[at].mean(axis=-1, dtype=np.float64)
+    chosen = {
+        name: tuple(grid.gains[int(np.argmin(np.where(among, error, np.inf)))].tolist())
+        for name, among in kinds.items()
+        if np.any(among)
+    }
+    with precision.float64():
+        plant = jax.tree.map(lambda leaf: jnp.asarray(leaf[at], float), official.plants)
+        controllers = PID(*(jnp.asarray(column) for column in zip(*chosen.values(), strict=True)))
+        cells = environment.nominal_scenario(np.full(len(chosen), EXAMPLE_PIP))
+        inspired, expired = rollouts.closed_loop(
+            plant, controllers, cells, whole=True, airway=airway
+        )
+        assert expired is not None
+        breaths = np.concatenate([inspired.pressure, expired.pressure], axis=-1)
+    runs = {name: breaths[k].reshape(-1) for k, name in enumerate(chosen)}
+    runs["residual"] = residual[at, pip]
+    rows = []
+    last = protocol.BREATH_STEPS * (protocol.BREATHS - 1)
+    for name, run in runs.items():
+        breath = run[last : last + protocol.INSPIRATION_STEPS]
+        rows.append(
+            (
+                name,
+                _gains(chosen[name]) if name in chosen else "network on PID",
+                float(np.mean(np.abs(breath - EXAMPLE_PIP))),
+                float(step_response.rise_time(breath, protocol.PEEP, EXAMPLE_PIP, protocol.DT)),
+                float(step_response.overshoot(breath, EXAMPLE_PIP)),
+                float(step_response.swings(breath, EXAMPLE_PIP)),
+            )
+        )
+    ours, others = rows[-1], rows[:-1]
+    faster = all(not ours[3] > row[3] for row in others if np.isfinite(row[3]))
+    nearer = all(ours[2] < row[2] for row in others)
+    verdict: Verdict = "agrees" if faster and nearer else "in part" if nearer else "differs"
+    steps = np.arange(protocol.BREATH_STEPS)
+    time = tuple((steps * protocol.DT).tolist())
+    target = tuple(np.asarray(waveform.target(steps, EXAMPLE_PIP), float).tolist())
+    lines = tuple(Line(name, time, tuple(run[last:].tolist())) for name, run in runs.items())
+    return Section(
+        "example", "Trajectories of one breath", "figures 2, 4 and 9",
+        "The trained controller rises fast and stays near the target; P-only, I-only and PID rise "
+        "later, overshoot or ring.",
+        verdict,
+        f"Error {ours[2]:.2f} cmH2O, rise {ours[3]:.2f} s, overshoot {ours[4]:.2f} cmH2O, against "
+        f"at best {min(row[2] for row in others):.2f} cmH2O by a PID. The example's lung and PIP "
+        "are ours; the paper names none.",
+        f"computed: {EXAMPLE} at PIP {EXAMPLE_PIP:g}, third breath",
+        (
+            Table(
+                "Third breath: error, cmH2O; rise from 10 to 90 %, s; overshoot, cmH2O; swings "
+                "around the target",
+                ("controller", "P, I, D", "error", "rise", "overshoot", "swings"), tuple(rows), 2,
+            ),
+        ),
+        (
+            Chart(
+                f"{EXAMPLE} at PIP {EXAMPLE_PIP:g} cmH2O", "time in the breath, s",
+                "pressure, cmH2O", (Line("target", time, target, dashed=True), *lines),
+            ),
+        ),
+    )  # fmt: skip
+
+
+def performance(grid: pid_grid.PIDGrid, residual: Floats) -> Section:
+    """Residual network against the best PID of each lung (the paper's figure 7).
+
+    Args:
+        grid: grid of PIDs.
+        residual: errors by lung and PIP, cmH2O, shape ``(6, 6)``.
+    """
+    pid = np.stack(
+        [grid.error[k, int(np.argmin(grid.error[k].mean(-1)))] for k in range(len(grid.lungs))]
+    )
+    by_lung = tuple(_compared(name, pid[k], residual[k]) for k, name in enumerate(grid.lungs))
+    by_pip = tuple(
+        _compared(f"PIP {pip:g}", pid[:, k], residual[:, k]) for k, pip in enumerate(grid.pips)
+    )
+    wins = sum(row[2] < row[1] for row in by_lung)
+    verdict: Verdict = "agrees" if wins == 6 else "in part" if wins >= 3 else "differs"
+    heads = ("best PID of the lung", "residual", "change, %")
+    return Section(
+        "performance", "A trained controller for each lung", "figure 7, contribution 1",
+        "A network on top of a PID, trained on the simulator, beats the best PID on every lung.",
+        verdict,
+        f"It is better on {wins} of 6 lungs and at {sum(row[2] < row[1] for row in by_pip)} of 6 "
+        f"PIPs; the mean falls from {pid.mean():.3f} to {residual.mean():.3f} cmH2O "
+        f"({_change(pid, residual):+.0f} %).",
+        "computed: submissions/residual_mlp and the grid, nominal runs, on simulators",
+        (
+            Table("Mean |pressure - PIP| by lung, cmH2O", ("lung", *heads), by_lung, 2),
+            Table("The same by waveform, cmH2O", ("waveform", *heads), by_pip, 2),
+        ),
+    )  # fmt: skip
+
+
+def robustness(grid: pid_grid.PIDGrid, own: Floats, residual: Floats) -> Section:
+    """One controller for all lungs against one PID for all (the paper's figure 8).
+
+    Args:
+        grid: grid of PIDs.
+        own: errors of the networks for single lungs, cmH2O, shape ``(6, 6)``.
+        residual: errors of the network for all lungs, cmH2O, shape ``(6, 6)``.
+    """
+    gains, _ = grid.best()
+    pid = grid.error[:, _index(grid.gains, gains)]
+    each = np.stack([error[int(np.argmin(error.mean(-1)))] for error in grid.error])
+    rows = tuple(_compared(name, pid[k], residual[k]) for k, name in enumerate(grid.lungs))
+    gain, single = _change(pid, residual), _change(each, own)
+    wins = sum(row[2] < row[1] for row in rows)
+    verdict: Verdict = "agrees" if wins == 6 and gain < single else "in part"
+    return Section(
+        "robustness", "One controller for all lungs", "figure 8, contribution 2",
+        "One network for all lungs beats the best single PID, by more than networks for single "
+        "lungs beat their PIDs.",
+        verdict,
+        f"{gain:+.0f} % against the single PID ({_gains(gains)}) over six lungs, {single:+.0f} % "
+        f"for networks of single lungs against theirs; better on {wins} of 6 lungs. On average it "
+        f"also has {residual.mean():.3f} cmH2O where the best PIDs of each lung have "
+        f"{each.mean():.3f}.",
+        "computed: submissions/residual_mlp_all and the grid, nominal runs",
+        (
+            Table(
+                "Mean |pressure - PIP|, cmH2O; neither is told the lung",
+                ("lung", "best single PID", "one network", "change, %"), rows, 2,
+            ),
+        ),
+    )  # fmt: skip
+
+
+def regularisation(controllers: Mapping[str, Any]) -> Section:
+    """Network on a PID against a network alone (the paper's section 5)."""
+    variants = {row["variant"]: row for row in controllers["variants"]}
+    base, direct = variants["base"], variants["direct"]
+    rows = tuple(
+        (name, row["meaning"], row["nominal"], row["draws"], row["exploitation"])
+        for name, row in variants.items()
+    )
+    better = direct["nominal"] > base["nominal"]
+    return Section(
+        "regularisation", "The PID under the network", "section 5",
+        "A correction of a PID does significantly better than a network that commands alone.",
+        "agrees" if better else "differs",
+        f"A network alone has {direct['nominal']:.3f} cmH2O, one on a PID {base['nominal']:.3f}; "
+        f"but its exploitation index, the spread of the ensemble under its commands, is "
+        f"{direct['exploitation']:.3f} against {base['exploitation']:.3f}. On simulators the PID "
+        "keeps the network where they agree; it does not lower the error.",
+        f"`{controllers['about']['command']}`, stored, simulators version "
+        f"{controllers['about']['simulators']}",
+        (
+            Table(
+                "Parts of the residual controller: error without noise and on the draws, and "
+                "exploitation index, cmH2O",
+                ("variant", "what", "nominal", "draws", "exploitation"), rows,
+            ),
+        ),
+    )  # fmt: skip
+
+
+def reinforcement(errors: Mapping[str, Floats]) -> Section:
+    """Residual network, PPO and DQN on the lungs (the paper's figure 10)."""
+    names = ("residual", "PPO", "DQN")
+    rows = [
+        (lung_id, *(float(errors[name][k].mean()) for name in names))
+        for k, lung_id in enumerate(LUNG_IDS)
+    ]
+    rows.append(("mean", *(float(errors[name].mean()) for name in names)))
+    ours, ppo, dqn = (float(x) for x in rows[-1][1:])
+    return Section(
+        "reinforcement", "Against PPO and DQN", "figure 10",
+        "The score is comparable to that of PPO and DQN on all simulators.",
+        "agrees" if ours <= 1.05 * min(ppo, dqn) else "differs",
+        f"{ours:.3f} cmH2O against {ppo:.3f} (PPO) and {dqn:.3f} (DQN), after a handful of trials "
+        f"each (the paper: {published.TRIALS['PPO']} and {published.TRIALS['DQN']}).",
+        "computed: submissions residual_mlp, ppo, dqn, performance track, nominal runs",
+        (Table("Mean |pressure - PIP|, cmH2O", ("lung", *names), tuple(rows)),),
+    )  # fmt: skip
+
+
+def sample_efficiency(samples: Mapping[str, Any]) -> Section:
+    """Error against experience (the paper's figure 11)."""
+    methods = {row["method"]: row for row in samples["methods"]}
+    columns = (
+        "final", "low95", "high95", "episodes", "at_100_episodes", "episodes_to_best_pid",
+        "episodes_to_2_percent",
+    )  # fmt: skip
+    rows = tuple(
+        (name, *(_plain_number(row[key]) for key in columns)) for name, row in methods.items()
+    )
+    gradient = methods["policy-gradient"]
+    reached = [methods[name]["episodes_to_best_pid"] for name in ("policy-gradient", "ppo", "dqn")]
+    short = methods["policy-gradient-short"]
+    if None in reached:  # such as in trainings cut short
+        first = "Not all methods beat the best PID."
+    else:
+        fewer = [count / reached[0] for count in reached[1:]]
+        first = (
+            f"It beats the best PID after {reached[0]} breaths, {fewer[0]:.0f} and {fewer[1]:.0f} "
+            "times fewer than PPO and DQN."
+        )
+    close = short["final"] <= 1.02 * min(row["final"] for row in methods.values())
+    lines = tuple(
+        Line(name, tuple(curve["episodes"]), tuple(curve["score"]))
+        for name, curve in samples["curves"].items()
+    )
+    elsewhere = "" if lines else "; the curves are drawn in docs/reinforcement.md"
+    chart = Chart(
+        f"{samples['lung']}: score without noise against experience", "breaths", "cmH2O", lines,
+        logarithmic=True,
+    )  # fmt: skip
+    return Section(
+        "samples", "Breaths of experience", "figure 11, contribution 4, conclusion 3",
+        "The policy gradient converges in about 100 episodes, PPO and DQN in tens of thousands.",
+        "agrees" if close else "in part",
+        f"{first} But within {short['episodes']} breaths it stops at "
+        f"{short['final']:.2f} cmH2O, and with {gradient['episodes']:,} it reaches "
+        f"{gradient['final']:.2f}. An episode here is one inspiration; in the paper a pass over "
+        "all PIPs.",
+        f"`{samples['about']['command']}`, stored, simulators version "
+        f"{samples['about']['simulators']}; {samples['seeds']} seeds{elsewhere}",
+        (
+            Table(
+                f"{samples['lung']}: score without noise, cmH2O (interquartile mean, 95 %), and "
+                "breaths",
+                ("method", "final", "from", "to", "breaths", "score at 100 breaths",
+                 "breaths to the best PID", "breaths to within 2 %"),
+                rows,
+            ),
+        ),
+        (chart,) if lines else (),
+    )  # fmt: skip
+
+
+def _compared(name: str, before: AnyFloats, after: AnyFloats) -> tuple[str, float, float, float]:
+    return name, float(np.mean(before)), float(np.mean(after)), _change(before, after)
+
+
+def _change(before: AnyFloats, after: AnyFloats) -> float:
+    """Change of the mean, %."""
+    return 100.0 * (float(np.mean(after)) / float(np.mean(before)) - 1.0)
+
+
+def _index(gains: Floats, wanted: Sequence[float]) -> int:
+    at = np.flatnonzero(np.all(gains == np.asarray(wanted), axis=1))
+    if not at.size:
+        raise InputError(f"the grid does not contain P, I, D = {_gains(wanted)}")
+    return int(at[0])
+
+
+def _gains(gains: Sequence[float] | Floats, count: int = 3) -> str:
+    return ", ".join(f"{gain:g}" for gain in list(gains)[:count])
+
+
+def _plain_number(value: float | None) -> Cell:
+    return f"{value:,}" if isinstance(value, int) else value
+
+
+def _gain_map(grid: pid_grid.PIDGrid, name: str) -> HeatMap:
+    """Error over P and I with D = 0."""
+    here = grid.gains[:, 2] == 0.0
+    (P, row), (I, column) = (  # noqa: E741
+        np.unique(grid.gains[here, k], return_inverse=True) for k in (0, 1)
+    )
+    values = np.full((P.size, I.size), np.nan)
+    error = grid.error[grid.lungs.index(name)].mean(axis=-1, dtype=np.float64)
+    values[row, column] = np.round(error[here], 4)
+    plain = tuple(tuple(line) for line in values.tolist())
+    return HeatMap(f"{name}, D = 0, cmH2O", "I", "P", tuple(I.tolist()), tuple(P.tolist()), plain)

@@ -1,0 +1,194 @@
+"""A comparison with a paper as plain data: sections with tables and charts, as text or Markdown."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+#: How a claim of the paper came out; ``none`` where a section makes no claim.
+Verdict = Literal["agrees", "in part", "differs", "none"]
+
+#: Value of a cell: a text, a number, or None where there is none.
+Cell = str | float | None
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table.
+
+    Attributes:
+        caption: what is in it, with units.
+        columns: headings; the first column holds texts.
+        rows: cells, a row as long as ``columns``.
+        digits: decimals of the numbers.
+    """
+
+    caption: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    digits: int = 3
+
+    def texts(self) -> list[list[str]]:
+        """Rows as they are shown."""
+        return [[self._text(cell) for cell in row] for row in self.rows]
+
+    def _text(self, cell: Cell) -> str:
+        if cell is None:
+            return "-"
+        return cell if isinstance(cell, str) else f"{cell:.{self.digits}f}"
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a chart.
+
+    Attributes:
+        name: what it shows.
+        x: positions, increasing.
+        y: values; NaN where there is none.
+        dashed: whether it is what others are compared with, such as a target.
+    """
+
+    name: str
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    dashed: bool = False
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Lines over one axis.
+
+    Attributes:
+        title: what is shown.
+        x_label: with unit.
+        y_label: with unit.
+        lines: the lines.
+        logarithmic: whether the x axis is.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    lines: tuple[Line, ...]
+    logarithmic: bool = False
+
+
+@dataclass(frozen=True)
+class HeatMap:
+    """Values over two discrete axes.
+
+    Attributes:
+        title: what is shown, with unit.
+        x_label: name of the columns.
+        y_label: name of the rows.
+        x: values of the columns.
+        y: values of the rows.
+        values: a row for each of ``y``.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    values: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class Section:
+    """One table, figure or claim of the paper beside ours.
+
+    Attributes:
+        id: short name.
+        title: what is compared.
+        place: where it stands in the paper, such as ``"table 2"``.
+        claim: what the paper says, in other words.
+        verdict: how the claim came out here.
+        finding: what came out here, in a sentence or two.
+        source: how the figures here were made.
+        tables: tables.
+        charts: charts.
+        maps: heat maps.
+    """
+
+    id: str
+    title: str
+    place: str
+    claim: str
+    verdict: Verdict
+    finding: str
+    source: str
+    tables: tuple[Table, ...] = ()
+    charts: tuple[Chart, ...] = ()
+    maps: tuple[HeatMap, ...] = ()
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """The whole comparison.
+
+    Attributes:
+        about: simulators, protocol and versions that the figures belong to.
+        sections: in the order of the paper's argument.
+        not_reproduced: place in the paper, what stands there, and why it is not reproduced.
+    """
+
+    about: Mapping[str, Any]
+    sections: tuple[Section, ...]
+    not_reproduced: tuple[tuple[str, str, str], ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON values, null where a number is missing."""
+        plain = {
+            "about": dict(self.about),
+            "sections": [dataclasses.asdict(section) for section in self.sections],
+            "not_reproduced": [
+                {"place": place, "what": what, "why": why}
+                for place, what, why in self.not_reproduced
+            ],
+        }
+        return _finite(plain)
+
+    def summary(self) -> Table:
+        """A row a section: place, claim, verdict and finding."""
+        rows = tuple(
+            (section.place, section.claim, section.verdict, section.finding)
+            for section in self.sections
+        )
+        return Table("The paper's claims", ("paper", "claim", "here", "figures here"), rows)
+
+    def to_markdown(self) -> str:
+        """The comparison as a page of documentation."""
+        about = ", ".join(f"{name} {value}" for name, value in self.about.items())
+        parts = [f"Figures of: {about}.", "## Claims", _markdown(self.summary())]
+        for section in self.sections:
+            parts += [f"## {section.title}", f"*{section.place}; {section.source}*"]
+            parts += [f"Paper: {section.claim}", f"Here (**{section.verdict}**): {section.finding}"]
+            for table in section.tables:
+                parts += [f"{table.caption}:", _markdown(table)]
+        missing = Table("", ("paper", "what", "why not here"), self.not_reproduced)
+        return "\n\n".join([*parts, "## Not reproduced", _markdown(missing)]) + "\n"
+
+    def __str__(self) -> str:
+        """Return a line a section."""
+        return "\n".join(
+            f"{section.place}: {section.claim} [{section.verdict}] {section.finding}"
+            for section in self.sections
+        )
+
+
+def _markdown(table: Table) -> str:
+    texts = [list(table.columns), ["---"] * len(table.columns), *table.texts()]
+    return "\n".join(f"| {' | '.join(row)} |" for row in texts)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(own) for key, own in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(own) for own in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

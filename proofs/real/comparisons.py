@@ -1,0 +1,361 @@
+"""Real against real: what the tool says of pairs whose difference it is not told.
+
+The answers are kept one by one; the report has rates of right answers and detection curves.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import ventbench
+from proofs.challenge.figures import wilson
+from proofs.real.pairs import KINDS, Material, Pair, Split, load, pairs
+from proofs.real.parts import slower_sensor
+from ventbench import files
+from ventbench.errors import InputError
+from ventbench.lungs import Lung
+from ventbench.mechanics.identify import Mechanics, Term, identify
+from ventbench.mechanics.labels import TOLERANCE_C, TOLERANCE_R, Estimate
+from ventbench.physics.model import Physics
+from ventbench.recordings.breaths import Breaths
+
+#: Names that are right for what is added, and rivals that act alike where flow is measured before
+#: the circuit: the tubing delays flow as the sensor delays pressure.
+_NAMES = {"leak": "leak", "lag": "sensor_lag"}
+_RIVALS = {"leak": (), "lag": ("circuit_compliance",)}
+
+#: What the PVP rigs have beyond R-C lungs (``python -m proofs rig``, part ``rc``): the simulator of
+#: a first recording is fitted with these.
+_KNOWN = ("exhalation_valve_delay", "circuit_compliance", "valve_curve", "sensor_lag")
+
+#: Kinds that need minutes a pair.
+SLOW = ("leak_driven", "lag_driven", "lung_pressure", "gain_pressure", "lag_pressure")
+
+
+@dataclass(frozen=True)
+class Answered:
+    """A pair with the answer of the tool.
+
+    Attributes:
+        pair: the pair.
+        answer: the answer in words.
+        right: whether it is right.
+        wrong_names: names of effects in the answer that are not in the truth, beyond those that the
+            tool also names without the concealed difference.
+        value: estimated strength of what was added, or None.
+        interval: its 95 % interval, or None.
+        in_class: whether it is named, or a rival that acts alike has appeared or grown.
+    """
+
+    pair: Pair
+    answer: str
+    right: bool
+    wrong_names: tuple[str, ...] = ()
+    value: float | None = None
+    interval: tuple[float, float] | None = None
+    in_class: bool = False
+
+
+def answer(pair: Pair, material: Material) -> Answered:
+    """Let the tool answer a pair; it sees no name and no true label."""
+    return _TOOLS[pair.kind](pair, material)
+
+
+def _label(pair: Pair, material: Material) -> Answered:
+    lung = material.mechanics(pair.second)
+    settings = [setting.id for setting in lung.settings]
+    shown = settings[0] if settings else "none known"
+    return Answered(pair, shown, shown == pair.truth)
+
+
+def _lung(pair: Pair, material: Material) -> Answered:
+    a, b = material.mechanics(pair.first), material.mechanics(pair.second)
+    truth = {part[0] for part in pair.truth.split(", ")} & {"R", "C"}
+    differs = {
+        name
+        for name, tolerance, x, y in (
+            ("R", TOLERANCE_R, _at_label(a, "R"), _at_label(b, "R")),
+            ("C", TOLERANCE_C, _at_label(a, "C"), _at_label(b, "C")),
+        )
+        if _apart(x, y, tolerance)
+    }
+    parts = [
+        f"{name} {_at_label(a, name).value:.3g} -> {_at_label(b, name).value:.3g}"
+        for name in sorted(differs, reverse=True)
+    ]
+    return Answered(pair, ", ".join(parts) or "nothing of the lung", differs == truth)
+
+
+def _at_label(lung: Mechanics, name: str) -> Estimate:
+    """R at the flow of the labels, or C."""
+    match = lung.match
+    return Estimate(getattr(match, f"fitted_{name}"), "", getattr(match, f"ci95_{name}"))
+
+
+def _apart(x: Estimate, y: Estimate, tolerance: float) -> bool:
+    """Whether two values differ by more than their intervals and a calibration's tolerance."""
+    low, high = (x, y) if x.value < y.value else (y, x)
+    return low.ci95[1] * tolerance < high.ci95[0]
+
+
+def _added(pair: Pair, material: Material) -> Answered:
+    """An added leak or lag: is it named, and which strength does it have?"""
+    breaths = material.runs[pair.second]
+    given = breaths
+    if pair.strength:
+        given = (with_leak if pair.kind == "leak" else slower_sensor)(breaths, pair.strength)
+    lung = identify(given)[0]
+    wanted = _NAMES[pair.kind]
+    before = {term.name: term for term in material.mechanics(pair.first).terms}
+    terms = {term.name: term for term in lung.terms}
+    value, interval = None, None
+    if wanted in terms:
+        estimate = next(iter(terms[wanted].parameters.values()))
+        value, interval = estimate.value, estimate.ci95
+    rivals = _RIVALS[pair.kind]
+    grown = any(_has_grown(terms.get(name), before.get(name)) for name in rivals)
+    right = (wanted in terms) == (pair.strength > 0)
+    wrong = tuple(sorted(set(terms) - set(before) - {wanted, *rivals}))
+    words = ", ".join(terms) or "nothing"
+    in_class = wanted in terms or (pair.strength > 0 and grown)
+    return Answered(pair, words, right, wrong, value, interval, in_class)
+
+
+def _has_grown(now: Term | None, before: Term | None) -> bool:
+    """Whether a term is new, or its strength above the interval that it had."""
+    if now is None:
+        return False
+    if before is None:
+        return True
+    x, y = (next(iter(term.parameters.values())) for term in (now, before))
+    return x.ci95[0] > y.ci95[1]
+
+
+def _driven(pair: Pair, material: Material) -> Answered:
+    """An added leak or lag by two diagnoses from flow: what is named with it and not without."""
+    from ventbench.diagnosis.diagnose import diagnose
+
+    kind = pair.kind.removesuffix("_driven")
+    add = with_leak if kind == "leak" else slower_sensor
+    diagnosis = diagnose(
+        add(material.runs[pair.second], pair.strength), patient=False, drive="flow"
+    )
+    wanted = _NAMES[kind]
+    named = {mechanism.name: mechanism for mechanism in diagnosis.mechanisms}
+    before = material.driven(pair.first)
+    value, interval = None, None
+    if wanted in named:
+        estimate = next(iter(named[wanted].parameters.values()))
+        value, interval = estimate.value, estimate.ci95
+    wrong = tuple(sorted(set(named) - before - {wanted, *_RIVALS[kind]}))
+    in_class = wanted in named or bool(set(_RIVALS[kind]) & (set(named) - before))
+    words = ", ".join(named) or "nothing"
+    return Answered(pair, words, wanted in named, wrong, value, interval, in_class)
+
+
+def with_leak(breaths: Breaths, slope: float) -> Breaths:
+    """Add a linear leak between flow sensor and lung to a recording.
+
+    The measured pressure stays; the sensor of flow sees the leak's flow as well.
+
+    Args:
+        breaths: recorded ones with flow or volume.
+        slope: mL/s per cmH2O.
+    """
+    leak = slope * np.nan_to_num(breaths.pressure)
+    dt = np.diff(breaths.time, axis=1)
+    lost = np.concatenate(
+        [np.zeros((len(breaths), 1)), np.cumsum(0.5 * (leak[:, 1:] + leak[:, :-1]) * dt, axis=1)],
+        axis=1,
+    )
+    return replace(
+        breaths,
+        flow=None if breaths.flow is None else breaths.flow + leak,
+        volume=None if breaths.volume is None else breaths.volume + lost,
+        sha256=None,
+    )
+
+
+def _diagnosed(pair: Pair, material: Material) -> Answered:
+    """Diagnose a simulator fitted to the first recording against the second one."""
+    from ventbench.diagnosis.diagnose import diagnose
+
+    first, second = material.lungs[pair.first], material.lungs[pair.second]
+    label = _lung_of(first)
+    simulator = {label.id: fitted_plant(first)}
+    given = replace(
+        second, R=np.full(len(second), label.R), C=np.full(len(second), label.C), sha256=None
+    )
+    if pair.kind == "gain_pressure":
+        given = replace(given, u_in=given.u_in / pair.strength)
+    if pair.kind == "lag_pressure":
+        given = slower_sensor(given, pair.strength)
+    diagnosis = diagnose(given, simulator=simulator, patient=False)
+    names = tuple(mechanism.name for mechanism in diagnosis.mechanisms)
+    match = diagnosis.lungs[0]
+    own = simulator[label.id]
+    ratio_R = match.fitted_R / float(own.get("R"))
+    ratio_C = match.fitted_C / float(own.get("C"))
+    words = f"{', '.join(names) or 'no effect'}; R x {ratio_R:.2f}, C x {ratio_C:.2f}"
+    if pair.kind == "lag_pressure":
+        lag = next((m for m in diagnosis.mechanisms if m.name == "sensor_lag"), None)
+        estimate = lag.parameters.get("tau") if lag is not None else None
+        return Answered(
+            pair, words, names == ("sensor_lag",), tuple(n for n in names if n != "sensor_lag"),
+            estimate.value if estimate else None, estimate.ci95 if estimate else None,
+        )  # fmt: skip
+    if pair.kind == "gain_pressure":
+        return Answered(pair, words, not names, names)
+    truth = _lung_of(second)
+    right = not names and truth.id in match.settings
+    return Answered(pair, words, right, names)
+
+
+def fitted_plant(breaths: Breaths) -> Physics:
+    """The plant of one lung, fitted with what the PVP rigs are known to have."""
+    from ventbench.physics.catalogue import paths
+    from ventbench.system_id import fit, make_data
+
+    fitted = fit(make_data(breaths), list(_KNOWN))
+    names = [path for path in paths(_KNOWN) if path != "position"]
+    return fitted.problem.predictor.plant({name: float(fitted.column(name)[0]) for name in names})
+
+
+def _lung_of(breaths: Breaths) -> Lung:
+    return Lung(float(breaths.R[0]), float(breaths.C[0]))
+
+
+_TOOLS: dict[str, Callable[[Pair, Material], Answered]] = {
+    "label": _label, "lung": _lung, "drive": _lung, "leak": _added, "lag": _added,
+    "leak_driven": _driven, "lag_driven": _driven,
+    "lung_pressure": _diagnosed, "gain_pressure": _diagnosed, "lag_pressure": _diagnosed,
+}  # fmt: skip
+
+
+def run(
+    folder: Path, out: Path, *, sealed: bool = False, kinds: Iterable[str] = (),
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Answered]:  # fmt: skip
+    """Answer the pairs that have no answer yet, and write each answer at once.
+
+    Args:
+        folder: folder of the public recordings.
+        out: folder of the answers; the same call continues.
+        sealed: True to open the sealed pairs, once.
+        kinds: kinds of pairs; those with flow if empty.
+        progress: called with the numbers of answered and of all pairs.
+
+    Raises:
+        InputError: if a kind or a file is unknown, or the sealed pairs were opened by another
+            version.
+    """
+    chosen = tuple(kinds) or tuple(kind for kind in KINDS if kind not in SLOW)
+    if unknown := sorted(set(chosen) - set(KINDS)):
+        raise InputError(f"no kind {unknown[0]!r} of pairs; choose of {', '.join(KINDS)}")
+    material = load(folder)
+    split: Split = "sealed" if sealed else "development"
+    asked = [pair for pair in pairs(material) if pair.kind in chosen and pair.split == split]
+    if sealed:
+        _open(out / "opened.json", chosen)
+    answers = []
+    for done, pair in enumerate(asked):
+        progress(done, len(asked))
+        path = out / split / f"{hashlib.sha256(pair.name.encode()).hexdigest()[:16]}.json"
+        stored = _stored(path, pair)
+        if stored is None:
+            stored = answer(pair, material)
+            files.write_json(path, asdict(stored))
+        answers.append(stored)
+    progress(len(asked), len(asked))
+    return answers
+
+
+def _open(path: Path, kinds: tuple[str, ...]) -> None:
+    """Note when, and by which version, sealed pairs of each kind were opened for the first time."""
+    opened = json.loads(path.read_text("utf-8")) if path.is_file() else {}
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    for kind in kinds:
+        if opened.get(kind, {"version": ventbench.__version__})["version"] != ventbench.__version__:
+            raise InputError(
+                f"{path}: the sealed pairs of kind {kind} were opened by version "
+                f"{opened[kind]['version']}; they can be opened once"
+            )
+        opened.setdefault(kind, {"opened": now, "version": ventbench.__version__})
+    files.write_json(path, opened)
+
+
+def _stored(path: Path, pair: Pair) -> Answered | None:
+    try:
+        plain = json.loads(path.read_text("utf-8"))
+        value = Answered(
+            Pair(**plain.pop("pair")),
+            **plain
+            | {
+                "wrong_names": tuple(plain["wrong_names"]),
+                "interval": tuple(plain["interval"]) if plain["interval"] else None,
+            },
+        )
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+    return value if value.pair == pair else None
+
+
+def report(answers: list[Answered]) -> str:
+    """Markdown: rates of right answers by kind, and detection curves."""
+    lines = [
+        "| kind | question | right | 95 % | pairs |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    counted = [a for a in answers if a.pair.kind not in ("leak", "lag")]
+    for kind, question in KINDS.items():
+        own = [a.right for a in counted if a.pair.kind == kind]
+        if own:
+            low, high = wilson(sum(own), len(own))
+            lines.append(
+                f"| `{kind}` | {question} | {sum(own)} ({sum(own) / len(own):.0%}) | "
+                f"{low:.0%} to {high:.0%} | {len(own)} |"
+            )
+    for kind, unit, scale in (("leak", "mL/s per cmH2O", 1.0), ("lag", "ms", 1e3)):
+        own = [a for a in answers if a.pair.kind == kind]
+        if own:
+            lines += ["", *_curve(kind, unit, scale, own)]
+    return "\n".join(lines)
+
+
+def _curve(kind: str, unit: str, scale: float, answers: list[Answered]) -> list[str]:
+    """Detection curve: share of the recordings in which what was added is named."""
+    lines = [
+        f"| added {kind}, {unit} | named | 95 % | or a rival that acts alike | recordings | "
+        "estimate, median | a new wrong name |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for strength in sorted({a.pair.strength for a in answers}):
+        own = [a for a in answers if a.pair.strength == strength]
+        named = [a.value for a in own if a.value is not None]
+        low, high = wilson(len(named), len(own))
+        middle = f"{scale * float(np.median(named)):.3g}" if named else "-"
+        alike = sum(a.in_class for a in own)
+        wrong = sum(bool(a.wrong_names) for a in own)
+        lines.append(
+            f"| {scale * strength:g} | {len(named)} ({len(named) / len(own):.0%}) | "
+            f"{low:.0%} to {high:.0%} | {alike} ({alike / len(own):.0%}) | {len(own)} | {middle} | "
+            f"{wrong} |"
+        )
+    return lines
+
+
+def as_dict(answers: list[Answered]) -> dict[str, Any]:
+    """JSON values."""
+    return {
+        "answers": [asdict(entry) for entry in answers],
+        "report": report(answers),
+        "ventbench": ventbench.__version__,
+    }

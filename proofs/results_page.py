@@ -1,0 +1,209 @@
+"""Sections of the page of results, written by the commands that measure.
+
+A section stands between two marks in a Markdown file, ``<!-- NAME -->`` and ``<!-- end NAME -->``;
+what is written replaces what stood there, so that no figure is copied by hand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from proofs import code_version
+from proofs.challenge.figures import full_answer
+from ventbench import files
+from ventbench.errors import InputError
+
+if TYPE_CHECKING:
+    from proofs.challenge.reveal import ChallengeResult
+    from proofs.real.rig import Proof
+
+#: Answers of a row of the table of truths that are told one by one.
+_LONGEST = 6
+
+
+def write_section(path: Path, name: str, text: str) -> None:
+    """Replace a section of a Markdown file, or write a file of it if there is none.
+
+    Args:
+        path: Markdown file.
+        name: name of the section.
+        text: its content.
+
+    Raises:
+        InputError: if the file has no such section.
+        OSError: if it cannot be read or written.
+    """
+    first, last = f"<!-- {name} -->", f"<!-- end {name} -->"
+    section = f"{first}\n\n{text.strip()}\n\n{last}"
+    if not path.exists():
+        files.write_text(path, section + "\n")
+        return
+    before = path.read_text("utf-8")
+    start, end = before.find(first), before.find(last)
+    if start < 0 or end < start:
+        raise InputError(
+            f"{path} has no section between {first} and {last}; add the two lines where it belongs"
+        )
+    files.write_text(path, before[:start] + section + before[end + len(last) :])
+
+
+def challenge_section(result: ChallengeResult, seeds: Sequence[str]) -> str:
+    """Figures of a challenge as Markdown, with the commands and what was committed.
+
+    Args:
+        result: opened challenge, of one or more draws.
+        seeds: seed of each draw.
+    """
+    source = result.generator
+    folder = "runs/strangers" if source == "stranger" else "runs/challenge"
+    versions = ", ".join(result.versions) or "unknown"
+    draws = [
+        (seed, f"{folder}{k}" if k > 1 else folder, draw)
+        for k, (seed, draw) in enumerate(zip(seeds, result.draws, strict=True), start=1)
+    ]
+    lines = ["```sh"]
+    for seed, where, draw in draws:
+        lines += [
+            f"python -m proofs challenge make --generator {source} --seed={seed} "
+            f"--cases {draw.total} --out {where}",
+            f"python -m proofs challenge answer {where} --jobs 1",
+        ]
+    folders = " ".join(where for _, where, _ in draws)
+    given = " ".join(f"--seed={seed}" for seed, _, _ in draws)
+    lines += [
+        f"python -m proofs challenge reveal {folders} {given}",
+        "```",
+        "",
+        f"Generator `{source}`, code {versions}:",
+        "",
+        "| seed | commitment | answered |",
+        "|---|---|---|",
+        *(
+            f"| `{seed}` | `{draw.commitment}` | {draw.answered} of {draw.total} |"
+            for seed, _, draw in draws
+        ),
+        "",
+        "| figure | measured | 95 % | cases | goal | met |",
+        "|---|---|---|---|---|---|",
+    ]
+    for figure in result.figures:
+        value, span = "–", ""
+        if figure.value is not None and figure.ci95 is not None:
+            value = f"{figure.value:.0%}"
+            span = f"{figure.ci95[0]:.0%} to {figure.ci95[1]:.0%}"
+        elif figure.value is not None:
+            value = f"{figure.value:.3g}"
+        met = {True: "yes", False: "no", None: ""}[figure.met]
+        lines.append(
+            f"| {figure.what} | {value} | {span} | {figure.count} | {figure.goal} | {met} |"
+        )
+    lines += ["", "Truth and answers:", "", "| truth | answers |", "|---|---|"]
+    for truth, counts in result.confusion.items():
+        shown = [f"{answer} {count}" for answer, count in list(counts.items())[:_LONGEST]]
+        if (rest := sum(list(counts.values())[_LONGEST:])) > 0:
+            shown.append(f"others {rest}")
+        lines.append(f"| {truth} | {', '.join(shown)} |")
+    return "\n".join([*lines, *_wrong_answers(result)])
+
+
+def _wrong_answers(result: ChallengeResult) -> list[str]:
+    """Every answer that is not right, by kind of the question."""
+    wrong = sorted(
+        (case for case in result.cases if not case.right),
+        key=lambda case: (case.kind, case.effects, case.name),
+    )
+    if not wrong:
+        return []
+    lines = [
+        "",
+        f"Answers that are not right ({len(wrong)} of {len(result.cases)}):",
+        "",
+        "| kind | lung | truth | answer | error given, refitted, corrected |",
+        "|---|---|---|---|---|",
+    ]
+    for case in wrong:
+        truth = " + ".join(
+            f"{name} ({strength}{'' if name in case.seen else ', below the detection limit'})"
+            for name, strength in zip(case.effects, case.strengths, strict=True)
+        )
+        errors = ", ".join(f"{x:.2f}" for x in (case.before, case.refit, case.after))
+        lines.append(
+            f"| {case.kind} | {case.lung} | {truth or 'nothing'} | {full_answer(case)} | {errors} |"
+        )
+    return lines
+
+
+def proof_section(proof: Proof) -> str:
+    """Figures of the finished parts of the proof on the real rig as Markdown."""
+    versions = sorted({part["code"] for part in proof.parts.values() if part.get("code")})
+    lines = [
+        "```sh",
+        "python -m proofs rig --recordings DIR --out runs/proof",
+        "```",
+        "",
+        f"Code {', '.join(versions) or 'unknown'}, recording `{proof.sha256[:16]}`; mean absolute "
+        "error of held-out inspirations, cmH2O:",
+        "",
+        "| part | breaths held out | as given | refitted | corrected | cut | named |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, part in proof.parts.items():
+        errors = " | ".join(_error(part["mae"][stage]) for stage in ("before", "refit", "after"))
+        cut = "–" if part["cut_percent"] is None else f"{part['cut_percent']:.0f} %"
+        named = ", ".join(f"`{m['name']}`" for m in part["mechanisms"]) or "nothing"
+        if part["slot"]:
+            named += f"; place: {part['slot']['name']}"
+        lines.append(f"| `{name}` | {part['held_out']} | {errors} | {cut} | {named} |")
+    if "rc" in proof.parts:
+        lines += ["", *_by_lung(proof.parts["rc"])]
+    lines += ["", "| part | claim | outcome | met |", "|---|---|---|---|"]
+    lines += [
+        f"| `{claim.part}` | {claim.what} | {claim.value} | {'yes' if claim.met else 'no'} |"
+        for claim in proof.claims
+    ]
+    lines += [f"| `{name}` | – | {reason} | |" for name, reason in proof.impossible.items()]
+    return "\n".join(lines)
+
+
+def pairs_section(report: str, *, half: str) -> str:
+    """Rates and detection curves of real pairs as Markdown.
+
+    Args:
+        report: tables of :func:`~proofs.real.pairs.report`.
+        half: ``"development"`` or ``"sealed"``.
+    """
+    option = " --sealed" if half == "sealed" else ""
+    return (
+        f"```sh\npython -m proofs pairs --recordings DIR --out runs/pairs{option}\n```\n\n"
+        f"The {half} half, code {code_version()}.\n\n{report}"
+    )
+
+
+def _by_lung(part: Mapping[str, Any]) -> list[str]:
+    """Errors and strengths of a part lung by lung."""
+    lines = [
+        "Lung by lung (part `rc`):",
+        "",
+        "| | as given | refitted | corrected |",
+        "|---|---|---|---|",
+    ]
+    for group, stages in part.get("groups", {}).items():
+        if group.startswith("lung "):
+            errors = (_error(stages[stage]["mae"]) for stage in ("before", "refit", "after"))
+            lines.append(f"| {group.removeprefix('lung ')} | {' | '.join(errors)} |")
+    lines += ["", "| named in part `rc` | value | 95 % interval |", "|---|---|---|"]
+    for mechanism in part["mechanisms"]:
+        for name, estimate in mechanism["parameters"].items():
+            low, high = estimate["ci95"]
+            unit = "" if estimate["unit"] == "1" else f" {estimate['unit']}"
+            span = "–" if low is None or high is None else f"{low:.3g} to {high:.3g}"
+            lines.append(
+                f"| `{mechanism['name']}` {name} | {estimate['value']:.3g}{unit} | {span} |"
+            )
+    return lines
+
+
+def _error(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"

@@ -1,0 +1,225 @@
+"""Ablation of the residual controller: its score when one part is removed or changed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from proofs.studies.networks import Progress, Tell, finish
+from ventbench import files, precision, protocol, rollouts
+from ventbench.board.replay import spread
+from ventbench.interfaces import Controller
+from ventbench.lungs import LUNG_IDS
+from ventbench.metrics.score import passes_safety_gate, run_error
+from ventbench.plants import frozen
+from ventbench.plants.stacking import take
+from ventbench.resume import WorkFolder
+from ventbench.submissions.scoring import protocol_cells
+from ventbench.training import pid_grid
+from ventbench.training.residual import ResidualConfig, fit
+
+#: Published draws to score on.
+DRAWS = 20
+
+#: Name of the variant that all others are compared with.
+BASE = "base"
+
+#: Figures by which trainings are compared.
+FIGURES = ("nominal", "draws", "exploitation")
+
+Gains = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to train.
+
+    Attributes:
+        meaning: the variant in words.
+        config: settings of the training.
+        direct: whether the network commands alone, without a PID to correct.
+    """
+
+    meaning: str
+    config: ResidualConfig
+    direct: bool = False
+
+
+def variants(config: ResidualConfig) -> dict[str, Variant]:
+    """Variants of the settings by name; each differs from the base in one thing."""
+
+    def changed(meaning: str, **fields: Any) -> Variant:
+        return Variant(meaning, replace(config, **fields))
+
+    wide = max(config.widths)
+    return {
+        BASE: Variant("as the submission is trained", config),
+        "direct": Variant("no PID, the network alone computes the command", config, direct=True),
+        "one simulator": changed("only the official simulator of each lung", members=1),
+        "no deviations": changed("training without noise, delay or other R and C", spread=0.0),
+        "no agreement": changed("no penalty where the simulators disagree", agreement=0.0),
+        "no breath before": changed("no features of the previous breath", ahead=0),
+        "no errors before": changed("no earlier errors of this breath", pressures=0),
+        "no commands before": changed("no earlier commands of this breath", commands=0),
+        "twice as far back": changed(
+            "twice as many errors and commands",
+            pressures=2 * config.pressures, commands=2 * config.commands,
+        ),
+        "narrow": changed("a quarter of the width", widths=(wide // 4,) * len(config.widths)),
+        "wide": changed("twice the width", widths=(2 * wide,) * len(config.widths)),
+        "shallow": changed("one hidden layer", widths=(wide,)),
+        "deep": changed("four hidden layers", widths=(wide,) * 4),
+    }  # fmt: skip
+
+
+def compare(
+    simulators: frozen.Frozen,
+    out: Path,
+    seeds: Sequence[int],
+    *,
+    config: ResidualConfig,
+    only: Sequence[str] | None = None,
+    draws: int = DRAWS,
+    gains: Gains | None = None,
+    workers: int = 0,
+    scheduler: str | None = None,
+    progress: Progress = lambda *_: None,
+) -> pd.DataFrame:
+    """Train one network for all six lungs by each variant with each seed.
+
+    Finished trainings are read from ``out``, where ``runs.csv`` and ``summary.csv`` are written.
+
+    Args:
+        simulators: simulators to train through and to score on.
+        out: folder.
+        seeds: one for each training of a variant.
+        config: settings of the base.
+        only: names of variants; all if not given. The base is always included.
+        draws: published draws to score on.
+        gains: P, I, D of the PID; the best single set of the paper's grid if not given.
+        workers: processes, each with a training at a time; 0 for this one alone.
+        scheduler: address of a Dask scheduler instead, whose workers see the same files.
+        progress: see :data:`Progress`.
+
+    Returns:
+        A row for each training: ``variant``, ``seed`` and :data:`FIGURES`, cmH2O.
+
+    Raises:
+        InputError: if ``out`` holds other trainings.
+        FloatingPointError: if a training diverges.
+    """
+    chosen = {k: v for k, v in variants(config).items() if only is None or k in (BASE, *only)}
+    gains = gains or best_single(simulators)
+    about = {
+        "config": asdict(config), "gains": list(gains), "draws": draws,
+        "simulators": simulators.about(),
+    }  # fmt: skip
+    work = WorkFolder((out / "rows").resolve(), about)
+    trainings = {
+        f"{name.replace(' ', '-')}-{seed}": (name, seed) for name in chosen for seed in seeds
+    }
+    jobs = {}
+    for part, (name, seed) in trainings.items():
+        own = (0.0, 0.0, 0.0) if chosen[name].direct else gains
+        checkpoint = work.checkpoint(part)
+        jobs[part] = (simulators, own, chosen[name].config, seed, draws, checkpoint)
+    finish(
+        work, _trained, jobs, workers=workers, scheduler=scheduler,
+        progress=lambda part, share: progress(trainings[part][0], share),
+    )  # fmt: skip
+    runs = pd.DataFrame(
+        {"variant": name, "seed": seed} | work.read(part)
+        for part, (name, seed) in trainings.items()
+    )
+    files.write_text(out / "runs.csv", runs.round(5).to_csv(index=False))
+    files.write_text(out / "summary.csv", summary(runs).round(4).to_csv(index=False))
+    return runs
+
+
+def best_single(simulators: frozen.Frozen) -> Gains:
+    """P, I, D of the paper's grid with the lowest mean error over the six lungs."""
+    grid = pid_grid.paper_gains()
+    error = pid_grid.errors(simulators.plants, grid).mean(axis=(0, 2))
+    P, I, D = (float(gain) for gain in grid[int(np.argmin(error))])  # noqa: E741
+    return P, I, D
+
+
+def summary(runs: pd.DataFrame) -> pd.DataFrame:
+    """A row a variant: mean over seeds, and the range of its difference to the base's same seed."""
+    base: Any = runs[runs["variant"] == BASE].set_index("seed")
+    rows = []
+    group: Any
+    for name, group in runs.groupby("variant", sort=False):
+        row: dict[str, Any] = {"variant": name, "seeds": len(group)}
+        apart = group.set_index("seed")[list(FIGURES)] - base[list(FIGURES)]
+        for figure in FIGURES:
+            row[figure] = group[figure].mean()
+            row[f"{figure}_change_low"] = apart[figure].min()
+            row[f"{figure}_change_high"] = apart[figure].max()
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _trained(
+    simulators: frozen.Frozen, gains: Gains, config: ResidualConfig, seed: int, draws: int,
+    checkpoint: Path, tell: Tell | None,
+) -> dict[str, float]:  # fmt: skip
+    def told(done: int, total: int, _: float) -> None:
+        if tell is not None:
+            tell(done / total)
+
+    with precision.float32():
+        controller = fit(
+            jax.tree.map(np.asarray, simulators.ensemble), gains, config=config, seed=seed,
+            checkpoint=checkpoint, progress=told, keep=True,
+        )  # fmt: skip
+    error, exploitation, _ = score_controllers(
+        simulators, [controller] * len(LUNG_IDS), protocol.PIPS, draws
+    )
+    checkpoint.unlink()
+    return {
+        "nominal": float(error[:, 0].mean()),
+        "draws": float(error[:, 1:].mean()) if draws else float("nan"),
+        "exploitation": exploitation,
+    }
+
+
+def score_controllers(
+    simulators: frozen.Frozen,
+    controllers: Sequence[Controller],
+    pips: Sequence[float] = protocol.PIPS,
+    draws: int = DRAWS,
+) -> tuple[NDArray[np.float64], float, bool]:
+    """Score pure controllers.
+
+    Args:
+        simulators: six lungs.
+        controllers: one for each lung.
+        pips: cmH2O, length P.
+        draws: published draws to score on as well.
+
+    Returns:
+        Errors, cmH2O, ``(6, 1 + draws, P)``, the nominal ones first; the exploitation index,
+        cmH2O; whether all runs were safe.
+    """
+    errors, requested, safe = [], [], True
+    with precision.float64():
+        cells = jax.tree.map(jnp.asarray, protocol_cells(tuple(pips), draws))
+        pip, dt = np.asarray(cells.pip)[..., None], np.asarray(cells.dt)[..., None]
+        for index, controller in enumerate(controllers):
+            plant = jax.tree.map(jnp.asarray, take(simulators.plants, index))
+            wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), controller)
+            run, _ = rollouts.closed_loop(plant, wide, cells)
+            errors.append(run_error(run.pressure, pip[..., None]))
+            requested.append(np.asarray(run.requested))
+            safe &= bool(np.all(passes_safety_gate(run.pressure, pip, dt)))
+    nominal = np.stack(requested)[None][:, :, 0]
+    return np.stack(errors), float(spread(simulators, tuple(pips), nominal).mean()), safe

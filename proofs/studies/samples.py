@@ -1,0 +1,293 @@
+"""Sample efficiency: every method on one lung with several seeds, as table and picture."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from ventbench import files
+from ventbench.errors import require
+from ventbench.lungs import LUNG_IDS, Lung
+from ventbench.metrics import bootstrap
+from ventbench.palette import RUNS
+from ventbench.plants import frozen
+from ventbench.training import pid_grid
+from ventbench.training.rl.parallel import TrainedPolicies, train
+from ventbench.training.rl.policy_gradient import PolicyGradient
+from ventbench.training.rl.train import METHODS, Method, method_for
+
+Floats = NDArray[np.float64]
+
+#: Share of the values that the interquartile mean cuts off at each end.
+CUT = 0.25
+
+#: How close to its final score counts as having reached it.
+CLOSE = 0.02
+
+
+def interquartile_mean(values: ArrayLike) -> Floats:
+    """Mean of what is left after cutting a quarter at each end; over the first axis.
+
+    Args:
+        values: shape ``(n, ...)``; ``floor(n / 4)`` values are cut at each end.
+    """
+    values = np.sort(np.asarray(values, float), axis=0)
+    cut = int(CUT * len(values))
+    return np.mean(values[cut : len(values) - cut], axis=0)
+
+
+def band(values: ArrayLike) -> tuple[Floats, Floats]:
+    """95 % bootstrap interval of the interquartile mean, the seeds drawn with replacement.
+
+    Args:
+        values: shape ``(seeds, points)``.
+
+    Returns:
+        Lower and upper limits, shape ``(points,)``.
+    """
+    values = np.asarray(values, float)
+    bits = np.random.PCG64(bootstrap.SEED)
+    drawn = bits.random_raw((len(values), bootstrap.RESAMPLES)) >> np.uint64(32)
+    index = ((drawn * np.uint64(len(values))) >> np.uint64(32)).astype(np.intp)
+    means = np.stack([interquartile_mean(column[index]) for column in values.T], axis=-1)
+    low, high = np.quantile(means, (0.025, 0.975), axis=0)
+    return low, high
+
+
+@dataclass(frozen=True)
+class LearningCurve:
+    """One method: score against experience.
+
+    Attributes:
+        method: name.
+        episodes: breaths that one training has seen, ``(points,)``.
+        seconds: computing time of all seeds together, without compiling, ``(points,)``.
+        compile_seconds: time of compiling, s.
+        scores: nominal, cmH2O, ``(seeds, points)``.
+    """
+
+    method: str
+    episodes: NDArray[np.int64]
+    seconds: Floats
+    compile_seconds: float
+    scores: Floats
+
+    @property
+    def middle(self) -> Floats:
+        """Interquartile mean over the seeds, ``(points,)``."""
+        return interquartile_mean(self.scores)
+
+    def first_below(self, score: float) -> int | None:
+        """Index of the first point whose interquartile mean is at or below a score."""
+        points = np.flatnonzero(self.middle <= score)
+        return int(points[0]) if points.size else None
+
+
+@dataclass(frozen=True)
+class SampleStudy:
+    """Learning curves of all methods on one lung, and the scores of PIDs there.
+
+    Attributes:
+        lung: id of the lung.
+        curves: learning curves of the methods.
+        start: nominal score of the PID that is corrected, cmH2O.
+        best_pid: nominal score of the best PID of the paper's grid on this lung, cmH2O.
+    """
+
+    lung: str
+    curves: tuple[LearningCurve, ...]
+    start: float
+    best_pid: float
+
+    def points(self) -> pd.DataFrame:
+        """One row for each point of each curve."""
+        parts = []
+        for curve in self.curves:
+            low, high = band(curve.scores)
+            columns = {
+                "method": curve.method,
+                "episodes": curve.episodes,
+                "seconds": np.round(curve.seconds, 3),
+                "iqm": curve.middle,
+                "low95": low,
+                "high95": high,
+            }
+            columns |= {f"seed{i}": row for i, row in enumerate(curve.scores)}
+            parts.append(pd.DataFrame(columns))
+        return pd.concat(parts, ignore_index=True).round(5)
+
+    def summary(self) -> pd.DataFrame:
+        """One row for each method; ``episodes_...`` is blank where it is not reached."""
+        return pd.DataFrame([self._row(curve) for curve in self.curves])
+
+    def _row(self, curve: LearningCurve) -> dict[str, object]:
+        low, high = band(curve.scores[:, -1:])
+        final = float(curve.middle[-1])
+        close = curve.first_below((1.0 + CLOSE) * final)
+        better = curve.first_below(self.best_pid)
+        at_100 = int(np.flatnonzero(curve.episodes <= 100)[-1])
+
+        def at(array: NDArray[np.generic], index: int | None) -> object:
+            return None if index is None else array[index].item()
+
+        return {
+            "method": curve.method,
+            "final": round(final, 3),
+            "low95": round(float(low[0]), 3),
+            "high95": round(float(high[0]), 3),
+            "episodes": int(curve.episodes[-1]),
+            "at_100_episodes": round(float(curve.middle[at_100]), 3),
+            "episodes_to_best_pid": at(curve.episodes, better),
+            "episodes_to_2_percent": at(curve.episodes, close),
+            "seconds_to_2_percent": at(np.round(curve.seconds, 2), close),
+            "seconds": round(float(curve.seconds[-1]), 1),
+            "compile_seconds": round(curve.compile_seconds, 1),
+        }
+
+
+#: Iterations between two points of a curve, by method.
+CHUNKS = {"policy-gradient": 1, "policy-gradient-short": 1, "ppo": 2, "dqn": 8}
+
+#: Called with the method, the share of it that is done, the lowest mean error so far, cmH2O.
+Progress = Callable[[str, float, float], None]
+
+
+def study_methods(share: float = 1.0) -> dict[str, Method]:
+    """Settings of the study; ``share`` below 1 shortens all trainings."""
+    methods = {name: method_for(name, 1) for name in METHODS}
+    # The same with a schedule of 96 breaths: a higher learning rate that falls to zero in them.
+    long = methods["policy-gradient"]
+    assert isinstance(long, PolicyGradient)
+    methods = {
+        "policy-gradient-short": replace(long, iterations=96 // long.breaths, learning_rate=1e-2),
+        **methods,
+    }
+    return {
+        name: replace(recipe, iterations=max(int(share * recipe.iterations), 1))
+        for name, recipe in methods.items()
+    }
+
+
+def sample_efficiency(
+    lung: Lung,
+    seeds: Sequence[int],
+    out: Path,
+    *,
+    share: float = 1.0,
+    simulators: frozen.Frozen | None = None,
+    progress: Progress = lambda *_: None,
+) -> SampleStudy:
+    """Train by every method with every seed; finished trainings are read from ``out``.
+
+    All methods correct the same PID with the same features, see cells drawn from the same
+    distributions and are judged by the score without noise.
+
+    Args:
+        lung: one of the six scored lungs.
+        seeds: one for each training of a method.
+        out: folder of the checkpoints, ``samples.csv`` and ``summary.csv``.
+        share: share of the full length of each training.
+        simulators: what is ventilated; the frozen simulators if not given.
+        progress: see :data:`Progress`.
+
+    Raises:
+        InputError: if ``out`` holds another study.
+    """
+    simulators = simulators or frozen.load()
+    at = LUNG_IDS.index(lung.id)
+    single = jax.tree.map(lambda leaf: leaf[at : at + 1], simulators.plants)
+    plants = jax.tree.map(lambda leaf: np.repeat(leaf[None], len(seeds), axis=0), single)
+    curves = []
+    for name, recipe in study_methods(share).items():
+        trained = train(
+            recipe,
+            plants,
+            seeds,
+            chunk=min(CHUNKS[name], recipe.iterations),
+            about=f"study {lung.id} {simulators.manifest_sha256}",
+            file=out / f"{name}.npz",
+            progress=lambda done, error, name=name: progress(name, done, float(error.mean())),
+        )
+        curves.append(_curve(name, trained))
+    grid = pid_grid.errors(single, pid_grid.paper_gains())[0].mean(axis=-1)
+    study = SampleStudy(lung.id, tuple(curves), float(curves[0].scores[0, 0]), float(grid.min()))
+    files.write_text(out / "samples.csv", study.points().to_csv(index=False))
+    files.write_text(out / "summary.csv", study.summary().to_csv(index=False))
+    return study
+
+
+def _curve(name: str, trained: TrainedPolicies) -> LearningCurve:
+    scores = trained.curves.astype(float)
+    return LearningCurve(name, trained.episodes, trained.seconds, trained.compile_seconds, scores)
+
+
+#: What the curves are called in the picture.
+CURVE_LABELS = {
+    "policy-gradient": "policy gradient through the simulator",
+    "policy-gradient-short": "the same, learning rate for 96 breaths",
+    "ppo": "PPO",
+    "dqn": "DQN",
+}
+
+_CURVE_COLORS = dict(zip(CURVE_LABELS, (RUNS[0], RUNS[3], RUNS[1], RUNS[2]), strict=True))
+
+#: Dots per inch of the picture.
+_DPI = 110
+
+
+def learning_curves_png(study: SampleStudy) -> bytes:
+    """Draw score against breaths of experience and against time.
+
+    Lines are interquartile means; bands are their 95 % intervals.
+
+    Raises:
+        InputError: if matplotlib is missing.
+    """
+    require("matplotlib")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11.0, 4.6), dpi=_DPI, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, sharey=True)
+    _curves(left, study, lambda curve: curve.episodes)
+    _curves(right, study, lambda curve: curve.seconds)
+    left.set_xlabel("breaths of experience of one training")
+    right.set_xlabel("seconds, all seeds together, without compiling")
+    left.set_ylabel("score without noise, cmH2O")
+    lines, names = left.get_legend_handles_labels()
+    order = [names.index(name) for name in CURVE_LABELS.values() if name in names]
+    shown = [lines[i] for i in order], [names[i] for i in order]
+    right.legend(*shown, loc="upper right", frameon=False, fontsize=9)
+    seeds = len(study.curves[0].scores)
+    figure.suptitle(f"{study.lung}: interquartile mean and 95 % band of {seeds} seeds", fontsize=11)
+    canvas.draw()
+    output = io.BytesIO()
+    figure.savefig(output, format="png")
+    return output.getvalue()
+
+
+def _curves(axes: Any, study: SampleStudy, across: Callable[[LearningCurve], Any]) -> None:
+    for curve in study.curves:
+        x, color = across(curve)[1:], _CURVE_COLORS[curve.method]
+        low, high = band(curve.scores[:, 1:])
+        axes.fill_between(x, low, high, color=color, alpha=0.2, linewidth=0)
+        axes.plot(x, curve.middle[1:], color=color, linewidth=1.6, label=CURVE_LABELS[curve.method])
+    axes.axhline(study.start, color="#5b636d", linestyle=":", linewidth=1.2)
+    axes.axhline(study.best_pid, color="#5b636d", linestyle="--", linewidth=1.2)
+    end = axes.get_xlim()[1]
+    axes.annotate("the PID that is corrected", (end, study.start), va="bottom", ha="right", size=8)
+    axes.annotate("best PID for this lung", (end, study.best_pid), va="bottom", ha="right", size=8)
+    axes.set_xscale("log")
+    lowest = min(float(np.min(curve.scores)) for curve in study.curves)
+    axes.set_ylim(0.95 * lowest, 1.25 * study.start)  # room for the legend
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(color="#d9dde2", linewidth=0.6)

@@ -1,0 +1,227 @@
+"""The paper's page: its figures, its verdicts, its forms."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import os
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from proofs.__main__ import app
+from proofs.paper import controller_sections, paper, published, simulator_sections
+from proofs.paper.report import Chart, HeatMap, Line, Reproduction, Section, Table
+from ventbench import protocol
+from ventbench.errors import InputError
+from ventbench.lungs import LUNG_IDS
+from ventbench.plants import frozen
+from ventbench.plants.learned import Architecture
+from ventbench.training.learned import LearnedConfig
+from ventbench.training.pid_grid import PIDGrid
+
+GAINS = np.array([(2.0, 0.0, 0.0), *published.BEST_PID.values(), (0.0, 4.0, 0.0), (5.0, 10.0, 1.0)])
+
+
+@pytest.fixture(scope="module")
+def stored():
+    return paper.load_stored()
+
+
+def grid_of(error):
+    """A grid whose PID k has the error ``error[k]`` on every lung and PIP."""
+    values = np.broadcast_to(np.asarray(error, np.float32)[:, None], (len(error), 6))
+    return PIDGrid(LUNG_IDS, protocol.PIPS, GAINS, np.stack([values] * 6))
+
+
+def test_stored_errors_are_those_of_the_official_simulators(stored):
+    """By clock, the frozen simulators state the same held-out errors in their manifest."""
+    official = frozen.load(version=2)
+    assert stored["horizon"]["about"]["simulators"] == official.manifest_sha256
+    for name, about in official.lungs().items():
+        here = stored["horizon"]["lungs"][name]
+        assert here["breaths"] == about["held_out_breaths"]
+        assert here["hybrid"]["mae"] == pytest.approx(about["held_out_mae"], abs=2e-3)
+        assert here["hybrid"]["median_mae"] == pytest.approx(about["held_out_median_mae"], abs=2e-3)
+
+
+def test_distances_are_sums_over_the_steps_of_an_inspiration(stored):
+    for about in stored["horizon"]["lungs"].values():
+        for kind in simulator_sections.KINDS:
+            longest = len(about[kind]["by_step"])
+            assert longest - 4 < about[kind]["distance"] / about[kind]["mae"] <= longest
+
+
+def test_errors_by_horizon_say_whether_they_grow(stored):
+    section = simulator_sections.by_horizon(stored["horizon"])
+    assert section.verdict in ("agrees", "in part")
+    assert [line.name for line in section.charts[0].lines] == list(
+        simulator_sections.KINDS.values()
+    )
+    grown = copy.deepcopy(stored["horizon"])
+    for about in grown["lungs"].values():
+        about["hybrid"]["by_step"] = [0.01 * 1.3**k for k in range(30)]
+    assert simulator_sections.by_horizon(grown).verdict == "differs"
+
+
+def test_networks_are_set_beside_the_papers(stored):
+    section = simulator_sections.architectures(stored["networks"])
+    rows = {row[0]: row[1:] for row in section.tables[0].rows}
+    assert rows["width 150"][0] == 0.643
+    wide, usual = rows["width 150"][2], rows["width 48"][2]
+    assert isinstance(wide, float)
+    assert isinstance(usual, float)
+    assert wide < usual
+    assert rows["N_B 5"][1] is None
+
+
+def test_the_grid_ranks_the_papers_gains():
+    error = np.full(len(GAINS), 3.0)
+    error[0] = 1.0
+    section = controller_sections.best_gains(grid_of(error))
+    row = section.tables[0].rows[0]
+    assert row[:3] == ("R5C10", "10, 0.2", 3.0)
+    assert row[3:5] == ("2, 0", 1.0)
+    assert section.verdict == "in part"
+    error[1:] = 1.02
+    assert controller_sections.best_gains(grid_of(error)).verdict == "agrees"
+
+
+def test_a_grid_without_the_papers_gains_is_refused():
+    grid = PIDGrid(LUNG_IDS, protocol.PIPS, GAINS[:1], np.ones((6, 1, 6), np.float32))
+    with pytest.raises(InputError, match=r"does not contain P, I, D = 10, 0\.2, 0"):
+        controller_sections.best_gains(grid)
+
+
+@pytest.mark.parametrize(
+    ("residual", "verdict"), [(0.9, "agrees"), (1.1, "differs")], ids=["better", "worse"]
+)
+def test_the_residual_network_is_judged_by_lung(residual, verdict):
+    grid = grid_of(np.linspace(1.0, 2.0, len(GAINS)))
+    section = controller_sections.performance(grid, np.full((6, 6), residual))
+    assert section.verdict == verdict
+    assert section.tables[0].rows[0][3] == pytest.approx(100.0 * (residual - 1.0), abs=1e-3)
+
+
+def test_one_network_for_all_must_win_by_more():
+    grid = grid_of(np.linspace(1.0, 2.0, len(GAINS)))
+    own, shared = np.full((6, 6), 0.9), np.full((6, 6), 0.8)
+    assert controller_sections.robustness(grid, own, shared).verdict == "agrees"
+    assert controller_sections.robustness(grid, shared, own).verdict == "in part"
+
+
+def test_reinforcement_learning_is_compared_by_the_mean():
+    errors = {"residual": np.ones((6, 6)), "PPO": np.ones((6, 6)), "DQN": 2 * np.ones((6, 6))}
+    assert controller_sections.reinforcement(errors).verdict == "agrees"
+    assert (
+        controller_sections.reinforcement(errors | {"PPO": 0.5 * np.ones((6, 6))}).verdict
+        == "differs"
+    )
+
+
+def test_studies_have_their_claims(stored):
+    samples = controller_sections.sample_efficiency(stored["samples"])
+    assert samples.verdict == "in part"
+    assert "ppo" in {row[0] for row in samples.tables[0].rows}
+    assert controller_sections.regularisation(stored["controllers"]).verdict == "differs"
+    unfinished = copy.deepcopy(stored["samples"])
+    unfinished["methods"][-1]["episodes_to_best_pid"] = None
+    assert "Not all methods" in controller_sections.sample_efficiency(unfinished).finding
+
+
+def small_page():
+    table = Table("numbers", ("name", "value"), (("a", 1.23456), ("b", None)), 2)
+    chart = Chart("lines", "s", "cmH2O", (Line("one", (1.0, 10.0), (2.0, math.nan)),), True)
+    field = HeatMap("map", "I", "P", (0.0, 1.0), (0.0, 1.0), ((3.0, 2.0), (math.nan, 1.0)))
+    section = Section(
+        "id", "A title", "table 9", "A <claim>.", "in part", "It is so.", "computed",
+        (table,), (chart,), (field,),
+    )  # fmt: skip
+    return Reproduction({"protocol": 2}, (section,), (("figure 1", "a drawing", "a drawing"),))
+
+
+def test_a_page_is_text_markdown_and_json():
+    page = small_page()
+    assert "table 9: A <claim>. [in part] It is so." in str(page)
+    markdown = page.to_markdown()
+    assert "| a | 1.23 |" in markdown
+    assert "| b | - |" in markdown
+    assert "| figure 1 | a drawing | a drawing |" in markdown
+    text = json.dumps(page.to_json(), allow_nan=False)
+    assert json.loads(text)["sections"][0]["charts"][0]["lines"][0]["y"] == [2.0, None]
+
+
+def test_the_html_page_is_whole_and_escapes():
+    pytest.importorskip("jinja2", reason="the extra ventbench[view] is missing")
+    from proofs.paper.page import html
+
+    text = html(small_page())
+    assert "A &lt;claim&gt;." in text
+    assert text.count("<rect") == 3
+    assert "<script" not in text
+    assert text == html(small_page())
+
+
+def test_an_unknown_protocol_is_refused():
+    with pytest.raises(InputError, match="protocol 3"):
+        paper.reproduce_paper(protocol_version=3)
+
+
+def test_stored_results_must_be_readable(tmp_path):
+    (tmp_path / "x.json").write_text("{")
+    with pytest.raises(InputError, match="cannot be read"):
+        paper.load_stored(tmp_path / "x.json")
+
+
+@pytest.mark.slow
+def test_the_whole_page_agrees_with_scores_and_manifest(tmp_path, monkeypatch):
+    """The figures of the command are those of a score and of the simulators' manifest."""
+    from ventbench.submissions.scoring import score
+
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(
+        app, ["paper", "--json", "paper.json", "--html", "paper.html",
+              "--markdown", "paper.md"],
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    sections = {s["id"]: s for s in json.loads((tmp_path / "paper.json").read_text())["sections"]}
+    rows = {row[0]: row for row in sections["reinforcement"]["tables"][0]["rows"]}
+    entry = score("residual_mlp", track="performance", sandbox=False, protocol=2)
+    for name, error in zip(LUNG_IDS, entry.by_lung, strict=True):
+        assert rows[name][1] == pytest.approx(error, abs=1e-9)
+    official = frozen.load(version=2).lungs()
+    for row in sections["simulators"]["tables"][0]["rows"]:
+        assert row[2] == official[row[0]]["own_rig_mae"]
+    assert (tmp_path / "paper.html").read_text().count("<svg") >= 8
+    assert (tmp_path / "paper.md").read_text().startswith("# The paper, reproduced")
+
+
+@pytest.mark.skipif("VENTBENCH_LONG" not in os.environ, reason="compiles for minutes")
+def test_the_studies_run_again_and_give_a_whole_page(tmp_path, public_recordings):
+    tiny = Architecture(pressures=2, controls=2, width=4, depth=2, boundaries=1, boundary_width=4)
+    networks = {
+        "base": tiny, "config": LearnedConfig(steps=1, batch=2), "members": 2, "only": ["H_c 1"],
+    }  # fmt: skip
+    sizes = paper.StudySizes(0.01, 2, 1, ("direct",), networks)
+    page, kept = paper.reproduce_paper(
+        recordings=public_recordings, full=True, out=tmp_path, seeds=2, gains=GAINS, sizes=sizes
+    )
+    sections = {section.id: section for section in page.sections}
+    lines = {line.name: line for line in sections["samples"].charts[0].lines}
+    assert set(lines) == {"policy-gradient-short", "policy-gradient", "ppo", "dqn"}
+    assert all(np.all(np.diff(line.x) > 0) for line in lines.values())
+    assert [row["variant"] for row in kept["controllers"]["variants"]] == ["base", "direct"]
+    assert kept["samples"]["about"]["command"] == "python -m proofs study samples --seeds 2"
+    assert {row["variant"] for row in kept["networks"]["variants"]} == {"base", "H_c 1"}
+    json.dumps(kept, allow_nan=False)
+
+
+def test_errors_by_horizon_can_be_measured_again(stored, public_recordings):
+    again = simulator_sections.measure_horizon(public_recordings / paper.MEASURED)
+    for name, about in stored["horizon"]["lungs"].items():
+        for kind in simulator_sections.KINDS:
+            np.testing.assert_allclose(
+                again["lungs"][name][kind]["by_step"], about[kind]["by_step"], atol=2e-3
+            )

@@ -1,0 +1,101 @@
+"""The statistics of the study, and its table and picture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import trim_mean
+from typer.testing import CliRunner
+
+from proofs.__main__ import app
+from proofs.studies import samples
+from proofs.studies.samples import LearningCurve, SampleStudy
+
+RNG = np.random.default_rng(1)
+
+
+@pytest.mark.parametrize("n", [1, 3, 4, 5, 8, 11])
+def test_interquartile_mean_is_the_trimmed_mean(n):
+    values = RNG.normal(size=(n, 4))
+    np.testing.assert_allclose(samples.interquartile_mean(values), trim_mean(values, 0.25, axis=0))
+
+
+def test_one_bad_seed_of_five_does_not_move_it():
+    values = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
+    assert samples.interquartile_mean(values) == 3.0
+    assert samples.interquartile_mean([1.0, 2.0, 3.0, 4.0, 500.0]) == 3.0
+
+
+def test_band_covers_the_middle_and_shrinks_with_seeds():
+    few, many = RNG.normal(size=(5, 3)), RNG.normal(size=(200, 3))
+    low, high = samples.band(few)
+    middle = samples.interquartile_mean(few)
+    assert np.all((low <= middle) & (middle <= high))
+    narrow = np.subtract(*samples.band(many)[::-1])
+    assert np.all(narrow < 0.5 * (high - low))
+    # A mean of 100 middle values of a Gaussian: its standard error is about 1.09 / sqrt(200).
+    np.testing.assert_allclose(narrow, 2 * 1.96 * 1.09 / np.sqrt(200), rtol=0.3)
+    same = samples.band(np.ones((5, 2)))
+    np.testing.assert_array_equal(same, np.ones((2, 2)))
+
+
+@pytest.fixture
+def made() -> SampleStudy:
+    def curve(method: str, ends: float) -> LearningCurve:
+        fall = np.array([3.0, 2.5, 2.1, 2.01, 2.0]) - 2.0 + ends
+        scores = fall + 0.01 * np.arange(5)[:, None]
+        return LearningCurve(method, np.array([0, 60, 120, 180, 240]), np.arange(5.0), 7.0, scores)
+
+    return SampleStudy("R20C50", (curve("ppo", 2.0), curve("dqn", 1.0)), 3.02, 2.3)
+
+
+def test_summary_says_when_a_score_was_reached(made):
+    rows = made.summary().set_index("method")
+    assert rows.loc["ppo", "final"] == pytest.approx(2.02)
+    assert rows.loc["ppo", "at_100_episodes"] == pytest.approx(2.52)
+    assert rows.loc["ppo", "episodes_to_best_pid"] == 120
+    assert rows.loc["ppo", "episodes_to_2_percent"] == 180
+    assert rows.loc["ppo", "seconds_to_2_percent"] == 3.0
+    assert rows.loc["dqn", "episodes_to_best_pid"] == 0  # better from the start
+    never = SampleStudy("R20C50", made.curves, 3.0, 0.5).summary()
+    assert never["episodes_to_best_pid"].tolist() == [None, None]
+
+
+def test_table_has_a_row_for_each_point(made):
+    points = made.points()
+    assert len(points) == 10
+    assert points["iqm"].iloc[4] == pytest.approx(2.02)
+    assert {f"seed{i}" for i in range(5)} < set(points.columns)
+
+
+def test_picture(made):
+    pytest.importorskip("matplotlib", reason="the picture needs the extra view")
+    content = samples.learning_curves_png(made)
+    assert content.startswith(b"\x89PNG")
+    assert len(content) < 300_000
+    assert content == samples.learning_curves_png(made)
+
+
+def test_the_short_recipe_is_done_after_96_breaths():
+    short = samples.study_methods()["policy-gradient-short"]
+    assert short.iterations * short.breaths == 96
+    assert all(one.iterations == 1 for one in samples.study_methods(1e-6).values())
+
+
+@pytest.mark.slow
+def test_study_samples(tmp_path):
+    asked = ["study", "samples", "--seeds", "2", "--share", "0.01", "--out", str(tmp_path)]
+    result = CliRunner().invoke(app, asked)
+    assert result.exit_code == 0, result.output
+    summary = pd.read_csv(tmp_path / "summary.csv").set_index("method")
+    assert list(summary.index) == ["policy-gradient-short", "policy-gradient", "ppo", "dqn"]
+    points = pd.read_csv(tmp_path / "samples.csv")
+    start = points[(points.method == "ppo") & (points.episodes == 0)]
+    assert start["iqm"].item() == pytest.approx(2.552, abs=2e-3)
+    assert (tmp_path / "study-samples.png").stat().st_size < 300_000
+    again = CliRunner().invoke(app, asked)
+    assert again.exit_code == 0, again.output
+    pd.testing.assert_frame_equal(
+        summary, pd.read_csv(tmp_path / "summary.csv").set_index("method")
+    )

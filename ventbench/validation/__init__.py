@@ -1,1 +1,0 @@
-"""Proofs that the diagnosis works: sealed challenges, and the real rig."""

@@ -292,7 +292,7 @@ def _breaths(recordings: RigRecordings, chosen: Judged) -> Breaths:
 
 def report(recordings: RigRecordings, write: Callable[..., None] = print) -> None:
     """Print what the errors of the frozen simulators are made of."""
-    simulators = frozen.load(version=2)
+    simulators = frozen.load()
     chosen = judged(recordings, simulators)
     data, lung = chosen.data, chosen.lung
 
@@ -349,7 +349,7 @@ def main() -> None:
         return
     compilation.keep()
     recordings = load_rig_recordings(options.recordings, folds=5, seed=0)
-    simulators = frozen.load(version=2)
+    simulators = frozen.load()
     if options.fits is None and not options.unseen:
         with precision.float64():
             report(recordings)

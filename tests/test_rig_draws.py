@@ -104,7 +104,7 @@ def test_wrong_requests_are_named(change, message):
 
 
 def test_plants_of_cells_are_those_of_rig_and_member():
-    official = frozen.load(version=2)
+    official = frozen.load()
     drawn = rig_draws.build(official.rigs, 5, n=4)
     reference = [own[0] for own in official.rigs]
     cells, rig, member = rig_draws.with_nominal(drawn, reference, protocol.PIPS)

@@ -87,7 +87,7 @@ class Inspirations:
     """Inspirations of a closed-loop run; every array has shape ``(..., BREATHS, steps)``.
 
     Attributes:
-        pressure: scored pressure at each step, cmH2O.
+        pressure: airway pressure at each step, cmH2O.
         requested: what the controller asked for, %.
         u_in: what was applied, %.
     """
@@ -117,12 +117,11 @@ def _breath(
     controller: Controller,
     scenario: Scenario,
     whole: bool,
-    airway: bool,
     state: Any,
     breath: Array,
 ) -> tuple[Any, tuple[Inspirations, Expirations | None]]:
     def scored(loop: env.LoopState) -> Array:
-        return env.airway_pressure(plant, loop) if airway else loop.pressure
+        return env.airway_pressure(plant, loop)
 
     def inspire(carry: tuple[env.LoopState, Any], step: Array) -> tuple[Any, Inspirations]:
         loop, state = carry
@@ -143,14 +142,13 @@ def _breath(
     return state, (inspirations, expirations)
 
 
-@partial(jax.jit, static_argnames=("whole", "airway"))
+@partial(jax.jit, static_argnames="whole")
 def closed_loop(
     plant: Plant,
     controller: Controller,
     scenario: Scenario,
     *,
     whole: bool = False,
-    airway: bool = False,
 ) -> tuple[Inspirations, Expirations | None]:
     """Run a pure controller through the protocol on one lung, all cells at once.
 
@@ -159,13 +157,12 @@ def closed_loop(
         controller: parameters broadcast against the cells.
         scenario: the cells, batch shape ``(...)``.
         whole: simulate the expirations too (for pictures; no score depends on them).
-        airway: return the airway pressure, which protocol version 2 scores, not the reading.
 
     Returns:
         The inspirations, and the expirations if asked for.
     """
     varied = env.vary(plant, scenario)
-    run = partial(_breath, varied, controller, scenario, whole, airway)
+    run = partial(_breath, varied, controller, scenario, whole)
     _, out = jax.lax.scan(run, controller.init(scenario.pip.shape), jnp.arange(BREATHS))
     # Scans stack time in front: (breath, step, ...) -> (..., breath, step).
     return jax.tree.map(lambda x: jnp.moveaxis(x, (0, 1), (-2, -1)), out)

@@ -24,7 +24,7 @@ def _of(score: StressScore, name: str) -> int:
 
 
 def test_reference_physics_has_the_rigs_own_parameters() -> None:
-    rigs = frozen.load(version=2).plants
+    rigs = frozen.load().plants
     reference = reference_physics(rigs, LUNGS)
     np.testing.assert_allclose(reference["C"], 1e3 / np.asarray(rigs.E))
     # The valve at 12 %, by the slopes between its knots.
@@ -35,7 +35,7 @@ def test_reference_physics_has_the_rigs_own_parameters() -> None:
 
 
 def test_a_condition_changes_its_parameters_in_its_breaths_only() -> None:
-    rigs = jax.tree.map(lambda leaf: leaf[:, None], frozen.load(version=2).plants)
+    rigs = jax.tree.map(lambda leaf: leaf[:, None], frozen.load().plants)
     every = conditions()
     stressed = stressed_plants(rigs, LUNGS, every).physics
     names = stressed.names
@@ -69,7 +69,7 @@ def test_nothing_is_changed_without_a_stressor(
         commands = score.requested[0].reshape(6, 1, -1)
         varied: Any = environment.vary(plant, cells)
         assert float(varied.R[0, 0]) != np.asarray(jax.tree.leaves(draws.plants)[0])[0, 0]
-        alone, _ = rollouts.closed_loop(plant, Script(commands), cells, airway=True)
+        alone, _ = rollouts.closed_loop(plant, Script(commands), cells)
     pressure = np.asarray(alone.pressure)
     np.testing.assert_allclose(score.peak[0], pressure.max(axis=(-2, -1)), rtol=0, atol=1e-9)
     error = run_error(pressure, np.asarray(cells.pip)[..., None, None])

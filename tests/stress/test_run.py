@@ -19,7 +19,7 @@ from ventbench.submissions.rig_scoring import load_rigs, rigs_of
 
 
 def test_draws_cover_every_pip_on_every_lung_and_are_those_of_the_protocol() -> None:
-    official = frozen.load(version=2)
+    official = frozen.load()
     rigs = rigs_of(official)
     six, two = draw_cells(rigs, 6), draw_cells(rigs, 2)
     for pips in six.nominal_pip:

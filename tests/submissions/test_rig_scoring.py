@@ -113,7 +113,7 @@ def test_unknown_protocol_is_refused():
 
 @pytest.mark.slow
 def test_the_frozen_rigs_can_be_scored():
-    official = rigs_of(frozen.load(version=2))
+    official = rigs_of(frozen.load())
     result = run_on_rigs(open_submission("pid_robust"), official, draws=2, pips=PIPS)
     errors, _ = compiled(official, 2)
     np.testing.assert_allclose(result.drawn, np.moveaxis(errors[:, 1:], 1, 0), atol=1e-9)

@@ -185,7 +185,7 @@ def score(
         from ventbench.board import create
         from ventbench.plants import frozen
 
-        for path in create.keep(record, scores, frozen.load(protocol), stressed):
+        for path in create.keep(record, scores, frozen.load(), stressed):
             console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
     if any(result.failures for result in (*scores, *stressed.values())):
         raise typer.Exit(1)

@@ -140,7 +140,7 @@ def _write_records(
     )
     scores = of_each_entry("scoring", work, [(entry,) for entry in entries], *parallel)
     by_name = {own.submission.manifest.name: own for own in stressed}
-    return create.keep(folder, scores, frozen.load(2), by_name)
+    return create.keep(folder, scores, frozen.load(), by_name)
 
 
 def stress_table(scores: list[dict[str, Any]]) -> Table:

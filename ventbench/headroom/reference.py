@@ -192,7 +192,7 @@ def reference_of(
 @jax.jit
 def _pid_pressures(plants: Plant, gains: Array, cells: Scenario) -> Array:
     def run(plant: Plant, gains: Array, cells: Scenario) -> Array:
-        return rollouts.closed_loop(plant, PID(*gains), cells, airway=True)[0].pressure
+        return rollouts.closed_loop(plant, PID(*gains), cells)[0].pressure
 
     return jax.vmap(run)(plants, gains, cells)
 

@@ -10,11 +10,9 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
@@ -120,7 +118,7 @@ def reproduce_paper(
     if protocol_version not in (1, 2):
         raise InputError(f"protocol {protocol_version} is not known; the versions are 1 and 2")
     tell = progress or (lambda what, share: None)
-    official = frozen.load(version=protocol_version)
+    official = frozen.load()
     kept = dict(load_stored() if stored is None else stored)
     if recordings is not None:
         tell("errors by horizon", 0.0)
@@ -136,7 +134,6 @@ def reproduce_paper(
             settings=official.about(),
             gains=gains,
             pool=pool,
-            errors_of=partial(_grid_errors, airway=protocol_version == 2),
         )
         jobs = {name: (*entry, protocol_version) for name, entry in ENTRIES.items()}
         scored: dict[str, tuple[Floats, Floats]] = {}
@@ -151,7 +148,7 @@ def reproduce_paper(
         simulators.architectures(kept["networks"]),
         simulators.exploration(official),
         controllers.best_gains(grid),
-        controllers.example(official, grid, scored["residual"][1], airway=protocol_version == 2),
+        controllers.example(official, grid, scored["residual"][1]),
         controllers.performance(grid, errors["residual"]),
         controllers.robustness(grid, errors["residual"], errors["residual, all lungs"]),
         controllers.regularisation(kept["controllers"]),
@@ -177,11 +174,6 @@ def load_stored(path: Path | None = None) -> dict[str, Any]:
         return json.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read: {error}") from error
-
-
-def _grid_errors(plant: Any, gains: Floats, *, airway: bool) -> NDArray[np.float32]:
-    stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], plant)
-    return pid_grid.errors(stacked, gains, airway=airway)[0]
 
 
 def _scored(name: str, track: str, version: int) -> tuple[Floats, Floats]:

@@ -359,9 +359,7 @@ def package_versions() -> dict[str, str]:
 
 def _official_simulators(version: int) -> str:
     """SHA-256 of the manifest of the simulators that a version of the protocol is scored on."""
-    if version == 1:
-        return frozen.MANIFEST_SHA256
-    return files.sha256(frozen.folder(version) / frozen.MANIFEST)
+    return files.sha256(frozen.folder() / frozen.MANIFEST)
 
 
 def _number(value: float | np.floating) -> float | None:

@@ -91,7 +91,7 @@ def load_rigs(simulator: Given = "frozen") -> Rigs:
         InputError: if there are no such simulators, or they have no plants.
     """
     if isinstance(simulator, str) and simulator == "frozen":
-        return rigs_of(frozen.load(version=2))
+        return rigs_of(frozen.load())
     simulators = load_simulators(simulator)
     return Rigs(simulators.lungs, simulators.stacked, None, simulators.about)
 

@@ -183,8 +183,7 @@ def replay(
     """
 
     def run(plant: Plant, scenario: Scenario, commands: Array) -> Any:
-        airway = version > 1
-        return rollouts.closed_loop(plant, Script(commands), scenario, whole=True, airway=airway)
+        return rollouts.closed_loop(plant, Script(commands), scenario, whole=True)
 
     commands = jnp.asarray(requested.reshape(*requested.shape[:-2], -1))
     return jax.vmap(run, in_axes=(0, None if version == 1 else 0, 0))(plants, scenario, commands)

@@ -51,7 +51,7 @@ def headroom(
     from ventbench.executor import executor
     from ventbench.headroom import reference as references
     from ventbench.submissions import rig_scoring
-    from ventbench.training import rig_pid
+    from ventbench.training import pid_grid
 
     console = Console(stderr=str(json) == "-")
     rigs = rig_scoring.load_rigs()
@@ -72,7 +72,7 @@ def headroom(
     with bars() as progress:
         task = progress.add_task("best PID of each lung", total=None)
         if season is None:
-            gains, _ = rig_pid.best_pids(
+            gains, _ = pid_grid.best_pids(
                 rigs, progress=lambda done, all_: progress.update(task, completed=done, total=all_)
             )
         else:

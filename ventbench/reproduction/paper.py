@@ -29,7 +29,7 @@ from ventbench.reproduction import simulator_sections as simulators
 from ventbench.reproduction.report import Reproduction
 from ventbench.submissions.scoring import score
 from ventbench.training import pid_grid
-from ventbench.training.simulator import MEASURED
+from ventbench.training.learned import MEASURED
 
 Floats = NDArray[np.float64]
 
@@ -189,8 +189,8 @@ def _studies(
     """Run the studies of minutes again, as JSON values; ``parallel``: workers and scheduler."""
     from ventbench.training import study
     from ventbench.training.ablation import controllers, networks
+    from ventbench.training.learned import ARCHITECTURE
     from ventbench.training.residual import ResidualConfig
-    from ventbench.training.simulator import ARCHITECTURE
 
     kept: dict[str, dict[str, Any]] = {}
     curves = study.sample_efficiency(

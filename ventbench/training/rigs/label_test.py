@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 from ventbench.lungs import Lung
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.sessions import Sessions
-from ventbench.training.hybrid.data import InspirationData
-from ventbench.training.hybrid.fit import simulate
-from ventbench.training.hybrid.parameters import Groups, Pooled, plants
-from ventbench.training.rigs.hierarchy import Scales
+from ventbench.training.rigs.data import InspirationData
+from ventbench.training.rigs.fit import simulate
+from ventbench.training.rigs.parameters import Groups, Pooled, Scales, plants
 
 #: Largest deviation of R and C from the label or from the pooled value, as a share of it.
 TOLERANCE = 0.2

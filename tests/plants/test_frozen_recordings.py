@@ -16,8 +16,9 @@ from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import nominal_plants
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.precision import float64
-from ventbench.recordings import folds, join, load
+from ventbench.recordings import load
 from ventbench.training.learned import MEASURED, RECONSTRUCTED
+from ventbench.training.rigs.data import load_rig_recordings
 
 single_compartments = partial(nominal_plants, single_compartment)
 two_balloons = partial(nominal_plants, two_balloon)
@@ -44,28 +45,27 @@ def reconstructed(public_recordings):
     return load(public_recordings / RECONSTRUCTED)
 
 
-def test_are_those_of_the_training(official, measured, reconstructed):
-    sources = official.manifest["recordings"]
-    assert sources[MEASURED] == {"sha256": measured.sha256, "breaths": len(measured)}
-    assert sources[RECONSTRUCTED] == {
-        "sha256": reconstructed.sha256,
-        "breaths": len(reconstructed),
-    }
-    both = join([measured, reconstructed])
-    assert set(official.seen.key.tolist()) == set(fingerprints(both).tolist())
-
-
-def test_each_measured_breath_is_judged_by_the_member_without_it(official, measured):
+@pytest.fixture(scope="module")
+def trained_on(official, public_recordings):
     split = official.manifest["split"]
-    assert split["by"] == "breath"
-    fold = folds(measured, count=split["folds"], seed=split["seed"]) + 1
-    np.testing.assert_array_equal(official.seen.folds(measured), fold)
+    return load_rig_recordings(public_recordings, folds=split["folds"], seed=split["seed"])
+
+
+def test_are_those_of_the_training(official, trained_on):
+    assert official.manifest["recordings"] == trained_on.sources
+    assert official.manifest["skipped"] == list(trained_on.skipped)
+    assert set(official.seen.key.tolist()) == set(fingerprints(trained_on.breaths).tolist())
+
+
+def test_each_measured_breath_is_judged_by_the_member_without_it(official, trained_on):
+    measured, member = trained_on.measured_breaths, trained_on.fold + 1
+    np.testing.assert_array_equal(official.seen.folds(measured), member)
     assert official.held_out(measured).all()
     assert not official.unseen(measured).any()  # member 0 is fitted to all
     at = official.sessions.assign(measured)
     with float64():
         judges = official.cross_fitted(measured)
-    np.testing.assert_array_equal(judges.E, official.members.E[fold, at])
+    np.testing.assert_array_equal(judges.E, official.members.E[member, at])
 
 
 def test_a_changed_command_makes_a_breath_new(official, measured):

@@ -185,7 +185,7 @@ def networks(
 
     Example: `ventbench study networks --recordings ../shared/recordings`
     """
-    from ventbench.training import simulator
+    from ventbench.training import learned as simulator
     from ventbench.training.ablation import networks as work
 
     folder = recordings_folder(recordings)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
@@ -203,7 +204,7 @@ def sample_efficiency(
     lungs = jax.tree.map(
         lambda leaf: np.repeat(leaf[None], len(seeds), axis=0),
         episodes.Lungs(
-            jax.tree.map(lambda leaf: leaf[None], single), np.ones((1, len(protocol.PIPS)))
+            jax.tree.map(lambda leaf: leaf[None], single), jnp.ones((1, len(protocol.PIPS)))
         ),
     )
     curves = []

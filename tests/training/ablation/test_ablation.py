@@ -197,18 +197,18 @@ def test_controllers_by_the_command(tmp_path, monkeypatch):
 
     def compare(simulators, out, seeds, **options):
         asked.update(options, seeds=list(seeds))
-        names = ("base", "one simulator")
+        names = ("base", "deep")
         figures = dict.fromkeys(controllers.FIGURES, 2.0)
         return pd.DataFrame([{"variant": name, "seed": 0} | figures for name in names])
 
     monkeypatch.setattr("ventbench.plants.frozen.load", Textbook)
     monkeypatch.setattr(controllers, "compare", compare)
-    given = ["study", "controllers", "--seeds", "1", "--updates", "7", "--only", "one simulator"]
+    given = ["study", "controllers", "--seeds", "1", "--updates", "7", "--only", "deep"]
     paths = ["--out", str(tmp_path / "out"), "--json", str(tmp_path / "x")]
     result = CliRunner().invoke(app, [*given, *paths])
     assert result.exit_code == 0, result.output
-    assert "one simulator" in result.output
-    assert (asked["seeds"], asked["only"]) == ([0], ["one simulator"])
+    assert "deep" in result.output
+    assert (asked["seeds"], asked["only"]) == ([0], ["deep"])
     assert asked["config"].updates == 7
     found = json.loads((tmp_path / "x").read_text())
-    assert [row["variant"] for row in found["variants"]] == ["base", "one simulator"]
+    assert [row["variant"] for row in found["variants"]] == ["base", "deep"]

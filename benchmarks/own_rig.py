@@ -126,7 +126,7 @@ def tuned_on(simulator: Any, plant: Plant) -> dict[str, Any]:
     Returns:
         Gains, and errors on the simulator (``promised``) and on the rig, cmH2O.
     """
-    grid, _ = pid_grid.tune_pid([LUNG], simulator=simulator, gains=gains(), single=False)
+    grid, _ = pid_grid.tune_pid([LUNG], simulator=simulator, gains=gains(), draws=0)
     best, promised = grid.best(LUNG)
     nominal, drawn = errors(PID(*best), plant)
     return {"gains": list(best), "promised": promised, "rig": nominal, "draws": drawn.tolist()}
@@ -139,7 +139,7 @@ def trained_on(
     trained = train_residual(
         [LUNG],
         out,
-        config=ResidualConfig(updates=updates, members=1, agreement=0.0),
+        config=ResidualConfig(updates=updates, members=1),
         seed=seed,
         gains=np.array([best]),  # the grid was searched before
         simulator=simulator,

@@ -30,12 +30,15 @@ from ventbench.metrics.open_loop import WIDE_OPEN
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import Hybrid
 from ventbench.recordings import Breaths, recordings_dir
-from ventbench.training.hybrid.data import InspirationData, groups_of, inspirations
-from ventbench.training.hybrid.fit import simulate
-from ventbench.training.hybrid.parameters import plants
-from ventbench.training.rigs.fit import FitConfig, Noise, fit
-from ventbench.training.rigs.hierarchy import Scales, centre
-from ventbench.training.rigs.recordings import RigRecordings, load_rig_recordings
+from ventbench.training.rigs.data import (
+    InspirationData,
+    RigRecordings,
+    groups_of,
+    inspirations,
+    load_rig_recordings,
+)
+from ventbench.training.rigs.fit import FitConfig, Noise, fit, simulate
+from ventbench.training.rigs.parameters import Scales, centre, plants
 from ventbench.training.rigs.train import UNRECORDED_SLOPE
 
 Floats = NDArray[np.float64]
@@ -292,7 +295,7 @@ def _breaths(recordings: RigRecordings, chosen: Judged) -> Breaths:
 
 def report(recordings: RigRecordings, write: Callable[..., None] = print) -> None:
     """Print what the errors of the frozen simulators are made of."""
-    simulators = frozen.load(version=2)
+    simulators = frozen.load()
     chosen = judged(recordings, simulators)
     data, lung = chosen.data, chosen.lung
 
@@ -349,7 +352,7 @@ def main() -> None:
         return
     compilation.keep()
     recordings = load_rig_recordings(options.recordings, folds=5, seed=0)
-    simulators = frozen.load(version=2)
+    simulators = frozen.load()
     if options.fits is None and not options.unseen:
         with precision.float64():
             report(recordings)

@@ -42,7 +42,7 @@ def pooled(groups: Sequence[Floats]) -> float:
 
 
 def main() -> None:
-    official = frozen.load(version=2)
+    official = frozen.load()
     members: Any = official.members
     drawn = rigs_of(official).draws(draws.COUNT)
     resistance, compliance = resistance_and_compliance(members)

@@ -16,7 +16,7 @@ import ventbench
 ROOT = Path(__file__).parents[1]
 
 #: What a name does is said by an example; these take minutes, and are tried where they are tested.
-LONG = ("diagnose", "train_dqn", "train_ppo", "train_residual", "train_rigs", "train_simulator")
+LONG = ("diagnose", "train_dqn", "train_ppo", "train_residual", "train_rigs")
 
 FUNCTIONS = sorted(
     name for name in ventbench.__all__ if inspect.isfunction(getattr(ventbench, name))

@@ -21,7 +21,7 @@ from ventbench.plants.stacking import nominal_plants
 from ventbench.precision import float64
 from ventbench.recordings import Breaths, load, make_breaths, write
 from ventbench.rollouts import open_loop
-from ventbench.training.simulator import MEASURED
+from ventbench.training.learned import MEASURED
 
 single_compartments = partial(nominal_plants, single_compartment)
 
@@ -83,9 +83,9 @@ def test_the_error_is_the_one_that_was_put_in(breaths):
     assert json.loads(json.dumps(result, allow_nan=False)) == result
 
 
-@pytest.mark.parametrize("kind", ["frozen", "hybrid", "learned", "physics"])
+@pytest.mark.parametrize("kind", ["frozen", "hybrid", "physics"])
 def test_each_kind_is_what_it_says(simulators, breaths, kind):
-    kinds = {"physics": single_compartments, "learned": frozen.load_learned().for_breaths}
+    kinds = {"physics": single_compartments}
     error = open_loop_report.errors(kinds.get(kind, simulators.for_breaths), breaths)
     result = as_json(breaths, kind)
     assert result["plant"] == kind
@@ -183,7 +183,7 @@ def test_the_command_writes_what_the_function_finds(breaths, tmp_path):
             assert len(result["lungs"][lung_id]["ci95"]) == 2
 
 
-@pytest.mark.parametrize("kind", ["frozen", "hybrid", "learned", "physics"])
+@pytest.mark.parametrize("kind", ["frozen", "hybrid", "physics"])
 def test_the_command_knows_all_kinds(breaths, tmp_path, kind):
     write(breaths, tmp_path / "lab.csv")
     text = run("open-loop", tmp_path / "lab.csv", "--plant", kind, "--json", "-")

@@ -25,7 +25,6 @@ from ventbench.plants import frozen
 from ventbench.plants.stacking import take
 from ventbench.rollouts import open_loop
 from ventbench.simulation import read_controls, simulate
-from ventbench.training import simulator
 from ventbench.training.rigs import train as rigs
 
 #: Records of the published leaderboard.
@@ -68,19 +67,17 @@ def columns(text: str) -> dict[str, np.ndarray]:
     return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_lungs_lists_the_six_with_their_errors(version):
-    text = run("lungs", "--version", version)
-    kinds = ("held_out",) if version == 1 else ("own_rig", "unseen_rig", "held_out")
-    for name, about in frozen.load(version).lungs().items():
+def test_lungs_lists_the_six_with_their_errors():
+    text = run("lungs")
+    for name, about in frozen.load().lungs().items():
         (line,) = [line for line in text.splitlines() if line.startswith(f"│ {name} ")]
-        for kind in (kind for kind in kinds if f"{kind}_mae" in about):
+        for kind in ("own_rig", "unseen_rig", "held_out"):
             assert f"{about[f'{kind}_mae']:.2f} / {about[f'{kind}_median_mae']:.2f}" in line
 
 
 def test_lungs_tells_which_sessions_are_not_scored():
     text = " ".join(run("lungs").split())
-    official = frozen.load(version=2)
+    official = frozen.load()
     six = [i for i in official.rejected if official.sessions.table[i].lung in official.lung_ids]
     assert six
     for session in six:
@@ -88,8 +85,7 @@ def test_lungs_tells_which_sessions_are_not_scored():
 
 
 def test_lungs_as_json():
-    assert json.loads(run("lungs", "--version", 1, "--json", "-")) == frozen.load().lungs()
-    assert json.loads(run("lungs", "--json", "-")) == frozen.load(version=2).lungs()
+    assert json.loads(run("lungs", "--json", "-")) == frozen.load().lungs()
 
 
 def test_coverage_of_a_published_entry(monkeypatch):
@@ -97,18 +93,11 @@ def test_coverage_of_a_published_entry(monkeypatch):
     # Nothing was recorded at and above 50 %, and plenty below.
     counts = {name: {"recorded_commands": [100] * 5 + [0] * 5} for name in LUNG_IDS}
     simulators = SimpleNamespace(lungs=lambda: counts)
-    monkeypatch.setattr(frozen, "load", lambda version=1, path=None: simulators)
+    monkeypatch.setattr(frozen, "load", lambda path=None: simulators)
     shares = json.loads(run("coverage", record, "--json", "-"))
     assert set(shares) == set(LUNG_IDS)
     assert all(0.0 <= share["wide_open"] <= share["sparse"] <= 1.0 for share in shares.values())
     assert max(share["sparse"] for share in shares.values()) > 0.0
-
-
-def test_coverage_needs_counts_of_recorded_commands(monkeypatch):
-    record = next(path for path in RECORDS.glob("*.json"))
-    simulators = SimpleNamespace(lungs=lambda: {name: {} for name in LUNG_IDS})
-    monkeypatch.setattr(frozen, "load", lambda version=1, path=None: simulators)
-    assert "tell no recorded commands" in run("coverage", record, code=2)
 
 
 @pytest.mark.parametrize("name", ["R5C10", "R20C50"])
@@ -157,10 +146,6 @@ def test_train_needs_recordings(tmp_path, monkeypatch):
     assert "no folder of the public recordings; give" in run("train", "simulator", code=2)
     to_train = ("train", "simulator", "--recordings", tmp_path, "--out", tmp_path / "x")
     assert "holds no recording in the public schema" in run(*to_train, code=2)
-    message = run(*to_train, "--version", 1, code=2)
-    assert f"{simulator.MEASURED}: there is no such file" in message
-    message = run(*to_train, "--version", 1, "--lungs", "R5C10", code=2)
-    assert "--lungs has no meaning for --version 1" in message
     assert not (tmp_path / "x").exists()
 
 
@@ -171,12 +156,11 @@ def test_train_hands_over_folder_target_and_progress(tmp_path, monkeypatch):
         progress("half", 0.5)
         called.append((folder, out, lungs))
 
-    monkeypatch.setattr(simulator, "train_simulator", train)
     monkeypatch.setattr(rigs, "train_rigs", train)
     out = tmp_path / "out"
     command = ("train", "simulator", "--recordings", tmp_path, "--out", out)
     assert f"wrote {out}" in run(*command, "--lungs", "R5C10,R9C33")
-    run(*command, "--version", 1)
+    run(*command)
     assert called == [(tmp_path, out, ["R5C10", "R9C33"]), (tmp_path, out, None)]
 
 

@@ -7,7 +7,7 @@ Everything that a notebook needs is an attribute of this package and is imported
 - controllers: ``score``, ``score_stress``, ``rollout``, ``tune_pid``, ``train_residual``,
   ``train_ppo``, ``train_dqn``, the protocol ``Controller``;
 - missing physics: ``diagnose``, ``Diagnosis``;
-- learned simulators: ``train_rigs``, ``train_simulator``; the leaderboard: ``load_board``.
+- learned simulators: ``train_rigs``; the leaderboard: ``load_board``.
 
 ``help(ventbench.score)`` and so on say types, shapes and units and give an example.
 """
@@ -43,11 +43,10 @@ if TYPE_CHECKING:
     from ventbench.submissions.result import Score as Score
     from ventbench.submissions.scoring import score as score
     from ventbench.training.pid_grid import tune_pid as tune_pid
-    from ventbench.training.residual.train import train_residual as train_residual
+    from ventbench.training.residual import train_residual as train_residual
     from ventbench.training.rigs.train import train_rigs as train_rigs
     from ventbench.training.rl.train import train_dqn as train_dqn
     from ventbench.training.rl.train import train_ppo as train_ppo
-    from ventbench.training.simulator import train_simulator as train_simulator
     from ventbench.trajectories import Trajectories as Trajectories
     from ventbench.trajectories import rollout as rollout
 
@@ -83,9 +82,8 @@ _SOURCES = {
     "simulate": ("simulation", "simulate"),
     "train_dqn": ("training.rl.train", "train_dqn"),
     "train_ppo": ("training.rl.train", "train_ppo"),
-    "train_residual": ("training.residual.train", "train_residual"),
+    "train_residual": ("training.residual", "train_residual"),
     "train_rigs": ("training.rigs.train", "train_rigs"),
-    "train_simulator": ("training.simulator", "train_simulator"),
     "tune_pid": ("training.pid_grid", "tune_pid"),
 }
 
@@ -121,7 +119,6 @@ __all__ = [
     "train_ppo",
     "train_residual",
     "train_rigs",
-    "train_simulator",
     "tune_pid",
 ]
 

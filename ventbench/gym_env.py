@@ -21,7 +21,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from ventbench import environment as env
-from ventbench import precision, protocol
+from ventbench import precision, protocol, rig_draws
 from ventbench.draws import random_scenarios
 from ventbench.environment import Scenario
 from ventbench.errors import InputError
@@ -47,21 +47,26 @@ def _start(plant: Plant, cell: Scenario) -> tuple[env.LoopState, Array]:
 def _step(
     plant: Plant, cell: Scenario, loop: env.LoopState, u_in: Array, step: Array
 ) -> tuple[env.LoopState, Array, Array]:
-    loop, _ = env.inspire(env.vary(plant, cell), cell, loop, u_in)
+    """State one step later, what is seen then, and the airway pressure, cmH2O."""
+    varied = env.vary(plant, cell)
+    loop, _ = env.inspire(varied, cell, loop, u_in)
     # The target holds to the last step; the observation after it is of the same kind.
     after = jnp.minimum(step + 1, protocol.INSPIRATION_STEPS - 1)
-    return loop, _seen(cell, loop, after), jnp.abs(loop.pressure - cell.pip)
+    pressure = env.airway_pressure(varied, loop)
+    return loop, _seen(cell, loop, after), pressure
 
 
 @partial(jax.jit, static_argnames="vary")
 def _cell(key: Array, pip: Array, vary: bool) -> Scenario:
-    cells = episodes.sample(key, 1, first=pip, vary=vary)
+    cells = episodes.sample(key, 1, first=pip, vary=vary, breaths=1)
     return jax.tree.map(lambda leaf: leaf[0], cells)
 
 
 @partial(jax.jit, static_argnames="vary")
 def _cells(key: Array, pips: Array, vary: bool) -> Scenario:
-    return random_scenarios(key, pips, spread=None if vary else 0.0, breaths=1)
+    return random_scenarios(
+        key, pips, spread=None if vary else 0.0, breaths=1, ranges=rig_draws.RANGES
+    )
 
 
 def _seen(cell: Scenario, loop: env.LoopState, step: Array | int) -> Array:
@@ -87,8 +92,8 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
     Args:
         lung: id of the lung; a lung at random for each breath if not given.
         pip: peak pressure, cmH2O; one of the six at random if not given.
-        noise: deviations and sensor noise drawn anew from the distributions of the published
-            draws; else nominal breaths.
+        noise: deviations and sensor noise drawn anew from the distributions of the scored draws;
+            else nominal breaths.
         render_mode: must be None.
 
     Raises:
@@ -136,7 +141,8 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
             self._plant = self._plants[LUNG_IDS.index(self._lung)]
             self._loop, seen = _start(self._plant, cell)
         self._count = 0
-        self._total = abs(float(cell.start) - float(cell.pip))
+        self._pressure = float(cell.start)
+        self._total = abs(self._pressure - float(cell.pip))
         return np.asarray(seen), self._info()
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
@@ -152,19 +158,19 @@ class Ventilator(gymnasium.Env[Floats, Floats]):
             raise InputError(f"the action is {value}; it must be a number from -1 to 1")
         with precision.float32():
             u_in, step = jnp.asarray(50.0 + 50.0 * value), jnp.asarray(self._count)
-            self._loop, seen, error = _step(self._plant, self._cell, self._loop, u_in, step)
+            self._loop, seen, pressure = _step(self._plant, self._cell, self._loop, u_in, step)
+        self._pressure = float(pressure)
+        error = abs(self._pressure - float(self._cell.pip))
         self._count += 1
-        self._total += float(error)
+        self._total += error
         ended = self._count == episodes.STEPS
         info = self._info()
         if ended:
             info["error"] = self._total / protocol.INSPIRATION_STEPS
-        return np.asarray(seen), -float(error) / episodes.REWARD_SCALE, ended, False, info
+        return np.asarray(seen), -error / episodes.REWARD_SCALE, ended, False, info
 
     def _info(self) -> dict[str, Any]:
-        assert self._loop is not None
-        pressure = float(self._loop.pressure)
-        return {"lung": self._lung, "pip": float(self._cell.pip), "pressure": pressure}
+        return {"lung": self._lung, "pip": float(self._cell.pip), "pressure": self._pressure}
 
 
 class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, NDArray[np.float64]]):
@@ -215,7 +221,7 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, NDArray[np.flo
             plants = jax.tree.map(
                 lambda *leaf: jnp.stack(leaf), *(single._plants[i] for i in lungs)
             )
-            which = jnp.arange(num_envs) % episodes.lung_count(plants)
+            which = jnp.arange(num_envs) % len(lungs)
             self._plants = jax.tree.map(lambda leaf: jnp.asarray(leaf)[which], plants)
         self._loop: env.LoopState | None = None
 
@@ -232,8 +238,8 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, NDArray[np.flo
             self._cells = _cells(key, pips, self._noise)
             loop, seen = _start(self._plants, self._cells)
         self._loop, self._count = loop, 0
-        error = np.asarray(loop.pressure) - np.asarray(self._cells.pip)
-        self._total = np.abs(error, dtype=float)
+        self._pressure = np.asarray(loop.pressure, float)
+        self._total = np.abs(self._pressure - np.asarray(self._cells.pip, float))
         return np.asarray(seen), self._info()
 
     def step(
@@ -259,9 +265,10 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, NDArray[np.flo
             raise InputError(f"action {at} is {values[at]}; it must be a number from -1 to 1")
         with precision.float32():
             u_in, step = jnp.asarray(50.0 + 50.0 * values), jnp.asarray(self._count)
-            self._loop, seen, error = _step(self._plants, self._cells, self._loop, u_in, step)
+            self._loop, seen, pressure = _step(self._plants, self._cells, self._loop, u_in, step)
         self._count += 1
-        errors = np.asarray(error, float)
+        self._pressure = np.asarray(pressure, float)
+        errors = np.abs(self._pressure - np.asarray(self._cells.pip, float))
         self._total += errors
         ended = np.full(self.num_envs, self._count == episodes.STEPS)
         info = self._info()
@@ -270,11 +277,10 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, NDArray[np.flo
         return np.asarray(seen), -errors / episodes.REWARD_SCALE, ended, nothing, info
 
     def _info(self) -> dict[str, Any]:
-        assert self._loop is not None
         values = {
             "lung": np.array(self._lungs, object),
             "pip": np.asarray(self._cells.pip, float),
-            "pressure": np.asarray(self._loop.pressure, float),
+            "pressure": self._pressure,
         }
         return values | {f"_{name}": np.ones(self.num_envs, bool) for name in values}
 

@@ -179,7 +179,7 @@ def networks(
     Example: `python -m proofs study networks --recordings ../shared/recordings`
     """
     from proofs.studies import networks as work
-    from ventbench.training import simulator
+    from ventbench.training import learned as simulator
 
     folder = recordings_folder(recordings)
     _check(only, work.variants(simulator.ARCHITECTURE))

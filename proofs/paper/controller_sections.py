@@ -77,16 +77,13 @@ def best_gains(grid: pid_grid.PIDGrid) -> Section:
     )  # fmt: skip
 
 
-def example(
-    official: frozen.Frozen, grid: pid_grid.PIDGrid, residual: Floats, *, airway: bool
-) -> Section:
+def example(official: frozen.Frozen, grid: pid_grid.PIDGrid, residual: Floats) -> Section:
     """Trajectories of P-only, I-only, PID and residual (the paper's figures 2, 4 and 9).
 
     Args:
         official: simulators.
         grid: grid of PIDs.
         residual: pressures of the residual entry, cmH2O, shape ``(6, 6, 300)``.
-        airway: take airway pressure, not the reading.
     """
     at, pip = LUNG_IDS.index(EXAMPLE), protocol.PIPS.index(EXAMPLE_PIP)
     P, I, D = grid.gains.T  # noqa: E741
@@ -106,9 +103,7 @@ def example(
         plant = jax.tree.map(lambda leaf: jnp.asarray(leaf[at], float), official.plants)
         controllers = PID(*(jnp.asarray(column) for column in zip(*chosen.values(), strict=True)))
         cells = environment.nominal_scenario(np.full(len(chosen), EXAMPLE_PIP))
-        inspired, expired = rollouts.closed_loop(
-            plant, controllers, cells, whole=True, airway=airway
-        )
+        inspired, expired = rollouts.closed_loop(plant, controllers, cells, whole=True)
         assert expired is not None
         breaths = np.concatenate([inspired.pressure, expired.pressure], axis=-1)
     runs = {name: breaths[k].reshape(-1) for k, name in enumerate(chosen)}

@@ -10,11 +10,9 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,7 +28,7 @@ from ventbench.plants import frozen
 from ventbench.plants.stacking import take
 from ventbench.submissions.scoring import score
 from ventbench.training import pid_grid
-from ventbench.training.simulator import MEASURED
+from ventbench.training.learned import MEASURED
 
 Floats = NDArray[np.float64]
 
@@ -118,7 +116,7 @@ def reproduce_paper(
     if protocol_version not in (1, 2):
         raise InputError(f"protocol {protocol_version} is not known; the versions are 1 and 2")
     tell = progress or (lambda what, share: None)
-    official = frozen.load(version=protocol_version)
+    official = frozen.load()
     kept = dict(load_stored() if stored is None else stored)
     if recordings is not None:
         tell("errors by horizon", 0.0)
@@ -134,7 +132,6 @@ def reproduce_paper(
             settings=official.about(),
             gains=gains,
             pool=pool,
-            errors_of=partial(_grid_errors, airway=protocol_version == 2),
         )
         jobs = {name: (*entry, protocol_version) for name, entry in ENTRIES.items()}
         scored: dict[str, tuple[Floats, Floats]] = {}
@@ -149,7 +146,7 @@ def reproduce_paper(
         simulators.architectures(kept["networks"]),
         simulators.exploration(official),
         controllers.best_gains(grid),
-        controllers.example(official, grid, scored["residual"][1], airway=protocol_version == 2),
+        controllers.example(official, grid, scored["residual"][1]),
         controllers.performance(grid, errors["residual"]),
         controllers.robustness(grid, errors["residual"], errors["residual, all lungs"]),
         controllers.regularisation(kept["controllers"]),
@@ -177,11 +174,6 @@ def load_stored(path: Path | None = None) -> dict[str, Any]:
         raise InputError(f"{path} cannot be read: {error}") from error
 
 
-def _grid_errors(plant: Any, gains: Floats, *, airway: bool) -> NDArray[np.float32]:
-    stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], plant)
-    return pid_grid.errors(stacked, gains, airway=airway)[0]
-
-
 def _scored(name: str, track: str, version: int) -> tuple[Floats, Floats]:
     """Errors and pressures of a bundled entry without noise, by lung and PIP."""
     result = score(name, track=track, sandbox=False, protocol=version)
@@ -194,8 +186,8 @@ def _studies(
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
     """Run the studies of minutes again, as JSON values; ``parallel``: workers and scheduler."""
     from proofs.studies import controllers, networks, samples
+    from ventbench.training.learned import ARCHITECTURE
     from ventbench.training.residual import ResidualConfig
-    from ventbench.training.simulator import ARCHITECTURE
 
     kept: dict[str, dict[str, Any]] = {}
     curves = samples.sample_efficiency(

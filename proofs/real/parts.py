@@ -83,7 +83,7 @@ class Part:
 
 def _rc(breaths: Breaths, out: Path) -> Setting:
     # The clocks of the simulators' training tell the ventilators apart.
-    return Setting(breaths, "physics", "physics", rigs=frozen.load(version=1).sessions)
+    return Setting(breaths, "physics", "physics", rigs=frozen.load().sessions)
 
 
 def _two_balloon(breaths: Breaths, out: Path) -> Setting:

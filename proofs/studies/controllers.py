@@ -65,7 +65,6 @@ def variants(config: ResidualConfig) -> dict[str, Variant]:
         "direct": Variant("no PID, the network alone computes the command", config, direct=True),
         "one simulator": changed("only the official simulator of each lung", members=1),
         "no deviations": changed("training without noise, delay or other R and C", spread=0.0),
-        "no agreement": changed("no penalty where the simulators disagree", agreement=0.0),
         "no breath before": changed("no features of the previous breath", ahead=0),
         "no errors before": changed("no earlier errors of this breath", pressures=0),
         "no commands before": changed("no earlier commands of this breath", commands=0),

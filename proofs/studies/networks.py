@@ -24,7 +24,7 @@ from ventbench.plants.learned import Architecture
 from ventbench.plants.stacking import VmappedPlant
 from ventbench.recordings import Breaths
 from ventbench.resume import WorkFolder
-from ventbench.training import simulator
+from ventbench.training import learned as simulator
 from ventbench.training.learned import LearnedConfig
 
 #: Name of the variant that all others are compared with.

@@ -9,20 +9,21 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench import files
+from ventbench import files, protocol
 from ventbench.errors import require
 from ventbench.lungs import LUNG_IDS, Lung
 from ventbench.metrics import bootstrap
 from ventbench.palette import RUNS
 from ventbench.plants import frozen
 from ventbench.training import pid_grid
-from ventbench.training.rl.parallel import TrainedPolicies, train
+from ventbench.training.rl import episodes
 from ventbench.training.rl.policy_gradient import PolicyGradient
-from ventbench.training.rl.train import METHODS, Method, method_for
+from ventbench.training.rl.train import METHODS, Method, TrainedPolicies, method_for, train
 
 Floats = NDArray[np.float64]
 
@@ -204,12 +205,17 @@ def sample_efficiency(
     simulators = simulators or frozen.load()
     at = LUNG_IDS.index(lung.id)
     single = jax.tree.map(lambda leaf: leaf[at : at + 1], simulators.plants)
-    plants = jax.tree.map(lambda leaf: np.repeat(leaf[None], len(seeds), axis=0), single)
+    lungs = jax.tree.map(
+        lambda leaf: np.repeat(leaf[None], len(seeds), axis=0),
+        episodes.Lungs(
+            jax.tree.map(lambda leaf: leaf[None], single), jnp.ones((1, len(protocol.PIPS)))
+        ),
+    )
     curves = []
     for name, recipe in study_methods(share).items():
         trained = train(
             recipe,
-            plants,
+            lungs,
             seeds,
             chunk=min(CHUNKS[name], recipe.iterations),
             about=f"study {lung.id} {simulators.manifest_sha256}",

@@ -32,7 +32,7 @@ KINDS = {"ppo": (GaussianPolicy, 1), "dqn": (GreedyPolicy, len(CHOICES))}
 NAMES = (*LUNG_IDS, "all")
 
 
-def make(name: str, looks_back: bool) -> dict[str, GaussianPolicy | GreedyPolicy]:
+def make(name: str) -> dict[str, GaussianPolicy | GreedyPolicy]:
     """Policies with random weights, none of them zero."""
     kind, outputs = KINDS[name]
     network = TanhNetwork((8, 8), outputs, first=0.2)
@@ -42,25 +42,23 @@ def make(name: str, looks_back: bool) -> dict[str, GaussianPolicy | GreedyPolicy
         start, bias = jax.random.split(key)
         parameters = jax.tree.map(
             lambda x, bias=bias: x + 0.05 * jax.random.normal(bias, x.shape),
-            init_parameters(network, start, looks_back),
+            init_parameters(network, start),
         )
-        made[lung] = kind(parameters, network, looks_back)
+        made[lung] = kind(parameters, network)
     return made
 
 
 @pytest.mark.parametrize(
-    ("name", "track", "looks_back"),
+    ("name", "track"),
     [
-        ("ppo", "performance", True),
-        ("ppo", "robustness", False),
-        ("dqn", "performance", False),
-        ("dqn", "robustness", True),
+        ("ppo", "performance"), ("ppo", "robustness"),
+        ("dqn", "performance"), ("dqn", "robustness"),
     ],
-)
-def test_numpy_and_jax_act_alike(name, track, looks_back, tmp_path):
+)  # fmt: skip
+def test_numpy_and_jax_act_alike(name, track, tmp_path):
     folder = tmp_path / name
     shutil.copytree(HERE / name, folder, ignore=shutil.ignore_patterns("__pycache__"))
-    made = make(name, looks_back)
+    made = make(name)
     save_weights(folder / "weights.npz", made)
     with precision.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS])

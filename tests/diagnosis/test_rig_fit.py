@@ -29,7 +29,7 @@ NAMES = ("exhalation_valve_delay", "circuit_compliance", "valve_curve", "sensor_
 def test_strengths_a_rig_on_the_public_recordings(public_recordings):
     breaths = load(public_recordings / "pvp_quicklung.csv")
     breaths = breaths.select(np.isin(breaths.lung_ids, LUNG_IDS))
-    rigs = frozen.load(version=1).sessions.assign(breaths)
+    rigs = frozen.load().sessions.assign(breaths)
     uses, data, names = split(breaths), make_data(breaths), paths(NAMES)
     seen, first = uses.identifying, breaths.pressure[:, 0]
     evaluator = make_evaluator(data.select(seen), uses.testing[seen], names, ("patient_effort",))

@@ -17,19 +17,13 @@ from ventbench.lungs import LUNG_IDS, LUNGS, RECORDED_LUNGS
 from ventbench.plants import frozen
 from ventbench.plants.frozen import BY_ALL, Seen, fingerprints
 from ventbench.precision import float64
-from ventbench.training.simulator import reference_session
 
-NAMES = (frozen.MEMBERS, frozen.LEARNED, frozen.SEEN)
+NAMES = (frozen.MEMBERS, frozen.SEEN)
 
 
 @pytest.fixture(scope="module")
 def official():
     return frozen.load()
-
-
-@pytest.fixture(scope="module")
-def networks():
-    return frozen.load_learned()
 
 
 @pytest.fixture
@@ -45,7 +39,7 @@ def test_every_file_is_what_the_manifest_says(official):
         assert manifest["files"][name]["sha256"] == files.sha256(folder / name)
     about = official.about()
     assert about == {
-        "version": 1,
+        "version": 2,
         "kind": "hybrid",
         "manifest_sha256": files.sha256(folder / frozen.MANIFEST),
         "files": {name: manifest["files"][name]["sha256"] for name in NAMES},
@@ -60,9 +54,6 @@ def test_one_flipped_bit_is_refused_and_the_file_named(copy, name, where):
     (copy / name).write_bytes(content)
     with pytest.raises(InputError, match=rf"{name} has SHA-256 .* the manifest says .* damaged"):
         frozen.load(path=copy)
-    if name != frozen.MEMBERS:
-        with pytest.raises(InputError, match=f"{name} has SHA-256"):
-            frozen.load_learned(path=copy)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -84,38 +75,30 @@ def test_a_file_that_the_manifest_lacks_is_named(copy):
     [
         (None, "cannot be read"),
         ("version = ", "cannot be read"),
-        ("version = 1\n", "key format: None is neither 'ventbench-simulators-1'"),
-        ('format = "ventbench-simulators-9"\n', "reads no other"),
+        ("version = 1\n", "key format: None is not 'ventbench-simulators-2'"),
+        ('format = "ventbench-simulators-1"\n', "reads no other"),
     ],
 )
 def test_a_wrong_manifest_is_refused(copy, text, message):
     (copy / frozen.MANIFEST).unlink()
     if text is not None:
         (copy / frozen.MANIFEST).write_text(text)
-    for read in (frozen.load, frozen.load_learned):
-        with pytest.raises(InputError, match=message) as refused:
-            read(path=copy)
-        assert frozen.MANIFEST in str(refused.value)
+    with pytest.raises(InputError, match=message) as refused:
+        frozen.load(copy)
+    assert frozen.MANIFEST in str(refused.value)
 
 
-def test_a_version_that_does_not_exist():
-    with pytest.raises(InputError, match="v9"):
-        frozen.load(version=9)
-
-
-def test_shapes_and_precision(official, networks):
+def test_shapes_and_precision(official):
     sessions = len(official.sessions)
     for plants, shape in (
         (official.plants, (6,)),
-        (official.ensemble, (5, 6)),
-        (official.members, (5, sessions)),
+        (official.ensemble, (6, 6)),
+        (official.members, (6, sessions)),
     ):
         leaves = jax.tree.leaves(plants)
         assert all(isinstance(leaf, np.ndarray) and leaf.dtype == np.float64 for leaf in leaves)
         assert all(leaf.shape[: len(shape)] == shape for leaf in leaves)
         assert all(np.isfinite(leaf).all() for leaf in leaves)
-    assert all(x.shape[:2] == (5, 9) for x in jax.tree.leaves(networks.members))
-    assert jax.tree.leaves(networks.members)[0].dtype == np.float32
 
 
 def test_the_first_of_the_ensemble_is_official(official):
@@ -131,7 +114,7 @@ def test_stiffness_and_resistance_are_in_the_order_of_the_labels(official):
     plants = official.plants
     elastance = plants.E.reshape(2, 3)
     assert (np.diff(elastance, axis=1) < 0).all()
-    np.testing.assert_allclose(elastance, [[1000.0 / x.C for x in LUNGS[:3]]] * 2, rtol=0.65)
+    np.testing.assert_allclose(elastance, [[1000.0 / x.C for x in LUNGS[:3]]] * 2, rtol=0.2)
     assert (plants.R[3:] > 2.0 * plants.R[:3]).all()
 
 
@@ -143,7 +126,6 @@ def test_lungs_tells_settings_and_errors(official):
         low, high = about["held_out_ci95"]
         assert 0.0 < low < about["held_out_mae"] < high
         assert official.sessions.table[about["session"]].lung == setting.id
-        assert about["session"] == reference_session(official.sessions, setting.id)
     lungs["R5C10"]["R"] = 0.0  # a copy
     assert official.lungs()["R5C10"]["R"] == 5.0
 
@@ -173,38 +155,26 @@ def test_a_breath_gets_its_lung_on_the_rig_of_its_clock(official, make_recording
     assert len(np.unique(official.members.E[0])) == len(table)
 
 
-def test_an_unknown_lung_is_refused_with_the_known_ones(official, networks, make_recording):
+def test_an_unknown_lung_is_refused_with_the_known_ones(official, make_recording):
     breaths = make_recording(["R5C10", "R5C30"])
     known = ", ".join(lung.id for lung in RECORDED_LUNGS)
     for find in (official.for_breaths, official.cross_fitted):
         with pytest.raises(InputError, match=f"lung R5C30.*known are {known}"):
             find(breaths)
-    for find in (networks.for_breaths, networks.cross_fitted):
-        with pytest.raises(InputError, match=f"R5C30; known are {known}"):
-            find(breaths)
 
 
-def test_who_has_seen_a_breath_decides_who_judges_it(official, networks, make_recording):
+def test_who_has_seen_a_breath_decides_who_judges_it(official, make_recording):
     breaths = make_recording(["R5C10"] * 7)
     keys = fingerprints(breaths)
-    folds = np.array([0, 1, 2, 3, 4, BY_ALL], np.int8)  # of the first six; the last is new
+    folds = np.array([1, 2, 3, 4, 5, BY_ALL], np.int8)  # of the first six; the last is new
     order = np.argsort(keys[:6])
-    known = Seen(keys[:6][order], folds[order])
-    simulators = replace(official, seen=known)
+    simulators = replace(official, seen=Seen(keys[:6][order], folds[order]))
     assert simulators.held_out(breaths).tolist() == [True] * 5 + [False, True]
-    assert simulators.unseen(breaths).tolist() == [True] + [False] * 5 + [True]
-    judges = [0, 1, 2, 3, 4, 0, 0]
+    assert simulators.unseen(breaths).tolist() == [False] * 6 + [True]
+    judges = [1, 2, 3, 4, 5, 0, 0]
     at = int(official.sessions.assign(breaths)[0])
     with float64():
         assert same(
             simulators.cross_fitted(breaths),
             jax.tree.map(lambda leaf: leaf[judges, at], official.members),
-        )
-        assert same(
-            replace(networks, seen=known).cross_fitted(breaths).plants,
-            jax.tree.map(lambda leaf: leaf[judges, 0], networks.members),
-        )
-        assert same(
-            networks.for_breaths(breaths).plants,
-            jax.tree.map(lambda leaf: leaf[[0] * 7, 0], networks.members),
         )

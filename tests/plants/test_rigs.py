@@ -1,4 +1,4 @@
-"""Version 2 of the official simulators: each lung is a set of rigs that passed a test."""
+"""The official simulators: each lung is a set of rigs that passed a test."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import files, protocol
+from ventbench import protocol
 from ventbench.lungs import LUNGS
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import RELIEF, RELIEF_ROOM, Hybrid
@@ -17,25 +17,7 @@ from ventbench.rollouts import open_loop
 
 @pytest.fixture(scope="module")
 def official():
-    return frozen.load(version=2)
-
-
-def test_files_are_what_the_manifest_says(official):
-    manifest = official.manifest
-    assert (manifest["format"], manifest["version"]) == (frozen.RIGS_FORMAT, 2)
-    for name, entry in manifest["files"].items():
-        assert files.sha256(frozen.folder(2) / name) == entry["sha256"]
-    assert official.about()["version"] == 2
-    assert official.manifest_sha256 != frozen.MANIFEST_SHA256
-
-
-def test_version_1_has_one_rig_a_lung():
-    version_1 = frozen.load()
-    references = tuple((version_1.manifest["lungs"][lung.id]["session"],) for lung in LUNGS)
-    assert version_1.rigs == version_1.training_rigs == references
-    assert version_1.held_out_rigs == (None,) * len(LUNGS)
-    assert version_1.rejected == {}
-    assert version_1.sessions_plants is version_1.members
+    return frozen.load()
 
 
 def test_rigs_are_sessions_of_their_lung_that_passed(official):

@@ -14,15 +14,15 @@ from ventbench.plants.sessions import Sessions, find
 from ventbench.precision import float64
 from ventbench.recordings import Breaths, make_breaths
 from ventbench.rollouts import open_loop
-from ventbench.training.hybrid.data import groups_of
-from ventbench.training.hybrid.parameters import Pooled, initial, plants
+from ventbench.training.rigs.data import groups_of
+from ventbench.training.rigs.parameters import Pooled, centre, plants
 
 SAMPLES, INSPIRATORY = 45, 30
 
 
 def truth() -> Pooled:
     """What the synthetic lungs are: not where a fit starts. Call it in float64."""
-    start = initial()
+    start = centre(RECORDED_LUNGS, len(RECORDED_LUNGS)).pooled
     return replace(
         start,
         slopes=start.slopes + jnp.linspace(0.5, -0.4, start.slopes.size),
@@ -51,7 +51,7 @@ def synthetic(
     start = rng.uniform(4.5, 7.0, (n, 1)) * np.ones(u_in.shape)
     breaths = make_breaths(np.arange(n) + first_id, R, C, time, u_in, opened, start)
     with float64():
-        plant = plants(truth(), groups_of(breaths, find(breaths)))
+        plant = plants(truth(), groups_of(breaths, find(breaths), RECORDED_LUNGS))
         columns = (breaths.pressure[:, 0], u_in, opened, breaths.dt)
         pressure = open_loop(plant, *(jnp.asarray(x) for x in columns))
     return replace(breaths, pressure=np.array(pressure))

@@ -5,12 +5,15 @@ from __future__ import annotations
 import io
 import json
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 
+import jax
 import numpy as np
+import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from ventbench import precision, protocol, rollouts
+from ventbench import precision, protocol, rig_draws, rollouts, seasons
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
 from ventbench.environment import nominal_scenario
@@ -18,10 +21,14 @@ from ventbench.errors import InputError
 from ventbench.executor import executor
 from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.metrics.score import run_error
+from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, take
+from ventbench.submissions.folder import submission_of
+from ventbench.submissions.rig_scoring import load_rigs, run_on_rigs
 from ventbench.training import pid_grid
 from ventbench.training.pid_grid import PIDGrid
+from ventbench.training.plants import plants_to_train_on
 
 GAINS = np.array([(p, i, d) for p in (0.0, 2.0, 5.0) for i in (0.0, 4.0) for d in (0.0, 1.0)])
 PLANTS = {lung.id: single_compartment(lung) for lung in LUNGS[:3]}
@@ -121,29 +128,14 @@ def test_dask_gives_the_same_grid(whole, tmp_path):
 
 def test_the_table_is_the_grid(whole, tmp_path):
     whole.save(tmp_path / "grid.parquet")
-    found = pid_grid.load_grid(tmp_path / "grid.parquet")
-    assert (found.lungs, found.pips) == (whole.lungs, whole.pips)
-    np.testing.assert_array_equal(found.gains, whole.gains)
-    np.testing.assert_array_equal(found.error, whole.error)
-
-
-def test_another_table_is_refused(tmp_path):
-    path = tmp_path / "x.parquet"
-    path.write_bytes(b"PAR1")
-    with pytest.raises(InputError, match=r"x\.parquet is not a table of `ventbench tune pid`"):
-        pid_grid.load_grid(path)
-
-
-def test_the_summary_names_the_least_errors():
-    error = np.array([[[1.0, 5.0], [2.0, 2.0]], [[1.0, 1.0], [1.5, 1.5]]], np.float32)
-    gains = np.array([(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)])
-    found = PIDGrid(("R5C10", "R5C20"), (10.0, 15.0), gains, error).summary()
-    assert found["lungs"]["R5C10"] == {"gains": [4.0, 5.0, 6.0], "error": 2.0}
-    assert found["lungs"]["R5C20"] == {"gains": [1.0, 2.0, 3.0], "error": 1.0}
-    assert found["single"] == {
-        "gains": [4.0, 5.0, 6.0], "error": 1.75, "lungs": {"R5C10": 2.0, "R5C20": 1.5},
-    }  # fmt: skip
-    assert found["trajectories"] == 8
+    found = pd.read_parquet(tmp_path / "grid.parquet")
+    assert tuple(found["lung"].unique()) == whole.lungs
+    assert (len(found), found.columns[-1]) == (3 * len(GAINS), "error")
+    second = found[found["lung"] == whole.lungs[1]]
+    np.testing.assert_array_equal(second[["P", "I", "D"]], whole.gains)
+    pips = second[[f"error_pip_{pip:g}" for pip in whole.pips]]
+    np.testing.assert_array_equal(pips, whole.error[1])
+    np.testing.assert_allclose(second["error"], whole.error[1].mean(axis=-1))
 
 
 def test_the_picture_has_a_row_a_lung_and_one_for_all(whole):
@@ -168,25 +160,36 @@ def small(monkeypatch):
 
 
 def test_the_command_writes_table_plot_and_result(small, tmp_path):
-    run = CliRunner().invoke(app, ["tune", "pid", "--all", "--out", str(tmp_path), "--json", "-"])
+    """Without draws; the result against the mean over all training rigs by hand."""
+    command = ["tune", "pid", "--all", "--draws", "0", "--out", str(tmp_path), "--json", "-"]
+    run = CliRunner().invoke(app, command)
     assert run.exit_code == 0, run.output
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["best.json", "grid.parquet", "grid.png"]
     result = json.loads((tmp_path / "best.json").read_text())
     assert tuple(result["lungs"]) == LUNG_IDS
-    table = pid_grid.load_grid(tmp_path / "grid.parquet")
-    gains, error = table.best()
-    assert result["single"]["gains"] == list(gains)
-    assert result["single"]["error"] == pytest.approx(error)
-    assert result["simulators"]["version"] == 1
+    official = frozen.load()
+    assert result["simulators"]["manifest_sha256"] == official.manifest_sha256
+    weights, totals = plants_to_train_on().weights, np.zeros(len(GAINS))
+    for k, name in enumerate(LUNG_IDS):
+        rigs = list(official.training_rigs[k])
+        each = pid_grid.errors(jax.tree.map(lambda x, r=rigs: x[0, r], official.members), GAINS)
+        error = each.mean(axis=0)
+        best = int(np.argmin(error @ weights[k]))
+        assert result["lungs"][name]["gains"] == list(GAINS[best])
+        assert result["lungs"][name]["error"] == pytest.approx(error[best].mean(), rel=1e-5)
+        totals += error @ weights[k]
+    assert result["single"]["gains"] == list(GAINS[int(np.argmin(totals))])
 
 
 def test_the_command_for_one_lung(small, tmp_path):
-    arguments = ["tune", "pid", "--lung", "R20C50", "--out", str(tmp_path)]
+    arguments = ["tune", "pid", "--lung", "R20C50", "--draws", "0", "--out", str(tmp_path)]
     assert CliRunner().invoke(app, arguments).exit_code == 0
     result = json.loads((tmp_path / "best.json").read_text())
     assert tuple(result["lungs"]) == ("R20C50",)
     assert "single" not in result
+    run = CliRunner().invoke(app, ["tune", "pid", "--lung", "all", "--out", str(tmp_path)])
+    assert isinstance(run.exception, InputError)
 
 
 @pytest.mark.parametrize("which", [[], ["--all", "--robust"], ["--lung", "R5C10", "--all"]])
@@ -231,10 +234,54 @@ def test_the_last_batch_may_be_short():
     np.testing.assert_allclose(pid_grid.errors(plants, gains, batch=2), whole, 1e-6)
 
 
-@pytest.mark.slow
-def test_the_best_single_set_on_the_frozen_simulators_is_that_of_the_submission():
-    from ventbench.plants import frozen
+#: Two good PIDs and a bad one.
+PIDS = np.array([(2.0, 4.0, 0.0), (5.0, 5.0, 0.0), (0.0, 0.1, 0.0)])
 
-    error = pid_grid.errors(frozen.load().plants, gains := pid_grid.paper_gains())
-    grid = pid_grid.PIDGrid(LUNG_IDS, protocol.PIPS, gains, error)
-    assert grid.best()[0] == (6.0, 6.0, 0.3)
+
+@pytest.mark.slow
+def test_gains_are_tuned_on_draws_of_their_own(monkeypatch):
+    told = []
+    grid, result = pid_grid.tune_pid(gains=PIDS, draws=2, progress=lambda *x: told.append(x))
+    assert told[-1] == (6 * 3 * 6, 6 * 3 * 6)
+    assert grid.lungs == tuple(result["lungs"]) == LUNG_IDS
+    good = [list(gains) for gains in PIDS[:2]]
+    assert all(entry["gains"] in good for entry in result["lungs"].values())
+    assert result["single"]["gains"] in good
+    assert result["draws"] == 2
+    assert pid_grid.TUNING_SEED != seasons.DEVELOPMENT_SEED
+
+    asked = []
+
+    @contextmanager
+    def cluster(*where):
+        asked.append(where)
+        with ThreadPoolExecutor(2) as pool:
+            yield pool
+
+    monkeypatch.setattr(pid_grid, "executor", cluster)
+    _, again = pid_grid.tune_pid(gains=PIDS, draws=2, scheduler="tcp://elsewhere:8786")
+    assert asked == [(0, "tcp://elsewhere:8786")]
+    assert again == result
+
+
+@pytest.mark.slow
+def test_an_error_on_draws_is_that_of_the_scorer():
+    rigs = load_rigs("single_compartment")
+    drawn = rig_draws.build(tuple((0,) for _ in rigs.lungs), 1, seed=pid_grid.TUNING_SEED, n=1)
+    found = pid_grid.drawn_errors(rigs, drawn, 2, PIDS[:1])
+
+    class Controller:
+        def reset(self, task):
+            self.integral = self.before = self.derivative = 0.0
+
+        def act(self, observation):
+            if observation.time == 0:
+                self.reset(None)
+            error = observation.target - observation.pressure
+            a = observation.dt / (observation.dt + 0.5)
+            self.integral += a * (error - self.integral)
+            return 2.0 * error + 4.0 * self.integral
+
+    score = run_on_rigs(submission_of(Controller), rigs, drawn=drawn)
+    assert score.controllable is not None
+    np.testing.assert_allclose(found[0], score.controllable[2, 1], atol=1e-9)

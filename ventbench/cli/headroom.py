@@ -44,7 +44,7 @@ def headroom(
     from ventbench.executor import executor
     from ventbench.headroom import reference as references
     from ventbench.plants.rigs import load_rigs
-    from ventbench.training import rig_pid
+    from ventbench.training import pid_grid
 
     console = Console(stderr=str(json) == "-")
     rigs = load_rigs()
@@ -64,7 +64,7 @@ def headroom(
     parts = out.with_suffix(".parts")
     with bars() as progress:
         task = progress.add_task("best PID of each lung", total=None)
-        gains, _ = rig_pid.best_pids(
+        gains, _ = pid_grid.best_pids(
             rigs, progress=lambda done, all_: progress.update(task, completed=done, total=all_)
         )
         task = progress.add_task("best attainable", total=None)

@@ -73,9 +73,8 @@ PlantName = Annotated[
     typer.Option(
         "--plant",
         metavar="PLANT",
-        help="Simulators: frozen (the official ones), learned, physics, two_balloon, a file of "
-        "plants such as corrected.json, a CSV or Parquet file of simulated pressures, or "
-        "module:function.",
+        help="Simulators: frozen (the official ones), physics, two_balloon, a file of plants such "
+        "as corrected.json, a CSV or Parquet file of simulated pressures, or module:function.",
     ),
 ]
 Workers = Annotated[

@@ -11,17 +11,12 @@ from ventbench import protocol
 from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, bars, counted, emit, notes
 
 
-def lungs(
-    version: Annotated[
-        int, typer.Option(min=1, max=2, help="Version of the frozen simulators.")
-    ] = 2,
-    json: JsonFile = None,
-) -> None:
+def lungs(json: JsonFile = None) -> None:
     """List the six lungs and the errors of their simulators on recorded breaths held out.
 
-    Version 2 has three errors a lung, mean / median |simulated - recorded| pressure in cmH2O: of
-    the rigs that are scored on their own breaths, of the lung on breaths of rigs that the fit has
-    not seen, and of all breaths that bear the label, each by the rig of its clock.
+    There are three errors a lung, mean / median |simulated - recorded| pressure in cmH2O: of the
+    rigs that are scored on their own breaths, of the lung on breaths of rigs that the fit has not
+    seen, and of all breaths that bear the label, each by the rig of its clock.
 
     Example: `ventbench lungs`
     """
@@ -30,27 +25,22 @@ def lungs(
 
     from ventbench.plants import frozen
 
-    official = frozen.load(version=version)
+    official = frozen.load()
     known = official.lungs()
-    title = f"The six lungs, simulators version {version}: error on breaths held out, cmH2O"
-    table = Table(title=title)
+    table = Table(title="The six lungs: error of their simulators on breaths held out, cmH2O")
     kinds = {"own_rig": "own rig", "unseen_rig": "unseen rig", "held_out": "by clock"}
-    if version == 1:
-        del kinds["own_rig"], kinds["unseen_rig"]
     table.caption = "Mean / median. R in cmH2O/(L/s), C in mL/cmH2O."
     for name in ("lung", "R", "C", "rigs", *kinds.values(), "breaths"):
         table.add_column(name, justify="left" if name == "lung" else "right", no_wrap=True)
     emit(known, json)
 
     def shown(about: dict[str, Any], kind: str) -> str:
-        if f"{kind}_mae" not in about:
-            return "-"
         return f"{about[f'{kind}_mae']:.2f} / {about[f'{kind}_median_mae']:.2f}"
 
     for rigs, (lung_id, about) in zip(official.rigs, known.items(), strict=True):
         setting = (f"{about['R']:g}", f"{about['C']:g}", str(len(rigs)))
         figures = (shown(about, kind) for kind in kinds)
-        table.add_row(lung_id, *setting, *figures, str(about.get("held_out_breaths", "-")))
+        table.add_row(lung_id, *setting, *figures, str(about["held_out_breaths"]))
     console = Console(stderr=str(json) == "-")
     console.print(table)
     for session, reason in official.rejected.items():
@@ -86,9 +76,7 @@ def coverage(
     entry = records.load(record)
     if not isinstance(entry, records.Record):
         raise InputError(f"{record} is no record of a score that lies open")
-    lungs = frozen.load(version=2).lungs()
-    if not all("recorded_commands" in about for about in lungs.values()):
-        raise InputError("the frozen simulators tell no recorded commands; train them again")
+    lungs = frozen.load().lungs()
     commands = actions.load(entry, record.parent).clip(0.0, 100.0)
     by_lung = open_loop.by_lung(dict(zip(entry.lungs, commands, strict=True)), lungs)
     emit({name: asdict(share) for name, share in by_lung.items()}, json)

@@ -38,16 +38,6 @@ Steps = Annotated[
     typer.Option(min=1, help="Control steps of experience; default: as in docs/reinforcement.md."),
 ]
 
-ProtocolVersion = Annotated[
-    int,
-    typer.Option(
-        "--protocol",
-        min=1,
-        max=2,
-        help="Version of the protocol to train for; 2: all rigs of each lung but the held-out one.",
-    ),
-]
-
 
 @train.callback()
 def _group() -> None:
@@ -67,12 +57,6 @@ def simulator(
             metavar="ID,ID,...", help="Lungs to list, such as R5C10,R20C50; default: all recorded."
         ),
     ] = None,
-    version: Annotated[
-        int,
-        typer.Option(
-            min=1, max=2, help="Recipe: 2, or 1 for the first frozen simulators and their files."
-        ),
-    ] = 2,
     laminar_share: Annotated[
         float,
         typer.Option(
@@ -90,35 +74,18 @@ def simulator(
 
     Example: `ventbench train simulator --recordings my-recordings --out runs/my-rig`
     """
-    from ventbench.errors import InputError
-
-    folder = recordings_folder(recordings)
-    if version == 1:
-        from ventbench.training.simulator import train_simulator
-
-        if lungs is not None:
-            raise InputError("--lungs has no meaning for --version 1, which lists the six lungs")
-        if laminar_share != 0.4:
-            raise InputError("--laminar-share has no meaning for --version 1")
-        _train_simulators(train_simulator, folder, out)
-        return
-    from functools import partial
-
     from ventbench.training.rigs.train import RigConfig, train_rigs
 
-    config = RigConfig(laminar_share=laminar_share)
+    folder = recordings_folder(recordings)
     listed = None if lungs is None else [name.strip() for name in lungs.split(",")]
-    _train_simulators(partial(train_rigs, lungs=listed, config=config), folder, out)
-
-
-def _train_simulators(run: Any, folder: Path, out: Path) -> None:
     with bars() as shown:
         task = shown.add_task("learning", total=1.0)
 
         def progress(what: str, share: float) -> None:
             shown.update(task, description=what, completed=share)
 
-        run(folder, out, progress=progress)
+        config = RigConfig(laminar_share=laminar_share)
+        train_rigs(folder, out, lungs=listed, config=config, progress=progress)
     typer.echo(f"wrote {out}")
 
 
@@ -139,11 +106,11 @@ def residual(
         int | None, typer.Option(min=1, help="Updates of each network; default: 3000.")
     ] = None,
     members: Annotated[
-        int,
+        int | None,
         typer.Option(
-            min=1, max=5, help="Simulators of each lung: 1 the official one, 5 the whole ensemble."
+            min=1, help="Plants of each lung, 1 for the reference rig alone; default: all."
         ),
-    ] = 5,
+    ] = None,
     randomise: Annotated[
         float,
         typer.Option(
@@ -152,14 +119,6 @@ def residual(
             help="Random deviations (noise, R, C, ...), as a multiple of the ranges of the draws.",
         ),
     ] = 1.0,
-    agreement: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            help="Weight of the disagreement between the simulators; default: 1, and 0 for "
-            "--protocol 2.",
-        ),
-    ] = None,
     penalty: Annotated[
         float,
         typer.Option(
@@ -173,7 +132,6 @@ def residual(
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ] = Path("runs/residual"),
     plant: PlantName = "frozen",
-    version: ProtocolVersion = 1,
     json: JsonFile = None,
 ) -> None:
     """Train networks that correct the best PID, by differentiating through the simulators.
@@ -184,24 +142,19 @@ def residual(
 
     Example: `ventbench train residual --all --out runs/residual_all`
     """
-    from dataclasses import replace
-
     from rich.console import Console
 
     from ventbench.errors import InputError
-    from ventbench.training.residual.fit import RIGS_CONFIG, ResidualConfig
-    from ventbench.training.trained import ALL
+    from ventbench.training.plants import ALL
+    from ventbench.training.residual import ResidualConfig
 
     if lung is not None and every:
         raise InputError("give --lung ID or --all, not both")
     names = (ALL,) if every else None if lung is None else (lung,)
-    standard = RIGS_CONFIG if version == 2 else ResidualConfig()
-    config = replace(
-        standard,
-        updates=updates or standard.updates,
+    config = ResidualConfig(
+        updates=updates or ResidualConfig.updates,
         members=members,
         spread=randomise,
-        agreement=standard.agreement if agreement is None else agreement,
         lam=penalty,
         round_robin=round_robin,
     )
@@ -259,7 +212,6 @@ def ppo(
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ] = Path("runs/ppo"),
     plant: PlantName = "frozen",
-    version: ProtocolVersion = 1,
     json: JsonFile = None,
 ) -> None:
     """Train networks that correct the PID, by proximal policy optimisation (PPO).
@@ -270,7 +222,7 @@ def ppo(
 
     Example: `ventbench train ppo --lung R20C50 --out runs/ppo-R20C50`
     """
-    _train_policies("ppo", lung, all_lungs, seed, seeds, steps, out, plant, version, json)
+    _train_policies("ppo", lung, all_lungs, seed, seeds, steps, out, plant, json)
 
 
 @train.command()
@@ -284,7 +236,6 @@ def dqn(
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
     ] = Path("runs/dqn"),
     plant: PlantName = "frozen",
-    version: ProtocolVersion = 1,
     json: JsonFile = None,
 ) -> None:
     """Train networks that choose among 19 corrections of the PID, by deep Q-learning (DQN).
@@ -295,7 +246,7 @@ def dqn(
 
     Example: `ventbench train dqn --lung R20C50 --out runs/dqn-R20C50`
     """
-    _train_policies("dqn", lung, all_lungs, seed, seeds, steps, out, plant, version, json)
+    _train_policies("dqn", lung, all_lungs, seed, seeds, steps, out, plant, json)
 
 
 def _train_policies(
@@ -307,14 +258,13 @@ def _train_policies(
     steps: int | None,
     out: Path,
     plant: str,
-    version: int,
     json: Path | None,
 ) -> None:
     from rich.console import Console
 
     from ventbench.errors import InputError
+    from ventbench.training.plants import ALL
     from ventbench.training.rl.train import train_dqn, train_ppo
-    from ventbench.training.trained import ALL
 
     if lung is not None and all_lungs:
         raise InputError("give --lung ID or --all, not both; neither trains all seven networks")
@@ -335,7 +285,6 @@ def _train_policies(
             seeds=range(seed, seed + seeds),
             steps=steps,
             simulator=plant,
-            version=version,
             progress=progress,
         )
     emit(trained.report, json)

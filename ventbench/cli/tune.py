@@ -49,85 +49,50 @@ def pid(
     workers: Workers = 0,
     scheduler: Scheduler = None,
     plant: PlantName = "frozen",
-    version: Annotated[
+    draws: Annotated[
         int,
         typer.Option(
-            "--protocol",
-            min=1,
-            max=2,
-            help="Version of the protocol; 2: on all rigs of each lung but the held-out one, the "
-            "best also with noise; only with --all.",
+            min=0,
+            max=20,
+            help="Draws with noise and deviations that decide among the 100 best; 0 to decide "
+            "without noise, as in the paper.",
         ),
-    ] = 1,
+    ] = 20,
     json: JsonFile = None,
 ) -> None:
     """Simulate the paper's 8,000 PIDs at six PIPs on the frozen simulators or others.
 
-    P, I and D each take the values 0, 0.1, ..., 0.9, 1, 2, ..., 10 %/cmH2O; there is no noise.
-    Ctrl-C keeps the finished parts; the same command continues. With --protocol 2 the 100 best also
-    run on draws of their own, and the best there win.
+    P, I and D each take the values 0, 0.1, ..., 0.9, 1, 2, ..., 10 %/cmH2O. On the frozen
+    simulators a lung has all its rigs but the held-out one. The 100 best without noise also run on
+    draws that are for tuning alone, and the best there win. Ctrl-C keeps the finished parts; the
+    same command continues.
 
     Example: `ventbench tune pid --all --out runs/pid`
     """
     from rich.console import Console
 
     from ventbench.errors import InputError
-    from ventbench.training.pid_grid import RESULT, TABLE
+    from ventbench.training.pid_grid import RESULT, TABLE, tune_pid
 
     if (lung is not None) + every + robust != 1:
         raise InputError("give exactly one of --lung LUNG, --all and --robust")
-    if version == 2:
-        if not every:
-            raise InputError("--protocol 2 tunes all lungs: give --all")
-        grid, result = _search_rigs(plant, out, workers, scheduler)
-    else:
-        names = None if lung is None else (lung,)
-        grid, result = _search(names, plant, out, workers, scheduler, not robust)
+    with bars() as shown:
+        grid, result = tune_pid(
+            None if lung is None else (lung,),
+            out,
+            draws=draws,
+            workers=workers,
+            scheduler=scheduler,
+            each=not robust,
+            simulator=plant,
+            progress=counted(shown, "trajectories"),
+        )
     written = [TABLE, RESULT, *_plot(out / PLOT, grid, not robust, lung is None)]
     emit(result, json)
     console = Console(stderr=str(json) == "-")
     console.print(_table(result))
     for name in written:
         console.print(f"wrote {out / name}", markup=False, highlight=False, soft_wrap=True)
-
-
-def _search(
-    names: tuple[str, ...] | None,
-    plant: str,
-    out: Path,
-    workers: int,
-    scheduler: str | None,
-    each: bool,
-) -> tuple[Any, dict[str, Any]]:
-    from ventbench.training.pid_grid import tune_pid
-
-    with bars() as shown:
-        return tune_pid(
-            names,
-            out,
-            workers=workers,
-            scheduler=scheduler,
-            each=each,
-            simulator=plant,
-            progress=counted(shown, "trajectories"),
-        )
-
-
-def _search_rigs(
-    plant: str, out: Path, workers: int, scheduler: str | None
-) -> tuple[Any, dict[str, Any]]:
-    """Tune for protocol version 2, and write the same files."""
-    from ventbench import files
-    from ventbench.training.pid_grid import RESULT, TABLE
-    from ventbench.training.rig_pid import tune_on_rigs
-
-    with bars() as shown:
-        progress = counted(shown, "lungs")
-        tuned = tune_on_rigs(plant, progress=progress, workers=workers, scheduler=scheduler)
-    tuned.nominal.save(out / TABLE)
-    result = tuned.to_json()
-    files.write_json(out / RESULT, result)
-    return tuned.nominal, result
 
 
 def _plot(path: Path, grid: Any, each: bool, single: bool) -> list[str]:

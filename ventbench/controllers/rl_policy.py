@@ -1,10 +1,10 @@
 """The PID with a correction by a small network, the policy of the reinforcement learners.
 
 All methods share the features that the network sees, the PID that it corrects, and the kind of
-network. The features are 15 of this breath, or the 30 of the residual controller
-(:mod:`ventbench.controllers.residual`), which look back at the breath before. The policy of PPO and
-of the policy gradient adds the network's output to the PID's command; the policy of DQN adds the
-one of 19 corrections that has the highest value.
+network. The features are the 30 of the residual controller (:mod:`ventbench.controllers.residual`),
+which look back at the breath before. The policy of PPO and of the policy gradient adds the
+network's output to the PID's command; the policy of DQN adds the one of 19 corrections that has the
+highest value.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from jax import Array
 
 from ventbench import protocol
-from ventbench.controllers.pid import PID, PIDState
+from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import Residual, ResidualState, inputs
 from ventbench.files import write_atomically
 from ventbench.interfaces import Observation
@@ -28,89 +28,31 @@ from ventbench.interfaces import Observation
 #: The PID that is corrected: the best single one of the grid for all six lungs, (P, I, D).
 GAINS = (6.0, 6.0, 0.3)
 
-#: Number of earlier errors, and of earlier commands, among the features.
-PAST = 4
+#: Gives the features, those of the residual controller; its network has no layers.
+_RESIDUAL = Residual(PID(*GAINS), ())
 
-#: Number of features of this breath.
-FEATURES = 2 * PAST + 7
-
-#: Gives the features that look back at the breath before; its network has no layers.
-_LOOKING_BACK = Residual(PID(*GAINS), ())
-
-#: Scales that bring the features to the order of 1: cmH2O, cmH2O and %.
-ERROR_SCALE, TARGET_SCALE, COMMAND_SCALE = 10.0, 40.0, 50.0
+#: Number of features.
+FEATURES = inputs(_RESIDUAL)
 
 
-@flax.struct.dataclass
-class FeatureState:
-    """Traces of earlier steps that the features need.
-
-    Attributes:
-        pid: state of the PID, ``(...)``.
-        errors: errors of the last steps, the latest first, cmH2O, ``(..., PAST)``.
-        commands: applied in the last steps, the latest first, %, ``(..., PAST)``.
-    """
-
-    pid: PIDState
-    errors: Array
-    commands: Array
+def init_features(shape: tuple[int, ...]) -> ResidualState:
+    """State before the first breath."""
+    return _RESIDUAL.init(shape)
 
 
-#: State of either kind of features.
-AnyFeatureState = FeatureState | ResidualState
-
-
-def feature_count(looks_back: bool = False) -> int:
-    """Number of features, with the breath before or without."""
-    return inputs(_LOOKING_BACK) if looks_back else FEATURES
-
-
-def init_features(shape: tuple[int, ...], looks_back: bool = False) -> AnyFeatureState:
-    """State before the first breath; one that does not look back is new at each breath."""
-    if looks_back:
-        return _LOOKING_BACK.init(shape)
-    past = jnp.zeros((*shape, PAST))
-    return FeatureState(PID(*GAINS).init(shape), past, past)
-
-
-def features(
-    state: AnyFeatureState, observation: Observation
-) -> tuple[AnyFeatureState, Array, Array]:
+def features(state: ResidualState, observation: Observation) -> tuple[ResidualState, Array, Array]:
     """Features of an observation.
 
     Args:
-        state: from :func:`init_features`, which decides whether they look back.
+        state: from :func:`init_features`.
         observation: the observation.
 
     Returns:
-        The next state, the features, shape ``(..., feature_count(looks_back))``, and the command of
-        the PID, clipped to the valve's range, %, shape ``(...)``.
+        The next state, the features, shape ``(..., FEATURES)``, and the command of the PID, clipped
+        to the valve's range, %, shape ``(...)``.
     """
-    if isinstance(state, ResidualState):
-        state, seen, asked = _LOOKING_BACK.features(state, observation)
-        return state, seen, jnp.clip(asked, 0.0, protocol.U_MAX)
-    restart = jnp.broadcast_to(observation.time == 0, jnp.shape(observation.pressure))[..., None]
-    error = observation.target - observation.pressure
-    before = jnp.where(restart, error[..., None], state.errors)
-    bias = observation.previous_u_in[..., None]
-    commands = jnp.concatenate([bias, state.commands[..., :-1]], axis=-1)
-    commands = jnp.where(restart, bias, commands)
-    pid, asked = PID(*GAINS).step(state.pid, observation)
-    base = jnp.clip(asked, 0.0, protocol.U_MAX)
-    now: list[Any] = [
-        error / ERROR_SCALE,
-        pid.integral / ERROR_SCALE,
-        pid.derivative,
-        base / COMMAND_SCALE - 1.0,
-        observation.target / TARGET_SCALE,
-        observation.targets_ahead[..., -1] / TARGET_SCALE,
-        jnp.broadcast_to(observation.time, error.shape),
-    ]
-    features = jnp.concatenate(
-        [jnp.stack(now, axis=-1), before / ERROR_SCALE, commands / COMMAND_SCALE - 1.0], axis=-1
-    )
-    errors = jnp.concatenate([error[..., None], before[..., :-1]], axis=-1)
-    return FeatureState(pid, errors, commands), features, base
+    state, seen, asked = _RESIDUAL.features(state, observation)
+    return state, seen, jnp.clip(asked, 0.0, protocol.U_MAX)
 
 
 #: Parameters of a network, as flax keeps them.
@@ -139,9 +81,9 @@ class TanhNetwork(nn.Module):
         return nn.Dense(self.outputs, kernel_init=start)(x)
 
 
-def init_parameters(network: TanhNetwork, key: Array, looks_back: bool = False) -> Parameters:
+def init_parameters(network: TanhNetwork, key: Array) -> Parameters:
     """Parameters at the start of a training."""
-    return network.init(key, jnp.zeros((1, feature_count(looks_back))))
+    return network.init(key, jnp.zeros((1, FEATURES)))
 
 
 def layers(parameters: Parameters) -> list[tuple[Array, Array]]:
@@ -167,20 +109,16 @@ class CorrectedPID:
     Attributes:
         parameters: weights and biases of the network.
         network: what the outputs of the network mean is told by the kind of policy.
-        looks_back: whether the features look back at the breath before.
     """
 
     parameters: Parameters
     network: TanhNetwork = flax.struct.field(pytree_node=False)
-    looks_back: bool = flax.struct.field(pytree_node=False, default=False)
 
-    def init(self, shape: tuple[int, ...]) -> AnyFeatureState:
+    def init(self, shape: tuple[int, ...]) -> ResidualState:
         """State at the start of a run."""
-        return init_features(shape, self.looks_back)
+        return init_features(shape)
 
-    def step(
-        self, state: AnyFeatureState, observation: Observation
-    ) -> tuple[AnyFeatureState, Array]:
+    def step(self, state: ResidualState, observation: Observation) -> tuple[ResidualState, Array]:
         """Return the next state and ``u_in``, %."""
         state, x, base = features(state, observation)
         outputs: Array = self.network.apply(self.parameters, x)  # type: ignore[assignment]

@@ -98,7 +98,7 @@ def diagnose(
     Args:
         breaths: n recorded breaths. Of each lung, every third tests which terms are needed, and
             every sixth, which nothing else sees, judges the corrected simulator.
-        simulator: what to diagnose. A name (``"physics"``, ``"frozen"``, ``"learned"``,
+        simulator: what to diagnose. A name (``"physics"``, ``"frozen"``,
             ``"two_balloon"``), a path to a plant file, a plant, plants by lung id, an array of
             simulated pressures of these breaths, cmH2O, ``(n, T)``, or a Python function of one
             breath's commands, ``f(u_in, u_out, dt, *, R, C, initial_pressure)``, that returns the

@@ -4,7 +4,6 @@
 What is given                         What it stands for
 ====================================  ============================================================
 ``frozen`` (or ``hybrid``)            the official simulators
-``learned``                           the paper's networks, trained on the same breaths
 ``physics``                           R-C lungs at their labels
 ``two_balloon``, ...                  another family of :mod:`~ventbench.plants.registry` at labels
 ``FILE.json``, ``FILE.npz``           plants of some lungs, such as a ``corrected.json``
@@ -243,15 +242,6 @@ def _trained(path: Path) -> Simulators:
     )  # fmt: skip
 
 
-def _learned() -> Simulators:
-    loaded, official = frozen.load_learned(), frozen.load()
-    about = {"kind": "learned", **{k: official.about()[k] for k in ("version", "manifest_sha256")}}
-    return Simulators(
-        "learned", "learned", about, LUNGS, official.manifest_sha256, None,
-        lambda: loaded.plants, loaded.for_breaths, loaded.cross_fitted, official,
-    )  # fmt: skip
-
-
 def _at_label(name: str, make: Callable[[Lung], Plant], for_breaths: PlantsFor) -> Simulators:
     """Simulators that need no more than a label, and so know every lung."""
 
@@ -269,7 +259,6 @@ def _named() -> dict[str, Callable[[], Simulators]]:
     resolvers: dict[str, Callable[[], Simulators]] = {
         "frozen": _official,
         "hybrid": _official,  # the kind of plant that the official ones are
-        "learned": _learned,
         # Of recorded breaths the exact solution is quicker than the general solver.
         "physics": partial(
             _at_label, "physics", physics, partial(nominal_plants, single_compartment)

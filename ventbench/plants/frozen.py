@@ -1,9 +1,9 @@
 """The official simulators: six lungs learned from real recordings, fixed by their hashes.
 
-Version 1 is an ensemble of five: member k has seen every recording but those of fold k, so that
-each measured breath is new to one of them. Member 0 is the official simulator, by which scores are
-made. Version 2 makes of each lung a set of rigs: the sessions of the recordings that are what their
-label says, by a test whose figures the manifest holds.
+Each lung is a set of rigs: the sessions of the recordings that are what their label says, by a test
+whose figures the manifest holds. They form an ensemble of six. Member 0, by which the paper's score
+is made, has seen every recording. Member k has seen all but those of fold k - 1, so that each
+measured breath is new to one of them.
 """
 
 from __future__ import annotations
@@ -22,19 +22,14 @@ from numpy.typing import NDArray
 from ventbench import files
 from ventbench.errors import InputError
 from ventbench.files import data_path
-from ventbench.interfaces import Plant
-from ventbench.lungs import LUNGS, RECORDED_LUNGS
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.plant_files import load_plant
 from ventbench.plants.sessions import Sessions
-from ventbench.plants.stacking import VmappedPlant
 from ventbench.recordings.breaths import Breaths
 
-#: Formats of the manifest: one rig a lung, and a set of rigs a lung.
-FORMAT, RIGS_FORMAT = "ventbench-simulators-1", "ventbench-simulators-2"
-#: SHA-256 of the manifest of version 1, which holds those of all its files.
-MANIFEST_SHA256 = "e4b214dd47b9233918260c0576bf76ce15eb1629309be0ae05cf04394fe368e9"
-MANIFEST, MEMBERS, LEARNED, SEEN = "manifest.toml", "hybrid.npz", "learned.npz", "seen.npz"
+#: Format of the manifest.
+FORMAT = "ventbench-simulators-2"
+MANIFEST, MEMBERS, SEEN = "manifest.toml", "hybrid.npz", "seen.npz"
 
 #: Fold of a breath that every member has seen, and of one that none has.
 BY_ALL, BY_NONE = -1, -2
@@ -95,16 +90,15 @@ class Frozen:
         """Sessions that are scored, for each of :attr:`lung_ids`, for the six those of ``LUNGS``.
 
         They passed the test of their label. The first is the lung's reference rig, whose plant is
-        in :attr:`plants`. Version 1 scores that one only.
+        in :attr:`plants`.
         """
-        lungs = self.manifest["lungs"].values()
-        return tuple(tuple(about.get("rigs", [about["session"]])) for about in lungs)
+        return tuple(tuple(about["rigs"]) for about in self.manifest["lungs"].values())
 
     @property
     def held_out_rigs(self) -> tuple[int | None, ...]:
         """For each lung the scored session on which no entry of ours may be trained.
 
-        None where too few sessions passed to spare one, and in version 1.
+        None where too few sessions passed to spare one.
         """
         return tuple(about.get("held_out_rig") for about in self.manifest["lungs"].values())
 
@@ -116,8 +110,8 @@ class Frozen:
 
     @property
     def rejected(self) -> dict[int, str]:
-        """Why a session is not scored, by its index; empty in version 1, which did not test."""
-        tests = self.manifest.get("label_tests", ())
+        """Why a session is not scored, by its index."""
+        tests = self.manifest["label_tests"]
         return {test["session"]: test["reason"] for test in tests if "reason" in test}
 
     @property
@@ -158,11 +152,7 @@ class Frozen:
 
     def unseen(self, breaths: Breaths) -> NDArray[np.bool_]:
         """Whether the official simulators, member 0, have not seen the breath, ``(n,)``."""
-        return np.isin(self.seen.folds(breaths), (BY_ALL, *range(1, self._count)), invert=True)
-
-    @property
-    def _count(self) -> int:
-        return self.members.R.shape[0]
+        return self.seen.folds(breaths) == BY_NONE
 
     def _of(self, breaths: Breaths, member: NDArray[np.int64]) -> Hybrid:
         at = self.sessions.assign(breaths)
@@ -181,43 +171,6 @@ class Frozen:
             "manifest_sha256": self.manifest_sha256,
             "files": hashes,
         }
-
-
-@dataclass(frozen=True, eq=False)
-class FrozenLearned:
-    """The paper's networks, trained on the same breaths, to compare with.
-
-    Attributes:
-        members: leaves ``(members, settings, ...)``, settings in the order of ``RECORDED_LUNGS``.
-        seen: the breaths of the training.
-    """
-
-    members: Plant
-    seen: Seen
-
-    @property
-    def plants(self) -> Plant:
-        """The networks of the six lungs, leaves ``(6, ...)`` in the order of ``LUNGS``."""
-        at = np.array([RECORDED_LUNGS.index(lung) for lung in LUNGS])
-        return jax.tree.map(lambda leaf: leaf[0, at], self.members)
-
-    def for_breaths(self, breaths: Breaths) -> Plant:
-        """Networks of the breaths' lungs, leaves ``(n, ...)``; a network knows no rig."""
-        return self._of(breaths, np.zeros(len(breaths), np.int64))
-
-    def cross_fitted(self, breaths: Breaths) -> Plant:
-        """Networks of the member that has not seen each breath; of member 0 if all have seen it."""
-        return self._of(breaths, np.maximum(self.seen.folds(breaths), 0))
-
-    def _of(self, breaths: Breaths, member: NDArray[np.int64]) -> Plant:
-        ids = [lung.id for lung in RECORDED_LUNGS]
-        unknown = sorted(set(breaths.lung_ids.tolist()) - set(ids))
-        if unknown:
-            raise InputError(
-                f"no network was trained for {', '.join(unknown)}; known are {', '.join(ids)}"
-            )
-        at = np.array([ids.index(name) for name in breaths.lung_ids.tolist()], np.int64)
-        return VmappedPlant(jax.tree.map(lambda leaf: jnp.asarray(leaf[member, at]), self.members))
 
 
 def fingerprints(breaths: Breaths) -> NDArray[np.uint64]:
@@ -248,42 +201,27 @@ def seen(breaths: Breaths, fold: NDArray[np.int64]) -> Seen:
     return Seen(key[kept], np.where(repeated, BY_ALL, fold[kept]).astype(np.int8))
 
 
-def folder(version: int = 2) -> Path:
-    """Folder of a version."""
-    return data_path(f"simulators/v{version}")
+def folder() -> Path:
+    """Folder of the official simulators."""
+    return data_path("simulators")
 
 
-def load(version: int = 2, path: Path | None = None) -> Frozen:
+def load(path: Path | None = None) -> Frozen:
     """Read the official simulators and check every file against the manifest.
 
     Args:
-        version: version of the simulators, 1 or 2.
         path: another folder, such as one that ``ventbench train simulator`` wrote.
 
     Raises:
         InputError: if a file is missing or is not what the manifest says.
     """
-    path = path or folder(version)
+    path = path or folder()
     manifest = _manifest(path)
     members = load_plant(_checked(path, MEMBERS, manifest), as_array=np.asarray)
-    if manifest["format"] == FORMAT:
-        _checked(path, LEARNED, manifest)  # its hash is told with every score too
-    return Frozen(
-        path,
-        manifest,
-        files.sha256(path / MANIFEST),
-        Sessions.from_list(manifest["sessions"]),
-        members,
-        _seen(path, manifest),
-    )
-
-
-def load_learned(version: int = 1, path: Path | None = None) -> FrozenLearned:
-    """Read the networks; see :func:`load`."""
-    path = path or folder(version)
-    manifest = _manifest(path)
-    members = load_plant(_checked(path, LEARNED, manifest), as_array=np.asarray)
-    return FrozenLearned(members, _seen(path, manifest))
+    with np.load(_checked(path, SEEN, manifest), allow_pickle=False) as arrays:
+        known = Seen(arrays["key"], arrays["fold"])
+    table = Sessions.from_list(manifest["sessions"])
+    return Frozen(path, manifest, files.sha256(path / MANIFEST), table, members, known)
 
 
 def _manifest(path: Path) -> dict[str, Any]:
@@ -291,10 +229,10 @@ def _manifest(path: Path) -> dict[str, Any]:
         manifest = tomllib.loads((path / MANIFEST).read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path / MANIFEST} cannot be read: {error}") from error
-    if manifest.get("format") not in (FORMAT, RIGS_FORMAT):
+    if manifest.get("format") != FORMAT:
         raise InputError(
-            f"{path / MANIFEST}, key format: {manifest.get('format')!r} is neither {FORMAT!r} nor "
-            f"{RIGS_FORMAT!r}; this ventbench reads no other"
+            f"{path / MANIFEST}, key format: {manifest.get('format')!r} is not {FORMAT!r}; this "
+            "ventbench reads no other"
         )
     return manifest
 
@@ -310,8 +248,3 @@ def _checked(path: Path, name: str, manifest: dict[str, Any]) -> Path:
             "it is damaged or changed: restore it, or reinstall ventbench"
         )
     return path / name
-
-
-def _seen(path: Path, manifest: dict[str, Any]) -> Seen:
-    with np.load(_checked(path, SEEN, manifest), allow_pickle=False) as arrays:
-        return Seen(arrays["key"], arrays["fold"])

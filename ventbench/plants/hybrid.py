@@ -95,7 +95,7 @@ class Hybrid:
         closing_delay: delay of the expiratory valve when it closes, s.
         rest: command that held the flow before the first sample, %.
         closing_lag: time constant with which the expiratory valve closes after its delay, s; None
-            for a valve that closes at once, as in version 1.
+            for a valve that closes at once.
     """
 
     R: Array

@@ -3,16 +3,21 @@
 Without noise each breath of a run is the same, as each begins at rest and the PID starts anew, so
 one inspiration stands for all. The search is dealt out in parts, which run in this process, in
 others or on a cluster; a finished part is never computed twice.
+
+The best of a grid then run on draws, whose noise a high gain amplifies, and the least mean error
+wins. On all scored rigs and the development draws this gives the 100 of normalised scores
+(:func:`best_pids`); on the rigs and draws that are for tuning, the gains of the entries
+``pid_best`` and ``pid_robust`` (:func:`tune_pid`).
 """
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,20 +29,36 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from ventbench import environment as env
-from ventbench import files, protocol
+from ventbench import files, precision, protocol, rig_draws, rollouts
 from ventbench.controllers.pid import PID
 from ventbench.environment import Scenario, nominal_scenario
 from ventbench.errors import InputError
-from ventbench.executor import InProcess, executor, results
+from ventbench.executor import InProcess, executor, in_order, results
 from ventbench.interfaces import Plant
-from ventbench.plants.catalog import Given, load_simulators
+from ventbench.metrics.score import controllable_error
+from ventbench.plants.catalog import Given
 from ventbench.resume import ARRAY, WorkFolder, fingerprint
+from ventbench.rig_draws import RigDraws
+from ventbench.submissions.rig_scoring import Rigs, load_rigs
+from ventbench.training.plants import check_names, plants_to_train_on
 
 #: The paper's twenty values of P, I and D, %/cmH2O.
 VALUES = (*(round(0.1 * i, 1) for i in range(10)), *(float(i) for i in range(1, 11)))
 
 #: Gains that are run together.
 BATCH = 2000
+
+#: How many PIDs of each lung run on the draws.
+FINALISTS = 100
+
+#: Finalists that are run together: bounds memory.
+TOGETHER = 20
+
+#: Draws that gains are tuned on; none of them is ever scored.
+TUNING = "tuning"
+TUNING_SEED = hashlib.sha256(b"ventbench, draws for tuning").digest()
+
+Floats = NDArray[np.float64]
 
 #: Files of a search in its folder.
 TABLE, RESULT, PARTS = "grid.parquet", "best.json", "parts"
@@ -53,8 +74,8 @@ def paper_gains() -> NDArray[np.float64]:
     return np.array(list(itertools.product(VALUES, VALUES, VALUES)))
 
 
-@partial(jax.jit, static_argnames="airway")
-def _errors(plant: Plant, gains: Array, cells: Scenario, airway: bool = False) -> Array:
+@jax.jit
+def _errors(plant: Plant, gains: Array, cells: Scenario) -> Array:
     cells = jax.tree.map(
         lambda x: jnp.broadcast_to(jnp.asarray(x, gains.dtype), (len(gains), *jnp.shape(x))), cells
     )
@@ -63,8 +84,7 @@ def _errors(plant: Plant, gains: Array, cells: Scenario, airway: bool = False) -
 
     def step(carry: tuple[env.LoopState, Any, Array], index: Array) -> tuple[Any, None]:
         loop, state, total = carry
-        pressure = env.airway_pressure(varied, loop) if airway else loop.pressure
-        total = total + jnp.abs(pressure - cells.pip)
+        total = total + jnp.abs(env.airway_pressure(varied, loop) - cells.pip)
         state, requested = controller.step(state, env.observe(cells, loop, 0, index))
         loop, _ = env.inspire(varied, cells, loop, requested)
         return (loop, state, total), None
@@ -80,8 +100,6 @@ def errors(
     gains: NDArray[np.float64],
     pips: tuple[float, ...] = protocol.PIPS,
     batch: int = BATCH,
-    *,
-    airway: bool = False,
 ) -> NDArray[np.float32]:
     """Nominal error of each PID on each lung at each PIP.
 
@@ -90,7 +108,6 @@ def errors(
         gains: P, I and D, %/cmH2O, shape ``(G, 3)``.
         pips: cmH2O, P of them.
         batch: gains that are run together.
-        airway: take the error of the airway pressure (protocol version 2), not of the reading.
 
     Returns:
         Mean ``|pressure - target|`` of an inspiration, cmH2O, shape ``(L, G, P)``; float32, which
@@ -107,7 +124,7 @@ def errors(
             # The last batch is padded with the last gains, so that all compile once.
             index = np.minimum(np.arange(first, first + batch), count - 1)
             some = jnp.asarray(gains[index], jnp.float32)
-            out[lung, index] = np.asarray(_errors(plant, some, cells, airway))
+            out[lung, index] = np.asarray(_errors(plant, some, cells))
     return out
 
 
@@ -138,32 +155,6 @@ class PIDGrid:
         P, I, D = self.gains[at].tolist()  # noqa: E741
         return (P, I, D), float(mean[at])
 
-    def summary(self, *, each: bool = True, single: bool = True) -> dict[str, Any]:
-        """Best gains and their errors, as JSON values.
-
-        Args:
-            each: the best gains of each lung.
-            single: the best gains for all lungs together.
-        """
-        result: dict[str, Any] = {
-            "trajectories": int(self.error.size),
-            "pips": list(self.pips),
-        }
-
-        def entry(lung: str | None) -> dict[str, Any]:
-            gains, error = self.best(lung)
-            return {"gains": list(gains), "error": error}
-
-        if each:
-            result["lungs"] = {lung: entry(lung) for lung in self.lungs}
-        if single:
-            at = entry(None)
-            index = int(np.flatnonzero(np.all(self.gains == at["gains"], axis=1))[0])
-            on_each = self.error[:, index].mean(axis=-1, dtype=np.float64)
-            at["lungs"] = dict(zip(self.lungs, on_each.tolist(), strict=True))
-            result["single"] = at
-        return result
-
     def to_frame(self) -> pd.DataFrame:
         """One row a lung and PID: ``lung, P, I, D``, an error a PIP, and ``error``, their mean."""
         columns: dict[str, Any] = {
@@ -178,89 +169,6 @@ class PIDGrid:
         """Write :meth:`to_frame` as Parquet, in one step."""
         table = self.to_frame()
         files.write_atomically(path, lambda file: table.to_parquet(file, index=False))
-
-
-def load_grid(path: Path) -> PIDGrid:
-    """Read what :meth:`PIDGrid.save` wrote.
-
-    Raises:
-        InputError: if it is not such a table.
-        OSError: if it cannot be read.
-    """
-    try:
-        table = pd.read_parquet(path)
-        lungs = tuple(dict.fromkeys(table["lung"]))
-        names = [name for name in table.columns if name.startswith("error_pip_")]
-        pips = tuple(float(name.removeprefix("error_pip_")) for name in names)
-        gains = table[_GAINS].to_numpy(float)[: len(table) // len(lungs)]
-        error = table[names].to_numpy(np.float32).reshape(len(lungs), len(gains), len(pips))
-    except (KeyError, ValueError, ZeroDivisionError) as error:
-        raise InputError(f"{path} is not a table of `ventbench tune pid`: {error}") from error
-    return PIDGrid(lungs, pips, gains, error)
-
-
-def tune_pid(
-    lungs: Sequence[str] | None = None,
-    out: Path | str | None = None,
-    *,
-    gains: ArrayLike | None = None,
-    workers: int = 0,
-    scheduler: str | None = None,
-    each: bool = True,
-    single: bool | None = None,
-    simulator: Given = "frozen",
-    progress: Progress | None = None,
-) -> tuple[PIDGrid, dict[str, Any]]:
-    """Run every PID of a grid on simulators without noise, and name the best gains.
-
-    Args:
-        lungs: ids; all lungs of the simulators if not given.
-        out: folder for ``grid.parquet``, the whole grid, and ``best.json``, the result; parts of an
-            interrupted search lie there too, and the same call continues from them. Nothing is
-            written if not given.
-        gains: P, I, D, %/cmH2O, shape ``(G, 3)``; the paper's 8,000 if not given.
-        workers: processes; 0 for this one alone, which uses all cores.
-        scheduler: address of a Dask scheduler instead, such as ``tcp://host:8786``.
-        each: put the best gains of each lung into the result.
-        single: put the best gains for all lungs together into the result; if not given, where there
-            are several lungs.
-        simulator: simulators with plants of these lungs; see :func:`ventbench.load_simulators`.
-        progress: see :data:`Progress`.
-
-    Returns:
-        The grid, and the content of ``best.json``: see :meth:`PIDGrid.summary`.
-
-    Raises:
-        InputError: if a lung or a simulator is unknown, ``out`` holds an unfinished search with
-            other settings, or a worker died.
-
-    Examples:
-        >>> from ventbench import tune_pid
-        >>> gains = [(2.0, 4.0, 0.0), (5.0, 5.0, 0.0)]  # %/cmH2O
-        >>> grid, result = tune_pid(["R20C50"], simulator="physics", gains=gains)
-        >>> grid.best("R20C50")[0]
-        (2.0, 4.0, 0.0)
-    """
-    simulators = load_simulators(simulator)
-    names = tuple(entry.id for entry in simulators.lungs) if lungs is None else tuple(lungs)
-    plants = {name: simulators.plant(name) for name in names}
-    parts = None if out is None else Path(out) / PARTS
-    with executor(workers, scheduler) as pool:
-        grid = search(
-            plants,
-            settings=dict(simulators.about),
-            folder=parts,
-            gains=None if gains is None else np.asarray(gains, float),
-            pool=pool,
-            progress=progress,
-        )
-    result = grid.summary(each=each, single=len(names) > 1 if single is None else single)
-    result["simulators"] = dict(simulators.about)
-    if out is not None:
-        grid.save(Path(out) / TABLE)
-        files.write_json(Path(out) / RESULT, result)
-        shutil.rmtree(Path(out) / PARTS)
-    return grid, result
 
 
 def search(
@@ -334,3 +242,210 @@ def _read_part(work: WorkFolder, name: str, gains: int) -> NDArray[np.float32]:
         path = work.path(name, ARRAY)
         raise InputError(f"{path} holds {error.dtype} {error.shape}, not float32 {shape}")
     return error
+
+
+@jax.jit
+def _pressures(plant: Plant, gains: Array, cells: Scenario) -> Array:
+    def run(gains: Array) -> Array:
+        return rollouts.closed_loop(plant, PID(*gains), cells)[0].pressure
+
+    return jax.vmap(run)(gains)
+
+
+def _nominal_plants(rigs: Rigs, lung: int) -> Plant:
+    """Plants of a lung's scored rigs, member 0."""
+    at = slice(lung, lung + 1) if rigs.sessions is None else (0, list(rigs.sessions[lung]))
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[at], rigs.plants)
+
+
+def _nominal_grid(rigs: Rigs, lungs: Sequence[int], gains: Floats, **options: Any) -> PIDGrid:
+    """Mean error without noise over the rigs of some lungs, member 0; see :func:`search`."""
+    plants = {rigs.lungs[at].id: _nominal_plants(rigs, at) for at in lungs}
+    settings = dict(rigs.about) | {"rigs": rigs.sessions}
+    return search(plants, settings=settings, gains=gains, errors_of=_mean_errors, **options)
+
+
+def _mean_errors(plants: Plant, gains: Floats) -> NDArray[np.float32]:
+    return errors(plants, gains).mean(axis=0, dtype=np.float64).astype(np.float32)
+
+
+def drawn_errors(rigs: Rigs, drawn: RigDraws, lung: int, gains: Floats) -> Floats:
+    """Error of PIDs on draws of one lung, without the first step.
+
+    Args:
+        rigs: that the draws are of.
+        drawn: K draws.
+        lung: index of the lung.
+        gains: P, I, D, %/cmH2O, shape ``(G, 3)``.
+
+    Returns:
+        Mean over the draws, cmH2O, shape ``(G, P)``.
+    """
+    plants, cells = rigs.cells(drawn, protocol.PIPS)
+    own = jax.tree.map(lambda x: np.asarray(x)[lung], plants)
+    if rigs.sessions is not None:  # without the nominal cells
+        own = jax.tree.map(lambda x: x[1:], own)
+    cell = jax.tree.map(lambda x: np.asarray(x)[lung, 1:], cells)
+    errors = []
+    for first in range(0, len(gains), TOGETHER):
+        # The last batch is padded, so that all compile once.
+        index = np.minimum(np.arange(first, first + TOGETHER), len(gains) - 1)
+        with precision.float64():
+            arrays = jax.tree.map(jnp.asarray, (own, gains[index], cell))
+            pressure = np.asarray(_pressures(*arrays))
+        error = controllable_error(pressure, cell.pip[..., None, None]).mean(axis=1)
+        errors.append(error[: len(gains) - first])
+    return np.concatenate(errors)
+
+
+def tune_pid(
+    lungs: Sequence[str] | None = None,
+    out: Path | str | None = None,
+    *,
+    gains: ArrayLike | None = None,
+    draws: int = rig_draws.COUNT,
+    workers: int = 0,
+    scheduler: str | None = None,
+    each: bool = True,
+    single: bool | None = None,
+    simulator: Given = "frozen",
+    progress: Progress | None = None,
+) -> tuple[PIDGrid, dict[str, Any]]:
+    """Run every PID of a grid on simulators without noise, the best on draws, and name the best.
+
+    Neither the development draws nor the rigs that are held out have a part in the choice. What
+    decides is the error weighted as in the normalised score: by the inverse of what there is to
+    gain at a PIP of a lung.
+
+    Args:
+        lungs: ids; all lungs of the simulators if not given.
+        out: folder for ``grid.parquet``, the whole grid, and ``best.json``, the result; parts of an
+            interrupted search lie there too, and the same call continues from them. Nothing is
+            written if not given.
+        gains: P, I, D, %/cmH2O, shape ``(G, 3)``; the paper's 8,000 if not given.
+        draws: number of draws for tuning that decide among the :data:`FINALISTS` best; 0 to decide
+            without noise, as in the paper.
+        workers: processes; 0 for this one alone, which uses all cores.
+        scheduler: address of a Dask scheduler instead, such as ``tcp://host:8786``.
+        each: put the best gains of each lung into the result.
+        single: put the best gains for all lungs together into the result; if not given, where there
+            are several lungs.
+        simulator: simulators with plants of these lungs; see :func:`ventbench.load_simulators`. Of
+            the frozen ones each lung has all its rigs but the held-out one.
+        progress: see :data:`Progress`.
+
+    Returns:
+        The grid, of errors without noise, and the content of ``best.json``: the best gains and
+        their errors without weights, on the draws without the first step if there are any.
+
+    Raises:
+        InputError: if a lung or a simulator is unknown, ``out`` holds an unfinished search with
+            other settings, or a worker died.
+
+    Examples:
+        >>> from ventbench import tune_pid
+        >>> gains = [(2.0, 4.0, 0.0), (5.0, 5.0, 0.0)]  # %/cmH2O
+        >>> grid, result = tune_pid(["R20C50"], simulator="physics", gains=gains, draws=0)
+        >>> result["lungs"]["R20C50"]["gains"]
+        [2.0, 4.0, 0.0]
+    """
+    trained_on = plants_to_train_on(simulator)
+    names = check_names(lungs, trained_on, all_lungs=False)
+    where = [trained_on.names.index(name) for name in names]
+    weights, single = trained_on.weights[where], len(names) > 1 if single is None else single
+    rigs = _training_rigs(load_rigs(simulator))
+    parts = None if out is None else Path(out) / PARTS
+    count = FINALISTS if draws else 1
+    with executor(workers, scheduler) as pool:
+        grid = _nominal_grid(
+            rigs,
+            where,
+            paper_gains() if gains is None else np.asarray(gains, float),
+            folder=parts,
+            pool=pool,
+            progress=progress,
+        )
+        weighted = np.einsum("lgp,lp->lg", grid.error.astype(float), weights)
+        common = np.argsort(weighted.sum(axis=0), kind="stable")[: count if single else 0]
+        own = np.argsort(weighted, axis=1, kind="stable")[:, : count if each else 0]
+        lists = [np.concatenate([row, common]) for row in own]
+        if draws:
+            sessions = rigs.sessions or tuple((0,) for _ in rigs.lungs)
+            drawn = rig_draws.build(
+                sessions, rigs.members, seed=TUNING_SEED, season=TUNING, n=draws
+            )
+            jobs = [
+                (rigs, drawn, lung, grid.gains[some])
+                for lung, some in zip(where, lists, strict=True)
+            ]
+            found = in_order(pool, drawn_errors, jobs)
+        else:
+            found = [
+                error[some] for error, some in zip(grid.error.astype(float), lists, strict=True)
+            ]
+    result: dict[str, Any] = {
+        "trajectories": int(grid.error.size),
+        "pips": list(grid.pips),
+        "draws": draws,
+    }
+    if each:
+        result["lungs"] = {}
+        for lung, row, error, weight in zip(names, own, found, weights, strict=True):
+            best = int(np.argmin(error[: len(row)] @ weight))
+            entry = {"gains": grid.gains[row[best]].tolist(), "error": float(error[best].mean())}
+            result["lungs"][lung] = entry
+    if single:
+        together = np.stack([error[len(row) :] for row, error in zip(own, found, strict=True)])
+        best = int(np.argmin(np.einsum("lgp,lp->g", together, weights)))
+        on_each = together[:, best].mean(axis=-1)
+        result["single"] = {
+            "gains": grid.gains[common[best]].tolist(),
+            "error": float(on_each.mean()),
+            "lungs": dict(zip(names, on_each.tolist(), strict=True)),
+        }
+    result["simulators"] = dict(trained_on.about)
+    if out is not None:
+        grid.save(Path(out) / TABLE)
+        files.write_json(Path(out) / RESULT, result)
+        shutil.rmtree(Path(out) / PARTS)
+    return grid, result
+
+
+def _training_rigs(scored: Rigs) -> Rigs:
+    """The same without the rigs that are held out."""
+    if scored.sessions is None:
+        return scored
+    pairs = zip(scored.sessions, scored.held_out, strict=True)
+    sessions = tuple(tuple(rig for rig in own if rig != apart) for own, apart in pairs)
+    return replace(scored, sessions=sessions)
+
+
+def best_pids(
+    rigs: Rigs,
+    *,
+    gains: Floats | None = None,
+    draws: int = 20,
+    progress: Progress | None = None,
+) -> tuple[Floats, Floats]:
+    """Find the best PID of each lung.
+
+    Args:
+        rigs: L lungs, all of whose scored rigs count alike.
+        gains: P, I, D, %/cmH2O, shape ``(G, 3)``; the paper's 8,000 if not given.
+        draws: number of development draws that decide among the best.
+        progress: see :data:`Progress`.
+
+    Returns:
+        Gains, shape ``(L, 3)``, and their mean errors over the draws without the first step, cmH2O,
+        shape ``(L,)``.
+    """
+    grid = paper_gains() if gains is None else np.asarray(gains, float)
+    drawn = rigs.draws(draws)
+    nominal = _nominal_grid(rigs, range(len(rigs.lungs)), grid, progress=progress)
+    chosen, least = [], []
+    for lung, error in enumerate(nominal.error.mean(axis=-1, dtype=np.float64)):
+        finalists = grid[np.argsort(error, kind="stable")[:FINALISTS]]
+        on_draws = drawn_errors(rigs, drawn, lung, finalists).mean(axis=-1)
+        chosen.append(finalists[np.argmin(on_draws)])
+        least.append(on_draws.min())
+    return np.array(chosen), np.array(least)

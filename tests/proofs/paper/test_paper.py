@@ -38,7 +38,7 @@ def grid_of(error):
 
 def test_stored_errors_are_those_of_the_official_simulators(stored):
     """By clock, the frozen simulators state the same held-out errors in their manifest."""
-    official = frozen.load(version=2)
+    official = frozen.load()
     assert stored["horizon"]["about"]["simulators"] == official.manifest_sha256
     for name, about in official.lungs().items():
         here = stored["horizon"]["lungs"][name]
@@ -191,7 +191,7 @@ def test_the_whole_page_agrees_with_scores_and_manifest(tmp_path, monkeypatch):
     entry = score("residual_mlp", track="performance", sandbox=False, protocol=2)
     for name, error in zip(LUNG_IDS, entry.by_lung, strict=True):
         assert rows[name][1] == pytest.approx(error, abs=1e-9)
-    official = frozen.load(version=2).lungs()
+    official = frozen.load().lungs()
     for row in sections["simulators"]["tables"][0]["rows"]:
         assert row[2] == official[row[0]]["own_rig_mae"]
     assert (tmp_path / "paper.html").read_text().count("<svg") >= 8

@@ -22,7 +22,7 @@ from ventbench.plants.learned import Architecture
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.recordings import write
-from ventbench.training import simulator
+from ventbench.training import learned as simulator
 from ventbench.training.learned import LearnedConfig
 from ventbench.training.residual import ResidualConfig
 
@@ -198,18 +198,18 @@ def test_controllers_by_the_command(tmp_path, monkeypatch):
 
     def compare(simulators, out, seeds, **options):
         asked.update(options, seeds=list(seeds))
-        names = ("base", "no agreement")
+        names = ("base", "deep")
         figures = dict.fromkeys(controllers.FIGURES, 2.0)
         return pd.DataFrame([{"variant": name, "seed": 0} | figures for name in names])
 
     monkeypatch.setattr("ventbench.plants.frozen.load", Textbook)
     monkeypatch.setattr(controllers, "compare", compare)
-    given = ["study", "controllers", "--seeds", "1", "--updates", "7", "--only", "no agreement"]
+    given = ["study", "controllers", "--seeds", "1", "--updates", "7", "--only", "deep"]
     paths = ["--out", str(tmp_path / "out"), "--json", str(tmp_path / "x")]
     result = CliRunner().invoke(app, [*given, *paths])
     assert result.exit_code == 0, result.output
-    assert "no agreement" in result.output
-    assert (asked["seeds"], asked["only"]) == ([0], ["no agreement"])
+    assert "deep" in result.output
+    assert (asked["seeds"], asked["only"]) == ([0], ["deep"])
     assert asked["config"].updates == 7
     found = json.loads((tmp_path / "x").read_text())
-    assert [row["variant"] for row in found["variants"]] == ["base", "no agreement"]
+    assert [row["variant"] for row in found["variants"]] == ["base", "deep"]

@@ -15,8 +15,8 @@ from ventbench.plants import frozen
 from ventbench.plants.catalog import load_simulators
 from ventbench.recordings import Breaths, join, load, write
 from ventbench.training.exploration import ExplorationRanges, SimulatedVentilator, explore
+from ventbench.training.rigs.data import load_rig_recordings
 from ventbench.training.rigs.fit import FitConfig
-from ventbench.training.rigs.recordings import load_rig_recordings
 from ventbench.training.rigs.train import RigConfig, train_rigs
 
 #: A lung that no simulator of ours was made for.

@@ -10,6 +10,7 @@ import pytest
 from ventbench import draws, environment, precision, protocol, rollouts
 from ventbench.controllers import rl_policy
 from ventbench.controllers.pid import PID
+from ventbench.controllers.residual import Residual
 from ventbench.controllers.rl_policy import GaussianPolicy, TanhNetwork, init_parameters
 from ventbench.interfaces import Observation
 from ventbench.lungs import LUNGS, Lung
@@ -40,8 +41,8 @@ def test_deviations_have_the_distributions_of_the_draws(cells):
         "c_scale": cells.c_scale,
         "delay": cells.delay,
     }
-    assert found.keys() == draws.RANGES.keys()
-    for name, (low, high) in draws.RANGES.items():
+    assert found.keys() == rig_draws.RANGES.keys()
+    for name, (low, high) in rig_draws.RANGES.items():
         values = np.asarray(found[name], float)
         assert low - 1e-5 <= values.min() < low + 0.02 * (high - low), name
         assert high - 0.02 * (high - low) < values.max() <= high + 1e-5, name
@@ -49,12 +50,6 @@ def test_deviations_have_the_distributions_of_the_draws(cells):
     spread = np.std(np.asarray(cells.noise), axis=(1, 2))
     assert abs(spread.mean() - np.mean(draws.NOISE_SD)) < 0.005
     assert np.all(np.asarray(cells.quantum, float) == np.float32(draws.QUANTUM))
-
-
-def test_the_published_draws_are_not_among_them(cells):
-    published = np.asarray(draws.scenarios().r_scale, float).ravel()
-    nearest = np.abs(np.asarray(cells.r_scale, float)[:, None] - published).min(axis=1)
-    assert np.mean(nearest < 1e-7) < 0.05
 
 
 def test_nominal_cells_are_the_protocols():
@@ -79,32 +74,31 @@ def test_the_pid_inside_the_features_is_the_pid(lungs):
     np.testing.assert_allclose(found.pressure, wanted.pressure, atol=1e-9)
 
 
-def test_features_by_hand():
-    def observed(time, pressure, before):
-        return Observation(
-            jnp.asarray(time), 0.03, jnp.asarray(pressure), jnp.asarray(20.0),
-            jnp.full((10,), 15.0), jnp.asarray(before),
-        )  # fmt: skip
-
-    memory, first, base = rl_policy.features(rl_policy.init_features(()), observed(0.0, 5.0, 5.0))
+def test_the_features_are_those_of_the_residual_controller():
+    network = Residual(PID(*rl_policy.GAINS), ())
+    assert rl_policy.FEATURES == 30
+    seen = Observation(
+        jnp.asarray(0.0), jnp.asarray(0.03), jnp.asarray(5.0), jnp.asarray(20.0),
+        jnp.full((10,), 15.0), jnp.asarray(5.0),
+    )  # fmt: skip
+    _, found, base = rl_policy.features(rl_policy.init_features(()), seen)
+    _, wanted, asked = network.features(network.init(()), seen)
+    np.testing.assert_array_equal(found, wanted)
     a = 0.03 / 0.53
-    u = 6 * 15 + 6 * a * 15 + 0.3 * a * 15
-    np.testing.assert_allclose(base, u, rtol=1e-6)
-    wanted = [1.5, a * 1.5, a * 15, u / 50 - 1, 0.5, 0.375, 0.0, *4 * [1.5], *4 * [-0.9]]
-    np.testing.assert_allclose(first, wanted, rtol=1e-5)
-    _, second, _ = rl_policy.features(memory, observed(0.03, 12.0, 95.0))
-    i = a * 15 + a * (8 - a * 15)
-    np.testing.assert_allclose(second[:2], [0.8, i / 10], rtol=1e-5)
-    np.testing.assert_allclose(second[7:], [*4 * [1.5], 0.9, *3 * [-0.9]], rtol=1e-5)
+    assert float(asked) == pytest.approx(6 * 15 + 6 * a * 15 + 0.3 * a * 15, rel=1e-6)
+    assert float(base) == pytest.approx(min(float(asked), 100.0))
 
 
 def test_rewards_and_errors_are_the_scores(lungs):
-    lung = jax.tree.map(lambda x: jnp.asarray(x[2:3], jnp.float32), lungs)
-    drawn = episodes.draw(jax.random.key(0), lung, 6, vary=False)
+    weights = jnp.ones((1, 6))
+    lung = jax.tree.map(lambda x: jnp.asarray(x[None, 2:3], jnp.float32), lungs)
+    drawn = episodes.draw(jax.random.key(0), episodes.Lungs(lung, weights), 6, vary=False)
     pid = PID(*rl_policy.GAINS)
     _, _, rewards = episodes.roll(drawn, lambda k, x, base: (base, None), jax.random.key(1))
     start = np.asarray(drawn.cells.pip - drawn.cells.start)
-    from_rewards = (start - episodes.REWARD_SCALE * rewards.sum(axis=0)) / 34
+    each = rewards.sum(axis=0).reshape(3, 6)  # without noise all breaths are alike
+    np.testing.assert_allclose(each[0], each[2], rtol=1e-4)
+    from_rewards = (start - episodes.REWARD_SCALE * each[1]) / 34
     errors = episodes.errors(drawn, pid)
     run, _ = rollouts.closed_loop(
         jax.tree.map(lambda x: x[2], lungs),
@@ -113,7 +107,7 @@ def test_rewards_and_errors_are_the_scores(lungs):
     )
     wanted = run_error(run.pressure, np.asarray(protocol.PIPS)[:, None, None])
     np.testing.assert_allclose(errors, wanted, rtol=1e-4)
-    np.testing.assert_allclose(from_rewards, wanted, rtol=1e-4)
+    np.testing.assert_allclose(from_rewards, wanted, rtol=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -123,11 +117,11 @@ def rig_lungs():
         first = stack([single_compartment(lung) for lung in LUNGS[:2]])
         second = stack([single_compartment(Lung(2 * lung.R, lung.C)) for lung in LUNGS[:2]])
         weights = jnp.arange(12.0).reshape(2, 6) + 1.0
-        return episodes.RigLungs(stack([first, second]), weights)
+        return episodes.Lungs(stack([first, second]), weights)
 
 
-def test_episodes_on_rigs_have_any_plant_their_weight_and_the_ranges_of_version_2(rig_lungs):
-    drawn = episodes.draw(jax.random.key(2), rig_lungs, 480, breaths=3)
+def test_episodes_on_rigs_have_any_plant_their_weight_and_the_ranges_of_the_draws(rig_lungs):
+    drawn = episodes.draw(jax.random.key(2), rig_lungs, 480)
     lung, pip = np.arange(480) % 2, np.arange(480) // 2 % 6
     np.testing.assert_array_equal(drawn.weight, 6 * lung + pip + 1)
     ratio = np.asarray(drawn.plants.R) / np.array([lung.R for lung in LUNGS[:2]])[lung]
@@ -137,8 +131,7 @@ def test_episodes_on_rigs_have_any_plant_their_weight_and_the_ranges_of_version_
     assert low <= drawn.cells.r_scale.min() < 0.85
     assert 1.15 < drawn.cells.r_scale.max() <= high
     assert drawn.cells.noise.shape == (480, 3, 34)
-    assert drawn.airway
-    nominal = episodes.draw(jax.random.key(2), rig_lungs, 12, vary=False, breaths=3)
+    nominal = episodes.draw(jax.random.key(2), rig_lungs, 12, vary=False)
     np.testing.assert_array_equal(nominal.plants.R, np.tile(rig_lungs.plants.R[0], 6))
     assert not np.any(nominal.cells.noise)
 
@@ -146,22 +139,20 @@ def test_episodes_on_rigs_have_any_plant_their_weight_and_the_ranges_of_version_
 def test_three_breaths_remember_the_one_before_and_score_as_the_protocol(rig_lungs):
     """Rewards and errors against the scorer's loop, with a policy that looks back."""
     network = TanhNetwork((4,), 1, first=0.5)
-    policy = GaussianPolicy(
-        init_parameters(network, jax.random.key(1), looks_back=True), network, looks_back=True
-    )
-    drawn = episodes.draw(jax.random.key(3), rig_lungs, 4, breaths=3)
+    policy = GaussianPolicy(init_parameters(network, jax.random.key(1)), network)
+    drawn = episodes.draw(jax.random.key(3), rig_lungs, 4)
 
     def act(key, x, base):
         mean = jnp.asarray(network.apply(policy.parameters, x))[..., 0]
         return base + rl_policy.SCALE * mean, x[..., 0]
 
-    x, kept, rewards = episodes.roll(drawn, act, jax.random.key(1), looks_back=True)
-    assert x.shape == (episodes.STEPS, 12, rl_policy.feature_count(looks_back=True))
+    x, kept, rewards = episodes.roll(drawn, act, jax.random.key(1))
+    assert x.shape == (episodes.STEPS, 12, rl_policy.FEATURES)
     np.testing.assert_array_equal(kept, x[..., 0])
     before = np.asarray(x).reshape(episodes.STEPS, 3, 4, -1)[..., 8:14]
     assert not before[:, 0].any()
     assert before[:, 1:].any()
-    found, _ = rollouts.closed_loop(drawn.plants, policy, drawn.cells, airway=True)
+    found, _ = rollouts.closed_loop(drawn.plants, policy, drawn.cells)
     error = np.abs(np.asarray(found.pressure) - np.asarray(drawn.cells.pip)[:, None, None])
     weighted = error * np.asarray(drawn.weight)[:, None, None]
     wanted = -weighted[..., 1:].transpose(2, 1, 0)

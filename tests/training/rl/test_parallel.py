@@ -21,7 +21,8 @@ from ventbench.errors import InputError
 from ventbench.lungs import LUNGS
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
-from ventbench.training.rl import episodes, parallel
+from ventbench.training.rl import episodes
+from ventbench.training.rl import train as parallel
 from ventbench.training.rl.dqn import DQN
 from ventbench.training.rl.policy_gradient import PolicyGradient
 from ventbench.training.rl.ppo import PPO
@@ -60,9 +61,10 @@ class RandomWalk:
 
 
 def lungs(index: int) -> Any:
-    """One lung for two runs, leaves ``(2, 1)``."""
-    single = stack([single_compartment(LUNGS[index])])
-    return jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), single)
+    """One plant of one lung for two runs, leaves ``(2, 1, 1)``."""
+    single = stack([stack([single_compartment(LUNGS[index])])])
+    made = episodes.Lungs(single, jnp.ones((1, 6)))
+    return jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), made)
 
 
 WALK = RandomWalk()
@@ -111,7 +113,7 @@ def iterations():
 
 
 def plant(index: int) -> Any:
-    """One lung in float32, leaves ``(1,)``."""
+    """One lung in float32."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf[0], jnp.float32), lungs(index))
 
 

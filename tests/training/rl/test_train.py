@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 from ventbench.cli import app
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS
+from ventbench.training.plants import NETWORKS
 from ventbench.training.rl import episodes
 from ventbench.training.rl.train import METHODS, _groups, method_for
-from ventbench.training.trained import NETWORKS
 
 
 def run(*arguments: object):

@@ -9,7 +9,7 @@ rig; with them a rig is where its breaths are on the whole. A simulator leaves t
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from ventbench.training.hybrid.data import InspirationData
-from ventbench.training.hybrid.fit import simulate
-from ventbench.training.hybrid.parameters import Pooled, plants
-from ventbench.training.rigs.hierarchy import Centre, Scales, heavy_tailed, penalty
+from ventbench.plants.hybrid import Hybrid
+from ventbench.rollouts import open_loop
+from ventbench.training.rigs.data import InspirationData, WholeBreaths
+from ventbench.training.rigs.parameters import Centre, Pooled, Scales, heavy_tailed, penalty, plants
 
 #: Iterations compiled into one scan; progress and Ctrl-C fall between two of them.
 CHUNK = 20
@@ -83,6 +83,17 @@ class Fitted:
     gain: Array
     start: Array
     rig_start: Array
+
+
+def simulate(plant: Hybrid, start: Array, data: InspirationData) -> Array:
+    """Pressures at the end of each command of the inspirations, cmH2O, ``(n, SAMPLES - 1)``."""
+
+    def step(state: Any, command: tuple[Array, Array]) -> tuple[Any, Array]:
+        u_in, dt = command
+        return plant.step(state, u_in, jnp.zeros_like(u_in), dt)
+
+    _, pressure = jax.lax.scan(step, plant.init(start), (data.u_in.T, data.dt.T))
+    return pressure.T
 
 
 def breath_errors(fitted: Fitted, data: InspirationData) -> Array:
@@ -182,3 +193,56 @@ def fit(
         if progress is not None:
             progress((done + CHUNK) / config.iterations)
     return carry[0], value
+
+
+#: Parameters that the second stage fits, and the prior standard deviation of their logarithms.
+EXPIRATORY_WIDTHS = {"conductance": 1.0, "session_conductance": 0.3, "opening_delay": 0.7}
+
+#: Settings of its optimisation.
+EXPIRATORY_ITERATIONS, EXPIRATORY_LEARNING_RATE = 80, 0.05
+
+#: Error below which its loss turns from absolute to square, and mean error of a breath above which
+#: the breath counts less and less, cmH2O; weight of the prior, in breaths times cmH2O.
+EXPIRATORY_SOFTNESS, EXPIRATORY_SATURATION, EXPIRATORY_PRIOR = 0.1, 2.0, 0.0135
+
+
+@jax.jit
+def fit_expiration(pooled: Pooled, data: WholeBreaths, weight: Array) -> Pooled:
+    """Fit the expiratory valve; the inspirations have fixed everything else.
+
+    Args:
+        pooled: pooled parameters from :func:`fit`.
+        data: data from :func:`whole_breaths`.
+        weight: weight of each breath, shape ``(n,)``; 0 leaves it out.
+
+    Returns:
+        The parameters with those of :data:`EXPIRATORY_WIDTHS` moved.
+    """
+    start = {name: getattr(pooled, name) for name in EXPIRATORY_WIDTHS}
+    optimiser = optax.adam(
+        optax.cosine_decay_schedule(EXPIRATORY_LEARNING_RATE, EXPIRATORY_ITERATIONS, 0.01)
+    )
+    soft, saturation = EXPIRATORY_SOFTNESS, EXPIRATORY_SATURATION
+
+    def loss(moved: dict[str, Array]) -> Array:
+        plant = plants(replace(pooled, **moved), data.groups)
+        simulated = open_loop(plant, data.pressure[:, 0], data.u_in, data.u_out, data.dt)
+        error = jnp.where(data.share > 0, simulated - data.pressure, 0.0)
+        breath = jnp.sum(data.share * (jnp.sqrt(error**2 + soft**2) - soft), axis=1)
+        breath = saturation * jnp.log1p(breath / saturation)
+        moves = [
+            jnp.sum(((moved[name] - start[name]) / EXPIRATORY_WIDTHS[name]) ** 2)
+            for name in EXPIRATORY_WIDTHS
+        ]
+        prior = 0.5 * EXPIRATORY_PRIOR * sum(moves)
+        return (jnp.sum(weight * breath) + prior) / jnp.maximum(jnp.sum(weight), 1.0)
+
+    def iterate(carry: tuple[Any, Any], _: None) -> tuple[tuple[Any, Any], None]:
+        moved, state = carry
+        updates, state = optimiser.update(jax.grad(loss)(moved), state)
+        return (optax.apply_updates(moved, updates), state), None
+
+    (moved, _), _ = jax.lax.scan(
+        iterate, (start, optimiser.init(start)), None, length=EXPIRATORY_ITERATIONS
+    )
+    return replace(pooled, **moved)

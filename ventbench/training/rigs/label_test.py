@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import jax
@@ -23,10 +22,9 @@ from numpy.typing import NDArray
 from ventbench.lungs import Lung
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.sessions import Sessions
-from ventbench.training.hybrid.data import InspirationData
-from ventbench.training.hybrid.fit import simulate
-from ventbench.training.hybrid.parameters import Groups, Pooled, plants
-from ventbench.training.rigs.hierarchy import Scales
+from ventbench.training.rigs.data import InspirationData
+from ventbench.training.rigs.fit import simulate
+from ventbench.training.rigs.parameters import Groups, Pooled, Scales, plants
 
 #: Largest deviation of R and C from the label or from the pooled value, as a share of it.
 TOLERANCE = 0.2
@@ -132,10 +130,11 @@ def interval(value: float, resampled: NDArray[np.float64]) -> tuple[float, float
     return float(value * np.exp(-wide)), float(value * np.exp(wide))
 
 
-@partial(jax.jit, static_argnames="directed")
-def _errors(pooled: Pooled, groups: Groups, gain: Array, start: Array, data: InspirationData,
-            directed: bool = True) -> Array:  # fmt: skip
-    plant = plants(pooled, groups, directed=directed)
+@jax.jit
+def _errors(
+    pooled: Pooled, groups: Groups, gain: Array, start: Array, data: InspirationData
+) -> Array:
+    plant = plants(pooled, groups)
     plant = plant.replace(slopes=plant.slopes * jnp.exp(gain))  # type: ignore[attr-defined]
     start = jnp.where(data.start_known > 0, data.start, start)
     error = jnp.where(data.share > 0, simulate(plant, start, data) - data.pressure, 0.0)

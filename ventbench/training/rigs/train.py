@@ -34,33 +34,34 @@ from ventbench.plants.plant_files import save_plant
 from ventbench.plants.sessions import Sessions
 from ventbench.recordings import Breaths
 from ventbench.resume import Format, WorkFolder
-from ventbench.training.hybrid.data import (
+from ventbench.training.rigs.data import (
     SAMPLES,
     InspirationData,
+    RigRecordings,
     WholeBreaths,
     groups_of,
     groups_of_sessions,
     inspirations,
+    load_rig_recordings,
     whole_breaths,
 )
-from ventbench.training.hybrid.fit import HybridConfig, fit_expiration
-from ventbench.training.hybrid.parameters import Pooled, plants
-from ventbench.training.rigs.fit import FitConfig, Fitted, Noise, fit
-from ventbench.training.rigs.hierarchy import (
+from ventbench.training.rigs.fit import FitConfig, Fitted, Noise, fit, fit_expiration
+from ventbench.training.rigs.label_test import LabelTest, label_errors, label_tests
+from ventbench.training.rigs.parameters import (
     LAMINAR_SHARE,
     SHEET_FLOW,
     Centre,
+    Pooled,
     Scales,
     centre,
     full_flow,
+    plants,
 )
-from ventbench.training.rigs.label_test import LabelTest, label_errors, label_tests
-from ventbench.training.rigs.recordings import RigRecordings, load_rig_recordings
 
 #: Called with what is being done and the share of all that is done, 0..1.
 Progress = Callable[[str, float], None]
 
-#: Version of the simulators, written into the manifest.
+#: Version of the recipe, written into the manifest.
 VERSION = 2
 
 #: Packages that have a part in the numbers.
@@ -280,9 +281,7 @@ def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progr
                 lambda share: report(what, 0.95 * (done + cost * share) / total),
             )  # fmt: skip
             if expiration:
-                pooled = fit_expiration(
-                    fitted.pooled, problem.whole, jnp.asarray(weight[:m]), HybridConfig()
-                )
+                pooled = fit_expiration(fitted.pooled, problem.whole, jnp.asarray(weight[:m]))
                 fitted = dataclasses.replace(fitted, pooled=pooled)
             return fitted
 
@@ -507,10 +506,10 @@ def _provenance(
 ) -> dict[str, Any]:
     settings = dataclasses.asdict(config)
     if config.laminar_share == LAMINAR_SHARE:
-        # Not told, so that the recordings of version 2 give its manifest again to the byte.
+        # Not told, so that the public recordings give the official manifest again to the byte.
         del settings["laminar_share"]
     return {
-        "format": frozen.RIGS_FORMAT,
+        "format": frozen.FORMAT,
         "version": VERSION,
         "kind": "hybrid",
         "packages": {name: metadata.version(name) for name in PACKAGES},

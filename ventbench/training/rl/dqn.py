@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from ventbench import protocol
 from ventbench.controllers import rl_policy
 from ventbench.controllers.rl_policy import (
     CHOICES,
@@ -57,12 +58,10 @@ class DQN:
     """Settings; one iteration is some breaths into the replay, then some updates.
 
     Attributes:
-        breaths: breaths of an iteration.
+        breaths: breaths of an iteration, three an episode.
         iterations: iterations of a training, over which the learning rate falls to zero.
         learning_rate: initial learning rate of Adam.
         vary: draw cells with noise and deviations; false for nominal ones.
-        looks_back: let the features look back at the breath before; episodes then have three
-            breaths.
         widths: hidden layers of the network.
         updates: updates of an iteration.
         batch: steps of an update.
@@ -78,7 +77,6 @@ class DQN:
     iterations: int = 2400
     learning_rate: float = 3e-3
     vary: bool = True
-    looks_back: bool = False
     widths: tuple[int, ...] = (64, 64)
     updates: int = 8
     batch: int = 256
@@ -102,9 +100,9 @@ class DQN:
     def init(self, key: Array) -> DQNState:
         """Return the state at the start of a training."""
         network_key, key = jax.random.split(key)
-        parameters = rl_policy.init_parameters(self.network, network_key, self.looks_back)
+        parameters = rl_policy.init_parameters(self.network, network_key)
         size = self.memory * episodes.STEPS
-        seen, zero = jnp.zeros((size, rl_policy.feature_count(self.looks_back))), jnp.zeros((size,))
+        seen, zero = jnp.zeros((size, rl_policy.FEATURES)), jnp.zeros((size,))
         replay = Replay(seen, jnp.zeros((size,), jnp.int32), zero, zero, seen)
         iteration = jnp.zeros((), jnp.int32)
         optimiser = self._optimiser.init(parameters)
@@ -134,17 +132,16 @@ class DQN:
 
     def policy(self, state: DQNState) -> GreedyPolicy:
         """Policy so far: the choices of the target network, the smoother of the two."""
-        return GreedyPolicy(state.target, self.network, self.looks_back)
+        return GreedyPolicy(state.target, self.network)
 
     def _values(self, parameters: Any, x: Array) -> Array:
         return self.network.apply(parameters, x)  # type: ignore[return-value]
 
     def _collect(self, state: DQNState, plants: episodes.Lungs, key: Array) -> Replay:
         cells_key, roll_key = jax.random.split(key)
-        breaths = episodes.breaths_of(self.looks_back)
-        count = self.breaths // breaths
-        first = state.iteration * max(count // episodes.lung_count(plants), 1)
-        drawn = episodes.draw(cells_key, plants, count, first, self.vary, breaths=breaths)
+        count = self.breaths // protocol.BREATHS
+        first = state.iteration * max(count // plants.count, 1)
+        drawn = episodes.draw(cells_key, plants, count, first, self.vary)
         start, end = self.explore
         progress = jnp.minimum(state.iteration / (self.explored * self.iterations), 1.0)
         share = start + (end - start) * progress
@@ -157,7 +154,7 @@ class DQN:
             choice = jnp.where(explore, random, greedy)
             return base + jnp.asarray(CHOICES, base.dtype)[choice], choice
 
-        x, choice, rewards = episodes.roll(drawn, act, roll_key, looks_back=self.looks_back)
+        x, choice, rewards = episodes.roll(drawn, act, roll_key)
         steps = jnp.arange(episodes.STEPS) + self.steps
         inside = steps < episodes.STEPS
         discount = jnp.where(inside, self.discount**self.steps, 0.0)

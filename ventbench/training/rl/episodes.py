@@ -1,14 +1,14 @@
 """Episodes of reinforcement learning: breaths of many cells in one scan, and their returns.
 
-An episode is one breath, or three where the features look back at the breath before; returns end
-with the breath.
+An episode is the three breaths of a run, since features look back at the breath before; returns
+end with the breath.
 
 In the functions of returns, time runs along the leading axis, and no reward comes after the last.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import flax.struct
@@ -19,9 +19,8 @@ from jax import Array
 from ventbench import environment as env
 from ventbench import protocol, rig_draws
 from ventbench.controllers import rl_policy
-from ventbench.draws import RANGES, random_scenarios
+from ventbench.draws import random_scenarios
 from ventbench.environment import Scenario
-from ventbench.interfaces import Plant
 
 #: Commands of an episode; the last command of a breath moves no pressure that is scored.
 STEPS = protocol.INSPIRATION_STEPS - 1
@@ -35,10 +34,8 @@ Act = Callable[[Array, Array, Array], tuple[Array, Any]]
 
 
 @flax.struct.dataclass
-class RigLungs:
-    """Lungs of protocol version 2 to learn on; see ``ventbench.training.rig_plants``.
-
-    Deviations have the ranges of version 2, and the airway pressure counts.
+class Lungs:
+    """Lungs to learn on; see :class:`ventbench.training.plants.TrainingPlants`.
 
     Attributes:
         plants: K plants of each of L lungs, the nominal one first, leaves ``(K, L, ...)``.
@@ -53,16 +50,10 @@ class RigLungs:
         """The nominal plants, leaves ``(L, ...)``."""
         return jax.tree.map(lambda leaf: leaf[0], self.plants)
 
-
-#: Lungs to learn on: plants with leaves ``(L, ...)`` for protocol version 1, or of version 2.
-Lungs = Plant | RigLungs
-
-
-def lung_count(lungs: Lungs) -> int:
-    """Number of lungs L."""
-    if isinstance(lungs, RigLungs):
-        return lungs.weights.shape[0]
-    return jax.tree.leaves(lungs)[0].shape[0]
+    @property
+    def count(self) -> int:
+        """Number of lungs L."""
+        return self.weights.shape[0]
 
 
 @flax.struct.dataclass
@@ -73,18 +64,11 @@ class Episodes:
         plants: leaves ``(E, ...)``.
         cells: E cells.
         weight: of the errors in each, ``(E,)``.
-        airway: whether the airway pressure counts, not the reading.
     """
 
     plants: Any
     cells: Scenario
     weight: Array
-    airway: bool = flax.struct.field(pytree_node=False, default=False)
-
-
-def breaths_of(looks_back: bool) -> int:
-    """Breaths of an episode: those of a run where the features look back, else one."""
-    return protocol.BREATHS if looks_back else 1
 
 
 def draw(
@@ -93,8 +77,6 @@ def draw(
     count: int,
     first: Array | int = 0,
     vary: bool = True,
-    *,
-    breaths: int = 1,
 ) -> Episodes:
     """Draw episodes: the lungs in turn, on any of their plants, with new deviations.
 
@@ -104,21 +86,16 @@ def draw(
         count: number of episodes E.
         first: which of the six PIPs comes first.
         vary: false for nominal cells on nominal plants.
-        breaths: breaths of each episode.
     """
-    number = lung_count(lungs)
+    number = lungs.count
     lung = jnp.arange(count) % number
-    if not isinstance(lungs, RigLungs):
-        plants = jax.tree.map(lambda leaf: jnp.asarray(leaf)[lung], lungs)
-        cells = sample(key, count, number, first, vary, breaths=breaths)
-        return Episodes(plants, cells, jnp.ones(count))
     which = jax.tree.leaves(lungs.plants)[0].shape[0]
     plant_key = jax.random.fold_in(key, 1)
     plant = jax.random.randint(plant_key, (count,), 0, which) * vary
     plants = jax.tree.map(lambda leaf: jnp.asarray(leaf)[plant, lung], lungs.plants)
     pip = (first + jnp.arange(count) // number) % len(protocol.PIPS)
-    cells = sample(key, count, number, first, vary, breaths=breaths, ranges=rig_draws.RANGES)
-    return Episodes(plants, cells, lungs.weights[lung, pip], airway=True)
+    cells = sample(key, count, number, first, vary)
+    return Episodes(plants, cells, lungs.weights[lung, pip])
 
 
 def sample(
@@ -128,10 +105,9 @@ def sample(
     first: Array | int = 0,
     vary: bool = True,
     *,
-    breaths: int = 1,
-    ranges: Mapping[str, tuple[float, float]] = RANGES,
+    breaths: int = protocol.BREATHS,
 ) -> Scenario:
-    """Draw cells with deviations as of the draws of a version of the protocol.
+    """Draw cells with deviations as of the scored draws.
 
     Args:
         key: key of the random numbers.
@@ -140,24 +116,20 @@ def sample(
         first: which of the six PIPs comes first.
         vary: false for nominal cells, without any deviation.
         breaths: breaths of each cell.
-        ranges: of the deviations.
     """
     which = (first + jnp.arange(count) // lungs) % len(protocol.PIPS)
     pip = jnp.asarray(protocol.PIPS, jnp.result_type(float))[which]
     spread = None if vary else 0.0
-    return random_scenarios(key, pip, spread=spread, breaths=breaths, ranges=ranges)
+    return random_scenarios(key, pip, spread=spread, breaths=breaths, ranges=rig_draws.RANGES)
 
 
-def roll(
-    episodes: Episodes, act: Act, key: Array, *, looks_back: bool = False
-) -> tuple[Array, Any, Array]:
+def roll(episodes: Episodes, act: Act, key: Array) -> tuple[Array, Any, Array]:
     """Run episodes.
 
     Args:
-        episodes: E of them, of one breath, or of three where the features look back.
+        episodes: E of them.
         act: see :data:`Act`; asked :data:`STEPS` times a breath.
         key: split for the steps.
-        looks_back: whether the features look back at the breath before.
 
     Returns:
         Of each of the B breaths of all episodes: features before each command, shape
@@ -167,9 +139,11 @@ def roll(
     cells, weight = episodes.cells, episodes.weight
     varied = env.vary(episodes.plants, cells)
     start = env.start_breath(varied, cells)
-    memory = rl_policy.init_features(cells.pip.shape, looks_back)
+    memory = rl_policy.init_features(cells.pip.shape)
 
-    def run(memory: Any, breath: Array | int, keys: Array) -> tuple[Any, Any]:
+    def run(memory: Any, now: tuple[Array, Array]) -> tuple[Any, Any]:
+        breath, keys = now
+
         def step(carry: Any, now: tuple[Array, Array]) -> tuple[Any, tuple[Array, Any, Array]]:
             loop, memory = carry
             index, key = now
@@ -177,20 +151,18 @@ def roll(
             memory, x, base = rl_policy.features(memory, seen)
             asked, kept = act(key, x, base)
             loop, _ = env.inspire(varied, cells, loop, asked)
-            pressure = env.airway_pressure(varied, loop) if episodes.airway else loop.pressure
+            pressure = env.airway_pressure(varied, loop)
             reward = -weight * jnp.abs(pressure - cells.pip) / REWARD_SCALE
             return (loop, memory), (x, kept, reward)
 
         (loop, memory), out = jax.lax.scan(step, (start, memory), (jnp.arange(STEPS), keys))
-        if looks_back:  # the last observation is remembered too
-            memory, _, _ = rl_policy.features(memory, env.observe(cells, loop, breath, STEPS))
+        # The last observation is remembered too.
+        memory, _, _ = rl_policy.features(memory, env.observe(cells, loop, breath, STEPS))
         return memory, out
 
-    if not looks_back:
-        return run(memory, 0, jax.random.split(key, STEPS))[1]
     keys = jax.random.split(key, (protocol.BREATHS, STEPS))
     breaths = jnp.arange(protocol.BREATHS)
-    _, out = jax.lax.scan(lambda memory, x: run(memory, *x), memory, (breaths, keys))
+    _, out = jax.lax.scan(run, memory, (breaths, keys))
     # (breath, step, episode, ...) -> (step, breath and episode, ...)
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(STEPS, -1, *x.shape[3:]), out)
 
@@ -199,7 +171,7 @@ def roll(
 def errors(episodes: Episodes, controller: Any) -> Array:
     """Mean weighted ``|pressure - PIP|`` of each episode, cmH2O, shape ``(E,)``.
 
-    Of an episode of three breaths those that are scored count.
+    The breaths that are scored count.
 
     Args:
         episodes: E of them.
@@ -208,23 +180,20 @@ def errors(episodes: Episodes, controller: Any) -> Array:
     cells = episodes.cells
     varied = env.vary(episodes.plants, cells)
     start = env.start_breath(varied, cells)
-    breaths = cells.noise.shape[-2]
 
-    def run(state: Any, breath: Array | int) -> tuple[Any, Array]:
+    def run(state: Any, breath: Array) -> tuple[Any, Array]:
         def step(carry: Any, index: Array) -> tuple[Any, Array]:
             loop, state = carry
             state, asked = controller.step(state, env.observe(cells, loop, breath, index))
             after, _ = env.inspire(varied, cells, loop, asked)
-            pressure = env.airway_pressure(varied, loop) if episodes.airway else loop.pressure
+            pressure = env.airway_pressure(varied, loop)
             return (after, state), jnp.abs(pressure - cells.pip)
 
         (_, state), out = jax.lax.scan(step, (start, state), jnp.arange(protocol.INSPIRATION_STEPS))
         return state, jnp.mean(out, axis=0)
 
     state = controller.init(cells.pip.shape)
-    if breaths == 1:
-        return run(state, 0)[1] * episodes.weight
-    _, each = jax.lax.scan(run, state, jnp.arange(breaths))
+    _, each = jax.lax.scan(run, state, jnp.arange(protocol.BREATHS))
     return jnp.mean(each[jnp.asarray(protocol.SCORED_BREATHS)], axis=0) * episodes.weight
 
 

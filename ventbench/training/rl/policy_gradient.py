@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from ventbench import protocol
 from ventbench.controllers import rl_policy
 from ventbench.controllers.rl_policy import (
     SCALE,
@@ -36,12 +37,10 @@ class PolicyGradient:
     """Settings; one iteration is one update.
 
     Attributes:
-        breaths: breaths of an update, PIPs in turn.
+        breaths: breaths of an update, three an episode, PIPs in turn.
         iterations: iterations of a training, over which the learning rate falls to zero.
         learning_rate: initial learning rate of Adam.
         vary: draw cells with noise and deviations; false for nominal ones.
-        looks_back: let the features look back at the breath before; episodes then have three
-            breaths.
         widths: hidden layers of the network.
     """
 
@@ -49,7 +48,6 @@ class PolicyGradient:
     iterations: int = 1600
     learning_rate: float = 3e-3
     vary: bool = True
-    looks_back: bool = False
     widths: tuple[int, ...] = (32, 32)
 
     @property
@@ -65,7 +63,7 @@ class PolicyGradient:
     def init(self, key: Array) -> PolicyGradientState:
         """Return the state at the start of a training."""
         network_key, key = jax.random.split(key)
-        parameters = rl_policy.init_parameters(self.network, network_key, self.looks_back)
+        parameters = rl_policy.init_parameters(self.network, network_key)
         return PolicyGradientState(
             parameters, self._optimiser.init(parameters), key, jnp.zeros((), jnp.int32)
         )
@@ -73,17 +71,16 @@ class PolicyGradient:
     def iterate(self, state: PolicyGradientState, plants: episodes.Lungs) -> PolicyGradientState:
         """One update on lungs."""
         cells_key, roll_key, key = jax.random.split(state.key, 3)
-        breaths = episodes.breaths_of(self.looks_back)
-        count = self.breaths // breaths
-        first = state.iteration * max(count // episodes.lung_count(plants), 1)
-        drawn = episodes.draw(cells_key, plants, count, first, self.vary, breaths=breaths)
+        count = self.breaths // protocol.BREATHS
+        first = state.iteration * max(count // plants.count, 1)
+        drawn = episodes.draw(cells_key, plants, count, first, self.vary)
 
         def loss(parameters: Parameters) -> Array:
             def act(key: Array, x: Array, base: Array) -> tuple[Array, None]:
                 mean: Array = self.network.apply(parameters, x)  # type: ignore[assignment]
                 return base + SCALE * mean[..., 0], None
 
-            return -jnp.mean(episodes.roll(drawn, act, roll_key, looks_back=self.looks_back)[2])
+            return -jnp.mean(episodes.roll(drawn, act, roll_key)[2])
 
         gradient = jax.grad(loss)(state.parameters)
         updates, optimiser = self._optimiser.update(gradient, state.optimiser, state.parameters)
@@ -92,4 +89,4 @@ class PolicyGradient:
 
     def policy(self, state: PolicyGradientState) -> GaussianPolicy:
         """The learned policy."""
-        return GaussianPolicy(state.parameters, self.network, self.looks_back)
+        return GaussianPolicy(state.parameters, self.network)

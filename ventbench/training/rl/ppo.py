@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from ventbench import protocol
 from ventbench.controllers import rl_policy
 from ventbench.controllers.rl_policy import (
     SCALE,
@@ -57,12 +58,10 @@ class PPO:
     """Settings; one iteration is one batch of breaths, used ``epochs`` times.
 
     Attributes:
-        breaths: breaths of an iteration.
+        breaths: breaths of an iteration, three an episode.
         iterations: iterations of a training, over which the learning rate falls to zero.
         learning_rate: initial learning rate of Adam.
         vary: draw cells with noise and deviations; false for nominal ones.
-        looks_back: let the features look back at the breath before; episodes then have three
-            breaths.
         widths: hidden layers of both networks.
         epochs: passes over a batch.
         minibatches: minibatches of a pass.
@@ -77,7 +76,6 @@ class PPO:
     iterations: int = 600
     learning_rate: float = 1e-3
     vary: bool = True
-    looks_back: bool = False
     widths: tuple[int, ...] = (32, 32)
     epochs: int = 6
     minibatches: int = 4
@@ -106,8 +104,8 @@ class PPO:
         """Return the state at the start of a training."""
         actor_key, critic_key, key = jax.random.split(key, 3)
         parameters = {
-            "actor": rl_policy.init_parameters(self.network, actor_key, self.looks_back),
-            "critic": rl_policy.init_parameters(self._critic, critic_key, self.looks_back),
+            "actor": rl_policy.init_parameters(self.network, actor_key),
+            "critic": rl_policy.init_parameters(self._critic, critic_key),
             "log_spread": jnp.log(jnp.asarray(self.spread)),
         }
         return PPOState(parameters, self._optimiser.init(parameters), key, jnp.zeros((), jnp.int32))
@@ -130,7 +128,7 @@ class PPO:
 
     def policy(self, state: PPOState) -> GaussianPolicy:
         """The learned policy: its mean."""
-        return GaussianPolicy(state.parameters["actor"], self.network, self.looks_back)
+        return GaussianPolicy(state.parameters["actor"], self.network)
 
     def _mean(self, parameters: Any, x: Array) -> Array:
         return self.network.apply(parameters["actor"], x)[..., 0]  # type: ignore[index]
@@ -141,10 +139,9 @@ class PPO:
     def _collect(self, state: PPOState, plants: episodes.Lungs, key: Array) -> PPOBatch:
         parameters = state.parameters
         cells_key, roll_key = jax.random.split(key)
-        breaths = episodes.breaths_of(self.looks_back)
-        count = self.breaths // breaths
-        first = state.iteration * max(count // episodes.lung_count(plants), 1)
-        drawn = episodes.draw(cells_key, plants, count, first, self.vary, breaths=breaths)
+        count = self.breaths // protocol.BREATHS
+        first = state.iteration * max(count // plants.count, 1)
+        drawn = episodes.draw(cells_key, plants, count, first, self.vary)
 
         def act(key: Array, x: Array, base: Array) -> tuple[Array, tuple[Array, Array]]:
             mean = self._mean(parameters, x)
@@ -152,9 +149,7 @@ class PPO:
             action = mean + jnp.exp(log_spread) * jax.random.normal(key, mean.shape)
             return base + SCALE * action, (action, log_probability(action, mean, log_spread))
 
-        x, (action, before), rewards = episodes.roll(
-            drawn, act, roll_key, looks_back=self.looks_back
-        )
+        x, (action, before), rewards = episodes.roll(drawn, act, roll_key)
         value = self._value(parameters, x)
         advantage = episodes.advantages(rewards, value, self.discount, self.trace)
         batch = PPOBatch(x, action, before, advantage, value)

@@ -1,30 +1,239 @@
-"""Networks for the lungs by PPO or DQN: settings, trainings of several seeds, weights, a report."""
+"""Networks for the lungs by PPO or DQN: settings, trainings of several seeds, weights, a report.
+
+:func:`train` runs several trainings side by side in one compiled step, with their learning curves.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from numpy.typing import NDArray
 
-from ventbench import files, precision
+from ventbench import files, precision, protocol
 from ventbench.controllers import rl_policy
 from ventbench.controllers.pid import PID
+from ventbench.environment import nominal_scenario
 from ventbench.errors import InputError
 from ventbench.plants.catalog import Given
-from ventbench.resume import fingerprint
-from ventbench.training.rig_plants import TrainingPlants, plants_to_train_on
+from ventbench.resume import Checkpoint, fingerprint
+from ventbench.training.plants import (
+    ALL,
+    TrainedControllers,
+    TrainingPlants,
+    check_names,
+    plants_to_train_on,
+)
 from ventbench.training.rl import episodes
 from ventbench.training.rl.dqn import DQN
-from ventbench.training.rl.parallel import TrainedPolicies, nominal_error, train
 from ventbench.training.rl.policy_gradient import PolicyGradient
 from ventbench.training.rl.ppo import PPO
-from ventbench.training.trained import ALL, TrainedControllers, check_names
+
+
+class Learner(Protocol):
+    """Settings of a way of learning: hashable, static in ``jit``; its methods are pure."""
+
+    @property
+    def breaths(self) -> int:
+        """Episodes in an iteration."""
+        ...
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of a training."""
+        ...
+
+    def init(self, key: Array) -> Any:
+        """State at the start."""
+        ...
+
+    def iterate(self, state: Any, plants: episodes.Lungs) -> Any:
+        """State one iteration later."""
+        ...
+
+    def policy(self, state: Any) -> Any:
+        """The policy learned so far, as a pure controller."""
+        ...
+
+
+#: Cells on each lung by which the best policy of a training is chosen, and the seed they come from.
+VALIDATION_CELLS, VALIDATION_SEED = 48, 2021
+
+#: At least this many seconds lie between two checkpoints: what an interruption may cost.
+SAVE_SECONDS = 5.0
+
+#: Called with the share that is done and the lowest error of each run, cmH2O, shape ``(R,)``.
+RunsProgress = Callable[[float, NDArray[np.float32]], None]
+
+
+@flax.struct.dataclass
+class _Run:
+    """One training under way; ``best`` is the policy with the lowest validation error so far."""
+
+    state: Any
+    best: Any
+    error: Array
+
+
+@dataclass(frozen=True)
+class TrainedPolicies:
+    """R finished trainings.
+
+    Attributes:
+        policies: the best of each, leaves ``(R, ...)``.
+        validation: errors of the policies on fresh cells with noise, cmH2O, ``(R,)``.
+        episodes: breaths that a run had seen at each point of its curve, ``(points,)``.
+        curves: nominal error of the policy then, cmH2O, ``(R, points)``.
+        validation_curves: error of the policy on the fresh cells, cmH2O, ``(R, points)``.
+        seconds: computing time of all runs together until each point, without compiling,
+            ``(points,)``.
+        compile_seconds: time of compiling, which comes first, with the chunk that is run for it, s.
+    """
+
+    policies: Any
+    validation: NDArray[np.float32]
+    episodes: NDArray[np.int64]
+    curves: NDArray[np.float32]
+    validation_curves: NDArray[np.float32]
+    seconds: NDArray[np.float64]
+    compile_seconds: float
+
+
+def nominal_error(lungs: episodes.Lungs, policy: Any) -> Array:
+    """Score without noise of a policy on the nominal plants of lungs, cmH2O.
+
+    The mean over lungs and PIPs, without weights.
+    """
+    pips = np.repeat(np.asarray(protocol.PIPS), lungs.count)
+    which = jnp.arange(len(pips)) % lungs.count
+    cells = nominal_scenario(pips)
+    each = jax.tree.map(lambda leaf: jnp.asarray(leaf)[which], lungs.nominal)
+    drawn = episodes.Episodes(each, cells, jnp.ones(len(pips)))
+    return jnp.mean(episodes.errors(drawn, policy))
+
+
+def _fresh_error(lungs: episodes.Lungs, policy: Any) -> Array:
+    """Error on fresh cells, weighted as in the training."""
+    count = VALIDATION_CELLS * lungs.count
+    key = jax.random.key(VALIDATION_SEED)
+    return jnp.mean(episodes.errors(episodes.draw(key, lungs, count), policy))
+
+
+@partial(jax.jit, static_argnames=("method", "count"))
+def _advance(method: Learner, runs: _Run, plants: episodes.Lungs, count: int) -> tuple[_Run, Array]:
+    """``count`` iterations of each run, then both errors, shape ``(R, 2)``."""
+
+    def advance(run: _Run, plant: episodes.Lungs) -> tuple[_Run, Array]:
+        def iterate(state: Any, _: None) -> tuple[Any, None]:
+            return method.iterate(state, plant), None
+
+        state, _ = jax.lax.scan(iterate, run.state, None, length=count)
+        policy = method.policy(state)
+        fresh = _fresh_error(plant, policy)
+        better = fresh < run.error
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), policy, run.best)
+        errors = jnp.stack([nominal_error(plant, policy), fresh])
+        return _Run(state, best, jnp.where(better, fresh, run.error)), errors
+
+    return jax.vmap(advance)(runs, plants)
+
+
+def _start(
+    method: Learner, seeds: Sequence[int], plants: episodes.Lungs
+) -> tuple[_Run, NDArray[np.float32]]:
+    numbers = jnp.asarray(np.asarray(seeds, np.uint32))
+    keys = jax.vmap(jax.random.key)(numbers)
+    states = jax.vmap(method.init)(keys)
+    best = jax.vmap(method.policy)(states)
+    errors = np.asarray(jax.jit(jax.vmap(nominal_error))(plants, best))
+    return _Run(states, best, jnp.full(len(seeds), jnp.inf)), errors
+
+
+def train(
+    method: Learner,
+    plants: episodes.Lungs,
+    seeds: Sequence[int],
+    *,
+    chunk: int,
+    about: str = "",
+    file: Path | None = None,
+    progress: RunsProgress | None = None,
+    save_seconds: float = SAVE_SECONDS,
+) -> TrainedPolicies:
+    """Train R policies side by side.
+
+    Bit-reproducible on one machine: all random numbers come from the seeds, and an interrupted
+    training goes on as if it had not been.
+
+    Args:
+        method: the recipe, common to all.
+        plants: lungs of each run, an axis ``(R, ...)`` in front of all leaves; taken in float32.
+        seeds: one for each run.
+        chunk: iterations between two points of the curves.
+        about: text that tells one training from another, such as the simulators' hash.
+        file: checkpoint that is resumed from and written to; kept at the end.
+        progress: see :data:`RunsProgress`.
+        save_seconds: least time between two checkpoints, s.
+
+    Raises:
+        InputError: if the checkpoint belongs to another training.
+        FloatingPointError: if a policy diverges.
+    """
+    with precision.float32():
+        plants = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), plants)
+        runs, first = _start(method, seeds, plants)
+        points = -(-method.iterations // chunk)
+        curves = np.full((len(seeds), points + 1, 2), np.nan, np.float32)
+        curves[:, 0, 0] = first
+        seconds, compiling = np.zeros(points + 1), np.zeros(())
+        carry: Any = (runs, curves, seconds, compiling)
+        settings = {
+            "method": type(method).__name__,
+            "recipe": asdict(method),  # type: ignore[call-overload]
+            "seeds": list(map(int, seeds)),
+            "chunk": chunk,
+            "about": about,
+            "jax": jax.__version__,
+        }
+        stored = Checkpoint(file, settings)
+        (runs, curves, seconds, compiling), done = stored.restore(carry)
+        began = time.perf_counter()
+        if done < points:  # once for nothing, so that no point's time contains the compiling
+            jax.block_until_ready(_advance(method, runs, plants, chunk))
+        saved = now = time.perf_counter()
+        compiling = compiling + (now - began)
+        while done < points:
+            runs, errors = _advance(method, runs, plants, chunk)
+            done += 1
+            curves[:, done] = np.asarray(errors)
+            before, now = now, time.perf_counter()
+            seconds[done] = seconds[done - 1] + now - before
+            if not np.isfinite(curves[:, done]).all():
+                raise FloatingPointError(f"training diverged before point {done} of {points}")
+            if now - saved > save_seconds or done == points:
+                stored.save((runs, curves, seconds, compiling), done)
+                saved = time.perf_counter()
+            if progress is not None:
+                progress(done / points, np.asarray(runs.error))
+        return TrainedPolicies(
+            policies=jax.tree.map(np.asarray, runs.best),
+            validation=np.asarray(runs.error),
+            episodes=np.arange(points + 1) * chunk * method.breaths,
+            curves=curves[..., 0],
+            validation_curves=curves[..., 1],
+            seconds=seconds,
+            compile_seconds=float(compiling),
+        )
+
 
 #: Names of the methods, as commands and tables have them.
 METHODS = ("policy-gradient", "ppo", "dqn")
@@ -53,7 +262,6 @@ def train_ppo(
     steps: int | None = None,
     method: PPO | None = None,
     simulator: Given = "frozen",
-    version: int = 1,
     progress: Progress | None = None,
 ) -> TrainedControllers:
     """Train corrections of a PID by proximal policy optimisation.
@@ -76,8 +284,6 @@ def train_ppo(
         method: settings of every training; the published ones, which differ for one lung and for
             all six, if not given.
         simulator: simulators with plants, see :func:`ventbench.load_simulators`.
-        version: of the protocol to train for, see
-            :func:`ventbench.training.rig_plants.plants_to_train_on`.
         progress: see :data:`Progress`.
 
     Returns:
@@ -88,7 +294,7 @@ def train_ppo(
             holds an unfinished training with other settings.
         FloatingPointError: if a training diverges.
     """
-    return _train("ppo", networks, out, seeds, steps, method, simulator, version, progress)
+    return _train("ppo", networks, out, seeds, steps, method, simulator, progress)
 
 
 def train_dqn(
@@ -99,7 +305,6 @@ def train_dqn(
     steps: int | None = None,
     method: DQN | None = None,
     simulator: Given = "frozen",
-    version: int = 1,
     progress: Progress | None = None,
 ) -> TrainedControllers:
     """Train a choice among 19 corrections of a PID by deep Q-learning.
@@ -112,23 +317,22 @@ def train_dqn(
         trained = ventbench.train_dqn(["R20C50"], "runs/mine", steps=60_000)
         trained.report["networks"]["R20C50"]["error_fresh"]  # cmH2O, by seed
     """
-    return _train("dqn", networks, out, seeds, steps, method, simulator, version, progress)
+    return _train("dqn", networks, out, seeds, steps, method, simulator, progress)
 
 
-def method_for(name: str, lungs: int, steps: int | None = None, version: int = 1) -> Method:
+def method_for(name: str, lungs: int, steps: int | None = None) -> Method:
     """Return the published settings of a method.
 
     Args:
         name: one of :data:`METHODS`.
         lungs: on which one network is trained: 1 or 6.
         steps: control steps of experience; those of the published settings if not given.
-        version: of the protocol; in version 2 the features look back at the breath before.
 
     Raises:
         InputError: if the steps do not make one iteration.
     """
     method = (_ONE_LUNG if lungs == 1 else _ALL_LUNGS)[name]
-    return _shortened(replace(method, looks_back=version == 2), name, steps)
+    return _shortened(method, name, steps)
 
 
 def _shortened(method: Method, name: str, steps: int | None) -> Method:
@@ -160,20 +364,18 @@ def _groups(names: Sequence[str], lungs: int) -> list[_Group]:
 
 def _train(
     name: str, networks: Sequence[str] | None, out: Path | str, seeds: Sequence[int],
-    steps: int | None, method: Method | None, simulator: Given, version: int,
+    steps: int | None, method: Method | None, simulator: Given,
     progress: Progress | None,
 ) -> TrainedControllers:  # fmt: skip
     began = time.perf_counter()
-    trained_on, out = plants_to_train_on(simulator, version), Path(out)
+    trained_on, out = plants_to_train_on(simulator), Path(out)
     known = list(trained_on.names)
     names = check_names(networks, trained_on)
     if networks is None and len(known) > 1:
         names = (*names, ALL)
     groups = _groups(names, len(known))
     methods = [
-        method_for(name, group.lungs, steps, version)
-        if method is None
-        else _shortened(method, name, steps)
+        method_for(name, group.lungs, steps) if method is None else _shortened(method, name, steps)
         for group in groups
     ]
     report = progress or (lambda *_: None)
@@ -181,7 +383,7 @@ def _train(
     for group, settings in zip(groups, methods, strict=True):
         label, kind = ", ".join(group.names), "all" if ALL in group.names else "one"
         checkpoints.append(out / f".{name}-{kind}.npz")
-        plants = _lungs(trained_on, version, group, len(seeds))
+        plants = _lungs(trained_on, group, len(seeds))
         trained = train(
             settings,
             plants,
@@ -201,7 +403,6 @@ def _train(
         "method": name,
         "recipes": used,
         "networks": about,
-        "protocol": version,
         "simulators": dict(trained_on.about),
         "jax": jax.__version__,
         "seconds": round(time.perf_counter() - began, 1),
@@ -213,19 +414,17 @@ def _train(
     return TrainedControllers(policies, result, out)
 
 
-def _lungs(trained_on: TrainingPlants, version: int, group: _Group, seeds: int) -> episodes.Lungs:
+def _lungs(trained_on: TrainingPlants, group: _Group, seeds: int) -> episodes.Lungs:
     """Lungs of each run, an axis of R in front: the seeds of a network in a row."""
     known = list(trained_on.names)
     if ALL in group.names:
         where = np.repeat([list(range(len(known)))], seeds, axis=0)
     else:
         where = np.repeat([[known.index(name)] for name in group.names], seeds, axis=0)
-    if version == 1:
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[where], trained_on.nominal)
     plants = jax.tree.map(lambda leaf: np.asarray(leaf)[:, where], trained_on.plants)
     # (plants, runs, lungs, ...) -> (runs, plants, lungs, ...)
     plants = jax.tree.map(lambda leaf: np.moveaxis(leaf, 1, 0), plants)
-    return episodes.RigLungs(plants, jnp.asarray(trained_on.weights[where]))
+    return episodes.Lungs(plants, jnp.asarray(trained_on.weights[where]))
 
 
 def _pid_errors(lungs: episodes.Lungs) -> list[float]:

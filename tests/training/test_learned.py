@@ -11,8 +11,14 @@ from ventbench.lungs import lung
 from ventbench.plants.learned import Architecture
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.rollouts import open_loop
-from ventbench.training.learned.data import expiratory_time_constant, inspirations
-from ventbench.training.learned.fit import CHUNK, LearnedConfig, fit, horizon
+from ventbench.training.learned import (
+    CHUNK,
+    LearnedConfig,
+    expiratory_time_constant,
+    fit,
+    horizon,
+    inspirations,
+)
 
 SHAPE = Architecture(pressures=3, controls=4, width=24, depth=3, boundary_width=8)
 #: Shared, so that it is compiled once.

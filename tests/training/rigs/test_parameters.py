@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,15 +13,19 @@ from scipy import stats
 from ventbench.lungs import Lung
 from ventbench.plants.hybrid import Hybrid
 from ventbench.precision import float64
-from ventbench.training.hybrid.parameters import Groups, plants
-from ventbench.training.rigs.hierarchy import (
+from ventbench.training.rigs.parameters import (
+    DIRECTION_SUM,
     SHEET_FLOW,
     TAIL,
+    Groups,
     Scales,
     centre,
+    direction,
     full_flow,
     heavy_tailed,
     penalty,
+    plants,
+    stiffening,
 )
 
 LABELS = (Lung(5.0, 20.0), Lung(20.0, 20.0), Lung(20.0, 50.0))
@@ -79,3 +84,19 @@ def test_lungs_of_one_label_share_their_spring_and_their_resistor(around):
         assert cost("E", [0, 1]) < 1.9 * cost("E", [0])
         assert cost("R", [1, 2]) < 1.9 * cost("R", [1])
         assert cost("E", [0, 2]) == pytest.approx(cost("E", [0]) + cost("E", [2]))
+
+
+def test_constraints_hold_for_any_parameters(around):
+    rng = np.random.default_rng(0)
+    with float64():
+        for _ in range(5):
+            pooled = jax.tree.map(
+                lambda x: x + jnp.asarray(rng.normal(size=x.shape) * 3.0), around.pooled
+            )
+            weights = direction(pooled)
+            assert (weights <= 0).all()
+            assert (weights.sum(axis=-1) >= -DIRECTION_SUM).all()
+            # The elastic curve rises everywhere: its slope stays positive past every knot.
+            assert (1.0 + jnp.cumsum(stiffening(pooled), axis=-1) > 0).all()
+            least = penalty(around.pooled, around, Scales())
+            assert float(penalty(pooled, around, Scales())) > float(least)

@@ -2,16 +2,16 @@
 
 The paper's objective, the mean of ``|pressure - PIP| + lambda |correction|`` over inspirations, is
 differentiated through the controller, the valve and the simulator. Each update runs every lung at
-every PIP. For protocol version 1 that is once on the official simulator without noise, and several
-times with deviations drawn as those of the published draws are. For version 2 every run has
-deviations and is on any rig and member, the airway pressure counts, and errors are divided by what
-there is to gain in the cell, as in the normalised score.
+every PIP, several times: on any training rig and member, with deviations drawn as those of the
+scored draws are. Errors are divided by what there is to gain in the cell, as in the normalised
+score. :func:`train_residual` takes the gains of the PIDs from the grid.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,15 +23,20 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ventbench import draws, protocol, rig_draws
+from ventbench import draws, files, precision, protocol, rig_draws, rollouts
 from ventbench import environment as env
 from ventbench.controllers.pid import PID
-from ventbench.controllers.residual import Residual, untrained
-from ventbench.environment import Scenario
-from ventbench.interfaces import Plant
+from ventbench.controllers.residual import Residual, save_weights, untrained
+from ventbench.environment import Scenario, nominal_scenario
+from ventbench.interfaces import Controller, Plant
+from ventbench.metrics.score import run_error
+from ventbench.plants.catalog import Given
+from ventbench.plants.stacking import take
 from ventbench.resume import Checkpoint, fingerprint
+from ventbench.training.pid_grid import tune_pid
+from ventbench.training.plants import ALL, TrainedControllers, check_names, plants_to_train_on
 
 
 @dataclass(frozen=True)
@@ -39,43 +44,35 @@ class ResidualConfig:
     """Settings of the training of residual controllers; hashable, since they are static in ``jit``.
 
     Attributes:
-        protocol: version of the protocol that is trained for: which pressure counts, and how far
-            deviations reach.
         updates: number of updates of the network; the schedule stretches over them.
-        copies: runs of each lung at each PIP in an update. In version 1 the first is on the
-            official simulator without noise; all others have random deviations.
+        copies: runs of each lung at each PIP in an update.
         learning_rate: peak of the cosine schedule of Adam.
         weight_decay: decay of the network's weights.
         lam: weight of the mean absolute correction, cmH2O for each %; the paper's lambda.
-        agreement: weight of the disagreement of the ensemble along the controller's own commands;
-            0 to train on the official simulator's response alone.
         first_breath: weight of the breath that is not scored; each scored breath has 1.
         widths: units of the network's hidden layers.
         pressures: number of earlier errors that it sees.
         commands: number of earlier commands that it sees.
         ahead: number of steps of the previous breath that it sees; 0 for none.
         limit: largest correction, %.
-        members: members of the simulators' ensemble, 1 (the official ones) to 5; in version 2 the
-            members of every rig are trained on.
+        members: plants of each lung that are trained on, the nominal one first; all if None.
         spread: reach of the deviations, as a multiple of the draws' ranges; 0 for none.
         round_robin: whether each update takes one lung at one PIP, in turn, as in the paper,
             instead of all of them.
     """
 
-    protocol: int = 1
     updates: int = 3000
-    copies: int = 4
+    copies: int = 6
     learning_rate: float = 4e-3
     weight_decay: float = 1e-5
     lam: float = 0.0
-    agreement: float = 1.0
-    first_breath: float = 0.25
+    first_breath: float = 0.1
     widths: tuple[int, ...] = (64, 64)
     pressures: int = 5
     commands: int = 6
     ahead: int = 6
     limit: float = 100.0
-    members: int = 5
+    members: int | None = None
     spread: float = 1.0
     round_robin: bool = False
 
@@ -85,15 +82,12 @@ class ResidualConfig:
         Raises:
             ValueError: naming the field and its value.
         """
-        if self.protocol not in protocol.VERSIONS:
-            raise ValueError(f"training: protocol = {self.protocol} is none of {protocol.VERSIONS}")
         for name in ("updates", "copies", "learning_rate", "limit", "members"):
-            if not getattr(self, name) > 0:
+            if getattr(self, name) is not None and not getattr(self, name) > 0:
                 raise ValueError(f"training: {name} = {getattr(self, name)} must be positive")
         for name in (
             "weight_decay",
             "lam",
-            "agreement",
             "first_breath",
             "pressures",
             "commands",
@@ -103,11 +97,6 @@ class ResidualConfig:
                 raise ValueError(f"training: {name} = {getattr(self, name)} must not be negative")
         if not 0 <= self.spread <= 4:
             raise ValueError(f"training: spread = {self.spread} is outside 0..4")
-
-
-#: Settings for version 2. There is no term for the ensemble's disagreement: its members are among
-#: the plants that are trained on, and drawn when a controller is scored.
-RIGS_CONFIG = ResidualConfig(protocol=2, copies=6, agreement=0.0, first_breath=0.1)
 
 
 @jax.custom_vjp
@@ -134,7 +123,7 @@ class DifferentiableRun:
     """One run of three inspirations; every array ``(..., BREATHS, INSPIRATION_STEPS)``.
 
     Attributes:
-        pressure: scored pressure, cmH2O.
+        pressure: airway pressure, cmH2O.
         correction: correction of the PID's command, %.
         u_in: command as applied, %.
     """
@@ -144,16 +133,13 @@ class DifferentiableRun:
     u_in: Array
 
 
-def run(
-    controller: Residual, plant: Plant, cell: Scenario, airway: bool = False
-) -> DifferentiableRun:
+def run(controller: Residual, plant: Plant, cell: Scenario) -> DifferentiableRun:
     """Run a controller through three inspirations.
 
     Args:
         controller: the controller.
         plant: plant of one lung.
         cell: one cell, batch shape ``()``.
-        airway: return the airway pressure (protocol version 2), not the reading.
     """
     varied = env.vary(plant, cell)
     start = env.start_breath(varied, cell)
@@ -168,7 +154,7 @@ def run(
         seen = env.observe(cell, loop, breath, index)
         state, base, correction = controller.parts(state, seen)
         after, applied = env.inspire(varied, cell, loop, valve(base + correction))
-        pressure = env.airway_pressure(varied, loop) if airway else loop.pressure
+        pressure = env.airway_pressure(varied, loop)
         return (state, after), DifferentiableRun(pressure, correction, applied)
 
     count = jnp.arange(protocol.BREATHS * protocol.INSPIRATION_STEPS)
@@ -185,9 +171,8 @@ def objective(
     first_breath: float,
     lam: float,
     *,
-    airway: bool = False,
     weight: Array | float = 1.0,
-) -> tuple[Array, Array]:
+) -> Array:
     """Mean of ``|pressure - PIP| + lam |correction|`` over inspirations and runs.
 
     Args:
@@ -196,51 +181,22 @@ def objective(
         cells: batch shape ``(n,)``.
         first_breath: weight of the first breath; the others have 1.
         lam: cmH2O for each %.
-        airway: see :func:`run`.
         weight: of each run, shape ``(n,)`` or ``()``.
 
     Returns:
-        The loss, cmH2O, and the applied commands, %, ``(n, BREATHS, INSPIRATION_STEPS)``.
+        The loss, cmH2O.
     """
-    runs = jax.vmap(partial(run, airway=airway), (None, 0, 0))(controller, plants, cells)
+    runs = jax.vmap(run, (None, 0, 0))(controller, plants, cells)
     scored = jnp.isin(jnp.arange(protocol.BREATHS), jnp.array(protocol.SCORED_BREATHS))
     breath = jnp.where(scored, 1.0, first_breath)[:, None]
     each = jnp.abs(runs.pressure - cells.pip[:, None, None]) + lam * jnp.abs(runs.correction)
     total = jnp.mean(each * breath * jnp.reshape(weight, (-1, 1, 1)))
-    return total / jnp.mean(breath), runs.u_in
-
-
-def disagreement(ensemble: Plant, cells: Scenario, u_in: Array) -> Array:
-    """Disagreement of the members of an ensemble about the response to the same commands.
-
-    Args:
-        ensemble: leaves ``(members, n, ...)``, two members at least.
-        cells: batch shape ``(n,)``.
-        u_in: commands of one inspiration, %, shape ``(n, INSPIRATION_STEPS)``.
-
-    Returns:
-        Sample standard deviation over members of the pressure, mean over steps and cells, cmH2O:
-        the exploitation index of one breath.
-    """
-
-    def pressures(plant: Plant, cell: Scenario, u_in: Array) -> Array:
-        varied = env.vary(plant, cell)
-
-        def step(loop: env.LoopState, u_in: Array) -> tuple[env.LoopState, Array]:
-            after, _ = env.inspire(varied, cell, loop, u_in)
-            return after, loop.pressure
-
-        return jax.lax.scan(step, env.start_breath(varied, cell), u_in)[1]
-
-    each = jax.vmap(jax.vmap(pressures), (0, None, None))(ensemble, cells, u_in)
-    variance = jnp.var(each, axis=0, ddof=1)
-    # 1e-6 keeps the derivative finite where all members agree, as in the first step.
-    return jnp.mean(jnp.sqrt(variance + 1e-6))
+    return total / jnp.mean(breath)
 
 
 #: Called with the number of updates done, the number of all updates, and the mean loss since the
 #: last call, cmH2O.
-Progress = Callable[[int, int, float], None]
+FitProgress = Callable[[int, int, float], None]
 
 #: Updates compiled into one scan; a checkpoint or a Ctrl-C falls between two of them.
 CHUNK = 50
@@ -284,36 +240,21 @@ def _advance(
         layers, state = carry
         member_key, scenario_key = jax.random.split(jax.random.fold_in(key, number))
         lung, pip = _cells(number, lungs, len(protocol.PIPS), config)
-        rigs = config.protocol == 2
-        nominal = (jnp.arange(lung.size) % config.copies == 0) & (not rigs)
-        member = jax.random.randint(member_key, lung.shape, 0, members) * ~nominal
+        member = jax.random.randint(member_key, lung.shape, 0, members)
         cells = draws.random_scenarios(
             scenario_key,
             pips[pip],
-            spread=config.spread * ~nominal,
+            spread=config.spread,
             smooth=True,
-            ranges=rig_draws.RANGES if rigs else draws.RANGES,
+            ranges=rig_draws.RANGES,
         )
         those = jax.tree.map(lambda leaf: leaf[member, lung], plants)
 
         def value(layers: Any) -> Array:
             corrected = controller.replace(layers=layers)  # type: ignore[attr-defined]
-            error, u_in = objective(
-                corrected,
-                those,
-                cells,
-                config.first_breath,
-                config.lam,
-                airway=rigs,
-                weight=weights[lung, pip],
+            return objective(
+                corrected, those, cells, config.first_breath, config.lam, weight=weights[lung, pip]
             )
-            if config.agreement == 0 or members == 1:
-                return error
-            some = slice(None, None, config.copies)  # the official runs
-            every = jax.tree.map(lambda leaf: leaf[:, lung[some]], plants)
-            cell = jax.tree.map(lambda x: x[some], cells)
-            apart = disagreement(every, cell, u_in[some, protocol.SCORED_BREATHS[0]])
-            return error + config.agreement * apart
 
         mean, gradient = jax.value_and_grad(value)(layers)
         updates, state = optimiser.update(gradient, state, layers)
@@ -333,7 +274,7 @@ def fit(
     config: ResidualConfig | None = None,
     seed: int = 0,
     checkpoint: Path | None = None,
-    progress: Progress | None = None,
+    progress: FitProgress | None = None,
     keep: bool = False,
     weights: ArrayLike | None = None,
     start: Residual | None = None,
@@ -365,8 +306,7 @@ def fit(
         FloatingPointError: if the loss is not finite; the checkpoint stays at the last good one.
     """
     config = config or ResidualConfig()
-    most = config.members if config.protocol == 1 else None
-    plants = jax.tree.map(lambda leaf: jnp.asarray(leaf[:most], jnp.float32), plants)
+    plants = jax.tree.map(lambda leaf: jnp.asarray(leaf[: config.members], jnp.float32), plants)
     lungs = jax.tree.leaves(plants)[0].shape[1]
     shape = (lungs, len(protocol.PIPS))
     weights = jnp.broadcast_to(jnp.asarray(1.0 if weights is None else weights, jnp.float32), shape)
@@ -405,3 +345,116 @@ def fit(
     if not keep:
         stored.delete()
     return controller.replace(layers=carry[0])  # type: ignore[attr-defined]
+
+
+#: Files that are written.
+WEIGHTS, RESULT, PARTS = "weights.npz", "training.json", "parts"
+
+#: Called with the name of the step, and its progress: updates done, updates in all, loss in cmH2O.
+Progress = Callable[[str, tuple[int, int, float] | None], None]
+
+
+def train_residual(
+    networks: Sequence[str] | None = None,
+    out: Path | str = "runs/residual",
+    *,
+    config: ResidualConfig | None = None,
+    seed: int = 0,
+    gains: NDArray[np.float64] | None = None,
+    simulator: Given = "frozen",
+    progress: Progress | None = None,
+) -> TrainedControllers:
+    """Train corrections of the best PIDs by differentiating through simulators.
+
+    Writes ``weights.npz``, as ``submissions/residual_mlp`` reads it, and ``training.json``. An
+    interrupted training continues where it was; a finished one is repeated, to the same bytes.
+
+    Example::
+
+        trained = ventbench.train_residual(["R20C50"], "runs/mine")
+        trained.report["networks"]["R20C50"]["error"]  # cmH2O, by lung
+
+    Args:
+        networks: ids of lungs, a network each, or ``"all"`` for one network that serves all; a
+            network for each lung of the simulators if not given.
+        out: folder.
+        config: settings of the training.
+        seed: seed of the weights and the random deviations, common to all networks.
+        gains: grid of P, I, D, %/cmH2O, shape ``(G, 3)``, of which each network corrects the best
+            PID; the paper's grid if not given.
+        simulator: simulators with plants to train through, see :func:`ventbench.load_simulators`;
+            of the frozen ones all members of all training rigs.
+        progress: see :data:`Progress`.
+
+    Returns:
+        The controllers, float32, and the report.
+
+    Raises:
+        InputError: if a network's name or a simulator is unknown, or ``out`` holds an unfinished
+            training with other settings.
+        FloatingPointError: if a training diverges.
+    """
+    config, progress = config or ResidualConfig(), progress or (lambda what, how_far: None)
+    trained_on, out = plants_to_train_on(simulator), Path(out)
+    names, known = check_names(networks, trained_on), list(trained_on.names)
+    progress("PID grid", None)
+    official = trained_on.nominal
+    lungs = {name: take(official, index) for index, name in enumerate(known)}
+    _, tuned = tune_pid(known if ALL in names else names, gains=gains, simulator=simulator)
+    controllers, about = {}, {}
+    for name in names:
+        best = tuple(tuned["single"]["gains"] if name == ALL else tuned["lungs"][name]["gains"])
+        where = list(range(len(known))) if name == ALL else [known.index(name)]
+        plants = jax.tree.map(
+            lambda leaf, where=where: np.asarray(leaf)[:, where], trained_on.plants
+        )
+        started = time.perf_counter()
+        with precision.float32():
+            controllers[name] = fit(
+                plants,
+                best,
+                config=config,
+                seed=seed,
+                checkpoint=_checkpoint(out, name),
+                progress=lambda *how_far, name=name: progress(f"network {name}", how_far),
+                keep=True,
+                weights=trained_on.weights[where],
+            )
+        about[name] = {
+            "gains": list(best),
+            "seconds": round(time.perf_counter() - started, 1),
+            "error_pid": _errors(PID(*best), lungs, where),
+            "error": _errors(controllers[name], lungs, where),
+        }
+    save_weights(out / WEIGHTS, controllers)
+    report = {
+        "networks": about,
+        "recipe": dataclasses.asdict(config),
+        "seed": seed,
+        "simulators": dict(trained_on.about),
+        "weights_sha256": files.sha256(out / WEIGHTS),
+    }
+    files.write_json(out / RESULT, report)
+    for name in names:
+        _checkpoint(out, name).unlink(missing_ok=True)
+    return TrainedControllers(controllers, report, out)
+
+
+def _checkpoint(out: Path, name: str) -> Path:
+    return out / PARTS / f"{name}.npz"
+
+
+def _errors(
+    controller: Controller, lungs: Mapping[str, Plant], where: list[int]
+) -> dict[str, float]:
+    """Nominal error on the reference plant of each lung, float64, cmH2O."""
+    errors = {}
+    with precision.float64():
+        cells = nominal_scenario(np.array(protocol.PIPS))
+        wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), controller)
+        for name in [list(lungs)[index] for index in where]:
+            plant = jax.tree.map(jnp.asarray, lungs[name])
+            inspirations, _ = rollouts.closed_loop(plant, wide, cells)
+            error = run_error(inspirations.pressure, np.asarray(cells.pip)[:, None, None])
+            errors[name] = round(float(error.mean()), 6)
+    return errors

@@ -1,1 +1,0 @@
-"""Fitting the hybrid plant to recordings of all settings at once."""

@@ -158,7 +158,7 @@ def operations(plant: Plant, batch: int) -> dict[str, int]:
 
     What occurs twice with equal operands counts once, and what no cell differs in not at all.
     """
-    state = plant.init(jnp.full(batch, 5.0))
+    state, _ = plant.init(jnp.full(batch, 5.0))
     command = jnp.full(batch, 20.0)
     dt = jnp.full(batch, protocol.DT)
     closed = jax.make_jaxpr(plant.step)(state, command, jnp.zeros(batch), dt)
@@ -229,7 +229,7 @@ STREAMS = 40
 
 def bytes_moved(plant: Plant, batch: int) -> tuple[float, int]:
     """Bytes that one compiled step of a cell reads and writes, by XLA, and the number of loops."""
-    state = plant.init(jnp.full(batch, 5.0))
+    state, _ = plant.init(jnp.full(batch, 5.0))
     command, dt = jnp.full(batch, 20.0), jnp.full(batch, protocol.DT)
     step = jax.jit(type(plant).step)
     compiled = step.lower(plant, state, command, jnp.zeros(batch), dt).compile()

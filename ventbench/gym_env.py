@@ -21,7 +21,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from ventbench import environment as env
-from ventbench import precision, protocol, rig_draws
+from ventbench import precision, protocol
 from ventbench.draws import random_scenarios
 from ventbench.environment import Scenario
 from ventbench.errors import InputError
@@ -52,8 +52,7 @@ def _step(
     loop, _ = env.inspire(varied, cell, loop, u_in)
     # The target holds to the last step; the observation after it is of the same kind.
     after = jnp.minimum(step + 1, protocol.INSPIRATION_STEPS - 1)
-    pressure = env.airway_pressure(varied, loop)
-    return loop, _seen(cell, loop, after), pressure
+    return loop, _seen(cell, loop, after), loop.signals.scored
 
 
 @partial(jax.jit, static_argnames="vary")
@@ -64,9 +63,7 @@ def _cell(key: Array, pip: Array, vary: bool) -> Scenario:
 
 @partial(jax.jit, static_argnames="vary")
 def _cells(key: Array, pips: Array, vary: bool) -> Scenario:
-    return random_scenarios(
-        key, pips, spread=None if vary else 0.0, breaths=1, ranges=rig_draws.RANGES
-    )
+    return random_scenarios(key, pips, spread=None if vary else 0.0, breaths=1)
 
 
 def _seen(cell: Scenario, loop: env.LoopState, step: Array | int) -> Array:
@@ -238,7 +235,7 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, NDArray[np.flo
             self._cells = _cells(key, pips, self._noise)
             loop, seen = _start(self._plants, self._cells)
         self._loop, self._count = loop, 0
-        self._pressure = np.asarray(loop.pressure, float)
+        self._pressure = np.asarray(loop.signals.scored, float)
         self._total = np.abs(self._pressure - np.asarray(self._cells.pip, float))
         return np.asarray(seen), self._info()
 

@@ -127,27 +127,52 @@ def scored_step(before: LoopState, after: LoopState, requested: Array, applied: 
     return Inspirations(before.signals.scored, requested, applied, before.signals.volume)
 
 
-def inspiration(
+def control_step(
     plant: Plant,
     scenario: Scenario,
-    loop: LoopState,
     policy: Policy,
-    state: Any,
-    *,
-    breath: Array | int = 0,
-    inputs: Any = None,
-    record: Record = scored_step,
-) -> tuple[LoopState, Any, Any]:
-    """Run one inspiration: the only loop over its steps that is compiled.
+    record: Record,
+    carry: tuple[LoopState, Any],
+    at: tuple[Array | int, Array | int, Any],
+) -> tuple[tuple[LoopState, Any], Any]:
+    """One step of an inspiration, as the body of a scan; every compiled loop is made of it.
 
     Args:
         plant: plants of the cells, from :func:`ventbench.environment.vary`.
         scenario: the cells.
-        loop: from :func:`ventbench.environment.start_breath`.
-        policy: takes its state, the observation and the ``inputs`` of a step, and returns its next
+        policy: takes its state, the observation and the inputs of a step, and returns its next
             state and ``u_in``, %.
+        record: what is kept of a step.
+        carry: states of the loop and of the policy.
+        at: index of the breath, index of the step, and inputs of the policy.
+    """
+    loop, state = carry
+    breath, index, given = at
+    state, requested = policy(state, env.observe(scenario, loop, breath, index), given)
+    after, applied = env.inspire(plant, scenario, loop, requested)
+    return (after, state), record(loop, after, requested, applied)
+
+
+def inspiration(
+    plant: Plant,
+    scenario: Scenario,
+    policy: Policy,
+    state: Any = None,
+    *,
+    breath: Array | int = 0,
+    steps: int = INSPIRATION,
+    inputs: Any = None,
+    record: Record = scored_step,
+) -> tuple[LoopState, Any, Any]:
+    """Run one inspiration from rest; arguments as of :func:`control_step`.
+
+    Args:
+        plant: plants of the cells, from :func:`ventbench.environment.vary`.
+        scenario: the cells.
+        policy: chooses the commands.
         state: of the policy.
         breath: index of the breath.
+        steps: number of steps.
         inputs: what the policy gets besides, with the steps on the leading axis of each leaf.
         record: what is kept of a step.
 
@@ -156,19 +181,21 @@ def inspiration(
     """
 
     def step(carry: tuple[LoopState, Any], at: tuple[Array, Any]) -> tuple[Any, Any]:
-        loop, state = carry
-        index, given = at
-        state, requested = policy(state, env.observe(scenario, loop, breath, index), given)
-        after, applied = env.inspire(plant, scenario, loop, requested)
-        return (after, state), record(loop, after, requested, applied)
+        return control_step(plant, scenario, policy, record, carry, (breath, *at))
 
-    (loop, state), out = jax.lax.scan(step, (loop, state), (jnp.arange(INSPIRATION), inputs))
+    start = (env.start_breath(plant, scenario), state)
+    (loop, state), out = jax.lax.scan(step, start, (jnp.arange(steps), inputs))
     return loop, state, out
 
 
 def controlled_by(controller: Controller) -> Policy:
-    """Return a pure controller as a policy of :func:`inspiration`."""
+    """Return a pure controller as a policy."""
     return lambda state, observation, _: controller.step(state, observation)
+
+
+def commanded(state: Any, observation: Any, command: Array) -> tuple[Any, Array]:
+    """Policy that applies its inputs, as if recorded before."""
+    return state, command
 
 
 @partial(jax.jit, static_argnames=("whole", "changing"))
@@ -198,8 +225,7 @@ def closed_loop(
     def run(state: Any, at: tuple[Array, Any]) -> tuple[Any, Any]:
         breath, own = at
         varied = env.vary(own if changing else plant, scenario)
-        start = env.start_breath(varied, scenario)
-        loop, state, inspired = inspiration(varied, scenario, start, policy, state, breath=breath)
+        loop, state, inspired = inspiration(varied, scenario, policy, state, breath=breath)
 
         def expire(loop: LoopState, step: Array) -> tuple[LoopState, Expirations]:
             after, u_in = env.expire(varied, scenario, loop, step)

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from ventbench import precision, protocol, rig_draws, rollouts, seasons
+from ventbench import draws, precision, protocol, rollouts
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
 from ventbench.environment import nominal_scenario
@@ -22,10 +22,11 @@ from ventbench.executor import executor
 from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.metrics.score import run_error
 from ventbench.plants import frozen
+from ventbench.plants.rigs import load_rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, take
 from ventbench.submissions.folder import submission_of
-from ventbench.submissions.rig_scoring import load_rigs, run_on_rigs
+from ventbench.submissions.scoring import run_protocol
 from ventbench.training import pid_grid
 from ventbench.training.pid_grid import PIDGrid
 from ventbench.training.plants import plants_to_train_on
@@ -248,7 +249,7 @@ def test_gains_are_tuned_on_draws_of_their_own(monkeypatch):
     assert all(entry["gains"] in good for entry in result["lungs"].values())
     assert result["single"]["gains"] in good
     assert result["draws"] == 2
-    assert pid_grid.TUNING_SEED != seasons.DEVELOPMENT_SEED
+    assert pid_grid.TUNING_SEED != draws.DEVELOPMENT_SEED
 
     asked = []
 
@@ -267,7 +268,7 @@ def test_gains_are_tuned_on_draws_of_their_own(monkeypatch):
 @pytest.mark.slow
 def test_an_error_on_draws_is_that_of_the_scorer():
     rigs = load_rigs("single_compartment")
-    drawn = rig_draws.build(tuple((0,) for _ in rigs.lungs), 1, seed=pid_grid.TUNING_SEED, n=1)
+    drawn = draws.build(tuple((0,) for _ in rigs.lungs), 1, seed=pid_grid.TUNING_SEED, n=1)
     found = pid_grid.drawn_errors(rigs, drawn, 2, PIDS[:1])
 
     class Controller:
@@ -282,6 +283,6 @@ def test_an_error_on_draws_is_that_of_the_scorer():
             self.integral += a * (error - self.integral)
             return 2.0 * error + 4.0 * self.integral
 
-    score = run_on_rigs(submission_of(Controller), rigs, drawn=drawn)
+    score = run_protocol(submission_of(Controller), rigs, drawn=drawn)
     assert score.controllable is not None
     np.testing.assert_allclose(found[0], score.controllable[2, 1], atol=1e-9)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ventbench import draws, precision, protocol, rig_draws, rollouts
+from ventbench import draws, precision, protocol, rollouts
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import (
@@ -176,9 +176,7 @@ def test_benches_deviate_as_the_draws_do_but_are_none_of_them():
     n = 4000
     pip = jnp.full(n, 20.0)
     normal = jnp.arange(n) % 2 == 0
-    found = draws.random_scenarios(
-        jax.random.key(0), pip, spread=1.0 * ~normal, smooth=True, ranges=rig_draws.RANGES
-    )
+    found = draws.random_scenarios(jax.random.key(0), pip, spread=1.0 * ~normal, smooth=True)
     calm = jax.tree.map(lambda x: np.asarray(x)[::2], found)
     expected = jax.tree.map(np.asarray, nominal_scenario(np.full(n // 2, 20.0)))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), calm, expected)
@@ -192,15 +190,13 @@ def test_benches_deviate_as_the_draws_do_but_are_none_of_them():
         "c_scale": wild.c_scale,
         "delay": wild.delay,
     }
-    for name, (low, high) in rig_draws.RANGES.items():
+    for name, (low, high) in draws.RANGES.items():
         width = high - low
         assert low - 1e-5 <= values[name].min() < low + 0.01 * width, name
         assert high - 0.01 * width < values[name].max() <= high + 1e-5, name
     width = np.sqrt(np.mean(np.square(draws.NOISE_SD)) + draws.QUANTUM**2 / 12)
     assert wild.noise.std() == pytest.approx(width, rel=0.02)
-    wider = draws.random_scenarios(
-        jax.random.key(0), pip, spread=2.0 * ~normal, smooth=True, ranges=rig_draws.RANGES
-    )
+    wider = draws.random_scenarios(jax.random.key(0), pip, spread=2.0 * ~normal, smooth=True)
     assert np.ptp(wider.r_scale) == pytest.approx(2 * 0.38, rel=0.01)
     assert np.asarray(wider.delay).max() < 1.0
 

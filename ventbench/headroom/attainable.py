@@ -37,7 +37,7 @@ from scipy import sparse
 from scipy.optimize import linprog
 
 from ventbench import environment as env
-from ventbench import precision, protocol
+from ventbench import precision, protocol, rollouts
 from ventbench.draws import DEVELOPMENT_SEED, uniforms
 from ventbench.environment import Scenario
 from ventbench.interfaces import Plant
@@ -88,13 +88,14 @@ class Attainable:
 
 def _pressures(plant: Plant, cell: Scenario, u_in: Array) -> Array:
     """Airway pressures of one inspiration after the first step, cmH2O, shape ``(COMMANDS,)``."""
-    varied = env.vary(plant, cell)
 
-    def step(loop: env.LoopState, command: Array) -> tuple[env.LoopState, Array]:
-        after, _ = env.inspire(varied, cell, loop, command)
-        return after, after.signals.scored
+    def record(_: env.LoopState, after: env.LoopState, *__: Array) -> Array:
+        return after.signals.scored
 
-    return jax.lax.scan(step, env.start_breath(varied, cell), u_in)[1]
+    return rollouts.inspiration(
+        env.vary(plant, cell), cell, rollouts.commanded,
+        steps=len(u_in), inputs=u_in, record=record,
+    )[2]  # fmt: skip
 
 
 #: Pressures of n cells under commands, ``(n, COMMANDS)``, and their derivatives by the commands.

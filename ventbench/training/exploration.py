@@ -161,15 +161,15 @@ class SimulatedVentilator:
     def start(self, peep: float) -> Floats:
         """Lungs at rest."""
         pressure = jnp.full(self.width, peep)
-        self._state = self._plant.init(pressure)
-        return self._measured(pressure)
+        self._state, signals = self._plant.init(pressure)
+        return self._measured(signals.reading)
 
     def step(self, u_in: Floats, u_out: Floats) -> Floats:
         """One control step."""
         commands = (jnp.asarray(u_in, jnp.float32), jnp.asarray(u_out, jnp.float32))
         dt = jnp.full(self.width, self.dt)
-        self._state, pressure = self._step(self._plant, self._state, *commands, dt)
-        return self._measured(pressure)
+        self._state, signals = self._step(self._plant, self._state, *commands, dt)
+        return self._measured(signals.reading)
 
     def _measured(self, pressure: Any) -> Floats:
         return np.asarray(pressure, float) + self._noise * self._random.standard_normal(self.width)

@@ -271,17 +271,17 @@ def open_loop_loss(
         # What was not measured is what the run itself predicted.
         state = dataclasses.replace(state, pressures=jnp.where(take, window, state.pressures))
         if config.rising == 0:
-            state, pressure = plant.step(state, u_in, closed, dt)
-            return state, (pressure, closed)
-        (state, pressure), (_, slope) = jax.jvp(
+            state, signals = plant.step(state, u_in, closed, dt)
+            return state, (signals.reading, closed)
+        (state, signals), (_, slopes) = jax.jvp(
             lambda u: plant.step(state, u, closed, dt), (u_in,), (jnp.ones_like(u_in),)
         )
-        return state, (pressure, slope)
+        return state, (signals.reading, slopes.reading)
 
     take = batch.known & measured[..., None]
     steps = (batch.u_in, batch.dt, batch.window + noise, take)
     _, (pressure, slope) = jax.lax.scan(
-        step, plant.init(batch.start), jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), steps)
+        step, plant.init(batch.start)[0], jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), steps)
     )
     error = (pressure.T - batch.after) / config.softness
     cost = config.softness * (jnp.sqrt(1.0 + error**2) - 1.0)

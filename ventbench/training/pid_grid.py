@@ -28,18 +28,19 @@ import pandas as pd
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
+from ventbench import draws as draw_tables
 from ventbench import environment as env
-from ventbench import files, precision, protocol, rig_draws, rollouts
+from ventbench import files, precision, protocol, rollouts
 from ventbench.controllers.pid import PID
+from ventbench.draws import Draws
 from ventbench.environment import Scenario, nominal_scenario
 from ventbench.errors import InputError
 from ventbench.executor import InProcess, executor, in_order, results
 from ventbench.interfaces import Plant
 from ventbench.metrics.score import controllable_error
 from ventbench.plants.catalog import Given
+from ventbench.plants.rigs import Rigs, load_rigs
 from ventbench.resume import ARRAY, WorkFolder, fingerprint
-from ventbench.rig_draws import RigDraws
-from ventbench.submissions.rig_scoring import Rigs, load_rigs
 from ventbench.training.plants import check_names, plants_to_train_on
 
 #: The paper's twenty values of P, I and D, %/cmH2O.
@@ -80,19 +81,13 @@ def _errors(plant: Plant, gains: Array, cells: Scenario) -> Array:
         lambda x: jnp.broadcast_to(jnp.asarray(x, gains.dtype), (len(gains), *jnp.shape(x))), cells
     )
     controller = PID(gains[:, :1], gains[:, 1:2], gains[:, 2:])
-    varied = env.vary(plant, cells)
 
-    def step(carry: tuple[env.LoopState, Any, Array], index: Array) -> tuple[Any, None]:
-        loop, state, total = carry
-        total = total + jnp.abs(env.airway_pressure(varied, loop) - cells.pip)
-        state, requested = controller.step(state, env.observe(cells, loop, 0, index))
-        loop, _ = env.inspire(varied, cells, loop, requested)
-        return (loop, state, total), None
+    def record(before: env.LoopState, *_: Any) -> Array:
+        return jnp.abs(before.signals.scored - cells.pip)
 
-    start = env.start_breath(varied, cells)
-    carry = (start, controller.init(start.pressure.shape), jnp.zeros_like(start.pressure))
-    (_, _, total), _ = jax.lax.scan(step, carry, jnp.arange(protocol.INSPIRATION_STEPS))
-    return total / protocol.INSPIRATION_STEPS
+    policy, state = rollouts.controlled_by(controller), controller.init(cells.pip.shape)
+    _, _, error = rollouts.inspiration(env.vary(plant, cells), cells, policy, state, record=record)
+    return error.mean(axis=0)
 
 
 def errors(
@@ -269,7 +264,7 @@ def _mean_errors(plants: Plant, gains: Floats) -> NDArray[np.float32]:
     return errors(plants, gains).mean(axis=0, dtype=np.float64).astype(np.float32)
 
 
-def drawn_errors(rigs: Rigs, drawn: RigDraws, lung: int, gains: Floats) -> Floats:
+def drawn_errors(rigs: Rigs, drawn: Draws, lung: int, gains: Floats) -> Floats:
     """Error of PIDs on draws of one lung, without the first step.
 
     Args:
@@ -303,7 +298,7 @@ def tune_pid(
     out: Path | str | None = None,
     *,
     gains: ArrayLike | None = None,
-    draws: int = rig_draws.COUNT,
+    draws: int = draw_tables.COUNT,
     workers: int = 0,
     scheduler: str | None = None,
     each: bool = True,
@@ -371,7 +366,7 @@ def tune_pid(
         lists = [np.concatenate([row, common]) for row in own]
         if draws:
             sessions = rigs.sessions or tuple((0,) for _ in rigs.lungs)
-            drawn = rig_draws.build(
+            drawn = draw_tables.build(
                 sessions, rigs.members, seed=TUNING_SEED, season=TUNING, n=draws
             )
             jobs = [

@@ -25,7 +25,7 @@ import optax
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench import draws, files, precision, protocol, rig_draws, rollouts
+from ventbench import draws, files, precision, protocol, rollouts
 from ventbench import environment as env
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import Residual, save_weights, untrained
@@ -142,24 +142,25 @@ def run(controller: Residual, plant: Plant, cell: Scenario) -> DifferentiableRun
         cell: one cell, batch shape ``()``.
     """
     varied = env.vary(plant, cell)
-    start = env.start_breath(varied, cell)
+    rest = env.start_breath(varied, cell)
 
-    def step(
-        carry: tuple[Any, env.LoopState], at: tuple[Array, Array]
-    ) -> tuple[Any, DifferentiableRun]:
-        state, loop = carry
-        breath, index = at
+    def policy(state: Any, seen: Any, _: Any) -> tuple[Any, Array]:
+        inner, base, correction = controller.parts(state[0], seen)
+        return (inner, correction), valve(base + correction)
+
+    def step(carry: tuple[env.LoopState, Any], at: tuple[Array, Array]) -> tuple[Any, Any]:
         # In one scan over all breaths: half the compilation of a scan of scans.
-        loop = jax.tree.map(lambda new, old: jnp.where(index == 0, new, old), start, loop)
-        seen = env.observe(cell, loop, breath, index)
-        state, base, correction = controller.parts(state, seen)
-        after, applied = env.inspire(varied, cell, loop, valve(base + correction))
-        pressure = env.airway_pressure(varied, loop)
-        return (state, after), DifferentiableRun(pressure, correction, applied)
+        start = jax.tree.map(lambda new, old: jnp.where(at[1] == 0, new, old), rest, carry[0])
+        (after, state), (pressure, applied) = rollouts.control_step(
+            varied, cell, policy, lambda before, _, __, u: (before.signals.scored, u),
+            (start, carry[1]), (*at, None),
+        )  # fmt: skip
+        return (after, state), DifferentiableRun(pressure, state[1], applied)
 
     count = jnp.arange(protocol.BREATHS * protocol.INSPIRATION_STEPS)
     at = (count // protocol.INSPIRATION_STEPS, count % protocol.INSPIRATION_STEPS)
-    _, steps = jax.lax.scan(step, (controller.init(()), start), at)
+    begin = (rest, (controller.init(()), jnp.zeros_like(cell.pip)))
+    _, steps = jax.lax.scan(step, begin, at)
     shape = (protocol.BREATHS, protocol.INSPIRATION_STEPS)
     return jax.tree.map(lambda leaf: leaf.reshape(shape), steps)
 
@@ -246,7 +247,6 @@ def _advance(
             pips[pip],
             spread=config.spread,
             smooth=True,
-            ranges=rig_draws.RANGES,
         )
         those = jax.tree.map(lambda leaf: leaf[member, lung], plants)
 

@@ -41,8 +41,8 @@ def test_deviations_have_the_distributions_of_the_draws(cells):
         "c_scale": cells.c_scale,
         "delay": cells.delay,
     }
-    assert found.keys() == rig_draws.RANGES.keys()
-    for name, (low, high) in rig_draws.RANGES.items():
+    assert found.keys() == draws.RANGES.keys()
+    for name, (low, high) in draws.RANGES.items():
         values = np.asarray(found[name], float)
         assert low - 1e-5 <= values.min() < low + 0.02 * (high - low), name
         assert high - 0.02 * (high - low) < values.max() <= high + 1e-5, name

@@ -90,9 +90,10 @@ def simulate(plant: Hybrid, start: Array, data: InspirationData) -> Array:
 
     def step(state: Any, command: tuple[Array, Array]) -> tuple[Any, Array]:
         u_in, dt = command
-        return plant.step(state, u_in, jnp.zeros_like(u_in), dt)
+        state, signals = plant.step(state, u_in, jnp.zeros_like(u_in), dt)
+        return state, signals.reading
 
-    _, pressure = jax.lax.scan(step, plant.init(start), (data.u_in.T, data.dt.T))
+    _, pressure = jax.lax.scan(step, plant.init(start)[0], (data.u_in.T, data.dt.T))
     return pressure.T
 
 

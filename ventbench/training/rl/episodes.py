@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ventbench import environment as env
-from ventbench import protocol, rig_draws
+from ventbench import protocol, rollouts
 from ventbench.controllers import rl_policy
 from ventbench.draws import random_scenarios
 from ventbench.environment import Scenario
@@ -120,7 +120,7 @@ def sample(
     which = (first + jnp.arange(count) // lungs) % len(protocol.PIPS)
     pip = jnp.asarray(protocol.PIPS, jnp.result_type(float))[which]
     spread = None if vary else 0.0
-    return random_scenarios(key, pip, spread=spread, breaths=breaths, ranges=rig_draws.RANGES)
+    return random_scenarios(key, pip, spread=spread, breaths=breaths)
 
 
 def roll(episodes: Episodes, act: Act, key: Array) -> tuple[Array, Any, Array]:
@@ -138,23 +138,26 @@ def roll(episodes: Episodes, act: Act, key: Array) -> tuple[Array, Any, Array]:
     """
     cells, weight = episodes.cells, episodes.weight
     varied = env.vary(episodes.plants, cells)
-    start = env.start_breath(varied, cells)
     memory = rl_policy.init_features(cells.pip.shape)
+
+    def policy(state: Any, seen: Any, key: Array) -> tuple[Any, Array]:
+        memory, x, base = rl_policy.features(state[0], seen)
+        asked, kept = act(key, x, base)
+        return (memory, (x, kept)), asked
 
     def run(memory: Any, now: tuple[Array, Array]) -> tuple[Any, Any]:
         breath, keys = now
 
         def step(carry: Any, now: tuple[Array, Array]) -> tuple[Any, tuple[Array, Any, Array]]:
             loop, memory = carry
-            index, key = now
-            seen = env.observe(cells, loop, breath, index)
-            memory, x, base = rl_policy.features(memory, seen)
-            asked, kept = act(key, x, base)
-            loop, _ = env.inspire(varied, cells, loop, asked)
-            pressure = env.airway_pressure(varied, loop)
+            (loop, (memory, (x, kept))), pressure = rollouts.control_step(
+                varied, cells, policy, lambda _, after, *__: after.signals.scored,
+                (loop, (memory, None)), (breath, *now),
+            )  # fmt: skip
             reward = -weight * jnp.abs(pressure - cells.pip) / REWARD_SCALE
             return (loop, memory), (x, kept, reward)
 
+        start = env.start_breath(varied, cells)
         (loop, memory), out = jax.lax.scan(step, (start, memory), (jnp.arange(STEPS), keys))
         # The last observation is remembered too.
         memory, _, _ = rl_policy.features(memory, env.observe(cells, loop, breath, STEPS))
@@ -177,24 +180,9 @@ def errors(episodes: Episodes, controller: Any) -> Array:
         episodes: E of them.
         controller: pure controller.
     """
-    cells = episodes.cells
-    varied = env.vary(episodes.plants, cells)
-    start = env.start_breath(varied, cells)
-
-    def run(state: Any, breath: Array) -> tuple[Any, Array]:
-        def step(carry: Any, index: Array) -> tuple[Any, Array]:
-            loop, state = carry
-            state, asked = controller.step(state, env.observe(cells, loop, breath, index))
-            after, _ = env.inspire(varied, cells, loop, asked)
-            pressure = env.airway_pressure(varied, loop)
-            return (after, state), jnp.abs(pressure - cells.pip)
-
-        (_, state), out = jax.lax.scan(step, (start, state), jnp.arange(protocol.INSPIRATION_STEPS))
-        return state, jnp.mean(out, axis=0)
-
-    state = controller.init(cells.pip.shape)
-    _, each = jax.lax.scan(run, state, jnp.arange(protocol.BREATHS))
-    return jnp.mean(each[jnp.asarray(protocol.SCORED_BREATHS)], axis=0) * episodes.weight
+    run, _ = rollouts.closed_loop(episodes.plants, controller, episodes.cells)
+    error = jnp.abs(run.pressure - episodes.cells.pip[..., None, None])
+    return error[..., protocol.SCORED_BREATHS, :].mean(axis=(-2, -1)) * episodes.weight
 
 
 def discounted(rewards: Array, discount: float) -> Array:

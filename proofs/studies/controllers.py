@@ -20,9 +20,9 @@ from ventbench.interfaces import Controller
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics.score import passes_safety_gate, run_error
 from ventbench.plants import frozen
+from ventbench.plants.rigs import Rigs
 from ventbench.plants.stacking import take
 from ventbench.resume import WorkFolder
-from ventbench.submissions.scoring import protocol_cells
 from ventbench.training import pid_grid
 from ventbench.training.residual import ResidualConfig, fit
 
@@ -211,9 +211,11 @@ def score_controllers(
     """
     errors, requested, safe = [], [], True
     with precision.float64():
-        cells = jax.tree.map(jnp.asarray, protocol_cells(tuple(pips), draws))
-        pip, dt = np.asarray(cells.pip)[..., None], np.asarray(cells.dt)[..., None]
+        rigs = Rigs(LUNGS, simulators.plants)
+        _, every = rigs.cells(rigs.draws(draws, pips) if draws else None, pips)
         for index, controller in enumerate(controllers):
+            cells = jax.tree.map(lambda leaf, k=index: jnp.asarray(leaf[k]), every)
+            pip, dt = np.asarray(cells.pip)[..., None], np.asarray(cells.dt)[..., None]
             plant = jax.tree.map(jnp.asarray, take(simulators.plants, index))
             wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), controller)
             run, _ = rollouts.closed_loop(plant, wide, cells)

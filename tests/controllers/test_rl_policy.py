@@ -25,7 +25,7 @@ from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.protocol import PIPS
 from ventbench.submissions.folder import open_submission
-from ventbench.submissions.scoring import protocol_cells, run_protocol
+from ventbench.submissions.scoring import run_protocol
 
 HERE = Path(__file__).parents[2] / "submissions"
 KINDS = {"ppo": (GaussianPolicy, 1), "dqn": (GreedyPolicy, len(CHOICES))}
@@ -62,14 +62,14 @@ def test_numpy_and_jax_act_alike(name, track, tmp_path):
     save_weights(folder / "weights.npz", made)
     with precision.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS])
-        found = run_protocol(
-            open_submission(str(folder)), Rigs(LUNGS, plants), track=track, draws=1
-        )
+        rigs = Rigs(LUNGS, plants)
+        found = run_protocol(open_submission(str(folder)), rigs, track=track, draws=1)
+        _, every = rigs.cells(rigs.draws(1), PIPS)
         for i, lung in enumerate(LUNG_IDS):
             policy = made[lung if track == "performance" else "all"]
             policy = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), policy)
             plant = jax.tree.map(lambda x, i=i: x[i], plants)
-            cells = jax.tree.map(jnp.asarray, protocol_cells(PIPS, 1))
+            cells = jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), every)
             wanted, _ = rollouts.closed_loop(plant, policy, cells)
             assert np.ptp(wanted.requested) > 20.0
             np.testing.assert_allclose(found.requested[i], wanted.requested, rtol=0, atol=1e-9)

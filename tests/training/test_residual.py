@@ -31,7 +31,7 @@ from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, take
 from ventbench.submissions.folder import open_submission
-from ventbench.submissions.scoring import protocol_cells, run_protocol
+from ventbench.submissions.scoring import run_protocol
 from ventbench.training import pid_grid
 from ventbench.training.pid_grid import tune_pid
 from ventbench.training.plants import ALL, plants_to_train_on
@@ -106,15 +106,15 @@ def test_the_submission_is_the_pure_controller(fields, tmp_path):
     with precision.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS[:3]])
         pure = load_weights(folder / "weights.npz")
-        cells = jax.tree.map(jnp.asarray, protocol_cells((10.0, 35.0), 2))
+        rigs = Rigs(LUNGS[:3], plants)
+        _, every = rigs.cells(rigs.draws(2, (10.0, 35.0)), (10.0, 35.0))
         errors = []
         for k in range(3):
+            cells = jax.tree.map(lambda x, k=k: jnp.asarray(x[k]), every)
             one = pure[LUNG_IDS[k] if k < 2 else ALL]
             found, _ = rollouts.closed_loop(take(plants, k), one, cells)
             errors.append(run_error(found.pressure, np.asarray(cells.pip)[..., None, None]))
-    result = run_protocol(
-        open_submission(str(folder)), Rigs(LUNGS[:3], plants), draws=2, pips=(10, 35)
-    )
+    result = run_protocol(open_submission(str(folder)), rigs, draws=2, pips=(10, 35))
     assert not result.failures
     expected = np.stack(errors)
     np.testing.assert_allclose(result.nominal, expected[:, 0], rtol=0, atol=1e-9)

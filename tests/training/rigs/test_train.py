@@ -130,7 +130,7 @@ def test_the_folder_is_a_plant_for_everything(trained, folder):
     assert rise[-1] > rise[5] > 5.0
     report = ventbench.open_loop(load(folder / "monday.csv"), out)
     assert report.lungs[OWN.id]["mae"] < 1.0
-    grid, _ = ventbench.tune_pid(simulator=out, gains=[(1.0, 3.0, 0.0), (0.0, 0.0, 0.0)])
+    grid, _ = ventbench.tune_pid(simulator=out, gains=[(1.0, 3.0, 0.0), (0.0, 0.0, 0.0)], draws=0)
     assert grid.best(OWN.id)[0] == (1.0, 3.0, 0.0)
     assert frozen.load(path=out).manifest_sha256 == simulators.manifest_sha256
 

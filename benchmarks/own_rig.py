@@ -113,7 +113,8 @@ def errors(controller: Controller, plant: Plant) -> tuple[float, Floats]:
         plant = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), plant)
         controller = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), controller)
         out = []
-        for cells in (nominal_scenario(np.asarray(protocol.PIPS)), draws.scenarios()):
+        drawn = jax.tree.map(lambda x: jnp.asarray(x[0]), draws.build([[0]], 1).cells)
+        for cells in (nominal_scenario(np.asarray(protocol.PIPS)), drawn):
             cells = jax.tree.map(jnp.asarray, cells)
             run, _ = rollouts.closed_loop(plant, controller, cells)
             out.append(run_error(run.pressure, np.asarray(cells.pip)[..., None, None]))

@@ -17,7 +17,7 @@ from proofs.studies.networks import Progress, Tell, finish
 from ventbench import files, precision, protocol, rollouts
 from ventbench.board.replay import spread
 from ventbench.interfaces import Controller
-from ventbench.lungs import LUNG_IDS
+from ventbench.lungs import LUNG_IDS, LUNGS
 from ventbench.metrics.score import passes_safety_gate, run_error
 from ventbench.plants import frozen
 from ventbench.plants.rigs import Rigs

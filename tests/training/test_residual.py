@@ -139,8 +139,8 @@ def test_beyond_the_valve_only_the_way_back_has_a_derivative(u_in, gradient, exp
 def test_the_run_is_that_of_the_scorer():
     one = controller(5)
     with precision.float64():
-        cells = draws.scenarios(n=1)
-        cells = jax.tree.map(lambda x: x[0], cells).replace(quantum=jnp.zeros(6))
+        cells = draws.build([[0]], 1, n=1).cells
+        cells = jax.tree.map(lambda x: jnp.asarray(x[0, 0]), cells).replace(quantum=jnp.zeros(6))
         plant = single_compartment(LUNGS[3])
         one = jax.tree.map(lambda x: jnp.asarray(x, float), one)
         found = jax.vmap(run, (None, None, 0))(one, plant, cells)

@@ -31,6 +31,9 @@ from ventbench.recordings.breaths import Breaths
 FORMAT = "ventbench-simulators-2"
 MANIFEST, MEMBERS, SEEN = "manifest.toml", "hybrid.npz", "seen.npz"
 
+#: SHA-256 of the official manifest, which holds those of all its files.
+MANIFEST_SHA256 = "e4b214dd47b9233918260c0576bf76ce15eb1629309be0ae05cf04394fe368e9"
+
 #: Fold of a breath that every member has seen, and of one that none has.
 BY_ALL, BY_NONE = -1, -2
 

@@ -248,12 +248,12 @@ def seen(breaths: Breaths, fold: NDArray[np.int64]) -> Seen:
     return Seen(key[kept], np.where(repeated, BY_ALL, fold[kept]).astype(np.int8))
 
 
-def folder(version: int = 1) -> Path:
+def folder(version: int = 2) -> Path:
     """Folder of a version."""
     return data_path(f"simulators/v{version}")
 
 
-def load(version: int = 1, path: Path | None = None) -> Frozen:
+def load(version: int = 2, path: Path | None = None) -> Frozen:
     """Read the official simulators and check every file against the manifest.
 
     Args:

@@ -139,9 +139,9 @@ def run_protocol(
         plants = as_float64(plants, len(names))
         frozen_sha256 = _frozen_sha256(plants)
         cells = protocol_cells(pips, draws)
-        run = step_through(plants, cells, runner, submission, tasks)
+        run = step_through(plants, cells, runner, submission, tasks, version=1)
         nominal = jax.tree.map(lambda x: x[0], cells)
-        replayed = replay(plants, nominal, run.requested[:, 0])
+        replayed = replay(plants, nominal, run.requested[:, 0], version=1)
     return assemble(
         submission,
         tasks,

@@ -78,7 +78,7 @@ def _strong(tree: Any) -> Any:
 # Axis of the lungs in the scenario: none where all lungs have the same cells (version 1).
 @partial(jax.jit, static_argnames="axis")
 def _begin(
-    plants: Plant, scenario: Scenario, axis: int | None = None
+    plants: Plant, scenario: Scenario, axis: int | None = 0
 ) -> tuple[Plant, env.LoopState]:
     def begin(plant: Plant, scenario: Scenario) -> tuple[Plant, env.LoopState]:
         varied = env.vary(plant, scenario)
@@ -89,7 +89,7 @@ def _begin(
 
 @partial(jax.jit, static_argnames="axis")
 def _observe(
-    scenario: Scenario, loop: env.LoopState, breath: Array, step: Array, axis: int | None = None
+    scenario: Scenario, loop: env.LoopState, breath: Array, step: Array, axis: int | None = 0
 ) -> Observation:
     def observe(scenario: Scenario, loop: env.LoopState) -> Observation:
         return env.observe(scenario, loop, breath, step)
@@ -99,7 +99,7 @@ def _observe(
 
 @partial(jax.jit, static_argnames="axis")
 def _inspire(
-    plants: Plant, scenario: Scenario, loop: env.LoopState, u_in: Array, axis: int | None = None
+    plants: Plant, scenario: Scenario, loop: env.LoopState, u_in: Array, axis: int | None = 0
 ) -> tuple[env.LoopState, Array]:
     return _strong(jax.vmap(env.inspire, in_axes=(0, axis, 0, 0))(plants, scenario, loop, u_in))
 
@@ -114,7 +114,7 @@ def step_through(
     submission: Submission,
     tasks: Sequence[Task],
     *,
-    version: int = 1,
+    version: int = 2,
 ) -> ProtocolRun:
     """Run a submission on every lung and cell. Call it within ``precision.float64()``.
 
@@ -168,7 +168,7 @@ def step_through(
 
 
 def replay(
-    plants: Plant, scenario: Scenario, requested: Floats, *, version: int = 1
+    plants: Plant, scenario: Scenario, requested: Floats, *, version: int = 2
 ) -> tuple[rollouts.Inspirations, rollouts.Expirations]:
     """Apply recorded commands again, with the expirations. Call it within ``float64()``.
 

@@ -84,7 +84,7 @@ class HardwareContent(
 ):
     """The content of a hardware record; L lungs, P PIPs, K repetitions."""
 
-    format: Literal[1]
+    format: schema.Version
     protocol: schema.Version
     created: schema.Time
     track: Literal["hardware"]

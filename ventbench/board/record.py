@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.board import canonical, hardware, layout, schema
+from ventbench.board import canonical, hardware, schema
 from ventbench.board.hardware import HardwareRecord
 from ventbench.errors import InputError
 from ventbench.metrics.score import normalised
@@ -23,12 +23,12 @@ from ventbench.stress.stressors import condition_of
 Floats = NDArray[np.float64]
 
 #: End of a record's file name, after its SHA-256.
-SUFFIX = layout.RECORD_SUFFIX
+SUFFIX = canonical.RECORD_SUFFIX
 
 
 @dataclass(frozen=True)
 class RecordHeadroom:
-    """What a record of protocol version 2 adds; L lungs, P PIPs, K draws.
+    """Rigs of the draws, and the errors that the score is relative to; L lungs, P PIPs, K draws.
 
     Attributes:
         session: rig of each draw, shape ``(L, K)``.
@@ -84,8 +84,8 @@ class Record(schema.Submitted):
             ``(1 + K, L, P)``.
         steps_above: longest time above the safety limit of each run, steps, shape
             ``(1 + K, L, P)``.
-        headroom: what protocol version 2 adds; None in version 1.
-        stress: runs under missing physics, on the robustness track of version 2; None without.
+        headroom: rigs, and what the score is relative to.
+        stress: runs under missing physics, on the robustness track; None without.
     """
 
     sha256: str
@@ -98,7 +98,7 @@ class Record(schema.Submitted):
     u_in: Floats
     peak: Floats
     steps_above: NDArray[np.int64]
-    headroom: RecordHeadroom | None = None
+    headroom: RecordHeadroom
     stress: RecordStress | None = None
 
     @property
@@ -112,9 +112,9 @@ class Record(schema.Submitted):
         return self.header.official
 
     @property
-    def key(self) -> tuple[int, str, str]:
-        """Version, track and name: what one entry of the board is known by."""
-        return self.version, self.track, self.name
+    def key(self) -> tuple[str, str]:
+        """Track and name: what one entry of the board is known by."""
+        return self.track, self.name
 
     @property
     def lungs(self) -> list[str]:
@@ -146,24 +146,16 @@ class Record(schema.Submitted):
     def basis(self) -> tuple[str, str, str]:
         """What its scores depend on besides commands: simulators, draws, reference errors.
 
-        Canonical text of the first two; a hash of the third, empty in version 1.
+        Canonical text of the first two; a hash of the third.
         """
-        simulators, draws = self.header.simulators, self.header.draws.about()
-        reference = ""
-        if self.headroom is not None:
-            tables = np.stack([self.headroom.attainable, self.headroom.pid])
-            reference = canonical.digest(tables.tobytes())
-        texts = (canonical.canonical(simulators).decode(), canonical.canonical(draws).decode())
-        return (*texts, reference)
+        about = (self.header.simulators, self.header.draws.about())
+        simulators, draws = (canonical.canonical(value).decode() for value in about)
+        tables = np.stack([self.headroom.attainable, self.headroom.pid])
+        return simulators, draws, canonical.digest(tables.tobytes())
 
     @cached_property
     def ranked_values(self) -> Floats:
-        """What ranks, of each lung and draw, shape ``(L, K)``; lower is better.
-
-        The mean error over PIPs, cmH2O, in version 1; the mean normalised score in version 2.
-        """
-        if self.headroom is None:
-            return self.drawn.mean(axis=2).T
+        """What ranks: mean normalised score of each lung and draw, shape ``(L, K)``."""
         return self.headroom.normalised[1:].mean(axis=2).T
 
 
@@ -184,62 +176,17 @@ class Withdrawal:
     created: str
 
 
-@dataclass(frozen=True)
-class Sealed:
-    """What is public of a score on hidden draws; see :mod:`ventbench.board.sealed`.
-
-    Attributes:
-        sha256: of its bytes: its name.
-        content: all that it says.
-    """
-
-    sha256: str
-    content: schema.SealedContent
-
-    @property
-    def name(self) -> str:
-        """Name of the submission."""
-        return self.manifest.name
-
-    @property
-    def manifest(self) -> schema.RecordedManifest:
-        """What the authors say about the submission."""
-        return self.content.submission.manifest
-
-    @property
-    def track(self) -> str:
-        """Track of the score."""
-        return self.content.track
-
-    @property
-    def version(self) -> int:
-        """Version of the protocol."""
-        return self.content.protocol
-
-    @property
-    def official(self) -> bool:
-        """Whether it was scored in a sandbox that deserves the word."""
-        return self.content.official
-
-    @property
-    def key(self) -> tuple[str, str, str]:
-        """Season, track and name: what a newer record may supersede."""
-        return self.content.season.id, self.track, self.name
-
-
 #: Everything that a leaderboard keeps.
-AnyRecord = Record | Withdrawal | Sealed | HardwareRecord
+AnyRecord = Record | Withdrawal | HardwareRecord
 
 _DECODER: msgspec.json.Decoder[Any] = msgspec.json.Decoder(
-    schema.ScoreContent | schema.WithdrawalContent | schema.SealedContent | hardware.HardwareContent
+    schema.ScoreContent | schema.WithdrawalContent | hardware.HardwareContent
 )
 
 
-def commands_of(entry: AnyRecord) -> str | None:
-    """SHA-256 of the file beside a record: its commands or its ciphertext; None if it has none."""
-    if isinstance(entry, Record):
-        return entry.header.actions.sha256
-    return entry.content.sealed.sha256 if isinstance(entry, Sealed) else None
+def created_of(entry: AnyRecord) -> str:
+    """When a record was made, UTC."""
+    return entry.created if isinstance(entry, Withdrawal) else entry.header.created
 
 
 def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
@@ -261,8 +208,6 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
         return Withdrawal(sha256, values.withdraws, values.reason, values.created)
     if isinstance(values, hardware.HardwareContent):
         return hardware.checked(values, sha256, label)
-    if isinstance(values, schema.SealedContent):
-        return Sealed(sha256, values)
     size = len(values.lungs), len(values.pips)
     return Record(
         sha256,
@@ -280,9 +225,7 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
     )
 
 
-def _headroom(values: schema.ScoreContent) -> RecordHeadroom | None:
-    if values.rigs is None or values.headroom is None:
-        return None
+def _headroom(values: schema.ScoreContent) -> RecordHeadroom:
     return RecordHeadroom(
         np.array(values.rigs.session),
         np.array(values.rigs.member),
@@ -294,7 +237,7 @@ def _headroom(values: schema.ScoreContent) -> RecordHeadroom | None:
 
 def _stress(values: schema.ScoreContent, label: str) -> RecordStress | None:
     own = values.stress
-    if own is None or values.rigs is None:
+    if own is None:
         return None
     chosen = tuple(condition_of(name, f"{label}, key stress.conditions") for name in own.conditions)
     if chosen[0].stressors or len(set(chosen)) < len(chosen):

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import draws, files, protocol
+from ventbench import files
 from ventbench.board import actions, canonical, create, store
+from ventbench.board.canonical import RECORDS
 from ventbench.board.record import Record, RecordStress
 from ventbench.board.replay import ReplayPlants, draws_of
 from ventbench.errors import InputError
@@ -29,7 +30,6 @@ from ventbench.stress.score import StressScore, run_stress
 from ventbench.submissions.folder import Submission, file_hashes, open_submission
 from ventbench.submissions.rig_scoring import rigs_of, run_on_rigs
 from ventbench.submissions.runner import Runner
-from ventbench.submissions.scoring import run_protocol
 
 #: What a second run can show.
 REPRODUCED, DIFFERENT, NOT_RERUN = "reproduced", "different", "not re-run"
@@ -86,15 +86,15 @@ def sandboxed() -> Runner:
     return SandboxRunner(require_official=True)
 
 
-def frozen_simulators(version: int) -> ReplayPlants:
-    """The frozen simulators of a version of the protocol.
+def frozen_simulators() -> ReplayPlants:
+    """The frozen simulators.
 
     Raises:
         InputError: if they were changed.
     """
     from ventbench.plants import frozen
 
-    return frozen.load(version)
+    return frozen.load()
 
 
 def rerun(
@@ -105,7 +105,7 @@ def rerun(
     work: Path,
     jobs: int = 1,
     scheduler: str | None = None,
-    load: Callable[[int], ReplayPlants] = frozen_simulators,
+    load: Callable[[], ReplayPlants] = frozen_simulators,
     runner: Callable[[], Runner] = sandboxed,
     progress: Callable[[Outcome], None] | None = None,
 ) -> list[Outcome]:
@@ -118,12 +118,12 @@ def rerun(
         work: folder for what is finished; the same one continues.
         jobs: number of processes; 1 for this one alone.
         scheduler: address of a Dask scheduler instead, whose workers see the same files.
-        load: gives the simulators of a version; outside of this process, a function of a module.
+        load: gives the simulators; outside of this process, a function of a module.
         runner: gives the runner; outside of this process, a function of a module.
         progress: called after each record.
 
     Returns:
-        One outcome a record, in the order of the chain.
+        One outcome a record, oldest first.
 
     Raises:
         InputError: if a hash names no record, ``work`` belongs to other versions, or this machine
@@ -131,19 +131,10 @@ def rerun(
         OSError: if a file cannot be read or written.
     """
     board = store.load(folder)
-    named = [store.find_record(board, sha256) for sha256 in records]
-    for entry in named:
-        if not isinstance(entry, Record):
-            raise InputError(
-                f"record {entry.sha256[:12]} is sealed; it can be run again once season "
-                f"{entry.content.season.id} is revealed"
-            )
-    chosen = {entry.sha256 for entry in named}
+    chosen = {store.find_record(board, sha256, Record).sha256 for sha256 in records}
     scores = [score for score in board.scores if not chosen or score.sha256 in chosen]
-    versions = sorted({score.version for score in scores} & set(protocol.VERSIONS))
-    about = {version: canonical.through_json(load(version).about()) for version in versions}
-    settings = {"simulators": {str(k): v for k, v in about.items()}}
-    done = WorkFolder(work, {**settings, "versions": create.versions()})
+    about = canonical.through_json(load().about())
+    done = WorkFolder(work, {"simulators": about, "versions": create.versions()})
     outcomes: dict[str, Outcome] = {}
     todo: list[tuple[Record, Path]] = []
 
@@ -167,7 +158,7 @@ def rerun(
             todo.append((score, code))
     if scheduler is None and (jobs == 1 or len(todo) < 2):
         for score, code in todo:
-            note(_run(score, code, folder, load(score.version), runner()))
+            note(_run(score, code, folder, load(), runner()))
     elif todo:
         work_of = {
             score.sha256: (score.sha256, code.resolve(), folder.resolve(), load, runner)
@@ -180,13 +171,8 @@ def rerun(
 
 
 def _folders(places: Sequence[Path]) -> Iterator[Path]:
-    """Folders that may hold a submission: the places themselves and those in them.
-
-    Also those in ``v1``: the bundled entries as they were scored for version 1.
-    """
-    bundled = files.submissions_folder()
-    several = (*places, bundled)
-    for place in (*several, *(place / "v1" for place in several)):
+    """Folders that may hold a submission: the places themselves and those in them."""
+    for place in (*places, files.submissions_folder()):
         if not place.is_dir():
             continue
         yield place
@@ -195,12 +181,10 @@ def _folders(places: Sequence[Path]) -> Iterator[Path]:
 
 
 def _code_of(
-    score: Record, available: Sequence[Path], simulators: Mapping[int, Mapping[str, Any]]
+    score: Record, available: Sequence[Path], simulators: Mapping[str, Any]
 ) -> tuple[Path | None, str]:
     """Find the code that a record names by its hashes; else why it cannot be run again."""
-    if score.version not in protocol.VERSIONS:
-        return None, f"its protocol version is {score.version}, which this ventbench does not know"
-    if score.header.simulators != simulators[score.version]:
+    if score.header.simulators != simulators:
         return None, "it was scored on other simulators than those of this ventbench"
     wanted = score.header.submission.files
     for folder in available:
@@ -214,13 +198,13 @@ def _run_in_process(
     sha256: str,
     code: Path,
     folder: Path,
-    load: Callable[[int], ReplayPlants],
+    load: Callable[[], ReplayPlants],
     runner: Callable[[], Runner],
 ) -> Outcome:
     """Run one record in a process of its own, which reads it again."""
-    score = store.find_record(store.load(folder), sha256)
+    score = store.find_record(store.load(folder), sha256, Record)
     assert isinstance(score, Record)
-    return _run(score, code, folder, load(score.version), runner())
+    return _run(score, code, folder, load(), runner())
 
 
 def _run(
@@ -232,26 +216,14 @@ def _run(
     try:
         submission = open_submission(str(code))
         _check_same(submission, score)
-        if score.version == 1:
-            result = run_protocol(
-                submission,
-                simulators.plants,
-                track=score.track,
-                draws=draws.COUNT,
-                runner=runner,
-                simulators=simulators.about(),
-            )
-        else:
-            season = store.load(folder).seasons.get(score.header.draws.season or "")
-            drawn = draws_of(score.header, simulators, season.revealed if season else None)
-            rigs = rigs_of(simulators)
-            result = run_on_rigs(submission, rigs, track=score.track, drawn=drawn, runner=runner)
-            if score.stress is not None:
-                cells = draw_cells(rigs, score.stress.tables.pips.shape[1], drawn=drawn)
-                chosen = score.stress.tables.conditions
-                stress = run_stress(submission, cells, chosen, runner=runner)
+        drawn, rigs = draws_of(score.header, simulators), rigs_of(simulators)
+        result = run_on_rigs(submission, rigs, track=score.track, drawn=drawn, runner=runner)
+        if score.stress is not None:
+            cells = draw_cells(rigs, score.stress.tables.pips.shape[1], drawn=drawn)
+            chosen = score.stress.tables.conditions
+            stress = run_stress(submission, cells, chosen, runner=runner)
         _check_same(open_submission(str(code)), score)
-        recorded = actions.load(score, folder / store.RECORDS)
+        recorded = actions.load(score, folder / RECORDS)
         detail = difference(score, recorded, result.requested)
         closeness = _closeness(recorded, result.requested)
         failed = {(x.lung, x.pip, x.draw) for x in result.failures}

@@ -20,7 +20,7 @@ from hardware_eval.bench.plan import CONTROL, Plan, make_plan, progress
 from hardware_eval.bench.raw_log import LoggedBreath, breaths, lines
 from ventbench import files, protocol
 from ventbench.board import canonical, create, record, schema
-from ventbench.board.hardware import TRACK, HardwareRecord
+from ventbench.board.record import TRACK, HardwareRecord
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics.score import passes_safety_gate

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ventbench.board import build, canonical, create, ranking, replay, store
+from ventbench.board import canonical, create, ranking, replay, store
 from ventbench.board.verify import verify
 from ventbench.cli import app
 from ventbench.errors import InputError
@@ -40,8 +40,7 @@ def test_errors_lowered_within_tolerance_are_refused(tmp_path: Path, drafts, sim
     with pytest.raises(InputError, match=r"key errors\.drawn, mean over cells"):
         put(tmp_path / "board", forged, simulators)
     put(tmp_path / "board", forged)  # as an owner without scruples does
-    build.build(tmp_path / "board")
-    nominal, drawn = verify(tmp_path / "board", lambda version: simulators).problems
+    nominal, drawn = verify(tmp_path / "board", lambda: simulators).problems
     assert "key errors.nominal, mean over cells" in nominal
     assert "key errors.drawn, mean over cells" in drawn
 
@@ -53,8 +52,7 @@ def test_replayed_errors_rank(tmp_path: Path, drafts, draft, simulators, monkeyp
     monkeypatch.setattr(replay, "MEAN_TOLERANCE", 1.0)
     put(folder, drafts["softer"], simulators)
     put(folder, _lowered(twin, 9e-10), simulators)
-    build.build(folder)
-    (problem,) = verify(folder, lambda version: simulators).problems
+    (problem,) = verify(folder, lambda: simulators).problems
     assert "(softer): ranks 2 on the performance track by its recorded errors, 1 by" in problem
 
 
@@ -70,9 +68,8 @@ def test_the_lung_is_not_known_before_it_shows(
         patched.setattr(replay, "lung_leaks", lambda *_: [])
         leaky = draft("leaky", "pid_robust", change=by_lung)
         record = put(leaderboard, leaky, simulators)  # control: nothing else sees it
-        build.build(leaderboard)
-        assert verify(leaderboard, lambda version: simulators).problems == []
-    (problem,) = verify(leaderboard, lambda version: simulators).problems
+        assert verify(leaderboard, lambda: simulators).problems == []
+    (problem,) = verify(leaderboard, lambda: simulators).problems
     assert record.sha256 in problem
     assert "key actions: in draw 5 at PIP 20 the first command" in problem
     with pytest.raises(InputError, match="the lung was known"):
@@ -103,9 +100,8 @@ def test_the_terminal_gets_no_commands(leaderboard: Path, drafts, monkeypatch) -
     assert not {"\x1b", "\x07", "\x9b", "\u202e"} & set(shown.output)
     assert "[red]bug" in shown.output
     (leaderboard / "\x1b[2Jx.html").write_text("x")
-    build.build(leaderboard)
     arguments[1] = "verify"
-    monkeypatch.setattr("ventbench.plants.frozen.load", lambda version=1, path=None: None)
+    monkeypatch.setattr("ventbench.plants.frozen.load", lambda path=None: None)
     checked = CliRunner().invoke(app, arguments)
     assert checked.exit_code == 1
     assert "\x1b" not in checked.output

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ventbench.board import build, rerun, store
+from ventbench.board import store
+from ventbench.board import verify as rerun
 from ventbench.board.verify import verify
 from ventbench.cli import app
 from ventbench.errors import InputError
 from ventbench.plants import frozen
 from ventbench.submissions.runner import InProcessRunner
 
-from ..textbook import Textbook
+from ..textbook_rigs import TextbookRigs
 from .conftest import entry_folder, put
 
 
@@ -26,12 +27,12 @@ def states(outcomes: list[rerun.Outcome]) -> dict[str, str]:
 
 
 @pytest.fixture
-def again(simulators: Textbook, tmp_path: Path):
+def again(simulators: TextbookRigs, tmp_path: Path):
     """Run records of a leaderboard again, in this process."""
 
     def run(folder: Path, *sources: Path, **options) -> list[rerun.Outcome]:
         options = {"work": tmp_path / "work", "runner": InProcessRunner, **options}
-        return rerun.rerun(folder, sources=sources, load=lambda version: simulators, **options)
+        return rerun.rerun(folder, sources=sources, load=lambda: simulators, **options)
 
     return run
 
@@ -47,20 +48,19 @@ def three(draft, drafts, simulators, tmp_path_factory: pytest.TempPathFactory) -
     folder = tmp_path_factory.mktemp("three") / "leaderboard"
     for made in (draft("honest"), drafts["softer"], draft("absent", "pid_robust")):
         put(folder, made, simulators)
-    build.build(folder)
     return folder
 
 
 @pytest.fixture
 def code(tmp_path: Path) -> Path:
     for name in ("honest", "softer"):
-        entry_folder(tmp_path / "code" / name, "v1/pid_best", name)
+        entry_folder(tmp_path / "code" / name, "pid_best", name)
     return tmp_path / "code"
 
 
 def test_commands_of_somebody_else_are_seen(board: Path, code: Path, again, simulators) -> None:
     """Commands of one's own making under the hashes of decent code: replay cannot see it."""
-    assert verify(board, lambda version: simulators).problems == [], "control"
+    assert verify(board, lambda: simulators).problems == [], "control"
     outcomes = again(board, code)
     assert states(outcomes) == {
         "honest": rerun.REPRODUCED,
@@ -131,9 +131,9 @@ def test_code_beside_the_leaderboard_and_the_folder_itself(
 def test_the_command_says_all_three(
     board: Path, code: Path, simulators, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(frozen, "load", lambda version=1, path=None: simulators)
+    monkeypatch.setattr(frozen, "load", lambda path=None: simulators)
     in_this_process = functools.partial(
-        rerun.rerun, load=lambda version: simulators, runner=InProcessRunner
+        rerun.rerun, load=lambda: simulators, runner=InProcessRunner
     )
     monkeypatch.setattr(rerun, "rerun", in_this_process)
     arguments = ["board", "verify", "--folder", str(board), "--out", str(tmp_path / "kept")]
@@ -150,9 +150,10 @@ def test_the_command_says_all_three(
 
 @pytest.mark.slow
 def test_published_records_are_reproduced_in_two_processes(tmp_path: Path) -> None:
-    """A PID of each version of this repository's leaderboard, in the sandbox."""
+    """The newest records of two PIDs of this repository's leaderboard, in the sandbox."""
     folder = Path(__file__).parents[2] / "leaderboard"
-    newest = {s.version: s.sha256 for s in store.load(folder).scores if s.name == "pid_best"}
+    scores = [score for score in store.load(folder).scores if score.track == "performance"]
+    newest = {s.name: s.sha256 for s in scores if s.name in ("pid_best", "pid_robust")}
     assert len(newest) == 2
     outcomes = rerun.rerun(folder, records=[*newest.values()], work=tmp_path / "work", jobs=2)
     assert [(x.state, x.detail) for x in outcomes if x.state != rerun.REPRODUCED] == []

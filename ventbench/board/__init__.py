@@ -3,7 +3,6 @@
 - :mod:`~ventbench.board.canonical`: the one text of a JSON value, its hash, and file names;
 - :mod:`~ventbench.board.schema`: what a record's JSON must look like;
 - :mod:`~ventbench.board.record`: a record as arrays; :mod:`~ventbench.board.create` makes one;
-- :mod:`~ventbench.board.hardware`: the record of a run on a physical lung;
 - :mod:`~ventbench.board.actions`: every command of a scored run, without loss;
 - :mod:`~ventbench.board.replay`: recorded commands through the frozen simulators again;
 - :mod:`~ventbench.board.store`: the folder ``leaderboard/``;
@@ -11,7 +10,7 @@
 - :mod:`~ventbench.board.ranking`: which record of an entry counts, ranks, intervals, differences;
 - :mod:`~ventbench.board.frames`: the columns of the board, its CSV and pandas frames;
 - :mod:`~ventbench.board.build`: the site, with :mod:`~ventbench.board.pages`;
-- :mod:`~ventbench.board.verify`: everything again; :mod:`~ventbench.board.rerun`: the code, too.
+- :mod:`~ventbench.board.verify`: everything again, and the code of records, too.
 
 :func:`load_board` and :func:`load_cells` give the board as pandas frames.
 """

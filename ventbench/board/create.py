@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 import ventbench
 from ventbench import files, rig_draws
 from ventbench.board import actions, canonical, record, schema
-from ventbench.board.hardware import HardwareRecord
+from ventbench.board.record import HardwareRecord
 from ventbench.board.replay import TRACE_BREATH, Replayed, ReplayPlants, differences, replay
 from ventbench.errors import InputError
 from ventbench.rig_draws import RigDraws

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.board.hardware import HardwareRecord
-from ventbench.board.record import AnyRecord, Record, Withdrawal
+from ventbench.board.record import AnyRecord, HardwareRecord, Record, Withdrawal
 from ventbench.board.store import Store
 from ventbench.metrics import bootstrap
 from ventbench.stress.results import StressTables

@@ -23,7 +23,7 @@ from ventbench.submissions.manifest import FAMILIES, MANIFEST, NAME, TRACKS
 from ventbench.text import plain
 
 if TYPE_CHECKING:
-    from ventbench.board.hardware import HardwareContent
+    from ventbench.board.record import HardwareContent
 
 #: What every record says of its form: records of another one are not read.
 FORMAT, PROTOCOL = 1, 2

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING
 from ventbench import files
 from ventbench.board import actions, attestation, canonical, record, schema
 from ventbench.board.canonical import RECORDS
-from ventbench.board.hardware import HardwareRecord
-from ventbench.board.record import AnyRecord, Record, Withdrawal
+from ventbench.board.record import AnyRecord, HardwareRecord, Record, Withdrawal
 from ventbench.errors import InputError
 
 if TYPE_CHECKING:

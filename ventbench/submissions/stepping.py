@@ -77,9 +77,7 @@ def _strong(tree: Any) -> Any:
 
 # Axis of the lungs in the scenario: none where all lungs have the same cells (version 1).
 @partial(jax.jit, static_argnames="axis")
-def _begin(
-    plants: Plant, scenario: Scenario, axis: int | None = 0
-) -> tuple[Plant, env.LoopState]:
+def _begin(plants: Plant, scenario: Scenario, axis: int | None = 0) -> tuple[Plant, env.LoopState]:
     def begin(plant: Plant, scenario: Scenario) -> tuple[Plant, env.LoopState]:
         varied = env.vary(plant, scenario)
         return varied, env.start_breath(varied, scenario)

@@ -32,7 +32,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "hidden failure": (
         lambda x: {**x, "errors": {**x["errors"], "nominal": [[None] * 6] * 6}},
-        "key failed_cells",
+        "key headroom.error: does not fit the errors",
     ),
     "official without a sandbox": (lambda x: {**x, "sandbox": None}, "was not official"),
     "other lungs": (lambda x: {**x, "lungs": ["R9C9"] * 6}, "all lungs and PIPs"),

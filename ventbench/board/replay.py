@@ -306,11 +306,14 @@ def differences(record: Record, replayed: Replayed) -> list[str]:
         ("headroom.error", record.headroom.error, replayed.controllable, TOLERANCE),
     )
     texts = [text for check in checks if (text := _difference(*check)) is not None]
-    for key in ("nominal", "drawn"):
-        recorded, given = getattr(record, key), getattr(replayed, key)
+    for key, recorded, given in (
+        ("errors.nominal", record.nominal, replayed.nominal),
+        ("errors.drawn", record.drawn, replayed.drawn),
+        ("headroom.error", record.headroom.error, replayed.controllable),
+    ):
         if np.all(_off(recorded, given) <= TOLERANCE):
             means = _means(recorded, given)
-            text = _difference(f"errors.{key}, mean over cells", *means, MEAN_TOLERANCE)
+            text = _difference(f"{key}, mean over cells", *means, MEAN_TOLERANCE)
             texts += [] if text is None else [text]
     return texts + lung_leaks(record, replayed)
 

@@ -78,7 +78,7 @@ class Column:
             return (value,)
         if value is None:
             return (math.nan,) * 3
-        return (value.value, value.low, value.high) if isinstance(value, Interval) else value
+        return value.value, value.low, value.high
 
 
 def _of_three(name: str, stem: str = "") -> tuple[str, str, str]:

@@ -158,9 +158,9 @@ def _short(value: Any) -> str:
 
 
 def hardware_of(made: Sequence[HardwareRow], name: str) -> HardwareRow | None:
-    """The row that stands for an entry: a physical lung's before an emulator's."""
+    """The row that stands for an entry: attested ones first, a physical lung before an emulator."""
     counting = [row for row in made if row.newest and row.record.name == name]
-    return min(counting, key=lambda row: row.record.emulated, default=None)
+    return min(counting, key=lambda row: (not row.attested, row.record.emulated), default=None)
 
 
 def hardware_shown(row: HardwareRow) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Tables of README.md and docs/protocol_v2.md from the records of the leaderboard.
+"""Tables of README.md and docs/protocol.md from the records of the leaderboard.
 
 Prints both; ``--write`` puts them where they belong. Usage:
 
@@ -17,7 +17,7 @@ from ventbench.board.frames import load_board
 ROOT = Path(__file__).parents[1]
 
 #: Pages with a table; that of README is shorter.
-PAGES = (ROOT / "README.md", ROOT / "docs" / "protocol_v2.md")
+PAGES = (ROOT / "README.md", ROOT / "docs" / "protocol.md")
 
 
 def rows(short: bool) -> list[list[str]]:
@@ -26,7 +26,7 @@ def rows(short: bool) -> list[list[str]]:
     Args:
         short: for README: without the nominal error and the difference to the PID.
     """
-    board = load_board(ROOT / "leaderboard", version=2)
+    board = load_board(ROOT / "leaderboard")
     titles = ["track", "rank", "entry", "normalised", "error", "nominal", "to PID", "stress"]
     table = [[*titles, "runs survived"]]
     for row in board.query("status == 'ranked'").to_dict(orient="records"):

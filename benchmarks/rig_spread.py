@@ -1,4 +1,4 @@
-"""Do draws of protocol version 2 differ as much as real rigs do? The table of docs/protocol_v2.md.
+"""Do draws differ as much as real rigs do? The table of docs/protocol.md.
 
 Standard deviations between the scored rigs of one lung, pooled over the lungs, beside those over
 the 20 development draws of one lung: of the deviation alone, and of all that a draw changes, which

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from ventbench import compilation
-from ventbench.board import stress_table
 from ventbench.board.frames import load_tracks
 from ventbench.stress.results import DRAWS, StressTables
 from ventbench.stress.score import score_stress
@@ -87,8 +86,8 @@ def main() -> None:
 
 def recorded() -> dict[str, StressTables]:
     """Tables of the records of the leaderboard, best first."""
-    (track,) = load_tracks(LEADERBOARD, track="robustness", version=2)
-    return {row.name: row.tables for row in stress_table.rows(track)}
+    (track,) = load_tracks(LEADERBOARD, track="robustness")
+    return {row.name: row.tables for row in track.stress}
 
 
 def anew(draws: int) -> dict[str, StressTables]:

@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from ci import workflow
 from ci.take import TakeError, changed_submissions, take
-from ventbench.lungs import LUNGS, Lung
+from ventbench.plants.rigs import Rigs
 from ventbench.submissions import contract
 from ventbench.submissions.folder import open_submission
 from ventbench.submissions.runner import Runner
@@ -29,10 +27,8 @@ def advise(
     base: str,
     commit: str,
     name: str,
-    plants: Any,
+    rigs: Rigs,
     runner: Runner,
-    *,
-    lungs: Sequence[Lung] = LUNGS,
 ) -> tuple[bool, list[str]]:
     """Say what is wrong with a submission, and its score if nothing is.
 
@@ -41,9 +37,8 @@ def advise(
         base: commit that the pull request is meant for.
         commit: its last one.
         name: of the submission.
-        plants: stacked over the lungs.
+        rigs: that are scored.
         runner: of the controller.
-        lungs: of the plants.
 
     Returns:
         Whether it is ready, and lines for its author.
@@ -61,7 +56,7 @@ def advise(
         if submission.manifest.name != name:
             return False, [*lines, f"{name}: submission.toml calls it {submission.manifest.name}"]
         for track in submission.manifest.tracks:
-            result = run_protocol(submission, plants, track=track, runner=runner, lungs=lungs)
+            result = run_protocol(submission, rigs, track=track, runner=runner)
             by_lung = zip(result.lungs, result.by_lung, strict=True)
             each = ", ".join(f"{lung} {value:.3f}" for lung, value in by_lung)
             lines.append(f"{name}: {track}: {result.score:.3f} cmH2O nominal ({each})")
@@ -72,7 +67,7 @@ def advise(
 
 def main() -> int:
     """Look at the pull request that the environment names; see ``score-pr.yml``."""
-    from ventbench.plants import frozen
+    from ventbench.plants.rigs import load_rigs
     from ventbench.sandbox.runner import SandboxRunner
 
     pull = workflow.required("SOURCE"), workflow.required("BASE"), workflow.required("COMMIT")
@@ -80,13 +75,13 @@ def main() -> int:
     if not names:
         workflow.summary(TITLE, ["this pull request changes no submission"])
         return 0
-    plants, runner = frozen.load().plants, SandboxRunner(require_official=True)
+    rigs, runner = load_rigs(), SandboxRunner(require_official=True)
     ready = len(names) <= MAX_SUBMISSIONS
     if not ready:
         text = f"{len(names)} submissions are changed; one pull request, one submission"
         workflow.summary(TITLE, [text])
     for name in names[:MAX_SUBMISSIONS]:
-        good, lines = advise(*pull, name, plants, runner)
+        good, lines = advise(*pull, name, rigs, runner)
         ready = ready and good
         workflow.summary(TITLE, lines)
     return 0 if ready else 1

@@ -1,7 +1,7 @@
 """Records, as data, into the leaderboard of a checkout, and from there onto a branch.
 
 This job may write to the repository, so nothing of a submission is here but numbers and text of a
-record: checked, replayed through the frozen simulators, and escaped on the pages.
+record: checked, and replayed through the frozen simulators.
 """
 
 from __future__ import annotations
@@ -14,12 +14,11 @@ from pathlib import Path
 
 from ci import workflow
 from ci.git import AUTHOR, Git
-from ci.seed import SECRET as SECRET_SEED
 from ci.take import submission_name
-from ventbench.board import attestation, build, create, record, store
-from ventbench.board.replay import Replayable
+from ventbench.board import attestation, create, record, store
+from ventbench.board.record import Record
+from ventbench.board.replay import ReplayPlants
 from ventbench.errors import InputError
-from ventbench.seasons import parse_seed
 
 TITLE = "Record"
 
@@ -53,11 +52,10 @@ def records(folder: Path) -> list[Path]:
 def add(
     folder: Path,
     leaderboard: Path,
-    simulators: Replayable,
+    simulators: ReplayPlants,
     secret: str | None = None,
-    seed: bytes | None = None,
-) -> list[record.Record | record.Sealed]:
-    """Add records to a leaderboard, each replayed, and build its pages.
+) -> list[Record]:
+    """Add records to a leaderboard, each replayed.
 
     The record of an entry that has one already names the old one as superseded.
 
@@ -66,33 +64,27 @@ def add(
         leaderboard: to add them to.
         simulators: the frozen ones.
         secret: key that signs them; without one they are listed as not official.
-        seed: of the season of sealed records, to replay what is inside; without it they are not
-            signed.
 
     Raises:
         InputError: if a record is not what it must be, or the key is not one of the leaderboard's.
     """
-    added: list[record.Record | record.Sealed] = []
+    added: list[Record] = []
     for path in records(folder):
         scored = record.load(path)
-        if not isinstance(scored, record.Record | record.Sealed):
+        if not isinstance(scored, Record):
             raise InputError(f"{path} is not the record of a score")
         older = store.newest_of(store.load(leaderboard), scored)
         if older is not None and older.sha256 != scored.sha256:
             path = create.amend(path, supersedes=older.sha256, reason=SCORED_AGAIN)
-        if isinstance(scored, record.Sealed):
-            new = store.add_sealed(leaderboard, path, seed=seed, simulators=simulators)
-        else:
-            new = store.add(leaderboard, path, simulators)
-            assert isinstance(new, record.Record)
-        if secret and (seed is not None or isinstance(new, record.Record)):
+        new = store.add(leaderboard, path, simulators)
+        assert isinstance(new, Record)
+        if secret:
             attestation.sign(leaderboard, new.sha256, secret)
         added.append(new)
-    build.build(leaderboard)
     return added
 
 
-def commit(checkout: Path, added: Sequence[record.Record | record.Sealed]) -> str:
+def commit(checkout: Path, added: Sequence[Record]) -> str:
     """Commit the leaderboard to a new branch.
 
     Args:
@@ -122,9 +114,7 @@ def main() -> int:
     # Read here, where no code of a submission runs.
     secret = os.environ.get(attestation.SECRET) or None
     downloaded = Path(workflow.required("RECORDS"))
-    text = os.environ.get(SECRET_SEED) or None
-    seed = None if text is None else parse_seed(text, SECRET_SEED)
-    added = add(downloaded, checkout / "leaderboard", frozen.load, secret, seed)
+    added = add(downloaded, checkout / "leaderboard", frozen.load(), secret)
     branch = commit(checkout, added)
     workflow.output(branch=branch, name=added[0].name)
     workflow.summary(

@@ -1,11 +1,10 @@
-"""The leaderboard as a branch of its own: records, chain and built pages, and no other file.
+"""The leaderboard as a branch of its own: its records, its built pages, and no other file.
 
-What was published before stays: a chain that does not begin with the published one is refused.
+What was published before stays: a commit that lacks a published record, or changes one, is refused.
 """
 
 from __future__ import annotations
 
-import hashlib
 import re
 import sys
 import tempfile
@@ -13,63 +12,61 @@ from pathlib import Path
 
 from ci import workflow
 from ci.git import AUTHOR, Git, GitError
-from ventbench.board import layout
+from ventbench.board import canonical
 from ventbench.errors import InputError
 
 TITLE = "Pages"
 LEADERBOARD = "leaderboard"
 
 _PLAIN = "100644"
-_MAX_CHAIN_BYTES = 100_000_000
+#: Most bytes of the listing of a tree.
+_MAX_LISTING = 50_000_000
 
 
-def pages(git: Git, commit: str, previous: str | None = None) -> str | None:
-    """Make a commit whose root is the leaderboard of another commit.
+def pages(git: Git, commit: str, site: Path, previous: str | None = None) -> str | None:
+    """Make a commit whose root is the leaderboard of another commit and its pages.
 
     Args:
         git: repository.
         commit: whose ``leaderboard/`` is published.
+        site: folder that ``ventbench board build`` made of it; its records are not looked at.
         previous: commit of the pages until now; None if there is none.
 
     Returns:
         The new commit; None if nothing has changed.
 
     Raises:
-        InputError: if there is no leaderboard, anything but its own plain files in it, or a chain
-            that does not begin with the one published until now, or a published season that was
-            changed.
+        InputError: if there is no leaderboard, anything but its own plain files in it or in the
+            site, or a published record that is missing or was changed.
     """
     tree = f"{commit}:{LEADERBOARD}"
     try:
-        listing = git.output("ls-tree", "-r", "-z", tree, limit=50_000_000)
+        listed = _files(git, tree)
     except GitError as error:
         raise InputError(f"commit {commit} holds no {LEADERBOARD}/: {error}") from None
-    lines = [line.decode() for line in listing.split(b"\0") if line]
-    odd = [line.partition("\t")[2] for line in lines if not line.startswith(f"{_PLAIN} blob ")]
-    if odd:
-        raise InputError(f"{LEADERBOARD}/{odd[0]} is no plain file")
-    names = {line.partition("\t")[2] for line in lines}
-    for required in (layout.INDEX, layout.CHAIN):
-        if required not in names:
-            raise InputError(f"{LEADERBOARD}/{required} is missing; run ventbench board build")
-    chain = chain_of(git, f"{tree}/{layout.CHAIN}")
-    stray = layout.stray(names, chain)
+    for name, (mode, _) in listed.items():
+        if mode != _PLAIN:
+            raise InputError(f"{LEADERBOARD}/{name} is no plain file")
+        if not canonical.named(name):
+            raise InputError(f"{LEADERBOARD}/{name} is no part of a leaderboard; remove it")
+    plain, odd = canonical.walk(site)
+    built = sorted(filter(canonical.BUILT.fullmatch, plain))
+    stray = [*odd, *sorted(x for x in plain - set(built) if not canonical.named(x))]
     if stray:
-        raise InputError(f"{LEADERBOARD}/{stray[0]} is no part of a leaderboard; remove it")
-    if previous and not chain.startswith(published(git, previous)):
-        raise InputError(
-            f"{LEADERBOARD}/{layout.CHAIN} does not begin with the published chain: records were "
-            "dropped, changed or put into another order"
-        )
+        raise InputError(f"{site / stray[0]} is no page of a leaderboard; remove it")
+    if canonical.INDEX not in built:
+        raise InputError(f"{site / canonical.INDEX} is missing; run ventbench board build")
     if previous:
-        _require_seasons(git, tree, names, previous)
+        _require_published(listed, _files(git, previous))
     with tempfile.TemporaryDirectory() as folder:
         index = {"GIT_INDEX_FILE": str(Path(folder) / "index")}
         git.output("read-tree", tree, more=index)
-        empty = git.output("hash-object", "-w", "--stdin").decode().strip()
         # Else the server leaves out what begins with an underscore.
-        added = f"{_PLAIN} {empty}\t.nojekyll\n".encode()
-        git.output("update-index", "--add", "--index-info", given=added, more=index)
+        contents = {name: (site / name).read_bytes() for name in built} | {".nojekyll": b""}
+        for name, content in contents.items():
+            blob = git.output("hash-object", "-w", "--stdin", given=content).decode().strip()
+            line = f"{_PLAIN} {blob}\t{name}\n".encode()
+            git.output("update-index", "--add", "--index-info", given=line, more=index)
         root = git.text("write-tree", more=index)
     if previous and git.text("rev-parse", f"{previous}^{{tree}}") == root:
         return None
@@ -77,68 +74,38 @@ def pages(git: Git, commit: str, previous: str | None = None) -> str | None:
     return git.text("commit-tree", root, *parents, "-m", f"Pages of {commit}", more=AUTHOR)
 
 
-def chain_of(git: Git, name: str) -> bytes:
-    """Content of a chain, by git's name of the file.
-
-    Raises:
-        GitError: if there is none.
-    """
-    return git.output("cat-file", "blob", name, limit=_MAX_CHAIN_BYTES)
-
-
-def published(git: Git, previous: str) -> bytes:
-    """The chain among pages; empty where the branch was made before there were records.
-
-    Args:
-        git: repository.
-        previous: commit of the pages.
-    """
-    if not git.output("ls-tree", "-z", previous, "--", layout.CHAIN):
-        return b""
-    return chain_of(git, f"{previous}:{layout.CHAIN}")
+def _files(git: Git, tree: str) -> dict[str, tuple[str, str]]:
+    """Mode and git's name of the content of each file of a tree, by path."""
+    listing = git.output("ls-tree", "-r", "-z", tree, limit=_MAX_LISTING)
+    found = {}
+    for line in filter(None, listing.decode().split("\0")):
+        about, _, name = line.partition("\t")
+        mode, _, sha = about.split(" ")
+        found[name] = mode, sha
+    return found
 
 
-def _require_seasons(git: Git, tree: str, names: set[str], previous: str) -> None:
-    """Refuse a season that was published and is gone, or says something else than then.
-
-    Else whoever holds several seeds could choose among their commitments afterwards.
-    """
-    listing = git.output("ls-tree", "-r", "--name-only", "-z", previous, limit=50_000_000)
-    for name in sorted(filter(layout.is_season, listing.decode().split("\0"))):
-        before = git.output("cat-file", "blob", f"{previous}:{name}")
-        if name not in names:
-            raise InputError(f"{LEADERBOARD}/{name} was published and is missing")
-        if not layout.same_season(before, git.output("cat-file", "blob", f"{tree}/{name}")):
-            raise InputError(
-                f"{LEADERBOARD}/{name} is not the one that was published; only its seed may join it"
-            )
-
-
-def head(git: Git, previous: str | None) -> str:
-    """Head of the published chain, for ``ventbench board verify --head``.
-
-    Args:
-        git: repository.
-        previous: commit of the pages; None if there is none.
-
-    Returns:
-        SHA-256 of the last line; zeros, the start of every chain, if nothing is published.
-    """
-    lines = published(git, previous).splitlines(keepends=True) if previous else []
-    return hashlib.sha256(lines[-1]).hexdigest() if lines else "0" * 64
+def _require_published(
+    listed: dict[str, tuple[str, str]], before: dict[str, tuple[str, str]]
+) -> None:
+    """Refuse what lacks a published record or its commands; signatures go with a leaked key."""
+    lasting = (canonical.RECORD_SUFFIX, canonical.ACTIONS_SUFFIX)
+    for name, content in before.items():
+        if name.startswith(f"{canonical.RECORDS}/") and name.endswith(lasting):
+            if name not in listed:
+                raise InputError(f"{LEADERBOARD}/{name} was published and is missing")
+            if listed[name] != content:
+                raise InputError(f"{LEADERBOARD}/{name} is not what was published")
 
 
 def main() -> int:
-    """Make the pages of ``COMMIT`` in this checkout, or say the head; see ``publish.yml``."""
+    """Make the pages of ``COMMIT`` in this checkout from ``SITE``; see ``publish.yml``."""
     git = Git(Path.cwd())
     previous = git.text("for-each-ref", "--format=%(objectname)", "refs/remotes/origin/gh-pages")
-    if sys.argv[1:] == ["head"]:
-        workflow.output(head=head(git, previous or None))
-        return 0
-    commit = workflow.required("COMMIT")
+    commit, site = workflow.required("COMMIT"), Path(workflow.required("SITE"))
     if not re.fullmatch(r"[0-9a-f]{40}", commit):
         raise InputError(f"COMMIT is {commit!r}, not the full name of one")
-    made = pages(git, commit, previous or None)
+    made = pages(git, commit, site, previous or None)
     workflow.output(commit=made or "")
     workflow.summary(TITLE, [f"pages {made}" if made else "the pages are up to date"])
     return 0

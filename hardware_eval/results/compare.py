@@ -19,7 +19,7 @@ from hardware_eval.bench.raw_log import recording
 from hardware_eval.results.evaluate import LOG
 from ventbench import files
 from ventbench.board import record as records
-from ventbench.board.hardware import HardwareRecord
+from ventbench.board.record import HardwareRecord
 from ventbench.errors import InputError
 from ventbench.metrics.open_loop import by_horizon, distance, mae
 from ventbench.plants.catalog import load_simulators

@@ -19,8 +19,8 @@ from hardware_eval.bench.loop import ON_TIME_S
 from hardware_eval.bench.plan import CONTROL, Plan, make_plan, progress
 from hardware_eval.bench.raw_log import LoggedBreath, breaths, lines
 from ventbench import files, protocol
-from ventbench.board import canonical, create, record
-from ventbench.board.hardware import TRACK, HardwareRecord
+from ventbench.board import canonical, create, record, schema
+from ventbench.board.record import TRACK, HardwareRecord
 from ventbench.errors import InputError
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics.score import passes_safety_gate
@@ -124,9 +124,9 @@ def hardware_record(log: Path, submission: Submission) -> bytes:
     lungs = [lung for lung in LUNG_IDS if lung in plan.lungs]
     runs = _scored(log, name)
     content = {
-        "format": 1,
+        "format": schema.FORMAT,
         "kind": "hardware",
-        "protocol": protocol.VERSION,
+        "protocol": schema.PROTOCOL,
         "created": record.timestamp(),
         "track": TRACK,
         "simulated_track": plan.track,

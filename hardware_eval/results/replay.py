@@ -16,7 +16,7 @@ from hardware_eval.results.evaluate import LOG
 from hardware_eval.results.record import Jitter, jitter, plan_of
 from ventbench import files, protocol, waveform
 from ventbench.board import record as records
-from ventbench.board.hardware import HardwareRecord
+from ventbench.board.record import HardwareRecord
 from ventbench.errors import InputError
 
 

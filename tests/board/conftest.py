@@ -1,8 +1,9 @@
-"""Records made on the spot: real commands of the PIDs on textbook lungs, and variations of them."""
+"""Records made on the spot: real commands of the PIDs on textbook rigs, and variations of them."""
 
 from __future__ import annotations
 
 import dataclasses
+import runpy
 import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -12,18 +13,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench import draws
-from ventbench.board import build, create, layout, record, store
+from ventbench import draws as draw_tables
+from ventbench import protocol
+from ventbench.board import build, canonical, create, record, store, verify
 from ventbench.board.record import Record
 from ventbench.board.replay import ReplayPlants, replay
+from ventbench.headroom import reference as references
 from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
+from ventbench.stress.score import StressScore
 from ventbench.submissions.errors import Failure
 from ventbench.submissions.folder import open_submission, resolve
 from ventbench.submissions.result import CellFailure, Score
 from ventbench.submissions.scoring import run_protocol
 
-from ..textbook import Textbook
+from ..textbook_rigs import TextbookRigs
 
 SANDBOX = {"layers": ["landlock", "seccomp"], "official": True}
 NOW = datetime(2026, 11, 20, 12, tzinfo=UTC)
@@ -35,20 +39,40 @@ HOSTILE = (
 
 
 @pytest.fixture(scope="session")
-def simulators() -> Textbook:
-    return Textbook()
+def simulators() -> TextbookRigs:
+    return TextbookRigs()
 
 
 @pytest.fixture(scope="session")
-def scores(simulators: Textbook) -> dict[str, Score]:
+def reference(simulators: TextbookRigs) -> references.Reference:
+    """The PID's true errors, and a tenth of them as what is attainable."""
+    own = simulators.scored()
+    drawn = own.draws(draw_tables.COUNT)
+    controller = runpy.run_path(str(resolve("pid_robust") / "controller.py"))
+    gains = np.tile(controller["GAINS"], (6, 1))
+    plants, cells = own.cells(drawn, protocol.PIPS)
+    pid = references.pid_errors(plants, cells, gains)
+    about = references.settings(own.about, drawn.about())
+    zero = np.zeros((*pid.shape, 33))
+    return references.Reference(about, gains, 0.1 * pid, 0.1 * pid, 0.0 * pid, pid, zero)
+
+
+@pytest.fixture(autouse=True)
+def _published(reference: references.Reference, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reference errors of the textbook rigs in the place of the published ones."""
+    monkeypatch.setattr(verify, "published", lambda: reference)
+
+
+@pytest.fixture(scope="session")
+def scores(simulators: TextbookRigs, reference: references.Reference) -> dict[str, Score]:
     """The two PIDs, scored."""
     found = {}
     for name in ("pid_best", "pid_robust"):
-        entry = open_submission(f"v1/{name}")
-        result = run_protocol(entry, simulators.plants, draws=draws.COUNT)
-        found[name] = dataclasses.replace(
-            result, sandbox=SANDBOX, frozen_sha256=frozen.MANIFEST_SHA256
+        result = run_protocol(
+            open_submission(name), simulators.scored(), draws=draw_tables.COUNT, reference=reference
         )
+        official = frozen.load().manifest_sha256
+        found[name] = dataclasses.replace(result, sandbox=SANDBOX, frozen_sha256=official)
     return found
 
 
@@ -57,7 +81,7 @@ Draft = Callable[..., create.Draft]
 
 @pytest.fixture(scope="session")
 def draft(
-    scores: dict[str, Score], simulators: Textbook, tmp_path_factory: pytest.TempPathFactory
+    scores: dict[str, Score], simulators: TextbookRigs, tmp_path_factory: pytest.TempPathFactory
 ) -> Draft:
     """Make a record: the commands of a PID times a factor, under any name."""
 
@@ -71,10 +95,11 @@ def draft(
         failed: int = 0,
         wide_open: bool = False,
         change: Callable[[np.ndarray], None] | None = None,
+        stress: Callable[[Score], StressScore] | None = None,
         **about: Any,
     ) -> create.Draft:
         score = scores[base]
-        folder = entry_folder(tmp_path_factory.mktemp("entries") / name, f"v1/{base}", name)
+        folder = entry_folder(tmp_path_factory.mktemp("entries") / name, base, name)
         manifest = dataclasses.replace(score.submission.manifest, name=name)
         if texts is not None:
             manifest = dataclasses.replace(
@@ -90,20 +115,22 @@ def draft(
         cells = [(i, j) for i in range(6) for j in range(6)][:failed]
         for i, j in cells:
             requested[i, 0, j] = 0.0
-        (found,) = replay(simulators, score.pips, [requested])
-        nominal = found.nominal.copy()
+        assert score.rig_draws is not None
+        (found,) = replay(simulators, score.pips, [requested], score.rig_draws)
+        nominal, controllable = found.nominal.copy(), found.controllable.copy()
         failures = []
         for i, j in cells:
-            nominal[i, j] = np.nan
+            nominal[i, j] = controllable[0, i, j] = np.nan
             what = Failure("act", texts or "raised ValueError", texts or "", 1, 2)
             message = what.message(str(folder), LUNG_IDS[i])
             failures.append(CellFailure(LUNG_IDS[i], score.pips[j], None, what, message))
         varied = dataclasses.replace(
             score, submission=opened, requested=requested, nominal=nominal, drawn=found.drawn,
             safe=found.safe, peak=found.peak.max(axis=(0, 2)), sandbox=sandbox,
-            failures=tuple(failures),
+            failures=tuple(failures), controllable=np.moveaxis(controllable, 0, 1),
         )  # fmt: skip
-        return create.create(varied, simulators, now=NOW, **about)
+        own = None if stress is None else stress(varied)
+        return create.create(varied, simulators, stress=own, now=NOW, **about)
 
     return make
 
@@ -134,19 +161,29 @@ def drafts(draft: Draft) -> dict[str, create.Draft]:
 
 @pytest.fixture(scope="session")
 def full(
-    drafts: dict[str, create.Draft], simulators: Textbook, tmp_path_factory: pytest.TempPathFactory
+    drafts: dict[str, create.Draft],
+    simulators: TextbookRigs,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Path:
-    """A built leaderboard that nobody may change; see :func:`leaderboard`."""
+    """A leaderboard that nobody may change; see :func:`leaderboard`."""
     folder = tmp_path_factory.mktemp("full") / "leaderboard"
     for made in drafts.values():
         put(folder, made, simulators)
-    build.build(folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def site(full: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built pages of :func:`full`."""
+    pytest.importorskip("jinja2", reason="needs the extra ventbench[view]")
+    out = tmp_path_factory.mktemp("site") / "site"
+    build.build(full, out)
+    return out
 
 
 @pytest.fixture
 def leaderboard(full: Path, tmp_path: Path) -> Path:
-    """A built leaderboard to change."""
+    """A leaderboard to change."""
     return shutil.copytree(full, tmp_path / "leaderboard")
 
 
@@ -161,11 +198,11 @@ def put(folder: Path, made: create.Draft, simulators: ReplayPlants | None = None
 def accept(folder: Path) -> None:
     """Vouch for all records that say that they are official, as their maintainers would."""
     lines = [
-        f'[[records]]\nrecord = "{score.sha256}"\nreason = "a test"\ndate = 2026-11-23\n'
-        for path in sorted((folder / store.RECORDS).glob("*.json"))
+        f'[[second_runs]]\nrecord = "{score.sha256}"\nreason = "a test"\ndate = 2026-11-23\n'
+        for path in store.record_paths(folder)
         if isinstance(score := record.load(path, strict=False), Record) and score.official
     ]
-    (folder / layout.ACCEPTED).write_text("".join(lines))
+    (folder / canonical.ATTESTATIONS).write_text("".join(lines))
 
 
 def opened(made: create.Draft) -> Record:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ventbench.board import attestation, build, canonical, frames, layout, store
+from ventbench.board import attestation, build, canonical, frames, store
 from ventbench.board.verify import verify
 from ventbench.errors import InputError
 
@@ -22,7 +22,7 @@ SECRET = "01" * 32
 
 @pytest.fixture(scope="module")
 def keys() -> str:
-    """Lines of keys.toml for :data:`SECRET`."""
+    """Lines of attestations.toml for :data:`SECRET`."""
     return lines_of(SECRET)
 
 
@@ -42,8 +42,7 @@ def status(folder: Path) -> dict[str, str]:
 @pytest.fixture
 def unsigned(leaderboard: Path) -> Path:
     """A leaderboard whose records say "official", and nobody else does."""
-    (leaderboard / layout.ACCEPTED).unlink()
-    build.build(leaderboard)
+    (leaderboard / canonical.ATTESTATIONS).unlink()
     return leaderboard
 
 
@@ -54,8 +53,9 @@ def sha_of(folder: Path, name: str) -> str:
 def test_official_is_not_self_declared(unsigned: Path, simulators) -> None:
     assert all(score.official for score in store.load(unsigned).scores if score.name != "home")
     assert set(status(unsigned).values()) == {"not official"}
-    assert verify(unsigned, lambda version: simulators).problems == []
-    page = (unsigned / "index.html").read_text()
+    assert verify(unsigned, lambda: simulators).problems == []
+    build.build(unsigned, unsigned.parent / "site")
+    page = (unsigned.parent / "site" / "index.html").read_text()
     assert "not official: no key of this leaderboard has signed the record" in page
     assert "not official: its sandbox lacked a layer" in page
     accept(unsigned)
@@ -63,24 +63,23 @@ def test_official_is_not_self_declared(unsigned: Path, simulators) -> None:
 
 
 def test_a_signed_record_is_official(unsigned: Path, keys: str, simulators) -> None:
-    (unsigned / layout.KEYS).write_text(keys)
+    (unsigned / canonical.ATTESTATIONS).write_text(keys)
     for name in ("softer", "home"):
         attestation.sign(unsigned, sha_of(unsigned, name), SECRET)
-    build.build(unsigned)
     found = status(unsigned)
     assert found["softer"] == "ranked"
     assert found["harder"] == "not official"
     assert found["home"] == "not official", "a signature gives nobody a sandbox"
-    assert verify(unsigned, lambda version: simulators).problems == []
+    assert verify(unsigned, lambda: simulators).problems == []
 
 
 def test_an_unsigned_record_does_not_take_the_place_of_a_signed_one(
     leaderboard: Path, draft, simulators
 ) -> None:
-    accepted = (leaderboard / layout.ACCEPTED).read_text()
+    accepted = (leaderboard / canonical.ATTESTATIONS).read_text()
     old = sha_of(leaderboard, "softer")
     new = put(leaderboard, draft("softer", factor=0.5, supersedes=old), simulators)
-    (leaderboard / layout.ACCEPTED).write_text(accepted)
+    (leaderboard / canonical.ATTESTATIONS).write_text(accepted)
     board = frames.load_board(leaderboard, track="performance").query("name == 'softer'")
     assert dict(zip(board["record"], board["status"], strict=True)) == {
         old: "ranked",
@@ -89,22 +88,22 @@ def test_an_unsigned_record_does_not_take_the_place_of_a_signed_one(
 
 
 def test_wrong_signatures_are_named(unsigned: Path, keys: str, simulators) -> None:
-    (unsigned / layout.KEYS).write_text(keys)
+    (unsigned / canonical.ATTESTATIONS).write_text(keys)
     softer, harder = (sha_of(unsigned, name) for name in ("softer", "harder"))
     path = attestation.sign(unsigned, softer, SECRET)
     good = path.read_bytes()
     values = json.loads(good)
 
     def problem() -> str:
-        found = verify(unsigned, lambda version: simulators).problems
+        found = verify(unsigned, lambda: simulators).problems
         with pytest.raises(InputError):
             store.load(unsigned)
-        return "\n".join(x for x in found if path.parent.name in x or "keys.toml" in x)
+        return "\n".join(x for x in found if path.parent.name in x or "attestations.toml" in x)
 
     wrong = {
         "signs another record": {"record": harder},
         "the signature is not by key": {"signature": "0" * 128},
-        "is not in keys.toml": {"key": "0" * 16},
+        "is not in attestations.toml": {"key": "0" * 16},
         "key signature": {"signature": "0"},
     }
     for message, change in wrong.items():
@@ -120,27 +119,29 @@ def test_wrong_signatures_are_named(unsigned: Path, keys: str, simulators) -> No
     moved.write_bytes(canonical.canonical(values | {"record": harder}))
     assert "the signature is not by key" in problem()
     moved.unlink()
-    (unsigned / layout.KEYS).write_text(keys.replace(json.loads(good)["key"], "0" * 16))
-    assert "keys.toml" in problem()
-    (unsigned / layout.KEYS).write_text(lines_of("02" * 32))
-    assert "is not in keys.toml" in problem()
+    (unsigned / canonical.ATTESTATIONS).write_text(keys.replace(json.loads(good)["key"], "0" * 16))
+    assert "attestations.toml: key" in problem()
+    (unsigned / canonical.ATTESTATIONS).write_text(lines_of("02" * 32))
+    assert "is not in attestations.toml" in problem()
 
 
 def test_lists_are_checked(leaderboard: Path, simulators) -> None:
-    path = leaderboard / layout.ACCEPTED
+    path = leaderboard / canonical.ATTESTATIONS
     good = path.read_text()
-    path.write_text(f'[[records]]\nrecord = "{"a" * 64}"\nreason = "x"\ndate = 2026-11-23\n{good}')
-    (problem,) = verify(leaderboard, lambda version: simulators).problems
-    assert f"record {'a' * 64} is not on the chain" in problem
+    path.write_text(
+        f'[[second_runs]]\nrecord = "{"a" * 64}"\nreason = "x"\ndate = 2026-11-23\n{good}'
+    )
+    (problem,) = verify(leaderboard, lambda: simulators).problems
+    assert f"record {'a' * 64} is not there" in problem
     path.write_text(good.replace('reason = "a test"', 'reason = " "'))
-    assert any("accepted.toml: " in x for x in verify(leaderboard, lambda _: simulators).problems)
+    assert any("attestations.toml: " in x for x in verify(leaderboard, lambda: simulators).problems)
     path.unlink()
     path.symlink_to("/dev/zero")
-    assert any("is a link" in x for x in verify(leaderboard, lambda _: simulators).problems)
+    assert any("is a link" in x for x in verify(leaderboard, lambda: simulators).problems)
 
 
 def test_only_a_listed_key_signs(unsigned: Path, keys: str) -> None:
-    (unsigned / layout.KEYS).write_text(keys)
+    (unsigned / canonical.ATTESTATIONS).write_text(keys)
     sha256 = sha_of(unsigned, "softer")
     with pytest.raises(InputError, match="is not in"):
         attestation.sign(unsigned, sha256, "02" * 32)
@@ -150,7 +151,7 @@ def test_only_a_listed_key_signs(unsigned: Path, keys: str) -> None:
 
 
 def test_without_the_library_there_is_advice(unsigned: Path, keys: str, monkeypatch) -> None:
-    (unsigned / layout.KEYS).write_text(keys)
+    (unsigned / canonical.ATTESTATIONS).write_text(keys)
     attestation.sign(unsigned, sha_of(unsigned, "softer"), SECRET)
     monkeypatch.setitem(sys.modules, "cryptography.exceptions", None)
     with pytest.raises(InputError, match=r"pip install 'ventbench\[attest\]'"):
@@ -164,7 +165,7 @@ def test_a_new_key_signs(unsigned: Path, monkeypatch) -> None:
 
     made = CliRunner().invoke(app, ["board", "new-key"]).output
     secret = made.splitlines()[1]
-    (unsigned / layout.KEYS).write_text(made[made.index("[[keys]]") :])
+    (unsigned / canonical.ATTESTATIONS).write_text(made[made.index("[[keys]]") :])
     monkeypatch.setitem(os.environ, attestation.SECRET, secret)
     name = sha_of(unsigned, "softer")
     signed = CliRunner().invoke(app, ["board", "sign", name[:12], "--folder", str(unsigned)])

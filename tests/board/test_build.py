@@ -5,47 +5,67 @@ from __future__ import annotations
 import csv
 import io
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
-from ventbench.board import build, pages, store
+import pytest
+
+from ventbench.board import build, canonical, store
 
 from .conftest import HOSTILE, put
 
 
-def test_a_second_build_changes_nothing(leaderboard: Path) -> None:
-    before = {path: path.read_bytes() for path in leaderboard.rglob("*") if path.is_file()}
-    done = build.build(leaderboard)
-    assert done.changed == ()
-    assert {p: p.read_bytes() for p in leaderboard.rglob("*") if p.is_file()} == before
+def read(folder: Path) -> dict[str, bytes]:
+    names = canonical.walk(folder)[0]
+    return {name: (folder / name).read_bytes() for name in names}
 
 
-def test_a_build_in_another_process_gives_the_same_bytes(leaderboard: Path) -> None:
-    before = {name: (leaderboard / name).read_bytes() for name in build.present(leaderboard)}
-    for name in before:
-        (leaderboard / name).unlink()
-    code = "import sys, pathlib; from ventbench.board import build; "
-    code += "build.build(pathlib.Path(sys.argv[1]))"
+@pytest.fixture
+def out(site: Path, tmp_path: Path) -> Path:
+    """A site to change."""
+    return shutil.copytree(site, tmp_path / "site")
+
+
+def test_a_second_build_changes_nothing(leaderboard: Path, out: Path) -> None:
+    before = read(out)
+    assert build.build(leaderboard, out).changed == ()
+    assert read(out) == before
+
+
+def test_a_site_has_the_records_that_its_pages_link_to(full: Path, site: Path) -> None:
+    records = {name for name in canonical.walk(full)[0] if name.startswith("records/")}
+    assert len(records) >= 15
+    assert {name for name in read(site) if name.startswith("records/")} == records
+    assert not any(canonical.BUILT.fullmatch(name) for name in canonical.walk(full)[0])
+
+
+def test_a_build_in_another_process_gives_the_same_bytes(
+    full: Path, site: Path, tmp_path: Path
+) -> None:
+    code = "import sys; from pathlib import Path; from ventbench.board import build; "
+    code += "build.build(Path(sys.argv[1]), Path(sys.argv[2]))"
     # Another seed of str hashes: no order of a set may reach a page.
     environment = {"PYTHONHASHSEED": "1", "PYTHONPATH": ":".join(filter(None, sys.path))}
-    subprocess.run([sys.executable, "-c", code, leaderboard], check=True, env=environment)
-    assert {n: (leaderboard / n).read_bytes() for n in build.present(leaderboard)} == before
+    command = [sys.executable, "-c", code, full, tmp_path / "other"]
+    subprocess.run(command, check=True, env=environment)
+    assert read(tmp_path / "other") == read(site)
 
 
-def test_stale_pages_go_and_other_files_stay(leaderboard: Path) -> None:
-    stale = leaderboard / "entries/v1/performance/nobody.html"
+def test_stale_pages_go_and_other_files_stay(leaderboard: Path, out: Path) -> None:
+    stale = out / "entries/performance/nobody.html"
     stale.write_text("old")
-    (leaderboard / "README.md").write_text("mine")
-    (leaderboard / "index.html").write_text("changed")
-    done = build.build(leaderboard)
-    assert set(done.changed) == {"index.html", "entries/v1/performance/nobody.html"}
+    (out / "README.md").write_text("mine")
+    (out / "index.html").write_text("changed")
+    done = build.build(leaderboard, out)
+    assert set(done.changed) == {"index.html", "entries/performance/nobody.html"}
     assert not stale.exists()
-    assert (leaderboard / "README.md").read_text() == "mine"
+    assert (out / "README.md").read_text() == "mine"
 
 
-def test_the_csv_has_every_entry(full: Path) -> None:
-    rows = list(csv.DictReader(io.StringIO((full / "leaderboard.csv").read_text())))
+def test_the_csv_has_every_entry(site: Path) -> None:
+    rows = list(csv.DictReader(io.StringIO((site / "leaderboard.csv").read_text())))
     status = {row["name"]: row["status"] for row in rows}
     assert status == {
         "softer": "ranked",
@@ -60,16 +80,16 @@ def test_the_csv_has_every_entry(full: Path) -> None:
     by_name = {row["name"]: row for row in rows}
     assert by_name["broken"]["failed_cells"] == "2"
     assert by_name["open"]["safe"] == "no"
-    scores = [float(row["score_cmH2O"]) for row in rows if row["track"] == "performance"][:3]
+    scores = [float(row["normalised"]) for row in rows if row["track"] == "performance"][:3]
     assert scores == sorted(scores)
-    assert by_name["pid_best"]["to_pid_cmH2O"] == ""
-    gap = float(by_name["harder"]["score_cmH2O"]) - float(by_name["pid_best"]["score_cmH2O"])
-    assert abs(float(by_name["harder"]["to_pid_cmH2O"]) - gap) < 2e-6
+    assert by_name["pid_best"]["normalised_to_pid"] == ""
+    gap = float(by_name["harder"]["normalised"]) - float(by_name["pid_best"]["normalised"])
+    assert abs(float(by_name["harder"]["normalised_to_pid"]) - gap) < 2e-6
 
 
-def test_text_of_records_is_escaped_everywhere(full: Path) -> None:
+def test_text_of_records_is_escaped_everywhere(site: Path) -> None:
     shown = 0
-    for path in full.rglob("*.html"):
+    for path in site.rglob("*.html"):
         page = path.read_text()
         assert page.count("<script>") == page.count("</script>") == 1  # ours
         assert "<img" not in page
@@ -80,8 +100,8 @@ def test_text_of_records_is_escaped_everywhere(full: Path) -> None:
     assert "\u202e" in HOSTILE
 
 
-def test_pages_stand_alone(full: Path) -> None:
-    for path in full.rglob("*.html"):
+def test_pages_stand_alone(site: Path) -> None:
+    for path in site.rglob("*.html"):
         page = path.read_text()
         policy = re.search(r'Content-Security-Policy" content="([^"]+)"', page)
         assert policy
@@ -99,27 +119,21 @@ def _texts(page: str) -> str:
 
 
 def test_a_new_leaderboard_has_a_page(tmp_path: Path) -> None:
-    done = build.build(tmp_path)
+    done = build.build(tmp_path / "none", tmp_path)
     assert done.records == 0
     assert set(done.changed) == {"index.html", "leaderboard.csv"}
     assert "No ranked entry yet" in (tmp_path / "index.html").read_text()
 
 
-def test_versions_are_kept_apart() -> None:
-    assert pages.version_path(2, [2, 1]) == "index.html"
-    assert pages.version_path(1, [2, 1]) == "version-1.html"
-
-
-def test_a_correction_takes_the_place_of_its_record(leaderboard, draft, drafts, simulators) -> None:
-    old = store.load(leaderboard).scores[2]
-    assert old.name == "softer"
+def test_a_correction_takes_the_place_of_its_record(leaderboard, out, draft, simulators) -> None:
+    old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
     corrected = draft("softer", factor=0.95, supersedes=old.sha256, reason="a better number")
     new = put(leaderboard, corrected, simulators)
-    done = build.build(leaderboard)
-    page = (leaderboard / "entries/v1/performance/softer.html").read_text()
-    assert "entries/v1/performance/softer.html" in done.changed
+    done = build.build(leaderboard, out)
+    page = (out / "entries/performance/softer.html").read_text()
+    assert "entries/performance/softer.html" in done.changed
     assert page.index(new.sha256[:12]) < page.index("superseded")
     assert f"<b>counts</b>: {'a better number'}" in page
     assert f"records/{old.sha256}.json" in page
-    rows = csv.DictReader(io.StringIO((leaderboard / "leaderboard.csv").read_text()))
+    rows = csv.DictReader(io.StringIO((out / "leaderboard.csv").read_text()))
     assert [row["record"] for row in rows if row["name"] == "softer"] == [new.sha256]

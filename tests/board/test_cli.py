@@ -16,15 +16,15 @@ from ventbench.cli import app
 from ventbench.errors import InputError
 from ventbench.plants import frozen
 
-from ..textbook import Textbook
+from ..textbook_rigs import TextbookRigs
 from .conftest import accept
 
 RUN = CliRunner()
 
 
 @pytest.fixture(autouse=True)
-def _textbook(monkeypatch: pytest.MonkeyPatch, simulators: Textbook) -> None:
-    monkeypatch.setattr(frozen, "load", lambda version=1, path=None: simulators)
+def _textbook(monkeypatch: pytest.MonkeyPatch, simulators: TextbookRigs) -> None:
+    monkeypatch.setattr(frozen, "load", lambda path=None: simulators)
 
 
 def run(*arguments: object, code: int = 0) -> str:
@@ -46,53 +46,54 @@ def test_from_records_to_a_verified_board(drafts, tmp_path: Path) -> None:
     for name in names:
         assert f"added {name} (performance)" in added
     accept(folder)
-    assert "3 records, 5 files, 5 changed" in run("build", "--folder", folder)
-    assert "3 records, 5 files, 0 changed" in run("build", "--folder", folder)
+    build = ("build", "--folder", folder, "--out", tmp_path / "site")
+    assert "3 records, 5 pages, 12 files changed" in run(*build)
+    assert "3 records, 5 pages, 0 files changed" in run(*build)
     output = run("verify", "--folder", folder)
     assert "no problems: 3 records, 3 replayed" in output
     report = tmp_path / "show.json"
     text = run("show", "--folder", folder, "--json", report)
     rows = json.loads(report.read_text())["rows"]
     assert [(row["name"], row["rank"]) for row in rows] == [
-        ("softer", 1), ("pid_best", 2), ("broken", ""),
+        ("pid_best", 1), ("softer", 2), ("broken", ""),
     ]  # fmt: skip
     assert "softer" in text
-    written = csv.DictReader(io.StringIO((folder / "leaderboard.csv").read_text()))
+    written = csv.DictReader(io.StringIO((tmp_path / "site" / "leaderboard.csv").read_text()))
     assert [row["score_cmH2O"] for row in written] == [row["score_cmH2O"] for row in rows]
 
 
 def test_verify_says_no_with_exit_code_1(leaderboard: Path, tmp_path: Path) -> None:
-    path = leaderboard / "leaderboard.csv"
-    path.write_bytes(path.read_bytes().replace(b"softer", b"better"))
+    path = next((leaderboard / "records").glob("*.json"))
+    path.write_bytes(path.read_bytes().replace(b"pid", b"PID"))
     output = run("verify", "--folder", leaderboard, "--json", tmp_path / "report.json", code=1)
-    assert f"{path} is not what the records give: byte" in output
+    assert f"{path} has been changed" in output
     assert "1 problem:" in output
     report = json.loads((tmp_path / "report.json").read_text())
     assert len(report["problems"]) == 1
-    assert report["replayed"] == 8
+    assert report["replayed"] == 7
 
 
 def test_withdraw(leaderboard: Path) -> None:
-    item = store.load(leaderboard).scores[2]
+    item = next(x for x in store.load(leaderboard).scores if x.name == "softer")
     output = run("withdraw", item.sha256[:12], "--reason", "a bug", "--folder", leaderboard)
     assert item.sha256 in output
-    run("build", "--folder", leaderboard)
-    assert "withdrawn: a bug" in (leaderboard / "index.html").read_text()
+    run("build", "--folder", leaderboard, "--out", leaderboard.parent / "site")
+    assert "withdrawn: a bug" in (leaderboard.parent / "site" / "index.html").read_text()
     assert "no problems" in run("verify", "--folder", leaderboard)
 
 
 def test_a_correction_says_why_and_whence(leaderboard: Path, draft) -> None:
-    old = store.load(leaderboard).scores[2]
+    old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
     path = draft("softer", factor=0.95).save(leaderboard.parent / "new")
     options = ("--supersedes", old.sha256[:8], "--reason", "a bug", "--source", "commit=9c1e5d0")
     run("add", path, *options, "--folder", leaderboard)
     accept(leaderboard)
-    run("build", "--folder", leaderboard)
+    run("build", "--folder", leaderboard, "--out", leaderboard.parent / "site")
     assert "no problems: 9 records" in run("verify", "--folder", leaderboard)
-    new = store.load(leaderboard).scores[-1]
+    new = next(x for x in store.load(leaderboard).scores if x.header.supersedes)
     assert new.header.supersedes == old.sha256
     assert new.header.provenance == {"commit": "9c1e5d0"}
-    page = (leaderboard / "entries/v1/performance/softer.html").read_text()
+    page = (leaderboard.parent / "site/entries/performance/softer.html").read_text()
     assert "<b>counts</b>: a bug" in page
     assert '<th scope="row">commit</th><td>9c1e5d0</td>' in page
     message = run("add", path, "--source", "commit", "--folder", leaderboard, code=2)
@@ -101,22 +102,10 @@ def test_a_correction_says_why_and_whence(leaderboard: Path, draft) -> None:
 
 def test_bad_input_is_explained(tmp_path: Path, full: Path) -> None:
     assert "holds no record" in run("show", "--folder", tmp_path, code=2)
-    assert "has no version 9; there are 1" in run("show", "--version", 9, "--folder", full, code=2)
+    refused = run("show", "--lung", "R1C1", "--folder", full, code=2)
+    assert "--lung R1C1: the board has R5C10" in refused
     (tmp_path / "x.json").write_text("{}\n")
     assert "field `kind`" in run("add", tmp_path / "x.json", "--folder", tmp_path, code=2)
-
-
-def test_score_keeps_a_record_that_can_be_added(tmp_path: Path) -> None:
-    folder = tmp_path / "board"
-    arguments = ["score", "pid_robust", "--in-process", "--draws", "20", "--record"]
-    found = RUN.invoke(app, [*arguments, str(tmp_path / "records")])
-    assert found.exit_code == 0, found.output
-    (path,) = (tmp_path / "records").glob("*.json")
-    assert path.name in found.output
-    assert "added pid_robust (robustness)" in run("add", path, "--folder", folder)
-    refused = RUN.invoke(app, ["score", "pid_robust", "--record", str(tmp_path / "other")])
-    assert "add --draws 20" in str(refused.exception)
-    assert not (tmp_path / "other").exists()
 
 
 def test_whose_each_record_is(leaderboard: Path, tmp_path: Path) -> None:
@@ -146,7 +135,9 @@ def test_without_the_extra_the_board_is_shown_and_a_page_says_what_it_needs(
         monkeypatch.setitem(sys.modules, missing, None)
     name = store.load(leaderboard).scores[0].name
     assert name in run("show", "--folder", leaderboard)
-    assert "need jinja2: install ventbench[view]" in run("build", "--folder", leaderboard, code=2)
+    assert "need jinja2: install ventbench[view]" in run(
+        "build", "--folder", leaderboard, "--out", leaderboard.parent, code=2
+    )
 
 
 def test_tables_fit_80_columns(full: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,11 +147,11 @@ def test_tables_fit_80_columns(full: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert max(map(len, text.splitlines())) <= 80
     for track in frames.load_tracks(full):
         for status, row in track.rows:
-            if status == "ranked" and row.score is not None:
-                own = row.score
+            if status == "ranked" and row.normalised is not None:
+                own = row.normalised.score
                 line = next(x for x in text.splitlines() if row.record.sha256[:8] in x)
                 assert row.record.name in line
-                assert f"{own.low:.3f}..{own.high:.3f}" in line
+                assert f"{own.low:.1f} to {own.high:.1f}" in line
     assert "…" not in text
     assert "broken: not ranked" in text or "broken: not official" in text
 

@@ -6,26 +6,31 @@ import dataclasses
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
-from ventbench import draws, environment, files, precision, protocol
-from ventbench.board import actions, create, ranking, record
+from ventbench import draws as draw_tables
+from ventbench import files, precision, protocol
+from ventbench.board import actions, create, ranking, record, schema
 from ventbench.board.record import Record
 from ventbench.errors import InputError
 
-from ..textbook import Textbook
+from ..textbook_rigs import TextbookRigs
 from .conftest import SANDBOX, opened
 
 
 def test_a_record_says_where_it_comes_from(drafts, scores) -> None:
     content = json.loads(drafts["pid_best"].content)
-    assert content["protocol"] == protocol.VERSION
+    assert (content["format"], content["protocol"]) == (schema.FORMAT, schema.PROTOCOL)
     assert content["official"] is True
     assert content["sandbox"] == SANDBOX
-    assert content["draws"] == {"version": 1, "sha256": draws.SHA256, "count": 20}
-    assert content["simulators"]["manifest_sha256"] == "0" * 64
-    root = Path(draws.__file__).parents[1]
+    seed = draw_tables.commitment(draw_tables.DEVELOPMENT_SEED)
+    assert content["draws"] == {
+        "version": 2, "sha256": seed, "count": 20, "season": "development",
+    }  # fmt: skip
+    assert content["simulators"]["manifest_sha256"] == "2" * 64
+    root = Path(draw_tables.__file__).parents[1]
     assert content["versions"]["requirements.lock"] == files.sha256(root / "requirements.lock")
     assert {"python", "jax", "numpy"} <= content["versions"].keys()
     machine = content["machine"]
@@ -63,15 +68,17 @@ def test_replay_agrees_with_the_scorer(drafts, scores) -> None:
     assert highest == pytest.approx(peaks, abs=0.0051)
 
 
-def test_spread_is_the_deviation_of_the_ensemble(drafts, scores, simulators: Textbook) -> None:
+def test_spread_is_the_deviation_of_the_ensemble(drafts, scores, simulators: TextbookRigs) -> None:
     from ventbench.plants.stacking import take
-    from ventbench.submissions.stepping import replay
+    from ventbench.submissions.stepping import as_float64, replay
 
     pressures = []
     with precision.float64():
-        for member in range(3):
-            plants = take(simulators.ensemble, member)
-            cells = environment.nominal_scenario(protocol.PIPS)
+        for member in range(2):
+            plants = as_float64(take(simulators.ensemble, member), 6)
+            plants = jax.tree.map(lambda leaf: leaf[:, None], plants)
+            cells, _, _ = draw_tables.with_nominal(None, [0] * 6, protocol.PIPS)
+            cells = jax.tree.map(lambda leaf: leaf[:, 0], cells)
             inspired, _ = replay(plants, cells, scores["pid_best"].requested[:, 0])
             pressures.append(np.asarray(inspired.pressure)[:, :, protocol.SCORED_BREATHS, :])
     expected = np.std(pressures, axis=0, ddof=1).mean(axis=(-2, -1))
@@ -91,13 +98,13 @@ def test_every_failure_is_there(draft) -> None:
     assert len(first) < 400
 
 
-def test_an_incomplete_score_makes_no_record(scores, simulators: Textbook) -> None:
+def test_an_incomplete_score_makes_no_record(scores, simulators: TextbookRigs) -> None:
     score = dataclasses.replace(scores["pid_best"], drawn=scores["pid_best"].drawn[:3])
     with pytest.raises(InputError, match="--draws 20"):
         create.create(score, simulators)
 
 
-def test_a_wrong_score_makes_no_record(scores, simulators: Textbook) -> None:
+def test_a_wrong_score_makes_no_record(scores, simulators: TextbookRigs) -> None:
     score = dataclasses.replace(scores["pid_best"], nominal=scores["pid_best"].nominal * 0.999)
     with pytest.raises(InputError, match=r"does not replay: key errors\.nominal"):
         create.create(score, simulators)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ventbench.board import build, canonical, create, ranking, replay, store
+from ventbench.board import canonical, create, ranking, replay, store
 from ventbench.board.verify import verify
 from ventbench.cli import app
 from ventbench.errors import InputError
@@ -27,6 +27,7 @@ def _lowered(made: create.Draft, by: float) -> create.Draft:
     values = json.loads(made.content)
     values["errors"] = lower(values["errors"]["nominal"]), lower(values["errors"]["drawn"])
     values["errors"] = dict(zip(("nominal", "drawn"), values["errors"], strict=True))
+    values["headroom"]["error"] = lower(values["headroom"]["error"])
     return create.Draft(canonical.canonical(values), made.commands)
 
 
@@ -35,15 +36,15 @@ def test_errors_lowered_within_tolerance_are_refused(tmp_path: Path, drafts, sim
     honest = opened(drafts["softer"])
     assert np.all(np.abs(opened(forged).drawn - honest.drawn) < replay.TOLERANCE)
     both = [opened(forged), honest]
-    ranks = ranking.places(both, [score.ranked_values for score in both])
-    assert ranks == [1, 2], "control: it leads"
+    ranks = ranking.ranges_of(both, [score.ranked_values for score in both])
+    assert ranks == [(1, 1), (2, 2)], "control: it leads"
     with pytest.raises(InputError, match=r"key errors\.drawn, mean over cells"):
         put(tmp_path / "board", forged, simulators)
     put(tmp_path / "board", forged)  # as an owner without scruples does
-    build.build(tmp_path / "board")
-    nominal, drawn = verify(tmp_path / "board", lambda version: simulators).problems
+    nominal, drawn, ranked = verify(tmp_path / "board", lambda: simulators).problems
     assert "key errors.nominal, mean over cells" in nominal
     assert "key errors.drawn, mean over cells" in drawn
+    assert "key headroom.error, mean over cells" in ranked
 
 
 def test_replayed_errors_rank(tmp_path: Path, drafts, draft, simulators, monkeypatch) -> None:
@@ -53,28 +54,26 @@ def test_replayed_errors_rank(tmp_path: Path, drafts, draft, simulators, monkeyp
     monkeypatch.setattr(replay, "MEAN_TOLERANCE", 1.0)
     put(folder, drafts["softer"], simulators)
     put(folder, _lowered(twin, 9e-10), simulators)
-    build.build(folder)
-    (problem,) = verify(folder, lambda version: simulators).problems
+    (problem,) = verify(folder, lambda: simulators).problems
     assert "(softer): ranks 2 on the performance track by its recorded errors, 1 by" in problem
 
 
 def test_the_lung_is_not_known_before_it_shows(
     leaderboard: Path, draft, simulators, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Robustness: the first observation of a draw and PIP is the same on all lungs."""
+    """Robustness: the first observation of a nominal run is the same on all lungs."""
 
     def by_lung(requested: np.ndarray) -> None:
-        requested[3, 5, 2, 0, 0] += 1e-3
+        requested[3, 0, 2, 0, 0] += 1e-3
 
     with monkeypatch.context() as patched:
         patched.setattr(replay, "lung_leaks", lambda *_: [])
         leaky = draft("leaky", "pid_robust", change=by_lung)
         record = put(leaderboard, leaky, simulators)  # control: nothing else sees it
-        build.build(leaderboard)
-        assert verify(leaderboard, lambda version: simulators).problems == []
-    (problem,) = verify(leaderboard, lambda version: simulators).problems
+        assert verify(leaderboard, lambda: simulators).problems == []
+    (problem,) = verify(leaderboard, lambda: simulators).problems
     assert record.sha256 in problem
-    assert "key actions: in draw 5 at PIP 20 the first command" in problem
+    assert "key actions: in the nominal run at PIP 20 the first command" in problem
     with pytest.raises(InputError, match="the lung was known"):
         put(leaderboard.parent / "other", leaky, simulators)
     with pytest.raises(InputError, match="the lung was known"):
@@ -84,8 +83,8 @@ def test_the_lung_is_not_known_before_it_shows(
 
 def test_later_commands_and_failed_runs_may_differ(draft) -> None:
     def later(requested: np.ndarray) -> None:
-        requested[3, 5, 2, 0, 1] += 1.0
-        requested[3, 5, 2, 1, 0] += 1.0
+        requested[3, 0, 2, 0, 1] += 1.0
+        requested[3, 0, 2, 1, 0] += 1.0
 
     draft("later", "pid_robust", change=later)
     failed = opened(draft("fails", "pid_robust", failed=2))
@@ -103,9 +102,8 @@ def test_the_terminal_gets_no_commands(leaderboard: Path, drafts, monkeypatch) -
     assert not {"\x1b", "\x07", "\x9b", "\u202e"} & set(shown.output)
     assert "[red]bug" in shown.output
     (leaderboard / "\x1b[2Jx.html").write_text("x")
-    build.build(leaderboard)
     arguments[1] = "verify"
-    monkeypatch.setattr("ventbench.plants.frozen.load", lambda version=1, path=None: None)
+    monkeypatch.setattr("ventbench.plants.frozen.load", lambda path=None: None)
     checked = CliRunner().invoke(app, arguments)
     assert checked.exit_code == 1
     assert "\x1b" not in checked.output

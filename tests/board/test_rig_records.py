@@ -1,68 +1,36 @@
-"""Records and boards of protocol version 2: rigs, normalised scores, shared ranks, seasons."""
+"""Rigs, normalised scores, shared ranks, stress, and who vouches for what has a rank."""
 
 import dataclasses
 import json
-import runpy
 import shutil
-from types import SimpleNamespace
 
-import msgspec
 import numpy as np
 import pytest
-from ventbench.submissions.rig_scoring import run_on_rigs
 
-from ventbench import protocol, rig_draws, seasons
+from ventbench import draws as draw_tables
+from ventbench import protocol
 from ventbench.board import (
     build,
     canonical,
     create,
     frames,
+    pages,
     ranking,
-    record,
-    rerun,
     store,
-    stress_table,
     verify,
 )
-from ventbench.board.replay import differences, draws_of, replay
+from ventbench.board.replay import differences, replay
 from ventbench.errors import InputError
-from ventbench.headroom import reference as references
-from ventbench.plants import frozen
 from ventbench.stress.results import DRAWS, pip_columns
 from ventbench.stress.score import StressScore
 from ventbench.stress.stressors import conditions
-from ventbench.submissions.folder import open_submission, resolve
 
-from ..textbook_rigs import TextbookRigs
-from .conftest import NOW, SANDBOX, accept, entry_folder, opened, put
+from .conftest import SANDBOX, accept, opened, put
 
 
 @pytest.fixture(scope="module")
-def rigs():
-    return TextbookRigs()
-
-
-@pytest.fixture(scope="module")
-def reference(rigs):
-    """The PID's true errors, and a tenth of them as what is attainable."""
-    own = rigs.scored()
-    drawn = own.draws(rig_draws.COUNT)
-    controller = runpy.run_path(str(resolve("pid_robust") / "controller.py"))
-    gains = np.tile(controller["GAINS"], (6, 1))
-    plants, cells = own.cells(drawn, protocol.PIPS)
-    pid = references.pid_errors(plants, cells, gains)
-    about = references.settings(own.about, drawn.about())
-    zero = np.zeros((*pid.shape, 33))
-    return references.Reference(about, gains, 0.1 * pid, 0.1 * pid, 0.0 * pid, pid, zero)
-
-
-@pytest.fixture(scope="module")
-def score(rigs, reference):
-    made = run_on_rigs(
-        open_submission("pid_robust"), rigs.scored(), draws=rig_draws.COUNT, reference=reference
-    )
-    official = frozen.load(version=2).manifest_sha256
-    return dataclasses.replace(made, sandbox=SANDBOX, frozen_sha256=official)
+def score(scores):
+    return scores["pid_robust"]
 
 
 @pytest.fixture(scope="module")
@@ -103,66 +71,56 @@ def stressed():
 
 
 @pytest.fixture(scope="module")
-def draft(rigs, score, stressed, tmp_path_factory):
-    """Make a record: the commands of the PID times a factor on some draws, under any name."""
+def drafts(draft, stressed):
+    """The PID, one that is better, one that is better in some draws only, and none at all."""
 
-    def make(name, factor=1.0, draws=slice(None), stress=None):
-        folder = entry_folder(tmp_path_factory.mktemp("rig") / name, "pid_robust", name)
-        manifest = dataclasses.replace(score.submission.manifest, name=name)
-        entry = dataclasses.replace(
-            score.submission, label=str(folder), folder=folder, manifest=manifest,
-            sha256=create.combined_hash(create.file_hashes(folder)),
-        )  # fmt: skip
-        requested = score.requested.copy()
-        requested[:, draws] *= factor
-        (found,) = replay(rigs, score.pips, [requested], score.rig_draws)
-        varied = dataclasses.replace(
-            score, submission=entry, requested=requested, nominal=found.nominal,
-            drawn=found.drawn, safe=found.safe, peak=found.peak.max(axis=(0, 2)),
-            controllable=np.moveaxis(np.asarray(found.controllable), 0, 1),
-        )  # fmt: skip
-        own = None if stress is None else stressed(varied, *stress)
-        return create.create(varied, rigs, stress=own, now=NOW)
+    def scaled(factor, draws=slice(None)):
+        def change(requested):
+            requested[:, draws] *= factor
 
-    return make
+        return change
 
+    def made(name, change=None, stress=None):
+        own = None if stress is None else lambda score: stressed(score, *stress)
+        return draft(name, "pid_robust", change=change, stress=own)
 
-@pytest.fixture(scope="module")
-def drafts(draft):
     return {
-        "pid_robust": draft("pid_robust", stress=(2.0,)),
-        "softer": draft("softer", 0.8, stress=(1.0,)),
-        # Better than the PID in some draws and worse in the others.
-        "uneven": draft("uneven", 0.97, slice(1, 11), stress=(1.02, 0.2)),
-        "zero": draft("zero", 0.0),
+        "pid_robust": made("pid_robust", stress=(2.0,)),
+        "softer": made("softer", scaled(1.2), stress=(1.0,)),
+        "uneven": made("uneven", scaled(0.97, slice(1, 11)), stress=(1.02, 0.2)),
+        "zero": made("zero", scaled(0.0)),
     }
 
 
 @pytest.fixture(scope="module")
-def board(drafts, rigs, tmp_path_factory):
+def board(drafts, simulators, tmp_path_factory):
     folder = tmp_path_factory.mktemp("rigs") / "leaderboard"
     for made in drafts.values():
-        put(folder, made, rigs)
-    build.build(folder)
+        put(folder, made, simulators)
     return folder
+
+
+@pytest.fixture(scope="module")
+def built(board, tmp_path_factory):
+    pytest.importorskip("jinja2", reason="needs the extra ventbench[view]")
+    out = tmp_path_factory.mktemp("built")
+    build.build(board, out)
+    return out
 
 
 def test_a_record_holds_rigs_and_normalised_scores(drafts, score):
     record = opened(drafts["pid_robust"])
-    assert record.version == 2
     assert record.header.draws.season == "development"
-    assert record.headroom is not None
     np.testing.assert_array_equal(record.headroom.session, score.rig_draws.rig)
     # It is the PID by which the scale was made.
     np.testing.assert_allclose(record.headroom.normalised, 100.0, atol=1e-6)
-    assert record.ranked_values.shape == (6, rig_draws.COUNT)
+    assert record.ranked_values.shape == (6, draw_tables.COUNT)
 
 
-def test_replay_finds_a_changed_normalised_error(drafts, rigs, score):
+def test_replay_finds_a_changed_normalised_error(drafts, simulators, score):
     record = opened(drafts["pid_robust"])
-    (found,) = replay(rigs, record.pips, [score.requested], score.rig_draws)
+    (found,) = replay(simulators, record.pips, [score.requested], score.rig_draws)
     assert differences(record, found) == []
-    assert record.headroom is not None
     better = dataclasses.replace(record.headroom, error=record.headroom.error - 1e-6)
     changed = dataclasses.replace(record, headroom=better)
     assert any("headroom.error" in text for text in differences(changed, found))
@@ -171,12 +129,11 @@ def test_replay_finds_a_changed_normalised_error(drafts, rigs, score):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda v: v.pop("rigs"), "key rigs: belongs to protocol version 2"),
-        (lambda v: v.pop("headroom"), "key headroom: belongs to protocol version 2"),
-        (lambda v: v.update(protocol=1), "belongs to protocol version 2 and no other"),
+        (lambda v: v.pop("rigs"), "missing required field `rigs`"),
+        (lambda v: v.pop("headroom"), "missing required field `headroom`"),
         (lambda v: v["rigs"]["session"].pop(), "key rigs.session: does not have the shape"),
         (lambda v: v["headroom"]["pid"].pop(), "key headroom.pid: does not have the shape"),
-        (lambda v: v["draws"].pop("season"), "key draws.season"),
+        (lambda v: v["draws"].pop("season"), "missing required field `season`"),
     ],
 )
 def test_schema_names_what_is_wrong(drafts, change, message):
@@ -188,9 +145,9 @@ def test_schema_names_what_is_wrong(drafts, change, message):
 
 
 def test_a_rank_counts_the_entries_that_are_better_beyond_doubt(board):
-    (track,) = (x for x in frames.load_tracks(board, version=2) if x.name == "robustness")
+    (track,) = frames.load_tracks(board, track="robustness")
     records = [row.record for row in track.ranked]
-    means = ranking._resampled(records, [r.ranked_values for r in records])
+    means = np.stack([ranking._resampled(r, r.ranked_values) for r in records])
     for row, own in zip(track.ranked, means, strict=True):
         limits = [np.quantile(own - other, (0.025, 0.975)) for other in means]
         better = sum(low > 1e-9 for low, _ in limits)
@@ -213,25 +170,25 @@ def test_ranks_that_are_not_transitive():
     assert ranking.rank_ranges(means) == [(1, 2), (1, 3), (2, 3)]
 
 
-def test_stress_is_ranked_and_shown(board):
-    (track,) = (x for x in frames.load_tracks(board, version=2) if x.name == "robustness")
-    rows = stress_table.rows(track)
+def test_stress_is_ranked_and_shown(board, built):
+    (track,) = frames.load_tracks(board, track="robustness")
+    rows = track.stress
     assert [row.name for row in rows] == ["softer", "uneven", "pid_robust"]
     # Two differ by one number in all runs, the third only in noise.
     assert [row.ranks for row in rows] == [(1, 2), (1, 2), (3, 3)]
     assert rows[0].score is not None
     assert rows[0].score.value == pytest.approx(rows[0].tables.error[1:].mean())
-    groups = stress_table.chart(rows)
+    groups = pages.stress_chart(rows)
     fields = [field for group in groups for row in group["rows"] for field in row["fields"]]
     assert sum(field is not None for field in fields) == 3 * (len(conditions()) - 1)
-    page = (board / "index.html").read_text()
+    page = (built / "index.html").read_text()
     assert "Stressor by severity" in page
     for row in rows:
         assert row.score is not None
-        own = (board / f"entries/v2/robustness/{row.name}.html").read_text()
+        own = (built / f"entries/robustness/{row.name}.html").read_text()
         assert f"{row.score.value:.2f}" in own
         assert f"{row.score.value:.2f}" in page
-    assert "Stressor" not in (board / "entries/v2/robustness/zero.html").read_text()
+    assert "Stressor" not in (built / "entries/robustness/zero.html").read_text()
     table = frames.load_board(board, track="robustness").set_index("name")
     assert table.stress_cmH2O["softer"] == pytest.approx(rows[0].score.value)
     assert np.isnan(table.stress_cmH2O["zero"])
@@ -264,42 +221,41 @@ def test_a_second_stress_run_is_compared(drafts, stressed, score):
     recorded = opened(drafts["softer"]).stress
     assert recorded is not None
     again = stressed(score, 1.0)
-    assert rerun.stress_difference(recorded, again) == ""
+    assert verify.stress_difference(recorded, again) == ""
     for key, text in (("error", "stress.errors"), ("volume", "stress.volume_mL")):
         moved = dataclasses.replace(again, **{key: getattr(again, key) + 2.0})
-        assert rerun.stress_difference(recorded, moved).startswith(text)
+        assert verify.stress_difference(recorded, moved).startswith(text)
     newer = dataclasses.replace(recorded, stressors=recorded.stressors + 1)
-    assert "stressors are version" in rerun.stress_difference(newer, again)
+    assert "stressors are version" in verify.stress_difference(newer, again)
 
 
-def test_a_record_takes_no_stress_score_of_another_submission(rigs, score, stressed):
+def test_a_record_takes_no_stress_score_of_another_submission(simulators, score, stressed):
     stress = stressed(score, 1.0)
     entry = dataclasses.replace(stress.submission, sha256="0" * 64)
     with pytest.raises(InputError, match="changed between"):
-        create.create(score, rigs, stress=dataclasses.replace(stress, submission=entry))
+        create.create(score, simulators, stress=dataclasses.replace(stress, submission=entry))
     few = dataclasses.replace(stress, conditions=stress.conditions[:5], error=stress.error[:5])
     with pytest.raises(InputError, match="all conditions and draws"):
-        create.create(score, rigs, stress=few)
+        create.create(score, simulators, stress=few)
     home = dataclasses.replace(stress, sandbox=None)
     with pytest.raises(InputError, match="full sandbox"):
-        create.create(score, rigs, stress=home)
+        create.create(score, simulators, stress=home)
 
 
-def test_everything_verifies(board, rigs, reference, monkeypatch):
-    monkeypatch.setattr(verify, "published", lambda: reference)
-    report = verify.verify(board, lambda version: rigs)
+def test_everything_verifies(board, simulators):
+    report = verify.verify(board, lambda: simulators)
     assert report.problems == []
     assert report.replayed == 4
 
 
-def test_a_lowered_bound_is_found(board, rigs, reference, monkeypatch):
+def test_a_lowered_bound_is_found(board, simulators, reference, monkeypatch):
     lower = dataclasses.replace(reference, pid=reference.pid + 1e-6)
     monkeypatch.setattr(verify, "published", lambda: lower)
-    problems = verify.verify(board, lambda version: rigs).problems
+    problems = verify.verify(board, lambda: simulators).problems
     assert sum("headroom.pid: not the published reference errors" in text for text in problems) == 4
 
 
-def test_references_must_be_common(board, drafts, rigs, tmp_path):
+def test_references_must_be_common(board, drafts, tmp_path):
     folder = shutil.copytree(board, tmp_path / "leaderboard")
     value = json.loads(drafts["softer"].content)
     value["headroom"]["attainable"][0][0][0] += 0.001
@@ -309,22 +265,22 @@ def test_references_must_be_common(board, drafts, rigs, tmp_path):
         store.add(folder, made.save(tmp_path / "drafts"))
 
 
-def test_pages_show_both_scores(board):
-    index = (board / "index.html").read_text("utf-8")
+def test_pages_show_both_scores(built):
+    index = (built / "index.html").read_text("utf-8")
     assert "Normalised" in index
-    assert "development draws" in index
-    page = (board / "entries/v2/robustness/softer.html").read_text("utf-8")
+    assert "Practice: the draws are published" in index
+    page = (built / "entries/robustness/softer.html").read_text("utf-8")
     assert "Normalised score over the draws" in page
-    assert "--protocol 2" in page
+    assert "--protocol" not in page
 
 
 def test_frames_and_cells(board):
-    frame = frames.load_board(board, version=2)
+    frame = frames.load_board(board)
     row = frame[frame["name"] == "pid_robust"].iloc[0]
     assert row["normalised"] == pytest.approx(100.0)
     assert row["normalised_R20C50"] == pytest.approx(100.0)
-    assert row["season"] == "development"
-    record = frames.load_tracks(board, version=2)[1].ranked[0].record
+    assert row["draws"] == "development"
+    record = frames.load_tracks(board)[1].ranked[0].record
     by_lung, by_pip = frames.cell_means(record, "all"), frames.cell_means(record, "R5C10")
     assert list(by_lung) == [*record.lungs, "mean"]
     assert by_pip["mean"] == pytest.approx(by_lung["R5C10"])
@@ -332,44 +288,9 @@ def test_frames_and_cells(board):
         frames.cell_means(record, "R1C1")
 
 
-def test_hidden_draws_need_the_seed_of_their_season(drafts, rigs):
-    header = opened(drafts["softer"]).header
-    seed = bytes(range(32))
-    about = {"season": "2027", "sha256": seasons.commitment(seed), "count": 20, "version": 2}
-    draws = type(header.draws)(**about)
-    hidden = msgspec.structs.replace(header, draws=draws)
-    with pytest.raises(InputError, match="season 2027 is not revealed"):
-        draws_of(hidden, rigs)
-    with pytest.raises(InputError, match="not the draws of the seed"):
-        draws_of(hidden, rigs, bytes(32))
-    found = draws_of(hidden, rigs, seed)
-    assert found is not None
-    assert found.about() == about
-
-
 def test_accepting_is_what_ranks(board, tmp_path):
     folder = shutil.copytree(board, tmp_path / "leaderboard")
-    (folder / "accepted.toml").unlink()
-    assert not frames.load_tracks(folder, version=2)[1].ranked
+    (folder / canonical.ATTESTATIONS).unlink()
+    assert not frames.load_tracks(folder)[1].ranked
     accept(folder)
-    assert len(frames.load_tracks(folder, version=2)[1].ranked) == 4
-
-
-def test_a_record_that_nobody_vouches_for_clears_no_board(drafts):
-    """The board shows the season of the newest official record, not of whatever came last."""
-    of_season, later = opened(drafts["softer"]), opened(drafts["zero"])
-    draws = type(later.header.draws)(season="2027", sha256="a" * 64, count=20, version=2)
-    header = msgspec.structs.replace(of_season.header, draws=draws)
-    hidden = dataclasses.replace(of_season, header=header)
-    inside = record.Sealed("b" * 64, SimpleNamespace(record=hidden.sha256))  # type: ignore[arg-type]
-
-    def shown(records, attested):
-        return [x.record.name for x in ranking.standings(records, attested)[2]["robustness"].ranked]
-
-    both = {hidden.sha256, later.sha256}
-    assert shown([inside, hidden, later], {hidden.sha256}) == ["softer"]
-    assert shown([inside, hidden, later], both) == ["softer"], (
-        "hidden draws rank, where there are some"
-    )
-    assert shown([later, inside, hidden], both) == ["softer"]
-    assert shown([later], both) == ["zero"]
+    assert len(frames.load_tracks(folder)[1].ranked) == 4

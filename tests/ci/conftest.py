@@ -8,11 +8,14 @@ import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from ventbench import draws as draw_tables
+from ventbench.headroom.reference import Reference, settings
 from ventbench.submissions.scaffold import contents
 
-from ..textbook import Textbook
+from ..textbook_rigs import TextbookRigs
 
 IDENTITY = {
     "GIT_AUTHOR_NAME": "A. Name",
@@ -101,5 +104,16 @@ def demo() -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="session")
-def simulators() -> Textbook:
-    return Textbook()
+def simulators() -> TextbookRigs:
+    return TextbookRigs()
+
+
+@pytest.fixture(scope="session")
+def reference(simulators: TextbookRigs) -> Reference:
+    """Reference errors of the textbook rigs: 0 and 1 cmH2O everywhere."""
+    own = simulators.scored()
+    drawn = own.draws(draw_tables.COUNT)
+    about = settings(own.about, drawn.about())
+    none = np.zeros((6, 1 + draw_tables.COUNT, 6))
+    gains, commands = np.zeros((6, 3)), np.zeros((*none.shape, 33))
+    return Reference(about, gains, none, none, none, none + 1.0, commands)

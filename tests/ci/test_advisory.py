@@ -13,7 +13,7 @@ from .conftest import PATH
 def advise(repository, simulators):
     def run(commit, runner=None):
         pull = repository.url, repository.base, commit
-        return advisory.advise(*pull, "demo", simulators.plants, runner or SandboxRunner())
+        return advisory.advise(*pull, "demo", simulators.scored(), runner or SandboxRunner())
 
     return run
 

@@ -8,7 +8,7 @@ import pytest
 from ci import official, propose, publish, workflow
 from ci.git import Git, GitError, environment
 from ci.take import TakeError, take
-from ventbench.board import attestation, canonical, record, store
+from ventbench.board import attestation, build, canonical, record, store
 from ventbench.errors import InputError
 from ventbench.sandbox.runner import SandboxRunner
 from ventbench.submissions.runner import InProcessRunner
@@ -30,13 +30,14 @@ def checked_out(repository, folder):
 @pytest.mark.parametrize(
     "runner", [InProcessRunner, pytest.param(SandboxRunner, marks=pytest.mark.slow)]
 )
-def test_from_a_commit_to_the_pages(repository, simulators, tmp_path, runner):
+def test_from_a_commit_to_the_pages(repository, simulators, reference, tmp_path, runner):
     """Everything in one, as scoring takes its time."""
     files = {f"{PATH}/{name}": content for name, content in contents("demo", "pid").items()}
     commit = repository.commit(files, repository.base)
     taken = take(repository.url, repository.base, commit, "demo", tmp_path / "taken")
     out, wanted = tmp_path / "records", "robustness"
-    lines = official.score_taken(taken, repository.url, wanted, simulators, runner(), out)
+    given = (taken, repository.url, wanted, simulators, runner(), out)
+    lines = official.score_taken(*given, reference)
     path = check_record(repository, commit, out, lines)
 
     leaderboard = checked_out(repository, tmp_path / "checkout") / "leaderboard"
@@ -79,7 +80,7 @@ def check_scored_again(path, folder, leaderboard, simulators, added):
         (folder / other.name).write_bytes(other.read_bytes())
     secret = "01" * 32
     public = attestation._private(secret).public_key().public_bytes_raw()
-    (leaderboard / "keys.toml").write_text(
+    (leaderboard / "attestations.toml").write_text(
         f'[[keys]]\nid = "{attestation.key_id(public)}"\npublic = "{public.hex()}"\n'
         'added = 2026-11-23\nholder = "a test"\n'
     )
@@ -112,11 +113,14 @@ def check_branch_and_pages(checkout, added):
     assert all(path.startswith("leaderboard/") for path in changed)
     assert git.text("status", "--porcelain") == ""
     head = git.text("rev-parse", "HEAD")
-    pages = publish.pages(git, head)
+    site = checkout.parent / "site"
+    build.build(checkout / "leaderboard", site)
+    pages = publish.pages(git, head, site)
     assert pages is not None
     listed = set(git.text("ls-tree", "-r", "--name-only", pages).splitlines())
-    assert listed == {path.removeprefix("leaderboard/") for path in changed} | {".nojekyll"}
-    assert publish.pages(git, head, pages) is None, "nothing new"
+    built = {"index.html", "leaderboard.csv", "entries/robustness/demo.html", ".nojekyll"}
+    assert listed == {path.removeprefix("leaderboard/") for path in changed} | built
+    assert publish.pages(git, head, site, pages) is None, "nothing new"
 
 
 def test_downloads_that_are_no_records(tmp_path):

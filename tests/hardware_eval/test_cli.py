@@ -16,7 +16,7 @@ from hardware_eval import cli
 from hardware_eval.results import evaluate
 from hardware_eval.results.evaluate import Line
 from ventbench.board import record
-from ventbench.board.hardware import HardwareRecord
+from ventbench.board.record import HardwareRecord
 from ventbench.errors import InputError
 
 MANUAL = Path(cli.__file__).parent / "README.md"

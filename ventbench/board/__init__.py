@@ -1,17 +1,16 @@
-"""The leaderboard: immutable records, a chain over them, pages built from nothing else.
+"""The leaderboard: immutable records, ranks, and pages built from nothing else.
 
-- :mod:`~ventbench.board.canonical`: the one text of a JSON value, and its hash;
+- :mod:`~ventbench.board.canonical`: the one text of a JSON value, its hash, and file names;
 - :mod:`~ventbench.board.schema`: what a record's JSON must look like;
 - :mod:`~ventbench.board.record`: a record as arrays; :mod:`~ventbench.board.create` makes one;
 - :mod:`~ventbench.board.actions`: every command of a scored run, without loss;
 - :mod:`~ventbench.board.replay`: recorded commands through the frozen simulators again;
-- :mod:`~ventbench.board.store`: the folder ``leaderboard/`` and its chain;
-- :mod:`~ventbench.board.layout`: which files it may hold;
+- :mod:`~ventbench.board.store`: the folder ``leaderboard/``;
 - :mod:`~ventbench.board.attestation`: signatures of records, and who may sign;
-- :mod:`~ventbench.board.rerun`: the code of records once more in the sandbox;
 - :mod:`~ventbench.board.ranking`: which record of an entry counts, ranks, intervals, differences;
-- :mod:`~ventbench.board.frames`: the board as CSV and as pandas frames;
-- :mod:`~ventbench.board.build`: CSV and pages; :mod:`~ventbench.board.verify`: everything again.
+- :mod:`~ventbench.board.frames`: the columns of the board, its CSV and pandas frames;
+- :mod:`~ventbench.board.build`: the site, with :mod:`~ventbench.board.pages`;
+- :mod:`~ventbench.board.verify`: everything again, and the code of records, too.
 
 :func:`load_board` and :func:`load_cells` give the board as pandas frames.
 """

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench import protocol
-from ventbench.board import canonical, layout
+from ventbench.board import canonical
 from ventbench.errors import InputError
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 ENCODING = "zlib, byte planes of little-endian float64"
 
 #: End of the file's name, after its SHA-256.
-SUFFIX = layout.ACTIONS_SUFFIX
+SUFFIX = canonical.ACTIONS_SUFFIX
 
 #: Largest file, bytes: float64 noise does not compress, but hardly grows.
 MAX_BYTES = 2_000_000

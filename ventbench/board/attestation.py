@@ -1,13 +1,13 @@
-"""Who vouches for a record: a signature of the scoring workflow, or the maintainers' list.
+"""Who vouches for a record: a signature of the scoring workflow, or an official second run.
 
 Replay proves that a record's errors follow from its commands, and nothing about who computed the
-commands. A record counts as official only if
+commands. No record is ranked, simulated, stressed or measured, unless
 
-- ``records/HASH.sig`` holds an Ed25519 signature over its hash by a key of ``keys.toml``, or
-- ``accepted.toml`` names it, with a reason and a date: records from before there were signatures.
+- ``records/HASH.sig`` holds an Ed25519 signature over its hash by a key of the leaderboard, or
+- the maintainers name it among the official second runs, with what they saw and a date.
 
-Both lists are changed by reviewed commits alone. The signature is made in a job that has run no
-code of a submission; see ``ci/propose.py``.
+Keys and second runs stand in ``attestations.toml``, which reviewed commits alone change. The
+signature is made in a job that has run no code of a submission; see ``ci/propose.py``.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import tomllib
 from collections.abc import Collection
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
 from ventbench import files
 from ventbench.board import canonical, schema
-from ventbench.board.layout import ACCEPTED, KEYS, RECORDS, SIGNATURE_SUFFIX
+from ventbench.board.canonical import ATTESTATIONS, RECORDS, SIGNATURE_SUFFIX
 from ventbench.errors import InputError
 
 if TYPE_CHECKING:
@@ -41,15 +41,13 @@ _MAX_SIGNATURE_BYTES, _MAX_LIST_BYTES = 1000, 1_000_000
 _Hex32 = Annotated[str, schema.matching("[0-9a-f]{64}")]
 _KeyId = Annotated[str, schema.matching("[0-9a-f]{16}")]
 
-T = TypeVar("T")
-
 
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A table with exactly these keys."""
 
 
 class Key(_Table, frozen=True):
-    """A public key of ``keys.toml``; ``id`` is the beginning of its SHA-256."""
+    """A public key that may sign; ``id`` is the beginning of its SHA-256."""
 
     id: _KeyId
     public: _Hex32
@@ -57,20 +55,19 @@ class Key(_Table, frozen=True):
     holder: schema.Text
 
 
-class Accepted(_Table, frozen=True):
-    """A record of ``accepted.toml`` that counts without a signature."""
+class SecondRun(_Table, frozen=True):
+    """A record whose code the maintainers ran again, and what they saw."""
 
     record: schema.Sha256
     reason: Annotated[str, msgspec.Meta(max_length=schema.MAX_TEXT, pattern=r"\S")]
     date: date
 
 
-class _Keys(_Table, frozen=True):
+class Attestations(_Table, frozen=True):
+    """Content of ``attestations.toml``."""
+
     keys: list[Key] = []
-
-
-class _AcceptedList(_Table, frozen=True):
-    records: list[Accepted] = []
+    second_runs: list[SecondRun] = []
 
 
 class _Signature(_Table, frozen=True):
@@ -86,11 +83,11 @@ def attested(folder: Path, records: Collection[str]) -> tuple[frozenset[str], li
 
     Args:
         folder: of the leaderboard.
-        records: SHA-256 of all records on its chain.
+        records: SHA-256 of all of its records.
 
     Returns:
-        Hashes of the records that are signed or accepted, and a sentence for each signature or
-        line of a list that is wrong.
+        Hashes of the records that are signed or were run again, and a sentence for each signature
+        or line of the list that is wrong.
 
     Raises:
         InputError: if there are signatures and no library to check them with.
@@ -98,23 +95,22 @@ def attested(folder: Path, records: Collection[str]) -> tuple[frozenset[str], li
     """
     vouched: set[str] = set()
     problems: list[str] = []
-    keys: dict[str, Key] = {}
-    accepted: list[Accepted] = []
+    listed, path = Attestations(), folder / ATTESTATIONS
     try:
-        keys = {key.id: key for key in _read_list(folder / KEYS, _Keys).keys}
-        accepted = _read_list(folder / ACCEPTED, _AcceptedList).records
+        listed = read_list(folder)
     except InputError as error:
         problems.append(str(error))
+    keys = {key.id: key for key in listed.keys}
     problems += [
-        f"{folder / KEYS}: key {key.id} should have the id {key_id(bytes.fromhex(key.public))}"
-        for key in keys.values()
+        f"{path}: key {key.id} should have the id {key_id(bytes.fromhex(key.public))}"
+        for key in listed.keys
         if key.id != key_id(bytes.fromhex(key.public))
     ]
-    for entry in accepted:
+    for entry in listed.second_runs:
         if entry.record in records:
             vouched.add(entry.record)
         else:
-            problems.append(f"{folder / ACCEPTED}: record {entry.record} is not on the chain")
+            problems.append(f"{path}: record {entry.record} is not there")
     for sha256 in records:
         path = signature_path(folder, sha256)
         if not path.is_file() or path.is_symlink():
@@ -148,7 +144,7 @@ def check(path: Path, sha256: str, keys: dict[str, Key]) -> None:
         raise InputError(f"{path} signs another record, {signature.record[:12]}")
     key = keys.get(signature.key)
     if key is None:
-        raise InputError(f"{path}: key {signature.key} is not in {KEYS}")
+        raise InputError(f"{path}: key {signature.key} is not in {ATTESTATIONS}")
     ed25519, invalid = _library()
     public = ed25519.Ed25519PublicKey.from_public_bytes(bytes.fromhex(key.public))
     try:
@@ -169,15 +165,16 @@ def sign(folder: Path, sha256: str, secret: str) -> Path:
         Path of the signature.
 
     Raises:
-        InputError: if the secret is not a key, its public key is not in ``keys.toml``, or there
-            is no library to sign with.
+        InputError: if the secret is not a key, its public key is not one of the leaderboard's, or
+            there is no library to sign with.
     """
     private = _private(secret)
     public = private.public_key().public_bytes_raw()
-    keys = {key.id: key for key in _read_list(folder / KEYS, _Keys).keys}
+    keys = {key.id: key for key in read_list(folder).keys}
     own = keys.get(key_id(public))
     if own is None or own.public != public.hex():
-        raise InputError(f"the public key of {SECRET}, {key_id(public)}, is not in {folder / KEYS}")
+        where = folder / ATTESTATIONS
+        raise InputError(f"the public key of {SECRET}, {key_id(public)}, is not in {where}")
     content = canonical.canonical(
         {
             "key": own.id,
@@ -194,7 +191,7 @@ def new_key() -> tuple[str, str]:
     """Make a key.
 
     Returns:
-        The secret, 64 hexadecimal digits, and the lines for ``keys.toml``.
+        The secret, 64 hexadecimal digits, and the lines for ``attestations.toml``.
 
     Raises:
         InputError: if there is no library to make one with.
@@ -244,14 +241,19 @@ def _library() -> tuple[Any, type[Exception]]:
     return ed25519, InvalidSignature
 
 
-def _read_list(path: Path, kind: type[T]) -> T:
-    """Read a TOML file; an empty list where there is none."""
+def read_list(folder: Path) -> Attestations:
+    """Read keys and second runs of a leaderboard; empty where there is no file.
+
+    Raises:
+        InputError: if it is not such a file.
+    """
+    path = folder / ATTESTATIONS
     if not path.exists():
-        return kind()
+        return Attestations()
     if path.is_symlink() or path.stat().st_size > _MAX_LIST_BYTES:
         raise InputError(f"{path} is a link, or larger than {_MAX_LIST_BYTES} bytes")
     try:
-        return msgspec.convert(tomllib.loads(path.read_text("utf-8")), kind)
+        return msgspec.convert(tomllib.loads(path.read_text("utf-8")), Attestations)
     except (ValueError, RecursionError) as error:  # not UTF-8, not TOML, or not of this form
         raise InputError(f"{path}: {error}") from None
 

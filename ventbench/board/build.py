@@ -1,39 +1,66 @@
 """CSV and pages: a pure function of the records, the same bytes at every build.
 
-The page of a version holds both tracks as sortable tables, and who is not ranked. The page of an
-entry holds figures, heat maps, traces against the PID, and how to reproduce it.
+The page of the board holds both tracks as sortable tables, and who is not ranked. The page of an
+entry holds figures, heat maps, each draw beside the PID's, traces against the PID, and how to
+reproduce it.
+
+Traces are 6 x 6 small multiples in whole numbers and short paths, since there are many. A panel is
+the nominal inspiration of the last scored breath on one lung at one PIP: pressure above, u_in
+below. Axes depend on the PIP alone, so that panels of all entries can be laid side by side. Lengths
+are in units of the panel, y downwards.
 """
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ventbench import files, protocol
-from ventbench.board import (
-    frames,
-    hardware_table,
-    layout,
-    pages,
-    plots,
-    ranking,
-    store,
-    stress_table,
-)
-from ventbench.board.hardware_table import HardwareRow
-from ventbench.board.ranking import BASELINES, Interval, Row, SealedEntry, Track
-from ventbench.board.record import Record
+from ventbench.board import canonical, frames, pages, ranking, store
+from ventbench.board.frames import Line
+from ventbench.board.ranking import BASELINES, Row, Track
+from ventbench.board.record import Floats, Record
 from ventbench.board.schema import ScoreHeader
-from ventbench.board.sealed import DECIMALS
 from ventbench.board.store import Store
 from ventbench.lungs import lung as parse_lung
 from ventbench.text import number
 
 if TYPE_CHECKING:
     import jinja2
+
+#: How many failures a page lists; the record has all.
+MAX_FAILURES = 12
+
+#: Size of the small plot of an interval; the entry's dot never touches its edge.
+INTERVAL_WIDTH, MARGIN = 120, 6
+
+#: Columns of the page's tables.
+SHOWN = [column for column in frames.COLUMNS if column.title]
+
+#: Plot of the draws: left and width of its axis, height of a row.
+PLOT_LEFT, PLOT_AXIS, PLOT_ROW = 40, 580, 14
+
+#: Limits between the shades of maps, cmH2O and points of the normalised score: the same for all
+#: entries, so that maps can be compared.
+ERROR_LIMITS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0)
+NORMALISED_LIMITS = (5.0, 15.0, 30.0, 50.0, 75.0, 100.0, 150.0, 250.0)
+DIFFERENCE_LIMITS = (0.02, 0.2, 0.7, 2.0)
+
+#: Size of a panel, left of its plots, units from one step to the next.
+WIDTH, HEIGHT = 690, 600
+LEFT, STEP = 70, 18
+
+#: Top and height of the two plots.
+TOP, PRESSURE_HEIGHT = 14, 350
+VALVE_TOP, VALVE_HEIGHT = 400, 140
+
+RIGHT = LEFT + STEP * protocol.INSPIRATION_STEPS
+VALVE_BOTTOM = VALVE_TOP + VALVE_HEIGHT
 
 
 @dataclass(frozen=True)
@@ -42,17 +69,17 @@ class Built:
 
     Attributes:
         records: how many there are.
-        pages: how many files belong to the leaderboard, CSV included.
+        files: how many pages there are, CSV included.
         changed: relative paths that were written or removed.
     """
 
     records: int
-    pages: int
+    files: int
     changed: tuple[str, ...]
 
 
 def content(leaderboard: Store) -> dict[str, bytes]:
-    """Return every built file by its path within the leaderboard's folder.
+    """Return every built file by its path.
 
     Args:
         leaderboard: all of its records.
@@ -60,93 +87,145 @@ def content(leaderboard: Store) -> dict[str, bytes]:
     Raises:
         InputError: if jinja2 is not installed.
     """
-    boards = ranking.boards(leaderboard.records, leaderboard.attested, leaderboard.breaches) or {
-        pages.CURRENT: ranking.empty(pages.CURRENT)
-    }
-    built = {"leaderboard.csv": frames.csv_text(boards).encode()}
+    tracks = ranking.board(leaderboard)
     environment = pages.environment()
-    versions = list(boards)
-    for version, tracks in boards.items():
-        page = _version_page(environment, leaderboard, version, versions, tracks)
-        built[pages.version_path(version, versions)] = page.encode()
-        for track in tracks:
-            measured = hardware_table.rows(leaderboard.records, track)
-            built.update(_entry_pages(environment, track, versions, measured))
+    built = {
+        canonical.CSV: frames.csv_text(tracks).encode(),
+        canonical.INDEX: _index(environment, leaderboard, tracks).encode(),
+    }
+    for track in tracks:
+        built.update(_entry_pages(environment, track))
     return built
 
 
-def build(folder: Path) -> Built:
-    """Bring CSV and pages up to date with the records; only files that differ are written.
+def build(folder: Path, out: Path) -> Built:
+    """Write the site of a leaderboard: pages, CSV, and the records that they link to.
 
-    Files that no build writes are left alone.
+    Only files that differ are written; pages of an earlier build that are no more are removed.
 
     Args:
         folder: of the leaderboard.
+        out: folder of the site.
 
     Raises:
-        InputError: if a record or the chain was changed, or jinja2 is not installed.
+        InputError: if a record was changed, or jinja2 is not installed.
         OSError: if a file cannot be read or written.
     """
     leaderboard = store.load(folder)
     built = content(leaderboard)
+    named = sorted(filter(canonical.named, canonical.walk(folder)[0]))
     changed = []
-    for name, text in built.items():
-        path = folder / name
+    for name, text in [*built.items(), *((name, (folder / name).read_bytes()) for name in named)]:
+        path = out / name
         if not path.is_file() or path.read_bytes() != text:
             files.write_atomically(path, lambda file, text=text: file.write(text))
             changed.append(name)
-    for name in sorted(present(folder) - built.keys()):
-        (folder / name).unlink()
-        changed.append(name)
+    for name in sorted(filter(canonical.BUILT.fullmatch, canonical.walk(out)[0])):
+        if name not in built:
+            (out / name).unlink()
+            changed.append(name)
     return Built(len(leaderboard.records), len(built), tuple(changed))
 
 
-def present(folder: Path) -> set[str]:
-    """Relative paths of the built files that are there now."""
-    return {name for name in layout.walk(folder)[0] if layout.BUILT.fullmatch(name)}
+def _index(environment: jinja2.Environment, leaderboard: Store, tracks: tuple[Track, ...]) -> str:
+    """Return the page of the board."""
+    lines = frames.lines(tracks)
+    header = lines[0].row.record.header if lines else None
+    stressed = [row for track in tracks for row in track.stress]
+    return environment.get_template("index.html.j2").render(
+        tracks=[_track(track) for track in tracks],
+        columns=SHOWN,
+        aside=[_aside(line) for line in lines if line.status != "ranked"],
+        simulators=pages.flatten(header.simulators) if header else [],
+        draws=header.draws if header else None,
+        stress=[pages.stress_shown(row) for row in stressed],
+        chart=pages.stress_chart(stressed),
+        records=len(leaderboard.records),
+        hardware=[
+            {**pages.hardware_shown(row), "track": track.name}
+            for track in tracks
+            for row in track.hardware
+        ],
+        protocol=protocol,
+    )
 
 
-#: How many failures a page lists; the record has all.
-MAX_FAILURES = 12
+def _track(track: Track) -> dict[str, Any]:
+    scores = [row.normalised.score for row in track.ranked if row.normalised is not None]
+    low = min((x.low for x in scores), default=1.0)
+    high = max((x.high for x in scores), default=1.0)
+    rows = []
+    for row in track.ranked:
+        own = pages.hardware_of(track.hardware, row.record.name)
+        rows.append(
+            {
+                "cells": [column.cell(Line(track, "ranked", row)) for column in SHOWN],
+                "path": pages.entry_path(track.name, row.record.name),
+                "baseline": row.record.name == BASELINES[track.name],
+                "plot": _plot(row, low, high),
+                "hardware": None if own is None else pages.hardware_shown(own),
+            }
+        )
+    return {"name": track.name, "title": track.name.capitalize(), "rows": rows}
 
 
-def _entry_pages(
-    environment: jinja2.Environment,
-    track: Track,
-    versions: Sequence[int],
-    measured: Sequence[HardwareRow] = (),
-) -> dict[str, bytes]:
-    """Return the pages of all entries of a track by their paths; see :func:`_version_page`."""
+def _aside(line: Line) -> dict[str, Any]:
+    """A line of the list of entries that are not ranked."""
+    return {
+        "name": line.row.record.name,
+        "track": line.track.name,
+        "path": pages.entry_path(line.track.name, line.row.record.name),
+        "score": pages.figure(line.row.error.value) if line.row.error else pages.NONE,
+        "reasons": list(line.row.entry.reasons),
+    }
+
+
+def _plot(row: Row, low: float, high: float) -> dict[str, str] | None:
+    """Positions of a score and its interval on an axis that all rows of a track share."""
+    if row.normalised is None:
+        return None
+    score = row.normalised.score
+    # A logarithm, so that one bad entry does not press all others together.
+    span = math.log(high / low) if high > low > 0.0 else 0.0
+
+    def x(value: float) -> float:
+        share = math.log(max(value, low) / low) / span if span else 0.5
+        return MARGIN + (INTERVAL_WIDTH - 2 * MARGIN) * share
+
+    left, dot, right = (x(v) for v in (score.low, score.value, score.high))
+    return {"x": f"{left:.1f}", "width": f"{max(right - left, 1.0):.1f}", "dot": f"{dot:.1f}"}
+
+
+def _entry_pages(environment: jinja2.Environment, track: Track) -> dict[str, bytes]:
+    """Return the pages of all entries of a track by their paths."""
     template = environment.get_template("entry.html.j2")
     base = track.baseline
-    other = None if base is None else plots.paths(base)
-    stressed = stress_table.rows(track)
-    made = {}
+    other = None if base is None else paths(base)
+    made: dict[str, bytes] = {}
     for status, row in track.rows:
-        path = pages.entry_path(track.version, track.name, row.record.name)
+        name = row.record.name
+        path = pages.entry_path(track.name, name)
         if path in made:  # an older official record beside a newer unofficial one
             continue
         same = base is not None and row.record.sha256 == base.sha256
-        values = _values(track, status, row, None if same else base)
-        values["panels"] = _panels(row.record, None if same else other)
-        values["hardware"] = [
-            hardware_table.shown(own) for own in measured if own.record.name == row.record.name
-        ]
-        stress = stress_table.of_entry(stressed, row.record.name)
-        values["stress"] = None if stress is None else stress_table.shown(stress)
-        values["chart"] = [] if stress is None else stress_table.chart([stress])
-        values["back"] = "../" * path.count("/") + pages.version_path(track.version, versions)
+        values = _values(Line(track, status, row), None if same else base)
+        drawn = panels(paths(row.record), None if same else other)
+        values["panels"] = [[pages.trusted(panel) for panel in lung] for lung in drawn]
+        measured = (own for own in track.hardware if own.record.name == name)
+        values["hardware"] = [pages.hardware_shown(own) for own in measured]
+        stressed = [own for own in track.stress if own.name == name]
+        values["stress"] = pages.stress_shown(stressed[0]) if stressed else None
+        values["chart"] = pages.stress_chart(stressed)
         values["root"] = "../" * path.count("/")
         made[path] = template.render(values).encode()
     return made
 
 
-def _values(track: Track, status: str, row: Row, base: Record | None) -> dict[str, Any]:
+def _values(line: Line, base: Record | None) -> dict[str, Any]:
+    track, status, row = line
     record, header = row.record, row.record.header
-    worst, lung, pip = row.worst
-    draws = plots.dumbbells(record, base)
-    own = row.normalised
-    gap = row.score.value - row.nominal if row.score else math.nan
+    draws = dumbbells(record, base)
+    cells = {column.names[0]: column.cell(line) for column in SHOWN}
     return {
         "record": record,
         "content": header,
@@ -154,54 +233,30 @@ def _values(track: Track, status: str, row: Row, base: Record | None) -> dict[st
         "status": status,
         "reasons": row.entry.reasons,
         "track": track.name,
-        "version": track.version,
-        "rank": row.rank,
-        "ranks": row.ranks,
         "count": len(track.ranked),
-        "score": pages.interval(row.score),
-        "normalised": pages.interval(own.score, 1) if own else None,
-        "to_pid": pages.difference(own.to_baseline, 1)
-        if own
-        else pages.difference(row.to_baseline),
-        "to_above": pages.difference(own.to_above, 1) if own else pages.difference(row.to_above),
-        "scaled": plots.normalised_map(record),
-        "above": _above(track, row),
-        "baseline": BASELINES[track.name],
+        "cells": cells,
+        "figures": [
+            (column.title, cells[column.names[0]])
+            for column in SHOWN
+            if column.names[0] not in ("rank", "name", "normalised")
+        ],
+        "scaled": _map(record.headroom.normalised, record, NORMALISED_LIMITS, 0),
         "compared": base.name if base else None,
-        "nominal": pages.figure(row.nominal),
-        "gap": pages.signed(gap),
-        "worst": pages.figure(worst),
-        "worst_where": f"{lung} at PIP {pip:g}" if lung else "",
-        "exploitation": pages.figure(record.exploitation),
-        "clipped": pages.figure(100.0 * record.clipped_share, 1),
-        "step": pages.figure(pages.step_time(header.timing), 0),
-        "heat": plots.error_map(record),
-        "limits": plots.ERROR_LIMITS,
-        "differences": plots.difference_map(record, base) if base else None,
+        "heat": _map(np.concatenate([record.nominal[None], record.drawn]), record, ERROR_LIMITS),
+        "differences": _difference_map(record, base) if base else None,
         "draws": draws,
         "dots": pages.trusted(draws.drawing) if draws else None,
         "safety": _safety(record),
         "failures": header.failures[:MAX_FAILURES],
-        "frames": [pages.trusted(plots.frame(pip)) for pip in record.pips],
+        "frames": [pages.trusted(frame(pip)) for pip in record.pips],
         "pips": [f"{pip:g}" for pip in record.pips],
         "lungs": [(name, *_setting(name)) for name in record.lungs],
         "breath": record.breath,
         "provenance": _provenance(header),
         "history": _history(row),
         "protocol": protocol,
-        "box": f"0 0 {plots.WIDTH} {plots.HEIGHT}",
+        "box": f"0 0 {WIDTH} {HEIGHT}",
     }
-
-
-def _panels(record: Record, other: list[list[tuple[str, str]]] | None) -> list[list[Any]]:
-    """Traces of the entry and of the PID of each lung and PIP, ready for the page."""
-    drawn = plots.panels(plots.paths(record), other)
-    return [[pages.trusted(panel) for panel in row] for row in drawn]
-
-
-def _above(track: Track, row: Row) -> str | None:
-    place = next((i for i, ranked in enumerate(track.ranked) if ranked is row), 0)
-    return track.ranked[place - 1].record.name if place else None
 
 
 def _safety(record: Record) -> list[dict[str, Any]]:
@@ -263,164 +318,182 @@ def _history(row: Row) -> list[dict[str, Any]]:
     return lines
 
 
-#: Size of the small plot of an interval; the entry's dot never touches its edge.
-WIDTH, MARGIN = 120, 6
+@dataclass(frozen=True)
+class Dumbbells:
+    """The plot and what it says.
 
-
-def _version_page(
-    environment: jinja2.Environment,
-    store: Store,
-    version: int,
-    versions: Sequence[int],
-    tracks: Sequence[Track],
-) -> str:
-    """Return the page of a version.
-
-    Args:
-        environment: from :func:`ventbench.board.pages.environment`.
-        store: the leaderboard.
-        version: of the protocol.
-        versions: all of them, newest first.
-        tracks: of the version.
+    Attributes:
+        drawing: SVG elements, numbers only.
+        height: of the drawing.
+        low: text of the lower end of the axis.
+        high: of the upper.
+        better: on how many draws the entry is better.
+        count: how many draws there are.
     """
-    measured = {track.name: hardware_table.rows(store.records, track) for track in tracks}
-    rows = [(track, status, row) for track in tracks for status, row in track.rows]
-    header = rows[0][2].record.header if rows else None
-    stressed = [row for track in tracks for row in stress_table.rows(track)]
-    return environment.get_template("index.html.j2").render(
-        version=version,
-        versions=[
-            {"number": v, "path": pages.version_path(v, versions), "here": v == version}
-            for v in versions
-        ],
-        tracks=[_track(track, measured[track.name]) for track in tracks],
-        aside=[_aside(*row) for row in rows],
-        sealed=[_sealed(track, entry) for track in tracks for entry in track.sealed],
-        seasons=sorted(store.seasons.values(), key=lambda season: season.id),
-        simulators=pages.flatten(header.simulators) if header else [],
-        draws=header.draws if header else None,
-        normalised=version > 1,
-        stress=[stress_table.shown(row) for row in stressed],
-        chart=stress_table.chart(stressed),
-        head=store.head,
-        records=len(store.records),
-        hardware=[
-            {**hardware_table.shown(row), "track": track.name}
-            for track in tracks
-            for row in measured[track.name]
-        ],
-        protocol=protocol,
+
+    drawing: str
+    height: int
+    low: str
+    high: str
+    better: int
+    count: int
+
+
+def dumbbells(record: Record, pid: Record | None) -> Dumbbells | None:
+    """Draw them; None where a draw failed or there is no PID to compare with."""
+    if pid is None or not np.isfinite(record.by_draw).all():
+        return None
+    both = np.stack([record.by_draw, pid.by_draw])
+    low, high = float(both.min()), float(both.max())
+    places = PLOT_LEFT + PLOT_AXIS * (both - low) / max(high - low, 1e-9)
+    rows = enumerate(places.T.round(1).tolist(), 1)
+    return Dumbbells(
+        drawing="".join(_row(draw, own, other) for draw, (own, other) in rows),
+        height=PLOT_ROW * both.shape[1] + 30,
+        low=number(low),
+        high=number(high),
+        better=int(np.sum(both[0] < both[1])),
+        count=both.shape[1],
     )
 
 
-def _track(track: Track, measured: Sequence[HardwareRow]) -> dict[str, Any]:
-    scores = [own for row in track.ranked if (own := _ranked_by(row)) is not None]
-    low = min((x.low for x in scores), default=1.0)
-    high = max((x.high for x in scores), default=1.0)
-    return {
-        "name": track.name,
-        "title": pages.TITLES[track.name],
-        "baseline": BASELINES[track.name],
-        "rows": [_row(track, row, low, high, measured) for row in track.ranked],
-    }
+def _row(draw: int, own: float, other: float) -> str:
+    y = PLOT_ROW * draw - 3
+    return (
+        f'<text x="{PLOT_LEFT - 14}" y="{y + 4}">{draw}</text><path d="M{other} {y}H{own}"/>'
+        f'<circle class="pid" cx="{other}" cy="{y}" r="3.5"/>'
+        f'<circle class="own" cx="{own}" cy="{y}" r="4.5"/>'
+    )
 
 
-def _row(
-    track: Track, row: Row, low: float, high: float, measured: Sequence[HardwareRow]
-) -> dict[str, Any]:
-    record = row.record
-    own = hardware_table.of_entry(measured, record.name)
-    worst, lung, pip = row.worst
-    step = pages.step_time(record.header.timing)
-    return {
-        "rank": row.rank,
-        "ranks": row.ranks,
-        "name": record.name,
-        "path": pages.entry_path(track.version, track.name, record.name),
-        "family": record.manifest.family,
-        "baseline": record.name == BASELINES[track.name],
-        "score": pages.interval(row.score),
-        "plot": _plot(row, low, high),
-        **_differences(row),
-        "nominal": _figure(row.nominal),
-        "worst": {**_figure(worst), "where": f"{lung}, {pip:g}"},
-        "exploitation": _figure(record.exploitation),
-        "clipped": _figure(100.0 * record.clipped_share, 1),
-        "step": _figure(step, 0),
-        "hardware": None if own is None else hardware_table.shown(own),
-    }
+def _map(
+    values: Floats, record: Record, limits: tuple[float, ...], digits: int = 2
+) -> list[dict[str, Any]]:
+    """Rows of a map of means over draws; the nominal value beside each.
 
-
-def _ranked_by(row: Row) -> Interval | None:
-    """The score that ranks: the normalised one in version 2."""
-    return row.score if row.normalised is None else row.normalised.score
-
-
-def _differences(row: Row) -> dict[str, Any]:
-    """Differences of the score that ranks, and in version 2 that score."""
-    own = row.normalised
-    if own is None:
-        return {
-            "normalised": None,
-            "to_pid": pages.difference(row.to_baseline),
-            "to_above": pages.difference(row.to_above),
+    Args:
+        values: nominal runs first, shape ``(1 + K, L, P)``.
+        record: whose they are.
+        limits: between the shades.
+        digits: that are shown.
+    """
+    means = values[1:].mean(axis=0)
+    return [
+        {
+            "name": lung,
+            "cells": [
+                {
+                    "text": number(value, digits),
+                    "small": number(nominal, digits),
+                    "shade": f"h{np.searchsorted(limits, value)}" if np.isfinite(value) else "hx",
+                }
+                for value, nominal in zip(means[i], values[0, i], strict=True)
+            ],
+            "mean": number(float(means[i].mean()), digits),
         }
-    return {
-        "normalised": pages.interval(own.score, 1),
-        "to_pid": pages.difference(own.to_baseline, 1),
-        "to_above": pages.difference(own.to_above, 1),
-    }
+        for i, lung in enumerate(record.lungs)
+    ]
 
 
-def _aside(track: Track, status: str, row: Row) -> dict[str, Any] | None:
-    """A line of the list of entries that are not ranked."""
-    if status == "ranked":
-        return None
-    return {
-        "name": row.record.name,
-        "track": track.name,
-        "path": pages.entry_path(track.version, track.name, row.record.name),
-        "official": status != "not official",
-        "score": pages.interval(row.score),
-        "reasons": list(row.entry.reasons),
-    }
+def _difference_map(record: Record, other: Record) -> list[dict[str, Any]]:
+    """Rows of the map of differences to another record, mean over draws; below zero is better."""
+    cells = record.drawn.mean(axis=0) - other.drawn.mean(axis=0)
+    return [
+        {
+            "name": lung,
+            "cells": [
+                {"text": pages.signed(value, 2), "shade": _difference_shade(value)}
+                for value in cells[i]
+            ],
+            "mean": pages.signed(float(cells[i].mean()), 2),
+        }
+        for i, lung in enumerate(record.lungs)
+    ]
 
 
-def _sealed(track: Track, entry: SealedEntry) -> dict[str, Any]:
-    """A line of the list of entries on hidden draws."""
-    content = entry.record.content
-    return {
-        "season": content.season.id,
-        "name": entry.record.name,
-        "track": track.name,
-        "created": content.created,
-        "scores": {
-            key: pages.NONE if value is None else number(value, DECIMALS)
-            for key, value in sorted(content.scores.items())
-        },
-        "state": "official" if entry.official else "not official",
-        "reasons": list(entry.reasons),
-    }
+def _difference_shade(value: float) -> str:
+    if not np.isfinite(value):
+        return "hx"
+    level = int(np.searchsorted(DIFFERENCE_LIMITS, abs(value)))
+    return f"{'b' if value < 0 else 'w'}{level}" if level else "h0"
 
 
-def _plot(row: Row, low: float, high: float) -> dict[str, str] | None:
-    """Positions of a score and its interval on an axis that all rows of a track share."""
-    score = _ranked_by(row)
-    if score is None:
-        return None
-    # A logarithm, so that one bad entry does not press all others together.
-    span = math.log(high / low) if high > low > 0.0 else 0.0
-
-    def x(value: float) -> float:
-        share = math.log(max(value, low) / low) / span if span else 0.5
-        return MARGIN + (WIDTH - 2 * MARGIN) * share
-
-    left, dot, right = (x(v) for v in (score.low, score.value, score.high))
-    return {"x": f"{left:.1f}", "width": f"{max(right - left, 1.0):.1f}", "dot": f"{dot:.1f}"}
+def _limits(pip: float) -> tuple[float, float]:
+    """Pressure axis of a PIP, cmH2O: a little below PEEP, and room for an overshoot of 60 %."""
+    height = pip - protocol.PEEP
+    return protocol.PEEP - 0.12 * height, pip + 0.6 * height
 
 
-def _figure(value: float, digits: int = 3) -> dict[str, str]:
-    """Text of a number and what it is sorted by; empty if it does not exist."""
-    if not math.isfinite(value):
-        return {"text": pages.NONE, "value": ""}
-    return {"text": number(value, digits), "value": f"{value:.9g}"}
+def _y(pressure: Floats | float, pip: float) -> Floats:
+    low, high = _limits(pip)
+    share = (high - np.asarray(pressure)) / (high - low)
+    return TOP + PRESSURE_HEIGHT * np.clip(share, 0.0, 1.0)
+
+
+@functools.cache
+def frame(pip: float) -> str:
+    """What all panels of a PIP share, as SVG: target, ticks, time axis."""
+    end = LEFT + round(1.0 / protocol.DT * STEP)
+    ticks = [(value, round(float(_y(value, pip)))) for value in (protocol.PEEP, pip)]
+    rules = [VALVE_TOP, VALVE_BOTTOM, *(y for _, y in ticks)]
+    lines = "".join(f"M{LEFT} {y}H{RIGHT}" for y in rules)
+    times = (("0", LEFT), ("0.5", (LEFT + end) // 2), ("1 s", end))
+    return "".join(
+        [
+            f'<path class="t" d="M{LEFT} {round(float(_y(pip, pip)))}H{RIGHT - STEP}"/>',
+            f'<path class="rule" d="{lines}"/>',
+            *(f'<text class="y" x="{LEFT - 10}" y="{y + 9}">{v:g}</text>' for v, y in ticks),
+            *(f'<text class="x" x="{x}" y="{HEIGHT - 18}">{text}</text>' for text, x in times),
+        ]
+    )
+
+
+def panels(
+    own: list[list[tuple[str, str]]], pid: list[list[tuple[str, str]]] | None
+) -> list[list[str]]:
+    """What is drawn in each panel, as SVG of numbers only; a template would take ten times as long.
+
+    Args:
+        own: paths of the entry, from :func:`paths`.
+        pid: paths of the PID; None to draw none.
+    """
+    return [
+        [
+            (
+                f'<path class="p pid" d="{pid[i][j][0]}"/><path class="u pid" d="{pid[i][j][1]}"/>'
+                if pid
+                else ""
+            )
+            + f'<path class="p own" d="{pressure}"/><path class="u own" d="{valve}"/>'
+            for j, (pressure, valve) in enumerate(row)
+        ]
+        for i, row in enumerate(own)
+    ]
+
+
+def paths(record: Record) -> list[list[tuple[str, str]]]:
+    """Paths of pressure and command of each lung and PIP."""
+    valves = np.rint(VALVE_BOTTOM - VALVE_HEIGHT * record.u_in / protocol.U_MAX).astype(int)
+    columns = []
+    for j, pip in enumerate(record.pips):
+        heights = np.rint(_y(record.pressure[:, j], pip)).astype(int)
+        moves = np.diff(heights, axis=-1)
+        rows = zip(heights[:, 0].tolist(), moves.tolist(), valves[:, j].tolist(), strict=True)
+        columns.append([(_line(first, rest), _stairs(valve)) for first, rest, valve in rows])
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _line(first: int, moves: list[int]) -> str:
+    """Path through points one step apart, relative to each other."""
+    return f"m{LEFT} {first}" + "".join([f" {STEP} {move}" for move in moves])
+
+
+def _stairs(heights: list[int]) -> str:
+    """A command holds until the next step; equal ones are joined."""
+    parts, before, run = [f"M{LEFT} {heights[0]}"], heights[0], 0
+    for height in heights:
+        if height != before:
+            parts.append(f"h{run}V{height}")
+            before, run = height, 0
+        run += STEP
+    return "".join([*parts, f"h{run}"])

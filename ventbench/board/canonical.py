@@ -1,18 +1,40 @@
-"""Canonical JSON: one text for a value, so that its SHA-256 names it.
+"""Canonical JSON, one text for a value, and the files of a leaderboard that its SHA-256 names.
 
 ASCII, keys sorted, no spaces, floats in the shortest form that reads back as the same float (as
 Python and JavaScript print them), no NaN, no infinity, one line that ends with a newline. The bytes
 of a file are what is hashed, so that ``sha256sum FILE`` gives its name.
+
+The job that publishes has nothing but Python's standard library, so this module needs no more.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
+import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from ventbench.errors import InputError
+
+#: Folder of records, commands and signatures within the leaderboard's.
+RECORDS = "records"
+
+#: End of the name of a record, of its commands and of its signature, after a SHA-256.
+RECORD_SUFFIX, ACTIONS_SUFFIX, SIGNATURE_SUFFIX = ".json", ".actions", ".sig"
+
+#: Keys that sign records, and records that an official second run vouches for.
+ATTESTATIONS = "attestations.toml"
+
+#: What a build writes: the page of the board, its CSV, and the pages of entries.
+INDEX, CSV = "index.html", "leaderboard.csv"
+BUILT = re.compile(
+    r"index\.html|leaderboard\.csv|entries/(performance|robustness)/[a-z][a-z0-9_]{0,39}\.html"
+)
+
+_RECORD_FILE = re.compile(rf"{RECORDS}/[0-9a-f]{{64}}\.(json|actions|sig)")
 
 
 def canonical(value: Any) -> bytes:
@@ -78,3 +100,29 @@ def _only_text_keys(value: Any) -> None:
     elif isinstance(value, list | tuple):
         for part in value:
             _only_text_keys(part)
+
+
+def named(name: str) -> bool:
+    """Whether a relative path may be one of a leaderboard: attestations, or named by a hash."""
+    return name == ATTESTATIONS or _RECORD_FILE.fullmatch(name) is not None
+
+
+def walk(folder: Path) -> tuple[set[str], list[str]]:
+    """List a folder without following links.
+
+    Returns:
+        Relative paths of plain files, and those of links, devices and the like.
+    """
+    plain: set[str] = set()
+    odd: list[str] = []
+    if folder.is_symlink():
+        return plain, ["."]
+    for parent, folders, names in os.walk(folder):
+        for name in sorted([*folders, *names]):
+            path = Path(parent) / name
+            relative = path.relative_to(folder).as_posix()
+            if path.is_symlink() or not (path.is_file() or path.is_dir()):
+                odd.append(relative)
+            elif path.is_file():
+                plain.add(relative)
+    return plain, odd

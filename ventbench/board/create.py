@@ -21,10 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ventbench
-from ventbench import draws, files
+from ventbench import draws as draw_tables
+from ventbench import files
 from ventbench.board import actions, canonical, record, schema
-from ventbench.board.hardware import HardwareRecord
+from ventbench.board.record import HardwareRecord
 from ventbench.board.replay import TRACE_BREATH, Replayed, ReplayPlants, differences, replay
+from ventbench.draws import Draws
 from ventbench.errors import InputError
 from ventbench.stress import stressors
 from ventbench.stress.score import StressScore
@@ -93,10 +95,10 @@ def create(
             or the score does not replay.
     """
     label, sandbox = score.submission.label, score.sandbox
-    if not score.complete or len(score.drawn) < draws.COUNT:
+    if not score.complete or len(score.drawn) < draw_tables.COUNT or score.rig_draws is None:
         raise InputError(
-            f"{label}: a record needs all lungs, all PIPs and all {draws.COUNT} draws; "
-            f"score it with --draws {draws.COUNT}"
+            f"{label}: a record needs all lungs, all PIPs and all {draw_tables.COUNT} draws; "
+            f"score it with --draws {draw_tables.COUNT}"
         )
     if score.submission.controller is not None:
         raise InputError(f"{label}: only a submission in a folder can have a record")
@@ -109,7 +111,7 @@ def create(
     content: dict[str, Any] = {
         "format": schema.FORMAT,
         "kind": "score",
-        "protocol": score.protocol,
+        "protocol": schema.PROTOCOL,
         "created": record.timestamp(now),
         "official": official and score.official,
         "supersedes": supersedes,
@@ -122,8 +124,8 @@ def create(
             "manifest": dataclasses.asdict(score.submission.manifest),
         },
         "simulators": dict(simulators.about()),
-        "draws": draws.about() if score.rig_draws is None else score.rig_draws.about(),
-        **_on_rigs(score),
+        "draws": score.rig_draws.about(),
+        **_headroom(score, score.rig_draws),
         **_stressed(score, stress),
         "lungs": list(score.lungs),
         "pips": list(score.pips),
@@ -163,16 +165,14 @@ def create(
     return draft
 
 
-def _on_rigs(score: Score) -> dict[str, Any]:
-    """What protocol version 2 adds to a record."""
-    if score.rig_draws is None:
-        return {}
+def _headroom(score: Score, drawn: Draws) -> dict[str, Any]:
+    """Rigs of the draws, and what the score is relative to."""
     if score.reference is None or score.controllable is None:
         raise InputError(
             f"{score.submission.label}: there are no reference errors of these simulators and "
             "draws; make them with `ventbench headroom`"
         )
-    drawn, reference = score.rig_draws, score.reference
+    reference = score.reference
     tables = {
         "error": score.controllable,
         "attainable": reference.attainable,
@@ -261,7 +261,7 @@ def amend(
     The amended record is a file of its own, beside the given one.
 
     Args:
-        path: of the record, sealed or not; its commands lie beside it.
+        path: of the record; its commands lie beside it.
         supersedes: SHA-256 of the record that it corrects.
         reason: why, for the page.
         source: where the submission came from, such as its commit; joins what is there.
@@ -276,7 +276,7 @@ def amend(
     loaded = record.load(path)
     if isinstance(loaded, HardwareRecord) and not (supersedes or reason or source):
         return path
-    if not isinstance(loaded, record.Record | record.Sealed):
+    if not isinstance(loaded, record.Record):
         raise InputError(f"{path} is not the record of a score")
     values = canonical.parse(path.read_bytes(), str(path))
     if supersedes is not None:

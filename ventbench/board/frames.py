@@ -1,18 +1,18 @@
-"""The board as tables: ``leaderboard.csv``, and pandas frames for a notebook."""
+"""The board as tables: one list of columns for pages, terminal, CSV and pandas frames."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ventbench.board import pages, ranking, store
-from ventbench.board.hardware import HardwareRecord
 from ventbench.board.ranking import Interval, Row, Track
-from ventbench.board.record import Record, Sealed, Withdrawal, commands_of
+from ventbench.board.record import Record, Withdrawal, created_of
 from ventbench.errors import InputError
 from ventbench.submissions.manifest import TRACKS
 from ventbench.text import plain
@@ -20,18 +20,150 @@ from ventbench.text import plain
 if TYPE_CHECKING:
     import pandas as pd
 
-#: Columns of ``leaderboard.csv``.
+
+class Line(NamedTuple):
+    """One entry of the board: its track, its status, its row."""
+
+    track: Track
+    status: str
+    row: Row
+
+
+@dataclass(frozen=True)
+class Column:
+    """One figure of an entry, wherever the board is shown.
+
+    Attributes:
+        names: of its columns in the CSV and in frames: one, or value, low and high end.
+        value: of an entry: text, a number, None, or an :class:`~ventbench.board.ranking.Interval`.
+        about: what it is, with its unit; on the page as the hint of its heading.
+        title: heading on the page; empty where the page does not show it.
+        digits: that page and terminal show.
+        sign: whether it is a difference to another entry, of which less than zero is better.
+        unit: that follows the number on the page.
+        small: below the number on the page, where it is no interval.
+        terminal: headings of the number, and of what is below it, in the terminal.
+    """
+
+    names: tuple[str, ...]
+    value: Callable[[Line], Any]
+    about: str
+    title: str = ""
+    digits: int = 3
+    sign: bool = False
+    unit: str = ""
+    small: Callable[[Line], str] = lambda line: ""
+    terminal: tuple[str, ...] = ()
+
+    def cell(self, line: Line) -> dict[str, Any]:
+        """Text, small text, value to sort by, and kind, for page and terminal."""
+        value = self.value(line)
+        if value is None or isinstance(value, Interval):
+            return pages.interval(value, self.digits, sign=self.sign)
+        if not isinstance(value, float):
+            return {"text": str(value), "small": self.small(line), "value": value, "kind": ""}
+        exists = math.isfinite(value)
+        text = f"{pages.figure(value, self.digits)}{self.unit if exists else ''}"
+        return {
+            "text": text,
+            "small": self.small(line),
+            "value": f"{value:.9g}" if exists else "",
+            "kind": "",
+        }
+
+    def values(self, line: Line) -> tuple[Any, ...]:
+        """Values by :attr:`names`; NaN or None where there is none."""
+        value = self.value(line)
+        if len(self.names) == 1:
+            return (value,)
+        if value is None:
+            return (math.nan,) * 3
+        return value.value, value.low, value.high
+
+
+def _of_three(name: str, stem: str = "") -> tuple[str, str, str]:
+    stem = stem or name
+    return name, f"{stem}_low", f"{stem}_high"
+
+
+def _ranks(line: Line) -> str:
+    return "" if line.row.ranks is None else f"{line.row.ranks[0]} to {line.row.ranks[1]}"
+
+
+def _compared(name: str) -> Callable[[Line], Interval | None]:
+    """A field of the comparison of normalised scores."""
+    return lambda line: None if line.row.normalised is None else getattr(line.row.normalised, name)
+
+
+def _stress(line: Line) -> Interval | None:
+    own = line.row.record.stress
+    if own is None:
+        return None
+    return Interval(own.tables.score, *own.tables.interval(own.tables.by_lung_and_draw))
+
+
+def _of_stress(figure: Callable[[Any], Any], missing: Any = math.nan) -> Callable[[Line], Any]:
+    """A figure of the stressed runs; ``missing`` where there are none."""
+
+    def value(line: Line) -> Any:
+        own = line.row.record.stress
+        return missing if own is None else figure(own.tables)
+
+    return value
+
+
+#: Every figure of an entry, in the order of pages and CSV.
 COLUMNS = (
-    "version", "track", "status", "rank", "rank_low", "rank_high", "name", "family",
-    "score_cmH2O", "score_low", "score_high", "to_pid_cmH2O", "to_pid_low", "to_pid_high",
-    "to_above_cmH2O", "to_above_low", "to_above_high", "nominal_cmH2O", "worst_cmH2O",
-    "worst_lung", "worst_pip", "exploitation_cmH2O", "clipped_share", "act_median_us",
-    "failed_cells", "safe", "created", "record", "submission", "reasons",
-    "normalised", "normalised_low", "normalised_high", "normalised_to_pid",
-    "normalised_to_pid_low", "normalised_to_pid_high", "normalised_to_above",
-    "normalised_to_above_low", "normalised_to_above_high", "season",
-    "stress_cmH2O", "stress_low", "stress_high", "stress_rise_cmH2O", "stress_survived",
-    "stress_unsafe_runs",
+    Column(("track",), lambda x: x.track.name, "performance or robustness"),
+    Column(("status",), lambda x: x.status, "ranked, not ranked or not official"),
+    Column(("rank",), lambda x: x.row.rank, "Rank, and the ranks that it may have",
+           title="Rank", small=_ranks, terminal=("rank", "ranks")),
+    Column(("rank_low",), lambda x: x.row.ranks and x.row.ranks[0], "best rank that it may have"),
+    Column(("rank_high",), lambda x: x.row.ranks and x.row.ranks[1], "worst rank"),
+    Column(("name",), lambda x: x.row.record.name, "Name and family of the controller",
+           title="Entry", small=lambda x: x.row.record.manifest.family, terminal=("entry",)),
+    Column(("family",), lambda x: x.row.record.manifest.family, "family of the controller"),
+    Column(_of_three("normalised"), _compared("score"),
+           "0 = best attainable, 100 = best PID of the lung; mean over the draws",
+           title="Normalised", digits=1, terminal=("score", "95 %")),
+    Column(_of_three("normalised_to_pid"), _compared("to_baseline"),
+           "Difference of the normalised score to the PID of this track",
+           title="To the PID", digits=1, sign=True),
+    Column(_of_three("normalised_to_above"), _compared("to_above"),
+           "Normalised score minus that of the entry one rank above",
+           title="To the rank above", digits=1, sign=True),
+    Column(_of_three("score_cmH2O", "score"), lambda x: x.row.error,
+           "The paper's figure: mean |pressure − target| over the draws, cmH₂O",
+           title="Error", terminal=("error",)),
+    Column(("nominal_cmH2O",), lambda x: x.row.nominal,
+           "Error without noise and deviations on the reference rigs, as in the paper, cmH₂O",
+           title="Nominal"),
+    Column(("worst_cmH2O",), lambda x: x.row.worst[0], "Highest mean of one lung and PIP, cmH₂O",
+           title="Worst cell", small=lambda x: f"{x.row.worst[1]}, {x.row.worst[2]:g}"),
+    Column(("worst_lung",), lambda x: x.row.worst[1], "lung of the worst cell"),
+    Column(("worst_pip",), lambda x: x.row.worst[2], "PIP of the worst cell, cmH₂O"),
+    Column(("exploitation_cmH2O",), lambda x: x.row.record.exploitation,
+           "How far the ensemble of simulators disagrees on this entry's pressures, cmH₂O",
+           title="Exploitation"),
+    Column(("clipped_share",), lambda x: x.row.record.clipped_share,
+           "Share of commands outside 0 to 100 %, 0 to 1", title="Clipped"),
+    Column(("act_median_us",), lambda x: pages.step_time(x.row.record.header.timing),
+           "Median time of one step of the controller, µs", title="Step", digits=0, unit=" µs"),
+    Column(_of_three("stress_cmH2O", "stress"), _stress, "stress score, cmH₂O"),
+    Column(("stress_rise_cmH2O",), _of_stress(lambda t: t.score - t.unstressed),
+           "what the stressors add, cmH₂O"),
+    Column(("stress_survived",), _of_stress(lambda t: t.survived_share),
+           "share of stressed runs survived, 0 to 1"),
+    Column(("stress_unsafe_runs",), _of_stress(lambda t: int((~t.safe[1:]).sum()), None),
+           "stressed runs with unsafe pressure"),
+    Column(("failed_cells",), lambda x: x.row.record.header.failed_cells, "cells that failed"),
+    Column(("safe",), lambda x: all(x.row.record.header.safe), "all lungs pass the safety gate"),
+    Column(("reasons",), lambda x: plain("; ".join(x.row.entry.reasons)), "why it is not ranked"),
+    Column(("created",), lambda x: x.row.record.header.created, "when it was scored, UTC"),
+    Column(("draws",), lambda x: x.row.record.header.draws.season, "name of the draws"),
+    Column(("record",), lambda x: x.row.record.sha256, "SHA-256 of the record"),
+    Column(("submission",), lambda x: x.row.record.header.submission.sha256,
+           "SHA-256 of the submission's files"),
 )  # fmt: skip
 
 #: Where commands look for a leaderboard.
@@ -41,72 +173,41 @@ FOLDER = Path("leaderboard")
 _NULLABLE_INTEGERS = ("rank", "rank_low", "rank_high", "stress_unsafe_runs")
 
 
-def load_board(
-    folder: Path | str | None = None, *, track: str | None = None, version: int | None = None
-) -> pd.DataFrame:
+def load_board(folder: Path | str | None = None, *, track: str | None = None) -> pd.DataFrame:
     """Read a leaderboard into a frame: one row an entry, in the order of the pages.
 
-    Columns:
-
-    - ``version``, ``track``, ``status`` (``"ranked"``, ``"not ranked"``, ``"not official"``),
-      ``name``, ``family``;
-    - ``rank``, ``rank_low``, ``rank_high``: rank and its 95 % interval; missing if not ranked;
-    - ``score_cmH2O``, ``score_low``, ``score_high``: mean error over draws, lungs and PIPs with its
-      95 % interval, cmH2O;
-    - ``to_pid_cmH2O``, ``to_pid_low``, ``to_pid_high``: difference of the score to the track's PID,
-      cmH2O; ``to_above_cmH2O``, ``to_above_low``, ``to_above_high``: to the entry above, cmH2O;
-    - ``nominal_cmH2O``: the paper's score without noise, cmH2O;
-    - ``worst_cmH2O``, ``worst_lung``, ``worst_pip``: highest mean error over draws of one lung and
-      PIP, cmH2O, and which cell it is (PIP in cmH2O);
-    - ``exploitation_cmH2O``: spread of the ensemble along the nominal commands, cmH2O;
-    - ``clipped_share``: share of commands outside 0..100 %, 0 to 1;
-    - ``act_median_us``: median time of one ``act``, µs;
-    - ``failed_cells``, ``safe`` (whether all lungs pass the safety gate), ``created`` (UTC),
-      ``record`` and ``submission`` (SHA-256), ``reasons`` (why an entry is not ranked);
-    - ``normalised``, ``normalised_low``, ``normalised_high``: normalised score, by which version 2
-      ranks, with its interval; ``normalised_to_pid``, ``normalised_to_above`` with limits: its
-      differences; ``normalised_R5C10``, ...: of each lung; missing in version 1;
-    - ``season``: of the draws, in version 2;
-    - ``stress_cmH2O``, ``stress_low``, ``stress_high``: stress score with its interval, cmH2O;
-      ``stress_rise_cmH2O``: what the stressors add; ``stress_survived``: share of runs, 0 to 1;
-      ``stress_unsafe_runs``: how many; missing where the stress track was not run;
-    - ``score_R5C10_cmH2O``, ...: mean error over draws and PIPs of each lung, cmH2O, and
-      ``nominal_R5C10_cmH2O``, ...: mean nominal error over PIPs of each lung, cmH2O.
+    Its columns are those of :data:`COLUMNS`, which say what each is: among them ``track``,
+    ``status`` (``"ranked"``, ``"not ranked"``, ``"not official"``), ``name``, ``rank`` with
+    ``rank_low`` and ``rank_high``, ``normalised`` (the score that ranks, points) and
+    ``score_cmH2O`` (the error of the same runs) with their 95 % intervals, ``nominal_cmH2O`` (the
+    paper's score) and ``stress_cmH2O``. Three more a lung follow: ``normalised_R5C10``,
+    ``score_R5C10_cmH2O`` and ``nominal_R5C10_cmH2O``.
 
     Args:
         folder: of the leaderboard; ``leaderboard`` in the working directory by default.
         track: ``"performance"`` or ``"robustness"``; both by default.
-        version: of the protocol; the newest by default.
 
     Returns:
         A frame whose numbers are those of the records, not rounded; NaN where a cell failed.
 
     Raises:
-        InputError: if there is no leaderboard, a record was changed, or the track or version is
-            not there.
+        InputError: if there is no leaderboard, a record was changed, or the track is not there.
         OSError: if a file cannot be read.
 
     Examples:
         >>> import ventbench
         >>> board = ventbench.load_board("leaderboard", track="performance")
-        >>> board[["rank", "name", "score_cmH2O", "score_R5C10_cmH2O"]].shape[1]
+        >>> board[["rank", "name", "normalised", "score_R5C10_cmH2O"]].shape[1]
         4
     """
     import pandas as pd
 
-    frame = pd.DataFrame(
-        [
-            _values(tracks.version, tracks.name, status, row) | _by_lung(row)
-            for tracks in load_tracks(folder, track=track, version=version)
-            for status, row in tracks.rows
-        ]
-    )
+    tracks = load_tracks(folder, track=track)
+    frame = pd.DataFrame([_values(line) | _by_lung(line.row.record) for line in lines(tracks)])
     return frame.astype({name: "Int64" for name in _NULLABLE_INTEGERS})
 
 
-def load_cells(
-    folder: Path | str | None = None, *, track: str | None = None, version: int | None = None
-) -> pd.DataFrame:
+def load_cells(folder: Path | str | None = None, *, track: str | None = None) -> pd.DataFrame:
     """Read every cell of every entry: one row a lung, PIP and draw.
 
     Columns: ``track``, ``name``, ``lung``, ``pip`` (cmH2O), ``draw`` (0 is the nominal run, the
@@ -117,18 +218,16 @@ def load_cells(
     Args:
         folder: of the leaderboard; ``leaderboard`` in the working directory by default.
         track: ``"performance"`` or ``"robustness"``; both by default.
-        version: of the protocol; the newest by default.
 
     Raises:
-        InputError: if there is no leaderboard, a record was changed, or the track or version is
-            not there.
+        InputError: if there is no leaderboard, a record was changed, or the track is not there.
         OSError: if a file cannot be read.
     """
     import numpy as np
     import pandas as pd
 
     parts = []
-    for tracks in load_tracks(folder, track=track, version=version):
+    for tracks in load_tracks(folder, track=track):
         for _, row in tracks.rows:
             record = row.record
             errors = np.concatenate([record.nominal[None], record.drawn])
@@ -150,51 +249,46 @@ def load_cells(
     return pd.concat(parts, ignore_index=True)
 
 
-def load_tracks(
-    folder: Path | str | None = None, *, track: str | None = None, version: int | None = None
-) -> list[Track]:
+def load_tracks(folder: Path | str | None = None, *, track: str | None = None) -> list[Track]:
     """Read and rank a leaderboard; arguments and errors as of :func:`load_board`."""
-    path = FOLDER if folder is None else Path(folder)
-    leaderboard = store.load(path)
-    boards = ranking.boards(leaderboard.records, leaderboard.attested, leaderboard.breaches)
-    if not boards:
-        raise InputError(f"{path} holds no record; add one with `ventbench board add`")
-    chosen = next(iter(boards)) if version is None else version
-    if chosen not in boards:
-        known = ", ".join(map(str, sorted(boards)))
-        raise InputError(f"{path} has no version {chosen}; there are {known}")
     if track is not None and track not in TRACKS:
         raise InputError(f"track {track!r} is not one of {', '.join(TRACKS)}")
-    return [tracks for tracks in boards[chosen] if track in (None, tracks.name)]
+    board = ranking.board(_loaded(folder))
+    return [tracks for tracks in board if track in (None, tracks.name)]
+
+
+def _loaded(folder: Path | str | None) -> store.Store:
+    path = FOLDER if folder is None else Path(folder)
+    leaderboard = store.load(path)
+    if not leaderboard.records:
+        raise InputError(f"{path} holds no record; add one with `ventbench board add`")
+    return leaderboard
+
+
+def lines(tracks: Sequence[Track]) -> list[Line]:
+    """All entries of some tracks, in the order in which they are shown."""
+    return [Line(track, *row) for track in tracks for row in track.rows]
 
 
 def record_index(folder: Path | str | None = None) -> list[dict[str, Any]]:
-    """List every record of a leaderboard in the order of the chain: whose each file is.
+    """List every record of a leaderboard: whose each file is.
 
     Args:
         folder: of the leaderboard; ``leaderboard`` in the working directory by default.
 
     Returns:
         For each record ``record`` and ``commands`` (SHA-256, or None: they name the files in
-        ``records/``), ``kind`` (``"score"``, ``"hardware"``, ``"sealed"``, ``"withdrawal"``),
-        ``version``, ``track`` and ``name`` (of what is withdrawn, for a withdrawal), ``created``
-        (UTC) and ``state``: ``"ranked"``, ``"not ranked"``, ``"not official"``, ``"superseded"``,
-        ``"withdrawn"``, or empty for what has none.
+        ``records/``), ``kind`` (``"score"``, ``"hardware"``, ``"withdrawal"``), ``track`` and
+        ``name`` (of what is withdrawn, for a withdrawal), ``created`` (UTC) and ``state``:
+        ``"ranked"``, ``"not ranked"``, ``"not official"``, ``"superseded"``, ``"withdrawn"``, or
+        empty for what has none.
 
     Raises:
         InputError: if there is no leaderboard, or a record was changed.
     """
-    path = FOLDER if folder is None else Path(folder)
-    leaderboard = store.load(path)
-    if not leaderboard.records:
-        raise InputError(f"{path} holds no record; add one with `ventbench board add`")
-    boards = ranking.boards(leaderboard.records, leaderboard.attested, leaderboard.breaches)
-    states = {
-        row.record.sha256: status
-        for tracks in boards.values()
-        for track in tracks
-        for status, row in track.rows
-    }
+    leaderboard = _loaded(folder)
+    shown = lines(ranking.board(leaderboard))
+    states = {line.row.record.sha256: line.status for line in shown}
     by_hash = {entry.sha256: entry for entry in leaderboard.records}
     taken_back = {x.withdraws for x in leaderboard.records if isinstance(x, Withdrawal)}
     rows = []
@@ -202,47 +296,36 @@ def record_index(folder: Path | str | None = None) -> list[dict[str, Any]]:
         about = by_hash.get(entry.withdraws) if isinstance(entry, Withdrawal) else entry
         if about is None or isinstance(about, Withdrawal):  # refused when the folder is verified
             continue
-        kind, state = "score", states.get(entry.sha256, "superseded")
-        if not isinstance(entry, Record):
-            kind = type(entry).__name__.removesuffix("Record").lower()
-            state = ""
+        scored = isinstance(entry, Record)
+        state = states.get(entry.sha256, "superseded") if scored else ""
         rows.append(
             {
                 "record": entry.sha256,
-                "commands": commands_of(entry),
-                "kind": kind,
-                "version": about.content.protocol
-                if isinstance(about, Sealed)
-                else about.header.protocol,
+                "commands": entry.header.actions.sha256 if scored else None,
+                "kind": "score" if scored else type(entry).__name__.removesuffix("Record").lower(),
                 "track": about.track,
                 "name": about.name,
-                "created": entry.created if isinstance(entry, Withdrawal) else _created(entry),
+                "created": created_of(entry),
                 "state": "withdrawn" if entry.sha256 in taken_back else state,
             }
         )
     return rows
 
 
-def _created(entry: Record | Sealed | HardwareRecord) -> str:
-    return entry.content.created if isinstance(entry, Sealed) else entry.header.created
-
-
 def cell_means(record: Record, lung: str) -> dict[str, float | None]:
-    """Means over draws of one lung by PIP, or of all lungs.
+    """Normalised scores over draws of one lung by PIP, or of all lungs.
 
     Args:
         record: of an entry.
         lung: id of a lung, or ``"all"``.
 
     Returns:
-        Normalised score in version 2, error in cmH2O in version 1, by lung or by PIP, with their
-        mean; None where a cell failed.
+        By lung or by PIP, with their mean; None where a cell failed.
 
     Raises:
         InputError: if the record has no such lung.
     """
-    cells = record.drawn if record.headroom is None else record.headroom.normalised[1:]
-    means = cells.mean(axis=0)
+    means = record.headroom.normalised[1:].mean(axis=0)
     if lung == "all":
         named = dict(zip(record.lungs, means.mean(axis=1).tolist(), strict=True))
     elif lung in record.lungs:
@@ -254,92 +337,37 @@ def cell_means(record: Record, lung: str) -> dict[str, float | None]:
     return {name: value if math.isfinite(value) else None for name, value in named.items()}
 
 
-def csv_text(boards: Mapping[int, Sequence[Track]]) -> str:
-    """Text of ``leaderboard.csv``: every entry of every board."""
+def csv_text(tracks: Sequence[Track]) -> str:
+    """Text of ``leaderboard.csv``: every entry."""
     output = io.StringIO()
     writer = csv.writer(output, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for tracks in boards.values():
-        for track in tracks:
-            writer.writerows(csv_row(track, *row) for row in track.rows)
+    writer.writerow(name for column in COLUMNS for name in column.names)
+    writer.writerows(csv_row(line).values() for line in lines(tracks))
     return output.getvalue()
 
 
-def csv_row(track: Track, status: str, row: Row) -> list[Any]:
-    """One line of the CSV, in the order of :data:`COLUMNS`: text, or a whole number."""
-    values = _values(track.version, track.name, status, row)
-    return [_csv_cell(key, value) for key, value in values.items()]
+def csv_row(line: Line) -> dict[str, Any]:
+    """One line of the CSV by column: text, or a whole number."""
+    return {key: _csv_cell(key, value) for key, value in _values(line).items()}
 
 
-def _values(version: int, track: str, status: str, row: Row) -> dict[str, Any]:
-    """Values of an entry by :data:`COLUMNS`; None or NaN where there is none."""
-    record, header = row.record, row.record.header
-    worst, lung, pip = row.worst
-    rank_low, rank_high = row.ranks or (None, None)
-    values = (
-        version,
-        track,
-        status,
-        row.rank,
-        rank_low,
-        rank_high,
-        record.name,
-        record.manifest.family,
-        *_interval(row.score),
-        *_interval(row.to_baseline),
-        *_interval(row.to_above),
-        row.nominal,
-        worst,
-        lung,
-        pip,
-        record.exploitation,
-        record.clipped_share,
-        pages.step_time(header.timing),
-        header.failed_cells,
-        all(header.safe),
-        header.created,
-        record.sha256,
-        header.submission.sha256,
-        plain("; ".join(row.entry.reasons)),
-        *_normalised(row),
-        header.draws.season or "",
-        *_stress(record),
-    )
-    return dict(zip(COLUMNS, values, strict=True))
+def _values(line: Line) -> dict[str, Any]:
+    """Values of an entry by column; None or NaN where there is none."""
+    pairs = (zip(column.names, column.values(line), strict=True) for column in COLUMNS)
+    return {name: value for pair in pairs for name, value in pair}
 
 
-def _by_lung(row: Row) -> dict[str, float]:
-    record = row.record
-    drawn, nominal = record.drawn.mean(axis=(0, 2)), record.nominal.mean(axis=1)
-    lungs = record.lungs
-    scores = {f"score_{lung}_cmH2O": float(drawn[i]) for i, lung in enumerate(lungs)}
-    values = scores | {f"nominal_{lung}_cmH2O": float(nominal[i]) for i, lung in enumerate(lungs)}
-    if record.headroom is not None:
-        means = record.ranked_values.mean(axis=1)
-        values |= {f"normalised_{lung}": float(means[i]) for i, lung in enumerate(lungs)}
-    return values
-
-
-def _normalised(row: Row) -> tuple[float, ...]:
-    own = row.normalised
-    if own is None:
-        return (math.nan,) * 9
-    return (*_interval(own.score), *_interval(own.to_baseline), *_interval(own.to_above))
-
-
-def _stress(record: Record) -> tuple[float | int | None, ...]:
-    if record.stress is None:
-        return (math.nan,) * 5 + (None,)
-    own = record.stress.tables
-    low, high = own.interval(own.by_lung_and_draw)
-    rise = own.score - own.unstressed
-    return own.score, low, high, rise, own.survived_share, int((~own.safe[1:]).sum())
-
-
-def _interval(estimate: Interval | None) -> tuple[float, float, float]:
-    if estimate is None:
-        return math.nan, math.nan, math.nan
-    return estimate.value, estimate.low, estimate.high
+def _by_lung(record: Record) -> dict[str, float]:
+    figures = {
+        "score_{}_cmH2O": record.drawn.mean(axis=(0, 2)),
+        "nominal_{}_cmH2O": record.nominal.mean(axis=1),
+        "normalised_{}": record.ranked_values.mean(axis=1),
+    }
+    return {
+        name.format(lung): float(values[i])
+        for name, values in figures.items()
+        for i, lung in enumerate(record.lungs)
+    }
 
 
 def _csv_cell(key: str, value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What all pages share: template environment, policy, addresses, and numbers and text as shown.
+"""What pages share: environment, policy, addresses, numbers as shown, stress and hardware tables.
 
 Pages stand alone: no network, no cookie, no address outside the leaderboard. The policy in their
 head allows the one style and the one script that are in them, by hash; all text of records is
@@ -15,15 +15,15 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-from ventbench import palette, protocol
-from ventbench.board.ranking import Interval
+import numpy as np
+
+from ventbench import palette
+from ventbench.board.ranking import HardwareRow, Interval, StressRow
+from ventbench.stress.stressors import CATEGORIES, SEVERITIES, Condition, conditions, stressor
 from ventbench.text import number, page_templates, plain
 
 if TYPE_CHECKING:
     import jinja2
-
-#: Version that this ventbench scores.
-CURRENT = protocol.VERSION
 
 #: Shown where there is nothing to show.
 NONE = "–"
@@ -31,7 +31,19 @@ NONE = "–"
 #: Longest text and most rows of what a record says about itself, on a page.
 MAX_CHARACTERS, MAX_ROWS = 300, 100
 
-TITLES = {"performance": "Performance", "robustness": "Robustness"}
+#: Shares of survived runs below which a field of the stress chart gets the next darker shade.
+SHARES = (1.0, 0.95, 0.85, 0.7, 0.5, 0.3)
+
+#: Titles of the stressors' categories, in the words of a clinician.
+CATEGORY_TITLES = {
+    "valve": "Valve and supply",
+    "circuit": "Circuit",
+    "sensor": "Sensor",
+    "lung": "Airway and lung",
+    "patient": "Patient",
+    "setting": "Other lungs",
+    "pairs": "Two at once, both mild",
+}
 
 
 def environment() -> jinja2.Environment:
@@ -53,19 +65,9 @@ def environment() -> jinja2.Environment:
     return made
 
 
-def version_path(version: int, versions: Sequence[int]) -> str:
-    """Address of a version's board; the newest one is the front page.
-
-    Args:
-        version: of the protocol.
-        versions: all of them, newest first.
-    """
-    return "index.html" if version == versions[0] else f"version-{version}.html"
-
-
-def entry_path(version: int, track: str, name: str) -> str:
+def entry_path(track: str, name: str) -> str:
     """Address of an entry; names are checked when records are read."""
-    return f"entries/v{version}/{track}/{name}.html"
+    return f"entries/{track}/{name}.html"
 
 
 @functools.cache
@@ -99,24 +101,24 @@ def signed(value: float, digits: int = 3) -> str:
     return number(value, digits, sign=True) if math.isfinite(value) else NONE
 
 
-def interval(estimate: Interval | None, digits: int = 3) -> dict[str, Any] | None:
-    """A score for a template: text, limits, value to sort by."""
-    if estimate is None:
-        return None
-    limits = f"{number(estimate.low, digits)} to {number(estimate.high, digits)}"
-    text = number(estimate.value, digits)
-    return {"text": text, "limits": limits, "value": f"{estimate.value:.9f}"}
+def interval(estimate: Interval | None, digits: int, *, sign: bool = False) -> dict[str, Any]:
+    """A figure with its limits for a template: texts, value to sort by, and its kind.
 
-
-def difference(estimate: Interval | None, digits: int = 3) -> dict[str, Any] | None:
-    """A difference for a template, and whether it is clear: below zero is better."""
+    Args:
+        estimate: the figure; None if it does not exist.
+        digits: that are shown.
+        sign: whether it is a difference, of which less than zero is better.
+    """
     if estimate is None:
-        return None
-    low, high = (number(x, digits, sign=True) for x in (estimate.low, estimate.high))
-    limits = f"{low} to {high}"
-    kind = "same" if not estimate.clear else "better" if estimate.value < 0 else "worse"
-    text = number(estimate.value, digits, sign=True)
-    return {"text": text, "limits": limits, "value": f"{estimate.value:.9f}", "kind": kind}
+        return {"text": NONE, "small": "", "value": "", "kind": "none"}
+    text, low, high = (
+        number(x, digits, sign=sign) for x in (estimate.value, estimate.low, estimate.high)
+    )
+    kind = "" if not sign else "same" if not estimate.clear else "worse"
+    kind = "better" if kind == "worse" and estimate.value < 0 else kind
+    return {
+        "text": text, "small": f"{low} to {high}", "value": f"{estimate.value:.9f}", "kind": kind,
+    }  # fmt: skip
 
 
 def step_time(timing: Mapping[str, Any]) -> float:
@@ -153,3 +155,156 @@ def _short(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def hardware_of(made: Sequence[HardwareRow], name: str) -> HardwareRow | None:
+    """The row that stands for an entry: attested ones first, a physical lung before an emulator."""
+    counting = [row for row in made if row.newest and row.record.name == name]
+    return min(counting, key=lambda row: (not row.attested, row.record.emulated), default=None)
+
+
+def hardware_shown(row: HardwareRow) -> dict[str, Any]:
+    """A hardware record for the templates."""
+    record, header = row.record, row.record.header
+    kind = "emulator" if record.emulated else header.device.name
+    spread = "" if math.isnan(record.spread) else f" ± {figure(record.spread)}"
+    return {
+        "name": record.name,
+        "sha256": record.sha256,
+        "path": entry_path(record.track, record.name),
+        "listed": row.simulated is not None,
+        "value": f"{record.score:.9f}" if math.isfinite(record.score) else "",
+        "score": figure(record.score) if math.isfinite(record.score) else "stopped",
+        "spread": spread,
+        "rank": row.rank,
+        "count": row.count,
+        "simulated_rank": row.simulated.rank if row.simulated else None,
+        "nominal": figure(row.nominal),
+        "gap": signed(row.gap),
+        "same_code": row.same_code,
+        "device": kind,
+        "firmware": header.device.firmware,
+        "calibration": header.device.calibration[:12],
+        "emulated": record.emulated,
+        "operator": header.operator,
+        "notes": header.notes,
+        "created": header.created,
+        "lungs": [
+            {
+                "name": lung,
+                "score": figure(float(record.by_lung[i])),
+                "peak": figure(header.peak_pressure_cmH2O[i], 1),
+                "safe": header.safe[i],
+            }
+            for i, lung in enumerate(header.lungs)
+        ],
+        "pips": ", ".join(f"{pip:g}" for pip in header.pips),
+        "repeats": header.repeats,
+        "stops": [
+            f"{stop.lung}, PIP {stop.pip:g}, repetition {stop.repeat}: {stop.reason}"
+            for stop in header.stops
+        ],
+        "withdrawn": row.withdrawn,
+        "newest": row.newest,
+        "attested": row.attested,
+        "recording": header.recording.sha256,
+    }
+
+
+def stress_shown(row: StressRow) -> dict[str, Any]:
+    """A row of the stress track for the templates."""
+    figures = row.tables.headline()
+    return {
+        "name": row.name,
+        "rank": row.rank,
+        "ranks": row.ranks,
+        "path": entry_path(row.row.record.track, row.name),
+        "family": row.row.record.manifest.family,
+        "score": None if row.score is None else interval(row.score, 2),
+        "unstressed": figure(row.tables.unstressed, 2),
+        "rise": signed(_float(figures["rise"]), 2),
+        "rise_value": "" if figures["rise"] is None else f"{figures['rise']:.6f}",
+        "survived": f"{100 * figures['survived']:.1f}",
+        "unsafe": figures["unsafe_runs"],
+        "runs": figures["stressed_runs"],
+        "alarm": figure(float(np.mean(row.tables.alarm_s[1:])), 2),
+        "worst": figure(_float(figures["worst_error"]), 1),
+        "worst_where": title_of(figures["worst_condition"]),
+    }
+
+
+def stress_chart(made: Sequence[StressRow]) -> list[dict[str, Any]]:
+    """Stressor by severity: groups of rows, each with the fields of every entry.
+
+    Args:
+        made: entries under the same conditions; one or several.
+
+    Returns:
+        A group a category with ``title`` and ``rows``; a row has a ``title`` and ``fields``, for
+        each entry one of each severity.
+    """
+    if not made:
+        return []
+    index = {condition: k for k, condition in enumerate(made[0].tables.conditions)}
+    groups = []
+    for category in CATEGORIES:
+        names = dict.fromkeys(
+            c.stressors[0]
+            for c in index
+            if len(c.stressors) == 1 and stressor(c.stressors[0]).category == category
+        )
+        lines = [
+            _line(
+                stressor(name).title, [(Condition((name,), s), s) for s in SEVERITIES], made, index
+            )
+            for name in names
+        ]
+        groups.append({"title": CATEGORY_TITLES[category], "rows": lines})
+    pairs = [c for c in index if len(c.stressors) > 1]
+    lines = [_line(_pair(c), [(c, "mild"), (None, "")], made, index) for c in pairs]
+    groups.append({"title": CATEGORY_TITLES["pairs"], "rows": lines})
+    return [group for group in groups if group["rows"]]
+
+
+def title_of(condition: str) -> str:
+    """A condition's id in words."""
+    for known in conditions():
+        if known.id == condition:
+            titles = " + ".join(stressor(name).title for name in known.stressors)
+            return f"{titles}, {known.severity}" if titles else "without stressor"
+    return condition
+
+
+def _pair(condition: Condition) -> str:
+    return " + ".join(stressor(name).title for name in condition.stressors)
+
+
+def _line(
+    title: str,
+    columns: Sequence[tuple[Condition | None, str]],
+    made: Sequence[StressRow],
+    index: dict[Condition, int],
+) -> dict[str, Any]:
+    fields = []
+    for entry in made:
+        for condition, severity in columns:
+            at = None if condition is None else index.get(condition)
+            fields.append(None if at is None else _field(entry, at, f"{title}, {severity}"))
+    return {"title": title, "fields": fields}
+
+
+def _field(entry: StressRow, at: int, title: str) -> dict[str, Any]:
+    own = entry.tables.by_condition[at]
+    share, rise = own["survived"], _float(own["rise_cmH2O"])
+    unsafe = own["unsafe_runs"]
+    return {
+        "share": f"{100 * share:.0f}",
+        "rise": number(rise, 1, sign=True) if math.isfinite(rise) else NONE,
+        "unsafe": unsafe,
+        "shade": f"s{sum(share < limit for limit in SHARES)}",
+        "said": f"{entry.name}, {title}: {100 * share:.0f} % survived, {unsafe} unsafe",
+    }
+
+
+def _float(value: float | None) -> float:
+    return math.nan if value is None else value

@@ -1,22 +1,27 @@
-"""From records to boards: which record of an entry counts, its rank, intervals and differences.
+"""From records to a board: which record of an entry counts, its rank, intervals and differences.
 
-The ranked score of an entry is the mean over the draws of its mean error over all lungs and PIPs in
-version 1, and of its normalised score in version 2. The draws are common to all entries and
-resampled alike, so that every interval of a difference is a paired one, and ranks can be counted
-within each resample. In version 2 rigs and members of the ensemble are resampled too.
+The ranked score of an entry is the mean of its normalised score over draws, lungs and PIPs. Draws,
+their rigs and members of the ensemble are common to all entries and resampled alike, so that every
+interval of a difference is a paired one. Stress ranks compare entries of the robustness track under
+missing physics, hardware ranks those that ran on the same lungs and PIPs of a bench. No rank of any
+kind without somebody who vouches for the record; see :mod:`ventbench.board.attestation`.
 """
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
-from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Container, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.board.record import AnyRecord, Record, Sealed, Withdrawal
+from ventbench.board.record import AnyRecord, HardwareRecord, Record, Withdrawal
+from ventbench.board.store import Store
 from ventbench.metrics import bootstrap
+from ventbench.stress.results import StressTables
 from ventbench.submissions.manifest import TRACKS
 
 Floats = NDArray[np.float64]
@@ -24,11 +29,17 @@ Floats = NDArray[np.float64]
 #: The PID that each track's entries are compared with.
 BASELINES = {"performance": "pid_best", "robustness": "pid_robust"}
 
-#: Decimals, of cmH2O, that decide: replays agree to so many, so that no machine decides a tie.
+#: Decimals that decide: replays agree to so many, so that no machine decides a tie.
 DECIMALS = 9
+
+#: Decimals, of cmH2O, that decide a hardware rank: measured scores repeat no better.
+_MEASURED_DECIMALS = 3
 
 #: Most characters of a failure's message that a reason quotes; a submission chose them.
 MAX_QUOTED = 300
+
+#: Why a record has no rank although its sandbox was official.
+UNATTESTED = "not official: no key of this leaderboard has signed the record"
 
 
 @dataclass(frozen=True)
@@ -38,14 +49,12 @@ class Event:
     Attributes:
         record: the record.
         withdrawn: why it was taken back; None if it was not.
-        attested: whether it is signed or accepted; see :mod:`ventbench.board.attestation`.
-        breach: why it does not count by the rules of its season; empty if it does.
+        attested: whether somebody vouches for it; see :mod:`ventbench.board.attestation`.
     """
 
     record: Record
     withdrawn: str | None
     attested: bool
-    breach: str = ""
 
     @property
     def official(self) -> bool:
@@ -68,36 +77,19 @@ class Entry:
     reasons: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class SealedEntry:
-    """A submission on hidden draws, whose rank is not known before the season's seed is.
-
-    Attributes:
-        record: the newest sealed record of the season, track and name.
-        official: whether it will be ranked if it is complete and safe.
-        reasons: why it is not official, or not ranked.
-    """
-
-    record: Sealed
-    official: bool
-    reasons: tuple[str, ...]
-
-
 @dataclass
 class Standing:
-    """One track of one version of the board.
+    """One track of the board.
 
     Attributes:
         ranked: official, complete and safe entries, in no order yet.
         unranked: official entries that are not ranked, with reasons.
         unofficial: newest unofficial record of each submission without a newer official one.
-        sealed: newest sealed record of each submission in each season that is not revealed yet.
     """
 
     ranked: list[Entry] = field(default_factory=list)
     unranked: list[Entry] = field(default_factory=list)
     unofficial: list[Entry] = field(default_factory=list)
-    sealed: list[SealedEntry] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -136,27 +128,21 @@ class Row:
 
     Attributes:
         entry: whose row it is.
-        rank: from 1; None if it is not ranked. See :func:`places`.
-        ranks: ranks that it may have: in version 1 the 95 % interval over resamples, in version 2
-            by :func:`rank_ranges`; None if it is not ranked.
-        score: mean over draws, cmH2O; None if a cell failed.
-        to_baseline: difference to the track's PID; None for the PID itself, or without one.
-        to_above: difference to the entry above; None for the first.
-        nominal: nominal score, cmH2O; NaN if a cell failed.
+        rank: from 1; None if it is not ranked. See :func:`rank_ranges`.
+        ranks: ranks that it may have; None if it is not ranked.
+        normalised: the normalised score, which ranks; None if a cell failed.
+        error: the error of the same runs, cmH2O; None if a cell failed.
+        nominal: the paper's score, cmH2O; NaN if a cell failed.
         worst: highest mean over draws of one cell, cmH2O, its lung and PIP; NaN if one failed.
-        normalised: the normalised score, by which version 2 ranks; None in version 1, and if a
-            cell failed.
     """
 
     entry: Entry
     rank: int | None
     ranks: tuple[int, int] | None
-    score: Interval | None
-    to_baseline: Interval | None
-    to_above: Interval | None
+    normalised: Comparison | None
+    error: Interval | None
     nominal: float
     worst: tuple[float, str, float]
-    normalised: Comparison | None = None
 
     @property
     def record(self) -> Record:
@@ -165,27 +151,98 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Track:
-    """One track of one version.
+class StressRow:
+    """One entry under missing physics.
 
     Attributes:
-        version: of the protocol.
+        row: of the entry on the robustness track.
+        tables: its stressed runs.
+        score: stress score with its interval, cmH2O; None if a run failed.
+        rank: 1 + the number of entries that are better beyond doubt; None if a run failed.
+        ranks: ranks that it may have.
+    """
+
+    row: Row
+    tables: StressTables
+    score: Interval | None = None
+    rank: int | None = None
+    ranks: tuple[int, int] | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the entry."""
+        return self.row.record.name
+
+
+@dataclass(frozen=True)
+class HardwareRow:
+    """One hardware record beside the simulated one of the same entry.
+
+    Attributes:
+        record: the hardware record.
+        withdrawn: why it was taken back; None if it was not.
+        attested: whether somebody vouches for it.
+        newest: whether no later one of the same entry and kind of device counts instead.
+        simulated: row of the entry in the simulated ranking; None if there is none.
+        nominal: nominal simulated score over the same lungs and PIPs, cmH2O; NaN without one.
+        rank: among the newest attested records over the same lungs and PIPs, from 1; None if a run
+            was stopped or it does not count.
+        count: how many were ranked.
+    """
+
+    record: HardwareRecord
+    withdrawn: str | None
+    attested: bool
+    newest: bool
+    simulated: Row | None
+    nominal: float
+    rank: int | None = None
+    count: int = 0
+
+    @property
+    def gap(self) -> float:
+        """Hardware score minus simulated one, cmH2O; NaN if one does not exist."""
+        return self.record.score - self.nominal
+
+    @property
+    def same_code(self) -> bool:
+        """Whether both records are of the same files."""
+        if self.simulated is None:
+            return False
+        submitted = self.simulated.record.header.submission
+        return submitted.sha256 == self.record.header.submission.sha256
+
+    @property
+    def comparable(self) -> tuple[Any, ...] | None:
+        """What it must share with another one to be ranked against it; None if it has no rank."""
+        if not (self.attested and self.newest and math.isfinite(self.record.score)):
+            return None
+        header = self.record.header
+        return self.record.emulated, frozenset(header.lungs), frozenset(header.pips)
+
+
+@dataclass(frozen=True)
+class Track:
+    """One track of the board.
+
+    Attributes:
         name: ``"performance"`` or ``"robustness"``.
         ranked: best first.
         unranked: official entries that are not ranked, with reasons, by name.
         unofficial: entries that nobody vouches for, or without a full sandbox, by name.
         baseline: record of the track's PID, that the others are compared with; None if there is no
             ranked one.
-        sealed: entries on hidden draws, by season and name.
+        stress: ranked entries that ran under the newest table of stressors, best first.
+        hardware: hardware records of the track, newest first.
     """
 
-    version: int
     name: str
     ranked: tuple[Row, ...]
     unranked: tuple[Row, ...]
     unofficial: tuple[Row, ...]
     baseline: Record | None
-    sealed: tuple[SealedEntry, ...] = ()
+    stress: tuple[StressRow, ...]
+    hardware: tuple[HardwareRow, ...]
 
     @property
     def rows(self) -> list[tuple[str, Row]]:
@@ -195,128 +252,47 @@ class Track:
         return [(kind, row) for kind, rows in zip(kinds, groups, strict=True) for row in rows]
 
 
-def boards(
-    records: Sequence[AnyRecord],
-    attested: Container[str],
-    breaches: Mapping[str, str] | None = None,
-) -> dict[int, tuple[Track, ...]]:
-    """Rank all records.
-
-    Args:
-        records: in the order of the chain.
-        attested: hashes of the records that are signed or accepted.
-        breaches: why records of seasons do not count, by their hashes.
-
-    Returns:
-        Tracks by version, newest version first.
-    """
-    by_version = standings(records, attested, breaches)
-    return {
-        version: tuple(_track(version, *track) for track in by_version[version].items())
-        for version in sorted(by_version, reverse=True)
-    }
+def board(leaderboard: Store) -> tuple[Track, ...]:
+    """Rank all records of a leaderboard: both tracks."""
+    return tuple(
+        _track(leaderboard, name, standing) for name, standing in standings(leaderboard).items()
+    )
 
 
-def empty(version: int) -> tuple[Track, ...]:
-    """Tracks of a version without a record."""
-    return tuple(_track(version, name, Standing()) for name in TRACKS)
-
-
-def _track(version: int, name: str, standing: Standing) -> Track:
+def _track(leaderboard: Store, name: str, standing: Standing) -> Track:
     ranked = rank(standing.ranked, name)
     records = [row.record for row in ranked]
     base = baseline(records, name)
-    return Track(
-        version=version,
+    track = Track(
         name=name,
         ranked=tuple(ranked),
         unranked=tuple(unranked_rows(standing.unranked)),
         unofficial=tuple(unranked_rows(standing.unofficial)),
         baseline=None if base is None else records[base],
-        sealed=tuple(sorted(standing.sealed, key=lambda entry: entry.record.key)),
+        stress=tuple(stress_rows(ranked)),
+        hardware=(),
     )
+    measured = hardware_rows(leaderboard.records, leaderboard.attested, track)
+    return replace(track, hardware=tuple(measured))
 
 
-def standings(
-    records: Sequence[AnyRecord],
-    attested: Container[str],
-    breaches: Mapping[str, str] | None = None,
-) -> dict[int, dict[str, Standing]]:
-    """Sort records into boards.
-
-    Args:
-        records: in the order of the chain: later is newer, whatever their clocks said.
-        attested: hashes of the records that are signed or accepted.
-        breaches: why records of seasons do not count, by their hashes.
-
-    Returns:
-        By version of the protocol, oldest first, then by track.
-    """
-    against = breaches or {}
-    withdrawn = {w.withdraws: w.reason for w in records if isinstance(w, Withdrawal)}
-    of_seasons = {entry.content.record: entry for entry in records if isinstance(entry, Sealed)}
-    for inside, sealed in of_seasons.items():
-        if sealed.sha256 in withdrawn:
-            withdrawn[inside] = withdrawn[sealed.sha256]
-    grouped: dict[tuple[int, str, str], list[Event]] = defaultdict(list)
-    season = _seasons_shown(records, attested, of_seasons)
-    for record in records:
-        # Only records over the same draws can be compared.
-        if isinstance(record, Record) and record.header.draws.season == season[record.version]:
-            sha256 = record.sha256
-            breach = against.get(sha256, "")
-            event = Event(record, withdrawn.get(sha256), sha256 in attested, breach)
-            grouped[record.version, record.track, record.name].insert(0, event)
-    boards: dict[int, dict[str, Standing]] = {}
-    for (version, track, _), history in sorted(grouped.items(), key=lambda group: group[0]):
-        tracks = boards.setdefault(version, {name: Standing() for name in TRACKS})
+def standings(leaderboard: Store) -> dict[str, Standing]:
+    """Sort the records of a leaderboard into tracks, by their names."""
+    withdrawn = _withdrawn(leaderboard.records)
+    grouped: dict[tuple[str, str], list[Event]] = defaultdict(list)
+    for record in leaderboard.scores:
+        sha256 = record.sha256
+        event = Event(record, withdrawn.get(sha256), sha256 in leaderboard.attested)
+        grouped[record.key].insert(0, event)
+    tracks = {name: Standing() for name in TRACKS}
+    for (track, _), history in sorted(grouped.items()):
         _place(tracks[track], tuple(history))
-    opened = {record.sha256 for record in records if isinstance(record, Record)}
-    newest = {x.key: x for x in of_seasons.values() if x.content.record not in opened}
-    for sealed in newest.values():
-        tracks = boards.setdefault(sealed.version, {name: Standing() for name in TRACKS})
-        event = (withdrawn.get(sealed.sha256), sealed.sha256 in attested)
-        tracks[sealed.track].sealed.append(_sealed(sealed, *event, against.get(sealed.sha256, "")))
-    return boards
+    return tracks
 
 
-def _seasons_shown(
-    records: Sequence[AnyRecord], attested: Container[str], of_seasons: Container[str]
-) -> dict[int, str | None]:
-    """Season whose records a version's board shows.
-
-    The newest hidden one with an official record; without any, that of the newest official record,
-    and else of the newest. So nobody clears a board by a record that nobody vouches for.
-
-    Args:
-        records: in the order of the chain.
-        attested: hashes of the records that are signed or accepted.
-        of_seasons: hashes of the records that were sealed once.
-
-    Returns:
-        By version.
-    """
-    shown: dict[int, tuple[tuple[bool, bool], str | None]] = {}
-    for record in records:
-        if not isinstance(record, Record):
-            continue
-        official = record.official and record.sha256 in attested
-        standing = (official and record.sha256 in of_seasons, official)
-        if standing >= shown.get(record.version, (standing, None))[0]:
-            shown[record.version] = standing, record.header.draws.season
-    return {version: season for version, (_, season) in shown.items()}
-
-
-def _sealed(record: Sealed, withdrawn: str | None, attested: bool, breach: str) -> SealedEntry:
-    official = record.official and attested and not breach
-    why = [] if official else [_why_not_official(record.official, breach)]
-    if withdrawn is not None:
-        why.append(f"withdrawn: {withdrawn}")
-    if not record.content.complete:
-        why.append("a cell failed; its message is sealed")
-    if not record.content.safe:
-        why.append("did not pass the safety gate")
-    return SealedEntry(record, official, tuple(why))
+def _withdrawn(records: Sequence[AnyRecord]) -> dict[str, str]:
+    """Why records were taken back, by their hashes."""
+    return {entry.withdraws: entry.reason for entry in records if isinstance(entry, Withdrawal)}
 
 
 def _place(standing: Standing, history: tuple[Event, ...]) -> None:
@@ -327,16 +303,9 @@ def _place(standing: Standing, history: tuple[Event, ...]) -> None:
         (standing.unranked if why else standing.ranked).append(entry)
     newest = history[0]
     if not newest.official:
-        why = (_why_not_official(newest.record.official, newest.breach), *reasons(newest))
-        standing.unofficial.append(Entry(newest.record, history, why))
-
-
-def _why_not_official(sandboxed: bool, breach: str) -> str:
-    if breach:
-        return breach
-    if not sandboxed:
-        return "not official: its sandbox lacked a layer, or there was none"
-    return "not official: no key of this leaderboard has signed the record"
+        why = "not official: its sandbox lacked a layer, or there was none"
+        first = UNATTESTED if newest.record.official else why
+        standing.unofficial.append(Entry(newest.record, history, (first, *reasons(newest))))
 
 
 def reasons(event: Event) -> tuple[str, ...]:
@@ -367,40 +336,30 @@ def rank(entries: Sequence[Entry], track: str) -> list[Row]:
     Returns:
         Best first; entries of equal score by name.
     """
-    ordered = sorted(entries, key=lambda e: (_key(e.record), e.record.name))
+    ordered = sorted(entries, key=lambda e: (_rounded(e.record.ranked_values), e.record.name))
     if not ordered:
         return []
     records = [entry.record for entry in ordered]
-    ranked = [record.ranked_values for record in records]
-    means = _resampled(records, ranked)
-    taken = places(records, ranked)
-    ranges = _rank_intervals(means) if records[0].headroom is None else rank_ranges(means)
-    base = baseline(records, track)
-    errors = _comparisons(records, [record.drawn.mean(axis=2).T for record in records], base)
-    scaled: list[Comparison | None] = [None] * len(records)
-    if records[0].headroom is not None:
-        scaled = list(_comparisons(records, ranked, base))
-    return [
-        Row(
-            entry=entry,
-            rank=taken[i],
-            ranks=ranges[i],
-            score=errors[i].score,
-            to_baseline=errors[i].to_baseline,
-            to_above=errors[i].to_above,
-            nominal=float(entry.record.nominal.mean()),
-            worst=worst(entry.record),
-            normalised=scaled[i],
-        )
-        for i, entry in enumerate(ordered)
-    ]
+    ranges = ranges_of(records, [record.ranked_values for record in records])
+    compared = _comparisons(records, baseline(records, track))
+    return [_row(entry, ranges[i][0], ranges[i], compared[i]) for i, entry in enumerate(ordered)]
 
 
-def _comparisons(
-    records: Sequence[Record], values: Sequence[Floats], base: int | None
-) -> list[Comparison]:
-    """Compare entries, in the order of their ranks, by values of shape ``(L, K)``."""
-    means = _resampled(records, values)
+def _row(
+    entry: Entry, rank: int | None, ranks: tuple[int, int] | None, compared: Comparison | None
+) -> Row:
+    record, error = entry.record, None
+    if compared is not None:
+        values = record.drawn.mean(axis=2).T
+        error = _interval(values, _resampled(record, values))
+    nominal = float(record.nominal.mean())
+    return Row(entry, rank, ranks, compared, error, nominal, worst(record))
+
+
+def _comparisons(records: Sequence[Record], base: int | None) -> list[Comparison]:
+    """Compare entries in the order of their ranks."""
+    values = [record.ranked_values for record in records]
+    means = [_resampled(*pair) for pair in zip(records, values, strict=True)]
     compared = []
     for i, own in enumerate(values):
         to_baseline = to_above = None
@@ -412,16 +371,11 @@ def _comparisons(
     return compared
 
 
-def places(records: Sequence[Record], values: Sequence[Floats]) -> list[int]:
-    """Rank records of one version by values of shape ``(L, K)``; lower is better.
-
-    In version 1 equal means share a rank. In version 2 the rank is one more than the number of
-    entries that are better beyond doubt; see :func:`rank_ranges`.
-    """
-    if records and records[0].headroom is not None:
-        return [best for best, _ in rank_ranges(_resampled(records, values))]
-    keys = np.array([_rounded(own) for own in values])
-    return [1 + int(np.sum(keys < key)) for key in keys]
+def ranges_of(records: Sequence[Record], values: Sequence[Floats]) -> list[tuple[int, int]]:
+    """Ranks that records may have by values of shape ``(L, K)``; see :func:`rank_ranges`."""
+    if not records:
+        return []
+    return rank_ranges(np.stack([_resampled(*x) for x in zip(records, values, strict=True)]))
 
 
 def rank_ranges(means: Floats) -> list[tuple[int, int]]:
@@ -446,14 +400,10 @@ def unranked_rows(entries: Sequence[Entry]) -> list[Row]:
     """Rows of entries that are not ranked, by name; scores where they exist."""
     rows = []
     for entry in sorted(entries, key=lambda e: e.record.name):
-        record = entry.record
-        score = scaled = None
-        if np.isfinite(record.by_draw).all():
-            score = _comparisons([record], [record.drawn.mean(axis=2).T], None)[0].score
-            if record.headroom is not None:
-                scaled = _comparisons([record], [record.ranked_values], None)[0]
-        nominal = float(record.nominal.mean())
-        rows.append(Row(entry, None, None, score, None, None, nominal, worst(record), scaled))
+        whole = np.isfinite(entry.record.by_draw).all()
+        rows.append(
+            _row(entry, None, None, _comparisons([entry.record], None)[0] if whole else None)
+        )
     return rows
 
 
@@ -472,24 +422,13 @@ def worst(record: Record) -> tuple[float, str, float]:
     return float(cells[i, j]), record.lungs[i], record.pips[j]
 
 
-def _key(record: Record) -> float:
-    return _rounded(record.ranked_values)
-
-
 def _rounded(values: Floats) -> float:
     return round(float(np.mean(values)), DECIMALS)
 
 
-def _resampled(records: Sequence[Record], values: Sequence[Floats]) -> Floats:
-    """Resampled means of each, shape ``(N, RESAMPLES)``: the same draws in each column."""
-    rows = []
-    for record, own in zip(records, values, strict=True):
-        if record.headroom is None:
-            rows.append(bootstrap.resampled_means(own.mean(axis=0)))
-        else:
-            session, member = record.headroom.session, record.headroom.member
-            rows.append(bootstrap.resampled_scores(own, session, member))
-    return np.stack(rows)
+def _resampled(record: Record, values: Floats) -> Floats:
+    """Resampled means of values of shape ``(L, K)``: the same draws for every record."""
+    return bootstrap.resampled_scores(values, record.headroom.session, record.headroom.member)
 
 
 def _interval(values: Floats, means: Floats) -> Interval:
@@ -497,13 +436,73 @@ def _interval(values: Floats, means: Floats) -> Interval:
     return Interval(float(np.mean(values)), float(low), float(high))
 
 
-def _rank_intervals(means: Floats) -> list[tuple[int, int]]:
-    """95 % intervals of ranks that are counted within each resample."""
-    rounded = np.round(means, DECIMALS)
-    ranks = np.empty(means.shape, np.int64)
-    for column in range(means.shape[1]):
-        values = rounded[:, column]
-        ranks[:, column] = 1 + np.searchsorted(np.sort(values), values, side="left")
-    low = np.quantile(ranks, 0.025, axis=1, method="lower")
-    high = np.quantile(ranks, 0.975, axis=1, method="higher")
-    return list(zip(low.astype(int).tolist(), high.astype(int).tolist(), strict=True))
+def stress_rows(ranked: Sequence[Row]) -> list[StressRow]:
+    """Entries that were run under the newest table of stressors, best first.
+
+    Args:
+        ranked: entries of a track; those of other tables of stressors are left out.
+    """
+    stressed = [(row, own) for row in ranked if (own := row.record.stress) is not None]
+    newest = max((own.stressors for _, own in stressed), default=0)
+    current = [(row, own.tables) for row, own in stressed if own.stressors == newest]
+    alike = [StressRow(row, own) for row, own in current if own.comparable(current[0][1])]
+    whole = [row for row in alike if math.isfinite(row.tables.score)]
+    means = [row.tables.resampled(row.tables.by_lung_and_draw) for row in whole]
+    ranges = rank_ranges(np.stack(means)) if means else []
+    made = []
+    for row, mean, ranks in zip(whole, means, ranges, strict=True):
+        low, high = np.quantile(mean, (0.025, 0.975))
+        score = Interval(row.tables.score, float(low), float(high))
+        made.append(replace(row, score=score, rank=ranks[0], ranks=ranks))
+    made.sort(key=lambda row: (row.tables.score, row.name))
+    return made + [row for row in alike if not math.isfinite(row.tables.score)]
+
+
+def hardware_rows(
+    records: Sequence[AnyRecord], attested: Container[str], track: Track
+) -> list[HardwareRow]:
+    """Rows of a track's hardware records, newest first.
+
+    Args:
+        records: all records, each after those that it names.
+        attested: hashes of the records that somebody vouches for.
+        track: the simulated ranking.
+    """
+    withdrawn = _withdrawn(records)
+    simulated = {row.record.name: row for _, row in reversed(track.rows)}
+    made: list[HardwareRow] = []
+    seen: set[tuple[str, bool]] = set()
+    for record in reversed(records):
+        if not isinstance(record, HardwareRecord) or record.track != track.name:
+            continue
+        vouched, why = record.sha256 in attested, withdrawn.get(record.sha256)
+        # Nobody takes a vouched-for record's place by one that nobody vouches for.
+        key = (record.name, record.emulated)
+        newest = why is None and key not in seen
+        if newest and vouched:
+            seen.add(key)
+        row = simulated.get(record.name)
+        nominal = _nominal(record, row)
+        made.append(HardwareRow(record, why, vouched, newest, row, nominal))
+    return [_hardware_rank(row, made) for row in made]
+
+
+def _nominal(record: HardwareRecord, row: Row | None) -> float:
+    """Nominal simulated score over the lungs and PIPs of a hardware record, cmH2O."""
+    if row is None:
+        return math.nan
+    simulated, header = row.record, record.header
+    if not (set(header.lungs) <= set(simulated.lungs) and set(header.pips) <= set(simulated.pips)):
+        return math.nan
+    lungs = [simulated.lungs.index(lung) for lung in header.lungs]
+    pips = [simulated.pips.index(pip) for pip in header.pips]
+    return float(simulated.nominal[np.ix_(lungs, pips)].mean())
+
+
+def _hardware_rank(row: HardwareRow, all_rows: Sequence[HardwareRow]) -> HardwareRow:
+    own = row.comparable
+    if own is None:
+        return row
+    scores = [round(x.record.score, _MEASURED_DECIMALS) for x in all_rows if x.comparable == own]
+    mine = round(row.record.score, _MEASURED_DECIMALS)
+    return replace(row, rank=1 + sum(score < mine for score in scores), count=len(scores))

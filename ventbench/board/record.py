@@ -1,4 +1,10 @@
-"""A record: the immutable result of one scored run, named by the SHA-256 of its bytes."""
+"""A record: the immutable result of one scored run, named by the SHA-256 of its bytes.
+
+An entry that ran on a physical lung has a hardware record: the same score, mean |pressure - target|
+over the inspirations of breaths 2 and 3, from measured pressures. It holds those pressures, so that
+every reader computes the score again; the raw recording of all breaths is named by its hash. There
+are no commands to replay: a lung answers differently every time.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +12,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.board import canonical, hardware, layout, schema
-from ventbench.board.hardware import HardwareRecord
+from ventbench import protocol
+from ventbench.board import canonical, schema
 from ventbench.errors import InputError
 from ventbench.metrics.score import normalised
 from ventbench.stress.results import StressTables
@@ -22,13 +28,24 @@ from ventbench.stress.stressors import condition_of
 
 Floats = NDArray[np.float64]
 
+#: What the key ``track`` says of every such record.
+TRACK = "hardware"
+
+#: Recorded errors may differ from those of the pressures, which are rounded to 0.001, cmH2O.
+_TOLERANCE = 0.001
+
+#: Most repetitions of one cell.
+MAX_REPEATS = 100
+
+_Run = list[list[schema.SmallInt]] | None
+
 #: End of a record's file name, after its SHA-256.
-SUFFIX = layout.RECORD_SUFFIX
+SUFFIX = canonical.RECORD_SUFFIX
 
 
 @dataclass(frozen=True)
 class RecordHeadroom:
-    """What a record of protocol version 2 adds; L lungs, P PIPs, K draws.
+    """Rigs of the draws, and the errors that the score is relative to; L lungs, P PIPs, K draws.
 
     Attributes:
         session: rig of each draw, shape ``(L, K)``.
@@ -84,8 +101,8 @@ class Record(schema.Submitted):
             ``(1 + K, L, P)``.
         steps_above: longest time above the safety limit of each run, steps, shape
             ``(1 + K, L, P)``.
-        headroom: what protocol version 2 adds; None in version 1.
-        stress: runs under missing physics, on the robustness track of version 2; None without.
+        headroom: rigs, and what the score is relative to.
+        stress: runs under missing physics, on the robustness track; None without.
     """
 
     sha256: str
@@ -98,7 +115,7 @@ class Record(schema.Submitted):
     u_in: Floats
     peak: Floats
     steps_above: NDArray[np.int64]
-    headroom: RecordHeadroom | None = None
+    headroom: RecordHeadroom
     stress: RecordStress | None = None
 
     @property
@@ -112,9 +129,9 @@ class Record(schema.Submitted):
         return self.header.official
 
     @property
-    def key(self) -> tuple[int, str, str]:
-        """Version, track and name: what one entry of the board is known by."""
-        return self.version, self.track, self.name
+    def key(self) -> tuple[str, str]:
+        """Track and name: what one entry of the board is known by."""
+        return self.track, self.name
 
     @property
     def lungs(self) -> list[str]:
@@ -146,25 +163,140 @@ class Record(schema.Submitted):
     def basis(self) -> tuple[str, str, str]:
         """What its scores depend on besides commands: simulators, draws, reference errors.
 
-        Canonical text of the first two; a hash of the third, empty in version 1.
+        Canonical text of the first two; a hash of the third.
         """
-        simulators, draws = self.header.simulators, self.header.draws.about()
-        reference = ""
-        if self.headroom is not None:
-            tables = np.stack([self.headroom.attainable, self.headroom.pid])
-            reference = canonical.digest(tables.tobytes())
-        texts = (canonical.canonical(simulators).decode(), canonical.canonical(draws).decode())
-        return (*texts, reference)
+        about = (self.header.simulators, self.header.draws.about())
+        simulators, draws = (canonical.canonical(value).decode() for value in about)
+        tables = np.stack([self.headroom.attainable, self.headroom.pid])
+        return simulators, draws, canonical.digest(tables.tobytes())
 
     @cached_property
     def ranked_values(self) -> Floats:
-        """What ranks, of each lung and draw, shape ``(L, K)``; lower is better.
-
-        The mean error over PIPs, cmH2O, in version 1; the mean normalised score in version 2.
-        """
-        if self.headroom is None:
-            return self.drawn.mean(axis=2).T
+        """What ranks: mean normalised score of each lung and draw, shape ``(L, K)``."""
         return self.headroom.normalised[1:].mean(axis=2).T
+
+
+class Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What ran: the ventilator's own computer, as it says of itself.
+
+    Attributes:
+        name: identity of the device.
+        firmware: its version.
+        calibration: hash of its calibration, as the device reports it.
+        emulated: whether software stood in for valves and lung.
+        about: what else it says.
+    """
+
+    name: schema.Text
+    firmware: schema.Text
+    calibration: schema.Text
+    emulated: bool
+    about: schema.FreeForm
+
+
+class Stop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A run that a safety check or a failure of the controller ended; it has no error."""
+
+    lung: schema.LungId
+    pip: float
+    repeat: schema.Count
+    reason: schema.Text
+
+
+class HardwareTrace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Scored inspirations of every run, ``(L, P, K)``; null for a stopped run.
+
+    Each run is ``(scored breaths, INSPIRATION_STEPS)``.
+    """
+
+    pressure_milli_cmH2O: list[list[list[_Run]]]
+    u_in_tenths_percent: list[list[list[_Run]]]
+
+
+class Recording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The raw recording: a file of the laboratory that the record names by its hash."""
+
+    sha256: schema.Sha256
+    bytes: schema.Count
+    breaths: schema.Count
+
+
+class HardwareContent(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="hardware"
+):
+    """The content of a hardware record; L lungs, P PIPs, K repetitions."""
+
+    format: schema.Version
+    protocol: schema.Version
+    created: schema.Time
+    track: Literal["hardware"]
+    simulated_track: schema.Track
+    submission: schema.RecordedSubmission
+    device: Device
+    operator: schema.Text
+    notes: schema.Text
+    lungs: Annotated[list[schema.LungId], msgspec.Meta(min_length=1, max_length=6)]
+    pips: Annotated[list[float], msgspec.Meta(min_length=1, max_length=12)]
+    repeats: Annotated[int, msgspec.Meta(ge=1, le=MAX_REPEATS)]
+    errors: list[list[list[schema.Error]]]
+    stops: list[Stop]
+    safe: list[bool]
+    peak_pressure_cmH2O: list[float]
+    trace: HardwareTrace
+    recording: Recording
+    plan: schema.FreeForm
+    control: schema.FreeForm
+    safety: schema.FreeForm
+    timing: schema.FreeForm
+    sandbox: schema.FreeForm | None
+    provenance: schema.FreeForm
+    versions: schema.FreeForm
+    machine: schema.FreeForm
+
+
+@dataclass(frozen=True)
+class HardwareRecord(schema.Submitted):
+    """A checked hardware record; L lungs, P PIPs, K repetitions.
+
+    Attributes:
+        sha256: of its bytes: its name.
+        header: its content.
+        errors: error of every run, cmH2O, shape ``(L, P, K)``; NaN for a stopped one.
+    """
+
+    sha256: str
+    header: HardwareContent
+    errors: Floats
+
+    @property
+    def track(self) -> str:
+        """Track whose task the controller was given; ``"performance"`` tells it the lung."""
+        return self.header.simulated_track
+
+    @property
+    def emulated(self) -> bool:
+        """Whether software stood in for the ventilator and its lung."""
+        return self.header.device.emulated
+
+    @cached_property
+    def score(self) -> float:
+        """Mean error over all runs, cmH2O; NaN if one was stopped."""
+        return float(self.errors.mean())
+
+    @cached_property
+    def by_repeat(self) -> Floats:
+        """Score of each repetition, cmH2O, shape ``(K,)``; NaN if one of its runs was stopped."""
+        return self.errors.mean(axis=(0, 1))
+
+    @cached_property
+    def by_lung(self) -> Floats:
+        """Mean error on each lung, cmH2O, shape ``(L,)``; NaN if a run was stopped."""
+        return self.errors.mean(axis=(1, 2))
+
+    @cached_property
+    def spread(self) -> float:
+        """Standard deviation of the score from repetition to repetition, cmH2O; or NaN."""
+        return float(np.std(self.by_repeat, ddof=1)) if self.header.repeats > 1 else float("nan")
 
 
 @dataclass(frozen=True)
@@ -184,62 +316,17 @@ class Withdrawal:
     created: str
 
 
-@dataclass(frozen=True)
-class Sealed:
-    """What is public of a score on hidden draws; see :mod:`ventbench.board.sealed`.
-
-    Attributes:
-        sha256: of its bytes: its name.
-        content: all that it says.
-    """
-
-    sha256: str
-    content: schema.SealedContent
-
-    @property
-    def name(self) -> str:
-        """Name of the submission."""
-        return self.manifest.name
-
-    @property
-    def manifest(self) -> schema.RecordedManifest:
-        """What the authors say about the submission."""
-        return self.content.submission.manifest
-
-    @property
-    def track(self) -> str:
-        """Track of the score."""
-        return self.content.track
-
-    @property
-    def version(self) -> int:
-        """Version of the protocol."""
-        return self.content.protocol
-
-    @property
-    def official(self) -> bool:
-        """Whether it was scored in a sandbox that deserves the word."""
-        return self.content.official
-
-    @property
-    def key(self) -> tuple[str, str, str]:
-        """Season, track and name: what a newer record may supersede."""
-        return self.content.season.id, self.track, self.name
-
-
 #: Everything that a leaderboard keeps.
-AnyRecord = Record | Withdrawal | Sealed | HardwareRecord
+AnyRecord = Record | Withdrawal | HardwareRecord
 
 _DECODER: msgspec.json.Decoder[Any] = msgspec.json.Decoder(
-    schema.ScoreContent | schema.WithdrawalContent | schema.SealedContent | hardware.HardwareContent
+    schema.ScoreContent | schema.WithdrawalContent | HardwareContent
 )
 
 
-def commands_of(entry: AnyRecord) -> str | None:
-    """SHA-256 of the file beside a record: its commands or its ciphertext; None if it has none."""
-    if isinstance(entry, Record):
-        return entry.header.actions.sha256
-    return entry.content.sealed.sha256 if isinstance(entry, Sealed) else None
+def created_of(entry: AnyRecord) -> str:
+    """When a record was made, UTC."""
+    return entry.created if isinstance(entry, Withdrawal) else entry.header.created
 
 
 def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
@@ -259,10 +346,8 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
     sha256 = canonical.digest(content)
     if isinstance(values, schema.WithdrawalContent):
         return Withdrawal(sha256, values.withdraws, values.reason, values.created)
-    if isinstance(values, hardware.HardwareContent):
-        return hardware.checked(values, sha256, label)
-    if isinstance(values, schema.SealedContent):
-        return Sealed(sha256, values)
+    if isinstance(values, HardwareContent):
+        return _checked(values, sha256, label)
     size = len(values.lungs), len(values.pips)
     return Record(
         sha256,
@@ -280,9 +365,7 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
     )
 
 
-def _headroom(values: schema.ScoreContent) -> RecordHeadroom | None:
-    if values.rigs is None or values.headroom is None:
-        return None
+def _headroom(values: schema.ScoreContent) -> RecordHeadroom:
     return RecordHeadroom(
         np.array(values.rigs.session),
         np.array(values.rigs.member),
@@ -294,7 +377,7 @@ def _headroom(values: schema.ScoreContent) -> RecordHeadroom | None:
 
 def _stress(values: schema.ScoreContent, label: str) -> RecordStress | None:
     own = values.stress
-    if own is None or values.rigs is None:
+    if own is None:
         return None
     chosen = tuple(condition_of(name, f"{label}, key stress.conditions") for name in own.conditions)
     if chosen[0].stressors or len(set(chosen)) < len(chosen):
@@ -360,3 +443,71 @@ def withdrawal(withdraws: str, reason: str, now: datetime | None = None) -> byte
 def timestamp(now: datetime | None = None) -> str:
     """A time as records write it; the clock's if none is given."""
     return (now or datetime.now(UTC)).strftime(schema.TIME_FORMAT)
+
+
+def _checked(content: HardwareContent, sha256: str, label: str) -> HardwareRecord:
+    """Check what ties the keys of a hardware record together.
+
+    Args:
+        content: types and ranges are right.
+        sha256: of its bytes.
+        label: names the file in messages.
+
+    Raises:
+        InputError: naming the first key that is wrong.
+    """
+    _check_tables(content, label)
+    errors = np.array(content.errors, float)
+    pressures = content.trace.pressure_milli_cmH2O
+    for lung, pip, repeat in np.ndindex(*errors.shape):
+        run = pressures[lung][pip][repeat]
+        recorded = errors[lung, pip, repeat]
+        place = f"{content.lungs[lung]}, PIP {content.pips[pip]:g}, repetition {repeat + 1}"
+        if (run is None) != np.isnan(recorded):
+            raise InputError(f"{label}, key errors: {place} has an error without pressures")
+        if run is None:
+            continue
+        given = float(np.mean(np.abs(np.array(run) / 1000.0 - content.pips[pip])))
+        if abs(given - recorded) > _TOLERANCE:
+            raise InputError(
+                f"{label}, key errors: {place} says {recorded:.4f} cmH2O, its pressures give "
+                f"{given:.4f}"
+            )
+    stopped = {(stop.lung, stop.pip, stop.repeat) for stop in content.stops}
+    missing = {
+        (content.lungs[lung], content.pips[pip], repeat + 1)
+        for lung, pip, repeat in np.argwhere(np.isnan(errors)).tolist()
+    }
+    if stopped != missing or len(stopped) != len(content.stops):
+        raise InputError(f"{label}, key stops: do not fit the errors")
+    return HardwareRecord(sha256, content, errors)
+
+
+def _check_tables(content: HardwareContent, label: str) -> None:
+    size = (len(content.lungs), len(content.pips), content.repeats)
+    if len(set(content.lungs)) != size[0] or len(set(content.pips)) != size[1]:
+        raise InputError(f"{label}, keys lungs and pips: name one twice")
+    if not set(content.pips) <= set(protocol.PIPS):
+        raise InputError(f"{label}, key pips: are not those of the protocol")
+    run = (len(protocol.SCORED_BREATHS), protocol.INSPIRATION_STEPS)
+    tables: tuple[tuple[str, Any], ...] = (
+        ("errors", content.errors),
+        ("trace.pressure_milli_cmH2O", content.trace.pressure_milli_cmH2O),
+        ("trace.u_in_tenths_percent", content.trace.u_in_tenths_percent),
+    )
+    for key, table in tables:
+        if not schema.has_shape(table, size):
+            raise InputError(f"{label}, key {key}: does not have the shape {size}")
+        if key == "errors":
+            continue
+        runs = [cell for row in table for cells in row for cell in cells if cell is not None]
+        if not all(schema.has_shape(cell, run) for cell in runs):
+            raise InputError(f"{label}, key {key}: a run does not have the shape {run}")
+    for key, values in (
+        ("safe", content.safe),
+        ("peak_pressure_cmH2O", content.peak_pressure_cmH2O),
+    ):
+        if len(values) != size[0]:
+            raise InputError(f"{label}, key {key}: does not have one value a lung")
+    if content.simulated_track not in content.submission.manifest.tracks:
+        raise InputError(f"{label}, key simulated_track: the submission does not enter it")

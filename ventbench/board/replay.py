@@ -7,9 +7,8 @@ with those of the scorer to 1e-9; matrix products of another batch size may roun
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Protocol
 
 import jax
@@ -18,11 +17,12 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench import draws as published
+from ventbench import draws as draw_tables
 from ventbench import environment as env
-from ventbench import precision, protocol, rig_draws
+from ventbench import precision, protocol
 from ventbench.board.record import Record
 from ventbench.board.schema import ScoreHeader
+from ventbench.draws import Draws
 from ventbench.environment import Scenario
 from ventbench.errors import InputError
 from ventbench.interfaces import Plant
@@ -33,10 +33,7 @@ from ventbench.metrics.score import (
     run_error,
     safety_limit,
 )
-from ventbench.rig_draws import RigDraws
-from ventbench.seasons import DEVELOPMENT_SEED
-from ventbench.submissions.rig_scoring import rigs_of
-from ventbench.submissions.scoring import protocol_cells
+from ventbench.plants.rigs import rigs_of
 from ventbench.submissions.stepping import as_float64
 
 Floats = NDArray[np.float64]
@@ -81,10 +78,6 @@ class ReplayPlants(Protocol):
         ...
 
 
-#: Simulators, or a function that loads those of a version of the protocol.
-Replayable = ReplayPlants | Callable[[int], ReplayPlants]
-
-
 @dataclass(frozen=True)
 class Replayed:
     """What the commands of one record give; L lungs, P PIPs, K draws.
@@ -102,8 +95,7 @@ class Replayed:
         pressure: nominal inspiration of :data:`TRACE_BREATH`, cmH2O, shape ``(L, P, S)``.
         u_in: commands of that inspiration as applied, %, shape ``(L, P, S)``.
         first: first command of each run, %, shape ``(1 + K, L, P)``.
-        controllable: error without the first step, cmH2O, shape ``(1 + K, L, P)``; None in version
-            1.
+        controllable: error without the first step, cmH2O, shape ``(1 + K, L, P)``.
     """
 
     nominal: Floats
@@ -117,43 +109,33 @@ class Replayed:
     pressure: Floats
     u_in: Floats
     first: Floats
-    controllable: Floats | None = None
+    controllable: Floats
 
 
-@partial(jax.jit, static_argnames="version")
-def _pressures(plants: Plant, cells: Scenario, requested: Array, version: int = 1) -> Array:
-    """Pressures of shape ``(L, n, ..., S)`` for commands of that shape.
-
-    Cells have batch shape ``(...)``, in version 2 ``(L, ...)``.
-    """
+@jax.jit
+def _pressures(plants: Plant, cells: Scenario, requested: Array) -> Array:
+    """Airway pressures for commands of the same shape, ``(L, n, ..., S)``; cells ``(L, ...)``."""
 
     def lung(plant: Plant, cells: Scenario, commands: Array) -> Array:
-        def scored(loop: env.LoopState) -> Array:
-            return loop.pressure if version == 1 else env.airway_pressure(varied, loop)
-
         varied = env.vary(plant, cells)
         start = env.start_breath(varied, cells)
 
         def step(loop: env.LoopState, u_in: Array) -> tuple[env.LoopState, Array]:
             after, _ = env.inspire(varied, cells, loop, u_in)
-            return after, scored(after)
+            return after, env.airway_pressure(varied, after)
 
         def inspiration(commands: Array) -> Array:
             # The last command acts after the last scored pressure.
             _, pressure = jax.lax.scan(step, start, jnp.moveaxis(commands, -1, 0)[:-1])
-            first = jnp.broadcast_to(scored(start), pressure.shape[1:])
+            first = jnp.broadcast_to(env.airway_pressure(varied, start), pressure.shape[1:])
             return jnp.moveaxis(jnp.concatenate([first[None], pressure]), 0, -1)
 
         return jax.vmap(inspiration)(commands)
 
-    axis = None if version == 1 else 0
-    return jax.vmap(lung, in_axes=(0, axis, 0))(plants, cells, requested)
+    return jax.vmap(lung)(plants, cells, requested)
 
 
-@partial(jax.jit, static_argnames="version")
-def _members(plants: Plant, cells: Scenario, requested: Array, version: int = 1) -> Array:
-    run = partial(_pressures, version=version)
-    return jax.vmap(run, in_axes=(0, None, None))(plants, cells, requested)
+_members = jax.jit(jax.vmap(_pressures, in_axes=(0, None, None)))
 
 
 def _breaths_first(requested: Floats) -> Array:
@@ -173,34 +155,27 @@ def pressures(
     simulators: ReplayPlants,
     pips: Sequence[float],
     requested: Floats,
-    draws: RigDraws | None = None,
+    draws: Draws | None,
 ) -> Floats:
-    """Scored pressures that commands give.
+    """Airway pressures that commands give.
 
     Args:
         simulators: L lungs.
         pips: cmH2O, length P.
         requested: %, shape ``(N, L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``, nominal cells first.
-        draws: those of protocol version 2; if not given, the published ones of version 1.
+        draws: K of them; None for nominal cells alone.
 
     Returns:
         cmH2O, shape of ``requested``.
     """
     with precision.float64():
-        if draws is None:
-            cells = protocol_cells(tuple(pips), requested.shape[2] - 1)
-            plants = as_float64(simulators.plants, requested.shape[1])
-            pressure = _pressures(plants, cells, _breaths_first(requested))
-        else:
-            plants, cells = rigs_of(simulators).cells(draws, pips)
-            plants = as_float64(plants, requested.shape[1])
-            pressure = _pressures(plants, cells, _breaths_first(requested), version=2)
+        plants, cells = rigs_of(simulators).cells(draws, pips)
+        plants = as_float64(plants, requested.shape[1])
+        pressure = _pressures(plants, cells, _breaths_first(requested))
     return _breaths_last(pressure, len(requested))
 
 
-def spread(
-    simulators: ReplayPlants, pips: Sequence[float], requested: Floats, *, version: int = 1
-) -> Floats:
+def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -> Floats:
     """Disagreement of the ensemble along an entry's own nominal trajectory.
 
     Sample standard deviation over members of the pressure that the same commands give, averaged
@@ -211,7 +186,6 @@ def spread(
         simulators: L lungs, M members.
         pips: cmH2O, length P.
         requested: nominal commands, %, shape ``(N, L, P, BREATHS, INSPIRATION_STEPS)``.
-        version: of the protocol.
 
     Returns:
         cmH2O, shape ``(N, L, P)``; NaN for fewer than two members.
@@ -221,57 +195,30 @@ def spread(
     if members < 2:
         return np.full(requested.shape[:3], np.nan)
     with precision.float64():
-        cells = protocol_cells(tuple(pips), 0)
-        if version > 1:
-            cells, _, _ = rig_draws.with_nominal(None, [0] * lungs, pips)
-        pressure = _members(
-            as_float64(simulators.ensemble, members),
-            cells,
-            _breaths_first(requested[:, :, None]),
-            version=version,
-        )
+        cells, _, _ = draw_tables.with_nominal(None, [0] * lungs, pips)
+        plants = as_float64(simulators.ensemble, members)
+        pressure = _members(plants, cells, _breaths_first(requested[:, :, None]))
     by_member = np.stack([_breaths_last(pressure[m], len(requested)) for m in range(members)])
     deviation = np.std(by_member[:, :, :, 0], axis=0, ddof=1)
     assert deviation.shape[1] == lungs
     return np.mean(deviation[..., protocol.SCORED_BREATHS, :], axis=(-2, -1))
 
 
-def draws_of(
-    header: ScoreHeader, simulators: ReplayPlants, seed: bytes | None = None
-) -> RigDraws | None:
+def draws_of(header: ScoreHeader, simulators: ReplayPlants) -> Draws:
     """Make the draws that a record names again.
 
     Args:
         header: of the record.
         simulators: that it names.
-        seed: of its season; not needed for the development draws.
-
-    Returns:
-        The draws of protocol version 2; None in version 1, whose draws are a file.
 
     Raises:
-        InputError: if the draws are not those of the published file, or of the season's seed, or
-            the seed is not known.
+        InputError: if the draws are not those of the published seed.
     """
     recorded = header.draws.about()
-    if header.protocol == 1:
-        if recorded != published.about():
-            raise InputError("key draws: not the published draws")
-        return None
-    if recorded["season"] == rig_draws.DEVELOPMENT:
-        seed = DEVELOPMENT_SEED
-    if seed is None:
-        raise InputError(f"key draws: season {recorded['season']} is not revealed")
     rigs = rigs_of(simulators)
-    drawn = rig_draws.build(
-        rigs.sessions or (),
-        rigs.members,
-        seed=seed,
-        season=recorded["season"],
-        n=recorded["count"],
-    )
+    drawn = draw_tables.build(rigs.sessions or (), rigs.members, n=recorded["count"])
     if drawn.about() != recorded:
-        raise InputError("key draws: not the draws of the seed of their season")
+        raise InputError("key draws: not the development draws, the only ones that are published")
     return drawn
 
 
@@ -279,7 +226,7 @@ def replay(
     simulators: ReplayPlants,
     pips: Sequence[float],
     requested: Sequence[Floats],
-    draws: RigDraws | None = None,
+    draws: Draws,
 ) -> Iterator[Replayed]:
     """Replay the commands of records of one shape, a few at a time.
 
@@ -287,29 +234,23 @@ def replay(
         simulators: L lungs.
         pips: cmH2O, length P.
         requested: of each record, %, shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``.
-        draws: those of protocol version 2; if not given, the published ones of version 1.
+        draws: K of them.
     """
     if not requested:
         return
-    version = 1 if draws is None else 2
     with precision.float64():
-        if draws is None:
-            cells = protocol_cells(tuple(pips), requested[0].shape[1] - 1)
-        else:
-            _, cells = rigs_of(simulators).cells(draws, pips)
+        _, cells = rigs_of(simulators).cells(draws, pips)
     size = min(BATCH, len(requested))
     for first in range(0, len(requested), size):
         batch = list(requested[first : first + size])
         padded = np.stack([*batch, *[batch[-1]] * (size - len(batch))])
         pressure = pressures(simulators, pips, padded, draws)
-        spreads = spread(simulators, pips, padded[:, :, 0], version=version)
+        spreads = spread(simulators, pips, padded[:, :, 0])
         for n, commands in enumerate(batch):
-            yield _measure(cells, commands, pressure[n], spreads[n], version)
+            yield _measure(cells, commands, pressure[n], spreads[n])
 
 
-def _measure(
-    cells: Scenario, requested: Floats, pressure: Floats, spread: Floats, version: int
-) -> Replayed:
+def _measure(cells: Scenario, requested: Floats, pressure: Floats, spread: Floats) -> Replayed:
     pip, dt = np.asarray(cells.pip), np.asarray(cells.dt)
     errors = run_error(pressure, pip[..., None, None])
     gate = passes_safety_gate(pressure, pip[..., None], dt[..., None])
@@ -326,9 +267,7 @@ def _measure(
         pressure=pressure[:, 0, :, TRACE_BREATH],
         u_in=np.clip(requested[:, 0, :, TRACE_BREATH], 0.0, protocol.U_MAX),
         first=np.moveaxis(requested[..., 0, 0], 1, 0),
-        controllable=None
-        if version == 1
-        else np.moveaxis(controllable_error(pressure, pip[..., None, None]), 1, 0),
+        controllable=np.moveaxis(controllable_error(pressure, pip[..., None, None]), 1, 0),
     )
 
 
@@ -365,16 +304,17 @@ def differences(record: Record, replayed: Replayed) -> list[str]:
         ("clipped.commands", clipped.commands, size, 0.0),
         ("trace.pressure_centi_cmH2O", record.pressure, replayed.pressure, _CENTI),
         ("trace.u_in_tenths_percent", record.u_in, replayed.u_in, _TENTH),
+        ("headroom.error", record.headroom.error, replayed.controllable, TOLERANCE),
     )
-    if record.headroom is not None and replayed.controllable is not None:
-        own = ("headroom.error", record.headroom.error, replayed.controllable, TOLERANCE)
-        checks = (*checks, own)
     texts = [text for check in checks if (text := _difference(*check)) is not None]
-    for key in ("nominal", "drawn"):
-        recorded, given = getattr(record, key), getattr(replayed, key)
+    for key, recorded, given in (
+        ("errors.nominal", record.nominal, replayed.nominal),
+        ("errors.drawn", record.drawn, replayed.drawn),
+        ("headroom.error", record.headroom.error, replayed.controllable),
+    ):
         if np.all(_off(recorded, given) <= TOLERANCE):
             means = _means(recorded, given)
-            text = _difference(f"errors.{key}, mean over cells", *means, MEAN_TOLERANCE)
+            text = _difference(f"{key}, mean over cells", *means, MEAN_TOLERANCE)
             texts += [] if text is None else [text]
     return texts + lung_leaks(record, replayed)
 
@@ -382,30 +322,27 @@ def differences(record: Record, replayed: Replayed) -> list[str]:
 def lung_leaks(record: Record, replayed: Replayed) -> list[str]:
     """Find first commands of the robustness track that differ from lung to lung.
 
-    The first observation of a run is that of a lung at PEEP: noise, start, target and step are
-    common to all lungs of a draw; in protocol version 2 to those of the nominal runs only. A
-    controller that is not told the lung cannot answer differently; one that does has learned it, or
-    nobody has computed its commands from observations. The reverse is no proof of honesty. Failed
-    runs are left out.
+    The first observation of a nominal run is that of a lung at PEEP: start, target and step are
+    common to all lungs. A controller that is not told the lung cannot answer differently; one that
+    does has learned it, or nobody has computed its commands from observations. The reverse is no
+    proof of honesty. Failed runs are left out.
 
     Returns:
-        One sentence for the first draw and PIP that shows it; empty if none does.
+        One sentence for the first PIP that shows it; empty if none does.
     """
     if record.track != "robustness":
         return []
-    failed = np.isnan(np.concatenate([record.nominal[None], record.drawn]))
-    same = slice(None) if record.version == 1 else slice(1)
-    highest = np.max(np.where(failed, -np.inf, replayed.first)[same], axis=1)
-    lowest = np.min(np.where(failed, np.inf, replayed.first)[same], axis=1)
-    apart = np.argwhere(highest > lowest)
+    failed = np.isnan(record.nominal)
+    highest = np.max(np.where(failed, -np.inf, replayed.first[0]), axis=0)
+    lowest = np.min(np.where(failed, np.inf, replayed.first[0]), axis=0)
+    apart = np.flatnonzero(highest > lowest)
     if not len(apart):
         return []
-    draw, pip = apart[0]
-    run = f"draw {draw}" if draw else "the nominal run"
+    pip = apart[0]
     return [
-        f"key actions: in {run} at PIP {record.pips[pip]:g} the first command is "
-        f"{lowest[draw, pip]:g} % on one lung and {highest[draw, pip]:g} % on another, though the "
-        "first observation is the same: the lung was known"
+        f"key actions: in the nominal run at PIP {record.pips[pip]:g} the first command is "
+        f"{lowest[pip]:g} % on one lung and {highest[pip]:g} % on another, though the first "
+        "observation is the same: the lung was known"
     ]
 
 

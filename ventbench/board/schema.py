@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from datetime import datetime
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import msgspec
 
@@ -23,10 +23,10 @@ from ventbench.submissions.manifest import FAMILIES, MANIFEST, NAME, TRACKS
 from ventbench.text import plain
 
 if TYPE_CHECKING:
-    from ventbench.board.hardware import HardwareContent
+    from ventbench.board.record import HardwareContent
 
-#: Version of the record's form.
-FORMAT = 1
+#: What every record says of its form: records of another one are not read.
+FORMAT, PROTOCOL = 1, 2
 
 #: Largest record, bytes.
 MAX_BYTES = 2 * 2**20
@@ -36,9 +36,6 @@ MAX_TEXT = 4000
 
 #: Deepest nesting of what a record says freely about its machine and the like.
 MAX_DEPTH = 6
-
-#: Most scores that a sealed record publishes: each can be made to tell something of the draws.
-MAX_SCORES = 4
 
 #: How times are written; always UTC.
 TIME_FORMAT = "%Y-%m-%dT%H:%M:%SZ"
@@ -126,27 +123,18 @@ class Submitted:
         """Name of the submission."""
         return self.manifest.name
 
-    @property
-    def version(self) -> int:
-        """Version of the protocol, and so of the board."""
-        return self.header.protocol
-
 
 class Draws(_Table, frozen=True):
-    """The draws; keys in the order of pages.
-
-    ``sha256`` is that of their file in version 1 and the commitment of their seed in version 2,
-    where ``season`` names the seed.
-    """
+    """The draws, keys in the order of pages: ``sha256`` is the commitment of their seed."""
 
     count: Annotated[int, msgspec.Meta(ge=1, lt=2**53)]
     sha256: Sha256
     version: Count
-    season: Annotated[str, matching("[a-z0-9][a-z0-9-]{0,39}")] | None = None
+    season: Annotated[str, matching("[a-z0-9][a-z0-9-]{0,39}")]
 
     def about(self) -> dict[str, Any]:
         """As the record has it."""
-        return {k: v for k, v in msgspec.structs.asdict(self).items() if v is not None}
+        return msgspec.structs.asdict(self)
 
 
 class Errors(_Table, frozen=True):
@@ -186,14 +174,14 @@ class RecordedFailure(_Table, frozen=True):
 
 
 class RecordedRigs(_Table, frozen=True):
-    """Session and member of the ensemble of each lung and draw, ``(L, K)``; version 2."""
+    """Session and member of the ensemble of each lung and draw, ``(L, K)``."""
 
     session: list[list[Count]]
     member: list[list[Count]]
 
 
 class RecordedHeadroom(_Table, frozen=True):
-    """Errors without the first step of the entry, the best commands and the best PID; version 2.
+    """Errors without the first step of the entry, the best commands and the best PID.
 
     Nominal runs first, cmH2O, ``(1 + K, L, P)``.
     """
@@ -204,7 +192,7 @@ class RecordedHeadroom(_Table, frozen=True):
 
 
 class RecordedStress(_Table, frozen=True):
-    """Runs under missing physics; S conditions, L lungs, n of the record's draws; version 2.
+    """Runs under missing physics; S conditions, L lungs, n of the record's draws.
 
     Tables have shape ``(S, L, n)``, the first condition is none; ``pips`` has shape ``(L, n)``.
     ``commands_sha256`` is that of all commands, float64, ``(S, L, n, BREATHS, INSPIRATION_STEPS)``:
@@ -240,10 +228,10 @@ class Actions(_Table, frozen=True):
     shape: Annotated[list[Count], msgspec.Meta(min_length=5, max_length=5)]
 
 
-class _ScoredSubmission(_Table, frozen=True):
-    """What every record of a score says in public: what ran, when, where, by which protocol."""
+class ScoreHeader(_Table, frozen=True):
+    """A score's record without its large tables; L lungs, P PIPs, K draws."""
 
-    format: Literal[1]
+    format: Version
     protocol: Version
     created: Time
     official: bool
@@ -255,11 +243,6 @@ class _ScoredSubmission(_Table, frozen=True):
     sandbox: FreeForm | None
     versions: FreeForm
     machine: FreeForm
-
-
-class ScoreHeader(_ScoredSubmission, frozen=True):
-    """A score's record without its large tables; L lungs, P PIPs, K draws."""
-
     simulators: FreeForm
     draws: Draws
     lungs: Annotated[list[LungName], msgspec.Meta(min_length=1)]
@@ -280,8 +263,8 @@ class ScoreContent(ScoreHeader, frozen=True, tag_field="kind", tag="score"):
     safety: Safety
     spread: list[list[Error]]
     trace: Trace
-    rigs: RecordedRigs | None = None
-    headroom: RecordedHeadroom | None = None
+    rigs: RecordedRigs
+    headroom: RecordedHeadroom
     stress: RecordedStress | None = None
 
     def header(self) -> ScoreHeader:
@@ -293,61 +276,15 @@ class ScoreContent(ScoreHeader, frozen=True, tag_field="kind", tag="score"):
 class WithdrawalContent(_Table, frozen=True, tag_field="kind", tag="withdrawal"):
     """The record that takes another one back."""
 
-    format: Literal[1]
+    format: Version
     created: Time
     withdraws: Sha256
     reason: Annotated[str, msgspec.Meta(max_length=MAX_TEXT, pattern=r"\S")]
 
 
-class RecordedSeason(_Table, frozen=True):
-    """The season whose hidden draws were used; see :class:`ventbench.seasons.Season`."""
-
-    id: Text
-    commitment: Sha256
-    draws: Annotated[int, msgspec.Meta(ge=1, lt=2**53)]
-
-
-class SealedFile(_Table, frozen=True):
-    """The file of the ciphertext; see :mod:`ventbench.board.sealed`."""
-
-    sha256: Sha256
-    bytes: Count
-    encoding: Literal["chacha20-poly1305"]
-
-
-class SealedContent(_ScoredSubmission, frozen=True, tag_field="kind", tag="sealed"):
-    """What is public of a score on hidden draws before their seed is revealed.
-
-    ``record`` names the record inside; ``scores`` are rounded, and null where a cell failed.
-    """
-
-    season: RecordedSeason
-    scores: dict[EntryName, Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)] | None]
-    complete: bool
-    safe: bool
-    record: Sha256
-    sealed: SealedFile
-
-
-class ChainLine(_Table, frozen=True):
-    """A line of the chain; ``actions`` names commands or a ciphertext, null for a withdrawal."""
-
-    index: Count
-    record: Sha256
-    actions: Sha256 | None
-    previous: Sha256
-
-
-_LINE = msgspec.json.Decoder(ChainLine)
-
-
-#: Reads scores and withdrawals; :mod:`~ventbench.board.record` knows one for all kinds.
-SCORES: msgspec.json.Decoder[Any] = msgspec.json.Decoder(ScoreContent | WithdrawalContent)
-
-
 def read(
-    content: bytes, label: str, decoder: msgspec.json.Decoder[Any] = SCORES
-) -> ScoreContent | WithdrawalContent | SealedContent | HardwareContent:
+    content: bytes, label: str, decoder: msgspec.json.Decoder[Any]
+) -> ScoreContent | WithdrawalContent | HardwareContent:
     """Read and check the content of a record.
 
     Args:
@@ -359,12 +296,19 @@ def read(
         InputError: naming the first key that is wrong.
     """
     record = decoded(decoder, content, label)
+    for key, known in (("format", FORMAT), ("protocol", PROTOCOL)):
+        found = getattr(record, key, known)
+        if found != known:
+            raise InputError(
+                f"{label}, key {key}: is {found}; this ventbench reads records of {key} {known} "
+                "and no other"
+            )
     _check_time(record.created, f"{label}, key created")
     if isinstance(record, WithdrawalContent):
         return record
-    if isinstance(record, ScoreContent | SealedContent):
+    if isinstance(record, ScoreContent):
         for key in ("provenance", "simulators", "sandbox", "versions", "machine", "timing"):
-            _check_free(getattr(record, key, None), f"{label}, key {key}")
+            _check_free(getattr(record, key), f"{label}, key {key}")
         _check_claims(record, label)
     else:
         for key in ("plan", "control", "safety", "timing", "sandbox", "provenance", "versions"):
@@ -375,26 +319,15 @@ def read(
     if isinstance(record, ScoreContent):
         _check_shapes(record, label)
         _check_consistent(record, label)
-    elif isinstance(record, SealedContent) and len(record.scores) > MAX_SCORES:
-        raise InputError(f"{label}, key scores: are more than {MAX_SCORES}")
     return record
 
 
-def _check_submitted(record: ScoreContent | SealedContent | HardwareContent, label: str) -> None:
+def _check_submitted(record: ScoreContent | HardwareContent, label: str) -> None:
     """Check what records of scores and of hardware say alike: the submission and the origin."""
     _check_free(record.submission.files, f"{label}, key submission.files")
     _check_free(record.submission.manifest.training, f"{label}, key submission.manifest")
     _check_submission(record.submission, f"{label}, key submission")
     _check_origin(record, label)
-
-
-def read_line(content: bytes, label: str) -> ChainLine:
-    """Read a line of the chain.
-
-    Raises:
-        InputError: if it is not one.
-    """
-    return decoded(_LINE, content, label)
 
 
 def decoded(decoder: msgspec.json.Decoder[T], content: bytes, label: str) -> T:
@@ -455,13 +388,11 @@ def _check_shapes(record: ScoreContent, label: str) -> None:
         "trace.pressure_centi_cmH2O": (record.trace.pressure_centi_cmH2O, (lungs, pips, steps)),
         "trace.u_in_tenths_percent": (record.trace.u_in_tenths_percent, (lungs, pips, steps)),
     }
-    if record.rigs is not None:
-        for key in ("session", "member"):
-            shapes = {**shapes, f"rigs.{key}": (getattr(record.rigs, key), (lungs, draws))}
-    if record.headroom is not None:
-        for key in ("error", "attainable", "pid"):
-            table = getattr(record.headroom, key)
-            shapes = {**shapes, f"headroom.{key}": (table, (1 + draws, lungs, pips))}
+    for key in ("session", "member"):
+        shapes = {**shapes, f"rigs.{key}": (getattr(record.rigs, key), (lungs, draws))}
+    for key in ("error", "attainable", "pid"):
+        table = getattr(record.headroom, key)
+        shapes = {**shapes, f"headroom.{key}": (table, (1 + draws, lungs, pips))}
     if record.stress is not None:
         cells = (lungs, min(draws, len(record.stress.pips[0])) if record.stress.pips else 0)
         shapes = {**shapes, "stress.pips": (record.stress.pips, cells)}
@@ -483,21 +414,9 @@ def has_shape(table: Any, shape: tuple[int, ...]) -> bool:
 
 def _check_consistent(record: ScoreContent, label: str) -> None:
     lungs, pips, draws = record.lungs, record.pips, record.draws.count
-    second = {
-        "rigs": record.rigs,
-        "headroom": record.headroom,
-        "draws.season": record.draws.season,
-    }
-    for key, value in second.items():
-        if record.protocol in protocol.VERSIONS and (value is not None) != (record.protocol == 2):
-            raise InputError(f"{label}, key {key}: belongs to protocol version 2 and no other")
-    if record.stress is not None and (record.protocol, record.track) != (2, "robustness"):
-        raise InputError(
-            f"{label}, key stress: belongs to the robustness track of protocol version 2"
-        )
-    if record.protocol in protocol.VERSIONS and (
-        tuple(lungs) != LUNG_IDS or tuple(pips) != protocol.PIPS
-    ):
+    if record.stress is not None and record.track != "robustness":
+        raise InputError(f"{label}, key stress: belongs to the robustness track")
+    if tuple(lungs) != LUNG_IDS or tuple(pips) != protocol.PIPS:
         raise InputError(f"{label}: does not cover all lungs and PIPs of the protocol")
     if record.actions.shape != list(actions.shape(len(lungs), draws, len(pips))):
         raise InputError(f"{label}, key actions.shape: does not fit lungs, draws and PIPs")
@@ -510,12 +429,11 @@ def _check_consistent(record: ScoreContent, label: str) -> None:
         for pip, error in zip(pips, row, strict=True)
         if error is None
     ]
-    if record.headroom is not None:
-        tables = [record.errors.nominal, *record.errors.drawn]
-        if [[[x is None for x in row] for row in rows] for rows in tables] != [
-            [[x is None for x in row] for row in rows] for rows in record.headroom.error
-        ]:
-            raise InputError(f"{label}, key headroom.error: does not fit the errors")
+    tables = [record.errors.nominal, *record.errors.drawn]
+    if [[[x is None for x in row] for row in rows] for rows in tables] != [
+        [[x is None for x in row] for row in rows] for rows in record.headroom.error
+    ]:
+        raise InputError(f"{label}, key headroom.error: does not fit the errors")
     if len(failed) != record.failed_cells:
         raise InputError(f"{label}, key failed_cells: does not fit the errors")
     named = [(failure.lung, failure.pip, failure.draw) for failure in record.failures]
@@ -530,7 +448,7 @@ def _check_consistent(record: ScoreContent, label: str) -> None:
                 )
 
 
-def _check_claims(record: ScoreContent | SealedContent, label: str) -> None:
+def _check_claims(record: ScoreContent, label: str) -> None:
     if record.track not in record.submission.manifest.tracks:
         raise InputError(f"{label}, key track: the submission does not enter it")
     if record.official and not (record.sandbox and record.sandbox.get("official") is True):
@@ -560,7 +478,7 @@ def _check_submission(submission: RecordedSubmission, where: str) -> None:
         raise InputError(f"{where}.sha256: is not that of its files")
 
 
-def _check_origin(record: ScoreContent | SealedContent | HardwareContent, label: str) -> None:
+def _check_origin(record: ScoreContent | HardwareContent, label: str) -> None:
     """Refuse a record that does not say by which versions and on what machine it was made."""
     for table, keys in (("versions", REQUIRED_VERSIONS), ("machine", REQUIRED_MACHINE)):
         for key in keys:

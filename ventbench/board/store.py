@@ -1,241 +1,110 @@
-"""The folder of a leaderboard: records, their commands, and the chain over them.
+"""The folder of a leaderboard: records and their commands, in the order in which they follow.
 
-``chain.jsonl`` has one line a record in the order of arrival, each with the hash of the line
-before. It makes the order and the set of records as immutable as a record itself: nothing can be
-changed, swapped or left out in the middle without changing every later line, and the last line's
-hash (the *head*) stands for all of them. Only the end can be cut off unseen; whoever has noted a
-head can check that it is still there.
+Every file in ``records/`` is named by its SHA-256, so that none can be changed unseen. A record
+that takes the place of another one, or takes it back, names it; what they do not order, the times
+of the records do. That none is missing shows in the history of the repository, and the job that
+publishes refuses to drop one; see ``ci/publish.py``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ventbench import files, protocol, seasons
+from ventbench import files
 from ventbench.board import actions, attestation, canonical, record, schema
-from ventbench.board.conflicts import conflicts
-from ventbench.board.hardware import HardwareRecord
-from ventbench.board.layout import CHAIN, RECORDS, SEASONS
-from ventbench.board.record import AnyRecord, Record, Sealed, Withdrawal, commands_of
+from ventbench.board.canonical import RECORDS
+from ventbench.board.record import AnyRecord, HardwareRecord, Record, Withdrawal
 from ventbench.errors import InputError
-from ventbench.seasons import Season
 
 if TYPE_CHECKING:
-    from ventbench.board.replay import Replayable
-
-#: Stands for the hash of the line before the first.
-CHAIN_START = "0" * 64
-
-
-@dataclass(frozen=True)
-class Link:
-    """One line of the chain.
-
-    Attributes:
-        index: of the line, from 0.
-        record: SHA-256 of the record.
-        actions: SHA-256 of its action file, or of its ciphertext; None for a withdrawal.
-        previous: SHA-256 of the line before, newline included.
-        sha256: of this line, newline included.
-    """
-
-    index: int
-    record: str
-    actions: str | None
-    previous: str
-    sha256: str
+    from ventbench.board.replay import ReplayPlants
 
 
 @dataclass(frozen=True)
 class Store:
-    """All records of a leaderboard, in the order of the chain.
+    """All records of a leaderboard, each after those that it names.
 
     Attributes:
         folder: of the leaderboard.
-        links: lines of the chain.
-        records: one for each line.
-        attested: hashes of the records that are signed or accepted; see
-            :mod:`ventbench.board.attestation`. A record that was sealed is attested where the
-            sealed one is.
-        seasons: by id.
-        breaches: why records of seasons are not official, by their hashes; see
-            :func:`ventbench.board.sealed.breaches`.
+        records: all of them.
+        attested: hashes of the records that somebody who may do so vouches for; see
+            :mod:`ventbench.board.attestation`.
     """
 
     folder: Path
-    links: tuple[Link, ...]
     records: tuple[AnyRecord, ...]
     attested: frozenset[str]
-    seasons: Mapping[str, Season] = field(default_factory=dict)
-    breaches: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def head(self) -> str:
-        """SHA-256 that stands for all records and their order."""
-        return chain_head(self.links)
 
     @property
     def scores(self) -> list[Record]:
         """Records of scores only."""
         return [entry for entry in self.records if isinstance(entry, Record)]
 
-    @property
-    def sealed(self) -> list[Sealed]:
-        """Sealed records only."""
-        return [entry for entry in self.records if isinstance(entry, Sealed)]
 
-
-def chain_line(index: int, added: AnyRecord, previous: str) -> bytes:
-    """Return the chain's line of a record.
-
-    Args:
-        index: of the line, from 0.
-        added: the record.
-        previous: SHA-256 of the line before; :data:`CHAIN_START` for the first.
-    """
-    line = {
-        "index": index,
-        "record": added.sha256,
-        "actions": commands_of(added),
-        "previous": previous,
-    }
-    return canonical.canonical(line)
-
-
-def chain_head(links: Sequence[Link]) -> str:
-    """SHA-256 of the last line; :data:`CHAIN_START` if there is none."""
-    return links[-1].sha256 if links else CHAIN_START
-
-
-def parse_chain(content: bytes, label: str = CHAIN) -> list[Link]:
-    """Read and check a chain.
-
-    Args:
-        content: of the file.
-        label: names it in messages.
-
-    Raises:
-        InputError: naming the first line that is wrong.
-    """
-    links: list[Link] = []
-    seen: set[str] = set()
-    for index, text in enumerate(content.splitlines(keepends=True)):
-        where = f"{label} line {index + 1}"
-        canonical.parse(text, where)
-        line = schema.read_line(text, where)
-        if line.index != index or line.previous != chain_head(links):
-            raise InputError(f"{where} does not follow the line before; one of them was changed")
-        if line.record in seen:
-            raise InputError(f"{where} names record {line.record} again")
-        seen.add(line.record)
-        links.append(Link(index, line.record, line.actions, line.previous, canonical.digest(text)))
-    return links
+def record_paths(folder: Path) -> list[Path]:
+    """Paths of the records of a leaderboard."""
+    paths = sorted((folder / RECORDS).glob(f"*{record.SUFFIX}"))
+    return [path for path in paths if canonical.named(f"{RECORDS}/{path.name}")]
 
 
 def load(folder: Path) -> Store:
     """Read a leaderboard; every record is checked against its hash and its signature.
 
     Raises:
-        InputError: naming the file that is missing, was changed, or holds a wrong signature.
+        InputError: naming the file that was changed, or holds a wrong signature.
         OSError: if one cannot be read.
     """
-    links = read_chain(folder)
-    attested, problems = attestation.attested(folder, [link.record for link in links])
+    records = in_order(read_record(path) for path in record_paths(folder))
+    attested, problems = attestation.attested(folder, [entry.sha256 for entry in records])
     if problems:
         raise InputError(problems[0])
-    records = tuple(read_record(folder, link) for link in links)
-    return assembled(folder, links, records, attested, read_seasons(folder))
+    return Store(folder, records, attested)
 
 
-def assembled(
-    folder: Path,
-    links: Sequence[Link],
-    records: Sequence[AnyRecord],
-    attested: frozenset[str],
-    known: Mapping[str, Season],
-) -> Store:
-    """Put together what was read, and judge the records of seasons by the rules of these.
+def in_order(records: Iterable[AnyRecord]) -> tuple[AnyRecord, ...]:
+    """Sort records by their times, each after the one that it supersedes or withdraws."""
+    known = {entry.sha256: entry for entry in records}
+    ordered: dict[str, AnyRecord] = {}
+    for entry in sorted(known.values(), key=lambda x: (record.created_of(x), x.sha256)):
+        waiting = [entry]
+        while (named := known.get(_follows(waiting[-1]))) and named.sha256 not in ordered:
+            waiting.append(named)  # ends: no record can hold the hash of a later one
+        ordered |= {x.sha256: x for x in reversed(waiting)}
+    return tuple(ordered.values())
+
+
+def _follows(entry: AnyRecord) -> str:
+    """Hash of the record that one names as its predecessor; empty if it names none."""
+    if isinstance(entry, Withdrawal):
+        return entry.withdraws
+    return (entry.header.supersedes or "") if isinstance(entry, Record) else ""
+
+
+def read_record(path: Path, *, strict: bool = False) -> AnyRecord:
+    """Read a record of a leaderboard.
 
     Args:
-        folder: of the leaderboard.
-        links: lines of the chain.
-        records: one for each line.
-        attested: hashes of the records that are signed or accepted.
-        known: seasons by id.
-    """
-    from ventbench.board.sealed import breaches
-
-    vouched = {
-        entry.content.record
-        for entry in records
-        if isinstance(entry, Sealed) and entry.sha256 in attested
-    }
-    against = breaches(records, known, attested)
-    there = {entry.sha256 for entry in records}
-    for entry in records:
-        if isinstance(entry, Sealed) and entry.content.record not in there:
-            season = known.get(entry.content.season.id)
-            if season is not None and season.seed is not None:
-                against[entry.sha256] = "not official: it does not hold the record that it names"
-    counting = frozenset((attested | vouched) - against.keys())
-    return Store(folder, tuple(links), tuple(records), counting, known, against)
-
-
-def season_path(folder: Path, name: str) -> Path:
-    """Where the file of a season lies."""
-    return folder / SEASONS / f"{name}.toml"
-
-
-def read_seasons(folder: Path) -> dict[str, Season]:
-    """Read the seasons of a leaderboard, by id.
-
-    Raises:
-        InputError: naming the first season file that is wrong.
-    """
-    paths = sorted((folder / SEASONS).glob("*.toml"))
-    return {path.stem: seasons.read_season(path) for path in paths}
-
-
-def read_chain(folder: Path) -> list[Link]:
-    """Read the chain; empty where there is no leaderboard yet.
+        path: of the record, named by its SHA-256.
+        strict: also check the canonical form again.
 
     Raises:
         InputError: if it was changed.
     """
-    path = folder / CHAIN
-    return parse_chain(path.read_bytes(), str(path)) if path.exists() else []
-
-
-def read_record(folder: Path, link: Link, *, strict: bool = False) -> AnyRecord:
-    """Read the record that a line of the chain names.
-
-    Args:
-        folder: of the leaderboard.
-        link: the line.
-        strict: also check the canonical form again.
-
-    Raises:
-        InputError: if it is missing or was changed.
-    """
-    path = folder / RECORDS / f"{link.record}{record.SUFFIX}"
     if not path.is_file() or path.is_symlink():
-        raise InputError(f"{path} is missing, but {CHAIN} names it")
+        raise InputError(f"{path} is no plain file")
     if path.stat().st_size > schema.MAX_BYTES:
         raise InputError(f"{path} has been changed: no record has {path.stat().st_size} bytes")
     content = path.read_bytes()
     sha256 = canonical.digest(content)
-    if sha256 != link.record:
+    if sha256 != path.stem:
         raise InputError(
             f"{path} has been changed: its SHA-256 is {sha256}{_what_changed(content)}"
         )
     # Its canonical form was checked when it was added, and no byte has changed since.
-    entry = record.from_bytes(content, str(path), strict=strict)
-    if commands_of(entry) != link.actions:
-        raise InputError(f"{path} names other commands than {CHAIN} line {link.index + 1}")
-    return entry
+    return record.from_bytes(content, str(path), strict=strict)
 
 
 def _what_changed(content: bytes) -> str:
@@ -248,172 +117,59 @@ def _what_changed(content: bytes) -> str:
     return ""
 
 
-def newest_of(store: Store, record: Record | Sealed) -> Record | Sealed | None:
-    """The newest record of the same entry, track and version or season; None if there is none."""
-    of_entry = [entry for entry in (*store.scores, *store.sealed) if entry.key == record.key]
+def newest_of(store: Store, record: Record) -> Record | None:
+    """The newest record of the same entry and track; None if there is none."""
+    of_entry = [entry for entry in store.scores if entry.key == record.key]
     return of_entry[-1] if of_entry else None
 
 
-def find_record(store: Store, sha256: str) -> Record | Sealed:
-    """Find the record of a score, sealed or not, by its hash or the unique beginning of one.
+def find_record(
+    store: Store, sha256: str, kind: type[Record | HardwareRecord] | None = None
+) -> Record | HardwareRecord:
+    """Find a record by its hash or the unique beginning of one.
+
+    Args:
+        store: the leaderboard.
+        sha256: of the record, or its beginning.
+        kind: of record; scores and hardware if not given.
 
     Raises:
         InputError: if none or several begin so.
     """
-    entries = (*store.scores, *store.sealed)
-    matches = [entry for entry in entries if entry.sha256.startswith(sha256)]
-    if len(matches) != 1:
+    known = [x for x in store.records if isinstance(x, kind or Record | HardwareRecord)]
+    matches = [entry for entry in known if entry.sha256.startswith(sha256)]
+    if len(matches) != 1 or isinstance(matches[0], Withdrawal):
         raise InputError(f"{store.folder} holds no single record that begins with {sha256!r}")
     return matches[0]
 
 
-def add_sealed(
-    folder: Path,
-    path: Path,
-    *,
-    seed: bytes | None = None,
-    simulators: Replayable | None = None,
-) -> Sealed:
-    """Add a sealed record to a leaderboard.
-
-    Args:
-        folder: of the leaderboard.
-        path: of the record; its ciphertext lies beside it.
-        seed: of the season, to look inside first; else nobody can until it is revealed.
-        simulators: to replay what is inside.
-
-    Returns:
-        The record.
-
-    Raises:
-        InputError: if it is not a sealed record of a season that is open, holds something else than
-            it says, or does not fit the records that are there.
-        OSError: if a file cannot be read or written.
-    """
-    from ventbench.board import sealed
-
-    store, added = load(folder), record.load(path)
-    if not isinstance(added, Sealed):
-        raise InputError(f"{path} is not a sealed record")
-    ciphertext = sealed.load(added, path.parent)
-    season = store.seasons.get(added.content.season.id)
-    if season is None:
-        raise InputError(f"{path}: {season_path(folder, added.content.season.id)} is missing")
-    problems = sealed.belongs(added, season)
-    if season.seed is not None:
-        problems.append(f"season {season.id} is over: its seed is public")
-    problems += conflicts([*store.records, added], start=len(store.records))
-    if problems:
-        raise InputError(f"{path}: {'; '.join(problems)}")
-    if seed is not None:
-        inside = sealed.unseal(added, ciphertext, season, seed)
-        if simulators is not None:
-            require_replay(inside.record, inside.commands, simulators, str(path), seed)
-    kept = sealed.path_of(added, folder / RECORDS)
-    files.write_atomically(kept, lambda file: file.write(ciphertext))
-    _append(store, added, path.read_bytes())
-    return added
-
-
-@dataclass(frozen=True)
-class Revealed:
-    """What came of the sealed records of a season.
-
-    Attributes:
-        opened: records that joined the leaderboard.
-        void: why a sealed record stays as it is, by its hash: it does not hold what it says.
-    """
-
-    opened: tuple[Record, ...]
-    void: Mapping[str, str]
-
-
-def reveal(folder: Path, name: str, seed: bytes, simulators: Replayable | None = None) -> Revealed:
-    """Reveal the seed of a season and open its sealed records.
-
-    What was opened before is left alone, so that an interrupted call can be repeated. A record that
-    does not hold what it says is void: else anybody's forgery could stop the reveal.
-
-    Args:
-        folder: of the leaderboard.
-        name: of the season.
-        seed: of the season.
-        simulators: to replay each record on; not replayed if not given.
-
-    Raises:
-        InputError: if there is no such season, or the seed is not the one that was committed to;
-            nothing has then been written.
-        OSError: if a file cannot be read or written.
-    """
-    from ventbench.board import sealed
-
-    store = load(folder)
-    if name not in store.seasons:
-        raise InputError(f"{season_path(folder, name)} is missing")
-    season = seasons.reveal(store.seasons[name], seed)
-    there = {entry.sha256 for entry in store.records}
-    waiting, void = [], {}
-    reference = None
-    if season.protocol > 1 and store.sealed and simulators is not None:
-        reference = sealed.open_reference(folder, season, seed)
-    for entry in store.sealed:
-        if entry.content.season.id != name or entry.content.record in there:
-            continue
-        try:
-            inside = sealed.unseal(entry, sealed.load(entry, folder / RECORDS), season, seed)
-            if simulators is not None:
-                label = f"the record of {inside.record.name}"
-                require_replay(inside.record, inside.commands, simulators, label, seed)
-            if reference is not None and (
-                wrong := sealed.other_reference(inside.record, reference)
-            ):
-                raise InputError(f"record {inside.record.sha256}, {'; '.join(wrong)}")
-            waiting.append(inside)
-        except InputError as error:
-            void[entry.sha256] = str(error)
-    seasons.write_season(season_path(folder, name), season)
-    for inside in waiting:
-        kept = actions.path_of(inside.record, folder / RECORDS)
-        commands = inside.commands
-        files.write_atomically(kept, lambda file, commands=commands: file.write(commands))
-        _append(load(folder), inside.record, inside.content)
-    return Revealed(tuple(inside.record for inside in waiting), void)
-
-
-def require_replay(
-    score: Record,
-    commands: bytes,
-    simulators: Replayable,
-    label: str,
-    seed: bytes | None = None,
-) -> None:
+def require_replay(score: Record, commands: bytes, simulators: ReplayPlants, label: str) -> None:
     """Replay a record.
 
     Args:
         score: the record.
         commands: content of its action file.
-        simulators: that it names, or a function that loads those of a protocol's version.
+        simulators: the frozen ones.
         label: names it in messages.
-        seed: of its season, for hidden draws.
 
     Raises:
         InputError: if it was scored on other simulators, or does not replay.
     """
     from ventbench.board.replay import differences, draws_of, replay
 
-    if callable(simulators):
-        simulators = simulators(score.version)
     if score.header.simulators != canonical.through_json(simulators.about()):
         raise InputError(f"{label} was scored on other simulators than those of this ventbench")
     requested = actions.decode(commands, score.header.actions.shape, label)
-    drawn = draws_of(score.header, simulators, seed)
+    drawn = draws_of(score.header, simulators)
     (replayed,) = replay(simulators, score.pips, [requested], drawn)
     problems = differences(score, replayed)
     if problems:
         raise InputError(f"{label} does not replay: {'; '.join(problems)}")
 
 
-def add(folder: Path, path: Path, simulators: Replayable | None = None) -> Record | HardwareRecord:
+def add(
+    folder: Path, path: Path, simulators: ReplayPlants | None = None
+) -> Record | HardwareRecord:
     """Add a record to a leaderboard.
 
     Args:
@@ -429,28 +185,19 @@ def add(folder: Path, path: Path, simulators: Replayable | None = None) -> Recor
         OSError: if a file cannot be read or written.
     """
     store, added = load(folder), record.load(path)
-    if isinstance(added, Sealed):
-        raise InputError(f"{path} is a sealed record; use add_sealed")
     if isinstance(added, Withdrawal):
         raise InputError(f"{path} is a withdrawal; use ventbench board withdraw")
-    if added.version not in protocol.VERSIONS:
-        raise InputError(
-            f"{path} is of protocol version {added.version}; this ventbench scores and replays "
-            f"versions {', '.join(map(str, protocol.VERSIONS))}"
-        )
     problems = conflicts([*store.records, added], start=len(store.records))
     if problems:
         raise InputError(f"{path}: {'; '.join(problems)}")
-    if isinstance(added, HardwareRecord):  # no commands to replay: its pressures are measured
-        _append(store, added, path.read_bytes())
-        return added
-    actions.load(added, path.parent)
-    content = actions.path_of(added, path.parent).read_bytes()
-    if simulators is not None:
-        require_replay(added, content, simulators, str(path))
-    kept = actions.path_of(added, folder / RECORDS)
-    files.write_atomically(kept, lambda file: file.write(content))
-    _append(store, added, path.read_bytes())
+    if isinstance(added, Record):  # a hardware record has measured pressures, and no commands
+        actions.load(added, path.parent)
+        content = actions.path_of(added, path.parent).read_bytes()
+        if simulators is not None:
+            require_replay(added, content, simulators, str(path))
+        kept = actions.path_of(added, folder / RECORDS)
+        files.write_atomically(kept, lambda file: file.write(content))
+    _write(folder, added, path.read_bytes())
     return added
 
 
@@ -466,25 +213,118 @@ def withdraw(folder: Path, sha256: str, reason: str) -> Withdrawal:
         InputError: if there is no such record, no reason, or it was withdrawn before.
     """
     store = load(folder)
-    kept = [entry for entry in store.records if not isinstance(entry, Withdrawal)]
-    matches = [entry.sha256 for entry in kept if entry.sha256.startswith(sha256)]
-    if len(matches) != 1:
-        raise InputError(f"{store.folder} holds no single record that begins with {sha256!r}")
-    withdrawn = matches[0]
+    withdrawn = find_record(store, sha256).sha256
     if any(isinstance(x, Withdrawal) and x.withdraws == withdrawn for x in store.records):
         raise InputError(f"record {withdrawn[:12]} is withdrawn already")
     content = record.withdrawal(withdrawn, reason)
     withdrawal = record.from_bytes(content, "the withdrawal")
     assert isinstance(withdrawal, Withdrawal)
-    _append(store, withdrawal, content)
+    _write(folder, withdrawal, content)
     return withdrawal
 
 
-def _append(store: Store, added: AnyRecord, content: bytes) -> None:
-    """Write the record, then the chain: a crash between leaves a file that nothing names."""
-    path = store.folder / RECORDS / f"{added.sha256}{record.SUFFIX}"
+def _write(folder: Path, added: AnyRecord, content: bytes) -> None:
+    path = folder / RECORDS / f"{added.sha256}{record.SUFFIX}"
     files.write_atomically(path, lambda file: file.write(content))
-    path = store.folder / CHAIN
-    before = path.read_bytes() if path.exists() else b""
-    lines = before + chain_line(len(store.links), added, store.head)
-    files.write_atomically(path, lambda file: file.write(lines))
+
+
+def conflicts(records: Sequence[AnyRecord], start: int = 0) -> list[str]:
+    """Find records that contradict those before them: what no record can say by itself.
+
+    Args:
+        records: in the order of :func:`in_order`.
+        start: index of the first one to check; those before are taken as they are.
+
+    Returns:
+        One sentence for each conflict, with the record's hash.
+    """
+    sentences: list[str] = []
+    before = _Before()
+    for index, entry in enumerate(records):
+        if index >= start:
+            sentences += _conflicts(entry, before)
+        before.append(entry)
+    return sentences
+
+
+@dataclass
+class _Before:
+    """What the records before one say.
+
+    Attributes:
+        first: record of a score.
+        first_of_name: first record of each entry's name, on any track.
+        newest: of each entry, by track and name.
+        known: all scores, by their hash.
+        hardware: hashes of all hardware records.
+        withdrawn: hashes of those that were taken back.
+    """
+
+    first: Record | None = None
+    first_of_name: dict[str, Record] = field(default_factory=dict)
+    newest: dict[tuple[str, str], Record] = field(default_factory=dict)
+    known: dict[str, Record] = field(default_factory=dict)
+    hardware: set[str] = field(default_factory=set)
+    withdrawn: set[str] = field(default_factory=set)
+
+    def append(self, entry: AnyRecord) -> None:
+        if isinstance(entry, Withdrawal):
+            self.withdrawn.add(entry.withdraws)
+        elif isinstance(entry, HardwareRecord):
+            self.hardware.add(entry.sha256)
+        else:
+            self.first = self.first or entry
+            self.first_of_name.setdefault(entry.name, entry)
+            self.newest[entry.key] = entry
+            self.known[entry.sha256] = entry
+
+
+def _conflicts(entry: AnyRecord, before: _Before) -> list[str]:
+    name = f"record {entry.sha256}"
+    if isinstance(entry, Withdrawal):
+        if entry.withdraws not in before.known and entry.withdraws not in before.hardware:
+            return [f"{name} withdraws {entry.withdraws[:12]}, which is not there"]
+        if entry.withdraws in before.withdrawn:
+            return [f"{name} withdraws {entry.withdraws[:12]} once more"]
+        return []
+    if entry.sha256 in before.known or entry.sha256 in before.hardware:
+        return [f"{name} is on the leaderboard already"]
+    sentences = []
+    first = before.first
+    if first is not None and isinstance(entry, Record):
+        # Records can only be compared over the same simulators, draws and reference errors.
+        keys = ("simulators", "draws", "headroom")
+        sentences = [
+            f"{name} ({entry.name}), key {key}: differs from record {first.sha256[:12]} "
+            f"({first.name})"
+            for key, own, common in zip(keys, entry.basis, first.basis, strict=True)
+            if own != common
+        ]
+    owner = before.first_of_name.get(entry.name)
+    if owner is not None and set(owner.manifest.authors) != set(entry.manifest.authors):
+        sentences.append(
+            f"{name} ({entry.name}), key submission.manifest.authors: the name belongs to the "
+            f"authors of record {owner.sha256[:12]}; choose another name"
+        )
+    if isinstance(entry, HardwareRecord):
+        return sentences
+    superseded, newest = entry.header.supersedes, before.newest.get(entry.key)
+    if superseded is None:
+        if newest is not None:
+            sentences.append(
+                f"{name} ({entry.name}), key supersedes: the entry has record "
+                f"{newest.sha256[:12]}; a new one must name it, with --supersedes and a --reason"
+            )
+        return sentences
+    old = before.known.get(superseded)
+    if old is None:
+        sentences.append(f"{name}, key supersedes: {superseded[:12]} is not there")
+    elif old.key != entry.key:
+        sentences.append(f"{name}, key supersedes: is of another entry or track")
+    elif newest is not None and old.sha256 != newest.sha256:
+        sentences.append(
+            f"{name}, key supersedes: the newest record of {entry.name} is {newest.sha256[:12]}"
+        )
+    elif old.official and not entry.official:
+        sentences.append(f"{name} is not official and supersedes an official record")
+    return sentences

@@ -1,33 +1,27 @@
-"""Everything again: chain, hashes, replay of all commands, and a rebuild of every page.
+"""Everything again: hashes, signatures, the replay of all commands, and the code of records.
 
-Nothing stops at the first problem: each names its file, and the key, line or byte in it.
+Nothing stops at the first problem: each names its file, and the key or line in it. Replay proves
+that errors follow from commands; :func:`rerun` runs the code of a record once more in the sandbox,
+which proves that the commands come from the code whose hashes the record names. What has been
+reproduced is kept in a folder, so that an interrupted run continues, and several processes can
+share the work.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
-from dataclasses import dataclass, field
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import protocol, rig_draws
-from ventbench import seasons as season_files
-from ventbench.board import (
-    actions,
-    attestation,
-    build,
-    canonical,
-    layout,
-    ranking,
-    record,
-    sealed,
-    store,
-)
-from ventbench.board.conflicts import conflicts
-from ventbench.board.record import AnyRecord, Record
+from ventbench import files
+from ventbench.board import actions, attestation, canonical, create, ranking, store
+from ventbench.board.canonical import ATTESTATIONS, RECORDS
+from ventbench.board.record import AnyRecord, Record, RecordStress
 from ventbench.board.replay import (
     BATCH,
     ReplayPlants,
@@ -36,15 +30,40 @@ from ventbench.board.replay import (
     draws_of,
     replay,
 )
+from ventbench.board.store import Store
+from ventbench.draws import Draws
 from ventbench.errors import InputError
+from ventbench.executor import executor, results
 from ventbench.headroom.reference import published, reference_of
 from ventbench.metrics.score import normalised
-from ventbench.rig_draws import RigDraws
+from ventbench.plants.rigs import rigs_of
+from ventbench.resume import WorkFolder
+from ventbench.stress import stressors
+from ventbench.stress.run import draw_cells
+from ventbench.stress.score import StressScore, run_stress
+from ventbench.submissions.folder import Submission, file_hashes, open_submission
+from ventbench.submissions.runner import Runner
+from ventbench.submissions.scoring import run_protocol
 
 Floats = NDArray[np.float64]
 
-#: Loads the frozen simulators of a version.
-Load = Callable[[int], ReplayPlants]
+#: What a second run can show.
+REPRODUCED, DIFFERENT, NOT_RERUN = "reproduced", "different", "not re-run"
+
+#: Most that a command up to 100 % may differ from the recorded one, %; larger requests by the same
+#: share. Another processor, or simulators whose
+#: sums run in another order, move the last bit of a pressure; a controller in single precision
+#: makes up to 1e-5 % of that, and feedback some more. No score shows a thousandth of a percent.
+COMMAND_TOLERANCE = 1e-3
+
+#: Most that the error of a stress run may differ, cmH2O, where commands are not equal to the bit.
+STRESS_TOLERANCE = 1e-3
+
+#: Most folders of submissions that are looked through in one place.
+MAX_FOLDERS = 5000
+
+#: Loads the frozen simulators.
+Load = Callable[[], ReplayPlants]
 
 #: Told how many records of how many have been replayed.
 Progress = Callable[[int, int], None]
@@ -55,22 +74,18 @@ class Report:
     """What a verification saw.
 
     Attributes:
-        head: SHA-256 that stands for all records and their order.
         records: how many there are.
         replayed: how many were replayed.
-        unsealed: how many sealed records were looked into.
         reproduced: how many were run again and gave the same commands; see
-            :mod:`ventbench.board.rerun`.
+            :func:`rerun`.
         second_runs: what each second run showed, one sentence a record.
         deviation: largest difference between a recorded error and its replay, cmH2O.
         problems: one sentence each; empty if all is well.
         notes: what could not be checked, which is no problem.
     """
 
-    head: str = store.CHAIN_START
     records: int = 0
     replayed: int = 0
-    unsealed: int = 0
     reproduced: int = 0
     second_runs: list[str] = field(default_factory=list)
     deviation: float = 0.0
@@ -78,212 +93,66 @@ class Report:
     notes: list[str] = field(default_factory=list)
 
 
-def verify(
-    folder: Path,
-    load: Load,
-    *,
-    head: str | None = None,
-    seed: bytes | None = None,
-    progress: Progress | None = None,
-) -> Report:
+def verify(folder: Path, load: Load, *, progress: Progress | None = None) -> Report:
     """Verify a leaderboard.
 
     Args:
         folder: of the leaderboard.
-        load: of the frozen simulators, by their version; raises InputError where they were changed.
-        head: of the chain, noted earlier: it must still be on it.
-        seed: of a season that is not revealed yet, to look into its sealed records.
+        load: of the frozen simulators; raises InputError where they were changed.
         progress: called after each batch of records.
 
     Raises:
-        InputError: if there is no leaderboard, or jinja2 is not installed.
+        InputError: if there is no leaderboard.
         OSError: if a file cannot be read.
     """
     report = Report()
-    if not (folder / store.CHAIN).is_file():
-        raise InputError(f"{folder} holds no leaderboard: {store.CHAIN} is missing")
-    try:
-        links = store.read_chain(folder)
-    except InputError as error:
-        report.problems.append(str(error))
-        links = []
-    report.head = store.chain_head(links)
-    if head is not None and head not in {store.CHAIN_START, *(link.sha256 for link in links)}:
-        report.problems.append(f"{folder / store.CHAIN} does not hold the line {head}")
-    entries: list[AnyRecord] = []
-    for link in links:
+    paths = store.record_paths(folder)
+    if not paths:
+        raise InputError(f"{folder} holds no leaderboard: there is no record in {RECORDS}/")
+    read: list[AnyRecord] = []
+    for path in paths:
         try:
-            entries.append(store.read_record(folder, link, strict=True))
+            read.append(store.read_record(path, strict=True))
         except (InputError, OSError) as error:
             report.problems.append(str(error))
+    entries = store.in_order(read)
     report.records = len(entries)
-    report.problems += _strange_files(folder, bool(links))
-    if len(entries) == len(links):
-        report.problems += _misnamed(folder, entries)
-    report.problems += conflicts(entries)
-    vouched: frozenset[str] = frozenset()
-    if links:  # else nobody knows which records there are
-        vouched, problems = attestation.attested(folder, [link.record for link in links])
-        report.problems += problems
-    known = _check_seasons(folder, report)
-    leaderboard = store.assembled(folder, links, entries, vouched, known)
-    hidden = _check_sealed(leaderboard, vouched, seed, report)
-    by_draw = _check_replay(folder, leaderboard.scores, load, known, report, progress)
-    seeds = {name: season.revealed for name, season in known.items() if season.revealed}
-    if seed is not None:
-        of_seed = season_files.commitment(seed)
-        seeds |= {name: seed for name, about in known.items() if about.commitment == of_seed}
-    _check_hidden(hidden, load, seeds, report)
+    report.problems += _strange_files(folder, entries, whole=len(entries) == len(paths))
+    report.problems += store.conflicts(entries)
+    vouched, problems = attestation.attested(folder, [path.stem for path in paths])
+    report.problems += problems
+    leaderboard = Store(folder, entries, vouched)
+    by_draw = _check_replay(leaderboard, load, report, progress)
     if not report.problems:  # else whatever is wrong has been said, and moves the ranks
         report.problems += _check_ranks(leaderboard, by_draw)
-    if len(entries) == len(links) > 0:
-        report.problems += _check_pages(leaderboard)
     return report
 
 
-def _check_seasons(folder: Path, report: Report) -> dict[str, season_files.Season]:
-    """Read each season file; one whose seed is not that of its commitment is a problem."""
-    known = {}
-    for path in sorted((folder / layout.SEASONS).glob("*.toml")):
-        try:
-            known[path.stem] = season_files.read_season(path)
-        except InputError as error:
-            report.problems.append(str(error))
-    return known
-
-
-def _check_sealed(
-    leaderboard: store.Store, vouched: Container[str], seed: bytes | None, report: Report
-) -> list[sealed.Opened]:
-    """Check sealed records; look into them where the seed of their season is known.
-
-    Returns:
-        What was inside those that are not on the chain yet.
-    """
-    opened = []
-    there = {entry.sha256 for entry in leaderboard.records}
-    closed = 0
-    for entry in leaderboard.sealed:
-        folder = leaderboard.folder / store.RECORDS
-        season = leaderboard.seasons.get(entry.content.season.id)
-        label = folder / f"{entry.sha256}{record.SUFFIX}"
-        if season is None:
-            name = f"{layout.SEASONS}/{entry.content.season.id}.toml"
-            report.problems.append(f"{label}, key season.id: {name} is missing or wrong")
-            continue
-        try:
-            ciphertext = sealed.load(entry, folder)
-            problems = sealed.belongs(entry, season)
-            if problems:
-                raise InputError(f"{label}: {'; '.join(problems)}")
-            own = season.revealed
-            if own is None and seed is not None:
-                own = seed if season_files.commitment(seed) == season.commitment else None
-            if own is None:
-                closed += 1
-                continue
-        except (InputError, OSError) as error:
-            report.problems.append(str(error))
-            continue
-        try:
-            inside = sealed.unseal(entry, ciphertext, season, own)
-        except InputError as error:
-            # Anybody can send a forgery; only a signature makes it somebody's fault.
-            (report.problems if entry.sha256 in vouched else report.notes).append(str(error))
-            continue
-        report.unsealed += 1
-        if inside.record.sha256 in there:
-            continue
-        if season.seed is not None:
-            report.problems.append(
-                f"{label} belongs to season {season.id}, which is revealed, and is still sealed; "
-                "run `ventbench board reveal` again"
-            )
-        opened.append(inside)
-    if closed:
-        report.notes.append(
-            f"{closed} sealed records cannot be looked into before their season is revealed"
-        )
-    return opened
-
-
-def _check_hidden(
-    hidden: Sequence[sealed.Opened], load: Load, seeds: Mapping[str, bytes], report: Report
-) -> None:
-    """Replay what is inside sealed records; ``seeds`` are known ones by season."""
-    for inside in hidden:
-        label = f"what is sealed of record {inside.record.sha256}"
-        simulators = _simulators(inside.record.header.simulators, load, report)
-        if simulators is None:
-            continue
-        try:
-            season = inside.record.header.draws.season
-            store.require_replay(
-                inside.record, inside.commands, simulators, label, seeds.get(season or "")
-            )
-            report.replayed += 1
-        except InputError as error:
-            report.problems.append(str(error))
-
-
-def _strange_files(folder: Path, readable: bool) -> list[str]:
-    """Files that belong to no leaderboard with this chain: none of them may be published.
+def _strange_files(folder: Path, entries: Sequence[AnyRecord], *, whole: bool) -> list[str]:
+    """Files that belong to no record of the leaderboard: none of them may be published.
 
     Args:
         folder: of the leaderboard.
-        readable: whether the chain could be read; else nobody knows which records it names.
+        entries: that could be read.
+        whole: whether these are all; else nobody knows which commands the others name.
     """
-    plain, odd = layout.walk(folder)
+    plain, odd = canonical.walk(folder)
     problems = [f"{folder / name} is neither a plain file nor a folder; remove it" for name in odd]
-    for name in layout.stray(plain, (folder / store.CHAIN).read_bytes()):
-        if not name.startswith(f"{store.RECORDS}/"):
+    named = {entry.sha256 for entry in entries}
+    commands = {entry.header.actions.sha256 for entry in entries if isinstance(entry, Record)}
+    for name in sorted(plain - {ATTESTATIONS}):
+        path = Path(name)
+        if not canonical.named(name):
             problems.append(f"{folder / name} is no part of a leaderboard; remove it")
-        elif readable:
-            problems.append(f"{folder / name} is not named by {store.CHAIN}; add it, or remove it")
+        elif whole and path.suffix != canonical.RECORD_SUFFIX:
+            of = commands if path.suffix == canonical.ACTIONS_SUFFIX else named
+            if path.stem not in of:
+                problems.append(f"{folder / name} belongs to no record; remove it")
     return problems
-
-
-def _misnamed(folder: Path, entries: Sequence[AnyRecord]) -> list[str]:
-    """Files that bear the hash of a file of another kind, or belong to a record that has none."""
-    beside = {record.commands_of(x): isinstance(x, record.Sealed) for x in entries}
-    return [
-        f"{folder / name} is not named by {store.CHAIN}; remove it"
-        for name in sorted(layout.walk(folder)[0])
-        if name.startswith(f"{store.RECORDS}/")
-        for path in [Path(name)]
-        if path.suffix in (layout.ACTIONS_SUFFIX, layout.SEALED_SUFFIX)
-        if beside.get(path.stem) is (path.suffix == layout.ACTIONS_SUFFIX)
-    ]
-
-
-def _check_pages(leaderboard: store.Store) -> list[str]:
-    """Built files that are missing, stale or changed, with the first byte that differs."""
-    folder = leaderboard.folder
-    built, present = build.content(leaderboard), build.present(folder)
-    missing, stale = sorted(built.keys() - present), sorted(present - built.keys())
-    problems = [f"{folder / name} is missing; run `ventbench board build`" for name in missing]
-    problems += [f"{folder / name} belongs to no record" for name in stale]
-    for name in sorted(built.keys() & present):
-        now = (folder / name).read_bytes()
-        if now != built[name]:
-            byte = _first_difference(now, built[name])
-            problems.append(f"{folder / name} is not what the records give: byte {byte}")
-    return problems
-
-
-def _first_difference(a: bytes, b: bytes) -> int:
-    """Index of the first byte that differs, or the length of the shorter one."""
-    pairs = enumerate(zip(a, b, strict=False))
-    return next((i for i, (x, y) in pairs if x != y), min(len(a), len(b)))
 
 
 def _check_replay(
-    folder: Path,
-    scores: Sequence[Record],
-    load: Load,
-    known: Mapping[str, season_files.Season],
-    report: Report,
-    progress: Progress | None,
+    leaderboard: Store, load: Load, report: Report, progress: Progress | None
 ) -> dict[str, Floats]:
     """Replay records and note in the report what differs.
 
@@ -292,27 +161,29 @@ def _check_replay(
         :attr:`ventbench.board.record.Record.ranked_values`.
     """
     by_draw: dict[str, Floats] = {}
-    for group in _by_simulators(scores, report):
+    groups: dict[tuple[str, str], list[Record]] = {}
+    for score in leaderboard.scores:
+        groups.setdefault(score.basis[:2], []).append(score)
+    for group in groups.values():
         header = group[0].header
         simulators = _simulators(header.simulators, load, report)
         if simulators is None:
             continue
         try:
-            season = known.get(header.draws.season or "")
-            drawn = draws_of(header, simulators, season.revealed if season else None)
+            drawn = draws_of(header, simulators)
         except InputError as error:
             report.problems += [f"record {score.sha256}, {error}" for score in group]
             continue
-        report.problems += _wrong_reference(folder, known, group)
+        report.problems += _wrong_reference(group)
         for first in range(0, len(group), BATCH):
             batch = group[first : first + BATCH]
-            by_draw |= _replay_batch(folder, batch, simulators, drawn, report)
+            by_draw |= _replay_batch(leaderboard.folder, batch, simulators, drawn, report)
             if progress is not None:
                 progress(min(first + BATCH, len(group)), len(group))
     return by_draw
 
 
-def _check_ranks(leaderboard: store.Store, by_draw: Mapping[str, Floats]) -> list[str]:
+def _check_ranks(leaderboard: Store, by_draw: Mapping[str, Floats]) -> list[str]:
     """Ranks that recorded errors give and replayed ones do not: nobody gains by a rounding error.
 
     Args:
@@ -320,75 +191,41 @@ def _check_ranks(leaderboard: store.Store, by_draw: Mapping[str, Floats]) -> lis
         by_draw: replayed values that rank; a record without them keeps its own.
     """
     problems = []
-    standings = ranking.standings(leaderboard.records, leaderboard.attested, leaderboard.breaches)
-    for tracks in standings.values():
-        for name, standing in tracks.items():
-            records = [entry.record for entry in standing.ranked]
-            recorded = ranking.places(records, [score.ranked_values for score in records])
-            again = [by_draw.get(x.sha256, x.ranked_values) for x in records]
-            replayed = ranking.places(records, again)
-            problems += [
-                f"record {score.sha256} ({score.name}): ranks {said} on the {name} track by its "
-                f"recorded errors, {given} by those that all commands give"
-                for score, said, given in zip(records, recorded, replayed, strict=True)
-                if said != given
-            ]
+    for name, standing in ranking.standings(leaderboard).items():
+        records = [entry.record for entry in standing.ranked]
+        recorded = ranking.ranges_of(records, [score.ranked_values for score in records])
+        again = [by_draw.get(x.sha256, x.ranked_values) for x in records]
+        replayed = ranking.ranges_of(records, again)
+        problems += [
+            f"record {score.sha256} ({score.name}): ranks {said[0]} on the {name} track by its "
+            f"recorded errors, {given[0]} by those that all commands give"
+            for score, said, given in zip(records, recorded, replayed, strict=True)
+            if said[0] != given[0]
+        ]
     return problems
 
 
-def _by_simulators(scores: Sequence[Record], report: Report) -> list[list[Record]]:
-    """Records that can be replayed together."""
-    groups: dict[str, list[Record]] = {}
-    old: set[int] = set()
-    for score in scores:
-        if score.version > max(protocol.VERSIONS):
-            report.problems.append(
-                f"record {score.sha256}, key protocol: version {score.version} is not known to "
-                "this ventbench"
-            )
-        elif score.version < min(protocol.VERSIONS):
-            old.add(score.version)
-        else:
-            groups.setdefault("".join((str(score.version), *score.basis[:2])), []).append(score)
-    report.notes += [
-        f"records of protocol version {version} were not replayed; an older ventbench does that"
-        for version in sorted(old)
-    ]
-    return list(groups.values())
-
-
-def _wrong_reference(
-    folder: Path, known: Mapping[str, season_files.Season], group: Sequence[Record]
-) -> list[str]:
-    """Records of one season whose reference errors are not those of the season."""
-    score = group[0]
-    season = known.get(score.header.draws.season or "")
-    development = score.header.draws.season == rig_draws.DEVELOPMENT
-    if score.headroom is None or not (development or (season and season.revealed)):
-        return []
+def _wrong_reference(group: Sequence[Record]) -> list[str]:
+    """Records whose reference errors are not the published ones of their draws."""
+    header = group[0].header
     try:
-        own = published()
-        if season is not None and season.revealed is not None and not development:
-            own = sealed.open_reference(folder, season, season.revealed)
-        reference = reference_of(score.header.simulators, score.header.draws.about(), own)
+        reference = reference_of(header.simulators, header.draws.about(), published())
     except InputError as error:
-        return [f"record {score.sha256}, key headroom: {error}"]
+        return [f"record {group[0].sha256}, key headroom: {error}"]
     assert reference is not None
+    tables = {"attainable": reference.attainable, "pid": reference.pid}
     return [
-        f"record {entry.sha256}, {text}"
-        for entry in group
-        for text in sealed.other_reference(entry, reference)
+        f"record {score.sha256}, key headroom.{key}: not the published reference errors"
+        for score in group
+        for key, table in tables.items()
+        if not np.array_equal(getattr(score.headroom, key), np.moveaxis(table, 1, 0))
     ]
 
 
 def _simulators(recorded: Mapping[str, Any], load: Load, report: Report) -> ReplayPlants | None:
-    """Load the simulators that records name; None, and a problem, where that is impossible."""
-    version = recorded.get("version")
-    if not isinstance(version, int):  # it becomes part of a path
-        report.problems.append(f"simulators: a record names version {version!r}, not a number")
-        return None
+    """Load the simulators; None, and a problem, where they are not those that records name."""
     try:
-        simulators = load(version)
+        simulators = load()
         here = canonical.through_json(simulators.about())
     # A damaged manifest can lack anything; InputError is a ValueError.
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
@@ -409,14 +246,14 @@ def _replay_batch(
     folder: Path,
     batch: Sequence[Record],
     simulators: ReplayPlants,
-    drawn: RigDraws | None,
+    drawn: Draws,
     report: Report,
 ) -> dict[str, Floats]:
     sound, requested = [], []
     by_draw: dict[str, Floats] = {}
     for score in batch:
         try:
-            requested.append(actions.load(score, folder / store.RECORDS))
+            requested.append(actions.load(score, folder / RECORDS))
             sound.append(score)
         except (InputError, OSError) as error:
             report.problems.append(str(error))
@@ -426,12 +263,284 @@ def _replay_batch(
     for score, replayed in zip(sound, runs, strict=True):
         report.replayed += 1
         report.deviation = max(report.deviation, deviation(score, replayed))
-        path = folder / store.RECORDS / f"{score.sha256}{record.SUFFIX}"
+        path = folder / RECORDS / f"{score.sha256}{canonical.RECORD_SUFFIX}"
         report.problems += [f"{path}, {text}" for text in differences(score, replayed)]
-        failed = np.isnan(score.drawn)
-        values = replayed.drawn
-        if score.headroom is not None and replayed.controllable is not None:
-            own = score.headroom
-            values = normalised(replayed.controllable, own.attainable, own.pid)[1:]
+        own, failed = score.headroom, np.isnan(score.drawn)
+        values = normalised(replayed.controllable, own.attainable, own.pid)[1:]
         by_draw[score.sha256] = np.where(failed, np.nan, values).mean(axis=2).T
     return by_draw
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the second run of a record showed.
+
+    Attributes:
+        record: SHA-256 of the record.
+        name: of the entry.
+        track: of the record.
+        state: ``"reproduced"``, ``"different"`` or ``"not re-run"``.
+        detail: what differs, or why it was not run again; for a reproduced record how close its
+            commands are.
+        seconds: that the run took.
+    """
+
+    record: str
+    name: str
+    track: str
+    state: str
+    detail: str = ""
+    seconds: float = 0.0
+
+    def __str__(self) -> str:
+        detail = f": {self.detail}" if self.detail else ""
+        return f"record {self.record} ({self.name}, {self.track}): {self.state}{detail}"
+
+
+def sandboxed() -> Runner:
+    """The runner of official scores.
+
+    Raises:
+        SandboxError: if this machine lacks a layer that they need.
+    """
+    from ventbench.sandbox.runner import SandboxRunner
+
+    return SandboxRunner(require_official=True)
+
+
+def frozen_simulators() -> ReplayPlants:
+    """The frozen simulators.
+
+    Raises:
+        InputError: if they were changed.
+    """
+    from ventbench.plants import frozen
+
+    return frozen.load()
+
+
+def rerun(
+    folder: Path,
+    *,
+    records: Sequence[str] = (),
+    sources: Sequence[Path] = (),
+    work: Path,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    load: Callable[[], ReplayPlants] = frozen_simulators,
+    runner: Callable[[], Runner] = sandboxed,
+    progress: Callable[[Outcome], None] | None = None,
+) -> list[Outcome]:
+    """Run the code of records again and compare commands.
+
+    Args:
+        folder: of the leaderboard.
+        records: hashes of the records, or the beginnings of them; all scores if empty.
+        sources: folders with the code: of one submission, or of several.
+        work: folder for what is finished; the same one continues.
+        jobs: number of processes; 1 for this one alone.
+        scheduler: address of a Dask scheduler instead, whose workers see the same files.
+        load: gives the simulators; outside of this process, a function of a module.
+        runner: gives the runner; outside of this process, a function of a module.
+        progress: called after each record.
+
+    Returns:
+        One outcome a record, oldest first.
+
+    Raises:
+        InputError: if a hash names no record, ``work`` belongs to other versions, or this machine
+            cannot run submissions as official scores are run, or a worker process died.
+        OSError: if a file cannot be read or written.
+    """
+    board = store.load(folder)
+    chosen = {store.find_record(board, sha256, Record).sha256 for sha256 in records}
+    scores = [score for score in board.scores if not chosen or score.sha256 in chosen]
+    about = canonical.through_json(load().about())
+    done = WorkFolder(work, {"simulators": about, "versions": create.versions()})
+    outcomes: dict[str, Outcome] = {}
+    todo: list[tuple[Record, Path]] = []
+
+    def note(outcome: Outcome) -> None:
+        outcomes[outcome.record] = outcome
+        # A run that differed may have met a limit of time: it is tried anew.
+        if outcome.state == REPRODUCED and not done.has(outcome.record):
+            done.put(outcome.record, asdict(outcome))
+        if progress is not None:
+            progress(outcome)
+
+    available = list(_folders([folder.parent / "submissions", *sources]))
+    for score in scores:
+        if done.has(score.sha256):
+            note(Outcome(**done.read(score.sha256)))
+            continue
+        code, why = _code_of(score, available, about)
+        if code is None:
+            note(Outcome(score.sha256, score.name, score.track, NOT_RERUN, why))
+        else:
+            todo.append((score, code))
+    if scheduler is None and (jobs == 1 or len(todo) < 2):
+        for score, code in todo:
+            note(_run(score, code, folder, load(), runner()))
+    elif todo:
+        work_of = {
+            score.sha256: (score.sha256, code.resolve(), folder.resolve(), load, runner)
+            for score, code in todo
+        }
+        with executor(jobs if scheduler is None else 0, scheduler) as pool:
+            for _, outcome in results(pool, _run_in_process, work_of):
+                note(outcome)
+    return [outcomes[score.sha256] for score in scores]
+
+
+def _folders(places: Sequence[Path]) -> Iterator[Path]:
+    """Folders that may hold a submission: the places themselves and those in them."""
+    for place in (*places, files.submissions_folder()):
+        if not place.is_dir():
+            continue
+        yield place
+        inside = (path for path in sorted(place.iterdir())[:MAX_FOLDERS] if not path.is_symlink())
+        yield from (path for path in inside if path.is_dir())
+
+
+def _code_of(
+    score: Record, available: Sequence[Path], simulators: Mapping[str, Any]
+) -> tuple[Path | None, str]:
+    """Find the code that a record names by its hashes; else why it cannot be run again."""
+    if score.header.simulators != simulators:
+        return None, "it was scored on other simulators than those of this ventbench"
+    wanted = score.header.submission.files
+    for folder in available:
+        # By its files first: hashing every folder for every record would take long.
+        if all((folder / name).is_file() for name in wanted) and file_hashes(folder) == wanted:
+            return folder, ""
+    return None, "no folder at hand has the files that it names; give --source DIR"
+
+
+def _run_in_process(
+    sha256: str,
+    code: Path,
+    folder: Path,
+    load: Callable[[], ReplayPlants],
+    runner: Callable[[], Runner],
+) -> Outcome:
+    """Run one record in a process of its own, which reads it again."""
+    score = store.find_record(store.load(folder), sha256, Record)
+    assert isinstance(score, Record)
+    return _run(score, code, folder, load(), runner())
+
+
+def _run(
+    score: Record, code: Path, folder: Path, simulators: ReplayPlants, runner: Runner
+) -> Outcome:
+    """Run the code of one record and compare."""
+    begun = time.perf_counter()
+    stress: StressScore | None = None
+    try:
+        submission = open_submission(str(code))
+        _check_same(submission, score)
+        drawn, rigs = draws_of(score.header, simulators), rigs_of(simulators)
+        result = run_protocol(submission, rigs, track=score.track, drawn=drawn, runner=runner)
+        if score.stress is not None:
+            cells = draw_cells(rigs, score.stress.tables.pips.shape[1], drawn=drawn)
+            chosen = score.stress.tables.conditions
+            stress = run_stress(submission, cells, chosen, runner=runner)
+        _check_same(open_submission(str(code)), score)
+        recorded = actions.load(score, folder / RECORDS)
+        detail = difference(score, recorded, result.requested)
+        closeness = _closeness(recorded, result.requested)
+        failed = {(x.lung, x.pip, x.draw) for x in result.failures}
+        if not detail and failed != {(x.lung, x.pip, x.draw) for x in score.header.failures}:
+            detail = f"{len(failed)} cells failed, {score.header.failed_cells} in the record"
+        if not detail and score.stress is not None and stress is not None:
+            detail = stress_difference(score.stress, stress)
+            closeness += _stress_closeness(score.stress, stress)
+    except (InputError, FloatingPointError) as error:
+        detail, closeness = f"its code cannot be run: {error}", ""
+    seconds = round(time.perf_counter() - begun, 1)
+    state = DIFFERENT if detail else REPRODUCED
+    return Outcome(score.sha256, score.name, score.track, state, detail or closeness, seconds)
+
+
+def _check_same(submission: Submission, score: Record) -> None:
+    """Refuse code that has changed since it was found."""
+    if submission.sha256 != score.header.submission.sha256:
+        raise InputError(f"{submission.label} was changed while it ran")
+
+
+def stress_difference(recorded: RecordStress, again: StressScore) -> str:
+    """Describe how runs of the stress track differ from the recorded ones; empty if they do not.
+
+    Args:
+        recorded: figures and hash of the commands.
+        again: the second run.
+    """
+    if recorded.stressors != stressors.VERSION:
+        return f"stress: its stressors are version {recorded.stressors}, not {stressors.VERSION}"
+    tables = recorded.tables
+    pairs = {
+        "errors": (tables.error, again.error, STRESS_TOLERANCE),
+        "safe": (tables.safe, again.safe, 0.0),
+        "survived": (tables.survived, again.survived, 0.0),
+        "above_alarm_ms": (tables.alarm_s, again.alarm_s, 1e-3),
+        "peak_centi_cmH2O": (tables.peak, again.peak, 0.011),
+        "volume_mL": (tables.volume, again.volume, 1.0),
+    }
+    for key, (old, new, tolerance) in pairs.items():
+        # A failed run has no error; -1 stands for it on both sides.
+        ours, theirs = (np.nan_to_num(np.asarray(x, float), nan=-1.0) for x in (new, old))
+        off = np.abs(ours - theirs)
+        if off.max() > tolerance:
+            return f"stress.{key}: differs by up to {off.max():.3g} from the record"
+    return ""
+
+
+def _stress_closeness(recorded: RecordStress, again: StressScore) -> str:
+    """Say whether the commands of the stress track, of which a record has the hash, are equal."""
+    if create.stress_digest(again.requested) == recorded.commands_sha256:
+        return ", stress to the bit"
+    return ", stress within tolerance"
+
+
+def _closeness(recorded: Floats, again: Floats) -> str:
+    """Say how close commands of equal shape are."""
+    if recorded.shape != again.shape:
+        return ""
+    if not _bits_apart(recorded, again).any():
+        return "to the bit"
+    return f"commands within {np.abs(recorded - again).max():.1e} %"
+
+
+def _bits_apart(recorded: Floats, again: Floats) -> NDArray[np.bool_]:
+    bits = (np.ascontiguousarray(x, np.float64).view(np.uint64) for x in (recorded, again))
+    return np.not_equal(*bits)
+
+
+def difference(score: Record, recorded: Floats, again: Floats) -> str:
+    """Describe how commands differ from the recorded ones; empty if they agree.
+
+    They agree within `COMMAND_TOLERANCE`, of which a processor's last bits are a small part.
+
+    Args:
+        score: whose commands they are.
+        recorded: %, shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``.
+        again: commands of the second run, of the same shape.
+    """
+    if recorded.shape != again.shape:
+        return f"commands of shape {again.shape}, {recorded.shape} in the record"
+    # Not `>`: whatever is no number is apart, too.
+    allowed = COMMAND_TOLERANCE * np.maximum(1.0, np.abs(recorded) / 100.0)
+    apart = ~(np.abs(recorded - again) <= allowed)
+    if not apart.any():
+        return ""
+    lung, draw, pip, breath, step = np.argwhere(apart)[0]
+    cells = int(apart.any(axis=(-2, -1)).sum())
+    run = f"draw {draw}" if draw else "nominal"
+    where = (
+        f"{score.lungs[lung]}, PIP {score.pips[pip]:g}, {run}, breath {breath + 1}, step {step + 1}"
+    )
+    first = lung, draw, pip, breath, step
+    return (
+        f"commands differ in {cells} of {apart[..., 0, 0].size} cells, by up to "
+        f"{np.abs(recorded - again).max():.3g} %; first in {where}: {recorded[first]:.12g} % in "
+        f"the record, {again[first]:.12g} % now"
+    )

@@ -7,20 +7,26 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ventbench.cli import seasons
 from ventbench.cli.options import JsonFile, Scheduler, bars, counted, emit, notes
-from ventbench.cli.seasons import FOLDER, Folder, SeedFile, seed_of
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from ventbench.board.ranking import Interval, Track
+    from ventbench.board.ranking import Track
     from ventbench.board.verify import Report
 
 app = typer.Typer(
     name="board", help="The leaderboard: add records, build and verify pages.", no_args_is_help=True
 )
+
+Folder = Annotated[
+    Path,
+    typer.Option(
+        "--folder", metavar="DIR", help="Folder of the leaderboard; default: leaderboard."
+    ),
+]
+FOLDER = Path("leaderboard")
 
 #: Characters of a hash that tables show, as `--supersedes` and `verify --rerun` take them.
 SHOWN = 8
@@ -46,18 +52,13 @@ def add(
         list[str] | None,
         typer.Option(metavar="KEY=TEXT", help="Origin of the submission; may be repeated."),
     ] = None,
-    seed: SeedFile = None,
     folder: Folder = FOLDER,
 ) -> None:
     """Add records whose replay gives the recorded numbers.
 
-    A sealed record of a season can only be replayed by those who hold the seed of the season
-    (--seed); else it is checked once the season is revealed.
-
     Example: `ventbench board add runs/record/3f2a....json --source commit=9c1e5d0`
     """
     from ventbench.board import create, store
-    from ventbench.board import record as records
     from ventbench.errors import InputError
     from ventbench.plants import frozen
 
@@ -75,12 +76,7 @@ def add(
             replaying = counted(shown, "replaying records")
             for path in paths:
                 new = create.amend(path, supersedes=supersedes, reason=reason, source=about)
-                if isinstance(records.load(new), records.Sealed):
-                    held = seed_of(seed)
-                    simulators = None if held is None else frozen.load
-                    done.append(store.add_sealed(folder, new, seed=held, simulators=simulators))
-                else:
-                    done.append(store.add(folder, new, frozen.load))
+                done.append(store.add(folder, new, frozen.load()))
                 replaying(len(done), len(paths))
     finally:  # also those before one that is refused
         for added in done:
@@ -131,7 +127,7 @@ def sign(
 
 @app.command(name="new-key")
 def new_key() -> None:
-    """Make a key that signs records: the secret, and the lines for leaderboard/keys.toml.
+    """Make a key that signs records: the secret, and the lines for attestations.toml.
 
     Example: `ventbench board new-key`
     """
@@ -139,21 +135,27 @@ def new_key() -> None:
 
     secret, lines = attestation.new_key()
     typer.echo(f"# secret: {attestation.SECRET} of the workflow; keep it nowhere else\n{secret}\n")
-    typer.echo(f"# public: for leaderboard/keys.toml\n{lines}", nl=False)
+    typer.echo(f"# public: for leaderboard/attestations.toml\n{lines}", nl=False)
 
 
 @app.command()
-def build(folder: Folder = FOLDER, json: JsonFile = None) -> None:
-    """Build the CSV and all pages from the records; the same records give the same bytes.
+def build(
+    folder: Folder = FOLDER,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Site: pages, CSV and the records.")
+    ] = Path("runs/board"),
+    json: JsonFile = None,
+) -> None:
+    """Build pages and CSV from the records; the same records give the same bytes.
 
-    Example: `ventbench board build`
+    Example: `ventbench board build --out runs/board`
     """
     from ventbench.board import build as builder
 
-    done = builder.build(folder)
-    emit({"records": done.records, "files": done.pages, "changed": list(done.changed)}, json)
+    done = builder.build(folder, out)
+    emit({"records": done.records, "files": done.files, "changed": list(done.changed)}, json)
     typer.echo(
-        f"{folder}: {done.records} records, {done.pages} files, {len(done.changed)} changed",
+        f"{out}: {done.records} records, {done.files} pages, {len(done.changed)} files changed",
         err=str(json) == "-",
     )
 
@@ -169,10 +171,6 @@ def verify(
         ),
     ] = None,
     folder: Folder = FOLDER,
-    head: Annotated[
-        str | None, typer.Option(help="Earlier head of the chain, which must still be part of it.")
-    ] = None,
-    seed: SeedFile = None,
     rerun: Annotated[
         bool,
         typer.Option("--rerun", help="Also run the code of records again, in the sandbox."),
@@ -192,7 +190,7 @@ def verify(
     ] = Path("runs/rerun"),
     json: JsonFile = None,
 ) -> None:
-    """Check every hash and signature, replay every record and rebuild every page.
+    """Check every hash and signature, and replay every record.
 
     With --rerun, the code that each record names by its hashes runs again, and its commands must
     be the recorded ones to 0.001 %. Records whose code is not at hand are listed.
@@ -214,13 +212,8 @@ def verify(
         raise InputError("records are chosen for --rerun; without it all are verified")
     console = Console(stderr=str(json) == "-")
     with bars() as shown:
-        report = verifier.verify(
-            folder,
-            frozen.load,
-            head=head,
-            seed=seed_of(seed),
-            progress=counted(shown, "replaying records"),
-        )
+        progress = counted(shown, "replaying records")
+        report = verifier.verify(folder, frozen.load, progress=progress)
     if rerun and not report.problems:  # else the records are not what they were
         _rerun(report, folder, records or [], source or [], out, jobs, scheduler)
     emit(dataclasses.asdict(report), json)
@@ -238,33 +231,31 @@ def _rerun(
     scheduler: str | None,
 ) -> None:  # fmt: skip
     """Run code again; note in the report what came of it."""
-    from ventbench.board import rerun
+    from ventbench.board import verify as verifier
 
     with notes().status("running code again") as status:
 
-        def note(outcome: rerun.Outcome) -> None:
-            if outcome.state == rerun.REPRODUCED:
+        def note(outcome: verifier.Outcome) -> None:
+            if outcome.state == verifier.REPRODUCED:
                 report.reproduced += 1
             status.update(f"{report.reproduced} records reproduced")
 
-        outcomes = rerun.rerun(
+        outcomes = verifier.rerun(
             folder, records=records, sources=sources, work=out, jobs=jobs,
             scheduler=scheduler, progress=note,
         )  # fmt: skip
     report.second_runs = [str(x) for x in outcomes]
-    report.problems += [str(x) for x in outcomes if x.state == rerun.DIFFERENT]
-    report.notes += [str(x) for x in outcomes if x.state == rerun.NOT_RERUN]
+    report.problems += [str(x) for x in outcomes if x.state == verifier.DIFFERENT]
+    report.notes += [str(x) for x in outcomes if x.state == verifier.NOT_RERUN]
 
 
 def _summary(console: Console, report: Report) -> None:
     count = len(report.problems)
     state = f"{count} problem{'s' if count > 1 else ''}" if count else "no problems"
     reproduced = f", {report.reproduced} reproduced by their code" if report.reproduced else ""
-    if report.unsealed:
-        reproduced += f", {report.unsealed} sealed ones looked into"
     console.print(
         f"{state}: {report.records} records, {report.replayed} replayed "
-        f"(largest difference {report.deviation:.1e} cmH2O){reproduced}\nhead {report.head}",
+        f"(largest difference {report.deviation:.1e} cmH2O){reproduced}",
         markup=False,
         highlight=False,
         soft_wrap=True,
@@ -274,19 +265,16 @@ def _summary(console: Console, report: Report) -> None:
 @app.command()
 def show(
     folder: Folder = FOLDER,
-    version: Annotated[
-        int | None, typer.Option(help="Version of the protocol; default: the newest.")
-    ] = None,
     lung: Annotated[
         str | None,
         typer.Option(metavar="LUNG", help="Show the cells of one lung by PIP, or `all` lungs."),
     ] = None,
     json: JsonFile = None,
 ) -> None:
-    """Show the ranking of both tracks, and in version 2 that under missing physics.
+    """Show the ranking of both tracks, and that under missing physics.
 
     With --lung the table has a column for each PIP of that lung, or for each lung with `all`: the
-    normalised score in version 2, the error in cmH2O in version 1, over the draws.
+    normalised score over the draws.
 
     Example: `ventbench board show --lung R20C50`
     """
@@ -295,30 +283,27 @@ def show(
     from ventbench.board import frames
     from ventbench.text import plain
 
-    tracks = frames.load_tracks(folder, version=version)
+    tracks = frames.load_tracks(folder)
     rows = [
-        dict(zip(frames.COLUMNS, frames.csv_row(track, *row), strict=True))
-        | ({} if lung is None else {"cells": frames.cell_means(row[1].record, lung)})
-        for track in tracks
-        for row in track.rows
+        frames.csv_row(line)
+        | ({} if lung is None else {"cells": frames.cell_means(line.row.record, lung)})
+        for line in frames.lines(tracks)
     ]
-    emit({"version": tracks[0].version, "rows": rows}, json)
+    emit({"rows": rows}, json)
     console = Console(stderr=str(json) == "-")
     for track in tracks:
         if lung is not None:
             console.print(_lung_table(track, lung))
-        else:
-            console.print(_table(track) if track.version == 1 else _normalised_table(track))
-            for status, row in track.rows:
-                if status != "ranked":
-                    reasons = row.entry.reasons
-                    said = any(reason.startswith(status) for reason in reasons)
-                    why = plain("; ".join(reasons if said else (status, *reasons))[:300])
-                    console.print(f"{row.record.name}: {why}", markup=False, highlight=False)
-            if any(row.record.stress for row in track.ranked):
-                console.print(_stress_table(track))
-        if track.sealed:
-            console.print(_sealed_table(track))
+            continue
+        console.print(_table(track))
+        for status, row in track.rows:
+            if status != "ranked":
+                reasons = row.entry.reasons
+                said = any(reason.startswith(status) for reason in reasons)
+                why = plain("; ".join(reasons if said else (status, *reasons))[:300])
+                console.print(f"{row.record.name}: {why}", markup=False, highlight=False)
+        if track.stress:
+            console.print(_stress_table(track))
 
 
 @app.command(name="records")
@@ -335,14 +320,13 @@ def list_records(folder: Folder = FOLDER, json: JsonFile = None) -> None:
     rows = frames.record_index(folder)
     emit({"records": rows}, json)
     table = _plain_table("")
-    for name in ("record", "entry", "track", "version", "kind", "made", "state"):
-        table.add_column(name, overflow="fold", justify="right" if name == "version" else "left")
+    for name in ("record", "entry", "track", "kind", "made", "state"):
+        table.add_column(name, overflow="fold")
     for row in rows:
         table.add_row(
             row["record"][:SHOWN],
             plain(row["name"]),
             row["track"],
-            str(row["version"]),
             row["kind"],
             row["created"][:10],
             row["state"],
@@ -375,8 +359,7 @@ def _lung_table(track: Track, lung: str) -> Table:
 
     from ventbench.board import frames
 
-    unit = "normalised score" if track.version > 1 else "error, cmH2O"
-    table = Table(title=f"{track.name}, version {track.version}, {lung}: {unit} over draws")
+    table = Table(title=f"{track.name}, {lung}: normalised score over draws")
     table.add_column("rank", justify="right")
     table.add_column("entry", no_wrap=True)
     names: list[str] = []
@@ -385,58 +368,37 @@ def _lung_table(track: Track, lung: str) -> Table:
         for name in cells if not names else ():
             names.append(name)
             table.add_column(name, justify="right")
-        digits = 1 if track.version > 1 else 3
-        texts = ("failed" if x is None else f"{x:.{digits}f}" for x in cells.values())
+        texts = ("failed" if x is None else f"{x:.1f}" for x in cells.values())
         table.add_row("" if row.rank is None else str(row.rank), row.record.name, *texts)
     return table
 
 
 def _table(track: Track) -> Table:
-    """Return the ranking of version 1: errors in cmH2O."""
-    table = _plain_table(f"{track.name}, version {track.version}: score over draws, cmH2O")
-    for name in ("rank", "entry", "score", "95 %", "to PID", "nominal", "record"):
-        table.add_column(name, justify="left" if name in ("entry", "record") else "right")
-    for _, row in track.rows:
-        table.add_row(
-            "" if row.rank is None else str(row.rank),
-            row.record.name,
-            "failed" if row.score is None else f"{row.score.value:.3f}",
-            _limits(row.score),
-            "" if row.to_baseline is None else f"{row.to_baseline.value:+.3f}",
-            f"{row.nominal:.3f}" if row.nominal == row.nominal else "failed",
-            row.record.sha256[:SHOWN],
-        )
-    return table
+    """Return the ranking: the columns of the board that have a heading for the terminal."""
+    from ventbench.board import frames
 
-
-def _normalised_table(track: Track) -> Table:
-    """Return the ranking of version 2: the normalised score ranks; errors in cmH2O beside it."""
-    title = f"{track.name}, version {track.version}: 0 = best attainable, 100 = best PID"
-    season = {row.record.header.draws.season for _, row in track.rows}
-    table = _plain_table(title)
-    table.caption = f"draws: {', '.join(sorted(filter(None, season)))}; error in cmH2O"
-    for name in ("rank", "entry", "score", "95 %", "ranks", "error", "record"):
+    shown = [column for column in frames.COLUMNS if column.terminal]
+    table = _plain_table(f"{track.name}: 0 = best attainable, 100 = best PID")
+    draws = sorted({row.record.header.draws.season for _, row in track.rows})
+    table.caption = f"{', '.join(draws)} draws, for practice; error in cmH2O"
+    for name in (*(name for column in shown for name in column.terminal), "record"):
         table.add_column(name, justify="left" if name in ("entry", "record") else "right")
-    for _, row in track.rows:
-        own = None if row.normalised is None else row.normalised.score
-        table.add_row(
-            "" if row.rank is None else str(row.rank),
-            row.record.name,
-            "failed" if own is None else f"{own.value:.1f}",
-            "" if own is None else f"{own.low:.1f}..{own.high:.1f}",
-            "" if row.ranks is None else f"{row.ranks[0]}..{row.ranks[1]}",
-            "failed" if row.score is None else f"{row.score.value:.3f}",
-            row.record.sha256[:SHOWN],
-        )
+    for line in frames.lines([track]):
+        texts = []
+        for column in shown:
+            cell = column.cell(line)
+            known = (cell["text"] if cell["value"] not in ("", None) else "", cell["small"])
+            texts += known[: len(column.terminal)]
+        table.add_row(*texts, line.row.record.sha256[:SHOWN])
     return table
 
 
 def _stress_table(track: Track) -> Table:
-    """Version 2: entries of the robustness track under missing physics."""
-    from ventbench.board import stress_table
+    """Entries of the robustness track under missing physics."""
+    from ventbench.board import pages
 
-    rows = [stress_table.shown(row) for row in stress_table.rows(track)]
-    table = _plain_table(f"stress, version {track.version}: mean |airway pressure - PIP|, cmH2O")
+    rows = [pages.stress_shown(row) for row in track.stress]
+    table = _plain_table("stress: mean |airway pressure - PIP|, cmH2O")
     runs = ", ".join(sorted({str(row["runs"]) for row in rows}))
     table.caption = f"survived, unsafe: of {runs} runs; calm: without stressors"
     for name in ("rank", "entry", "score", "95 %", "ranks", "calm", "survived", "unsafe"):
@@ -447,8 +409,8 @@ def _stress_table(track: Track) -> Table:
             "" if row["rank"] is None else str(row["rank"]),
             row["name"],
             "failed" if score is None else score["text"],
-            "" if score is None else score["limits"].replace(" to ", ".."),
-            "" if ranks is None else f"{ranks[0]}..{ranks[1]}",
+            "" if score is None else score["small"],
+            "" if ranks is None else f"{ranks[0]} to {ranks[1]}",
             row["unstressed"],
             f"{row['survived']} %",
             str(row["unsafe"]),
@@ -456,33 +418,6 @@ def _stress_table(track: Track) -> Table:
     return table
 
 
-def _sealed_table(track: Track) -> Table:
-    from rich.markup import escape
-    from rich.table import Table
-
-    from ventbench.text import plain
-
-    table = Table(title=f"{track.name}, version {track.version}: hidden draws, not revealed yet")
-    for name in ("season", "entry", "scores", "state"):
-        table.add_column(name)
-    for entry in track.sealed:
-        content = entry.record.content
-        scores = (f"{key} {value}" for key, value in content.scores.items() if value is not None)
-        state = ("official" if entry.official else "not official", *entry.reasons)
-        table.add_row(
-            escape(plain(content.season.id)),
-            entry.record.name,
-            ", ".join(scores) or "failed",
-            escape(plain("; ".join(state))[:200]),
-        )
-    return table
-
-
-def _limits(interval: Interval | None) -> str:
-    return "" if interval is None else f"{interval.low:.3f}..{interval.high:.3f}"
-
-
 def register(parent: typer.Typer) -> None:
     """Add the group of commands."""
-    seasons.register(app)
     parent.add_typer(app)

@@ -33,7 +33,7 @@ from hardware_eval.wire.errors import RefusedError
 from hardware_eval.wire.link import Link
 from hardware_eval.wire.messages import Capability, Flag, Mode
 from ventbench.board import record
-from ventbench.board.hardware import HardwareRecord
+from ventbench.board.record import HardwareRecord
 from ventbench.cli import app as ventbench
 
 LUNG, OTHER = "R20C50", "R5C20"
@@ -124,11 +124,13 @@ def test_self_test_wrong_lung_run_and_board(terminal: DeviceOnTerminal, tmp_path
     shutil.copytree(Path(__file__).parents[3] / "leaderboard", board)
     added = invoke(ventbench, "board", "add", path, "--folder", str(board))
     assert added.exit_code == 0, added.output
-    built = invoke(ventbench, "board", "build", "--folder", str(board))
+    built = invoke(
+        ventbench, "board", "build", "--folder", str(board), "--out", str(tmp_path / "site")
+    )
     assert built.exit_code == 0, built.output
     made = record.load(Path(path))
     assert isinstance(made, HardwareRecord)
-    page = (board / "version-1.html").read_text()
+    page = (tmp_path / "site" / "index.html").read_text()
     assert f"{made.score:.3f}" in page
     assert all(word in page for word in ("hardware", "gap", "emulator"))
 

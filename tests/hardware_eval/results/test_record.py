@@ -17,13 +17,13 @@ from hardware_eval.results import record as records
 from hardware_eval.results.compare import compare, recorded_breaths
 from hardware_eval.results.evaluate import Line
 from hardware_eval.results.replay import replay
-from ventbench.board import build, canonical, record, store
-from ventbench.board.hardware import HardwareRecord
+from ventbench.board import build, canonical, frames, record, store
+from ventbench.board.record import HardwareRecord
 from ventbench.errors import InputError
 from ventbench.submissions.folder import open_submission
 
-#: Page of the board of protocol version 1, which a bench runs.
-BOARD = "version-1.html"
+#: Page of the board.
+BOARD = "index.html"
 
 LUNG, PIPS = "R5C20", (10.0, 15.0)
 
@@ -111,33 +111,38 @@ def test_a_record_that_contradicts_itself_is_refused(path: Path, change: Any, ke
 
 
 def test_the_board_shows_it_beside_the_simulated_score(path: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "leaderboard"
+    folder, out = tmp_path / "leaderboard", tmp_path / "site"
     shutil.copytree(Path(__file__).parents[3] / "leaderboard", folder)
-    before = {name: (folder / name).read_bytes() for name in build.present(folder)}
-    assert not build.build(folder).changed  # pages without hardware records stay as they are
+    build.build(folder, out)
+    other = (out / "entries/robustness/pid_robust.html").read_bytes()
     added = store.add(folder, path)
     assert isinstance(added, HardwareRecord)
-    done = build.build(folder)
+    (hardware,) = frames.load_tracks(folder, track="performance")[0].hardware
+    assert hardware.rank is None, "nobody vouches for it"
+    listed = folder / "attestations.toml"
+    entry = f'[[second_runs]]\nrecord = "{added.sha256}"\nreason = "a test"\ndate = 2026-11-23\n'
+    listed.write_text(listed.read_text() + entry)
+    (hardware,) = frames.load_tracks(folder, track="performance")[0].hardware
+    assert (hardware.rank, hardware.count) == (1, 1)
+    done = build.build(folder, out)
     assert BOARD in done.changed
-    page = (folder / BOARD).read_text()
+    page = (out / BOARD).read_text()
     made = loaded(path)
-    key = (made.version, "performance", "pid_best")
     simulated = next(
-        entry for entry in store.load(folder).scores
-        if entry.official and (entry.version, entry.track, entry.name) == key
+        entry for entry in reversed(store.load(folder).scores)
+        if entry.official and entry.key == ("performance", "pid_best")
     )  # fmt: skip
     lung, pips = simulated.lungs.index(LUNG), [simulated.pips.index(pip) for pip in PIPS]
     gap = made.score - simulated.nominal[lung, pips].mean()
     assert f"{made.score:.3f}" in page
     assert f"gap {gap:+.3f}".replace("-", "−") in page.replace("-", "−")
     assert "emulator" in page
-    other = "entries/v1/robustness/pid_robust.html"
-    assert (folder / other).read_bytes() == before[other]
+    assert (out / "entries/robustness/pid_robust.html").read_bytes() == other
     with pytest.raises(InputError, match="already"):
         store.add(folder, path)
     store.withdraw(folder, made.sha256, "a test")
-    build.build(folder)
-    assert "withdrawn: a test" in (folder / BOARD).read_text()
+    build.build(folder, out)
+    assert "withdrawn: a test" in (out / BOARD).read_text()
 
 
 def test_the_recording_is_compared_with_simulators(path: Path) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ventbench import draws as draw_tables
 from ventbench import environment as env
-from ventbench import precision, protocol
+from ventbench import precision, protocol, rollouts
 from ventbench.board.record import Record
 from ventbench.board.schema import ScoreHeader
 from ventbench.draws import Draws
@@ -118,17 +118,13 @@ def _pressures(plants: Plant, cells: Scenario, requested: Array) -> Array:
 
     def lung(plant: Plant, cells: Scenario, commands: Array) -> Array:
         varied = env.vary(plant, cells)
-        start = env.start_breath(varied, cells)
-
-        def step(loop: env.LoopState, u_in: Array) -> tuple[env.LoopState, Array]:
-            after, _ = env.inspire(varied, cells, loop, u_in)
-            return after, env.airway_pressure(varied, after)
 
         def inspiration(commands: Array) -> Array:
-            # The last command acts after the last scored pressure.
-            _, pressure = jax.lax.scan(step, start, jnp.moveaxis(commands, -1, 0)[:-1])
-            first = jnp.broadcast_to(env.airway_pressure(varied, start), pressure.shape[1:])
-            return jnp.moveaxis(jnp.concatenate([first[None], pressure]), 0, -1)
+            _, _, pressure = rollouts.inspiration(
+                varied, cells, rollouts.commanded, inputs=jnp.moveaxis(commands, -1, 0),
+                record=lambda before, *_: before.signals.scored,
+            )  # fmt: skip
+            return jnp.moveaxis(pressure, 0, -1)
 
         return jax.vmap(inspiration)(commands)
 

@@ -367,7 +367,7 @@ def tune_pid(
         if draws:
             sessions = rigs.sessions or tuple((0,) for _ in rigs.lungs)
             drawn = draw_tables.build(
-                sessions, rigs.members, seed=TUNING_SEED, season=TUNING, n=draws
+                sessions, rigs.members, seed=TUNING_SEED, name=TUNING, n=draws
             )
             jobs = [
                 (rigs, drawn, lung, grid.gains[some])

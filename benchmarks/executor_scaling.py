@@ -1,6 +1,6 @@
 """Official scores of several entries by one worker and by two: speed-up, and what 10,000 cost.
 
-Every entry is scored in the sandbox by protocol version 2, as ``ventbench score --workers N`` and
+Every entry is scored in the sandbox as ``ventbench score --workers N`` and
 ``--scheduler ADDRESS`` do it. Workers are warm: each has scored once before the clock starts.
 
 Usage:
@@ -41,7 +41,7 @@ def processor_seconds() -> float:
 def scored(draws: int, stress: bool) -> float:
     """Score one entry; returns the processor time that it took, s."""
     begun = processor_seconds()
-    score(ENTRY, draws=draws, protocol=2)
+    score(ENTRY, draws=draws)
     if stress:
         score_stress(ENTRY, draws=STRESS_DRAWS if draws else 1)
     return processor_seconds() - begun

@@ -1,4 +1,4 @@
-"""Why simulators of version 2 err on breaths of their own rigs: a table of docs/simulators.md.
+"""Why simulators err on breaths of their own rigs: a table of docs/simulators.md.
 
 Every measured breath of a scored rig is simulated by the member that has not seen it. Then one
 quantity of that breath alone is fitted to its pressure, which no prediction can do: what remains

@@ -17,8 +17,8 @@ from ventbench.metrics import bootstrap
 from ventbench.metrics.open_loop import mae
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators, names
+from ventbench.plants.stacking import PlantsFor, open_loop_breaths
 from ventbench.recordings import Breaths, load
-from ventbench.rollouts import PlantsFor, open_loop_breaths
 
 if TYPE_CHECKING:
     import pandas as pd

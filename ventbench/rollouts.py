@@ -9,29 +9,20 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
 from ventbench import environment as env
-from ventbench import precision, protocol
+from ventbench import protocol
 from ventbench.environment import LoopState, Scenario
 from ventbench.interfaces import Controller, Plant
-from ventbench.recordings.breaths import Breaths
 
 BREATHS, INSPIRATION = protocol.BREATHS, protocol.INSPIRATION_STEPS
-
-#: Gives the plants of some breaths: parameters of shape ``(n, ...)``.
-PlantsFor = Callable[[Breaths], Plant]
 
 #: State, observation and inputs of a step, to the next state and ``u_in``, %.
 Policy = Callable[[Any, Any, Any], tuple[Any, Array]]
 
 #: The loop before and after a step, the request and the command as applied, to what is kept.
 Record = Callable[[LoopState, LoopState, Array, Array], Any]
-
-# Breaths rolled out together: bounds memory, and the last batch is padded so that all compile once.
-_BATCH = 4096
 
 
 @jax.jit
@@ -56,37 +47,6 @@ def open_loop(plant: Plant, start: Array, u_in: Array, u_out: Array, dt: Array) 
     commands = jax.tree.map(lambda x: jnp.moveaxis(x[:, :-1], 1, 0), (u_in, u_out, dt))
     _, pressure = jax.lax.scan(step, plant.init(start)[0], commands)
     return jnp.concatenate([start[:, None], jnp.moveaxis(pressure, 0, 1)], axis=1)
-
-
-def open_loop_breaths(
-    plants_for: PlantsFor, breaths: Breaths, progress: Callable[[int], object] | None = None
-) -> NDArray[np.float64]:
-    """Pressures that plants answer to the commands of recorded breaths with, in batches.
-
-    Each breath starts at its first recorded pressure.
-
-    Args:
-        plants_for: see :data:`PlantsFor`.
-        breaths: n breaths of T samples.
-        progress: called with the number of breaths of each batch, as it is done.
-
-    Returns:
-        cmH2O, shape ``(n, T)``; NaN for a breath whose first pressure is blank.
-    """
-    n = len(breaths)
-    batch = min(_BATCH, n)
-    parts = []
-    with precision.float64():
-        for first in range(0, n, batch):
-            index = np.minimum(np.arange(first, first + batch), n - 1)
-            part = breaths.select(index)
-            columns = (part.pressure[:, 0], part.u_in, part.u_out, part.dt)
-            start, *commands = (jnp.asarray(x, float) for x in columns)
-            answer = open_loop(plants_for(part), start, *commands)
-            parts.append(np.asarray(answer)[: min(batch, n - first)])
-            if progress is not None:
-                progress(len(parts[-1]))
-    return np.concatenate(parts)
 
 
 @flax.struct.dataclass

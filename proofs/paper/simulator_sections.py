@@ -22,7 +22,7 @@ from proofs.paper.report import (
     Table,
     Verdict,
 )
-from ventbench import files, precision, rollouts
+from ventbench import files, precision
 from ventbench.lungs import LUNG_IDS
 from ventbench.metrics import open_loop
 from ventbench.plants import frozen
@@ -85,7 +85,7 @@ def measure_horizon(recording: Path) -> dict[str, Any]:
         for name, index in breaths.by_lung_index.items()
     }
     for kind, plants_for in judged.items():
-        simulated = np.nan_to_num(rollouts.open_loop_breaths(plants_for, breaths))
+        simulated = np.nan_to_num(open_loop_breaths(plants_for, breaths))
         for name, index in breaths.by_lung_index.items():
             pair = (breaths.pressure[index], simulated[index], breaths.inspiratory[index])
             curve = open_loop.by_horizon(*pair)

@@ -45,10 +45,14 @@ from ventbench.plants.python_simulator import PythonSimulator, is_jax_plant, pyt
 from ventbench.plants.registry import FAMILIES
 from ventbench.plants.simulators import Simulators
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stacking import VmappedPlant, nominal_plants, stack_heterogeneous
+from ventbench.plants.stacking import (
+    PlantsFor,
+    VmappedPlant,
+    nominal_plants,
+    stack_heterogeneous,
+)
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.simulated import read_simulated
-from ventbench.rollouts import PlantsFor
 
 Floats = NDArray[np.float64]
 

@@ -18,9 +18,9 @@ from ventbench.interfaces import Plant
 from ventbench.lungs import Lung, lung
 from ventbench.plants import frozen
 from ventbench.plants.python_simulator import PythonSimulator
-from ventbench.plants.stacking import VmappedPlant, take
+from ventbench.plants.stacking import PlantsFor, VmappedPlant, open_loop_breaths, take
 from ventbench.recordings.breaths import Breaths
-from ventbench.rollouts import PlantsFor, open_loop, open_loop_breaths
+from ventbench.rollouts import open_loop
 
 Floats = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Several plants as one: stacked along a leading axis, run side by side, made for every breath."""
+"""Several plants as one: stacked on a leading axis, run side by side, made for every breath."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import NDArray
 
 from ventbench import precision
 from ventbench.errors import InputError
@@ -18,8 +19,15 @@ from ventbench.interfaces import Plant, Signals
 from ventbench.lungs import Lung
 from ventbench.physics.model import Physics
 from ventbench.recordings.breaths import Breaths
+from ventbench.rollouts import open_loop
 
 PlantT = TypeVar("PlantT")
+
+#: Gives the plants of some breaths: parameters of shape ``(n, ...)``.
+PlantsFor = Callable[[Breaths], Plant]
+
+# Breaths simulated together: bounds memory, and the last batch is padded so that all compile once.
+_BATCH = 4096
 
 
 def stack(plants: Sequence[PlantT]) -> PlantT:
@@ -149,3 +157,34 @@ class VmappedPlant:
         return VmappedPlant(
             jax.vmap(lambda plant, *x: plant.vary(*x))(self.plants, r_scale, c_scale)
         )
+
+
+def open_loop_breaths(
+    plants_for: PlantsFor, breaths: Breaths, progress: Callable[[int], object] | None = None
+) -> NDArray[np.float64]:
+    """Pressures that plants answer to the commands of recorded breaths with, in batches.
+
+    Each breath starts at its first recorded pressure.
+
+    Args:
+        plants_for: see :data:`PlantsFor`.
+        breaths: n breaths of T samples.
+        progress: called with the number of breaths of each batch, as it is done.
+
+    Returns:
+        cmH2O, shape ``(n, T)``; NaN for a breath whose first pressure is blank.
+    """
+    n = len(breaths)
+    batch = min(_BATCH, n)
+    parts = []
+    with precision.float64():
+        for first in range(0, n, batch):
+            index = np.minimum(np.arange(first, first + batch), n - 1)
+            part = breaths.select(index)
+            columns = (part.pressure[:, 0], part.u_in, part.u_out, part.dt)
+            start, *commands = (jnp.asarray(x, float) for x in columns)
+            answer = open_loop(plants_for(part), start, *commands)
+            parts.append(np.asarray(answer)[: min(batch, n - first)])
+            if progress is not None:
+                progress(len(parts[-1]))
+    return np.concatenate(parts)

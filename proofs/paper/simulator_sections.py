@@ -27,7 +27,7 @@ from ventbench.lungs import LUNG_IDS
 from ventbench.metrics import open_loop
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stacking import nominal_plants, take
+from ventbench.plants.stacking import nominal_plants, open_loop_breaths, take
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.recordings import load
 from ventbench.training.exploration import RANGES, SimulatedVentilator, explore

@@ -18,10 +18,9 @@ from ventbench.plants import frozen
 from ventbench.plants.catalog import load_simulators, names
 from ventbench.plants.plant_files import save_plants
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.plants.stacking import nominal_plants
+from ventbench.plants.stacking import nominal_plants, open_loop_breaths
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.recordings import write
-from ventbench.rollouts import open_loop_breaths
 
 single_compartments = partial(nominal_plants, single_compartment)
 two_balloons = partial(nominal_plants, two_balloon)

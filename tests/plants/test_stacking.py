@@ -15,10 +15,17 @@ from ventbench.lungs import LUNGS, lung
 from ventbench.physics import physics
 from ventbench.plants.learned import Architecture, learned
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
-from ventbench.plants.stacking import VmappedPlant, nominal_plants, stack, stack_heterogeneous, take
+from ventbench.plants.stacking import (
+    VmappedPlant,
+    nominal_plants,
+    open_loop_breaths,
+    stack,
+    stack_heterogeneous,
+    take,
+)
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.precision import float64
-from ventbench.rollouts import open_loop, open_loop_breaths
+from ventbench.rollouts import open_loop
 
 single_compartments = partial(nominal_plants, single_compartment)
 two_balloons = partial(nominal_plants, two_balloon)

@@ -12,9 +12,9 @@ import pytest
 from ventbench import open_loop_report
 from ventbench.errors import InputError
 from ventbench.lungs import RECORDED_LUNGS, lung
+from ventbench.plants.stacking import open_loop_breaths
 from ventbench.precision import float64
 from ventbench.recordings import join
-from ventbench.rollouts import open_loop_breaths
 from ventbench.training.rigs.data import SAMPLES, groups_of, inspirations, whole_breaths
 from ventbench.training.rigs.fit import CHUNK, EXPIRATORY_WIDTHS, FitConfig, fit, fit_expiration
 from ventbench.training.rigs.parameters import centre, plants

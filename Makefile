@@ -34,10 +34,11 @@ test: check ## ruff, arrows between rooms and the fast tests
 test-slow: setup ## the tests that take minutes
 	$(PY) -m pytest -n auto -m slow $(PYTEST_ARGS)
 
-check: setup ## ruff and arrows between rooms, changing nothing
+check: setup ## ruff, arrows between rooms and how big they are, changing nothing
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(VENV)/bin/lint-imports --no-cache --no-logo
+	$(PY) -m ci.house
 
 lint: check ## the same and pyright, which takes a minute
 	$(PY) -m pyright --pythonpath $(PY)

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
-from ventbench.diagnosis.findings import ErrorRegion, Findings, MissingMechanism, NonparametricTerm
+from ventbench.diagnosis.findings import (
+    Change,
+    ErrorRegion,
+    Findings,
+    MissingMechanism,
+    NonparametricTerm,
+)
 from ventbench.diagnosis.residual_axes import EDGE
 from ventbench.mechanics.labels import (
     APPARATUS,
@@ -45,8 +52,14 @@ _NUMBERS = {3: "Three", 4: "Four", 5: "Five", 6: "Six"}
 #: Fewer judging breaths than these leave the worth of a correction vague.
 _FEW_BREATHS = 10
 
-#: Places of less weight than this are not listed.
-_LEAST_WEIGHT = 0.02
+#: Places of less weight than this are told from the likeliest one; the others are one answer.
+_LEAST_WEIGHT = 0.05
+
+#: Preference over other names below which a name is weak: another one, or all others, have more.
+_WEAK = 0.5
+
+#: A strength this near to the end of its range, as a share of the range, stands there.
+_AT_END = 0.01
 
 #: A mean error below this share of the noise says nothing about its sign.
 _NO_SIGN = 0.25
@@ -72,7 +85,8 @@ def headline(findings: Findings) -> str:
     simulator, errors = f"the {findings.simulator} simulator", findings.open_loop
     before, after = rounded(errors.refit.rmse, 2), rounded(errors.after.rmse, 2)
     if findings.verdict == "nothing_missing":
-        return f"Nothing is missing in {simulator}: it errs by {after} cmH2O"
+        nothing = "No mechanism is shown to be" if findings.remaining else "Nothing is"
+        return f"{nothing} missing in {simulator}: it errs by {after} cmH2O"
     if findings.verdict == "unnamed":
         what = f"Something is missing in {simulator} that has no name"
     else:
@@ -88,19 +102,38 @@ def headline(findings: Findings) -> str:
 
 def verdict(findings: Findings) -> str:
     """What is missing, and how sure that is; without a full stop."""
+    if findings.saturated is not None:
+        reading, share = findings.saturated
+        saturates = (
+            f"The pressure sensor saturates at {rounded(reading, 1)} cmH2O "
+            f"({100 * share:.0f} % of the readings, which are left out); by the others: "
+        )
+        return saturates + verdict(dataclasses.replace(findings, saturated=None))
     simulator, term = f"the {findings.simulator} simulator", findings.nonparametric
     if findings.verdict == "nothing_missing":
         how = "" if _is_unchanged(findings) else "with R and C refitted, "
-        return f"Nothing is missing: {how}{simulator} explains the recording"
-    if findings.verdict == "unnamed":
-        if term is None:
+        if findings.remaining:
+            region = max(findings.remaining, key=lambda region: region.share)
             return (
-                f"Something is missing in {simulator}, but the recording singles out neither a "
-                "mechanism nor a place in the model"
+                f"No mechanism is shown to be missing in {simulator}, but "
+                f"{_error(region, findings.noise[0])} ({probability(region.p_value)})"
+            )
+        return f"Nothing is missing: {how}{simulator} explains the recording"
+    besides = "".join(f", and {change(each)}" for each in findings.changes[:1])
+    if findings.verdict == "unnamed":
+        if term is not None:
+            return (
+                f"Something is missing in {simulator} that is not in the library of mechanisms "
+                f"({odds(term.nats)}); its place in the model is {_places(term)}{besides}"
+            )
+        if findings.changes:
+            return (
+                f"Something is missing in {simulator} that depends on the breath number: "
+                f"{change(findings.changes[0])}, which no mechanism of the library explains"
             )
         return (
-            f"Something is missing in {simulator} that is not in the library of mechanisms "
-            f"({odds(term.nats)}); its place in the model is {place(term)}"
+            f"Something is missing in {simulator}, but the recording singles out neither a "
+            "mechanism nor a place in the model"
         )
     names = _listed([title(mechanism.name) for mechanism in findings.mechanisms])
     rest = "" if term is None else ", and an effect that is not in the library"
@@ -108,16 +141,54 @@ def verdict(findings: Findings) -> str:
         several = len(findings.mechanisms) > 1
         which = f"; {_listed([title(name) for name in findings.form.form_of])}" if several else ""
         rest = f"{which}, in another form than the library's{rest}"
-    return f"Missing in {simulator}: {names}{rest} ({sureness(findings)})"
+    return f"Missing in {simulator}: {names}{rest} ({sureness(findings)}){besides}"
 
 
 def sureness(findings: Findings) -> str:
-    """How sure the names are, or the place without a name, in words."""
+    """How sure the names are, or the place without a name, in words.
+
+    Odds say that a term of that kind acts. They are given only where nothing speaks against the
+    name or its strength; else that is said in their place.
+    """
+    doubts = [doubt for missing in findings.mechanisms for doubt in _doubts(missing, findings)]
+    if doubts:
+        return f"uncertain: {'; '.join(doubts)}"
     nats = [mechanism.nats for mechanism in findings.mechanisms]
     if not nats:
         return odds(findings.nonparametric.nats) if findings.nonparametric is not None else ""
     each = "each at " if len(nats) > 1 else ""
     return f"{each}{odds(min(nats))}"
+
+
+def _doubts(missing: MissingMechanism, findings: Findings) -> list[str]:
+    """What speaks against a name or its strength, in words."""
+    doubts = []
+    about = mechanism(missing.name).description.strength
+    if missing.confidence < _WEAK:
+        share = f"{100 * missing.confidence:.0f} %"
+        doubts.append(f"{missing.name} is preferred over other names at {share} only")
+    if about.name in missing.parameters:
+        value, near = missing.parameters[about.name].value, _AT_END * (about.high - about.low)
+        if min(value - about.low, about.high - value) < near and about.neutral != value:
+            doubts.append(f"the strength of {missing.name} is at the end of its range")
+    least = findings.settings.residuals.negligible
+    if missing.worth < least:
+        doubts.append(f"{missing.name} is worth less than {least:g} cmH2O")
+    return doubts
+
+
+def change(found: Change) -> str:
+    """What changes in the course of the recording, as a phrase."""
+    what = {
+        "gain": "the gain of the valve", "zero": "the zero of the pressure",
+        "error": "the size of the error",
+    }[found.of]  # fmt: skip
+    by = f"x {found.size:.3g}" if found.of != "zero" else f"by {_signed(found.size)} cmH2O"
+    if found.drifts:
+        how = f"drifts from the first to the last breath ({by}"
+    else:
+        how = f"changes at breath {found.breath} ({by}"
+    return f"{what} {how}, {probability(found.p_value)})"
 
 
 def odds(nats: float) -> str:
@@ -136,6 +207,9 @@ def worth(findings: Findings) -> str:
     """
     errors = findings.open_loop
     after, noise = rounded(errors.after.rmse, 2), rounded(errors.noise_floor, 2)
+    if errors.noise_floor > findings.settings.residuals.absorbed * errors.sensor_noise:
+        quiet = rounded(errors.sensor_noise, 2)
+        noise = f"{noise} (quiet readings scatter by {quiet}: some of it may be unexplained too)"
     if errors.gain_error:
         noise = f"{noise} and the {rounded(errors.gain_error, 2)} of the valve's scattering gain"
     beyond = rounded(errors.unexplained, 2)
@@ -145,24 +219,33 @@ def worth(findings: Findings) -> str:
     elif errors.unexplained < 0.5 * errors.least_error:
         left = f"hardly more than the noise of {noise} is left"
     count = len(errors.held_out_breaths)
+    out = errors.groups.get("expiration", {})
+    before_out, after_out = (
+        rounded(out[stage].rmse, 2) if stage in out else "unknown" for stage in ("refit", "after")
+    )
+    also = "" if after_out == "unknown" else f" in inspiration and {after_out} in expiration"
     if findings.verdict == "nothing_missing":
-        return f"it errs by {after} cmH2O on {count} breaths set aside, and {left}"
+        return f"it errs by {after} cmH2O{also} on {count} breaths set aside, and {left}"
     refit = rounded(errors.refit.rmse, 2)
     term = findings.nonparametric
     if term is not None and term.x_unit.startswith("sample") and not findings.mechanisms:
         return (
             "it differs from breath to breath, so that no correction of the simulator mends it: "
-            f"the error on {count} breaths set aside stays at {after} cmH2O, and {left}"
+            f"the error on {count} breaths set aside stays at {after} cmH2O{also}, and {left}"
         )
-    if errors.after == errors.refit or after == refit:
+    if errors.after == errors.refit or (after, after_out) == (refit, before_out):
         return (
             f"mending {_it(findings)} is worth nothing on the {count} breaths set aside, where the "
-            f"error stays at {after} cmH2O, and {left}"
+            f"error stays at {after} cmH2O{also}, and {left}"
         )
+    if also:
+        worse = out["after"].rmse - out["refit"].rmse >= findings.settings.residuals.negligible
+        also = f" in inspiration, and from {before_out} to {after_out} in expiration"
+        also += ", where it gets worse" if worse else ""
     start = " (R and C refitted)" if errors.refit != errors.before else ""
     return (
         f"mending {_it(findings)} takes the error on {count} breaths set aside from {refit}{start} "
-        f"to {after} cmH2O, and {left}"
+        f"to {after} cmH2O{also}, and {left}"
     )
 
 
@@ -244,8 +327,8 @@ def visible_strengths(findings: Findings) -> dict[str, str]:
 
 
 def scatter(findings: Findings) -> str:
-    """That breaths have valve gains of their own."""
-    if findings.gain_scatter <= 0.0:
+    """That breaths have valve gains of their own; gains with an order in time do not scatter."""
+    if findings.gain_scatter <= 0.0 or any(each.of == "gain" for each in findings.changes):
         return ""
     share = 100.0 * math.expm1(findings.gain_scatter)
     return (
@@ -366,20 +449,35 @@ def nonparametric_term(findings: Findings) -> str:
         return ""
     start = "In addition to these mechanisms, a" if findings.verdict == "named" else "A"
     return (
-        f"{start} nonparametric term for {place(term)} explains {100 * term.explains:.0f} % of "
+        f"{start} nonparametric term for {_places(term)} explains {100 * term.explains:.0f} % of "
         f"the squared error above the noise.{_certainty(term)}"
     )
 
 
 def _certainty(term: NonparametricTerm) -> str:
-    """Sentence on how certain the place of a course in time is; empty for a curve."""
+    """Sentence on how certain a place is, and by what.
+
+    A course in time at any place can give any pressures: only its smoothness tells places apart.
+    """
     listed = [(name, share) for name, share in term.places if share >= _LEAST_WEIGHT]
-    if not listed:
-        return ""
+    text = ""
+    if len(listed) > 1:
+        weights = _listed([f"{name} {100 * share:.0f} %" for name, share in listed], "or")
+        text = f" The breaths do not settle where it acts: {weights}."
+    if not term.x_unit.startswith("sample"):
+        return text
     if len(listed) == 1:
-        return " Held-out breaths leave no other place for it."
-    weights = _listed([f"{name} {100 * share:.0f} %" for name, share in listed], "or")
-    return f" Held-out breaths do not settle where it acts: {weights}."
+        others = _listed([name for name, _ in term.places if name != listed[0][0]], "and")
+        text = f" A course as smooth at other places ({others}) is less likely." if others else ""
+    return f"{text} From pressure alone, a rougher course elsewhere would read the same."
+
+
+def _places(term: NonparametricTerm) -> str:
+    """Place of a term, with those that the recording cannot tell from it."""
+    others = [n for n, share in term.places if share >= _LEAST_WEIGHT and n != term.name]
+    if not others:
+        return place(term)
+    return f"{place(term)}, or {_listed(others, 'or')}, which these breaths cannot tell from it"
 
 
 def place(term: NonparametricTerm) -> str:
@@ -430,6 +528,11 @@ def lung(match: LungMatch) -> str:
         also = f" Within the same tolerance it could be {' or '.join(others)}." if others else ""
         return f"The lung matches its label {match.label}: {fitted} ({tolerance}).{also}"
     known = f" It may be {' or '.join(others)}." if others else ""
+    if not match.informative:
+        return (
+            f"Whether the lung matches its label {match.label} is unknown, since the intervals are "
+            f"too wide: {fitted}.{known}"
+        )
     return f"The lung does not match its label {match.label}: {fitted} ({tolerance}).{known}"
 
 
@@ -521,6 +624,10 @@ def _error(region: ErrorRegion, noise: float) -> str:
 def _two_digits(value: float) -> str:
     """Two digits, without an exponent."""
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}" if value >= 0.01 else f"{value:.3f}"
+
+
+def _signed(value: float) -> str:
+    return f"{'-' if value < 0 else ''}{_two_digits(abs(value))}"
 
 
 def _time(seconds: float) -> str:

@@ -92,9 +92,10 @@ def facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     told = []
     if sure := report_text.sureness(diagnosis):
         decided, _, breaths = sure.partition(" on ")
-        told.append(("How sure?", decided.removeprefix("each at "), f"each, on {breaths}"))
-        if len(diagnosis.mechanisms) < 2:
-            told[-1] = (told[-1][0], told[-1][1], f"on {breaths}")
+        each = "each, " if sure.startswith("each at ") else ""
+        told.append(("How sure?", decided.removeprefix("each at "), f"{each}on {breaths}"))
+        if sure.startswith("uncertain"):
+            told[-1] = ("How sure?", "uncertain", sure.removeprefix("uncertain: "))
     after = _number(errors.after.rmse)
     if diagnosis.verdict == "nothing_missing":
         told.append(("How far off?", f"{after} cmH2O", f"root mean square on {count} breaths"))

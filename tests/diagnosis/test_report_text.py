@@ -6,9 +6,9 @@ import dataclasses
 
 import pytest
 
-from ventbench.diagnosis import report_text
+from ventbench.diagnosis import number_text, report_text
 from ventbench.diagnosis.findings import Change, ErrorRegion, MissingMechanism, OpenLoopError
-from ventbench.diagnosis.report_text import probability, quantity
+from ventbench.diagnosis.number_text import probability, quantity
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics import library, parameter
 
@@ -124,9 +124,9 @@ def test_a_simulator_that_is_left_as_it_is_was_not_refitted():
 )
 def test_places(place, text):
     axis, low, high, unit = place
-    sentence = report_text.error_region(ErrorRegion(axis, low, high, unit, 0.52, 0.01, 0.5), 0.2)
+    sentence = number_text.error_region(ErrorRegion(axis, low, high, unit, 0.52, 0.01, 0.5), 0.2)
     assert sentence.startswith(f"The simulated pressure is 0.52 cmH2O too low {text}")
-    square = report_text.error_region(ErrorRegion(axis, low, high, unit, 0.01, 0.01, 0.5), 0.2)
+    square = number_text.error_region(ErrorRegion(axis, low, high, unit, 0.01, 0.01, 0.5), 0.2)
     assert square.startswith(f"The simulated pressure is off {text}")
     assert square.endswith(", by errors whose sign changes from breath to breath.")
 

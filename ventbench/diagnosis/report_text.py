@@ -1,4 +1,4 @@
-"""A diagnosis in plain sentences, and numbers as a person reads them."""
+"""A diagnosis in plain sentences."""
 
 from __future__ import annotations
 
@@ -8,12 +8,22 @@ from collections.abc import Sequence
 
 from ventbench.diagnosis.findings import (
     Change,
-    ErrorRegion,
     Findings,
     MissingMechanism,
     NonparametricTerm,
 )
-from ventbench.diagnosis.residual_axes import EDGE
+from ventbench.diagnosis.number_text import (
+    PHASES,
+    error_phrase,
+    error_region,
+    probability,
+    quantity,
+    quantity_like,
+    rounded,
+    scaled,
+    signed,
+    two_digits,
+)
 from ventbench.mechanics.labels import (
     APPARATUS,
     GAIN,
@@ -22,23 +32,7 @@ from ventbench.mechanics.labels import (
     Estimate,
     LungMatch,
 )
-from ventbench.physics import mechanism, parameter
-
-#: Axes whose ranges are parts of a breath: an effect is described best by these.
-_PHASES = ("time since inspiration", "time since expiration")
-
-#: How a range of time is described: what it starts from, and what it is the beginning of.
-_MOMENTS = {
-    _PHASES[0]: ("the start of inspiration", "of each breath"),
-    _PHASES[1]: ("the start of expiration", "of expiration"),
-    EDGE: ("an edge of a valve", "after an edge of a valve"),
-}
-
-#: Moments up to this are given in ms, s.
-_SHORT_MOMENT = 0.15
-
-#: Parameters of time below this are given in ms, s.
-_SHORT_PARAMETER = 0.5
+from ventbench.physics import mechanism
 
 #: Odds beyond these are called sure: no model is so right that larger ones mean anything.
 _SURE_ODDS = 1e6
@@ -60,9 +54,6 @@ _WEAK = 0.5
 
 #: A strength this near to the end of its range, as a share of the range, stands there.
 _AT_END = 0.01
-
-#: A mean error below this share of the noise says nothing about its sign.
-_NO_SIGN = 0.25
 
 
 def sentences(findings: Findings) -> list[str]:
@@ -116,7 +107,7 @@ def verdict(findings: Findings) -> str:
             region = max(findings.remaining, key=lambda region: region.share)
             return (
                 f"No mechanism is shown to be missing in {simulator}, but "
-                f"{_error(region, findings.noise[0])} ({probability(region.p_value)})"
+                f"{error_phrase(region, findings.noise[0])} ({probability(region.p_value)})"
             )
         return f"Nothing is missing: {how}{simulator} explains the recording"
     besides = "".join(f", and {change(each)}" for each in findings.changes[:1])
@@ -183,7 +174,7 @@ def change(found: Change) -> str:
         "gain": "the gain of the valve", "zero": "the zero of the pressure",
         "error": "the size of the error",
     }[found.of]  # fmt: skip
-    by = f"x {found.size:.3g}" if found.of != "zero" else f"by {_signed(found.size)} cmH2O"
+    by = f"x {found.size:.3g}" if found.of != "zero" else f"by {signed(found.size)} cmH2O"
     if found.drifts:
         how = f"drifts from the first to the last breath ({by}"
     else:
@@ -294,7 +285,7 @@ def remaining(findings: Findings) -> str:
     if not findings.remaining or findings.open_loop.after == findings.open_loop.refit:
         return ""
     region = max(findings.remaining, key=lambda region: region.share)
-    return f"After the correction, {_error(region, findings.noise[0])}."
+    return f"After the correction, {error_phrase(region, findings.noise[0])}."
 
 
 def visible(findings: Findings) -> str:
@@ -320,8 +311,8 @@ def visible_strengths(findings: Findings) -> dict[str, str]:
     texts = {}
     for name, limit in findings.detection_limits.items():
         about = mechanism(name).description.strength
-        factor, unit = _scale(Estimate(limit, about.unit, (limit, limit)), f"{name}.{about.name}")
-        shown = f"{_two_digits(factor * limit)}{f' {unit}' if unit else ''}"
+        factor, unit = scaled(Estimate(limit, about.unit, (limit, limit)), f"{name}.{about.name}")
+        shown = f"{two_digits(factor * limit)}{f' {unit}' if unit else ''}"
         texts[name] = shown if math.isfinite(limit) else ""
     return texts
 
@@ -372,43 +363,15 @@ def effect(findings: Findings) -> str:
     """Sentence on where and by how much the simulator errs without the correction."""
     if not findings.location:
         return ""
-    phases = [region for region in findings.location if region.axis in _PHASES]
+    phases = [region for region in findings.location if region.axis in PHASES]
     region = max(phases or findings.location, key=lambda region: region.share)
-    text = _error(region, findings.noise[0])
+    text = error_phrase(region, findings.noise[0])
     if findings.verdict == "named":
         without = "Without it" if len(findings.mechanisms) == 1 else "Without them"
         return f"{without} {text}, even with R and C refitted."
     if _is_unchanged(findings):
         return error_region(region, findings.noise[0])
     return f"With R and C refitted, {text}."
-
-
-def error_region(region: ErrorRegion, noise: float = 0.0) -> str:
-    """One error region as a sentence.
-
-    Args:
-        region: the range to describe.
-        noise: standard deviation of the measurement, cmH2O; far smaller errors have no sign.
-    """
-    return _capital(f"{_error(region, noise)}.")
-
-
-def where(region: ErrorRegion) -> str:
-    """A region in words that follow "the pressure is too high"."""
-    if region.axis in _MOMENTS:
-        after, whole = _MOMENTS[region.axis]
-        if region.low == 0:
-            return f"in the first {_time(region.high)} {whole}"
-        ends = f"{region.low:.6g} to {region.high:.6g} s"
-        if region.high <= _SHORT_MOMENT:
-            ends = f"{1000 * region.low:.6g} to {1000 * region.high:.6g} ms"
-        return f"from {ends} after {after}"
-    if region.axis == "breath number":
-        return f"in breaths {region.low:.6g} to {region.high:.6g} of the recording"
-    if region.axis.startswith("lung "):
-        return f"on {region.axis}"
-    unit = "" if region.unit in ("1", "") else f" {region.unit}"
-    return f"where the {region.axis} is {region.low:.6g} to {region.high:.6g}{unit}"
 
 
 def alternatives(findings: Findings) -> list[str]:
@@ -536,63 +499,6 @@ def lung(match: LungMatch) -> str:
     return f"The lung does not match its label {match.label}: {fitted} ({tolerance}).{known}"
 
 
-def quantity(estimate: Estimate, path: str = "") -> str:
-    """A value with the ends of its interval, such as ``41 ms [38, 44]``.
-
-    Args:
-        estimate: the estimate to show.
-        path: path of the parameter, such as ``valve_curve.loss``; tells shares, which are given in
-            %.
-    """
-    factor, unit = _scale(estimate, path)
-    value, low, high = (factor * x for x in (estimate.value, *estimate.ci95))
-    places = _decimals(value, low, high)
-    name = f" {unit}" if unit else ""
-    if not (math.isfinite(low) and math.isfinite(high)):
-        return f"{rounded(value, places)}{name}"
-    return f"{rounded(value, places)}{name} [{rounded(low, places)}, {rounded(high, places)}]"
-
-
-def quantity_like(value: float, estimate: Estimate, path: str = "") -> str:
-    """Another value of a parameter, in the unit and with the digits of its estimate."""
-    factor, unit = _scale(estimate, path)
-    places = _decimals(*(factor * x for x in (estimate.value, *estimate.ci95)))
-    return f"{rounded(factor * value, places)}{f' {unit}' if unit else ''}"
-
-
-def rounded(value: float, places: int) -> str:
-    """Fixed decimals; zero is never negative."""
-    if not math.isfinite(value):
-        return "unknown"
-    text = f"{value:.{places}f}"
-    return text.removeprefix("-") if float(text) == 0 else text
-
-
-def probability(p_value: float) -> str:
-    """A p-value as it is written in text."""
-    return "p < 0.01" if p_value < 0.01 else f"p = {p_value:.2f}"
-
-
-def _decimals(value: float, low: float, high: float) -> int:
-    """Digits after the point with which half the interval shows one or two digits."""
-    half = 0.5 * (high - low)
-    if not (math.isfinite(half) and half > 0):
-        half = abs(value) / 100 if math.isfinite(value) and value else 1.0
-    return min(max(0, -math.floor(math.log10(half))), 6)
-
-
-def _scale(estimate: Estimate, path: str) -> tuple[float, str]:
-    """Factor and unit in which a parameter is given."""
-    largest = max(
-        (abs(x) for x in (estimate.value, *estimate.ci95) if math.isfinite(x)), default=0.0
-    )
-    if estimate.unit == "s" and 0.0 < largest < _SHORT_PARAMETER:
-        return 1000.0, "ms"
-    if path and parameter(path).share:
-        return 100.0, "%"
-    return 1.0, "" if estimate.unit == "1" else estimate.unit
-
-
 def _it(findings: Findings) -> str:
     """Pronoun for what is missing."""
     count = len(findings.mechanisms) + (findings.nonparametric is not None)
@@ -607,31 +513,6 @@ def _deciding(findings: Findings) -> float:
 def _is_unchanged(findings: Findings) -> bool:
     """Whether the simulator is left as it is, without a refit."""
     return findings.open_loop.refit == findings.open_loop.before
-
-
-def _error(region: ErrorRegion, noise: float) -> str:
-    """Phrase on how the simulator errs in a region; errors are recorded minus simulated."""
-    size = abs(region.mean_error)
-    if size < max(_NO_SIGN * noise, 0.005):
-        return (
-            f"the simulated pressure is off {where(region)}, by errors whose sign changes from "
-            "breath to breath"
-        )
-    side = "too low" if region.mean_error > 0 else "too high"
-    return f"the simulated pressure is {_two_digits(size)} cmH2O {side} {where(region)}"
-
-
-def _two_digits(value: float) -> str:
-    """Two digits, without an exponent."""
-    return f"{value:.0f}" if value >= 10 else f"{value:.2g}" if value >= 0.01 else f"{value:.3f}"
-
-
-def _signed(value: float) -> str:
-    return f"{'-' if value < 0 else ''}{_two_digits(abs(value))}"
-
-
-def _time(seconds: float) -> str:
-    return f"{1000 * seconds:.6g} ms" if seconds <= _SHORT_MOMENT else f"{seconds:.6g} s"
 
 
 def _listed(names: Sequence[str], word: str = "and") -> str:

@@ -330,6 +330,9 @@ def test_what_vetoes_nothing_is_told_first():
         "of the valve changes at breath 15 (x 1.25, p < 0.01), which no mechanism of the library "
         "explains"
     )
+    assert report_text.headline(found).startswith(
+        "Missing in the physics simulator: the gain of the valve changes at breath 15"
+    )
     drift = Change("zero", 9, -0.52, True, 5e-4, 0.4)
     assert report_text.change(drift) == (
         "the zero of the pressure drifts from the first to the last breath (by -0.52 cmH2O, "
@@ -342,6 +345,7 @@ def test_what_vetoes_nothing_is_told_first():
         "The pressure sensor saturates at 31.0 cmH2O (4 % of the readings, which are left out); by "
         "the others: Nothing is missing"
     )
+    assert report_text.headline(saturated).startswith("Readings saturate at 31.0 cmH2O. Nothing")
     place = ErrorRegion("volume", 0.0, 50.0, "mL", 0.8, 0.03, 0.9)
     weak = dataclasses.replace(made.nothing(12), remaining=(place,))
     assert report_text.verdict(weak) == (

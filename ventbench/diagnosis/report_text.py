@@ -73,6 +73,9 @@ def answer(findings: Findings) -> str:
 
 def headline(findings: Findings) -> str:
     """What is missing and what mending it is worth, in one short sentence."""
+    if findings.saturated is not None:
+        others = headline(dataclasses.replace(findings, saturated=None))
+        return f"Readings saturate at {rounded(findings.saturated[0], 1)} cmH2O. {others}"
     simulator, errors = f"the {findings.simulator} simulator", findings.open_loop
     before, after = rounded(errors.refit.rmse, 2), rounded(errors.after.rmse, 2)
     if findings.verdict == "nothing_missing":
@@ -80,6 +83,8 @@ def headline(findings: Findings) -> str:
         return f"{nothing} missing in {simulator}: it errs by {after} cmH2O"
     if findings.verdict == "unnamed":
         what = f"Something is missing in {simulator} that has no name"
+        if findings.nonparametric is None and findings.changes:
+            what = f"Missing in {simulator}: {change(findings.changes[0])}"
     else:
         titles = [title(mechanism.name) for mechanism in findings.mechanisms]
         several = f"{_NUMBERS.get(len(titles), str(len(titles)))} effects are missing in"

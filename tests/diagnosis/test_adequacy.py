@@ -124,7 +124,8 @@ def test_the_verdict_of_a_gain_that_rises():
     usual = small.made()
     raised = small.made(base=dataclasses.replace(small.RIG, gain=1.25 * small.RIG.gain), seed=1)
     half = small.BREATHS // 2
-    both = join(usual.select(np.arange(half)), small.numbered(raised.select(np.arange(half)), 9))
+    first_half, second_half = (each.select(np.arange(half)) for each in (usual, raised))
+    both = join((first_half, small.numbered(second_half, half + 1)))
     found = diagnose(both, settings=small.SETTINGS)
     assert found.verdict == "unnamed"
     (first,) = found.changes[:1]

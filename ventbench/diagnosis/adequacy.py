@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.diagnosis.findings import Change, ErrorRegion
+from ventbench.diagnosis.findings import Change, ErrorRegion, Quantity
 from ventbench.diagnosis.residual_analysis import errors, locate
 from ventbench.diagnosis.settings import DEFAULT, ResidualSettings
 from ventbench.recordings.breaths import Breaths
@@ -75,7 +75,11 @@ def check_residuals(
         settings=settings, least=settings.negligible,
     )  # fmt: skip
     lungs = np.unique(breaths.lung_ids, return_inverse=True)[1]
-    series = {"gain": amplitudes[:, 0], "zero": amplitudes[:, 1], "error": size}
+    series: dict[Quantity, Floats] = {
+        "gain": amplitudes[:, 0],
+        "zero": amplitudes[:, 1],
+        "error": size,
+    }
     p = [order_p_value(each, lungs, settings) for each in series.values()]
     p.append(min((region.p_value for region in regions), default=1.0))
     significant = passes_fdr(np.array(p), settings.veto_level)

@@ -23,6 +23,10 @@ Verdict = Literal["named", "nothing_missing", "unnamed"]
 Stage = Literal["before", "refit", "after", "rigs"]
 
 
+#: What may have an order in time: the valve's gain, the zero of the pressure, the errors' size.
+Quantity = Literal["gain", "zero", "error"]
+
+
 @dataclass(frozen=True)
 class MissingMechanism:
     """A mechanism that the recording needs and the simulator lacks.
@@ -119,7 +123,7 @@ class Change:
         worth: root-mean-square error that it causes, cmH2O.
     """
 
-    of: Literal["gain", "zero", "error"]
+    of: Quantity
     breath: int
     size: float
     drifts: bool

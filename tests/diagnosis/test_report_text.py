@@ -333,6 +333,7 @@ def test_what_vetoes_nothing_is_told_first():
     assert report_text.headline(found).startswith(
         "Missing in the physics simulator: the gain of the valve changes at breath 15"
     )
+    assert any("The breaths before 15, and" in text for text in report_text.would_change(found))
     drift = Change("zero", 9, -0.52, True, 5e-4, 0.4)
     assert report_text.change(drift) == (
         "the zero of the pressure drifts from the first to the last breath (by -0.52 cmH2O, "

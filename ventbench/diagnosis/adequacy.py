@@ -84,6 +84,9 @@ def check_residuals(
     p.append(min((region.p_value for region in regions), default=1.0))
     significant = passes_fdr(np.array(p), settings.veto_level)
     whole = _mean_square(error - of_start, usable)
+    # The simulator's own gain in units of the sensitivity, which may be that of another lung.
+    gain_here = np.median(_amplitudes(np.where(usable, simulated, 0.0), usable, signals)[:, 0])
+    offsets = {"gain": max(float(gain_here), 0.1), "error": 0.0}
     changes = []
     for k, (name, each) in enumerate(series.items()):
         if not significant[k]:
@@ -95,7 +98,9 @@ def check_residuals(
         else:
             mended = error - of_start - signals[..., k] * (fitted - fitted.mean())[:, None]
             worth = _root(whole) - _root(_mean_square(mended, usable))
-        how_much = high - low if name == "zero" else (high + (k == 0)) / max(low + (k == 0), 1e-6)
+        how_much = high - low
+        if name != "zero":
+            how_much = (offsets[name] + high) / max(offsets[name] + low, 1e-6)
         if worth >= settings.negligible:
             number = int(breaths.breath_id[first])
             changes.append(Change(name, number, float(how_much), drifts, p[k], float(worth)))

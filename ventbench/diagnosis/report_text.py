@@ -277,7 +277,13 @@ def would_change(findings: Findings) -> list[str]:
             "More than the noise is unexplained: a further effect may act, and with it the "
             "strengths given here may move."
         )
-    if findings.verdict == "unnamed":
+    steps = [found.breath for found in findings.changes if not found.drifts]
+    if steps:
+        texts.append(
+            f"The breaths before {steps[0]}, and those from it on, diagnosed by themselves, show "
+            "what else is missing."
+        )
+    elif findings.verdict == "unnamed":
         texts.append(
             "A mechanism of that shape in the library would give it a name; docs/physics.md says "
             "how one is added."

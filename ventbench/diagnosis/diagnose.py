@@ -248,6 +248,8 @@ def diagnose(
         noise_floor(float(noise.sigma[0]), sensor, settings.residuals),
         settings.residuals, gain_error, sensor,
     )  # fmt: skip
+    if adequacy.changes:  # breaths that err more because of a change are no outliers
+        open_loop = replace(open_loop, usual=open_loop.after.rmse)
     is_input = conclusion.unnamed is not None and conclusion.unnamed.latent_input is not None
     rejected = (bool(missing) or term is not None) and not _helps(
         correction, recording_model, open_loop, data.select(uses.judging), by_breath=is_input

@@ -6,9 +6,9 @@ import dataclasses
 
 import pytest
 
-from ventbench.diagnosis import report_text
-from ventbench.diagnosis.findings import ErrorRegion, MissingMechanism, OpenLoopError
-from ventbench.diagnosis.report_text import probability, quantity
+from ventbench.diagnosis import number_text, report_text
+from ventbench.diagnosis.findings import Change, ErrorRegion, MissingMechanism, OpenLoopError
+from ventbench.diagnosis.number_text import probability, quantity
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics import library, parameter
 
@@ -124,9 +124,9 @@ def test_a_simulator_that_is_left_as_it_is_was_not_refitted():
 )
 def test_places(place, text):
     axis, low, high, unit = place
-    sentence = report_text.error_region(ErrorRegion(axis, low, high, unit, 0.52, 0.01, 0.5), 0.2)
+    sentence = number_text.error_region(ErrorRegion(axis, low, high, unit, 0.52, 0.01, 0.5), 0.2)
     assert sentence.startswith(f"The simulated pressure is 0.52 cmH2O too low {text}")
-    square = report_text.error_region(ErrorRegion(axis, low, high, unit, 0.01, 0.01, 0.5), 0.2)
+    square = number_text.error_region(ErrorRegion(axis, low, high, unit, 0.01, 0.01, 0.5), 0.2)
     assert square.startswith(f"The simulated pressure is off {text}")
     assert square.endswith(", by errors whose sign changes from breath to breath.")
 
@@ -154,13 +154,17 @@ def test_other_verdicts():
     term = made.unnamed(12).nonparametric
     assert term is not None
     places = (("f(t) at the supply", 0.7), ("f(t) at the alveolus", 0.29), ("measurement", 0.01))
-    timed = dataclasses.replace(term, places=places)
-    assert report_text.nonparametric_term(dataclasses.replace(both, nonparametric=timed)).endswith(
-        "where it acts: f(t) at the supply 70 % or f(t) at the alveolus 29 %."
+    timed = dataclasses.replace(
+        term, name=places[0][0], places=places, x_unit="sample of the breath where it is largest"
     )
-    sure = dataclasses.replace(term, places=(places[0], places[2]))
+    assert report_text.nonparametric_term(dataclasses.replace(both, nonparametric=timed)).endswith(
+        "where it acts: f(t) at the supply 70 % or f(t) at the alveolus 29 %. From pressure alone, "
+        "a rougher course elsewhere would read the same."
+    )
+    sure = dataclasses.replace(timed, places=(places[0], places[2]))
     assert report_text.nonparametric_term(dataclasses.replace(both, nonparametric=sure)).endswith(
-        "Held-out breaths leave no other place for it."
+        "A course as smooth at other places (measurement) is less likely. From pressure alone, a "
+        "rougher course elsewhere would read the same."
     )
     own = dataclasses.replace(term, name="f(u)", form_of=("valve_delay",))
     bent = dataclasses.replace(made.diagnosis(12), form=own)
@@ -250,6 +254,105 @@ def test_the_headline_is_short():
     useless = dataclasses.replace(loop, after=loop.refit)
     text = report_text.headline(dataclasses.replace(found, open_loop=useless))
     assert text.endswith(f"and the error stays at {loop.refit.rmse:.2f} cmH2O")
+
+
+def test_places_that_breaths_cannot_tell_apart_are_one_answer():
+    """Pattern 5: one was told, and no other place was left for it."""
+    found = made.unnamed(12)
+    term = found.nonparametric
+    assert term is not None
+    weights = (("R(V)", 0.6), ("f(V)", 0.36), ("f(Q)", 0.04))
+    texts = report_text.sentences(
+        dataclasses.replace(found, nonparametric=dataclasses.replace(term, places=weights))
+    )
+    assert (
+        "its place in the model is R(V) (resistance of the airway), or f(V), which these breaths "
+        "cannot tell from it;"
+    ) in texts[0]
+    assert any("do not settle where it acts: R(V) 60 % or f(V) 36 %." in text for text in texts)
+
+
+def test_doubts_stand_in_the_first_sentence():
+    """Pattern 7: names at 33 %, at the end of their range or worth nothing, at a million to one."""
+    found = made.diagnosis(12)
+    (sure,) = found.mechanisms
+    high = parameter("valve_delay.delay").high
+    for changed, doubt in (
+        ({"confidence": 0.33}, "valve_delay is preferred over other names at 33 % only"),
+        ({"worth": 0.01}, "valve_delay is worth less than 0.02 cmH2O"),
+        (
+            {"parameters": {"delay": Estimate(high, "s", (0.9 * high, high))}},
+            "the strength of valve_delay is at the end of its range",
+        ),
+    ):
+        doubtful = dataclasses.replace(sure, **changed)
+        first = report_text.sentences(dataclasses.replace(found, mechanisms=(sure, doubtful)))[0]
+        assert f"(uncertain: {doubt})" in first
+        assert "million" not in first
+    earned = dataclasses.replace(found, mechanisms=(dataclasses.replace(sure, worth=0.4),))
+    assert "a million to one" in report_text.answer(earned)
+
+
+def test_expiration_counts():
+    """Pattern 7: a collapse, or a rise, of the error in expiration went untold."""
+    found = made.diagnosis(12)
+    loop = found.open_loop
+
+    def answer(before: float, after: float) -> str:
+        stages = {"refit": OpenLoopError(0.0, before), "after": OpenLoopError(0.0, after)}
+        groups = loop.groups | {"expiration": stages}
+        return report_text.answer(
+            dataclasses.replace(found, open_loop=dataclasses.replace(loop, groups=groups))
+        )
+
+    assert "in inspiration, and from 1.13 to 0.19 in expiration, and hardly" in answer(1.13, 0.19)
+    assert "from 0.46 to 0.49 in expiration, where it gets worse" in answer(0.46, 0.49)
+
+
+def test_noise_above_that_of_quiet_readings_is_said():
+    """Pattern 7: the estimate of the noise had absorbed the fault, 0.44 for 0.18."""
+    found = made.diagnosis(12)
+    loop = dataclasses.replace(found.open_loop, noise_floor=0.44, sensor_noise=0.18)
+    assert "0.44 (quiet readings scatter by 0.18: some of it may be" in report_text.answer(
+        dataclasses.replace(found, open_loop=loop)
+    )
+    loop = dataclasses.replace(loop, noise_floor=0.2)
+    assert "quiet" not in report_text.answer(dataclasses.replace(found, open_loop=loop))
+
+
+def test_what_vetoes_nothing_is_told_first():
+    """Patterns 1 and 2."""
+    found = dataclasses.replace(
+        made.nothing(12), verdict="unnamed", changes=(Change("gain", 15, 1.25, False, 5e-4, 0.4),)
+    )
+    assert report_text.verdict(found) == (
+        "Something is missing in the physics simulator that depends on the breath number: the gain "
+        "of the valve changes at breath 15 (x 1.25, p < 0.01), which no mechanism of the library "
+        "explains"
+    )
+    assert report_text.headline(found).startswith(
+        "Missing in the physics simulator: the gain of the valve changes at breath 15"
+    )
+    assert any("The breaths before 15, and" in text for text in report_text.would_change(found))
+    drift = Change("zero", 9, -0.52, True, 5e-4, 0.4)
+    assert report_text.change(drift) == (
+        "the zero of the pressure drifts from the first to the last breath (by -0.52 cmH2O, "
+        "p < 0.01)"
+    )
+    named = dataclasses.replace(made.diagnosis(12), changes=(drift,))
+    assert "on held-out breaths), and the zero of the" in report_text.verdict(named)
+    saturated = dataclasses.replace(made.nothing(12), saturated=(31.0, 0.045))
+    assert report_text.verdict(saturated).startswith(
+        "The pressure sensor saturates at 31.0 cmH2O (4 % of the readings, which are left out); by "
+        "the others: Nothing is missing"
+    )
+    assert report_text.headline(saturated).startswith("Readings saturate at 31.0 cmH2O. Nothing")
+    place = ErrorRegion("volume", 0.0, 50.0, "mL", 0.8, 0.03, 0.9)
+    weak = dataclasses.replace(made.nothing(12), remaining=(place,))
+    assert report_text.verdict(weak) == (
+        "No mechanism is shown to be missing in the physics simulator, but the simulated pressure "
+        "is 0.8 cmH2O too low where the volume is 0 to 50 mL (p = 0.03)"
+    )
 
 
 @pytest.mark.parametrize(

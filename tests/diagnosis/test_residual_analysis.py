@@ -15,6 +15,7 @@ from ventbench.diagnosis.residual_analysis import (
     open_loop_error,
     p_values,
     profiles,
+    sensor_noise,
     statistic,
 )
 from ventbench.diagnosis.residual_axes import axes, before, round_edges, since_edge
@@ -357,7 +358,9 @@ def test_the_floor_of_the_noise_is_the_sensors_not_that_of_a_bad_fit():
     settled = np.where(recorded.u_out == 1, 5.0, pressure)
     noise = coloured(np.random.default_rng(14), pressure.shape, 0.6)
     seen = dataclasses.replace(recorded, pressure=settled + noise)
-    assert noise_floor(seen, SD) == pytest.approx(SD), "a good fit's noise stands"
-    assert noise_floor(seen, 2.5) == pytest.approx(3.0 * SD, rel=0.4)
+    sensor = sensor_noise(seen)
+    assert sensor == pytest.approx(SD, rel=0.4)
+    assert noise_floor(SD, sensor) == pytest.approx(SD), "a good fit's noise stands"
+    assert noise_floor(2.5, sensor) == pytest.approx(3.0 * SD, rel=0.4)
     inspired = dataclasses.replace(seen, u_out=np.zeros_like(seen.u_out))
-    assert noise_floor(inspired, 2.5) == 2.5, "nothing is quiet"
+    assert noise_floor(2.5, sensor_noise(inspired)) == 2.5, "nothing is quiet"

@@ -13,7 +13,14 @@ import pytest
 from ventbench import mechanics
 from ventbench.errors import InputError
 from ventbench.lungs import lung
-from ventbench.mechanics.labels import LungMatch, label_texts, tolerance_text, value_text
+from ventbench.mechanics.labels import (
+    Estimate,
+    LungMatch,
+    label_texts,
+    match_label,
+    tolerance_text,
+    value_text,
+)
 from ventbench.recordings import Breaths, make_breaths
 
 SENSORS = ("flow", "volume")
@@ -353,6 +360,24 @@ def test_a_label_that_holds_is_named_first_among_what_the_lung_may_be():
     wrong = replace(match, label_matches=False)
     assert label_texts(wrong, known[1:]) == ("no", "R20C10")
     assert "a factor of 1.3" in tolerance_text()
+
+
+@pytest.mark.parametrize(
+    ("of_R", "of_C", "matches", "informative"),
+    [
+        ((0.0, 200.0), (19.0, 21.0), False, False),
+        ((19.0, 22.0), (5.0, 80.0), False, False),
+        ((19.0, 22.0), (19.0, 21.0), True, True),
+        ((50.0, 400.0), (19.0, 21.0), False, True),
+    ],
+)
+def test_an_interval_that_says_nothing_matches_no_label(of_R, of_C, matches, informative):
+    """Pattern 10: R of [0, 200] matched any label. An interval beyond it still contradicts it."""
+    R, C = Estimate(20.0, "cmH2O/(L/s)", of_R), Estimate(20.0, "mL/cmH2O", of_C)
+    match = match_label(lung("R20C20"), lambda _: R, C, "pressure")
+    assert (match.label_matches, match.informative) == (matches, informative)
+    told = "yes" if matches else "no" if informative else "unknown"
+    assert label_texts(match, (lung("R20C20"),))[0] == told
 
 
 def test_the_label_comes_first_where_it_holds():

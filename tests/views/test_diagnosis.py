@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.diagnosis import made
-from ventbench.diagnosis import report_text
+from ventbench.diagnosis import number_text
 from ventbench.diagnosis.findings import MissingMechanism
 from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY
 from ventbench.diagnosis.residual_analysis import profiles
@@ -262,7 +262,7 @@ def test_sentences_and_charts_agree(found: Diagnosis) -> None:
         )
         means = profile.mean[inside]
         assert np.nanmin(means) - 1e-6 <= region.mean_error <= np.nanmax(means) + 1e-6
-        sentence = report_text.error_region(region, found.noise[0])
+        sentence = number_text.error_region(region, found.noise[0])
         if "too" in sentence:
             assert ("too low" in sentence) == (np.nanmean(means) > 0)
 

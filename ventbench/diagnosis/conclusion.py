@@ -11,8 +11,10 @@ gain and, if these are few, from the base model.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
+
+import numpy as np
 
 from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
@@ -67,6 +69,8 @@ class Conclusion:
         gain_sd: standard deviation of the logarithm of the breaths' valve gains; 0 if all breaths
             have the same gain.
         unresolved: whether much is missing, and neither mechanism nor unnamed effect is accepted.
+        worths: root-mean-square error, cmH2O, by which held-out breaths are fitted worse without
+            each mechanism, by name.
         slow_noise: what is left as slow noise of the sensor, with the weight of each place where a
             course in time may act; None if nothing slow is left, or an unnamed effect is it.
     """
@@ -81,6 +85,7 @@ class Conclusion:
     gain_sd: float = 0.0
     unresolved: bool = False
     slow_noise: UnnamedEffect | None = None
+    worths: dict[str, float] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -162,7 +167,7 @@ def conclude(
             full, beside = selected, best_term(wide, selected)
         if beside is not None:
             place = component_of(beside.term)
-            unnamed = UnnamedEffect(place, beside.term, None, beside.nats)
+            unnamed = UnnamedEffect(place, beside.term, None, beside.nats, beside.places)
             full = beside.full
     elif remaining.slow_noise is not None and not selected.hypothesis.breath_terms:
         # Efforts have been compared with slow noise when they were selected.
@@ -176,7 +181,7 @@ def conclude(
         swap=unnamed is None and remaining.slow_noise is None,
     )  # fmt: skip
     has_term = unnamed is not None and unnamed.term is not None
-    selected, gains = _supported(evaluator, selected, (wide, full) if has_term else None)
+    selected, gains, worths = _supported(evaluator, selected, (wide, full) if has_term else None)
     if unnamed is None or unnamed.term is None:
         full = selected
     else:
@@ -195,6 +200,7 @@ def conclude(
         evaluator.gain_sd,
         unnamed is None and not selected.names and is_unresolved(evaluator, comparisons),
         remaining.slow_noise if unnamed is None else None,
+        worths,
     )
 
 
@@ -318,8 +324,10 @@ def is_unresolved(evaluator: Evaluator, comparisons: Sequence[Comparison]) -> bo
 
 def _supported(
     evaluator: Evaluator, selected: FittedModel, beside: tuple[Evaluator, FittedModel] | None
-) -> tuple[FittedModel, dict[str, float]]:
-    """Drop mechanisms that held-out breaths do not agree on; and the gains of the others, nats.
+) -> tuple[FittedModel, dict[str, float], dict[str, float]]:
+    """Drop mechanisms that held-out breaths do not agree on; and what the others gain.
+
+    That is log-likelihood, nats, and root-mean-square error, cmH2O, of the held-out breaths.
 
     Of a recording with few breaths, each is held out once (cross-validation).
 
@@ -331,30 +339,37 @@ def _supported(
     """
     settings = evaluator.settings.plausibility
 
+    def error(evaluator: Evaluator, model: FittedModel) -> float:
+        data = evaluator.held_out.data
+        left = evaluator.predict(model, evaluator.held_out) - data.measured
+        return float(np.sqrt(np.mean(np.square(left[data.weight > 0.0]))))
+
     def gains_in(evaluator: Evaluator, model: FittedModel, name: str) -> tuple[Floats, FittedModel]:
         left = evaluator.fit(model.hypothesis.without(name), model.noise, model)
         held_out = evaluator.held_out_log_likelihood(model)
         return held_out - evaluator.held_out_log_likelihood(left), left
 
-    def compared(name: str) -> tuple[Floats, bool]:
+    def compared(name: str) -> tuple[Floats, float, bool]:
         gains, left = gains_in(evaluator, selected, name)
+        worth = error(evaluator, left) - error(evaluator, selected)
         if is_negligible(evaluator, selected, left, name):
-            return gains, False
+            return gains, worth, False
         if is_consistent(gains, settings):
-            return gains, True
+            return gains, worth, True
         if beside is not None and name in beside[1].names:
-            other = gains_in(*beside, name)[0]
+            other, left = gains_in(*beside, name)
             if is_consistent(other, settings):
-                return other, True
+                return other, error(beside[0], left) - error(*beside), True
         if gains.sum() <= 0.0:
-            return gains, False
+            return gains, worth, False
         validated = cross_validated_gain(evaluator, selected, left)
-        return gains, is_consistent(validated, settings)
+        return gains, worth, is_consistent(validated, settings)
 
     while True:
         results = dict(zip(selected.names, parallel_map(compared, selected.names), strict=True))
-        weak = [name for name, (_, supported) in results.items() if not supported]
+        weak = [name for name, (_, _, supported) in results.items() if not supported]
         if not weak:
-            return selected, {name: float(gains.sum()) for name, (gains, _) in results.items()}
+            nats = {name: float(gains.sum()) for name, (gains, _, _) in results.items()}
+            return selected, nats, {name: worth for name, (_, worth, _) in results.items()}
         least = min(weak, key=lambda name: float(results[name][0].sum()))
         selected = fit_with_noise(evaluator, selected.hypothesis.without(least), selected)

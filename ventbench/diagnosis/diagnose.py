@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.diagnosis import estimates, flow_drive
+from ventbench.diagnosis.adequacy import check_residuals
 from ventbench.diagnosis.conclusion import Conclusion
 from ventbench.diagnosis.corrected import Correction, correct
 from ventbench.diagnosis.detection_limits import detection_limits
@@ -31,6 +32,7 @@ from ventbench.diagnosis.identification import (
     never_fitted,
     split,
     usable,
+    without_saturated,
 )
 from ventbench.diagnosis.residual_analysis import (
     compare_open_loop,
@@ -38,6 +40,7 @@ from ventbench.diagnosis.residual_analysis import (
     is_unexplained,
     locate,
     noise_floor,
+    sensor_noise,
 )
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.diagnosis.selection.alternatives import Alternatives
@@ -147,6 +150,7 @@ def diagnose(
     notes_on_flow: list[str] = []
     if by_flow:
         breaths, notes_on_flow = flow_drive.with_flow(breaths)
+    breaths, saturated = without_saturated(breaths, settings.data)
     breaths, notes = usable(breaths, settings.data)
     recorded, uses = breaths, split(breaths, settings.data, never_fitted(breaths, simulators))
     seen = uses.identifying  # nothing below looks at other breaths until a simulator is chosen
@@ -222,12 +226,30 @@ def diagnose(
         notes_on_simulator.append(f"The simulator needs a nonparametric term at {term.name} too.")
     lungs, notes_on_lungs = _lungs(recorded, recording_only_model.fit)
     noise, pressures = conclusion.noise, correction.pressures
-    # A simulator that is more than a lung and a valve may know the gains of its rigs.
-    gain_error = recording_model.gain_error(data) if simulators.is_base_physics else None
-    open_loop = compare_open_loop(
-        breaths, uses.judging, pressures, noise_floor(breaths, float(noise.sigma[0])),
-        settings.residuals, gain_error,
+    if by_flow and breaths.flow is not None:
+        flow = breaths.flow
+        volume = np.cumsum(data.u_in * data.dt, axis=1) * float(parameter("gain").neutral)
+    else:
+        flow, volume = flow_and_volume(breaths, recording_model.fit, pressures["refit"])
+    here = np.flatnonzero(~np.isnan(pressures["refit"]).all(axis=1))
+    gain, start = recording_model.sensitivities(data)
+    adequacy = check_residuals(
+        breaths.select(here), pressures["after"][here], gain[here], start[here], noise.sigma[0],
+        flow[here], volume[here], gains_scatter=conclusion.gain_sd > 0.0,
+        settings=settings.residuals,
     )  # fmt: skip
+    # A simulator that is more than a lung and a valve may know the gains of its rigs, and gains
+    # that have an order in time do not scatter.
+    scatters = simulators.is_base_physics and not any(c.of == "gain" for c in adequacy.changes)
+    gain_error = conclusion.gain_sd * np.abs(gain) if scatters else None
+    sensor = sensor_noise(breaths, settings.residuals)
+    open_loop = compare_open_loop(
+        breaths, uses.judging, pressures,
+        noise_floor(float(noise.sigma[0]), sensor, settings.residuals),
+        settings.residuals, gain_error, sensor,
+    )  # fmt: skip
+    if adequacy.changes:  # breaths that err more because of a change are no outliers
+        open_loop = replace(open_loop, usual=open_loop.after.rmse)
     is_input = conclusion.unnamed is not None and conclusion.unnamed.latent_input is not None
     rejected = (bool(missing) or term is not None) and not _helps(
         correction, recording_model, open_loop, data.select(uses.judging), by_breath=is_input
@@ -235,22 +257,13 @@ def diagnose(
     if rejected:
         missing, notes_on_simulator = {}, [_note_on_unchanged(correction)]
         term = term if is_input and not correction.unchanged else None
-    if by_flow and breaths.flow is not None:
-        flow = breaths.flow
-        volume = np.cumsum(data.u_in * data.dt, axis=1) * float(parameter("gain").neutral)
-    else:
-        flow, volume = flow_and_volume(breaths, recording_model.fit, pressures["refit"])
-    here = np.flatnonzero(~np.isnan(pressures["refit"]).all(axis=1))
-    location, remaining = (
-        locate(
-            breaths.select(here), pressures[stage][here], noise.sigma[0], flow[here], volume[here],
-            settings=settings.residuals,
-        )
-        for stage in ("refit", "after")
+    location = locate(
+        breaths.select(here), pressures["refit"][here], noise.sigma[0], flow[here], volume[here],
+        settings=settings.residuals,
     )  # fmt: skip
     form, term = estimates.split_form(term, tuple(missing))
     unnamed = term is not None or conclusion.unresolved or (rejected and location)
-    unnamed = unnamed or is_unexplained(open_loop, settings.correction)
+    unnamed = unnamed or is_unexplained(open_loop, settings.correction) or adequacy.vetoed
     verdict: Verdict = "named" if missing else "unnamed" if unnamed else "nothing_missing"
     limits: dict[str, float] = {}
     if verdict == "nothing_missing":
@@ -264,7 +277,7 @@ def diagnose(
         nonparametric=term,
         form=form,
         location=location,
-        remaining=remaining,
+        remaining=adequacy.regions,
         open_loop=open_loop,
         lungs=lungs,
         request=None if rejected or by_flow else _request(conclusion, settings),
@@ -273,6 +286,8 @@ def diagnose(
         split=_ids(breaths, uses),
         chosen=correction.chosen,
         rigs=correction.rigs,
+        changes=adequacy.changes,
+        saturated=saturated,
         gain_scatter=conclusion.gain_sd,
         detection_limits=limits,
         plants=correction.plants,
@@ -454,6 +469,7 @@ def _missing_mechanism(
         nats=conclusion.held_out_gains.get(name, 0.0),
         changed=changed,
         simulator_values={key: estimate.value for key, estimate in own.items()},
+        worth=conclusion.worths.get(name, float("nan")),
     )
 
 

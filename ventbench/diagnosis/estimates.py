@@ -261,7 +261,9 @@ def nonparametric_term(conclusion: Conclusion) -> NonparametricTerm | None:
     assert place.term is not None
     x, y, x_unit, y_unit = _curve(conclusion.full, place.term)
     meaning = NONPARAMETRIC_COMPONENTS[place.name].meaning
-    return NonparametricTerm(place.name, meaning, explains, place.nats, x, x_unit, y, y_unit)
+    return NonparametricTerm(
+        place.name, meaning, explains, place.nats, x, x_unit, y, y_unit, places=place.places
+    )
 
 
 def split_form(

@@ -23,6 +23,10 @@ Verdict = Literal["named", "nothing_missing", "unnamed"]
 Stage = Literal["before", "refit", "after", "rigs"]
 
 
+#: What may have an order in time: the valve's gain, the zero of the pressure, the errors' size.
+Quantity = Literal["gain", "zero", "error"]
+
+
 @dataclass(frozen=True)
 class MissingMechanism:
     """A mechanism that the recording needs and the simulator lacks.
@@ -36,6 +40,8 @@ class MissingMechanism:
         nats: held-out log-likelihood that is lost without it.
         changed: True if the simulator has the mechanism too, with other parameters.
         simulator_values: parameters that the simulator has, by short name; empty if not changed.
+        worth: root-mean-square error, cmH2O, by which held-out breaths are fitted worse without it;
+            NaN if unknown.
     """
 
     name: str
@@ -45,6 +51,7 @@ class MissingMechanism:
     nats: float
     changed: bool = False
     simulator_values: dict[str, float] = field(default_factory=dict)
+    worth: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +69,8 @@ class NonparametricTerm:
         y_unit: name and unit of ``y``.
         form_of: missing mechanisms that the term contains. If there are any, the term is no further
             effect: it shows how their form differs from the library's.
-        places: where a course in time may act and the weight of each place by held-out breaths, the
-            largest first; empty if the term has a curve.
+        places: where the effect may act and the weight of each place that was compared, the largest
+            first: of a course in time by held-out breaths, of a curve by BIC.
     """
 
     name: str
@@ -103,6 +110,28 @@ class ErrorRegion:
 
 
 @dataclass(frozen=True)
+class Change:
+    """Something that has an order in time though breaths should be exchangeable.
+
+    Attributes:
+        of: ``gain`` of the valve, ``zero`` of the pressure, or size of the ``error``.
+        breath: id of the first breath after the change.
+        size: factor from before to after (gain, error), or shift (zero), cmH2O.
+        drifts: whether a straight line from the first to the last breath fits better than a step;
+            the size is then that of the whole line.
+        p_value: by permutations of the breaths.
+        worth: root-mean-square error that it causes, cmH2O.
+    """
+
+    of: Quantity
+    breath: int
+    size: float
+    drifts: bool
+    p_value: float
+    worth: float
+
+
+@dataclass(frozen=True)
 class OpenLoopError:
     """Mean absolute and root-mean-square open-loop error, cmH2O."""
 
@@ -112,7 +141,7 @@ class OpenLoopError:
 
 @dataclass(frozen=True, eq=False)
 class OpenLoopComparison:
-    """Open-loop errors over the inspirations of held-out breaths.
+    """Open-loop errors of held-out breaths: of inspirations, and in ``groups`` of expirations too.
 
     On each lung, ``after`` is at most ``refit``, and ``refit`` at most ``before``: these breaths
     choose the corrected simulator.
@@ -129,6 +158,8 @@ class OpenLoopComparison:
             gain differs from breath to breath; 0 if it does not.
         usual: root-mean-square error of the corrected simulator, cmH2O, without the tenth of the
             breaths that err most; NaN if unknown.
+        sensor_noise: standard deviation of quiet readings, cmH2O, which no missing physics can
+            raise; NaN if nothing is quiet.
     """
 
     held_out_breaths: tuple[int, ...]
@@ -139,6 +170,7 @@ class OpenLoopComparison:
     groups: dict[str, dict[str, OpenLoopError]]
     gain_error: float = 0.0
     usual: float = float("nan")
+    sensor_noise: float = float("nan")
 
     @property
     def least_error(self) -> float:
@@ -259,6 +291,9 @@ class Findings:
         detection_limits: if nothing is missing: smallest strength of each mechanism that would have
             been seen, in the unit of the strength, by name; infinite if none would.
         rigs: parameters of each rig where the correction has them; empty otherwise.
+        changes: what changes in the course of the recording and is in no model.
+        saturated: reading at which the pressure sensor saturates, cmH2O, and share of the readings
+            that do, which are left out; None if it does not.
     """
 
     verdict: Verdict
@@ -282,3 +317,5 @@ class Findings:
     gain_scatter: float = 0.0
     detection_limits: dict[str, float] = field(default_factory=dict)
     rigs: tuple[RigParameters, ...] = ()
+    changes: tuple[Change, ...] = ()
+    saturated: tuple[float, float] | None = None

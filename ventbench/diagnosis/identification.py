@@ -22,7 +22,6 @@ from ventbench.diagnosis.hypothesis import (
     make_partition,
     varies_by_breath,
 )
-from ventbench.diagnosis.latent_inputs import GAIN_SCATTER, input_responses
 from ventbench.diagnosis.plausibility import excludes_neutral, is_weak
 from ventbench.diagnosis.selection.screening import all_parameter_paths, library_paths
 from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
@@ -112,6 +111,28 @@ def never_fitted(breaths: Breaths, simulators: Simulators) -> tuple[int, ...]:
     return tuple(int(breath) for breath in origin.get("held_out_breaths", ()))
 
 
+def without_saturated(
+    breaths: Breaths, settings: DataSettings = DEFAULT.data
+) -> tuple[Breaths, tuple[float, float] | None]:
+    """Breaths without the readings at which the pressure sensor saturates, and what these are.
+
+    A saturated reading is censored: it says only that the pressure was at least that. Readings that
+    merely come near a largest one thin out towards it; those that saturate pile up there.
+
+    Returns:
+        The breaths, and the reading, cmH2O, with its share of all readings; None if none saturates.
+    """
+    pressure = np.where(breaths.valid, breaths.pressure, np.nan)
+    values, counts = np.unique(pressure[np.isfinite(pressure)], return_counts=True)
+    if len(values) < 2 or counts[-1] < max(
+        settings.saturated_share * counts.sum(), 10 * counts[-2]
+    ):
+        return breaths, None
+    masked = np.where(pressure == values[-1], np.nan, breaths.pressure)
+    share = float(counts[-1] / counts.sum())
+    return replace(breaths, pressure=masked), (float(values[-1]), share)
+
+
 def usable(breaths: Breaths, settings: DataSettings = DEFAULT.data) -> tuple[Breaths, list[str]]:
     """Breaths that can be diagnosed, and notes on the others.
 
@@ -178,22 +199,21 @@ class IdentifiedModel:
         partition = make_partition(data, names, self.evaluator.settings)
         return self.evaluator.predict(fitted, partition, first)[:, 0]
 
-    def gain_error(self, data: Data) -> Floats | None:
-        """Standard deviation of the pressures of n breaths because gains differ between breaths.
+    def sensitivities(self, data: Data) -> tuple[Floats, Floats]:
+        """Change of the pressures of n breaths by what is a breath's own, cmH2O, ``(n, T)`` each.
 
         Args:
             data: breaths of the model's lungs.
 
         Returns:
-            cmH2O, ``(n, T)``; None if all breaths have one gain.
+            By the logarithm of the valve's gain, and by the pressure that the breath starts from.
         """
-        sd = self.conclusion.gain_sd
-        if not sd:
-            return None
         evaluator, model = self.evaluator, self.conclusion.full
         partition = make_partition(data, evaluator.training.predictor.names, evaluator.settings)
-        values = evaluator.transferred_values(model, partition)
-        return sd * np.abs(input_responses(partition, values, GAIN_SCATTER)[:, 0])
+        values, names = evaluator.transferred_values(model, partition), partition.predictor.names
+        gain = names.index("gain")
+        slopes = partition.predictor.derivatives(values, (gain, len(names)))[1][:, :, 0]
+        return slopes[:, 0] * values[:, gain, None], slopes[:, 1]
 
     def plants(self) -> dict[str, Plant]:
         """The identified plant of each lung, by label; it answers as :meth:`pressures` does."""

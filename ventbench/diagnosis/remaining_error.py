@@ -28,6 +28,7 @@ from ventbench.diagnosis.selection.held_out_test import passes_heldout_test
 from ventbench.diagnosis.selection.refinement import (
     NonparametricFit,
     compare_nonparametric_terms,
+    places_of,
     without_breath_terms,
 )
 from ventbench.diagnosis.settings import SelectionConfig
@@ -43,8 +44,7 @@ class UnnamedEffect:
         term: the component's basis term, or None for a latent input.
         latent_input: the input, or None for a basis term.
         nats: held-out log-likelihood that it gains.
-        places: weight of each place where a latent input may act, the largest first; empty for a
-            basis term.
+        places: weight of each place that was compared, the largest first.
     """
 
     name: str
@@ -154,7 +154,8 @@ def best_term(wide: Evaluator, selected: FittedModel) -> NonparametricFit | None
     nats = float(gained.sum())
     if _is_negligible_term(wide, start, best.fitted, nats):
         return None
-    return NonparametricFit(best.name, best.fitted, nats)
+    places = places_of(comparison, wide.settings.refinement)
+    return NonparametricFit(best.name, best.fitted, nats, places)
 
 
 def _is_negligible_term(

@@ -1,12 +1,29 @@
-"""A diagnosis in plain sentences, and numbers as a person reads them."""
+"""A diagnosis in plain sentences."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
-from ventbench.diagnosis.findings import ErrorRegion, Findings, MissingMechanism, NonparametricTerm
-from ventbench.diagnosis.residual_axes import EDGE
+from ventbench.diagnosis.findings import (
+    Change,
+    Findings,
+    MissingMechanism,
+    NonparametricTerm,
+)
+from ventbench.diagnosis.number_text import (
+    PHASES,
+    error_phrase,
+    error_region,
+    probability,
+    quantity,
+    quantity_like,
+    rounded,
+    scaled,
+    signed,
+    two_digits,
+)
 from ventbench.mechanics.labels import (
     APPARATUS,
     GAIN,
@@ -15,23 +32,7 @@ from ventbench.mechanics.labels import (
     Estimate,
     LungMatch,
 )
-from ventbench.physics import mechanism, parameter
-
-#: Axes whose ranges are parts of a breath: an effect is described best by these.
-_PHASES = ("time since inspiration", "time since expiration")
-
-#: How a range of time is described: what it starts from, and what it is the beginning of.
-_MOMENTS = {
-    _PHASES[0]: ("the start of inspiration", "of each breath"),
-    _PHASES[1]: ("the start of expiration", "of expiration"),
-    EDGE: ("an edge of a valve", "after an edge of a valve"),
-}
-
-#: Moments up to this are given in ms, s.
-_SHORT_MOMENT = 0.15
-
-#: Parameters of time below this are given in ms, s.
-_SHORT_PARAMETER = 0.5
+from ventbench.physics import mechanism
 
 #: Odds beyond these are called sure: no model is so right that larger ones mean anything.
 _SURE_ODDS = 1e6
@@ -45,11 +46,14 @@ _NUMBERS = {3: "Three", 4: "Four", 5: "Five", 6: "Six"}
 #: Fewer judging breaths than these leave the worth of a correction vague.
 _FEW_BREATHS = 10
 
-#: Places of less weight than this are not listed.
-_LEAST_WEIGHT = 0.02
+#: Places of less weight than this are told from the likeliest one; the others are one answer.
+_LEAST_WEIGHT = 0.05
 
-#: A mean error below this share of the noise says nothing about its sign.
-_NO_SIGN = 0.25
+#: Preference over other names below which a name is weak: another one, or all others, have more.
+_WEAK = 0.5
+
+#: A strength this near to the end of its range, as a share of the range, stands there.
+_AT_END = 0.01
 
 
 def sentences(findings: Findings) -> list[str]:
@@ -69,12 +73,18 @@ def answer(findings: Findings) -> str:
 
 def headline(findings: Findings) -> str:
     """What is missing and what mending it is worth, in one short sentence."""
+    if findings.saturated is not None:
+        others = headline(dataclasses.replace(findings, saturated=None))
+        return f"Readings saturate at {rounded(findings.saturated[0], 1)} cmH2O. {others}"
     simulator, errors = f"the {findings.simulator} simulator", findings.open_loop
     before, after = rounded(errors.refit.rmse, 2), rounded(errors.after.rmse, 2)
     if findings.verdict == "nothing_missing":
-        return f"Nothing is missing in {simulator}: it errs by {after} cmH2O"
+        nothing = "No mechanism is shown to be" if findings.remaining else "Nothing is"
+        return f"{nothing} missing in {simulator}: it errs by {after} cmH2O"
     if findings.verdict == "unnamed":
         what = f"Something is missing in {simulator} that has no name"
+        if findings.nonparametric is None and findings.changes:
+            what = f"Missing in {simulator}: {change(findings.changes[0])}"
     else:
         titles = [title(mechanism.name) for mechanism in findings.mechanisms]
         several = f"{_NUMBERS.get(len(titles), str(len(titles)))} effects are missing in"
@@ -88,19 +98,38 @@ def headline(findings: Findings) -> str:
 
 def verdict(findings: Findings) -> str:
     """What is missing, and how sure that is; without a full stop."""
+    if findings.saturated is not None:
+        reading, share = findings.saturated
+        saturates = (
+            f"The pressure sensor saturates at {rounded(reading, 1)} cmH2O "
+            f"({100 * share:.0f} % of the readings, which are left out); by the others: "
+        )
+        return saturates + verdict(dataclasses.replace(findings, saturated=None))
     simulator, term = f"the {findings.simulator} simulator", findings.nonparametric
     if findings.verdict == "nothing_missing":
         how = "" if _is_unchanged(findings) else "with R and C refitted, "
-        return f"Nothing is missing: {how}{simulator} explains the recording"
-    if findings.verdict == "unnamed":
-        if term is None:
+        if findings.remaining:
+            region = max(findings.remaining, key=lambda region: region.share)
             return (
-                f"Something is missing in {simulator}, but the recording singles out neither a "
-                "mechanism nor a place in the model"
+                f"No mechanism is shown to be missing in {simulator}, but "
+                f"{error_phrase(region, findings.noise[0])} ({probability(region.p_value)})"
+            )
+        return f"Nothing is missing: {how}{simulator} explains the recording"
+    besides = "".join(f", and {change(each)}" for each in findings.changes[:1])
+    if findings.verdict == "unnamed":
+        if term is not None:
+            return (
+                f"Something is missing in {simulator} that is not in the library of mechanisms "
+                f"({odds(term.nats)}); its place in the model is {_places(term)}{besides}"
+            )
+        if findings.changes:
+            return (
+                f"Something is missing in {simulator} that depends on the breath number: "
+                f"{change(findings.changes[0])}, which no mechanism of the library explains"
             )
         return (
-            f"Something is missing in {simulator} that is not in the library of mechanisms "
-            f"({odds(term.nats)}); its place in the model is {place(term)}"
+            f"Something is missing in {simulator}, but the recording singles out neither a "
+            "mechanism nor a place in the model"
         )
     names = _listed([title(mechanism.name) for mechanism in findings.mechanisms])
     rest = "" if term is None else ", and an effect that is not in the library"
@@ -108,16 +137,54 @@ def verdict(findings: Findings) -> str:
         several = len(findings.mechanisms) > 1
         which = f"; {_listed([title(name) for name in findings.form.form_of])}" if several else ""
         rest = f"{which}, in another form than the library's{rest}"
-    return f"Missing in {simulator}: {names}{rest} ({sureness(findings)})"
+    return f"Missing in {simulator}: {names}{rest} ({sureness(findings)}){besides}"
 
 
 def sureness(findings: Findings) -> str:
-    """How sure the names are, or the place without a name, in words."""
+    """How sure the names are, or the place without a name, in words.
+
+    Odds say that a term of that kind acts. They are given only where nothing speaks against the
+    name or its strength; else that is said in their place.
+    """
+    doubts = [doubt for missing in findings.mechanisms for doubt in _doubts(missing, findings)]
+    if doubts:
+        return f"uncertain: {'; '.join(doubts)}"
     nats = [mechanism.nats for mechanism in findings.mechanisms]
     if not nats:
         return odds(findings.nonparametric.nats) if findings.nonparametric is not None else ""
     each = "each at " if len(nats) > 1 else ""
     return f"{each}{odds(min(nats))}"
+
+
+def _doubts(missing: MissingMechanism, findings: Findings) -> list[str]:
+    """What speaks against a name or its strength, in words."""
+    doubts = []
+    about = mechanism(missing.name).description.strength
+    if missing.confidence < _WEAK:
+        share = f"{100 * missing.confidence:.0f} %"
+        doubts.append(f"{missing.name} is preferred over other names at {share} only")
+    if about.name in missing.parameters:
+        value, near = missing.parameters[about.name].value, _AT_END * (about.high - about.low)
+        if min(value - about.low, about.high - value) < near and about.neutral != value:
+            doubts.append(f"the strength of {missing.name} is at the end of its range")
+    least = findings.settings.residuals.negligible
+    if missing.worth < least:
+        doubts.append(f"{missing.name} is worth less than {least:g} cmH2O")
+    return doubts
+
+
+def change(found: Change) -> str:
+    """What changes in the course of the recording, as a phrase."""
+    what = {
+        "gain": "the gain of the valve", "zero": "the zero of the pressure",
+        "error": "the size of the error",
+    }[found.of]  # fmt: skip
+    by = f"x {found.size:.3g}" if found.of != "zero" else f"by {signed(found.size)} cmH2O"
+    if found.drifts:
+        how = f"drifts from the first to the last breath ({by}"
+    else:
+        how = f"changes at breath {found.breath} ({by}"
+    return f"{what} {how}, {probability(found.p_value)})"
 
 
 def odds(nats: float) -> str:
@@ -136,6 +203,9 @@ def worth(findings: Findings) -> str:
     """
     errors = findings.open_loop
     after, noise = rounded(errors.after.rmse, 2), rounded(errors.noise_floor, 2)
+    if errors.noise_floor > findings.settings.residuals.absorbed * errors.sensor_noise:
+        quiet = rounded(errors.sensor_noise, 2)
+        noise = f"{noise} (quiet readings scatter by {quiet}: some of it may be unexplained too)"
     if errors.gain_error:
         noise = f"{noise} and the {rounded(errors.gain_error, 2)} of the valve's scattering gain"
     beyond = rounded(errors.unexplained, 2)
@@ -145,24 +215,33 @@ def worth(findings: Findings) -> str:
     elif errors.unexplained < 0.5 * errors.least_error:
         left = f"hardly more than the noise of {noise} is left"
     count = len(errors.held_out_breaths)
+    out = errors.groups.get("expiration", {})
+    before_out, after_out = (
+        rounded(out[stage].rmse, 2) if stage in out else "unknown" for stage in ("refit", "after")
+    )
+    also = "" if after_out == "unknown" else f" in inspiration and {after_out} in expiration"
     if findings.verdict == "nothing_missing":
-        return f"it errs by {after} cmH2O on {count} breaths set aside, and {left}"
+        return f"it errs by {after} cmH2O{also} on {count} breaths set aside, and {left}"
     refit = rounded(errors.refit.rmse, 2)
     term = findings.nonparametric
     if term is not None and term.x_unit.startswith("sample") and not findings.mechanisms:
         return (
             "it differs from breath to breath, so that no correction of the simulator mends it: "
-            f"the error on {count} breaths set aside stays at {after} cmH2O, and {left}"
+            f"the error on {count} breaths set aside stays at {after} cmH2O{also}, and {left}"
         )
-    if errors.after == errors.refit or after == refit:
+    if errors.after == errors.refit or (after, after_out) == (refit, before_out):
         return (
             f"mending {_it(findings)} is worth nothing on the {count} breaths set aside, where the "
-            f"error stays at {after} cmH2O, and {left}"
+            f"error stays at {after} cmH2O{also}, and {left}"
         )
+    if also:
+        worse = out["after"].rmse - out["refit"].rmse >= findings.settings.residuals.negligible
+        also = f" in inspiration, and from {before_out} to {after_out} in expiration"
+        also += ", where it gets worse" if worse else ""
     start = " (R and C refitted)" if errors.refit != errors.before else ""
     return (
         f"mending {_it(findings)} takes the error on {count} breaths set aside from {refit}{start} "
-        f"to {after} cmH2O, and {left}"
+        f"to {after} cmH2O{also}, and {left}"
     )
 
 
@@ -198,7 +277,13 @@ def would_change(findings: Findings) -> list[str]:
             "More than the noise is unexplained: a further effect may act, and with it the "
             "strengths given here may move."
         )
-    if findings.verdict == "unnamed":
+    steps = [found.breath for found in findings.changes if not found.drifts]
+    if steps:
+        texts.append(
+            f"The breaths before {steps[0]}, and those from it on, diagnosed by themselves, show "
+            "what else is missing."
+        )
+    elif findings.verdict == "unnamed":
         texts.append(
             "A mechanism of that shape in the library would give it a name; docs/physics.md says "
             "how one is added."
@@ -211,7 +296,7 @@ def remaining(findings: Findings) -> str:
     if not findings.remaining or findings.open_loop.after == findings.open_loop.refit:
         return ""
     region = max(findings.remaining, key=lambda region: region.share)
-    return f"After the correction, {_error(region, findings.noise[0])}."
+    return f"After the correction, {error_phrase(region, findings.noise[0])}."
 
 
 def visible(findings: Findings) -> str:
@@ -237,15 +322,15 @@ def visible_strengths(findings: Findings) -> dict[str, str]:
     texts = {}
     for name, limit in findings.detection_limits.items():
         about = mechanism(name).description.strength
-        factor, unit = _scale(Estimate(limit, about.unit, (limit, limit)), f"{name}.{about.name}")
-        shown = f"{_two_digits(factor * limit)}{f' {unit}' if unit else ''}"
+        factor, unit = scaled(Estimate(limit, about.unit, (limit, limit)), f"{name}.{about.name}")
+        shown = f"{two_digits(factor * limit)}{f' {unit}' if unit else ''}"
         texts[name] = shown if math.isfinite(limit) else ""
     return texts
 
 
 def scatter(findings: Findings) -> str:
-    """That breaths have valve gains of their own."""
-    if findings.gain_scatter <= 0.0:
+    """That breaths have valve gains of their own; gains with an order in time do not scatter."""
+    if findings.gain_scatter <= 0.0 or any(each.of == "gain" for each in findings.changes):
         return ""
     share = 100.0 * math.expm1(findings.gain_scatter)
     return (
@@ -289,43 +374,15 @@ def effect(findings: Findings) -> str:
     """Sentence on where and by how much the simulator errs without the correction."""
     if not findings.location:
         return ""
-    phases = [region for region in findings.location if region.axis in _PHASES]
+    phases = [region for region in findings.location if region.axis in PHASES]
     region = max(phases or findings.location, key=lambda region: region.share)
-    text = _error(region, findings.noise[0])
+    text = error_phrase(region, findings.noise[0])
     if findings.verdict == "named":
         without = "Without it" if len(findings.mechanisms) == 1 else "Without them"
         return f"{without} {text}, even with R and C refitted."
     if _is_unchanged(findings):
         return error_region(region, findings.noise[0])
     return f"With R and C refitted, {text}."
-
-
-def error_region(region: ErrorRegion, noise: float = 0.0) -> str:
-    """One error region as a sentence.
-
-    Args:
-        region: the range to describe.
-        noise: standard deviation of the measurement, cmH2O; far smaller errors have no sign.
-    """
-    return _capital(f"{_error(region, noise)}.")
-
-
-def where(region: ErrorRegion) -> str:
-    """A region in words that follow "the pressure is too high"."""
-    if region.axis in _MOMENTS:
-        after, whole = _MOMENTS[region.axis]
-        if region.low == 0:
-            return f"in the first {_time(region.high)} {whole}"
-        ends = f"{region.low:.6g} to {region.high:.6g} s"
-        if region.high <= _SHORT_MOMENT:
-            ends = f"{1000 * region.low:.6g} to {1000 * region.high:.6g} ms"
-        return f"from {ends} after {after}"
-    if region.axis == "breath number":
-        return f"in breaths {region.low:.6g} to {region.high:.6g} of the recording"
-    if region.axis.startswith("lung "):
-        return f"on {region.axis}"
-    unit = "" if region.unit in ("1", "") else f" {region.unit}"
-    return f"where the {region.axis} is {region.low:.6g} to {region.high:.6g}{unit}"
 
 
 def alternatives(findings: Findings) -> list[str]:
@@ -366,20 +423,35 @@ def nonparametric_term(findings: Findings) -> str:
         return ""
     start = "In addition to these mechanisms, a" if findings.verdict == "named" else "A"
     return (
-        f"{start} nonparametric term for {place(term)} explains {100 * term.explains:.0f} % of "
+        f"{start} nonparametric term for {_places(term)} explains {100 * term.explains:.0f} % of "
         f"the squared error above the noise.{_certainty(term)}"
     )
 
 
 def _certainty(term: NonparametricTerm) -> str:
-    """Sentence on how certain the place of a course in time is; empty for a curve."""
+    """Sentence on how certain a place is, and by what.
+
+    A course in time at any place can give any pressures: only its smoothness tells places apart.
+    """
     listed = [(name, share) for name, share in term.places if share >= _LEAST_WEIGHT]
-    if not listed:
-        return ""
+    text = ""
+    if len(listed) > 1:
+        weights = _listed([f"{name} {100 * share:.0f} %" for name, share in listed], "or")
+        text = f" The breaths do not settle where it acts: {weights}."
+    if not term.x_unit.startswith("sample"):
+        return text
     if len(listed) == 1:
-        return " Held-out breaths leave no other place for it."
-    weights = _listed([f"{name} {100 * share:.0f} %" for name, share in listed], "or")
-    return f" Held-out breaths do not settle where it acts: {weights}."
+        others = _listed([name for name, _ in term.places if name != listed[0][0]], "and")
+        text = f" A course as smooth at other places ({others}) is less likely." if others else ""
+    return f"{text} From pressure alone, a rougher course elsewhere would read the same."
+
+
+def _places(term: NonparametricTerm) -> str:
+    """Place of a term, with those that the recording cannot tell from it."""
+    others = [n for n, share in term.places if share >= _LEAST_WEIGHT and n != term.name]
+    if not others:
+        return place(term)
+    return f"{place(term)}, or {_listed(others, 'or')}, which these breaths cannot tell from it"
 
 
 def place(term: NonparametricTerm) -> str:
@@ -430,64 +502,12 @@ def lung(match: LungMatch) -> str:
         also = f" Within the same tolerance it could be {' or '.join(others)}." if others else ""
         return f"The lung matches its label {match.label}: {fitted} ({tolerance}).{also}"
     known = f" It may be {' or '.join(others)}." if others else ""
+    if not match.informative:
+        return (
+            f"Whether the lung matches its label {match.label} is unknown, since the intervals are "
+            f"too wide: {fitted}.{known}"
+        )
     return f"The lung does not match its label {match.label}: {fitted} ({tolerance}).{known}"
-
-
-def quantity(estimate: Estimate, path: str = "") -> str:
-    """A value with the ends of its interval, such as ``41 ms [38, 44]``.
-
-    Args:
-        estimate: the estimate to show.
-        path: path of the parameter, such as ``valve_curve.loss``; tells shares, which are given in
-            %.
-    """
-    factor, unit = _scale(estimate, path)
-    value, low, high = (factor * x for x in (estimate.value, *estimate.ci95))
-    places = _decimals(value, low, high)
-    name = f" {unit}" if unit else ""
-    if not (math.isfinite(low) and math.isfinite(high)):
-        return f"{rounded(value, places)}{name}"
-    return f"{rounded(value, places)}{name} [{rounded(low, places)}, {rounded(high, places)}]"
-
-
-def quantity_like(value: float, estimate: Estimate, path: str = "") -> str:
-    """Another value of a parameter, in the unit and with the digits of its estimate."""
-    factor, unit = _scale(estimate, path)
-    places = _decimals(*(factor * x for x in (estimate.value, *estimate.ci95)))
-    return f"{rounded(factor * value, places)}{f' {unit}' if unit else ''}"
-
-
-def rounded(value: float, places: int) -> str:
-    """Fixed decimals; zero is never negative."""
-    if not math.isfinite(value):
-        return "unknown"
-    text = f"{value:.{places}f}"
-    return text.removeprefix("-") if float(text) == 0 else text
-
-
-def probability(p_value: float) -> str:
-    """A p-value as it is written in text."""
-    return "p < 0.01" if p_value < 0.01 else f"p = {p_value:.2f}"
-
-
-def _decimals(value: float, low: float, high: float) -> int:
-    """Digits after the point with which half the interval shows one or two digits."""
-    half = 0.5 * (high - low)
-    if not (math.isfinite(half) and half > 0):
-        half = abs(value) / 100 if math.isfinite(value) and value else 1.0
-    return min(max(0, -math.floor(math.log10(half))), 6)
-
-
-def _scale(estimate: Estimate, path: str) -> tuple[float, str]:
-    """Factor and unit in which a parameter is given."""
-    largest = max(
-        (abs(x) for x in (estimate.value, *estimate.ci95) if math.isfinite(x)), default=0.0
-    )
-    if estimate.unit == "s" and 0.0 < largest < _SHORT_PARAMETER:
-        return 1000.0, "ms"
-    if path and parameter(path).share:
-        return 100.0, "%"
-    return 1.0, "" if estimate.unit == "1" else estimate.unit
 
 
 def _it(findings: Findings) -> str:
@@ -504,27 +524,6 @@ def _deciding(findings: Findings) -> float:
 def _is_unchanged(findings: Findings) -> bool:
     """Whether the simulator is left as it is, without a refit."""
     return findings.open_loop.refit == findings.open_loop.before
-
-
-def _error(region: ErrorRegion, noise: float) -> str:
-    """Phrase on how the simulator errs in a region; errors are recorded minus simulated."""
-    size = abs(region.mean_error)
-    if size < max(_NO_SIGN * noise, 0.005):
-        return (
-            f"the simulated pressure is off {where(region)}, by errors whose sign changes from "
-            "breath to breath"
-        )
-    side = "too low" if region.mean_error > 0 else "too high"
-    return f"the simulated pressure is {_two_digits(size)} cmH2O {side} {where(region)}"
-
-
-def _two_digits(value: float) -> str:
-    """Two digits, without an exponent."""
-    return f"{value:.0f}" if value >= 10 else f"{value:.2g}" if value >= 0.01 else f"{value:.3f}"
-
-
-def _time(seconds: float) -> str:
-    return f"{1000 * seconds:.6g} ms" if seconds <= _SHORT_MOMENT else f"{seconds:.6g} s"
 
 
 def _listed(names: Sequence[str], word: str = "and") -> str:

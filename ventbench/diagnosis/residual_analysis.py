@@ -55,6 +55,7 @@ def compare_open_loop(
     noise_floor: float,
     settings: ResidualSettings = DEFAULT.residuals,
     gain_error: Floats | None = None,
+    sensor: float = float("nan"),
 ) -> OpenLoopComparison:
     """Open-loop errors of a simulator before and after its correction.
 
@@ -67,6 +68,7 @@ def compare_open_loop(
         settings: length of the beginning of inspiration.
         gain_error: standard deviation of the pressure because gains differ from breath to breath,
             cmH2O, ``(n, T)``; None if they do not.
+        sensor: that of :func:`sensor_noise`.
     """
     # The first sample is where every simulation starts.
     inspiration = breaths.inspiratory & (breaths.time > 0) & held_out[:, None]
@@ -95,8 +97,9 @@ def compare_open_loop(
     error = np.where(inspiration, breaths.pressure - pressures["after"], np.nan)[held_out]
     usual = _usual_error(error, settings.set_aside)
     return OpenLoopComparison(
-        ids, whole["before"], whole["refit"], whole["after"], noise_floor, groups, scatter, usual
-    )
+        ids, whole["before"], whole["refit"], whole["after"], noise_floor, groups, scatter, usual,
+        sensor,
+    )  # fmt: skip
 
 
 def _usual_error(error: Floats, set_aside: float) -> float:
@@ -118,19 +121,15 @@ def is_unexplained(
     )
 
 
-def noise_floor(
-    breaths: Breaths, noise_sd: float, settings: ResidualSettings = DEFAULT.residuals
-) -> float:
-    """Standard deviation of the measurement, cmH2O, which no simulator can beat.
+def sensor_noise(breaths: Breaths, settings: ResidualSettings = DEFAULT.residuals) -> float:
+    """Standard deviation of the sensor, cmH2O, by quiet readings alone; NaN if nothing is quiet.
 
-    The noise of a model that fits badly contains the model's own slow errors. Late in an expiration
-    hardly anything moves, so that the scatter about a parabola shows the sensor alone; the floor is
-    never more than a few times that.
+    Late in an expiration hardly anything moves, so that the scatter about a parabola shows the
+    sensor. A converter hides the scatter of a quiet signal; its step's own scatter is a floor.
 
     Args:
         breaths: the recording.
-        noise_sd: standard deviation of the noise that the identified model leaves, cmH2O.
-        settings: which part of expirations is quiet, and the factor.
+        settings: which part of expirations is quiet.
     """
     late = (breaths.u_out == 1) & breaths.valid & np.isfinite(breaths.pressure)
     scatter = []
@@ -145,10 +144,25 @@ def noise_floor(
             left = pressure[use] - np.polyval(np.polyfit(time[use], pressure[use], 2), time[use])
             scatter.append(1.4826 * np.median(np.abs(left)))
     if not scatter:
-        return noise_sd
-    return min(
-        noise_sd, settings.quiet_factor * max(float(np.median(scatter)), settings.least_noise)
-    )
+        return float("nan")
+    step = np.diff(np.unique(breaths.pressure[late])).min(initial=np.inf) / np.sqrt(12.0)
+    return max(float(np.median(scatter)), float(step), settings.least_noise)
+
+
+def noise_floor(
+    noise_sd: float, sensor: float, settings: ResidualSettings = DEFAULT.residuals
+) -> float:
+    """Standard deviation of the measurement, cmH2O, which no simulator can beat.
+
+    The noise of a model that fits badly contains the model's own slow errors; the floor is never
+    more than a few times the scatter of the sensor.
+
+    Args:
+        noise_sd: standard deviation of the noise that the identified model leaves, cmH2O.
+        sensor: that of :func:`sensor_noise`; NaN if unknown.
+        settings: give the factor.
+    """
+    return float(np.fmin(noise_sd, settings.quiet_factor * sensor))
 
 
 def flow_and_volume(breaths: Breaths, fit: Fit, pressure: Floats) -> tuple[Floats, Floats]:
@@ -179,6 +193,7 @@ def locate(
     volume: Floats | None = None,
     *,
     settings: ResidualSettings = DEFAULT.residuals,
+    least: float = 0.0,
     seed: int = 0,
 ) -> tuple[ErrorRegion, ...]:
     """Find the ranges of phase, command, pressure and other quantities in which a simulator errs.
@@ -195,6 +210,7 @@ def locate(
         flow: flow of the refitted simulator, mL/s, ``(n, T)``, or None.
         volume: volume of the refitted simulator, mL, ``(n, T)``, or None.
         settings: ranges and levels.
+        least: root-mean-square error, cmH2O, that a mean error must add to the noise.
         seed: seed of the random sign flips.
 
     Returns:
@@ -215,6 +231,8 @@ def locate(
     with np.errstate(invalid="ignore"):
         is_material = _nanmean(excess) > settings.min_excess * variance
         by_square = np.where(is_material, by_square, 1.0)
+        adds = np.hypot(np.sqrt(variance), _nanmean(mean)) - np.sqrt(variance)
+        by_mean = np.where(adds >= least, by_mean, 1.0)
     by_mean = by_mean / settings.mean_share
     p_value = np.minimum(1.0, np.minimum(by_mean, by_square / (1.0 - settings.mean_share)))
     sign = np.where(by_mean <= settings.level, np.sign(np.nan_to_num(_nanmean(mean))), 0.0)

@@ -192,6 +192,10 @@ class Diagnosis(Findings):
             "split": {name: list(ids) for name, ids in self.split.items()},
             "chosen": dict(self.chosen),
             "rigs": [asdict(rig) for rig in self.rigs],
+            "changes": [asdict(change) for change in self.changes],
+            "saturated": None
+            if self.saturated is None
+            else {"reading": self.saturated[0], "share": self.saturated[1]},
             "gain_scatter": self.gain_scatter,
             "detection_limits": {
                 name: {"strength": limit, "unit": mechanism(name).description.strength.unit}
@@ -216,6 +220,7 @@ def _mechanism(missing: MissingMechanism) -> dict[str, Any]:
         "preferred_over_other_names": missing.confidence,
         "alternatives": list(missing.alternatives),
         "nats": missing.nats,
+        "worth": missing.worth,
         "changed": missing.changed,
         "simulator_has": missing.simulator_values,
     }
@@ -264,6 +269,7 @@ def _open_loop(comparison: OpenLoopComparison) -> dict[str, Any]:
         "refit": _error(comparison.refit),
         "after": _error(comparison.after),
         "noise_floor": comparison.noise_floor,
+        "sensor_noise": comparison.sensor_noise,
         "gain_error": comparison.gain_error,
         "usual": comparison.usual,
         "unexplained": comparison.unexplained,
@@ -280,6 +286,7 @@ def _lung(match: LungMatch) -> dict[str, Any]:
         "fitted_R": match.fitted_R,
         "fitted_C": match.fitted_C,
         "label_matches": match.label_matches,
+        "informative": match.informative,
         "ci95_R": list(match.ci95_R),
         "ci95_C": list(match.ci95_C),
         "source": match.source,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 #: Raised when a value or the meaning of a setting changes.
-VERSION = "selection-12"
+VERSION = "selection-13"
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,8 @@ class DataSettings:
             that test terms judge as well, and fits never see them.
         batch_size: breaths that are simulated at once. One size means one compilation; two thirds
             of 60 breaths are one batch.
+        saturated_share: share of the readings that must equal the largest one exactly to be taken
+            for a saturated sensor; ten times as many as equal the next smaller reading.
         label_tolerance: scale, as a share, of the differences between a lung's R and C and its
             label: tolerances of test lungs, and of the valve's gain, which scales both.
     """
@@ -38,6 +40,7 @@ class DataSettings:
     judging_every: int = 6
     judging_from: int = 18
     batch_size: int = 40
+    saturated_share: float = 0.01
     label_tolerance: float = 0.15
 
 
@@ -465,6 +468,12 @@ class ResidualSettings:
         min_excess: excess of the squared error that is reported, as a share of the noise's
             variance. Noise that differs a little from range to range is no missing physics.
         certain: p-value below which ranges are ordered by their share of the error.
+        veto_level: false discovery rate of the tests that veto "nothing is missing": as rare as a
+            false name, by ``held_out_test.threshold``.
+        negligible: root-mean-square error, cmH2O, below which an effect is worth nothing: the step
+            of a converter of 12 bits over 80 cmH2O.
+        absorbed: times the scatter of quiet readings from which the model's noise may hold part of
+            what is missing. Coloured noise scatters about a parabola by a quarter less than at all.
         beginning: length of what is reported as the beginning of inspiration, s.
         quiet_after: time after the start of expiration from which little moves, s.
         quiet_samples: fewest quiet samples of a breath that show the sensor's scatter.
@@ -490,6 +499,9 @@ class ResidualSettings:
     mean_share: float = 0.8
     min_excess: float = 0.3
     certain: float = 0.01
+    veto_level: float = 0.01
+    negligible: float = 0.02
+    absorbed: float = 1.5
     beginning: float = 0.2
     quiet_after: float = 0.6
     quiet_samples: int = 10

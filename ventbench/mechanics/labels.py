@@ -24,6 +24,10 @@ TOLERANCE_R, TOLERANCE_C = 1.3, 1.2
 #: cmH2O/(L/s).
 APPARATUS = 2.0
 
+#: Ratio of the ends of an interval beyond which it says nothing of a label: neighbouring settings
+#: of test lungs differ by no more.
+INFORMATIVE = 2.5
+
 #: Flow at which a parabolic resistor has its nominal resistance, L/s.
 REFERENCE_FLOW = 1.0
 
@@ -50,9 +54,11 @@ class LungMatch:
         fitted_C: compliance.
         ci95_R: ends of the 95 % interval of R.
         ci95_C: ends of the 95 % interval of C.
-        label_matches: whether R and C are within tolerance of the label.
+        label_matches: whether R and C are within tolerance of the label, and known well enough to
+            be called a match.
         source: ``pressure`` (given the valve's gain) or ``pressure and flow``.
         settings: ids of known settings that the lung may be, the nearest first.
+        informative: False if the label is within tolerance only because the intervals are wide.
     """
 
     label: str
@@ -63,6 +69,7 @@ class LungMatch:
     label_matches: bool
     source: str
     settings: tuple[str, ...] = ()
+    informative: bool = True
 
 
 #: Resistance, cmH2O/(L/s), at a flow, L/s.
@@ -115,9 +122,17 @@ def match_label(
     """
     at = resistance(REFERENCE_FLOW)
     same = fits(resistance, compliance, label, scale)
+    known = _is_informative(at.ci95, APPARATUS) and _is_informative(compliance.ci95)
     return LungMatch(
-        label.id, at.value, compliance.value, at.ci95, compliance.ci95, same, source
+        label.id, at.value, compliance.value, at.ci95, compliance.ci95, same and known, source,
+        informative=known or not same,
     )  # fmt: skip
+
+
+def _is_informative(ci95: tuple[float, float], apparatus: float = 0.0) -> bool:
+    """Whether an interval, with tubes on top of it, tells neighbouring settings apart."""
+    low, high = (max(end, 0.0) + apparatus for end in ci95)
+    return high <= INFORMATIVE * low
 
 
 def value_text(value: float, ci95: tuple[float, float]) -> str:
@@ -135,6 +150,8 @@ def label_texts(match: LungMatch, settings: tuple[Lung, ...]) -> tuple[str, str]
     if not math.isfinite(match.fitted_C):
         return "unknown", "unknown"
     others = [setting.id for setting in settings if setting.id != match.label]
+    if not match.informative:
+        return "unknown", f"{match.label}, or {others[0]}" if others else match.label
     if match.label_matches:
         return "yes", f"{match.label}, or {others[0]}" if others else match.label
     return "no", ", ".join(others[:2]) or "none known"

@@ -20,6 +20,8 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from operator import itemgetter
 
+import numpy as np
+
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.latent_inputs import (
@@ -38,7 +40,12 @@ from ventbench.diagnosis.selection.candidate_comparison import (
 )
 from ventbench.diagnosis.selection.forward import Progress
 from ventbench.diagnosis.selection.held_out_test import is_needed, passes_heldout_test
-from ventbench.diagnosis.selection.screening import score_nonparametric_terms, screen_mechanisms
+from ventbench.diagnosis.selection.screening import (
+    component_of,
+    score_nonparametric_terms,
+    screen_mechanisms,
+)
+from ventbench.diagnosis.settings import RefinementSettings
 from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import special_cases
 
@@ -51,11 +58,28 @@ class NonparametricFit:
         term: name of the basis term.
         full: the model with the term and the mechanisms.
         nats: held-out log-likelihood that the term gains.
+        places: components whose best term BIC cannot tell from it, and their weights, the largest
+            first.
     """
 
     term: str
     full: FittedModel
     nats: float
+    places: tuple[tuple[str, float], ...] = ()
+
+
+def places_of(
+    comparison: Comparison, settings: RefinementSettings
+) -> tuple[tuple[str, float], ...]:
+    """Components that BIC cannot tell from the best one's, and their weights."""
+    best = comparison.ranked[0].criterion
+    odds: dict[str, float] = {}
+    for model in comparison.ranked:
+        behind = model.criterion - best
+        if behind < settings.close_criterion:
+            odds.setdefault(component_of(model.name), float(np.exp(-0.5 * behind)))
+    total = sum(odds.values())
+    return tuple((name, each / total) for name, each in odds.items())
 
 
 def compare_nonparametric_terms(wide: Evaluator, current: FittedModel) -> Comparison | None:
@@ -215,7 +239,7 @@ def backward_elimination(
         anew.
     """
     settings = wide.settings.refinement
-    term, full, nats = unnamed.term, unnamed.full, unnamed.nats
+    term, full, nats, places = unnamed.term, unnamed.full, unnamed.nats, unnamed.places
     kept = selected.hypothesis
     for name in selected.names:
         left = wide.fit(full.hypothesis.without(name), full.noise, full)
@@ -245,7 +269,8 @@ def backward_elimination(
         ):
             term, full = comparison.ranked[0].name, comparison.ranked[0].fitted
             nats = float(comparison.held_out_gain.sum())
-    return selected, NonparametricFit(term, full, nats)
+            places = places_of(comparison, settings)
+    return selected, NonparametricFit(term, full, nats, places)
 
 
 def special_case_of(

@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 import ventbench
 from ventbench import palette
-from ventbench.diagnosis import report_text
+from ventbench.diagnosis import number_text, report_text
 from ventbench.diagnosis.findings import (
     ErrorRegion,
     MissingMechanism,
@@ -92,9 +92,10 @@ def facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     told = []
     if sure := report_text.sureness(diagnosis):
         decided, _, breaths = sure.partition(" on ")
-        told.append(("How sure?", decided.removeprefix("each at "), f"each, on {breaths}"))
-        if len(diagnosis.mechanisms) < 2:
-            told[-1] = (told[-1][0], told[-1][1], f"on {breaths}")
+        each = "each, " if sure.startswith("each at ") else ""
+        told.append(("How sure?", decided.removeprefix("each at "), f"{each}on {breaths}"))
+        if sure.startswith("uncertain"):
+            told[-1] = ("How sure?", "uncertain", sure.removeprefix("uncertain: "))
     after = _number(errors.after.rmse)
     if diagnosis.verdict == "nothing_missing":
         told.append(("How far off?", f"{after} cmH2O", f"root mean square on {count} breaths"))
@@ -162,7 +163,7 @@ def _named(diagnosis: Diagnosis, missing: MissingMechanism) -> dict[str, Any]:
         "name": missing.name,
         "heading": about.title[:1].upper() + about.title[1:],
         "simulator": {
-            key: report_text.quantity_like(value, missing.parameters[key], f"{missing.name}.{key}")
+            key: number_text.quantity_like(value, missing.parameters[key], f"{missing.name}.{key}")
             for key, value in missing.simulator_values.items()
             if key in missing.parameters
         },
@@ -174,7 +175,7 @@ def _named(diagnosis: Diagnosis, missing: MissingMechanism) -> dict[str, Any]:
         "alternatives": missing.alternatives,
         "chart": None if shown is None else charts.own_signal(about.title, shown),
         "parameters": [
-            (key, meanings.get(key, key), report_text.quantity(value, f"{missing.name}.{key}"))
+            (key, meanings.get(key, key), number_text.quantity(value, f"{missing.name}.{key}"))
             for key, value in missing.parameters.items()
         ],
     }
@@ -197,9 +198,9 @@ def _values(diagnosis: Diagnosis, missing: MissingMechanism) -> dict[str, float]
 
 def _place(diagnosis: Diagnosis, place: ErrorRegion) -> dict[str, str]:
     return {
-        "text": report_text.error_region(place, diagnosis.noise[0]),
+        "text": number_text.error_region(place, diagnosis.noise[0]),
         "share": f"{100 * place.share:.0f} %",
-        "p": report_text.probability(place.p_value),
+        "p": number_text.probability(place.p_value),
     }
 
 
@@ -299,7 +300,7 @@ def _entry(number: int, missing: MissingMechanism) -> Entry:
     strength = missing.parameters.get(about.strength.name)
     value = ""
     if strength is not None:
-        value = report_text.quantity(strength, f"{missing.name}.{about.strength.name}")
+        value = number_text.quantity(strength, f"{missing.name}.{about.strength.name}")
     return Entry(number, about.title, value, "lit", PARTS[about.site])
 
 

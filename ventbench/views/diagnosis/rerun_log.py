@@ -11,7 +11,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ventbench import palette
-from ventbench.diagnosis import report_text
+from ventbench.diagnosis import number_text, report_text
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.errors import InputError
 from ventbench.text import escape_markdown
@@ -75,7 +75,7 @@ def markdown(diagnosis: Diagnosis) -> str:
     """The text panel: the diagnosis in words, and a guide to the views."""
     verdict, *others = (escape_markdown(plain(text)) for text in report_text.sentences(diagnosis))
     places = [
-        escape_markdown(report_text.error_region(place, diagnosis.noise[0]))
+        escape_markdown(number_text.error_region(place, diagnosis.noise[0]))
         for place in diagnosis.location[:5]
     ]
     lines = [f"## {verdict}", "", *(f"{text}\n" for text in others)]

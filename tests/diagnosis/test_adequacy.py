@@ -1,0 +1,135 @@
+"""What the residuals of a final model say of the session: order in time, and nothing where it is
+noise. The rig of these tests is that of :mod:`.made`, plain numpy without any fit."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ventbench.diagnosis.adequacy import Adequacy, check_residuals, order_p_value, passes_fdr
+from ventbench.diagnosis.diagnose import diagnose
+from ventbench.diagnosis.identification import without_saturated
+from ventbench.diagnosis.settings import DEFAULT, ResidualSettings
+from ventbench.recordings import join
+
+from . import made, small
+
+BREATHS, LEVEL = 28, DEFAULT.residuals.veto_level
+GROUPS = np.zeros(BREATHS, np.int64)
+
+#: Enough permutations for the level of the veto.
+FEWER = dataclasses.replace(DEFAULT.residuals, flips=500)
+
+
+def checked(
+    gains: np.ndarray,
+    zeros: np.ndarray | float = 0.0,
+    seed: int = 0,
+    *,
+    scatter: bool = False,
+    settings: ResidualSettings = FEWER,
+) -> Adequacy:
+    """Residuals of a perfect simulator where gains and zeros differ from breath to breath."""
+    recorded = made.breaths(n=BREATHS)
+    u_in, u_out, dt = recorded.u_in, np.asarray(recorded.u_out), recorded.dt
+    simulated = made.answer(u_in, u_out, dt, 22.0, 47.5)[0]
+    slope = made.answer(1.01 * u_in, u_out, dt, 22.0, 47.5)[0]
+    pressure = made.answer(gains[:, None] * u_in, u_out, dt, 22.0, 47.5)[0]
+    noise = made.NOISE * np.random.default_rng(seed).standard_normal(pressure.shape)
+    pressure = pressure + noise + np.reshape(zeros, (-1, 1))
+    return check_residuals(
+        dataclasses.replace(recorded, pressure=pressure), simulated, (slope - simulated) / 0.01,
+        np.zeros_like(slope), made.NOISE, gains_scatter=scatter, settings=settings,
+    )  # fmt: skip
+
+
+def test_a_gain_that_rises_in_mid_session_is_located_and_vetoes():
+    """Pattern 1: it was counted as scatter of the gain, and nothing was missing."""
+    gains = np.where(np.arange(BREATHS) < 14, 1.0, 1.25)
+    for scatter in (False, True):
+        found = checked(gains * np.exp(0.02 * np.sin(np.arange(BREATHS))), scatter=scatter)
+        first = found.changes[0]
+        assert (first.of, first.breath, first.drifts) == ("gain", 15, False)
+        assert first.size == pytest.approx(1.25, rel=0.02)
+        assert first.p_value < LEVEL
+        assert first.worth > 0.2
+        assert found.vetoed
+
+
+def test_a_ramp_and_a_shift_of_the_zero():
+    ramp = checked(np.linspace(0.9, 1.1, BREATHS)).changes[0]
+    assert (ramp.of, ramp.drifts) == ("gain", True)
+    assert ramp.size == pytest.approx(1.1 / 0.9, rel=0.03)
+    shifted = checked(np.ones(BREATHS), 0.8 * (np.arange(BREATHS) >= 20)).changes[0]
+    assert (shifted.of, shifted.breath) == ("zero", 21)
+    assert shifted.size == pytest.approx(0.8, rel=0.1)
+
+
+def test_scatter_without_an_order_is_no_change():
+    gains = np.exp(np.random.default_rng(3).normal(0.0, 0.1, BREATHS))
+    found = checked(gains, scatter=True)
+    assert found.changes == ()
+    assert not found.vetoed
+    assert checked(gains, settings=DEFAULT.residuals).vetoed, (
+        "but it is an error where all breaths have one gain"
+    )
+
+
+def test_noise_is_vetoed_as_rarely_as_promised():
+    assert not any(checked(np.ones(BREATHS), seed=seed).vetoed for seed in range(5))
+
+
+def test_a_change_that_is_worth_nothing_is_not_told():
+    assert checked(np.where(np.arange(BREATHS) < 14, 1.0, 1.004)).changes == ()
+
+
+def test_p_values_of_exchangeable_breaths_are_uniform():
+    """Whatever the distribution; two lungs that differ are no order."""
+    rng, few = np.random.default_rng(1), dataclasses.replace(DEFAULT.residuals, flips=200)
+    p = np.array([order_p_value(rng.standard_cauchy(BREATHS), GROUPS, few) for _ in range(300)])
+    assert 0.06 < np.mean(p <= 0.1) < 0.15
+    assert 0.43 < np.mean(p <= 0.5) < 0.58
+    lungs = (np.arange(BREATHS) >= 14).astype(np.int64)
+    assert order_p_value(rng.normal(5.0 * lungs, 1.0), lungs) > 0.05
+    assert order_p_value(rng.normal(5.0 * lungs, 1.0), GROUPS) < 0.001
+    assert order_p_value(np.arange(4.0), GROUPS[:4]) == 1.0, "too few breaths to tell"
+
+
+def test_false_discovery_rate_by_hand():
+    p = np.array([0.03, 0.001, 0.02, 0.5])
+    assert passes_fdr(p, 0.05).tolist() == [True, True, True, False]  # 0.03 <= 3/4 of 0.05
+    assert passes_fdr(p, 0.01).tolist() == [False, True, False, False]
+    assert not passes_fdr(np.full(4, 0.2), 0.05).any()
+
+
+def test_saturated_readings_are_left_out():
+    """Pattern 2: they became a valve whose flow falls with pressure."""
+    recorded = made.breaths(n=BREATHS)
+    top = float(np.quantile(recorded.pressure, 0.95))
+    clipped = dataclasses.replace(recorded, pressure=np.minimum(recorded.pressure, top))
+    kept, saturated = without_saturated(clipped)
+    assert saturated == pytest.approx((top, 0.05), rel=0.01)
+    np.testing.assert_array_equal(np.isnan(kept.pressure), recorded.pressure >= top)
+    step = np.round(recorded.pressure / 0.07) * 0.07
+    for whole in (recorded, dataclasses.replace(recorded, pressure=step)):
+        same, nothing = without_saturated(whole)
+        assert nothing is None
+        assert same is whole
+
+
+@pytest.mark.slow
+def test_the_verdict_of_a_gain_that_rises():
+    usual = small.made()
+    raised = small.made(base=dataclasses.replace(small.RIG, gain=1.25 * small.RIG.gain), seed=1)
+    half = small.BREATHS // 2
+    first_half, second_half = (each.select(np.arange(half)) for each in (usual, raised))
+    both = join((first_half, small.numbered(second_half, half + 1)))
+    found = diagnose(both, settings=small.SETTINGS)
+    assert found.verdict == "unnamed"
+    (first,) = found.changes[:1]
+    assert (first.of, first.breath) == ("gain", half + 1)
+    assert first.size == pytest.approx(1.25, rel=0.05)
+    assert found.open_loop.gain_error == 0.0, "it is no scatter"
+    assert "the gain of the valve changes at breath 9 (x 1.2" in str(found).splitlines()[0]

@@ -1,0 +1,181 @@
+"""Whether the final model leaves noise alone: tests of its residuals, which veto "nothing missing".
+
+Each breath's error is a sum of what may differ from breath to breath, and of the rest,
+
+    e_b(t) = a_b g_b(t) + z_b + s_b h_b(t) + r_b(t),
+
+with the sensitivities ``g`` to the logarithm of the valve's gain and ``h`` to the state that the
+breath starts from, and a shift ``z`` of the zero, by least squares. If nothing is missing, breaths
+are exchangeable: the order of ``a_b``, of ``z_b`` and of the size of ``r_b`` says nothing. A test
+by ranks asks that (after Pettitt, Applied Statistics 28, 1979), and permutations of the breaths of
+each lung give its p-value whatever the noise. Scatter of gains that has an order is thus no noise.
+The rest is tested along all axes (:func:`~ventbench.diagnosis.residual_analysis.locate`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.diagnosis.findings import Change, ErrorRegion, Quantity
+from ventbench.diagnosis.residual_analysis import errors, locate
+from ventbench.diagnosis.settings import DEFAULT, ResidualSettings
+from ventbench.recordings.breaths import Breaths
+
+Floats = NDArray[np.float64]
+
+#: Directions that a breath's samples tell apart by less than this share are one.
+_RIDGE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Adequacy:
+    """What the residuals of the final model say.
+
+    Attributes:
+        regions: ranges in which they are not noise, as :func:`locate` orders them.
+        changes: significant and material orders in time, the largest effect first.
+        vetoed: whether "nothing is missing" would be wrong.
+    """
+
+    regions: tuple[ErrorRegion, ...]
+    changes: tuple[Change, ...]
+    vetoed: bool
+
+
+def check_residuals(
+    breaths: Breaths, simulated: Floats, gain: Floats, start: Floats, noise_sd: float,
+    flow: Floats | None = None, volume: Floats | None = None, *, gains_scatter: bool = False,
+    settings: ResidualSettings = DEFAULT.residuals,
+) -> Adequacy:  # fmt: skip
+    """Test what a model leaves of a recording.
+
+    Args:
+        breaths: n breaths of T samples, in the order of their recording.
+        simulated: pressures of the final model from the first readings, cmH2O, ``(n, T)``.
+        gain: change of the pressures by the logarithm of the valve's gain, cmH2O, ``(n, T)``.
+        start: change of the pressures by the pressure that a breath starts from, ``(n, T)``.
+        noise_sd: standard deviation of the measurement, cmH2O.
+        flow: flow of the refitted simulator, mL/s, ``(n, T)``, or None.
+        volume: volume of the refitted simulator, mL, ``(n, T)``, or None.
+        gains_scatter: whether gains that differ from breath to breath are no error.
+        settings: levels and ranges.
+    """
+    error, usable = errors(breaths, simulated)
+    signals = np.stack([gain, np.ones_like(gain), start], axis=-1)  # (n, T, 3)
+    amplitudes = _amplitudes(error, usable, signals)
+    rest = error - np.einsum("ntk,nk->nt", signals, amplitudes)
+    size = np.sqrt(_mean_square(rest, usable))
+    of_start = signals[..., 2] * amplitudes[:, 2:]
+    own_gain = signals[..., 0] * amplitudes[:, :1] if gains_scatter else 0.0
+    regions = locate(
+        breaths, simulated + of_start + own_gain, noise_sd, flow, volume,
+        settings=settings, least=settings.negligible,
+    )  # fmt: skip
+    lungs = np.unique(breaths.lung_ids, return_inverse=True)[1]
+    series: dict[Quantity, Floats] = {
+        "gain": amplitudes[:, 0],
+        "zero": amplitudes[:, 1],
+        "error": size,
+    }
+    p = [order_p_value(each, lungs, settings) for each in series.values()]
+    p.append(min((region.p_value for region in regions), default=1.0))
+    significant = passes_fdr(np.array(p), settings.veto_level)
+    whole = _mean_square(error - of_start, usable)
+    # The simulator's own gain in units of the sensitivity, which may be that of another lung.
+    gain_here = np.median(_amplitudes(np.where(usable, simulated, 0.0), usable, signals)[:, 0])
+    offsets = {"gain": max(float(gain_here), 0.1), "error": 0.0}
+    changes = []
+    for k, (name, each) in enumerate(series.items()):
+        if not significant[k]:
+            continue
+        first, fitted, drifts = _step_or_line(each, lungs)
+        low, high = fitted[0], fitted[-1]
+        if name == "error":
+            worth = abs(high - low)
+        else:
+            mended = error - of_start - signals[..., k] * (fitted - fitted.mean())[:, None]
+            worth = _root(whole) - _root(_mean_square(mended, usable))
+        how_much = high - low
+        if name != "zero":
+            how_much = (offsets[name] + high) / max(offsets[name] + low, 1e-6)
+        if worth >= settings.negligible:
+            number = int(breaths.breath_id[first])
+            changes.append(Change(name, number, float(how_much), drifts, p[k], float(worth)))
+    changes.sort(key=lambda change: -change.worth)
+    return Adequacy(regions, tuple(changes), bool(changes) or bool(significant[-1]))
+
+
+def order_p_value(
+    values: Floats, groups: NDArray[np.int64], settings: ResidualSettings = DEFAULT.residuals
+) -> float:
+    """Probability that values in random order show as large a change at any breath.
+
+    Args:
+        values: a value of each breath, in the order of time, ``(n,)``.
+        groups: lung of each breath, ``(n,)``; only breaths of one lung are exchanged.
+        settings: number of permutations, and fewest breaths.
+    """
+    n = len(values)
+    if n < settings.min_breaths:
+        return 1.0
+    rng = np.random.default_rng(0)
+    drawn = np.zeros((settings.flips + 1, n), np.float32)  # as recorded, then permuted
+    for group in np.unique(groups):
+        own = np.flatnonzero(groups == group)
+        ranks = np.argsort(np.argsort(values[own])) - 0.5 * (len(own) - 1)
+        ranks = ranks / max(float(np.std(ranks)), 1e-12)
+        drawn[0, own] = ranks
+        drawn[1:, own] = rng.permuted(np.tile(ranks, (settings.flips, 1)), axis=1)
+    k = np.arange(1, n)
+    largest = np.abs(np.cumsum(drawn, axis=1)[:, :-1] / np.sqrt(k * (n - k))).max(axis=1)
+    return float(np.mean(largest >= largest[0] * (1.0 - 1e-5)))
+
+
+def passes_fdr(p_values: Floats, level: float) -> NDArray[np.bool_]:
+    """Which of m tests are significant at a false discovery rate (Benjamini and Hochberg, 1995)."""
+    order = np.argsort(p_values)
+    below = p_values[order] <= level * np.arange(1, len(order) + 1) / len(order)
+    count = int(np.flatnonzero(below)[-1]) + 1 if below.any() else 0
+    significant = np.zeros(len(order), bool)
+    significant[order[:count]] = True
+    return significant
+
+
+def _amplitudes(error: Floats, usable: NDArray[np.bool_], signals: Floats) -> Floats:
+    """Least-squares amplitude of each signal in each breath, ``(n, k)``."""
+    weighted = np.where(usable[..., None], signals, 0.0)
+    scale = np.sqrt(np.maximum((weighted**2).sum(axis=1), 1e-12))
+    normal = np.einsum("nti,ntj->nij", weighted, weighted) / (scale[:, :, None] * scale[:, None])
+    right = np.einsum("nti,nt->ni", weighted, error) / scale
+    normal = normal + _RIDGE * np.eye(signals.shape[-1])
+    return np.linalg.solve(normal, right[..., None])[..., 0] / scale
+
+
+def _step_or_line(values: Floats, groups: NDArray[np.int64]) -> tuple[int, Floats, bool]:
+    """First breath after the best step, the values of the step or line, and whether it is a line.
+
+    Both are fitted by least squares to the values less each lung's mean; the better one is told.
+    """
+    centred = values.copy()
+    for group in np.unique(groups):
+        centred[groups == group] -= values[groups == group].mean()
+    n, k = len(values), np.arange(1, len(values))
+    before = np.cumsum(centred)[:-1]
+    gained = before**2 / k + (centred.sum() - before) ** 2 / (n - k)
+    first = int(np.argmax(gained)) + 1
+    step = np.where(np.arange(n) < first, centred[:first].mean(), centred[first:].mean())
+    line = np.polyval(np.polyfit(np.arange(n), centred, 1), np.arange(n))
+    drifts = bool(np.sum((centred - line) ** 2) < np.sum((centred - step) ** 2))
+    return first, values.mean() + (line if drifts else step), drifts
+
+
+def _mean_square(values: Floats, usable: NDArray[np.bool_]) -> Floats:
+    """Mean square over the usable samples of each breath, ``(n,)``."""
+    return np.sum(np.where(usable, values**2, 0.0), axis=1) / np.maximum(usable.sum(axis=1), 1)
+
+
+def _root(mean_squares: Floats) -> float:
+    return float(np.sqrt(np.mean(mean_squares)))

@@ -6,9 +6,11 @@ Exit codes: 0 done; 1 the command ran and the answer is no (a plan that is not f
 
 from __future__ import annotations
 
+import contextlib
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +19,9 @@ from ventbench.cli import options
 from ventbench.cli.options import JsonFile, emit
 from ventbench.errors import InputError
 from ventbench.text import plain
+
+if TYPE_CHECKING:
+    from hardware_eval.bench.console import ConsoleOperator
 
 app = typer.Typer(
     name="ventbench-hardware",
@@ -47,6 +52,19 @@ Control = Annotated[
         metavar="SOCKET", help="Control socket of an emulator, which then disturbs the tube itself."
     ),
 ]
+
+
+@contextlib.contextmanager
+def _keys(person: ConsoleOperator) -> Iterator[None]:
+    """Any key is the emergency stop; it ends the command with exit code 1."""
+    from hardware_eval.bench.loop import EmergencyStop
+
+    with person.keys():
+        try:
+            yield
+        except EmergencyStop:
+            print("stopped: the operator pressed the emergency stop", file=sys.stderr)
+            raise typer.Exit(1) from None
 
 
 def _version(value: bool) -> None:
@@ -152,7 +170,7 @@ def run(
     line = ev.connect(port)
     person = ConsoleOperator(yes=yes, control=control, device=line.device)
     try:
-        with person.keys():
+        with _keys(person):
             done = ev.evaluate(
                 entries, line, out, person, plan=plan, view=views, sandbox=sandbox, dry=dry_run,
                 before_lung=before_lung, settings=settings, operator_name=operator, notes=notes,
@@ -231,7 +249,7 @@ def selftest(
     person = ConsoleOperator(yes=True)
     line = ev.connect(port)
     try:
-        with person.keys():
+        with _keys(person):
             sheet = run_selftest(
                 Bench(line.client, line.clock, DEFAULT, person), label, simulator=plant
             )
@@ -324,10 +342,11 @@ def collect(
     person = ConsoleOperator(yes=yes)
     line = ev.connect(port)
     try:
-        if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
-            raise typer.Exit(1)
         about = {"device": ev.device_about(line.client.welcome or line.client.hello())}
-        with person.keys(), bars() as shown:
+        with _keys(person), contextlib.ExitStack() as stack:
+            if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
+                raise typer.Exit(1)
+            shown = stack.enter_context(bars())
             bar = shown.add_task("exploring", total=breaths)
             done = collection.collect(
                 Bench(line.client, line.clock, DEFAULT, person), label, breaths, out, seed=seed,

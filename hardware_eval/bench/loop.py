@@ -28,7 +28,7 @@ from hardware_eval.bench.safety import SafetySample, SafetySettings, Trip
 from hardware_eval.clock import Clock
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.errors import LinkError, NoAnswerError, RefusedError
-from hardware_eval.wire.messages import Flag, Reading
+from hardware_eval.wire.messages import CAUSES, Flag, Reading
 from ventbench import protocol, waveform
 from ventbench.lungs import lung as parse_lung
 
@@ -419,10 +419,7 @@ class _Loop:
         )  # fmt: skip
 
 
-_CAUSES = (
-    Flag.COMMANDS_STOPPED | Flag.OUT_OF_RANGE | Flag.OVERPRESSURE | Flag.SENSOR_LOST
-    | Flag.DEVICE_LATE
-)  # fmt: skip
+_CAUSES = CAUSES & ~Flag.HOST_VENTED
 
 
 _HELD_UP = Flag.COMMANDS_STOPPED | Flag.DEVICE_LATE

@@ -101,6 +101,13 @@ def _run(given: argparse.Namespace) -> int:
     hal = PvpHal(given.config)
     try:
         if not given.vent:
+            if settings.pressure_limit >= hal.identity.highest:
+                raise InputError(
+                    f"the pressure limit of {settings.pressure_limit:g} cmH2O lies outside the "
+                    f"sensor's range, up to {hal.identity.highest:.4g}: nothing could trip it. "
+                    "Give a smaller --pressure-limit, or the sensor's own highest_pressure in "
+                    f"{given.config}"
+                )
             if reason := realtime.prefer():
                 print(f"no real-time scheduling: {reason}", file=sys.stderr)
             _serve_until_signal(hal, settings, open_line)

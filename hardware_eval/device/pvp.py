@@ -36,6 +36,9 @@ STEP, LAST = 0.002, 2047
 #: Conversions of which one sample is the median, against spikes; 0.3 ms each.
 _MEDIAN_OF = 3
 
+#: Share of its range at which a sensor is at its end: some clip a little early.
+_SATURATED = 0.99
+
 #: Full duty of pigpio's hardware PWM.
 _FULL_DUTY = 1_000_000
 
@@ -52,6 +55,7 @@ class PvpConfiguration:
         adc_channel: input of the pressure sensor, 0..3.
         offset_voltage: sensor at ambient pressure, V.
         cmH2O_per_volt: slope of the sensor.
+        highest_pressure: largest pressure that the sensor can tell, cmH2O; 20 inH2O are 50.8.
         inspiratory_pin: GPIO of the proportional valve; one with hardware PWM (12, 13, 18, 19).
         pwm_frequency: Hz.
         expiratory_pin: GPIO of the on/off valve.
@@ -68,6 +72,7 @@ class PvpConfiguration:
     adc_channel: int = 0
     offset_voltage: float = 2.2
     cmH2O_per_volt: float = 35.15
+    highest_pressure: float = 50.8
     inspiratory_pin: int = 12
     pwm_frequency: int = 20_000
     expiratory_pin: int = 17
@@ -140,8 +145,9 @@ def _check(configuration: PvpConfiguration) -> None:
         raise ValueError(f"device_id = {configuration.device_id!r} must have 16 hexadecimal digits")
     if not 0 <= configuration.adc_channel <= 3:
         raise ValueError(f"adc_channel = {configuration.adc_channel} is outside 0..3")
-    if configuration.cmH2O_per_volt <= 0.0:
-        raise ValueError(f"cmH2O_per_volt = {configuration.cmH2O_per_volt} must be positive")
+    for key in ("cmH2O_per_volt", "highest_pressure"):
+        if not getattr(configuration, key) > 0.0:
+            raise ValueError(f"{key} = {getattr(configuration, key)} must be positive")
 
 
 def _check_table(table: ValveTable) -> None:
@@ -178,6 +184,8 @@ class PvpHal:
         if not self._pi.connected:
             raise InputError("pigpiod does not run: start it with `sudo pigpiod`")
         self._pi.set_mode(self._configuration.expiratory_pin, pigpio.OUTPUT)
+        converted = self._pressure(LAST)
+        self._highest = min(self._configuration.highest_pressure, converted)
         self._set: tuple[float, int] | None = None
         self._rising = True
         self.actuate(0.0, 0.0, 1)
@@ -192,7 +200,7 @@ class PvpHal:
             ) from error
         self.identity = Identity(
             self._configuration.name, bytes.fromhex(self._configuration.device_id), calibration,
-            Capability.NONE,
+            Capability.NONE, highest=self._highest, noisy=True,
         )  # fmt: skip
 
     def sample(self, now: float) -> Sample:
@@ -203,9 +211,8 @@ class PvpHal:
             return Sample(now, math.nan)
         if counts <= 0:  # no voltage: the wire is off; ambient pressure gives 2.2 V
             return Sample(now, math.nan)
-        volts = counts * STEP
-        pressure = (volts - self._configuration.offset_voltage) * self._configuration.cmH2O_per_volt
-        return Sample(now, pressure, saturated=counts >= LAST)
+        pressure = self._pressure(counts)
+        return Sample(now, pressure, saturated=pressure >= _SATURATED * self._highest)
 
     def actuate(self, now: float, u_in: float, u_out: int) -> None:
         """Set the valves; the expiratory one first, so that air finds its way out."""
@@ -228,6 +235,11 @@ class PvpHal:
         self.actuate(0.0, 0.0, 1)
         self._bus.close()
         self._pi.stop()
+
+    def _pressure(self, counts: float) -> float:
+        """Pressure of a conversion, cmH2O."""
+        volts = counts * STEP - self._configuration.offset_voltage
+        return volts * self._configuration.cmH2O_per_volt
 
     def _configure_converter(self) -> None:
         channel = self._configuration.adc_channel << 12

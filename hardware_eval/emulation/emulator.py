@@ -246,6 +246,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--quantum", type=float, default=0.0, help="step of the sensor's converter, cmH2O"
     )
     parser.add_argument(
+        "--highest", type=float, default=float("inf"), help="end of the sensor's range, cmH2O"
+    )
+    parser.add_argument(
         "--realtime",
         action="store_true",
         help="refuse to run without real-time scheduling, which is taken where it is granted",
@@ -265,7 +268,10 @@ def _emulate(given: argparse.Namespace) -> int:
     faults = [parse(text) for text in given.fault]
     lung_faults = [fault for fault in faults if isinstance(fault, LungFault)]
     line_faults = [fault for fault in faults if isinstance(fault, LineFault)]
-    sensor = {"noise": given.noise, "quantum": given.quantum, "faults": lung_faults}
+    sensor = {
+        "noise": given.noise, "quantum": given.quantum, "highest": given.highest,
+        "faults": lung_faults,
+    }  # fmt: skip
     if given.conceal is None:
         hal = simulated_lung(given.lung, given.plant, **sensor)
         told = given.lung

@@ -114,6 +114,11 @@ def test_the_sensor(configuration: Path, hardware: SimpleNamespace) -> None:
     assert hal.sample(1.5).pressure == pytest.approx(0.0703)  # one step of the recordings
     hardware.bus.counts = [1500, 0, 1501]
     assert hal.sample(2.0).pressure == pytest.approx(400 * 0.0703)  # spikes are cut
+    assert hal.identity.highest == 50.8
+    hardware.bus.counts = [1100 + int(0.98 * 50.8 / 0.0703)]
+    assert not hal.sample(2.0).saturated
+    hardware.bus.counts = [1100 + int(50.8 / 0.0703)]
+    assert hal.sample(2.0).saturated
     hardware.bus.counts = [LAST]
     assert hal.sample(2.0).saturated
     for nothing in ([0], [-5]):
@@ -172,6 +177,7 @@ def test_identity_changes_with_the_calibration_only(
         ("adc_channel = 7", TABLE, r"outside 0\.\.3"),
         ('adc_channel = "1"', TABLE, "must be a int"),
         ('device_id = "01"', TABLE, "16 hexadecimal"),
+        ("highest_pressure = -1.0", TABLE, "must be positive"),
         ("= 1", TABLE, "pvp.toml"),
         (CONFIGURATION, "u_in,opening,closing\n0,0,0\n90,1,1\n", "0 to 100"),
         (CONFIGURATION, "u_in,opening,closing\n0,0,0\n100,1.1,1\n", "leaves"),
@@ -203,6 +209,15 @@ def test_missing_packages_and_hardware_say_what_to_do(
     assert "pip install" in capsys.readouterr().err
     assert board.main(["--config", "x.toml", "--listen", "here"]) == 2
     assert "HOST:PORT" in capsys.readouterr().err
+
+
+def test_a_limit_outside_the_sensors_range_is_refused(
+    configuration: Path, hardware: SimpleNamespace, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert board.main(["--config", str(configuration), "--port", "x"]) == 2
+    assert "smaller --pressure-limit" in capsys.readouterr().err
+    assert hardware.pi.levels == {17: 1}
+    assert hardware.pi.stopped
 
 
 def test_the_board_vents_once(configuration: Path, hardware: SimpleNamespace) -> None:

@@ -55,6 +55,8 @@ class Troubled:
         trouble: called with its command from then on; gives the command that is sent.
     """
 
+    longest_answer = 0.0
+
     def __init__(
         self, device: LoopbackDevice, lung: str, moment: float, trouble: Callable[[float], Any]
     ) -> None:

@@ -1,7 +1,7 @@
 """The command line ``ventbench-hardware``: parses, calls, prints.
 
-Exit codes: 0 done; 1 the command ran and the answer is no (a plan that is not finished, a no-go);
-2 bad input or no device.
+Exit codes: 0 done; 1 the command ran and the answer is no (a plan that is not finished, an entry
+without a score, a no-go); 2 bad input or no device.
 """
 
 from __future__ import annotations
@@ -180,11 +180,12 @@ def run(
         line.client.close()
     emit(
         {
-            "complete": done.complete,
+            "complete": done.complete and not done.stopped,
             "reason": done.reason,
             "log": str(done.log),
             "recording": None if done.recording is None else str(done.recording),
             "records": {name: str(path) for name, path in done.records.items()},
+            "stopped": dict(done.stopped),
         },
         json,
     )
@@ -195,7 +196,12 @@ def run(
         raise typer.Exit(1)
     for name, path in done.records.items():
         print(f"{name}: record {path}", file=shown)
-        print(f"next: ventbench board add {path}", file=shown)
+        if name in done.stopped:
+            print(f"{name}: no score: {plain(done.stopped[name])}", file=shown)
+        if name not in done.unrun:
+            print(f"next: ventbench board add {path}", file=shown)
+    if done.stopped:
+        raise typer.Exit(1)
 
 
 def _numbers(option: str, text: str | None) -> list[float]:
@@ -343,7 +349,7 @@ def collect(
     person = ConsoleOperator(yes=yes)
     line = ev.connect(port)
     try:
-        about = {"device": ev.device_about(line.client.welcome or line.client.hello())}
+        about = {"device": ev.device_about(line)}
         with _keys(person), contextlib.ExitStack() as stack:
             if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
                 raise typer.Exit(1)

@@ -122,7 +122,7 @@ def shown(row: HardwareRow) -> dict[str, Any]:
     """A row for the templates."""
     record, header = row.record, row.record.header
     kind = "emulator" if record.emulated else header.device.name
-    spread = "" if math.isnan(record.spread) else f" ± {pages.figure(record.spread)}"
+    spread = "" if math.isnan(record.spread) else f" (SD {pages.figure(record.spread)})"
     return {
         "name": record.name,
         "sha256": record.sha256,

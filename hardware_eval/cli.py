@@ -222,8 +222,8 @@ def emulate(context: typer.Context) -> None:
     """Emulate the ventilator and a lung on a pseudo-terminal; prints its path.
 
     Options: --lung, --plant, --conceal WORDS, --seal FILE, --link PATH, --control SOCKET, --fault
-    KIND@START[-END][:STRENGTH], --noise, --quantum, --highest, --log FILE;
-    `emulate --help` explains them.
+    KIND@START[-END][:STRENGTH], --noise, --quantum, --highest, --log FILE,
+    --electronics FILE, --normally-closed, --no-monostable; `emulate --help` explains them.
 
     Example: `ventbench-hardware emulate --lung R20C50 --link ./lung`
     """

@@ -17,6 +17,7 @@ class Sample:
         time: when it was taken, s, on the clock that the program is stepped with.
         pressure: airway pressure, cmH2O; NaN if the sensor did not answer.
         flow: flow into the lung, mL/s; NaN if it is not measured.
+        lapsed: whether the electronics have vented by themselves, as the program stood still.
         saturated: whether the pressure stands at the upper end of the sensor's range.
     """
 
@@ -24,6 +25,7 @@ class Sample:
     pressure: float
     flow: float = math.nan
     saturated: bool = False
+    lapsed: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -281,6 +281,8 @@ def _dangers(identity: Identity, state: DeviceState, now: float, sample: Sample)
     causes = Flag.NONE
     if sample.pressure > state.pressure_limit or sample.saturated:
         causes |= Flag.OVERPRESSURE
+    if sample.lapsed:
+        causes |= Flag.DEVICE_LATE
     if now - state.valid > SENSOR_TIMEOUT:
         causes |= Flag.SENSOR_LOST
     if identity.noisy and state.valid - state.changed > STUCK:

@@ -12,6 +12,7 @@ Texas Instruments, SBAS473E, tables 3 to 8.
 from __future__ import annotations
 
 import hashlib
+import importlib
 import math
 import statistics
 import tomllib
@@ -61,6 +62,8 @@ class PvpConfiguration:
         expiratory_pin: GPIO of the on/off valve.
         expiratory_normally_open: whether that valve is open without current. The PVP's own is
             closed without current: with it, a device without power does not vent.
+        heartbeat_pin: GPIO of the monostable's trigger, which moves with every order to the valves;
+            -1 for none.
         valve_table: CSV of the proportional valve with columns u_in (%, 0 to 100, increasing),
             opening, closing (duty cycle, 0..1); beside the TOML file.
     """
@@ -77,6 +80,7 @@ class PvpConfiguration:
     pwm_frequency: int = 20_000
     expiratory_pin: int = 17
     expiratory_normally_open: bool = False
+    heartbeat_pin: int = -1
     valve_table: str = "valve.csv"
 
 
@@ -159,36 +163,69 @@ def _check_table(table: ValveTable) -> None:
             raise ValueError(f"{name} leaves 0..1 or decreases")
 
 
-class PvpHal:
-    """The ventilator's valves and sensor; see :class:`~hardware_eval.device.hal.Hal`."""
+class PvpValves:
+    """The ventilator's valves and its heartbeat pin, owned by the deadman's process."""
 
-    def __init__(self, path: Path) -> None:
-        """Open the hardware, vented.
+    def __init__(self, path: Path | str) -> None:
+        """Open the valves, vented.
 
         Args:
             path: TOML file, see :class:`PvpConfiguration`.
 
         Raises:
-            InputError: if the file is wrong, a package is missing, or the hardware does not answer.
+            InputError: if the file is wrong, pigpio is missing, or its daemon does not run.
         """
-        self._configuration, self._table, calibration = load_configuration(path)
-        try:
-            import pigpio  # pyright: ignore[reportMissingImports]
-            import smbus2  # pyright: ignore[reportMissingImports]
-        except ImportError as error:
-            raise InputError(
-                f"the ventilator's computer needs pigpio and smbus2 (pip install pigpio smbus2): "
-                f"{error}"
-            ) from error
+        self._configuration, self._table, _ = load_configuration(Path(path))
+        pigpio = _imported("pigpio")
         self._pi: Any = pigpio.pi()
         if not self._pi.connected:
             raise InputError("pigpiod does not run: start it with `sudo pigpiod`")
-        self._pi.set_mode(self._configuration.expiratory_pin, pigpio.OUTPUT)
-        converted = self._pressure(LAST)
-        self._highest = min(self._configuration.highest_pressure, converted)
+        for pin in (self._configuration.expiratory_pin, self._configuration.heartbeat_pin):
+            if pin >= 0:
+                self._pi.set_mode(pin, pigpio.OUTPUT)
         self._set: tuple[float, int] | None = None
-        self._rising = True
-        self.actuate(0.0, 0.0, 1)
+        self._rising, self._beat = True, 0
+        self.actuate(0.0, 1)
+
+    def actuate(self, u_in: float, u_out: int) -> None:
+        """Set the valves; the expiratory one first, so that air finds its way out."""
+        configuration, before = self._configuration, self._set[0] if self._set else 0.0
+        if configuration.heartbeat_pin >= 0:
+            self._beat = 1 - self._beat
+            self._pi.write(configuration.heartbeat_pin, self._beat)
+        if (u_in, u_out) == self._set:
+            return
+        energised = u_out == 0 if configuration.expiratory_normally_open else u_out == 1
+        self._pi.write(configuration.expiratory_pin, int(energised))
+        if u_in != before:
+            self._rising = u_in > before
+        duty = self._table.duty(u_in, self._rising)
+        self._pi.hardware_PWM(
+            configuration.inspiratory_pin, configuration.pwm_frequency, round(duty * _FULL_DUTY)
+        )
+        self._set = u_in, u_out
+
+    def close(self) -> None:
+        """Vent and release the hardware."""
+        self._set = None
+        self.actuate(0.0, 1)
+        self._pi.stop()
+
+
+class PvpSensor:
+    """The ventilator's pressure sensor; see :class:`~hardware_eval.device.deadman.Sensor`."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the converter.
+
+        Args:
+            path: TOML file, see :class:`PvpConfiguration`.
+
+        Raises:
+            InputError: if the file is wrong, smbus2 is missing, or the converter does not answer.
+        """
+        self._configuration, _, calibration = load_configuration(path)
+        smbus2 = _imported("smbus2")
         try:
             self._bus: Any = smbus2.SMBus(self._configuration.i2c_bus)
             self._configure_converter()
@@ -198,6 +235,7 @@ class PvpHal:
                 f"0x{self._configuration.adc_address:02x} of I2C bus "
                 f"{self._configuration.i2c_bus}: {error}"
             ) from error
+        self._highest = min(self._configuration.highest_pressure, self._pressure(LAST))
         self.identity = Identity(
             self._configuration.name, bytes.fromhex(self._configuration.device_id), calibration,
             Capability.NONE, highest=self._highest, noisy=True,
@@ -214,27 +252,9 @@ class PvpHal:
         pressure = self._pressure(counts)
         return Sample(now, pressure, saturated=pressure >= _SATURATED * self._highest)
 
-    def actuate(self, now: float, u_in: float, u_out: int) -> None:
-        """Set the valves; the expiratory one first, so that air finds its way out."""
-        if (u_in, u_out) == self._set:
-            return
-        configuration, before = self._configuration, self._set[0] if self._set else 0.0
-        energised = u_out == 0 if configuration.expiratory_normally_open else u_out == 1
-        self._pi.write(configuration.expiratory_pin, int(energised))
-        if u_in != before:
-            self._rising = u_in > before
-        duty = self._table.duty(u_in, self._rising)
-        self._pi.hardware_PWM(
-            configuration.inspiratory_pin, configuration.pwm_frequency, round(duty * _FULL_DUTY)
-        )
-        self._set = u_in, u_out
-
     def close(self) -> None:
-        """Vent and release the hardware."""
-        self._set = None
-        self.actuate(0.0, 0.0, 1)
+        """Release the bus."""
         self._bus.close()
-        self._pi.stop()
 
     def _pressure(self, counts: float) -> float:
         """Pressure of a conversion, cmH2O."""
@@ -253,3 +273,13 @@ class PvpHal:
         high, low = self._bus.read_i2c_block_data(self._configuration.adc_address, _CONVERSION, 2)
         word = high << 8 | low
         return (word - 0x10000 if word & 0x8000 else word) >> 4
+
+
+def _imported(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(
+            "the ventilator's computer needs pigpio and smbus2 (pip install pigpio smbus2): "
+            f"{error}"
+        ) from error

@@ -81,6 +81,7 @@ class SimulatedHal:
         self._flow = hasattr(plant, "observe") or isinstance(plant, Hybrid)
         capabilities = Capability.SIMULATED | (Capability.FLOW if self._flow else Capability.NONE)
         noisy = noise > 0.0 and noise >= 0.5 * quantum
+        self.told = name
         self.identity = Identity(
             name, calibration[:8], calibration, capabilities, highest=highest, noisy=noisy
         )
@@ -140,6 +141,8 @@ class SimulatedHal:
     def sample(self, now: float) -> Sample:
         """Pressure and flow by now; see :class:`~hardware_eval.device.hal.Hal`."""
         kinds = active(self.faults, now)
+        if FaultKind.BUS_BLOCKED in kinds:
+            return self._last
         _, shown = self._by(now, kinds)
         pressure, flow = (float(x) for x in np.asarray(shown))
         flow = flow if self._flow else math.nan

@@ -19,6 +19,7 @@ class Bench:
     pressure: float = 5.0
     noise: float = 0.0
     saturated: bool = False
+    lapsed: bool = False
     identity: Identity = field(
         default_factory=lambda: Identity("bench", b"12345678", bytes(32), Capability.NONE)
     )
@@ -29,7 +30,7 @@ class Bench:
         pressure = self.pressure
         if self.noise:
             pressure = round(self.random.gauss(pressure, self.noise) / 0.0703) * 0.0703
-        return Sample(now, pressure, saturated=self.saturated)
+        return Sample(now, pressure, saturated=self.saturated, lapsed=self.lapsed)
 
     def actuate(self, now: float, u_in: float, u_out: int) -> None:
         self.valves.append((now, u_in, u_out))

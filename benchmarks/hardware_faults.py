@@ -55,6 +55,8 @@ class Troubled:
         trouble: called with its command from then on; gives the command that is sent.
     """
 
+    longest_answer = 0.0
+
     def __init__(
         self, device: LoopbackDevice, lung: str, moment: float, trouble: Callable[[float], Any]
     ) -> None:
@@ -132,6 +134,7 @@ def interrupts(wanted: float) -> float:
 
 FAULTS = (
     Fault("sensor stuck", (FaultKind.SENSOR_STUCK, 1.0)),
+    Fault("sensor noisy (3 cmH2O)", (FaultKind.SENSOR_NOISY, 3.0)),
     Fault("sensor gives nothing", (FaultKind.SENSOR_LOST, 1.0)),
     Fault("sensor 25 cmH2O too high", (FaultKind.SENSOR_OFFSET, 25.0)),
     Fault("sensor 10 cmH2O too low", (FaultKind.SENSOR_OFFSET, -10.0)),

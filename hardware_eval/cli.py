@@ -1,14 +1,16 @@
 """The command line ``ventbench-hardware``: parses, calls, prints.
 
-Exit codes: 0 done; 1 the command ran and the answer is no (a plan that is not finished, a no-go);
-2 bad input or no device.
+Exit codes: 0 done; 1 the command ran and the answer is no (a plan that is not finished, an entry
+without a score, a no-go); 2 bad input or no device.
 """
 
 from __future__ import annotations
 
+import contextlib
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +19,9 @@ from ventbench.cli import options
 from ventbench.cli.options import JsonFile, emit
 from ventbench.errors import InputError
 from ventbench.text import plain
+
+if TYPE_CHECKING:
+    from hardware_eval.bench.console import ConsoleOperator
 
 app = typer.Typer(
     name="ventbench-hardware",
@@ -47,6 +52,19 @@ Control = Annotated[
         metavar="SOCKET", help="Control socket of an emulator, which then disturbs the tube itself."
     ),
 ]
+
+
+@contextlib.contextmanager
+def _keys(person: ConsoleOperator) -> Iterator[None]:
+    """Any key is the emergency stop; it ends the command with exit code 1."""
+    from hardware_eval.bench.loop import EmergencyStop
+
+    with person.keys():
+        try:
+            yield
+        except EmergencyStop:
+            print("stopped: the operator pressed the emergency stop", file=sys.stderr)
+            raise typer.Exit(1) from None
 
 
 def _version(value: bool) -> None:
@@ -152,7 +170,7 @@ def run(
     line = ev.connect(port)
     person = ConsoleOperator(yes=yes, control=control, device=line.device)
     try:
-        with person.keys():
+        with _keys(person):
             done = ev.evaluate(
                 entries, line, out, person, plan=plan, view=views, sandbox=sandbox, dry=dry_run,
                 before_lung=before_lung, settings=settings, operator_name=operator, notes=notes,
@@ -162,11 +180,12 @@ def run(
         line.client.close()
     emit(
         {
-            "complete": done.complete,
+            "complete": done.complete and not done.stopped,
             "reason": done.reason,
             "log": str(done.log),
             "recording": None if done.recording is None else str(done.recording),
             "records": {name: str(path) for name, path in done.records.items()},
+            "stopped": dict(done.stopped),
         },
         json,
     )
@@ -177,7 +196,12 @@ def run(
         raise typer.Exit(1)
     for name, path in done.records.items():
         print(f"{name}: record {path}", file=shown)
-        print(f"next: ventbench board add {path}", file=shown)
+        if name in done.stopped:
+            print(f"{name}: no score: {plain(done.stopped[name])}", file=shown)
+        if name not in done.unrun:
+            print(f"next: ventbench board add {path}", file=shown)
+    if done.stopped:
+        raise typer.Exit(1)
 
 
 def _numbers(option: str, text: str | None) -> list[float]:
@@ -198,7 +222,8 @@ def emulate(context: typer.Context) -> None:
     """Emulate the ventilator and a lung on a pseudo-terminal; prints its path.
 
     Options: --lung, --plant, --conceal WORDS, --seal FILE, --link PATH, --control SOCKET, --fault
-    KIND@START[-END][:STRENGTH], --noise, --quantum, --log FILE; `emulate --help` explains them.
+    KIND@START[-END][:STRENGTH], --noise, --quantum, --highest, --log FILE,
+    --electronics FILE, --normally-closed, --no-monostable; `emulate --help` explains them.
 
     Example: `ventbench-hardware emulate --lung R20C50 --link ./lung`
     """
@@ -231,7 +256,7 @@ def selftest(
     person = ConsoleOperator(yes=True)
     line = ev.connect(port)
     try:
-        with person.keys():
+        with _keys(person):
             sheet = run_selftest(
                 Bench(line.client, line.clock, DEFAULT, person), label, simulator=plant
             )
@@ -324,10 +349,11 @@ def collect(
     person = ConsoleOperator(yes=yes)
     line = ev.connect(port)
     try:
-        if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
-            raise typer.Exit(1)
-        about = {"device": ev.device_about(line.client.welcome or line.client.hello())}
-        with person.keys(), bars() as shown:
+        about = {"device": ev.device_about(line)}
+        with _keys(person), contextlib.ExitStack() as stack:
+            if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
+                raise typer.Exit(1)
+            shown = stack.enter_context(bars())
             bar = shown.add_task("exploring", total=breaths)
             done = collection.collect(
                 Bench(line.client, line.clock, DEFAULT, person), label, breaths, out, seed=seed,

@@ -13,8 +13,11 @@ PRIORITY = 40
 #: Priority of a device: its guard comes before a host on the same machine.
 DEVICE_PRIORITY = PRIORITY + 1
 
+#: Priority of a device's deadman: it comes before what it watches.
+DEADMAN_PRIORITY = PRIORITY + 2
 
-def prefer() -> str | None:
+
+def prefer(level: int = DEVICE_PRIORITY) -> str | None:
     """Ask for real-time scheduling (``SCHED_FIFO``) of all threads of this process, a device.
 
     Root has the right to it, and users with ``rtprio`` in ``/etc/security/limits.conf``.
@@ -30,7 +33,7 @@ def prefer() -> str | None:
         threads = [0]
     try:
         for thread in threads:
-            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(DEVICE_PRIORITY))
+            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(level))
     except ProcessLookupError:  # a thread that has ended since
         return None
     except OSError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import socket
 import sys
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hardware_eval.bench.loop import BreathLog
+from hardware_eval.bench.loop import BreathLog, EmergencyStop
 from hardware_eval.bench.plan import PlannedRun
 from hardware_eval.emulation.faults import parse
 from ventbench import protocol
@@ -31,16 +32,26 @@ _BY_HAND = {
     "pinch": ("pinch the tube NOW", "let the tube go"),
 }
 
+#: Time that a person takes at least to answer what has just been shown, s.
+REACTION = 0.2
+
+#: Keys that are read at once, and what stands for a terminal that has gone.
+_KEYS, _GONE = 4096, b"\x04"
+
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
 class ConsoleOperator:
     """Asks and tells at a terminal; while a run goes on, any key is the emergency stop.
 
+    Keys are read from the terminal's descriptor and nowhere else, so that none waits in a buffer.
+    A key that was pressed before a question was shown is no answer to it: it was meant as a stop.
+
     Args:
         yes: confirm everything; for an emulator and for tests.
         control: control socket of an emulator, which then does perturbations by itself.
         device: a device that is emulated in this process, to which the same applies.
+        reaction: time after a question was shown in which a key cannot be an answer yet, s.
     """
 
     def __init__(
@@ -49,54 +60,71 @@ class ConsoleOperator:
         yes: bool = False,
         control: Path | None = None,
         device: LoopbackDevice | None = None,
+        reaction: float = REACTION,
     ) -> None:
         self._yes, self._control, self._device = yes, control, device
-        self._keys = False
+        self._reaction = reaction
+        self._terminal: int | None = None
 
     @contextlib.contextmanager
     def keys(self) -> Iterator[None]:
-        """Let single keys arrive without Enter; does nothing where stdin is no terminal."""
+        """Let single keys arrive without Enter; does nothing where stdin is no terminal.
+
+        What was typed before is dropped: nothing could move yet.
+        """
         if not sys.stdin.isatty():
             yield
             return
         import termios
         import tty
 
-        before = termios.tcgetattr(sys.stdin)
-        tty.setcbreak(sys.stdin)  # Ctrl-C still interrupts
-        self._keys = True
+        terminal = sys.stdin.fileno()
+        before = termios.tcgetattr(terminal)
+        tty.setcbreak(terminal, termios.TCSAFLUSH)  # Ctrl-C still interrupts
+        self._terminal = terminal
         try:
             yield
         finally:
-            self._keys = False
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+            self._terminal = None
+            with contextlib.suppress(termios.error):  # it has gone
+                termios.tcsetattr(terminal, termios.TCSAFLUSH, before)
 
     def confirm(self, question: str) -> bool:
-        """Ask with the keys y and n; without a terminal only ``--yes`` confirms."""
+        """Ask within :meth:`keys`: the key y alone confirms, every other one declines.
+
+        Without a terminal only ``--yes`` confirms.
+
+        Raises:
+            EmergencyStop: if a key was pressed before the question had been shown.
+        """
         print(f"{question} [y/n] ", end="", flush=True)
-        if self._yes or not sys.stdin.isatty():
+        if self._yes or self._terminal is None:
             print("y (--yes)" if self._yes else "n (no terminal; give --yes to confirm)")
             return self._yes
-        if not self._keys:
-            return input().strip().lower().startswith("y")
-        while self.stop():  # keys that were pressed before the question
-            pass
-        answer = ""
-        while answer not in ("y", "n"):
-            answer = sys.stdin.read(1).lower()
-        print(answer)
-        return answer == "y"
+        if self._pressed(self._reaction):
+            print("stop (a key came before the question)", flush=True)
+            raise EmergencyStop
+        answer = self._pressed(None)
+        print(answer.decode("ascii", "replace"), flush=True)
+        return answer.lower() == b"y"
+
+    def stop(self) -> bool:
+        """Whether a key has been pressed, or the terminal has gone."""
+        return self._terminal is not None and bool(self._pressed(0.0))
+
+    def _pressed(self, timeout: float | None) -> bytes:
+        """Keys that come within a time, s; those of a terminal that has gone are end-of-file."""
+        assert self._terminal is not None
+        if not select.select([self._terminal], [], [], timeout)[0]:
+            return b""
+        try:
+            return os.read(self._terminal, _KEYS) or _GONE
+        except OSError:
+            return _GONE
 
     def tell(self, text: str) -> None:
         """Print a line."""
         print(text, flush=True)
-
-    def stop(self) -> bool:
-        """Whether a key has been pressed."""
-        if not self._keys or not select.select([sys.stdin], [], [], 0.0)[0]:
-            return False
-        sys.stdin.read(1)
-        return True
 
     def disturb(self, perturbation: str, on: bool) -> None:
         """Have a leak opened or the tube pinched, by hand or by the emulator."""

@@ -25,6 +25,11 @@ class ControllerFailedError(Exception):
 class LiveController(Protocol):
     """A controller that answers in time or not at all."""
 
+    @property
+    def longest_answer(self) -> float:
+        """Longest time that an answer took so far, s."""
+        ...
+
     def act(self, row: Floats, budget: float) -> float | None:
         """Ask for the next command.
 
@@ -67,7 +72,14 @@ class SubmissionController:
         begin = take_priority if real_time else None
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="controller", initializer=begin)
         self._pending: Future[Floats] | None = None
+        self._asked = self._longest = 0.0
         self._check()
+
+    @property
+    def longest_answer(self) -> float:
+        """Longest time that an answer took so far, s; also one that is still to come."""
+        waits = 0.0 if self._pending is None else time.perf_counter() - self._asked
+        return max(self._longest, waits)
 
     def act(self, row: Floats, budget: float) -> float | None:
         """Ask for the next command; an answer to an earlier observation is dropped."""
@@ -76,9 +88,15 @@ class SubmissionController:
             if self._result(self._pending, budget) is None:
                 return None
             budget -= time.perf_counter() - began
-        self._pending = self._thread.submit(self._session.act, row)
+        self._asked = time.perf_counter()
+        self._pending = self._thread.submit(self._answer, row)
         answer = self._result(self._pending, budget)
         return None if answer is None else float(answer[0])
+
+    def _answer(self, row: Floats) -> Floats:
+        answer = self._session.act(row)
+        self._longest = max(self._longest, time.perf_counter() - self._asked)
+        return answer
 
     def _result(self, pending: Future[Floats], budget: float) -> Floats | None:
         try:
@@ -106,6 +124,8 @@ class PIDController:
         gains: P, I and D, %/cmH2O.
         added: what is added to its command at a time of the breath, %; nothing if not given.
     """
+
+    longest_answer = 0.0
 
     def __init__(
         self,

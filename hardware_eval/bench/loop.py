@@ -28,7 +28,7 @@ from hardware_eval.bench.safety import SafetySample, SafetySettings, Trip
 from hardware_eval.clock import Clock
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.errors import LinkError, NoAnswerError, RefusedError
-from hardware_eval.wire.messages import Flag, Reading
+from hardware_eval.wire.messages import CAUSES, Flag, Reading
 from ventbench import protocol, waveform
 from ventbench.lungs import lung as parse_lung
 
@@ -37,6 +37,12 @@ Floats = NDArray[np.float64]
 #: When a controller must have answered, s after the step's deadline: what is left of 30 ms is for
 #: the command's way to the device, and for this loop.
 ANSWER_BY = 0.022
+
+#: Share of a run's answers that may come later than that; an entry that is late more often fails.
+LATE_SHARE = 0.01
+
+#: A late answer counts only if it had this time at least, s: else the host was late, not the entry.
+_FAIR = 0.5 * ANSWER_BY
 
 #: What is left of a step when the wait for the command's answer ends, s: the next step must not be
 #: late. An answer that comes later is missed, and the next reading tells what the device does.
@@ -144,11 +150,13 @@ class RunResult:
         reason: why it did not complete; empty if it did.
         trips: safety checks that tripped.
         breaths: those that began.
-        late_answers: steps whose controller did not answer in time.
+        late_answers: steps whose controller did not answer in time, though the host asked in time.
         limited: commands that a limit of the bench cut.
         vented_after: time from the sample that tripped until the device had vented, s; NaN if
             nothing tripped.
         held_up: whether host or line, too slow for the loop, ended it.
+        asked: steps whose controller was asked.
+        longest_answer: longest time that an answer took, s.
     """
 
     status: str
@@ -159,6 +167,8 @@ class RunResult:
     limited: int
     vented_after: float = math.nan
     held_up: bool = False
+    asked: int = 0
+    longest_answer: float = 0.0
 
     @property
     def error(self) -> float:
@@ -244,7 +254,7 @@ class _Loop:
         self._on_breath = on_breath
         self._safety = safety.init(parse_lung(run.lung))
         self._breaths: list[BreathLog] = []
-        self._late_answers = self._limited = self._unanswered = 0
+        self._asked = self._late_answers = self._limited = self._unanswered = 0
         self._command = (0.0, 1)
         self._disturbed = False
 
@@ -275,7 +285,17 @@ class _Loop:
         return self._measured()
 
     def _measured(self) -> RunResult:
-        """The end of a run that went through; a score needs every pressure of its inspirations."""
+        """The end of a run that went through.
+
+        A score needs every pressure of its inspirations, and a controller that answered in time.
+        """
+        if self._late_answers > LATE_SHARE * self._asked:
+            return self._ended(
+                "failed",
+                f"{self._late_answers} of {self._asked} answers took longer than "
+                f"{1e3 * ANSWER_BY:.0f} ms, the longest "
+                f"{1e3 * self._controller.longest_answer:.0f} ms; {100 * LATE_SHARE:g} % may",
+            )
         if self._run.kind not in ("scored", "control"):
             return self._ended("complete", "")
         pressures = [
@@ -358,7 +378,7 @@ class _Loop:
         """Choose a command and send it."""
         bench, run, log = self._bench, self._run, self._breaths[-1]
         inspiring = step < protocol.INSPIRATION_STEPS
-        requested = math.nan
+        requested, budget = math.nan, 0.0
         if inspiring:
             previous = _BIAS if step == 0 else self._command[0]
             if step == 0:
@@ -368,6 +388,7 @@ class _Loop:
             if reading is not None:
                 row = _row(step, reading.pressure, target, run.pip, previous)
                 budget = deadline + ANSWER_BY - bench.clock.now()
+                self._asked += 1
                 try:
                     answer = self._controller.act(row, budget)
                 except ControllerFailedError as error:
@@ -375,7 +396,7 @@ class _Loop:
                     return self._ended("failed", str(error))
                 requested = math.nan if answer is None else answer
             if math.isnan(requested):
-                self._late_answers += 1
+                self._late_answers += budget >= _FAIR
                 u_in = self._command[0] if self._command[1] == 0 else 0.0
             else:
                 u_in, cut = safety.limit_command(bench.settings, previous, requested)
@@ -415,14 +436,11 @@ class _Loop:
             self._bench.operator.disturb(self._run.perturbation, False)
         return RunResult(
             status, reason, self._safety.trips, tuple(self._breaths), self._late_answers,
-            self._limited, vented_after, held_up,
+            self._limited, vented_after, held_up, self._asked, self._controller.longest_answer,
         )  # fmt: skip
 
 
-_CAUSES = (
-    Flag.COMMANDS_STOPPED | Flag.OUT_OF_RANGE | Flag.OVERPRESSURE | Flag.SENSOR_LOST
-    | Flag.DEVICE_LATE
-)  # fmt: skip
+_CAUSES = CAUSES & ~Flag.HOST_VENTED
 
 
 _HELD_UP = Flag.COMMANDS_STOPPED | Flag.DEVICE_LATE

@@ -218,7 +218,9 @@ def _one(
         {
             **line,
             "error": None if math.isnan(result.error) else result.error,
+            "asked": result.asked,
             "late_answers": result.late_answers,
+            "longest_answer": round(result.longest_answer, 6),
             "limited": result.limited,
             "trips": [vars(trip) for trip in result.trips],
         }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import signal
 import socket
@@ -13,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 
 from hardware_eval import realtime
-from hardware_eval.device.hal import Hal
+from hardware_eval.device import deadman
 from hardware_eval.device.port import Guard, Port
 from hardware_eval.device.program import DeviceService, DeviceSettings
 from hardware_eval.wire.link import BAUD_RATE
@@ -86,33 +87,50 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(given: argparse.Namespace) -> int:
-    from hardware_eval.device.pvp import PvpHal
+    from hardware_eval.device.pvp import PvpSensor, PvpValves
 
+    host, _, number = (given.listen or ":0").rpartition(":")
+    if not number.isdigit():
+        raise InputError(f"--listen {given.listen}: write HOST:PORT, such as 0.0.0.0:5005")
+    PvpValves(given.config).close()  # vented; what is wrong with them is told here
+    if given.vent:
+        return 0
     limit = given.pressure_limit
     settings = DeviceSettings() if limit is None else DeviceSettings(limit)
+    sensor = PvpSensor(given.config)
+    if settings.pressure_limit >= sensor.identity.highest:
+        raise InputError(
+            f"the pressure limit of {settings.pressure_limit:g} cmH2O lies outside the sensor's "
+            f"range, up to {sensor.identity.highest:.4g}: nothing could trip it. Give a smaller "
+            f"--pressure-limit, or the sensor's own highest_pressure in {given.config}"
+        )
     listener: socket.socket | None = None
     if given.listen:
-        host, _, number = given.listen.rpartition(":")
-        if not number.isdigit():
-            raise InputError(f"--listen {given.listen}: write HOST:PORT, such as 0.0.0.0:5005")
         open_line, listener = tcp_line(host, int(number))
     else:
         open_line = serial_line(given.port or "")
-    hal = PvpHal(given.config)
+    process, orders = deadman.start(
+        f"{PvpValves.__module__}:{PvpValves.__name__}", str(given.config)
+    )
+    hal = deadman.SupervisedHal(sensor, orders)
     try:
-        if not given.vent:
-            if reason := realtime.prefer():
-                print(f"no real-time scheduling: {reason}", file=sys.stderr)
-            _serve_until_signal(hal, settings, open_line)
+        if reason := realtime.prefer():
+            print(f"no real-time scheduling: {reason}", file=sys.stderr)
+        _serve_until_signal(hal, settings, open_line)
     finally:
         hal.close()
+        process.wait()
+        sensor.close()
         if listener is not None:
             listener.close()
-    return 0
+    if hal.lost:
+        PvpValves(given.config).close()  # the deadman could not
+        print("the deadman has gone; vented", file=sys.stderr)
+    return int(hal.lost)
 
 
 def _serve_until_signal(
-    hal: Hal, settings: DeviceSettings, open_line: Callable[[], int | None]
+    hal: deadman.SupervisedHal, settings: DeviceSettings, open_line: Callable[[], int | None]
 ) -> None:
     ended = False
 
@@ -123,10 +141,46 @@ def _serve_until_signal(
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, end)
     port = Port(open_line, os.close)
+    awake = notifier()
     try:
-        Guard(DeviceService(hal, settings, time.monotonic()), port).run(lambda: ended)
+        Guard(DeviceService(hal, settings, time.monotonic()), port).run(
+            lambda: ended or hal.lost or awake()
+        )
     finally:
         port.close()
+
+
+def notifier() -> Callable[[], bool]:
+    """Tell systemd that the program is ready, and then, whenever called, that it is awake.
+
+    Returns:
+        What to call in the loop; it tells four times in systemd's ``WatchdogSec`` and is False. It
+        does nothing where systemd did not ask.
+    """
+    path, period = os.environ.get("NOTIFY_SOCKET"), os.environ.get("WATCHDOG_USEC")
+    told = time.monotonic()
+    if path is None:
+        return lambda: False
+    address = "\0" + path[1:] if path.startswith("@") else path
+
+    def tell(state: bytes) -> None:
+        with (
+            contextlib.suppress(OSError),  # it is busy; the next one will do
+            socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd,
+        ):
+            systemd.setblocking(False)
+            systemd.sendto(state, address)
+
+    def awake() -> bool:
+        nonlocal told
+        now = time.monotonic()
+        if period and now - told > 0.25e-6 * float(period):
+            told = now
+            tell(b"WATCHDOG=1")
+        return False
+
+    tell(b"READY=1")
+    return awake
 
 
 if __name__ == "__main__":

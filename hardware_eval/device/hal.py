@@ -17,13 +17,15 @@ class Sample:
         time: when it was taken, s, on the clock that the program is stepped with.
         pressure: airway pressure, cmH2O; NaN if the sensor did not answer.
         flow: flow into the lung, mL/s; NaN if it is not measured.
-        saturated: whether the pressure stands at the end of the sensor's range.
+        lapsed: whether the electronics have vented by themselves, as the program stood still.
+        saturated: whether the pressure stands at the upper end of the sensor's range.
     """
 
     time: float
     pressure: float
     flow: float = math.nan
     saturated: bool = False
+    lapsed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +37,17 @@ class Identity:
         device_id: its own number, 8 bytes.
         calibration: SHA-256 of its calibration, 32 bytes.
         capabilities: what it is and has.
+        highest: largest pressure that the sensor can tell, cmH2O.
+        noisy: whether noise moves the sensor's readings at rest by half a digit or more, so that
+            one that does not move is stuck.
     """
 
     name: str
     device_id: bytes
     calibration: bytes
     capabilities: Capability
+    highest: float = math.inf
+    noisy: bool = False
 
 
 class Hal(Protocol):

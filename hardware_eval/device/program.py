@@ -4,12 +4,14 @@ It is stepped with the time, the bytes that arrived and the newest sample, and a
 valves' positions and the bytes to send. The lung is *vented* when the inspiratory valve is closed
 and the expiratory valve open. It is vented whenever the device is not running a host's commands,
 and the device stops running them when no acceptable command came for :data:`WATCHDOG` seconds, when
-a command is out of range, when the pressure exceeds the limit, and when the sensor is lost. What
-the host says cannot change these limits, except to lower the pressure limit.
+a command is out of range, when the pressure exceeds the limit or stands at the end of the sensor's
+range, and when the sensor is lost, stuck or noisy. What the host says cannot change these limits,
+except to lower the pressure limit.
 """
 
 from __future__ import annotations
 
+import statistics
 from dataclasses import dataclass, field, replace
 
 from hardware_eval.device.hal import Hal, Identity, Sample
@@ -49,6 +51,16 @@ OLDEST_SEEN = 0.100
 
 #: Time without a valid sample after which the device vents, s: ten samples at 5 ms.
 SENSOR_TIMEOUT = 0.050
+
+#: Time without a change of the reading after which a sensor that has noise is stuck, s.
+STUCK = 0.250
+
+#: Samples from which the noise of the sensor is estimated, and its largest standard deviation,
+#: cmH2O: twice what the self-test allows, three times that of the recordings.
+NOISE_WINDOW, LARGEST_NOISE = 40, 1.0
+
+#: Standard deviation of white noise over the median absolute second difference of it.
+_PER_SECOND_DIFFERENCE = 1.0 / (0.6745 * 6.0**0.5)
 
 #: Largest step of the sequence number: a lost cable loses fewer messages than this.
 SEQUENCE_WINDOW = 1 << 16
@@ -102,6 +114,8 @@ class DeviceState:
         u_out: expiratory valve, 0 or 1.
         fed: when the last acceptable command or arming came, s.
         valid: when the last valid sample was taken, s.
+        changed: when the reading last changed, s.
+        newest: the last valid pressures, oldest first, at most :data:`NOISE_WINDOW`, cmH2O.
         stepped: time of the last step, s.
         causes: why the device vented since it was last armed.
         counters: counts since the program started.
@@ -109,7 +123,9 @@ class DeviceState:
 
     pressure_limit: float
     valid: float
+    changed: float
     stepped: float
+    newest: tuple[float, ...] = ()
     parser: ParserState = field(default_factory=ParserState)
     mode: Mode = Mode.CLOSED
     session: int | None = None
@@ -123,7 +139,7 @@ class DeviceState:
 
 def init(settings: DeviceSettings, now: float) -> DeviceState:
     """Vented, no session."""
-    return DeviceState(settings.pressure_limit, valid=now, stepped=now)
+    return DeviceState(settings.pressure_limit, valid=now, changed=now, stepped=now)
 
 
 def step(
@@ -152,10 +168,9 @@ def step(
         send.
     """
     held_up = now - state.stepped
-    valid = sample.time if sample.pressure == sample.pressure else state.valid
-    state = replace(state, valid=max(valid, state.valid), stepped=now)
+    state = replace(_sampled(state, sample), stepped=now)
     if state.mode is Mode.RUNNING:
-        causes = _dangers(state, now, sample)
+        causes = _dangers(identity, state, now, sample)
         if now - state.fed > settings.watchdog:
             causes |= Flag.COMMANDS_STOPPED
             causes |= Flag.DEVICE_LATE if held_up > 0.5 * settings.watchdog else Flag.NONE
@@ -230,8 +245,10 @@ def _received(
         case Statistics():
             return state, state.counters
         case Arm():
-            if _dangers(state, now, sample):
-                return refused(_vented(state, _dangers(state, now, sample)), Reason.UNSAFE)
+            if state.pressure_limit >= identity.highest:
+                return refused(state, Reason.SENSOR_RANGE)
+            if causes := _dangers(identity, state, now, sample):
+                return refused(_vented(state, causes), Reason.UNSAFE)
             return reading(
                 replace(state, mode=Mode.RUNNING, fed=now, u_in=0.0, u_out=1, causes=Flag.NONE)
             )
@@ -248,20 +265,48 @@ def _received(
             return reading(state)
 
 
-def _dangers(state: DeviceState, now: float, sample: Sample) -> Flag:
+def _sampled(state: DeviceState, sample: Sample) -> DeviceState:
+    """Remember a sample, if it is valid and new."""
+    if sample.pressure != sample.pressure or sample.time <= state.valid:
+        return state
+    same = bool(state.newest) and sample.pressure == state.newest[-1]
+    return replace(
+        state, valid=sample.time, changed=state.changed if same else sample.time,
+        newest=(*state.newest[1 - NOISE_WINDOW :], sample.pressure),
+    )  # fmt: skip
+
+
+def _dangers(identity: Identity, state: DeviceState, now: float, sample: Sample) -> Flag:
     """Causes of venting that the sensor gives."""
     causes = Flag.NONE
-    if sample.pressure > state.pressure_limit:
+    if sample.pressure > state.pressure_limit or sample.saturated:
         causes |= Flag.OVERPRESSURE
+    if sample.lapsed:
+        causes |= Flag.DEVICE_LATE
     if now - state.valid > SENSOR_TIMEOUT:
         causes |= Flag.SENSOR_LOST
+    if identity.noisy and state.valid - state.changed > STUCK:
+        causes |= Flag.SENSOR_STUCK
+    if len(state.newest) == NOISE_WINDOW and _noise(state.newest) > LARGEST_NOISE:
+        causes |= Flag.SENSOR_NOISY
     return causes
+
+
+def _noise(pressures: tuple[float, ...]) -> float:
+    """Standard deviation of white noise, cmH2O.
+
+    Second differences leave out what the lung does, and their median the jumps at commands.
+    """
+    triples = zip(pressures, pressures[1:], pressures[2:], strict=False)
+    return _PER_SECOND_DIFFERENCE * statistics.median(abs(a - 2.0 * b + c) for a, b, c in triples)
 
 
 _COUNTED = {
     Flag.COMMANDS_STOPPED: "watchdog",
     Flag.OVERPRESSURE: "overpressure",
     Flag.SENSOR_LOST: "sensor",
+    Flag.SENSOR_STUCK: "sensor",
+    Flag.SENSOR_NOISY: "sensor",
     Flag.DEVICE_LATE: "device_late",
 }
 

@@ -12,6 +12,7 @@ Texas Instruments, SBAS473E, tables 3 to 8.
 from __future__ import annotations
 
 import hashlib
+import importlib
 import math
 import statistics
 import tomllib
@@ -36,6 +37,9 @@ STEP, LAST = 0.002, 2047
 #: Conversions of which one sample is the median, against spikes; 0.3 ms each.
 _MEDIAN_OF = 3
 
+#: Share of its range at which a sensor is at its end: some clip a little early.
+_SATURATED = 0.99
+
 #: Full duty of pigpio's hardware PWM.
 _FULL_DUTY = 1_000_000
 
@@ -52,11 +56,14 @@ class PvpConfiguration:
         adc_channel: input of the pressure sensor, 0..3.
         offset_voltage: sensor at ambient pressure, V.
         cmH2O_per_volt: slope of the sensor.
+        highest_pressure: largest pressure that the sensor can tell, cmH2O; 20 inH2O are 50.8.
         inspiratory_pin: GPIO of the proportional valve; one with hardware PWM (12, 13, 18, 19).
         pwm_frequency: Hz.
         expiratory_pin: GPIO of the on/off valve.
         expiratory_normally_open: whether that valve is open without current. The PVP's own is
             closed without current: with it, a device without power does not vent.
+        heartbeat_pin: GPIO of the monostable's trigger, which moves with every order to the valves;
+            -1 for none.
         valve_table: CSV of the proportional valve with columns u_in (%, 0 to 100, increasing),
             opening, closing (duty cycle, 0..1); beside the TOML file.
     """
@@ -68,10 +75,12 @@ class PvpConfiguration:
     adc_channel: int = 0
     offset_voltage: float = 2.2
     cmH2O_per_volt: float = 35.15
+    highest_pressure: float = 50.8
     inspiratory_pin: int = 12
     pwm_frequency: int = 20_000
     expiratory_pin: int = 17
     expiratory_normally_open: bool = False
+    heartbeat_pin: int = -1
     valve_table: str = "valve.csv"
 
 
@@ -140,8 +149,9 @@ def _check(configuration: PvpConfiguration) -> None:
         raise ValueError(f"device_id = {configuration.device_id!r} must have 16 hexadecimal digits")
     if not 0 <= configuration.adc_channel <= 3:
         raise ValueError(f"adc_channel = {configuration.adc_channel} is outside 0..3")
-    if configuration.cmH2O_per_volt <= 0.0:
-        raise ValueError(f"cmH2O_per_volt = {configuration.cmH2O_per_volt} must be positive")
+    for key in ("cmH2O_per_volt", "highest_pressure"):
+        if not getattr(configuration, key) > 0.0:
+            raise ValueError(f"{key} = {getattr(configuration, key)} must be positive")
 
 
 def _check_table(table: ValveTable) -> None:
@@ -153,65 +163,38 @@ def _check_table(table: ValveTable) -> None:
             raise ValueError(f"{name} leaves 0..1 or decreases")
 
 
-class PvpHal:
-    """The ventilator's valves and sensor; see :class:`~hardware_eval.device.hal.Hal`."""
+class PvpValves:
+    """The ventilator's valves and its heartbeat pin, owned by the deadman's process."""
 
-    def __init__(self, path: Path) -> None:
-        """Open the hardware, vented.
+    def __init__(self, path: Path | str) -> None:
+        """Open the valves, vented.
 
         Args:
             path: TOML file, see :class:`PvpConfiguration`.
 
         Raises:
-            InputError: if the file is wrong, a package is missing, or the hardware does not answer.
+            InputError: if the file is wrong, pigpio is missing, or its daemon does not run.
         """
-        self._configuration, self._table, calibration = load_configuration(path)
-        try:
-            import pigpio  # pyright: ignore[reportMissingImports]
-            import smbus2  # pyright: ignore[reportMissingImports]
-        except ImportError as error:
-            raise InputError(
-                f"the ventilator's computer needs pigpio and smbus2 (pip install pigpio smbus2): "
-                f"{error}"
-            ) from error
+        self._configuration, self._table, _ = load_configuration(Path(path))
+        pigpio = _imported("pigpio")
         self._pi: Any = pigpio.pi()
         if not self._pi.connected:
             raise InputError("pigpiod does not run: start it with `sudo pigpiod`")
-        self._pi.set_mode(self._configuration.expiratory_pin, pigpio.OUTPUT)
+        for pin in (self._configuration.expiratory_pin, self._configuration.heartbeat_pin):
+            if pin >= 0:
+                self._pi.set_mode(pin, pigpio.OUTPUT)
         self._set: tuple[float, int] | None = None
-        self._rising = True
-        self.actuate(0.0, 0.0, 1)
-        try:
-            self._bus: Any = smbus2.SMBus(self._configuration.i2c_bus)
-            self._configure_converter()
-        except OSError as error:
-            raise InputError(
-                f"the pressure converter does not answer at address "
-                f"0x{self._configuration.adc_address:02x} of I2C bus "
-                f"{self._configuration.i2c_bus}: {error}"
-            ) from error
-        self.identity = Identity(
-            self._configuration.name, bytes.fromhex(self._configuration.device_id), calibration,
-            Capability.NONE,
-        )  # fmt: skip
+        self._rising, self._beat = True, 0
+        self.actuate(0.0, 1)
 
-    def sample(self, now: float) -> Sample:
-        """Median of three conversions; NaN if the converter does not answer."""
-        try:
-            counts = statistics.median(self._conversion() for _ in range(_MEDIAN_OF))
-        except OSError:
-            return Sample(now, math.nan)
-        if counts <= 0:  # no voltage: the wire is off; ambient pressure gives 2.2 V
-            return Sample(now, math.nan)
-        volts = counts * STEP
-        pressure = (volts - self._configuration.offset_voltage) * self._configuration.cmH2O_per_volt
-        return Sample(now, pressure, saturated=counts >= LAST)
-
-    def actuate(self, now: float, u_in: float, u_out: int) -> None:
+    def actuate(self, u_in: float, u_out: int) -> None:
         """Set the valves; the expiratory one first, so that air finds its way out."""
+        configuration, before = self._configuration, self._set[0] if self._set else 0.0
+        if configuration.heartbeat_pin >= 0:
+            self._beat = 1 - self._beat
+            self._pi.write(configuration.heartbeat_pin, self._beat)
         if (u_in, u_out) == self._set:
             return
-        configuration, before = self._configuration, self._set[0] if self._set else 0.0
         energised = u_out == 0 if configuration.expiratory_normally_open else u_out == 1
         self._pi.write(configuration.expiratory_pin, int(energised))
         if u_in != before:
@@ -225,9 +208,58 @@ class PvpHal:
     def close(self) -> None:
         """Vent and release the hardware."""
         self._set = None
-        self.actuate(0.0, 0.0, 1)
-        self._bus.close()
+        self.actuate(0.0, 1)
         self._pi.stop()
+
+
+class PvpSensor:
+    """The ventilator's pressure sensor; see :class:`~hardware_eval.device.deadman.Sensor`."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the converter.
+
+        Args:
+            path: TOML file, see :class:`PvpConfiguration`.
+
+        Raises:
+            InputError: if the file is wrong, smbus2 is missing, or the converter does not answer.
+        """
+        self._configuration, _, calibration = load_configuration(path)
+        smbus2 = _imported("smbus2")
+        try:
+            self._bus: Any = smbus2.SMBus(self._configuration.i2c_bus)
+            self._configure_converter()
+        except OSError as error:
+            raise InputError(
+                f"the pressure converter does not answer at address "
+                f"0x{self._configuration.adc_address:02x} of I2C bus "
+                f"{self._configuration.i2c_bus}: {error}"
+            ) from error
+        self._highest = min(self._configuration.highest_pressure, self._pressure(LAST))
+        self.identity = Identity(
+            self._configuration.name, bytes.fromhex(self._configuration.device_id), calibration,
+            Capability.NONE, highest=self._highest, noisy=True,
+        )  # fmt: skip
+
+    def sample(self, now: float) -> Sample:
+        """Median of three conversions; NaN if the converter does not answer."""
+        try:
+            counts = statistics.median(self._conversion() for _ in range(_MEDIAN_OF))
+        except OSError:
+            return Sample(now, math.nan)
+        if counts <= 0:  # no voltage: the wire is off; ambient pressure gives 2.2 V
+            return Sample(now, math.nan)
+        pressure = self._pressure(counts)
+        return Sample(now, pressure, saturated=pressure >= _SATURATED * self._highest)
+
+    def close(self) -> None:
+        """Release the bus."""
+        self._bus.close()
+
+    def _pressure(self, counts: float) -> float:
+        """Pressure of a conversion, cmH2O."""
+        volts = counts * STEP - self._configuration.offset_voltage
+        return volts * self._configuration.cmH2O_per_volt
 
     def _configure_converter(self) -> None:
         channel = self._configuration.adc_channel << 12
@@ -241,3 +273,13 @@ class PvpHal:
         high, low = self._bus.read_i2c_block_data(self._configuration.adc_address, _CONVERSION, 2)
         word = high << 8 | low
         return (word - 0x10000 if word & 0x8000 else word) >> 4
+
+
+def _imported(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(
+            "the ventilator's computer needs pigpio and smbus2 (pip install pigpio smbus2): "
+            f"{error}"
+        ) from error

@@ -62,6 +62,7 @@ class Emulator(Guard):
         control: Path | None = None,
         line_faults: Sequence[LineFault] = (),
         log: Path | None = None,
+        begun: float | None = None,
     ) -> None:
         """Open the terminal.
 
@@ -73,14 +74,16 @@ class Emulator(Guard):
             line_faults: what goes wrong on the line.
             log: file to which each change of the valves is written as it happens: time of
                 ``time.monotonic``, s, u_in, %, u_out, flags.
+            begun: zero of the hardware's clock on ``time.monotonic``, s, if it is not now.
 
         Raises:
             InputError: if the link or the socket cannot be made.
         """
-        begun = time.monotonic()
-        service = DeviceService(hal, settings or DeviceSettings(), 0.0)
+        now = time.monotonic()
+        begun = now if begun is None else begun
+        service = DeviceService(hal, settings or DeviceSettings(), now - begun)
         self.actuations: deque[Actuation] = deque(maxlen=_REMEMBERED)
-        self.actuations.append(Actuation(begun, 0.0, 1))
+        self.actuations.append(Actuation(now, 0.0, 1))
         self.line = Line(line_faults)
         self._outgoing: list[tuple[float, int, bytes]] = []
         self._order = count()
@@ -237,13 +240,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--link", type=Path, help="symbolic link to make to the terminal")
     parser.add_argument("--control", type=Path, help="control socket to make")
-    parser.add_argument("--log", type=Path, help="CSV of every change of the valves")
+    parser.add_argument("--log", type=Path, help="CSV of every order of the program to the valves")
+    parser.add_argument(
+        "--electronics", type=Path, help="CSV of everything that the valves do, and why"
+    )
+    parser.add_argument(
+        "--normally-closed",
+        action="store_true",
+        help="the expiratory valve is closed without current, as PVP's own",
+    )
+    parser.add_argument(
+        "--no-monostable", action="store_true", help="no monostable on the heartbeat pin"
+    )
     parser.add_argument(
         "--fault", action="append", default=[], help="KIND@START[-END][:STRENGTH], repeatedly"
     )
     parser.add_argument("--noise", type=float, default=0.0, help="sensor noise, cmH2O (SD)")
     parser.add_argument(
         "--quantum", type=float, default=0.0, help="step of the sensor's converter, cmH2O"
+    )
+    parser.add_argument(
+        "--highest", type=float, default=float("inf"), help="end of the sensor's range, cmH2O"
     )
     parser.add_argument(
         "--realtime",
@@ -260,45 +277,49 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _emulate(given: argparse.Namespace) -> int:
-    from hardware_eval.emulation.simulated import SimulatedHal, simulated_lung
+    from hardware_eval.device.deadman import MONOSTABLE
+    from hardware_eval.emulation.electronics import EmulatedHal
 
     faults = [parse(text) for text in given.fault]
-    lung_faults = [fault for fault in faults if isinstance(fault, LungFault)]
     line_faults = [fault for fault in faults if isinstance(fault, LineFault)]
-    sensor = {"noise": given.noise, "quantum": given.quantum, "faults": lung_faults}
-    if given.conceal is None:
-        hal = simulated_lung(given.lung, given.plant, **sensor)
-        told = given.lung
-    else:
-        from hardware_eval.emulation.concealed import conceal
-
-        concealed = conceal(given.conceal, given.plant)
-        hal = SimulatedHal(concealed.plant, name=f"emulated {concealed.lung}", **sensor)
-        told = f"{concealed.lung}, with concealed physics {concealed.seal['commitment'][:16]}..."
-        if given.seal:
-            concealed.write(given.seal)
     limit = given.pressure_limit
     try:
         settings = DeviceSettings() if limit is None else DeviceSettings(limit)
     except ValueError as error:
         raise InputError(str(error)) from error
-    emulator = Emulator(
-        hal, settings, link=given.link, control=given.control, line_faults=line_faults,
-        log=given.log,
+    about = {name: getattr(given, name) for name in ("lung", "plant", "conceal", "seal")}
+    sensor = {name: getattr(given, name) for name in ("noise", "quantum", "highest")}
+    begun = time.monotonic()
+    hal = EmulatedHal(
+        {
+            **about, **sensor, "faults": [x for x in faults if isinstance(x, LungFault)],
+            "log": given.electronics, "normally_open": not given.normally_closed,
+            "monostable": float("inf") if given.no_monostable else MONOSTABLE,
+        },
+        lambda: time.monotonic() - begun, begun,
     )  # fmt: skip
-    reason = realtime.prefer()
-    if given.realtime and reason:
-        raise InputError(f"--realtime: {reason}; run as root, or without it")
-    ended = False
+    try:
+        emulator = Emulator(
+            hal, settings, link=given.link, control=given.control, line_faults=line_faults,
+            log=given.log, begun=begun,
+        )  # fmt: skip
+        reason = realtime.prefer()
+        if given.realtime and reason:
+            emulator.close()
+            raise InputError(f"--realtime: {reason}; run as root, or without it")
+        ended = False
 
-    def end(number: int, frame: FrameType | None) -> None:
-        nonlocal ended
-        ended = True
+        def end(number: int, frame: FrameType | None) -> None:
+            nonlocal ended
+            ended = True
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, end)
-    print(emulator.terminal, flush=True)
-    print(f"emulated lung {told}; Ctrl-C ends it", file=sys.stderr, flush=True)
-    emulator.run(lambda: ended)
-    print(f"longest lateness of the device: {1e3 * emulator.lateness:.1f} ms", file=sys.stderr)
-    return 0
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, end)
+        print(emulator.terminal, flush=True)
+        processes = ", ".join(f"{name} {number}" for name, number in hal.processes.items())
+        print(f"{hal.told} ({processes}); Ctrl-C ends it", file=sys.stderr, flush=True)
+        emulator.run(lambda: ended or hal.lost)
+        print(f"longest lateness of the device: {1e3 * emulator.lateness:.1f} ms", file=sys.stderr)
+    finally:
+        hal.close()
+    return int(hal.lost)

@@ -23,6 +23,10 @@ class FaultKind(Enum):
     SENSOR_OFFSET = "sensor_offset"
     #: The sensor gives no value.
     SENSOR_LOST = "sensor_lost"
+    #: The sensor scatters with a standard deviation of ``strength`` cmH2O more.
+    SENSOR_NOISY = "sensor_noisy"
+    #: The sensor's bus is blocked: nobody who reads it gets on.
+    BUS_BLOCKED = "bus_blocked"
     #: Each sample is lost with probability ``strength``.
     SENSOR_DROPOUTS = "sensor_dropouts"
     #: The inspiratory valve stays where it was.

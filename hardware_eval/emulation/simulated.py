@@ -52,6 +52,7 @@ class SimulatedHal:
         faults: Sequence[LungFault] = (),
         noise: float = 0.0,
         quantum: float = 0.0,
+        highest: float = math.inf,
         seed: int = 0,
     ) -> None:
         """Put a lung at rest at PEEP on the ventilator.
@@ -62,6 +63,7 @@ class SimulatedHal:
             faults: what goes wrong, and when.
             noise: standard deviation of the sensor's noise, cmH2O.
             quantum: step of the sensor's converter, cmH2O; 0 for none.
+            highest: end of the sensor's range, cmH2O.
             seed: of the noise.
 
         Raises:
@@ -70,7 +72,9 @@ class SimulatedHal:
         for what, value in (("noise", noise), ("quantum", quantum)):
             if not 0.0 <= value < math.inf:
                 raise InputError(f"--{what} {value:g} cmH2O: give 0 or more, such as 0.1")
-        self._noise, self._quantum = noise, quantum
+        if not highest > 0.0:
+            raise InputError(f"--highest {highest:g} cmH2O: give more than 0, such as 50.8")
+        self._noise, self._quantum, self._highest = noise, quantum, highest
         leaves = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(plant))
         calibration = hashlib.sha256(type(plant).__name__.encode() + leaves).digest()
         start = jnp.asarray(protocol.PEEP, jnp.float32)
@@ -79,7 +83,11 @@ class SimulatedHal:
         vector, unravel = ravel_pytree(rest)
         self._flow = signals.flow is not None
         capabilities = Capability.SIMULATED | (Capability.FLOW if self._flow else Capability.NONE)
-        self.identity = Identity(name, calibration[:8], calibration, capabilities)
+        noisy = noise > 0.0 and noise >= 0.5 * quantum
+        self.told = name
+        self.identity = Identity(
+            name, calibration[:8], calibration, capabilities, highest=highest, noisy=noisy
+        )
 
         def advance(vector: jax.Array, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
             u_in, u_out, dt, r_scale, restart = inputs
@@ -117,6 +125,8 @@ class SimulatedHal:
     def sample(self, now: float) -> Sample:
         """Pressure and flow by now; see :class:`~hardware_eval.device.hal.Hal`."""
         kinds = active(self.faults, now)
+        if FaultKind.BUS_BLOCKED in kinds:
+            return self._last
         _, shown = self._by(now, kinds)
         pressure, flow = (float(x) for x in np.asarray(shown))
         if FaultKind.DISCONNECTED in kinds:
@@ -129,8 +139,12 @@ class SimulatedHal:
             pressure += self._noise * float(self._random.standard_normal())
         if FaultKind.SENSOR_OFFSET in kinds:
             pressure += kinds[FaultKind.SENSOR_OFFSET].strength
+        if FaultKind.SENSOR_NOISY in kinds:
+            strength = kinds[FaultKind.SENSOR_NOISY].strength
+            pressure += strength * float(self._random.standard_normal())
         if self._quantum:
             pressure = round(pressure / self._quantum) * self._quantum
+        pressure = min(pressure, self._highest)
         if FaultKind.SENSOR_STUCK in kinds:
             if math.isnan(self._stuck_reading):
                 self._stuck_reading = self._last.pressure
@@ -143,7 +157,7 @@ class SimulatedHal:
             kinds[FaultKind.SENSOR_DROPOUTS].strength
         ):
             pressure = math.nan
-        self._last = Sample(now, pressure, flow)
+        self._last = Sample(now, pressure, flow, saturated=pressure >= self._highest)
         return self._last
 
     def actuate(self, now: float, u_in: float, u_out: int) -> None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 from hardware_eval.bench import session
 from hardware_eval.bench.controllers import (
@@ -24,8 +27,10 @@ from hardware_eval.bench.safety import DEFAULT, SafetySettings
 from hardware_eval.clock import Clock, RealClock
 from hardware_eval.results import record as records
 from hardware_eval.wire.client import Client
-from hardware_eval.wire.messages import Capability, Welcome
+from hardware_eval.wire.messages import Capability
 from ventbench import protocol
+from ventbench.board import record
+from ventbench.board.record import HardwareRecord
 from ventbench.errors import InputError
 from ventbench.interfaces import Task
 from ventbench.recordings.write import write
@@ -49,6 +54,8 @@ class Evaluation:
         log: the raw recording.
         recording: all whole breaths in the public schema; None if there is none.
         records: path of each entry's hardware record; empty until the plan is done.
+        stopped: entries that have no score, as a run of theirs failed, and why, by name.
+        unrun: those of them of which every run failed, so that there is nothing for the board.
     """
 
     complete: bool
@@ -56,6 +63,8 @@ class Evaluation:
     log: Path
     recording: Path | None
     records: Mapping[str, Path]
+    stopped: Mapping[str, str]
+    unrun: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -66,16 +75,43 @@ class Line:
         client: of the device.
         clock: real, or the loopback device's.
         device: the device if it is emulated in this process, else None.
+        port: what carries the bytes, see :func:`port_kind`.
     """
 
     client: Client
     clock: Clock
     device: LoopbackDevice | None = None
+    port: str = "virtual"
 
     @property
     def real(self) -> bool:
         """Whether time is real, so that a controller can be late."""
         return isinstance(self.clock, RealClock)
+
+
+#: Ports behind which there is software, whatever the device says of itself.
+EMULATED_PORTS = frozenset({"virtual", "pseudo-terminal", "own socket"})
+
+#: Major numbers of Linux's pseudo-terminals.
+_PSEUDO_TERMINALS = range(136, 144)
+
+
+def port_kind(port: str) -> str:
+    """What a port is: ``virtual``, ``pseudo-terminal``, ``own socket``, ``socket`` or ``serial``.
+
+    No ventilator is on a pseudo-terminal or on a socket of the host itself.
+    """
+    if port.startswith(VIRTUAL):
+        return "virtual"
+    if "://" in port:
+        host = urlsplit(port).hostname or "localhost"
+        own = host == "localhost" or host.startswith("127.") or host == "::1"
+        return "own socket" if own else "socket"
+    path = os.path.realpath(port)
+    with contextlib.suppress(OSError):
+        if sys.platform == "linux" and os.major(os.stat(path).st_rdev) in _PSEUDO_TERMINALS:
+            return "pseudo-terminal"
+    return "pseudo-terminal" if re.fullmatch(r"/dev/(pts/\d+|ttys\d+)", path) else "serial"
 
 
 #: Begins a port that is an emulated device in this process, on a virtual clock.
@@ -103,23 +139,32 @@ def connect(port: str) -> Line:
         virtual = Client(device, device.clock)
         virtual.hello()
         return Line(virtual, device.clock, device)
+    kind = port_kind(port)
     client = Client(Link(port))
     try:
         client.hello()
     except InputError:
         client.close()
         raise
-    return Line(client, RealClock())
+    return Line(client, RealClock(), port=kind)
 
 
-def device_about(welcome: Welcome) -> dict[str, Any]:
-    """A device as records name it."""
+def device_about(line: Line) -> dict[str, Any]:
+    """A device as records name it.
+
+    Software is told by the port that the host opened; a device may also say that it is simulated,
+    but not that it is not.
+    """
+    welcome = line.client.welcome or line.client.hello()
+    simulated = bool(welcome.capabilities & Capability.SIMULATED)
     return {
         "name": welcome.name,
         "firmware": ".".join(map(str, welcome.firmware)),
         "calibration": welcome.calibration.hex(),
-        "emulated": bool(welcome.capabilities & Capability.SIMULATED),
+        "emulated": simulated or line.port in EMULATED_PORTS,
         "about": {
+            "port": line.port,
+            "says_simulated": simulated,
             "device_id": welcome.device_id.hex(),
             "wire_protocol": welcome.version,
             "watchdog_s": round(welcome.watchdog, 4),
@@ -224,9 +269,8 @@ def evaluate(
                 "the dry run on the simulators stopped: " + "; ".join(problems) + ". Nothing was "
                 "sent to the bench; --no-dry-run skips this"
             )
-    welcome = line.client.welcome or line.client.hello()
     about = {
-        "device": device_about(welcome),
+        "device": device_about(line),
         "operator": operator_name,
         "notes": notes,
         "entries": {x.manifest.name: x.sha256 for x in submissions},
@@ -244,12 +288,19 @@ def evaluate(
         breaths = recording(log_path)
         written = out / RECORDING
         write(breaths, written)
-    made = {}
-    if end.complete:
-        for submission in submissions:
-            content = records.hardware_record(log_path, submission)
-            made[submission.manifest.name] = records.save(out, content)
-    return Evaluation(end.complete, end.reason, log_path, written, made)
+    made: dict[str, Path] = {}
+    stopped: dict[str, str] = {}
+    unrun: set[str] = set()
+    for submission in submissions if end.complete else ():
+        name = submission.manifest.name
+        content = records.hardware_record(log_path, submission)
+        made[name] = records.save(out, content)
+        checked = record.from_bytes(content, str(made[name]))
+        if isinstance(checked, HardwareRecord) and (stops := checked.header.stops):
+            runs = checked.errors.size
+            stopped[name] = f"{len(stops)} of {runs} runs failed, the first: {stops[0].reason}"
+            unrun |= {name} if len(stops) == runs else set()
+    return Evaluation(end.complete, end.reason, log_path, written, made, stopped, frozenset(unrun))
 
 
 @contextlib.contextmanager

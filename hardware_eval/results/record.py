@@ -40,6 +40,8 @@ class Jitter:
         lost: steps that began after the deadline of the next one.
         worst: how late the latest step began, s.
         late_answers: steps whose controller did not answer in time.
+        late_share: their share of the steps whose controller was asked.
+        longest_answer: longest time that an answer took, s.
         busy_median, busy_worst: time from a step's beginning to its command's answer, s.
     """
 
@@ -48,6 +50,8 @@ class Jitter:
     lost: int
     worst: float
     late_answers: int
+    late_share: float
+    longest_answer: float
     busy_median: float
     busy_worst: float
 
@@ -70,25 +74,28 @@ def plan_of(logged: list[dict[str, Any]], label: str) -> Plan:
     raise InputError(f"{label} holds no plan: no session has begun")
 
 
-def jitter(log: Path) -> Jitter:
-    """Statistics of all steps of a log.
+def jitter(log: Path, entry: str | None = None) -> Jitter:
+    """Statistics of all steps of a log; answers of one entry's runs, or of all.
 
     Raises:
         InputError: if it holds no step.
     """
-    late, busy, answers = [], [], 0
+    late, busy, answers, asked, longest = [], [], 0, 0, 0.0
     for line in lines(log):
         if line["type"] == "breath":
             late += line["late"]
             busy += line["busy"]
-        if line["type"] == "run":
+        if line["type"] == "run" and line["entry"] == (entry or line["entry"]):
             answers += line.get("late_answers", 0)
+            asked += line.get("asked", 0)
+            longest = max(longest, line.get("longest_answer", 0.0))
     if not late:
         raise InputError(f"{log} holds no breath")
     delays = np.array(late, float)
     return Jitter(
         len(delays), float(np.mean(delays <= ON_TIME_S)), int(np.sum(delays > protocol.DT)),
-        float(delays.max()), answers, float(np.median(busy)), float(np.max(busy)),
+        float(delays.max()), answers, answers / max(asked, 1), longest, float(np.median(busy)),
+        float(np.max(busy)),
     )  # fmt: skip
 
 
@@ -150,7 +157,7 @@ def hardware_record(log: Path, submission: Submission) -> bytes:
         "plan": plan.as_dict(),
         "control": _control(log),
         "safety": about["safety"],
-        "timing": dataclasses.asdict(jitter(log)),
+        "timing": dataclasses.asdict(jitter(log, name)),
         "sandbox": about["sandbox"],
         "provenance": {},
         "versions": create.versions(),

@@ -54,7 +54,8 @@ class Replay:
             rows.append(f"{entry}: {cells} cmH2O")
         rows.append(
             f"{timing.steps} steps, {100 * timing.on_time:.2f} % within 2 ms, latest "
-            f"{1e3 * timing.worst:.1f} ms, {timing.lost} lost, {timing.late_answers} late answers"
+            f"{1e3 * timing.worst:.1f} ms, {timing.lost} lost, {timing.late_answers} late answers "
+            f"({100 * timing.late_share:.2f} %), longest {1e3 * timing.longest_answer:.1f} ms"
         )
         return "\n".join([*rows, *self.problems])
 

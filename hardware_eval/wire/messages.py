@@ -77,6 +77,10 @@ class Flag(IntFlag):
     DEVICE_LATE = 32
     #: The pressure of this reading is at the end of the sensor's range.
     SATURATED = 64
+    #: The reading did not move for too long, though the sensor's noise should move it.
+    SENSOR_STUCK = 128
+    #: The readings scatter too much to be a pressure.
+    SENSOR_NOISY = 256
 
 
 #: Flags that name a cause of venting.
@@ -87,6 +91,8 @@ CAUSES = (
     | Flag.SENSOR_LOST
     | Flag.HOST_VENTED
     | Flag.DEVICE_LATE
+    | Flag.SENSOR_STUCK
+    | Flag.SENSOR_NOISY
 )
 
 
@@ -107,6 +113,8 @@ class Reason(IntEnum):
     OUT_OF_RANGE = 6
     #: The device cannot be armed while a cause of venting lasts.
     UNSAFE = 7
+    #: The session's pressure limit lies outside the sensor's range, where nothing could trip it.
+    SENSOR_RANGE = 8
 
 
 class Capability(IntFlag):

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +16,12 @@ import typer.main
 from typer.testing import CliRunner
 
 from hardware_eval import cli
+from hardware_eval.bench.controllers import ControllerFailedError, SubmissionController
+from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.results import evaluate
 from hardware_eval.results.evaluate import Line
+from hardware_eval.wire.client import Client
+from tests.hardware_eval.stand_in import Bench
 from ventbench.board import record
 from ventbench.board.record import HardwareRecord
 from ventbench.errors import InputError
@@ -56,6 +63,67 @@ def test_without_a_terminal_and_without_yes_nothing_moves(on_line: Line, tmp_pat
     )  # fmt: skip
     assert done.exit_code == 1
     assert "did not confirm" in done.output
+
+
+def raises(self: Any, row: Any, budget: float) -> float:
+    raise ControllerFailedError("it raised ValueError")
+
+
+@pytest.mark.parametrize(
+    ("act", "said"),
+    [(raises, "it raised ValueError"), (lambda *_: None, "102 of 102 answers took longer")],
+    ids=["raises", "late"],
+)
+def test_an_entry_of_which_every_run_failed_has_no_score(
+    act: Any, said: str, on_line: Line, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SubmissionController, "act", act)
+    out, result = tmp_path / "out", tmp_path / "result.json"
+    done = invoke(
+        "run", "pid_best", "--port", "p", "--lung", "R5C20", "--pips", "10", "--repeats", "1",
+        "--control-every", "0", "--no-dry-run", "--no-selftest", "--no-sandbox", "--rest", "0.5",
+        "--yes", "--out", str(out), "--json", str(result),
+    )  # fmt: skip
+    assert done.exit_code == 1, done.output
+    assert "no score: 1 of 1 runs failed" in done.output
+    assert said in done.output
+    assert "board add" not in done.output
+    assert json.loads(result.read_text())["complete"] is False
+
+
+def test_without_the_extra_one_line_says_what_to_install() -> None:
+    program = (
+        "import importlib.util as u, sys; find = u.find_spec;"
+        "u.find_spec = lambda name, *_: None if name in ('cobs', 'serial') else find(name);"
+        "sys.argv[1:] = ['selftest', '--port', 'p', '--lung', 'R5C20'];"
+        "from hardware_eval.cli import main; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [
+        "ventbench-hardware: the wire needs cobs and pyserial, which this installation lacks: "
+        "pip install 'ventbench[hardware]'"
+    ]
+
+
+def test_the_port_and_not_the_device_decides_what_is_emulated(tmp_path: Path) -> None:
+    master, slave = os.openpty()
+    link = tmp_path / "ttyACM0"  # called what it likes
+    link.symlink_to(os.ttyname(slave))
+    kinds = {
+        "virtual:R5C20": "virtual", str(link): "pseudo-terminal", "/dev/ttyACM0": "serial",
+        "socket://localhost:5": "own socket", "socket://127.0.1.1:5": "own socket",
+        "socket://pi.lan:5005": "socket", "/dev/ttys003": "pseudo-terminal",
+    }  # fmt: skip
+    assert {port: evaluate.port_kind(port) for port in kinds} == kinds
+    for descriptor in (master, slave):
+        os.close(descriptor)
+    device = LoopbackDevice(Bench())  # says that it is hardware
+    client = Client(device, device.clock)
+    for kind, emulated in (("serial", False), ("pseudo-terminal", True), ("virtual", True)):
+        about = evaluate.device_about(Line(client, device.clock, port=kind))
+        assert about["emulated"] is emulated
+        assert about["about"]["says_simulated"] is False
 
 
 def commands() -> list[str]:

@@ -177,13 +177,14 @@ class Record(schema.Submitted):
 
 
 class Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What ran: the ventilator's own computer, as it says of itself.
+    """What ran: the ventilator's own computer, as it says of itself, and what the host knows.
 
     Attributes:
         name: identity of the device.
         firmware: its version.
         calibration: hash of its calibration, as the device reports it.
-        emulated: whether software stood in for valves and lung.
+        emulated: whether software stood in for valves and lung: by the port that the host opened,
+            or by the device's own word.
         about: what else it says.
     """
 

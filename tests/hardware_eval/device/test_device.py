@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -117,6 +120,56 @@ def test_the_host_lowers_the_pressure_limit_and_cannot_raise_it(
     bench.pressure = 30.5
     device.clock.advance(PERIOD)
     assert _vented(bench)
+
+
+def test_a_limit_that_the_sensor_cannot_see_bars_arming(
+    device: LoopbackDevice, bench: Bench
+) -> None:
+    bench.identity = replace(bench.identity, highest=50.8)
+    client = Client(device, device.clock)
+    client.hello()
+    with pytest.raises(RefusedError, match="SENSOR_RANGE"):
+        client.arm()
+    client.hello(50.0)
+    assert _run(client, device).mode is Mode.RUNNING
+
+
+def test_a_sensor_at_the_end_of_its_range_vents_at_once(
+    client: Client, device: LoopbackDevice, bench: Bench
+) -> None:
+    _run(client, device)
+    bench.saturated = True
+    device.clock.advance(PERIOD)
+    assert _vented(bench)
+    assert client.heartbeat().flags == Flag.OVERPRESSURE | Flag.SATURATED
+    with pytest.raises(RefusedError, match="UNSAFE"):
+        client.arm()
+
+
+@pytest.mark.parametrize(
+    ("noise", "flag"), [(0.0, Flag.SENSOR_STUCK), (2.0, Flag.SENSOR_NOISY)], ids=["stuck", "noisy"]
+)
+@pytest.mark.parametrize("healthy", [0.05, 0.1, 0.5])
+def test_stuck_and_noisy_readings_are_found(
+    device: LoopbackDevice, bench: Bench, healthy: float, noise: float, flag: Flag
+) -> None:
+    bench.noise, bench.identity = healthy, replace(bench.identity, noisy=True)
+    client = Client(device, device.clock)
+    client.hello()
+    for phase in range(10):
+        bench.noise = healthy
+        device.clock.advance(0.5 + 1e-3 * phase)
+        assert _run(client, device, 30).mode is Mode.RUNNING  # a second of health is no fault
+        begun, bench.noise = device.clock.now(), noise
+        with contextlib.suppress(RefusedError):  # once it has vented
+            for _ in range(20):
+                client.command(10.0, 0)
+                device.clock.advance(0.028)
+        assert flag in client.heartbeat().flags
+        vents = [time for time, _, u_out in bench.valves if time > begun and u_out == 1]
+        assert min(vents) - begun <= 0.30
+        with pytest.raises(RefusedError, match="UNSAFE"):
+            client.arm()
 
 
 def test_a_lost_sensor_vents(client: Client, device: LoopbackDevice, bench: Bench) -> None:

@@ -17,7 +17,7 @@ import pytest
 from hardware_eval.device import __main__ as board
 from hardware_eval.device.port import Guard, Port
 from hardware_eval.device.program import DeviceService, DeviceSettings
-from hardware_eval.device.pvp import LAST, PvpHal
+from hardware_eval.device.pvp import LAST, PvpSensor, PvpValves
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.link import Link
 from hardware_eval.wire.messages import Mode
@@ -49,7 +49,8 @@ class FakePi:
         self.stopped = False
 
     def set_mode(self, pin: int, mode: int) -> None:
-        assert (pin, mode) == (17, 1)
+        assert pin in (17, 27)
+        assert mode == 1
 
     def write(self, pin: int, level: int) -> None:
         self.levels[pin] = level
@@ -106,7 +107,7 @@ def hardware(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 
 def test_the_sensor(configuration: Path, hardware: SimpleNamespace) -> None:
-    hal = PvpHal(configuration)
+    hal = PvpSensor(configuration)
     # Continuous, channel 1 against ground, +-4.096 V, 3300 samples/s, comparator off.
     assert hardware.bus.configured == [0b0101_0010, 0b1100_0011]
     assert hal.sample(1.5).pressure == pytest.approx(0.0)
@@ -114,6 +115,11 @@ def test_the_sensor(configuration: Path, hardware: SimpleNamespace) -> None:
     assert hal.sample(1.5).pressure == pytest.approx(0.0703)  # one step of the recordings
     hardware.bus.counts = [1500, 0, 1501]
     assert hal.sample(2.0).pressure == pytest.approx(400 * 0.0703)  # spikes are cut
+    assert hal.identity.highest == 50.8
+    hardware.bus.counts = [1100 + int(0.98 * 50.8 / 0.0703)]
+    assert not hal.sample(2.0).saturated
+    hardware.bus.counts = [1100 + int(50.8 / 0.0703)]
+    assert hal.sample(2.0).saturated
     hardware.bus.counts = [LAST]
     assert hal.sample(2.0).saturated
     for nothing in ([0], [-5]):
@@ -124,24 +130,24 @@ def test_the_sensor(configuration: Path, hardware: SimpleNamespace) -> None:
 
 
 def test_the_valves(configuration: Path, hardware: SimpleNamespace) -> None:
-    hal = PvpHal(configuration)
+    hal = PvpValves(configuration)
     pi = hardware.pi
     assert pi.levels == {17: 1}  # vented: the valve without current is closed
     assert pi.duties[-1] == (12, 20_000, 0)
-    hal.actuate(0.0, 50.0, 0)
+    hal.actuate(50.0, 0)
     assert pi.levels == {17: 0}
     assert pi.duties[-1][2] == 500_000
-    hal.actuate(0.0, 75.0, 0)
+    hal.actuate(75.0, 0)
     assert pi.duties[-1][2] == 700_000
-    hal.actuate(0.0, 25.0, 0)
+    hal.actuate(25.0, 0)
     assert pi.duties[-1][2] == 300_000  # of the closing curve: 0.2 + 0.1
     pi.told.clear()
-    hal.actuate(0.0, 0.0, 1)
+    hal.actuate(0.0, 1)
     assert pi.told == ["expiratory", "inspiratory"]
     assert pi.duties[-1][2] == 0
-    hal.actuate(0.0, 0.0, 1)
+    hal.actuate(0.0, 1)
     assert len(pi.told) == 2  # nothing is told twice
-    hal.actuate(0.0, 30.0, 0)
+    hal.actuate(30.0, 0)
     hal.close()
     assert (pi.levels[17], pi.duties[-1][2], pi.stopped) == (1, 0, True)
 
@@ -150,19 +156,47 @@ def test_a_normally_open_valve_is_turned_around(
     configuration: Path, hardware: SimpleNamespace
 ) -> None:
     configuration.write_text(CONFIGURATION + "expiratory_normally_open = true\n")
-    PvpHal(configuration)
+    PvpValves(configuration)
     assert hardware.pi.levels == {17: 0}
+
+
+def test_the_heartbeat_pin_moves_with_every_order(
+    configuration: Path, hardware: SimpleNamespace
+) -> None:
+    configuration.write_text(CONFIGURATION + "heartbeat_pin = 27\n")
+    valves = PvpValves(configuration)
+    levels = []
+    for _ in range(4):
+        valves.actuate(0.0, 1)
+        levels.append(hardware.pi.levels[27])
+    assert levels == [0, 1, 0, 1]
+
+
+def test_systemd_is_told_that_the_program_is_ready_and_awake(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert board.notifier()() is False  # without systemd
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.setenv("WATCHDOG_USEC", "20000")
+        awake = board.notifier()
+        assert systemd.recv(100) == b"READY=1"
+        for _ in range(2):
+            time.sleep(0.006)
+            assert awake() is False
+            assert systemd.recv(100) == b"WATCHDOG=1"
 
 
 def test_identity_changes_with_the_calibration_only(
     configuration: Path, hardware: SimpleNamespace
 ) -> None:
-    first = PvpHal(configuration).identity
+    first = PvpSensor(configuration).identity
     assert (first.name, first.device_id.hex()) == ("bench 3", "0123456789abcdef")
     configuration.write_text(CONFIGURATION.replace("bench 3", "bench 4"))
-    assert PvpHal(configuration).identity.calibration == first.calibration
+    assert PvpSensor(configuration).identity.calibration == first.calibration
     (configuration.parent / "valve.csv").write_text(TABLE.replace("0.90", "0.91"))
-    assert PvpHal(configuration).identity.calibration != first.calibration
+    assert PvpSensor(configuration).identity.calibration != first.calibration
 
 
 @pytest.mark.parametrize(
@@ -172,6 +206,7 @@ def test_identity_changes_with_the_calibration_only(
         ("adc_channel = 7", TABLE, r"outside 0\.\.3"),
         ('adc_channel = "1"', TABLE, "must be a int"),
         ('device_id = "01"', TABLE, "16 hexadecimal"),
+        ("highest_pressure = -1.0", TABLE, "must be positive"),
         ("= 1", TABLE, "pvp.toml"),
         (CONFIGURATION, "u_in,opening,closing\n0,0,0\n90,1,1\n", "0 to 100"),
         (CONFIGURATION, "u_in,opening,closing\n0,0,0\n100,1.1,1\n", "leaves"),
@@ -184,7 +219,7 @@ def test_wrong_files_say_what_is_wrong(
     configuration.write_text(toml)
     (configuration.parent / "valve.csv").write_text(table)
     with pytest.raises(InputError, match=message):
-        PvpHal(configuration)
+        PvpSensor(configuration)
 
 
 def test_missing_packages_and_hardware_say_what_to_do(
@@ -195,14 +230,23 @@ def test_missing_packages_and_hardware_say_what_to_do(
 ) -> None:
     hardware.pi.connected = False
     with pytest.raises(InputError, match="sudo pigpiod"):
-        PvpHal(configuration)
+        PvpValves(configuration)
     monkeypatch.setitem(sys.modules, "pigpio", None)
     with pytest.raises(InputError, match="pip install"):
-        PvpHal(configuration)
+        PvpValves(configuration)
     assert board.main(["--config", str(configuration), "--vent"]) == 2
     assert "pip install" in capsys.readouterr().err
     assert board.main(["--config", "x.toml", "--listen", "here"]) == 2
     assert "HOST:PORT" in capsys.readouterr().err
+
+
+def test_a_limit_outside_the_sensors_range_is_refused(
+    configuration: Path, hardware: SimpleNamespace, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert board.main(["--config", str(configuration), "--port", "x"]) == 2
+    assert "smaller --pressure-limit" in capsys.readouterr().err
+    assert hardware.pi.levels == {17: 1}
+    assert hardware.pi.stopped
 
 
 def test_the_board_vents_once(configuration: Path, hardware: SimpleNamespace) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import socket
 import threading
@@ -14,6 +15,7 @@ import pytest
 import serial
 
 from hardware_eval.emulation import emulator as emulator_module
+from hardware_eval.emulation.electronics import emulated_lung
 from hardware_eval.emulation.emulator import Emulator, tell
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.errors import (
@@ -187,11 +189,16 @@ def test_a_socket_and_a_loop_are_links_too() -> None:
 def test_wrong_arguments_say_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert emulator_module.main(["--fault", "fire@1"]) == 2
     assert "KIND@START" in capsys.readouterr().err
-    assert emulator_module.main(["--lung", "X"]) == 2
-    assert "R20C50" in capsys.readouterr().err
-    for words in (["--noise", "-1"], ["--quantum", "nan"]):
-        assert emulator_module.main(["--plant", "single_compartment", *words]) == 2
-        assert f"{words[0]} {words[1]} cmH2O: give 0 or more" in capsys.readouterr().err
+    assert emulator_module.main(["--pressure-limit", "200"]) == 2
+    assert "outside 0..100" in capsys.readouterr().err
+    for lung, sensor, said in (
+        ("X", {}, "R20C50"),
+        ("R5C20", {"noise": -1.0}, "--noise -1 cmH2O: give 0 or more"),
+        ("R5C20", {"quantum": math.nan}, "--quantum nan cmH2O: give 0 or more"),
+        ("R5C20", {"highest": -1.0}, "--highest -1 cmH2O: give more than 0"),
+    ):
+        with pytest.raises(InputError, match=said):
+            emulated_lung(lung, "single_compartment", None, None, **sensor)
     taken = tmp_path / "taken"
     taken.touch()
     with pytest.raises(InputError, match="remove it"):

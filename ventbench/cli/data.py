@@ -33,6 +33,9 @@ def check(
 ) -> None:
     """Report every problem of a recording, with line, column and value.
 
+    Also whether columns are what they are called: signs, units, valves, labels, sensors that
+    saturate. Ends with 0 if all is well, 1 if something is suspicious, 2 if it cannot be used.
+
     Example: `ventbench data check lab.csv`
     """
     from ventbench import recordings
@@ -45,6 +48,8 @@ def check(
         typer.echo(line, err=str(json) == "-")
     if not report.ok:
         raise typer.Exit(2)
+    if report.suspicious:
+        raise typer.Exit(1)
 
 
 @app.command("import")

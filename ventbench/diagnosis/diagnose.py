@@ -57,6 +57,7 @@ from ventbench.plants.catalog import Given, load_simulators
 from ventbench.plants.sessions import Sessions
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.roles import require_roles
 from ventbench.recordings.decimation import decimate, is_fast
 from ventbench.system_id import Data, Fit, Noise, make_data
 
@@ -139,6 +140,7 @@ def diagnose(
         if patient and passive:
             raise InputError("patient=True and passive=True contradict each other; give patient")
         patient = not passive
+    require_roles(breaths)
     tell = progress or (lambda what, share: None)
     simulators = load_simulators(simulator, breaths=breaths)
     if lung is not None:

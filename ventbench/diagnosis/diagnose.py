@@ -57,8 +57,8 @@ from ventbench.plants.catalog import Given, load_simulators
 from ventbench.plants.sessions import Sessions
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
-from ventbench.recordings.roles import require_roles
 from ventbench.recordings.decimation import decimate, is_fast
+from ventbench.recordings.roles import require_roles
 from ventbench.system_id import Data, Fit, Noise, make_data
 
 #: Receives the current step in words, and the share of the whole that is done.

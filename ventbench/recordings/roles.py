@@ -361,6 +361,14 @@ def _labels(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding
     return found
 
 
+def opposite_sign(pressure: Floats, flow: Floats) -> bool:
+    """Whether flow is counted from the patient, by whole breaths of both, ``(m,)`` each."""
+    known = np.isfinite(pressure) & np.isfinite(flow)
+    if known.sum() < 3 or np.ptp(pressure[known]) < _FLAT or np.ptp(flow[known]) == 0.0:
+        return False
+    return bool(np.corrcoef(pressure[known], flow[known])[0, 1] < _OPPOSITE)
+
+
 def check_roles(breaths: Breaths) -> tuple[Finding, ...]:
     """Check the roles of columns of breaths in memory; see :func:`findings`."""
     lengths = breaths.valid.sum(axis=1)

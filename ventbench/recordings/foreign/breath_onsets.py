@@ -41,7 +41,7 @@ def find_breaths(
         Rows of each whole breath, and a sentence that says how they were found.
 
     Raises:
-        InputError: if no whole breath is found, or time goes back within one.
+        InputError: if no whole breath is found.
     """
     rows = np.arange(len(time))
     broken = np.zeros(len(time), bool)
@@ -82,8 +82,6 @@ def find_breaths(
         if edge or not _SHORTEST <= length <= _LONGEST:
             short += 1
             continue
-        if not np.all(np.diff(at) > 0):
-            raise InputError(f"{file}: the time goes back within the breath of row {piece[0] + 1}")
         kept.append(piece)
     if not kept:
         raise InputError(

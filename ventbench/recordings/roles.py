@@ -33,8 +33,8 @@ _FLAT, _MOVES = 0.02, 1.0
 #: Correlation of flow and pressure below which the sign of the flow is the opposite.
 _OPPOSITE = -0.25
 
-#: Share of its range of pressure from which a breath that begins there begins at its peak.
-_PEAK = 0.6
+#: Share of a breath that is its end, and of its range of pressure above which it ends at its peak.
+_END, _PEAK = 0.1, 0.6
 
 #: Saturation: fewest readings and share of them at the level, times as many as at the next level,
 #: and largest step from it as a share of the range (a square wave leaves its top by a larger one).
@@ -109,7 +109,9 @@ def breath_figures(
     Returns:
         Figures by name, ``(k,)`` each.
     """
-    breath = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(time)))
+    lengths = np.diff(starts, append=len(time))
+    breath = np.repeat(np.arange(len(starts)), lengths)
+    left = (starts + lengths)[breath] - np.arange(len(time))  # samples to the end of the breath
     pressure, u_in = samples["pressure"], np.nan_to_num(samples["u_in"])
     inside = samples["u_out"] == 0
 
@@ -119,9 +121,8 @@ def breath_figures(
         return _ratio(np.add.reduceat(np.where(where, values, 0.0), starts), count)
 
     out = {
-        "inspiration": np.add.reduceat(inside.astype(float), starts)
-        / np.diff(starts, append=len(time)),
-        "first": pressure[starts],
+        "inspiration": np.add.reduceat(inside.astype(float), starts) / lengths,
+        "end": mean(pressure, left <= _END * lengths[breath]),
         "inside": mean(pressure, inside),
         "outside": mean(pressure, ~inside),
         "u_in_inside": mean(u_in, inside),
@@ -312,9 +313,9 @@ def _phases(
     figures: Mapping[str, Floats], low: Floats, spans: Floats, moves: NDArray[np.bool_]
 ) -> list[Finding]:
     share = float(np.nanmedian(figures["inspiration"]))
-    height = _ratio(figures["first"] - low, spans)[moves]
+    height = _ratio(figures["end"] - low, spans)[moves]
     if _agree(-height, -_PEAK):
-        what = "breaths begin at their highest pressure, so their number changes at expiration"
+        what = "breaths end at their highest pressure, so their number changes at expiration"
         return [Finding("breath_id", what, "Pass --split-breaths to `ventbench data import`.")]
     if _INSPIRATION[0] <= share <= _INSPIRATION[1]:
         return []

@@ -367,10 +367,12 @@ def _time(
     median = float(np.median(onwards))
     if (steps[inside] == 0).mean() > _STANDS_STILL:
         rows_per_step = inside.sum() / len(onwards)
+        guess = rows_per_step / median
+        guess = round(guess) if abs(guess - round(guess)) < 0.005 * guess else guess
         raise InputError(
             f"{table.file}: the clock has steps of {1e3 * median:.4g} ms for "
             f"{rows_per_step:.3g} rows each; give the sampling rate, such as "
-            f"--rate {rows_per_step / median:.4g}"
+            f"--rate {guess:.4g}"
         )
     if median > SLOW:
         raise InputError(

@@ -175,8 +175,8 @@ def _dialect(
     """The separator and decimal mark with which most cells of most lines are numbers."""
     best, most = None, 0.0
     for own in (separator,) if separator else _SEPARATORS:
-        split = [_filled(_cells(line, own)) for line in lines]
-        split = [cells for cells in split if len(cells) > 1]
+        split = [cells for cells in (_cells(line, own) for line in lines) if len(cells) > 1]
+        split = [cells for cells in map(_filled, split) if cells]
         for mark in (decimal,) if decimal else (".", ","):
             if mark == own:
                 continue

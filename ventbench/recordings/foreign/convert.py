@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ventbench.errors import InputError
 from ventbench.lungs import Lung
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
-from ventbench.recordings.foreign.breath_onsets import bridged, find_breaths, is_high
+from ventbench.recordings.foreign.breath_onsets import expiratory_valve, find_breaths
 from ventbench.recordings.foreign.layouts import LAYOUTS, ROLES, USUAL, Layout, recognise
 from ventbench.recordings.foreign.tables import Table, read_table
 from ventbench.recordings.foreign.units import Conversion, conversion, in_file_unit, stem
@@ -186,7 +186,7 @@ def import_recording(
     notes.append(how)
     R, C, how = _lung(lung, other, len(table))
     notes.append(how)
-    u_out, how = _valve(values, other, pieces, time)
+    u_out, how = expiratory_valve(values, other, pieces)
     notes.append(how)
     u_in = values.get("u_in")
     if u_in is None:
@@ -366,9 +366,8 @@ def _time(
         raise InputError(f"{table.file}: the time does not increase")
     median = float(np.median(onwards))
     if (steps[inside] == 0).mean() > _STANDS_STILL:
-        rows_per_step = inside.sum() / len(onwards)
+        rows_per_step = float(np.median(np.diff(np.flatnonzero(steps > 0))))
         guess = rows_per_step / median
-        guess = round(guess) if abs(guess - round(guess)) < 0.005 * guess else guess
         raise InputError(
             f"{table.file}: the clock has steps of {1e3 * median:.4g} ms for "
             f"{rows_per_step:.3g} rows each; give the sampling rate, such as "
@@ -399,37 +398,6 @@ def _lung(given: str | None, other: Mapping[str, Floats], count: int) -> tuple[F
         "no columns hold R and C of the lung; give --lung R20C50 (a guess is enough: R in "
         "cmH2O/(L/s) and C in mL/cmH2O are fitted again), or map the columns"
     )
-
-
-def _valve(
-    values: Mapping[str, Floats], other: Mapping[str, Floats], pieces: list[NDArray[np.int64]],
-    time: Floats,
-) -> tuple[NDArray[np.int8], str]:  # fmt: skip
-    """u_out of each row, and where it is from."""
-    if "u_out" in other:
-        return (other["u_out"] > 0.5).astype(np.int8), "u_out is that of the file."
-    if "target" in other:
-        u_out = (~is_high(other["target"])).astype(np.int8)
-        return u_out, "u_out is 1 where the target is low."
-    u_out = np.zeros(len(time), np.int8)
-    if "flow" in values:
-        flow = np.nan_to_num(values["flow"])
-        limit = -0.02 * float(np.quantile(np.abs(flow), 0.99))
-        for piece in pieces:
-            out = np.flatnonzero(flow[piece] < limit)
-            inward = np.flatnonzero(flow[piece] > -limit)
-            first = out[out > (inward[0] if len(inward) else -1)]
-            if len(first):
-                u_out[piece[first[0]] : piece[-1] + 1] = 1
-        return u_out, "u_out is 1 from where flow turns outwards."
-    for piece in pieces:
-        p = bridged(values["pressure"])[piece]
-        peak = int(np.argmax(p))
-        half = 0.5 * (p[peak] + p[-1])
-        below = np.flatnonzero(p[peak:] < half)
-        if len(below):
-            u_out[piece[peak + below[0]] : piece[-1] + 1] = 1
-    return u_out, "u_out is 1 from where pressure has fallen half-way from its peak (a guess)."
 
 
 def _invert(values: dict[str, Floats], other: dict[str, Floats], roles: Iterable[str]) -> None:
@@ -471,18 +439,16 @@ def _sound(
     pieces: list[NDArray[np.int64]], skip: bool,
 ) -> tuple[list[NDArray[np.int64]], list[str]]:  # fmt: skip
     """Breaths that the schema can hold; refuse the others, or leave them out and name them."""
-    rows = np.concatenate(pieces)
+    rows, bad, problems = np.concatenate(pieces), dict[int, str](), list[str]()
     owner = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
-    bad: dict[int, str] = {}
-    problems = []
     for name, values in samples.items():
         column, own = COLUMNS[name], np.asarray(values, float)[rows]
         low = own <= column.low if column.positive else own < column.low
         wrong = np.flatnonzero(low | (own > column.high) | (np.isnan(own) & (not column.blank)))
         if len(wrong):
             problems.append(
-                f"{table.file}, column {by_role.get(name, name)}: {len(wrong)} of {len(own)} "
-                f"values are outside {column.span}, the first in {table.place(rows[wrong[0]])} "
+                f"{table.file}, column {by_role.get(name, name)}: {len(wrong)} of {len(own)} values "
+                f"are outside {column.span}, the first in {table.place(int(rows[wrong[0]]))} "
                 f"({own[wrong[0]]:g}). Check the unit (such as --flow-unit L/min) and the map."
             )
         for at in wrong[np.unique(owner[wrong], return_index=True)[1]]:
@@ -495,7 +461,7 @@ def _sound(
                 reason = f"{name} changes"
         if reason is not None:
             bad.setdefault(k, reason)
-            problems.append(f"{table.file}: {reason} in the breath of {table.place(piece[0])}")
+            problems.append(f"{table.file}: {reason} in the breath of {table.place(int(piece[0]))}")
     if problems and (not skip or len(bad) == len(pieces)):
         some = len(bad) < len(pieces)
         problems.append(
@@ -504,7 +470,7 @@ def _sound(
         )
         raise InputError("\n".join([*problems[:5], *problems[5:][-1:]]))
     kept = [piece for k, piece in enumerate(pieces) if k not in bad]
-    said = [f"{table.place(pieces[k][0])} ({why})" for k, why in sorted(bad.items())]
+    said = [f"{table.place(int(pieces[k][0]))} ({why})" for k, why in sorted(bad.items())]
     more = f" and {len(said) - 10} more" if len(said) > 10 else ""
     left = f"{len(said)} bad breaths were left out: {', '.join(said[:10])}{more}."
     return kept, [left] if said else []

@@ -121,7 +121,8 @@ def read_table(
 
 def _text(file: str, separator: str | None, decimal: str | None) -> Table:
     text, encoding = _decoded(file)
-    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    text = text.replace("\r\n", "\n").replace("\r", "\n").replace("\N{MINUS SIGN}", "-")
+    lines = text.split("\n")
     if not any(line.strip() for line in lines):
         raise InputError(f"{file} holds no text")
     if re.match(r"\s*BS\b", next((x for x in lines if re.match(r"\s*B[SE]\b", x)), "")):
@@ -174,11 +175,12 @@ def _dialect(
 ) -> tuple[str, str]:
     """The separator and decimal mark with which most cells of most lines are numbers."""
     best, most = None, 0.0
+    quoted = any('"' in line for line in lines)
     for own in (separator,) if separator else _SEPARATORS:
         split = [cells for cells in (_cells(line, own) for line in lines) if len(cells) > 1]
         split = [cells for cells in map(_filled, split) if cells]
         for mark in (decimal,) if decimal else (".", ","):
-            if mark == own:
+            if mark == own and not quoted:
                 continue
             score = sum(sum(_is_value(cell, mark) for cell in c) / len(c) for c in split)
             # Between equals: "7,736" alone is a decimal comma, and integers have no mark.
@@ -269,7 +271,8 @@ def _header(
     known = sum(is_unit(cell) for cell in texts[-1])
     if len(texts) > 1 and known and 2 * known >= sum(map(bool, texts[-1])):
         units_row = texts.pop()
-    cells = texts[-1]
+    # The names are the last line of as many cells as columns; an alarm may stand below them.
+    cells = next((text for text in reversed(texts) if sum(map(bool, text)) == width), texts[-1])
     if packed and len(cells) != width:
         raise InputError(
             f"{file}: {len(cells)} names stand above {width} columns that blanks separate; put "
@@ -478,7 +481,7 @@ def _matlab(file: str) -> Table:
     from scipy.io import loadmat
 
     try:
-        content = loadmat(file, squeeze_me=True, struct_as_record=True)
+        content = loadmat(file, simplify_cells=True)
     except (ValueError, NotImplementedError, OSError, TypeError) as error:
         raise InputError(f"{file} cannot be read as a MATLAB file ({error})") from None
     flat: dict[str, NDArray[Any]] = {}
@@ -516,25 +519,23 @@ def _flatten(
     name: str, value: Any, flat: dict[str, NDArray[Any]], scalars: dict[str, float]
 ) -> None:
     """Collect the columns and single numbers of a MATLAB variable."""
-    array = np.asarray(value)
-    if array.dtype.names:  # a struct, or an array of records
-        for key in array.dtype.names:
-            inner = array[key]
-            if inner.dtype == object and inner.ndim == 0:
-                _flatten(f"{name}.{key}", inner.item(), flat, scalars)
-            elif inner.dtype == object:
-                try:
-                    _flatten(f"{name}.{key}", np.array([float(x) for x in inner]), flat, scalars)
-                except (TypeError, ValueError):
-                    continue
-            else:
-                _flatten(f"{name}.{key}", inner, flat, scalars)
-    elif array.dtype.kind in "iufb":
-        if array.ndim == 0:
-            scalars[name] = float(array)
-        elif array.ndim == 1 and len(array) > 1:
-            flat[name] = array.astype(float)
-        elif array.ndim == 2:
-            rows = array if array.shape[0] >= array.shape[1] else array.T
-            for k in range(rows.shape[1]):
-                flat[f"{name}.{k + 1}"] = rows[:, k].astype(float)
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _flatten(f"{name}.{key}", inner, flat, scalars)
+        return
+    if isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
+        for key in value[0]:  # an array of records
+            _flatten(f"{name}.{key}", [row.get(key) for row in value], flat, scalars)
+        return
+    try:
+        array = np.squeeze(np.asarray(value, float))
+    except (TypeError, ValueError):
+        return
+    if array.ndim == 0:
+        scalars[name] = float(array)
+    elif array.ndim == 1 and len(array) > 1:
+        flat[name] = array
+    elif array.ndim == 2:
+        rows = array if array.shape[0] >= array.shape[1] else array.T
+        for k in range(rows.shape[1]):
+            flat[f"{name}.{k + 1}"] = rows[:, k]

@@ -19,6 +19,7 @@ _PASCAL = {
     "kPa": Fraction(1000),
     "Pa": Fraction(1),
     "mmHg": Fraction("133.322387415"),
+    "mmH2O": Fraction("9.80665"),
     "psi": Fraction("6894.757293168"),
 }
 

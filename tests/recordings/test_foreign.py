@@ -15,7 +15,7 @@ from ventbench.cli.data import app
 from ventbench.errors import InputError
 from ventbench.recordings import check, load, write
 from ventbench.recordings.foreign import import_recording
-from ventbench.recordings.foreign.tables import UNITS, conversion
+from ventbench.recordings.foreign.units import UNITS, conversion
 
 RATE, PERIOD = 50.0, 3.0
 
@@ -84,7 +84,7 @@ def test_matlab_struct_with_its_rate(tmp_path):
     savemat(path, {"data": {"Paw": made["pressure"], "Flow": made["flow"]}, "fs": RATE})
     imported = import_recording(path, lung="R5C20")
     assert len(imported.breaths) == 4
-    assert "50 Hz, from fs" in " ".join(imported.understood)
+    assert "50 Hz, of the file" in " ".join(imported.understood)
     with pytest.raises(InputError, match="MATLAB file"):
         load(path)
     assert "data import" in check(path).problems[0].advice
@@ -160,7 +160,7 @@ def test_breaths_from_pressure_alone_and_from_a_rate(tmp_path):
         ({"lung": "R20C50", "layout": "none"}, "choose one of kaggle"),
         ({"lung": "R20C50", "invert": ["volume"]}, "no column is volume"),
         ({"lung": "R20C50", "select": {"run": "3"}}, "no column run"),
-        ({"lung": "R20C50", "units": {"time": "s"}}, "no whole breath"),
+        ({"lung": "R20C50", "units": {"time": "s"}}, "--time-unit ms"),
     ],
 )
 def test_messages_say_what_to_do(tmp_path, options, message):

@@ -304,10 +304,12 @@ def test_ids_that_do_not_increase_are_a_warning(rows, write_csv):
     assert (report.warnings[0].line, report.warnings[0].column) == (7, "id")
 
 
-def test_milliseconds_are_a_warning(rows, write_csv):
+def test_milliseconds_are_refused(rows, write_csv):
     for row in rows:
         row[TIME] = str(1000 * float(row[TIME]))
-    report = check(write_csv(rows))
-    assert report.ok
-    assert "250 s" in report.warnings[0].what
-    assert "milliseconds" in report.warnings[0].advice
+    path = write_csv(rows)
+    report = check(path)
+    assert not report.ok
+    assert "250 s" in report.problems[0].what
+    assert "--time-unit ms" in report.problems[0].advice
+    assert "--time-unit ms" in load(path).notes[0]

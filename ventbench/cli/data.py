@@ -33,6 +33,9 @@ def check(
 ) -> None:
     """Report every problem of a recording, with line, column and value.
 
+    Also whether columns are what they are called: signs, units, valves, labels, sensors that
+    saturate. Ends with 0 if all is well, 1 if something is suspicious, 2 if it cannot be used.
+
     Example: `ventbench data check lab.csv`
     """
     from ventbench import recordings
@@ -45,12 +48,14 @@ def check(
         typer.echo(line, err=str(json) == "-")
     if not report.ok:
         raise typer.Exit(2)
+    if report.suspicious:
+        raise typer.Exit(1)
 
 
 @app.command("import")
 def import_(
     file: Annotated[
-        Path, typer.Argument(help="CSV with any separator, Parquet, or MATLAB .mat (-v7).")
+        Path, typer.Argument(help="CSV with any separator, .xlsx, Parquet, or MATLAB .mat (-v7).")
     ],
     out: Annotated[
         Path | None,
@@ -64,7 +69,7 @@ def import_(
             "--map",
             metavar="NAME=ROLE",
             help="What a column is: time, pressure, flow, volume, u_in, u_out, R, C, breath, "
-            "group or target. May be repeated; usual names need none.",
+            "group, target or unused. May be repeated; usual names need none.",
         ),
     ] = None,
     layout: Annotated[
@@ -74,7 +79,7 @@ def import_(
         str | None, typer.Option(metavar="R20C50", help="Label where no columns hold R and C.")
     ] = None,
     rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Sampling rate where there is no time.")
+        float | None, typer.Option(metavar="HZ", help="Sampling rate where no clock is fine.")
     ] = None,
     split_breaths: Annotated[
         bool,
@@ -88,12 +93,22 @@ def import_(
     time_unit: Annotated[str | None, typer.Option(help="s, ms, us or min.")] = None,
     u_in_unit: Annotated[str | None, typer.Option(help="% or 1 (0 to 1).")] = None,
     invert: Annotated[
-        list[str] | None, typer.Option(metavar="ROLE", help="Its sign is the opposite: flow.")
+        list[str] | None,
+        typer.Option(metavar="ROLE", help="Its sign is the opposite: flow; u_out: 0 is open."),
+    ] = None,
+    offset: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ROLE=VALUE", help="Added, in the file's unit: pressure=-1013.25 if absolute."
+        ),
     ] = None,
     select: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=VALUE", help="Only rows with this value; may be repeated."),
     ] = None,
+    skip_bad_breaths: Annotated[
+        bool, typer.Option("--skip-bad-breaths", help="Leave out bad breaths, and name them.")
+    ] = False,
     separator: Annotated[str | None, typer.Option(help="Separator of the cells.")] = None,
     decimal: Annotated[str | None, typer.Option(help="Decimal mark, '.' or ','.")] = None,
     json: JsonFile = None,
@@ -122,7 +137,9 @@ def import_(
             rate=rate,
             split_breaths=split_breaths,
             invert=invert or (),
+            offsets=_offsets(offset),
             select=_pairs(select, "--select"),
+            skip_bad_breaths=skip_bad_breaths,
             separator=separator,
             decimal=decimal,
         )
@@ -157,6 +174,17 @@ def _pairs(given: list[str] | None, option: str) -> dict[str, str]:
             raise InputError(f"{option} {text}: NAME=VALUE is wanted, such as Paw=pressure")
         pairs[name] = value
     return pairs
+
+
+def _offsets(given: list[str] | None) -> dict[str, float]:
+    """Numbers of ``ROLE=VALUE``."""
+    from ventbench.errors import InputError
+
+    pairs = _pairs(given, "--offset")
+    try:
+        return {role: float(value) for role, value in pairs.items()}
+    except ValueError as error:
+        raise InputError(f"--offset: a number is wanted ({error})") from None
 
 
 @app.command()

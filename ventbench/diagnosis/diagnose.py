@@ -61,6 +61,7 @@ from ventbench.plants.sessions import Sessions
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.decimation import decimate, is_fast
+from ventbench.recordings.roles import require_roles
 from ventbench.system_id import Data, Fit, Noise, make_data
 
 #: Receives the current step in words, and the share of the whole that is done.
@@ -142,6 +143,7 @@ def diagnose(
         if patient and passive:
             raise InputError("patient=True and passive=True contradict each other; give patient")
         patient = not passive
+    require_roles(breaths)
     tell = progress or (lambda what, share: None)
     simulators = load_simulators(simulator, breaths=breaths)
     if lung is not None:

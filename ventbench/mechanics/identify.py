@@ -41,6 +41,7 @@ from ventbench.mechanics.term_selection import (
     select_terms,
 )
 from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.roles import check_roles, require_roles
 from ventbench.system_id.fit import t_quantile
 
 Floats = NDArray[np.float64]
@@ -133,8 +134,10 @@ def identify(
             lungs that are identified, and a share of those of the lung under way.
 
     Raises:
-        InputError: if neither is recorded, or too little of a lung to tell R from C.
+        InputError: if neither is recorded, too little of a lung to tell R from C, or the flow is
+            counted from the patient.
     """
+    require_roles(breaths)
     lungs, done = [], 0
     for name, part in breaths.by_lung().items():
 
@@ -238,7 +241,8 @@ def _delay_term(delayed_by: DelayEstimate | None, lung: LungFit) -> tuple[Term, 
 def _notes(
     breaths: Breaths, segments: tuple[Segment, ...], table: CrossProducts, noise: float
 ) -> list[str]:
-    notes = []
+    found = check_roles(breaths)
+    notes = [str(finding) for finding in found]
     if len(table) < FEWEST_BREATHS:
         notes.append(
             f"Fewer than {FEWEST_BREATHS} breaths: R and C alone, nothing else could be tested."
@@ -252,7 +256,7 @@ def _notes(
             "left out."
         )
     peak = max(float(segment.flow.max()) for segment in segments)
-    if peak < _SMALL_FLOW:
+    if peak < _SMALL_FLOW and not any(finding.column == "flow" for finding in found):
         notes.append(f"The flow stays below {1000 * peak:.0f} mL/s: R is known at small flow only.")
     if noise > _NOTED_NOISE:
         notes.append(

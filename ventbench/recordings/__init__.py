@@ -12,6 +12,11 @@ from ventbench.recordings.read import recordings_dir as recordings_dir
 from ventbench.recordings.report import RecordingReport as RecordingReport
 from ventbench.recordings.respiraworks import RespiraWorksRun as RespiraWorksRun
 from ventbench.recordings.respiraworks import load_respiraworks as load_respiraworks
+from ventbench.recordings.roles import Finding as Finding
+from ventbench.recordings.roles import Saturation as Saturation
+from ventbench.recordings.roles import check_roles as check_roles
+from ventbench.recordings.roles import find_saturation as find_saturation
+from ventbench.recordings.roles import require_roles as require_roles
 from ventbench.recordings.schema import COLUMNS as COLUMNS
 from ventbench.recordings.schema import Column as Column
 from ventbench.recordings.split import Split as Split

@@ -18,7 +18,7 @@ from ventbench.recordings.report import (
     check_inferable,
     check_lengths,
     describe,
-    unit_warning,
+    role_problems,
 )
 from ventbench.recordings.scan import Block, Source, join_blocks, locate, open_source, scan
 from ventbench.recordings.times import IntervalTable
@@ -80,7 +80,7 @@ def load(
 def check(
     path: FilePath, *, clip: bool = False, pad: bool = False, progress: Progress | None = None
 ) -> RecordingReport:
-    """Check a recording; needs about 80 bytes of memory a breath.
+    """Check a recording; needs about 300 bytes of memory a breath.
 
     Args:
         path: the file.
@@ -90,7 +90,8 @@ def check(
 
     Returns:
         What the file holds and what is wrong with it; also for a file that cannot be read. A file
-        without any pressure is reported as a problem, though `load` takes it.
+        without pressure, or whose columns are surely not what they are called, is reported as a
+        problem, though `load` takes it.
     """
     tally = Tally()
     log = ProblemLog(str(path))
@@ -114,12 +115,16 @@ def check(
             warning_count=len(warnings),
         )
     report = _report(source, log, tally)
-    if report.ok and report.blank_pressures == report.rows:
+    if not report.ok:
+        return report
+    if report.blank_pressures == report.rows:
         what = f"all {report.rows} pressures are blank"
         advice = "Fill in the pressure in cmH2O: there is nothing to compare a simulator with."
-        problem = RecordingProblem(source.file, what, advice, column="pressure")
-        return replace(report, problems=(problem,), problem_count=1)
-    return report
+        refused = (RecordingProblem(source.file, what, advice, column="pressure"),)
+    else:
+        refused = role_problems(source.file, tally)["refused"]
+    suspicious = tuple(found for found in report.suspicious if found not in refused)
+    return replace(report, problems=refused, problem_count=len(refused), suspicious=suspicious)
 
 
 def iter_breaths(
@@ -184,8 +189,9 @@ def _no_rows(source: Source) -> RecordingError:
 
 def _report(source: Source, log: ProblemLog, tally: Tally) -> RecordingReport:
     find = partial(locate, source)
-    whole: tuple[RecordingProblem, ...] = source.warnings + unit_warning(source.file, tally)
-    warnings = whole + log.listed("warning", find, source.place)
+    sound = log.counts["problem"] == 0
+    roles = role_problems(source.file, tally) if sound else {}
+    warnings = source.warnings + log.listed("warning", find, source.place)
     return RecordingReport(
         source.file,
         source.kind,
@@ -193,7 +199,8 @@ def _report(source: Source, log: ProblemLog, tally: Tally) -> RecordingReport:
         log.listed("problem", find, source.place),
         log.counts["problem"],
         warnings,
-        len(whole) + log.counts["warning"],
+        len(source.warnings) + log.counts["warning"],
+        roles.get("refused", ()) + roles.get("suspicious", ()),
         **describe(tally),
     )
 

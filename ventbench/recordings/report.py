@@ -9,11 +9,9 @@ import numpy as np
 
 from ventbench.lungs import Lung
 from ventbench.recordings.problems import ProblemLog, RecordingProblem
+from ventbench.recordings.roles import breath_figures, few_breaths, findings
 from ventbench.recordings.scan import Block
 from ventbench.recordings.times import IntervalTable, interval_table
-
-SLOW = 0.5
-"""Median sampling interval, s, above which times are probably not in seconds."""
 
 PAD_LIMIT = 10
 """Largest factor by which padding may enlarge a file in memory."""
@@ -31,6 +29,7 @@ class RecordingReport:
         problem_count: number of all problems.
         warnings: the first warnings.
         warning_count: number of all warnings.
+        suspicious: columns that are not what they are called, though `load` takes the file.
         rows: data rows read.
         breaths: breaths read.
         lengths: smallest and largest number of samples in a breath.
@@ -51,6 +50,7 @@ class RecordingReport:
     problem_count: int = 0
     warnings: tuple[RecordingProblem, ...] = ()
     warning_count: int = 0
+    suspicious: tuple[RecordingProblem, ...] = ()
     rows: int = 0
     breaths: int = 0
     lengths: tuple[int, int] = (0, 0)
@@ -73,6 +73,7 @@ class RecordingReport:
         plain["ok"] = self.ok
         plain["problems"] = [problem.to_dict() for problem in self.problems]
         plain["warnings"] = [problem.to_dict() for problem in self.warnings]
+        plain["suspicious"] = [problem.to_dict() for problem in self.suspicious]
         plain["lengths"] = list(self.lengths)
         plain["optional"] = list(self.optional)
         plain["time_inferred"] = {str(key): dt for key, dt in self.time_inferred.items()}
@@ -80,7 +81,10 @@ class RecordingReport:
 
     def notes(self) -> tuple[str, ...]:
         """What was inferred, changed or ignored, a sentence each."""
-        notes = []
+        notes = [str(problem) for problem in self.suspicious]
+        few = few_breaths(self.breaths)
+        if few is not None:
+            notes.append(few)
         if self.time_inferred:
             listed = [f"breath {i}: {1e3 * dt:.1f} ms" for i, dt in self.time_inferred.items()]
             more = f" and {len(listed) - 10} more" if len(listed) > 10 else ""
@@ -115,12 +119,17 @@ class RecordingReport:
                 f"{shown['p5']} to {shown['p95']} ms; single steps {shown['min']} to "
                 f"{shown['max']} ms)"
             )
-        lines += [f"note: {note}" for note in self.notes()]
+        lines += [f"note: {note}" for note in self.notes()[len(self.suspicious) :]]
+        lines += [f"suspicious: {problem}" for problem in self.suspicious]
         lines += [f"error: {problem}" for problem in self.problems]
         if self.problem_count > len(self.problems):
             more = self.problem_count - len(self.problems)
             lines.append(f"... and {more} more problems ({self.problem_count} in all).")
-        lines.append("ok" if self.ok else f"not ok: {self.problem_count} problems")
+        plural = "s" if self.problem_count > 1 else ""
+        if not self.ok:
+            lines.append(f"not ok: {self.problem_count} problem{plural}")
+        else:
+            lines.append(f"suspicious: {len(self.suspicious)}" if self.suspicious else "ok")
         return lines
 
 
@@ -153,14 +162,19 @@ def describe(tally: Tally) -> dict[str, Any]:
     }
 
 
-def unit_warning(file: str, tally: Tally) -> tuple[RecordingProblem, ...]:
-    """Return a warning if times look like milliseconds."""
-    median = tally.table().overall
-    if median is None or median <= SLOW:
-        return ()
-    what = f"the median sampling interval is {median:g} s"
-    advice = "time_step is in seconds; divide by 1000 if the file has milliseconds."
-    return (RecordingProblem(file, what, advice, column="time_step", value=f"{median:g}"),)
+def role_problems(file: str, tally: Tally) -> dict[str, tuple[RecordingProblem, ...]]:
+    """What the physics of a ventilated lung says about the columns, by its level."""
+    found = findings(
+        tally.figures(), tally.column("interval"), tally.column("R"), tally.column("C")
+    )
+    return {
+        level: tuple(
+            RecordingProblem(file, f.what, f.advice, column=f.column, value=f"{f.value:g}")
+            for f in found
+            if f.level == level
+        )
+        for level in ("refused", "suspicious")
+    }
 
 
 def _intervals(tally: Tally) -> dict[str, float]:
@@ -188,6 +202,7 @@ class Tally:
     dt_max: float = float("-inf")
     optional: tuple[str, ...] = ()
     _parts: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    _figures: list[dict[str, np.ndarray]] = field(default_factory=list)
 
     def add(self, block: Block) -> None:
         """Count a block."""
@@ -203,6 +218,13 @@ class Tally:
         steps = steps[np.isfinite(steps)]
         self.dt_min = min(self.dt_min, float(steps.min(initial=np.inf)))
         self.dt_max = max(self.dt_max, float(steps.max(initial=-np.inf)))
+        starts = (np.cumsum(block.lengths) - block.lengths).astype(np.int64)
+        with np.errstate(all="ignore"):  # infinite values are problems already
+            self._figures.append(breath_figures(block.times.time, block.samples, starts))
+
+    def figures(self) -> dict[str, np.ndarray]:
+        """Figures by which roles are checked, (n,) each."""
+        return {k: np.concatenate([part[k] for part in self._figures]) for k in self._figures[0]}
 
     def column(self, name: str) -> np.ndarray:
         """One number a breath, (n,), by the name of a field of `Block` or `KnownTimes`."""

@@ -158,4 +158,4 @@ def _advice(names: Sequence[str], missing: Sequence[str]) -> str:
             hints.append(f"rename {plain[match]!r} to {name}")
     if hints:
         return f"Perhaps {', '.join(hints)}."
-    return f"The header is {HEADER}."
+    return f"The header is {HEADER}; `ventbench data import` reads other tables."

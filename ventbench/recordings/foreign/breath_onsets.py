@@ -1,4 +1,4 @@
-"""Where inspirations begin in a continuous recording: at a number, valve, flow or pressure."""
+"""Where inspirations begin and end in a recording: at a number, valve, flow or pressure."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def find_breaths(
         Rows of each whole breath, and a sentence that says how they were found.
 
     Raises:
-        InputError: if no whole breath is found, or time goes back within one.
+        InputError: if no whole breath is found.
     """
     rows = np.arange(len(time))
     broken = np.zeros(len(time), bool)
@@ -82,8 +82,6 @@ def find_breaths(
         if edge or not _SHORTEST <= length <= _LONGEST:
             short += 1
             continue
-        if not np.all(np.diff(at) > 0):
-            raise InputError(f"{file}: the time goes back within the breath of row {piece[0] + 1}")
         kept.append(piece)
     if not kept:
         raise InputError(
@@ -97,6 +95,42 @@ def find_breaths(
     return kept, f"{len(kept)} breaths, split {how}{left}."
 
 
+def expiratory_valve(
+    values: Mapping[str, Floats], other: Mapping[str, Floats], pieces: list[NDArray[np.int64]]
+) -> tuple[NDArray[np.int8], str]:
+    """Return u_out of each row, ``(N,)``, and a sentence that says where it is from.
+
+    Args:
+        values: measured columns by role, in the units of the schema, ``(N,)`` each.
+        other: further columns by role, ``(N,)`` each.
+        pieces: rows of each breath.
+    """
+    if "u_out" in other:
+        return (other["u_out"] > 0.5).astype(np.int8), "u_out is that of the file."
+    if "target" in other:
+        u_out = (~_is_high(other["target"])).astype(np.int8)
+        return u_out, "u_out is 1 where the target is low."
+    u_out = np.zeros(len(values["pressure"]), np.int8)
+    if "flow" in values:
+        flow = np.nan_to_num(values["flow"])
+        limit = -0.02 * float(np.quantile(np.abs(flow), 0.99))
+        for piece in pieces:
+            out = np.flatnonzero(flow[piece] < limit)
+            inward = np.flatnonzero(flow[piece] > -limit)
+            first = out[out > (inward[0] if len(inward) else -1)]
+            if len(first):
+                u_out[piece[first[0]] : piece[-1] + 1] = 1
+        return u_out, "u_out is 1 from where flow turns outwards."
+    for piece in pieces:
+        p = _bridged(values["pressure"])[piece]
+        peak = int(np.argmax(p))
+        half = 0.5 * (p[peak] + p[-1])
+        below = np.flatnonzero(p[peak:] < half)
+        if len(below):
+            u_out[piece[peak + below[0]] : piece[-1] + 1] = 1
+    return u_out, "u_out is 1 from where pressure has fallen half-way from its peak (a guess)."
+
+
 def _onsets(
     file: str, time: Floats, values: Mapping[str, Floats], other: Mapping[str, Floats]
 ) -> tuple[NDArray[np.int64], str]:
@@ -105,7 +139,7 @@ def _onsets(
         shut = other["u_out"] < 0.5
         return np.flatnonzero(shut[1:] & ~shut[:-1]) + 1, "where the expiratory valve closes"
     if "target" in other:
-        high = is_high(other["target"])
+        high = _is_high(other["target"])
         return np.flatnonzero(high[1:] & ~high[:-1]) + 1, "where the target rises"
     if "u_in" in values and np.nanmax(values["u_in"]) > 0:
         on = np.nan_to_num(values["u_in"]) > 0
@@ -115,7 +149,7 @@ def _onsets(
         flow = np.nan_to_num(values["flow"])
         size = float(np.quantile(np.abs(flow), 0.99))
         return _crossings(flow, _ONSET * size, 0.3 * _ONSET * size), "where flow turns inwards"
-    pressure = bridged(values["pressure"])
+    pressure = _bridged(values["pressure"])
     low, high = np.quantile(pressure, [0.1, 0.98])
     if high - low < 1.0:
         raise InputError(
@@ -151,12 +185,12 @@ def _after_pause(on: NDArray[np.bool_], time: Floats) -> NDArray[np.int64]:
     return np.array(onsets, np.int64)
 
 
-def is_high(signal: Floats) -> NDArray[np.bool_]:
+def _is_high(signal: Floats) -> NDArray[np.bool_]:
     """Whether a signal of two levels is at the upper one."""
     return signal > 0.5 * (np.nanmin(signal) + np.nanmax(signal))
 
 
-def bridged(values: Floats) -> Floats:
+def _bridged(values: Floats) -> Floats:
     """Values with their blanks interpolated, shape ``(N,)``."""
     known = np.isfinite(values)
     return np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])

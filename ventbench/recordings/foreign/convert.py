@@ -7,8 +7,8 @@ resampled or smoothed.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from ventbench.errors import InputError
 from ventbench.lungs import Lung
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
-from ventbench.recordings.foreign.breath_onsets import bridged, find_breaths, is_high
+from ventbench.recordings.foreign.breath_onsets import expiratory_valve, find_breaths
 from ventbench.recordings.foreign.layouts import LAYOUTS, ROLES, USUAL, Layout, recognise
-from ventbench.recordings.foreign.tables import Conversion, Table, conversion, read_table
+from ventbench.recordings.foreign.tables import Table, read_table
+from ventbench.recordings.foreign.units import Conversion, conversion, in_file_unit, stem
+from ventbench.recordings.roles import SLOW, check_roles, few_breaths, opposite_sign
 from ventbench.recordings.schema import COLUMNS
 
 Floats = NDArray[np.float64]
@@ -32,9 +34,12 @@ _MEASURED = ("time", "pressure", "flow", "volume", "u_in")
 #: Rows of the preview.
 _PREVIEW = 5
 
-#: Largest usual sizes, to warn of a forgotten unit: flow of an adult in mL/s is above the first,
-#: volume in mL above the second.
-_SMALL_FLOW, _SMALL_VOLUME, _SMALL_PRESSURE = 150.0, 5.0, 2.0
+#: Flow, mL/s, and volume, mL, below which another unit is likely; pressure, cmH2O, from which it
+#: is absolute.
+_SMALL_FLOW, _SMALL_VOLUME, _ABSOLUTE = 150.0, 5.0, 500.0
+
+#: Share of the steps of a clock that may be zero.
+_STANDS_STILL = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,32 +93,38 @@ def import_recording(
     rate: float | None = None,
     split_breaths: bool = False,
     invert: Iterable[str] = (),
+    offsets: Mapping[str, float] | None = None,
     select: Mapping[str, str] | None = None,
+    skip_bad_breaths: bool = False,
     separator: str | None = None,
     decimal: str | None = None,
 ) -> Imported:
     """Read a recording of another laboratory.
 
     Args:
-        path: text with any separator (also gzipped), Parquet or MATLAB up to version 7.
+        path: text with any separator (also gzipped), a spreadsheet, Parquet or MATLAB up to
+            version 7.
         columns: role of each column, ``{"Paw": "pressure"}``; the roles are ``time``,
             ``pressure``, ``flow``, ``volume``, ``u_in``, ``u_out``, ``R``, ``C``, ``breath``,
-            ``group`` (a breath ends where it changes) and ``target`` (inspiration is where it is
-            high). Columns of usual names need none.
+            ``group`` (a breath ends where it changes), ``target`` (inspiration is where it is
+            high) and ``unused``. Columns of usual names need none.
         units: unit by role where it is not that of the header or of the schema,
             ``{"flow": "L/min"}``.
         layout: name of a known layout, see :data:`~.layouts.LAYOUTS`; recognised if None.
         lung: label such as ``"R20C50"`` where no columns hold R and C.
-        rate: sampling rate, Hz, where no column holds the time.
+        rate: sampling rate, Hz, where no column holds the time, or only a coarse one.
         split_breaths: split at inspirations even if a column numbers the breaths.
-        invert: roles whose sign is the opposite, such as ``flow``.
+        invert: roles whose sign is the opposite, such as ``flow``; of valves, 0 and 1 (100 %).
+        offsets: what is added by role, in the unit of the file, ``{"pressure": -1013.25}``.
         select: values that columns must have, ``{"run": "a", "test": "1"}``; other rows are left
             out.
+        skip_bad_breaths: leave out breaths that the schema cannot hold, and name them.
         separator: separator of the cells; found out if None.
         decimal: ``"."`` or ``","``; found out if None.
 
     Raises:
-        InputError: if a column is missing, a unit is unknown, or there is no breath.
+        InputError: if a column is missing, a unit is unknown, there is no breath, or columns are
+            not what they are called.
 
     Example:
         >>> import ventbench
@@ -135,19 +146,18 @@ def import_recording(
     notes, warnings = [*table.notes, *selected], []
     if known is not None:
         notes.append(f"Layout {known.name}: {known.about}.")
+    added = dict(offsets or {})
     values = {
-        role: changes[role].apply(_numbers(table, name))
+        role: changes[role].apply(_numbers(table, name) + added.pop(role, 0.0))
         for role, name in by_role.items()
-        if role in _MEASURED
+        if role in _MEASURED and not (role == "time" and rate is not None)
     }
+    if added:
+        raise InputError(f"--offset {next(iter(added))}: no column is {next(iter(added))}")
     for role in ("flow", "volume"):
         if role in values and not np.isfinite(values[role]).any():
             notes.append(f"Column {by_role[role]} is blank throughout.")
             del values[role]
-    for role in invert:
-        if role not in values:
-            raise InputError(f"--invert {role}: no column is {role}")
-        values[role] = -values[role]
     if not np.isfinite(values["pressure"]).any():
         raise InputError(
             f"{table.file}, column {by_role['pressure']}: every pressure is blank, so there is "
@@ -158,6 +168,8 @@ def import_recording(
         for role, name in by_role.items()
         if role not in _MEASURED and role not in ("group", "breath")
     }
+    _invert(values, other, invert)
+    _check_signs(table, by_role, values, changes)
     keys = [
         _labels(table.columns[name])
         for name, role in roles.items()
@@ -166,11 +178,15 @@ def import_recording(
     groups = [_labels(table.columns[n]) for n, role in roles.items() if role == "group"]
     time, how = _time(table, values.get("time"), rate, keys)
     notes.append(how)
+    unused = [name for name in table.columns if roles.get(name, "unused") == "unused"]
+    unused += [by_role["time"]] if rate is not None and "time" in by_role else []
+    if unused:
+        notes.append(f"Columns that are not used: {', '.join(unused)}.")
     pieces, how = find_breaths(table.file, time, values, other, keys, groups, known)
     notes.append(how)
     R, C, how = _lung(lung, other, len(table))
     notes.append(how)
-    u_out, how = _valve(values, other, pieces, time)
+    u_out, how = expiratory_valve(values, other, pieces)
     notes.append(how)
     u_in = values.get("u_in")
     if u_in is None:
@@ -188,12 +204,19 @@ def import_recording(
         "u_in": u_in, "u_out": u_out, "pressure": values["pressure"],
         **{name: values[name] for name in ("flow", "volume") if name in values},
     }  # fmt: skip
-    _check_ranges(table, by_role, samples, R, C, pieces)
+    labelled = {**samples, "R": R, "C": C}
+    pieces, left = _sound(table, by_role, labelled, time, pieces, skip_bad_breaths)
+    notes += left
     warnings += _suspicious(samples, changes)
     breaths = _breaths(str(path), pieces, time, samples, R, C, notes)
-    return Imported(
-        breaths, changes, roles, tuple(notes), tuple(warnings), _preview(breaths)
-    )  # fmt: skip
+    few = few_breaths(len(breaths))
+    found = check_roles(breaths)
+    if found and found[0].level == "refused":
+        raise InputError(f"{table.file}, column {by_role.get(found[0].column)}: {found[0]}")
+    warnings += [str(finding) for finding in found]
+    notes += [few] if few is not None else []
+    used = {name: role for name, role in roles.items() if role != "unused"}
+    return Imported(breaths, changes, used, tuple(notes), tuple(warnings), _preview(breaths))
 
 
 def _selected(table: Table, select: dict[str, str]) -> tuple[Table, list[str]]:
@@ -212,8 +235,9 @@ def _selected(table: Table, select: dict[str, str]) -> tuple[Table, list[str]]:
     if keep.all():
         return table, []
     columns = {name: values[keep] for name, values in table.columns.items()}
+    lines = None if table.lines is None else table.lines[keep]
     note = f"{int(keep.sum())} of {len(keep)} rows were selected."
-    return Table(table.file, columns, table.units, None, table.scalars, table.notes), [note]
+    return replace(table, columns=columns, lines=lines), [note]
 
 
 def _same(cell: Any, value: str) -> bool:
@@ -251,19 +275,41 @@ def _roles(table: Table, given: dict[str, str], layout: Layout | None) -> dict[s
                 f"{', '.join(table.columns)}.{hint}"
             )
     roles = dict(given)
-    taken = {role for role in given.values() if role != "group"}
+    taken = {role for role in given.values() if role not in ("group", "unused")}
     known = layout.columns if layout is not None else {}
+    alike: dict[str, list[str]] = {}
     for name in table.columns:
-        role = known.get(name) or (USUAL.get(name.lower()) if layout is None else None)
-        if name not in roles and role is not None and role not in taken:
+        role = known.get(name) or (USUAL.get(stem(name)) if layout is None else None)
+        if name not in roles and role == "group":
             roles[name] = role
-            if role != "group":
-                taken.add(role)
-    for role in set(roles.values()) - {"group"}:
+        elif name not in roles and role is not None and role not in taken:
+            alike.setdefault(role, []).append(name)
+    for role, names in alike.items():
+        _check_alike(table, role, names)
+        roles[names[0]] = role
+    for role in set(roles.values()) - {"group", "unused"}:
         names = [name for name, own in roles.items() if own == role]
         if len(names) > 1:
             raise InputError(f"columns {' and '.join(names)} are both {role}; map one of them")
     return roles
+
+
+def _check_alike(table: Table, role: str, names: Sequence[str]) -> None:
+    """Refuse to choose among columns of one role that differ."""
+    if role not in _MEASURED or role == "time":
+        return
+    first = table.columns[names[0]]
+    for name in names[1:]:
+        second = table.columns[name]
+        if first.dtype.kind not in "fiub" or second.dtype.kind not in "fiub":
+            continue
+        apart = np.abs(np.asarray(first, float) - np.asarray(second, float))
+        if np.isfinite(apart).any() and np.nanmax(apart) > 1e-9 * np.nanmax(np.abs(first)):
+            raise InputError(
+                f"{table.file}: columns {names[0]} and {name} may both be {role}, and differ by "
+                f"{np.nanmedian(apart):.3g} (median); say which with --map {name}={role}, or give "
+                f"--map {name}=unused"
+            )
 
 
 def _conversions(
@@ -298,34 +344,41 @@ def _time(
     table: Table, time: Floats | None, rate: float | None, keys: list[NDArray[np.int64]]
 ) -> tuple[Floats, str]:
     """Time of each row, s; NaN where the file leaves it blank."""
-    if rate is None and time is None:
-        rates = {k: v for k, v in table.scalars.items() if k.lower().split(".")[-1] in _RATES}
-        if not rates:
-            raise InputError(
-                f"{table.file}: no column is the time; say which with --map NAME=time, or give "
-                "the sampling rate with --rate 50"
-            )
-        name, rate = next(iter(rates.items()))
-        return np.arange(len(table)) / rate, f"Sampling rate {rate:g} Hz, from {name}."
     if rate is not None:
         if rate <= 0:
             raise InputError(f"--rate {rate:g}: a positive rate in Hz is needed")
         return np.arange(len(table)) / rate, f"Sampling rate {rate:g} Hz, as given."
-    assert time is not None
+    if time is None:
+        if table.rate is None:
+            raise InputError(
+                f"{table.file}: no column is the time; say which with --map NAME=time, or give "
+                "the sampling rate with --rate 50"
+            )
+        return np.arange(len(table)) / table.rate, f"Sampling rate {table.rate:g} Hz, of the file."
     steps = np.diff(time)
     inside = np.isfinite(steps)
     for key in keys:
         inside &= np.diff(key) == 0
     if not inside.any():
         return time, "Times are blank in part."
-    if np.median(steps[inside]) <= 0:
+    onwards = steps[inside & (steps > 0)]
+    if len(onwards) == 0:
         raise InputError(f"{table.file}: the time does not increase")
-    median = float(np.median(steps[inside & (steps > 0)]))
+    median = float(np.median(onwards))
+    if (steps[inside] == 0).mean() > _STANDS_STILL:
+        rows_per_step = float(np.median(np.diff(np.flatnonzero(steps > 0))))
+        guess = rows_per_step / median
+        raise InputError(
+            f"{table.file}: the clock has steps of {1e3 * median:.4g} ms for "
+            f"{rows_per_step:.3g} rows each; give the sampling rate, such as "
+            f"--rate {guess:.4g}"
+        )
+    if median > SLOW:
+        raise InputError(
+            f"{table.file}: the median sampling interval is {median:.4g} s, and rates are 20 to "
+            "1000 Hz; give --time-unit ms, or the sampling rate with --rate 100"
+        )
     return time, f"Sampling interval {1e3 * median:.4g} ms (median), {1 / median:.4g} Hz."
-
-
-#: Names of a sampling rate among the single numbers of a MATLAB file.
-_RATES = ("fs", "rate", "sampling_rate", "samplingrate", "samplerate", "sample_rate", "freq")
 
 
 def _lung(given: str | None, other: Mapping[str, Floats], count: int) -> tuple[Floats, Floats, str]:
@@ -334,7 +387,9 @@ def _lung(given: str | None, other: Mapping[str, Floats], count: int) -> tuple[F
 
     if given is not None:
         label: Lung = parse(given)
-        return np.full(count, label.R), np.full(count, label.C), f"Lung {label.id}, as given."
+        over = " in place of R and C of the file" if "R" in other and "C" in other else ""
+        how = f"Lung {label.id}, as given{over}."
+        return np.full(count, label.R), np.full(count, label.C), how
     if "R" in other and "C" in other:
         pairs = np.unique(np.stack([other["R"], other["C"]], axis=1), axis=0)
         ids = ", ".join(f"R{R:g}C{C:g}" for R, C in pairs[:9].tolist())
@@ -345,70 +400,90 @@ def _lung(given: str | None, other: Mapping[str, Floats], count: int) -> tuple[F
     )
 
 
-def _valve(
-    values: Mapping[str, Floats], other: Mapping[str, Floats], pieces: list[NDArray[np.int64]],
-    time: Floats,
-) -> tuple[NDArray[np.int8], str]:  # fmt: skip
-    """u_out of each row, and where it is from."""
-    if "u_out" in other:
-        return (other["u_out"] > 0.5).astype(np.int8), "u_out is that of the file."
-    if "target" in other:
-        u_out = (~is_high(other["target"])).astype(np.int8)
-        return u_out, "u_out is 1 where the target is low."
-    u_out = np.zeros(len(time), np.int8)
-    if "flow" in values:
-        flow = np.nan_to_num(values["flow"])
-        limit = -0.02 * float(np.quantile(np.abs(flow), 0.99))
-        for piece in pieces:
-            out = np.flatnonzero(flow[piece] < limit)
-            inward = np.flatnonzero(flow[piece] > -limit)
-            first = out[out > (inward[0] if len(inward) else -1)]
-            if len(first):
-                u_out[piece[first[0]] : piece[-1] + 1] = 1
-        return u_out, "u_out is 1 from where flow turns outwards."
-    for piece in pieces:
-        p = bridged(values["pressure"])[piece]
-        peak = int(np.argmax(p))
-        half = 0.5 * (p[peak] + p[-1])
-        below = np.flatnonzero(p[peak:] < half)
-        if len(below):
-            u_out[piece[peak + below[0]] : piece[-1] + 1] = 1
-    return u_out, "u_out is 1 from where pressure has fallen half-way from its peak (a guess)."
+def _invert(values: dict[str, Floats], other: dict[str, Floats], roles: Iterable[str]) -> None:
+    """Change signs; of a valve, what is open."""
+    for role in roles:
+        if role == "u_out" and role in other:
+            other[role] = 1.0 - other[role]
+        elif role in values:
+            values[role] = 100.0 - values[role] if role == "u_in" else -values[role]
+        else:
+            raise InputError(f"--invert {role}: no column is {role}")
 
 
-def _check_ranges(
-    table: Table, by_role: Mapping[str, str], samples: Mapping[str, NDArray[Any]],
-    R: Floats, C: Floats, pieces: list[NDArray[np.int64]],
+def _check_signs(
+    table: Table, by_role: Mapping[str, str], values: Mapping[str, Floats],
+    changes: Mapping[str, Conversion],
 ) -> None:  # fmt: skip
-    """Refuse what the schema cannot hold: one sentence a column."""
-    rows, problems = np.concatenate(pieces), []
-    for name, values in {**samples, "R": R, "C": C}.items():
+    """Refuse absolute pressure, and flow that is counted from the patient.
+
+    Before anything is inferred from them: breaths and valves would be wrong too.
+    """
+    pressure = values["pressure"]
+    if np.nanmedian(pressure) > _ABSOLUTE:
+        change = changes["pressure"]
+        raise InputError(
+            f"{table.file}, column {by_role['pressure']}: pressure is {np.nanmedian(pressure):.4g} "
+            f"cmH2O in the median, so it is absolute; subtract that of the air, in {change.unit}: "
+            f"--offset pressure=-{in_file_unit(change, 101325):.6g}"
+        )
+    if "flow" in values and opposite_sign(pressure, values["flow"]):
+        raise InputError(
+            f"{table.file}, column {by_role['flow']}: flow goes out while pressure is high, so it "
+            "is counted from the patient; give --invert flow"
+        )
+
+
+def _sound(
+    table: Table, by_role: Mapping[str, str], samples: Mapping[str, NDArray[Any]], time: Floats,
+    pieces: list[NDArray[np.int64]], skip: bool,
+) -> tuple[list[NDArray[np.int64]], list[str]]:  # fmt: skip
+    """Breaths that the schema can hold; refuse the others, or leave them out and name them."""
+    rows, bad, problems = np.concatenate(pieces), dict[int, str](), list[str]()
+    owner = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
+    for name, values in samples.items():
         column, own = COLUMNS[name], np.asarray(values, float)[rows]
         low = own <= column.low if column.positive else own < column.low
         wrong = np.flatnonzero(low | (own > column.high) | (np.isnan(own) & (not column.blank)))
         if len(wrong):
-            row = int(rows[wrong[0]])
-            where = f"row {row + 1}"
-            if table.first_line is not None:
-                where = f"line {table.first_line + row}"
             problems.append(
-                f"{table.file}, column {by_role.get(name, name)}: {len(wrong)} of {len(own)} "
-                f"values are outside {column.span}, the first in {where} ({own[wrong[0]]:g}). "
-                "Check the unit (such as --flow-unit L/min) and the map."
+                f"{table.file}, column {by_role.get(name, name)}: {len(wrong)} of {len(own)} values "
+                f"are outside {column.span}, the first in {table.place(int(rows[wrong[0]]))} "
+                f"({own[wrong[0]]:g}). Check the unit (such as --flow-unit L/min) and the map."
             )
-    if problems:
-        raise InputError("\n".join(problems))
+        for at in wrong[np.unique(owner[wrong], return_index=True)[1]]:
+            bad.setdefault(int(owner[at]), f"{name} is {own[at]:g}")
+    for k, piece in enumerate(pieces):
+        at = time[piece][np.isfinite(time[piece])]
+        reason = "the time goes back" if np.any(np.diff(at) <= 0) else None
+        for name in ("R", "C"):
+            if reason is None and np.any(samples[name][piece] != samples[name][piece[0]]):
+                reason = f"{name} changes"
+        if reason is not None:
+            bad.setdefault(k, reason)
+            problems.append(f"{table.file}: {reason} in the breath of {table.place(int(piece[0]))}")
+    if problems and (not skip or len(bad) == len(pieces)):
+        some = len(bad) < len(pieces)
+        problems.append(
+            f"{len(bad)} of {len(pieces)} breaths are concerned"
+            + ("; --skip-bad-breaths leaves them out." if some else ".")
+        )
+        raise InputError("\n".join([*problems[:5], *problems[5:][-1:]]))
+    kept = [piece for k, piece in enumerate(pieces) if k not in bad]
+    said = [f"{table.place(int(pieces[k][0]))} ({why})" for k, why in sorted(bad.items())]
+    more = f" and {len(said) - 10} more" if len(said) > 10 else ""
+    left = f"{len(said)} bad breaths were left out: {', '.join(said[:10])}{more}."
+    return kept, [left] if said else []
 
 
 def _suspicious(
     samples: Mapping[str, NDArray[Any]], changes: Mapping[str, Conversion]
 ) -> list[str]:
-    """Sizes that look like a forgotten unit, and signs that look inverted."""
+    """Sizes that look like a forgotten unit."""
     warnings = []
     for role, small, advice in (
         ("flow", _SMALL_FLOW, "--flow-unit L/min or L/s"),
         ("volume", _SMALL_VOLUME, "--volume-unit L"),
-        ("pressure", _SMALL_PRESSURE, "--pressure-unit kPa"),
     ):
         if role in samples and np.isfinite(samples[role]).any():
             size = float(np.nanquantile(np.abs(samples[role]), 0.99))
@@ -417,13 +492,6 @@ def _suspicious(
                     f"{role} is {size:.3g} {changes[role].to} at most (99 %), which is little; is "
                     f"the unit right ({advice})?"
                 )
-    if "flow" in samples and "u_out" in samples:
-        flow = samples["flow"]
-        inside, known = samples["u_out"] == 0, np.isfinite(flow)
-        if (inside & known).any() and (~inside & known).any():
-            into, out = flow[inside & known].mean(), flow[~inside & known].mean()
-            if into < 0.0 < out:
-                warnings.append("flow is negative in inspirations; pass --invert flow if so.")
     return warnings
 
 
@@ -433,12 +501,6 @@ def _breaths(
 ) -> Breaths:  # fmt: skip
     rows, lengths = np.concatenate(pieces), np.array([len(piece) for piece in pieces])
     first = np.array([piece[0] for piece in pieces])
-    for name, values in (("R", R), ("C", C)):
-        for piece in pieces:
-            if np.any(values[piece] != values[piece[0]]):
-                raise InputError(
-                    f"{source}: {name} changes within the breath of row {piece[0] + 1}"
-                )
     parts = []
     for piece in pieces:
         at, k = time[piece], np.arange(len(piece))

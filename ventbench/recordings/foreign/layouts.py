@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 #: What a column may stand for.
 ROLES = (
     "time", "pressure", "flow", "volume", "u_in", "u_out", "R", "C", "breath", "group", "target",
+    "unused",
 )  # fmt: skip
 
 
@@ -68,14 +69,19 @@ LAYOUTS: dict[str, Layout] = {
     )
 }  # fmt: skip
 
-#: Names of columns that are understood without a map, in lower case.
-USUAL: dict[str, str] = {
-    "time": "time", "time_step": "time", "timestamp": "time", "t": "time", "zeit": "time",
-    "pressure": "pressure", "paw": "pressure", "p_aw": "pressure", "airway_pressure": "pressure",
-    "airway pressure": "pressure", "flow": "flow", "flow_rate": "flow", "q": "flow",
-    "volume": "volume", "vol": "volume", "u_in": "u_in", "u_out": "u_out", "r": "R", "c": "C",
-    "breath": "breath", "breath_id": "breath", "cycle_number": "breath",
+_NAMES: dict[str, str] = {
+    "time": "time timestep timestamp t zeit tempo temps tiempo clock datetime elapsed elapsedtime "
+    "relativetime seconds",
+    "pressure": "pressure paw airwaypressure p pao pvent pmouth pcircuit druck pressione pression "
+    "presion",
+    "flow": "flow flowrate airflow q vdot fluss flusso debit flujo",
+    "volume": "volume vol v volumen",
+    "u_in": "uin", "u_out": "uout", "R": "r", "C": "c",
+    "breath": "breath breathid cyclenumber breathnumber",
 }  # fmt: skip
+
+#: Roles of columns that are understood without a map, by the stem of their names.
+USUAL: dict[str, str] = {name: role for role, names in _NAMES.items() for name in names.split()}
 
 
 def recognise(names: tuple[str, ...]) -> Layout | None:

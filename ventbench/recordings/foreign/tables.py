@@ -1,31 +1,57 @@
-"""Tables of numbers from text with any separator, Parquet and MATLAB files, and their units."""
+"""Tables of numbers from text of any dialect, spreadsheets, Parquet and MATLAB files.
+
+Text is split once, by the separator and the decimal mark that make most cells numbers. The first
+three lines of numbers in a row begin the data; names and units stand above them. What stands
+between rows and is none, such as an alarm, is left out and named.
+"""
 
 from __future__ import annotations
 
+import csv
 import gzip
 import re
 from collections import Counter
 from dataclasses import dataclass, field
-from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.errors import InputError
+from ventbench.recordings.foreign.units import is_unit, spelled, unit_of
 
-#: Lines that decide on separator, decimal mark and header.
-_LOOKED_AT = 60
+#: Lines that decide on separator, decimal mark and header, and of those, the ones that are split.
+_LOOKED_AT = 400
 
 #: Separators, the likelier first.
-_SEPARATORS = ("\t", ";", ",", "|")
+_SEPARATORS = ("\t", ";", ",", "|", " ")
 
 #: Cells that stand for nothing.
 _BLANKS = ("", "nan", "na", "n/a", "null", "none", "-", "--", "#n/a", "inf", "-inf")
 
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-_COMMA_NUMBER = re.compile(r"[+-]?(\d+,?\d*|,\d+)([eE][+-]?\d+)?")
+#: Numbers by decimal mark, also with thousands apart: "1,061.3" or "1.061,3".
+_NUMBER = {
+    mark: re.compile(
+        rf"[+-]?(?:\d+{m}?\d*|{m}\d+|\d{{1,3}}(?:[{other} '’\u00a0\u202f]\d{{3}})+(?:{m}\d*)?)"
+        r"(?:[eE][+-]?\d+)?"
+    )
+    for mark, m, other in ((".", r"\.", ","), (",", ",", r"\."))
+}
+
+#: A time of day or a stopwatch, with or without a date; before milliseconds also a colon.
+_CLOCK = re.compile(
+    r"(?:[^\s:]+[ T])?(\d{1,2}):(\d{2})(?::(\d{2}))?(?:([.,:])(\d{1,9}))?\s*([AaPp][Mm])?"
+    r"(?:Z|[+-]\d{2}:?\d{2})?"
+)
+
+#: Names of a sampling rate, Hz, and of an interval, above a table or beside it.
+_RATES = ("fs", "rate", "samplingrate", "samplerate", "freq", "frequency", "samplingfrequency")
+
+#: Share of the lines that may be no rows before a file is refused, and number of lines anyway.
+_STRAY, _STRAY_LINES = 0.01, 20
+
+_Row: TypeAlias = tuple[int, list[str]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,23 +61,27 @@ class Table:
     Attributes:
         file: path as the caller wrote it.
         columns: values by name, float64 with NaN for blank, ``(m,)``; text only where no cell is a
-            number.
+            number. Times of day are seconds.
         units: units that headers state, by name.
-        first_line: line of the first row in a text file, else None.
-        scalars: single numbers beside the columns, such as a sampling rate in a MATLAB file.
+        lines: line of each row in a text file, ``(m,)``, else None.
+        rate: sampling rate that stands beside the columns, Hz, or None.
         notes: what was understood, a sentence each.
     """
 
     file: str
     columns: dict[str, NDArray[Any]]
     units: dict[str, str] = field(default_factory=dict)
-    first_line: int | None = None
-    scalars: dict[str, float] = field(default_factory=dict)
+    lines: NDArray[np.int64] | None = None
+    rate: float | None = None
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Number of rows."""
         return len(next(iter(self.columns.values())))
+
+    def place(self, row: int) -> str:
+        """Where a row stands in the file, in words."""
+        return f"row {row + 1}" if self.lines is None else f"line {self.lines[row]}"
 
 
 def read_table(
@@ -60,7 +90,7 @@ def read_table(
     """Read a table.
 
     Args:
-        path: text (also gzipped), Parquet or MATLAB (up to version 7).
+        path: text (also gzipped), a spreadsheet (.xlsx), Parquet or MATLAB (up to version 7).
         separator: separator of the cells; found out if None.
         decimal: ``"."`` or ``","``; found out if None.
 
@@ -85,175 +115,340 @@ def read_table(
             "MATLAB, or export the table as CSV"
         )
     if first.startswith(b"PK\x03\x04"):
-        raise InputError(f"{file} is a zip archive or a spreadsheet; unpack it, or save it as CSV")
+        return _spreadsheet(file)
     return _text(file, separator, decimal)
 
 
 def _text(file: str, separator: str | None, decimal: str | None) -> Table:
-    import pandas as pd
-
     text, encoding = _decoded(file)
-    lines = [line for line in text.splitlines()[:_LOOKED_AT]]
+    text = text.replace("\r\n", "\n").replace("\r", "\n").replace("\N{MINUS SIGN}", "-")
+    lines = text.split("\n")
     if not any(line.strip() for line in lines):
         raise InputError(f"{file} holds no text")
-    separator = separator or _separator(lines)
-    cells = [_cells(line, separator) for line in lines]
-    decimal = decimal or _decimal(cells, separator)
-    number = _COMMA_NUMBER if decimal == "," else _NUMBER
-    width = Counter(len(row) for row in cells if len(row) > 1).most_common(1)
-    if not width:
-        raise InputError(
-            f"{file}: no line has two cells separated by {separator!r}; give --separator"
-        )
-    start = next(
-        k for k, row in enumerate(cells)
-        if len(row) == width[0][0] and _numeric(row, number) >= max(0.5 * len(row), 1)
-    ) if any(
-        len(row) == width[0][0] and _numeric(row, number) >= max(0.5 * len(row), 1)
-        for row in cells
-    ) else None  # fmt: skip
-    if start is None:
-        raise InputError(f"{file}: no line of the first {len(lines)} is one of numbers")
-    names, units, notes = _header(cells[:start], width[0][0])
-    frame = pd.read_csv(
-        _Lines(text, start), sep=separator if separator != " " else r"\s+", header=None,
-        names=list(range(width[0][0])), decimal=decimal, dtype=str, skip_blank_lines=True,
-        keep_default_na=False, quotechar='"', on_bad_lines="error", engine="c",
-        index_col=False,
-    )  # fmt: skip
-    columns: dict[str, NDArray[Any]] = {}
-    unreadable = []
-    for name, (_, cell_values) in zip(names, frame.items(), strict=True):
-        values, odd = _column(cell_values.to_numpy(str), decimal)
-        columns[name] = values
-        if odd:
-            unreadable.append(f"{name}: {odd[0]} cells, such as {odd[1]!r}")
-    if unreadable:
-        notes.append(f"Cells that are no numbers are blank ({'; '.join(unreadable)}).")
+    if re.match(r"\s*BS\b", next((x for x in lines if re.match(r"\s*B[SE]\b", x)), "")):
+        return _delimited_breaths(file, lines, encoding)
+    named = re.fullmatch(r"\ufeff?\"?sep=(.)\"?", lines[0].strip("\n"))
+    if named is not None:  # a spreadsheet's own line
+        separator, lines[0] = separator or named[1], ""
+    looked_at = [line for line in lines[:_LOOKED_AT] if line.strip()]
+    separator, decimal = _dialect(file, looked_at, separator, decimal)
+    rows = [(k + 1, _cells(line, separator)) for k, line in enumerate(lines) if line.strip()]
     shown = {"\t": "tab", " ": "blanks"}.get(separator, repr(separator))
-    notes.insert(
-        0, f"Text ({encoding}), cells separated by {shown}, decimal {decimal!r}, first row in "
-        f"line {start + 1}."
-    )  # fmt: skip
-    return Table(file, columns, units, start + 1, {}, tuple(notes))
-
-
-def _Lines(text: str, start: int) -> Any:
-    import io
-
-    stream = io.StringIO(text)
-    for _ in range(start):
-        stream.readline()
-    return stream
+    note = f"Text ({encoding}), cells separated by {shown}, decimal {decimal!r}"
+    return _table(file, rows, decimal, note, packed=separator == " ")
 
 
 def _decoded(file: str) -> tuple[str, str]:
-    with open(file, "rb") as stream:
-        data = stream.read()
+    data = Path(file).read_bytes()
     if data.startswith(b"\x1f\x8b"):
         try:
             data = gzip.decompress(data)
         except (OSError, EOFError) as error:
             raise InputError(f"{file} cannot be unpacked ({error})") from None
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+    zeros = data[:4096].count(0)
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")) or zeros > 0.3 * len(data[:4096]):
+        wide = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-16-le"
         try:
-            return data.decode("utf-16"), "UTF-16"
+            return data.decode(wide), "UTF-16"
         except UnicodeDecodeError:
             raise InputError(
                 f"{file} begins like UTF-16 text and is none; export it as CSV"
             ) from None
+    if zeros:
+        raise InputError(f"{file} is no text, Parquet or MATLAB file; export it as CSV")
     try:
         return data.decode("utf-8-sig"), "UTF-8"
     except UnicodeDecodeError:
-        if b"\x00" in data[:4096]:
-            raise InputError(
-                f"{file} is no text, Parquet or MATLAB file; export it as CSV"
-            ) from None
         return data.decode("latin-1"), "Latin-1"
 
 
 def _cells(line: str, separator: str) -> list[str]:
-    import csv
-
     if separator == " ":
         return line.split()
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
+    if '"' not in line:
+        return [cell.strip() for cell in line.split(separator)]
+    return [cell.strip() for cell in next(csv.reader([line.strip()], delimiter=separator), [])]
 
 
-def _separator(lines: list[str]) -> str:
-    """The separator that divides most lines into equally many cells, and into most of them."""
-    best, most = " ", 0.0
-    for separator in (*_SEPARATORS, " "):
-        counts = Counter(len(_cells(line, separator)) for line in lines if line.strip())
-        counts.pop(1, None)
-        if counts:
-            width, hits = counts.most_common(1)[0]
-            # A decimal comma divides lines evenly too, but into cells of which none has a point.
-            score = hits + 0.01 * width
-            if separator == "," and most >= 0.8 * hits:
+def _dialect(
+    file: str, lines: list[str], separator: str | None, decimal: str | None
+) -> tuple[str, str]:
+    """The separator and decimal mark with which most cells of most lines are numbers."""
+    best, most = None, 0.0
+    quoted = any('"' in line for line in lines)
+    for own in (separator,) if separator else _SEPARATORS:
+        split = [cells for cells in (_cells(line, own) for line in lines) if len(cells) > 1]
+        split = [cells for cells in map(_filled, split) if cells]
+        for mark in (decimal,) if decimal else (".", ","):
+            if mark == own and not quoted:
                 continue
-            if separator == " ":
-                score *= 0.5
-            if score > most:
-                best, most = separator, score
+            score = sum(sum(_is_value(cell, mark) for cell in c) / len(c) for c in split)
+            # Between equals: "7,736" alone is a decimal comma, and integers have no mark.
+            if mark == ",":
+                score += 1e-6 if any("," in cell for cells in split for cell in cells) else -1e-6
+            if score > most + 1e-9:
+                best, most = (own, mark), score
+    if best is None:
+        asked = f" separated by {separator!r}" if separator else ""
+        raise InputError(
+            f"{file}: no line has two cells{asked} of which one is a number; give --separator"
+        )
     return best
 
 
-def _decimal(cells: list[list[str]], separator: str) -> str:
-    flat = [cell for row in cells for cell in row]
-    commas = sum(bool(re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell)) for cell in flat)
-    points = sum(bool(re.fullmatch(r"[+-]?\d*\.\d+([eE][+-]?\d+)?", cell)) for cell in flat)
-    return "," if commas > points else "."
+def _filled(cells: list[str]) -> list[str]:
+    return [cell for cell in cells if cell.lower() not in _BLANKS]
 
 
-def _numeric(row: list[str], number: re.Pattern[str]) -> int:
-    return sum(bool(number.fullmatch(cell)) for cell in row)
+def _is_value(cell: str, mark: str) -> bool:
+    return bool(_NUMBER[mark].fullmatch(cell) or (":" in cell and _CLOCK.fullmatch(cell)))
 
 
-def _header(before: list[list[str]], width: int) -> tuple[list[str], dict[str, str], list[str]]:
+def _table(file: str, rows: list[_Row], mark: str, note: str, packed: bool = False) -> Table:
+    """Rows of cells as columns: header, units, values, and lines that are none."""
+    looked_at = rows[:_LOOKED_AT]
+    good = []
+    for _, cells in looked_at:
+        filled = _filled(cells)
+        values = sum(_is_value(cell, mark) for cell in filled)
+        good.append(values > len(filled) - values or (values and 2 * values >= len(cells) > 2))
+    runs = [k for k in range(len(good)) if all(good[k : k + 3])]
+    if not runs:
+        raise InputError(f"{file}: no line of the first {len(looked_at)} is one of numbers")
+    start = runs[0]
+    widths = Counter(_width(cells) for _, cells in looked_at[start:])
+    width = max(w for w, count in widths.items() if count >= 0.05 * sum(widths.values()))
+    names, units, notes = _header(file, looked_at[:start], width, packed)
+    width = len(names)
+    kept = [row for row in rows[start:] if _width(row[1]) <= width]
+    stray = [row for row in rows[start:] if _width(row[1]) > width]
+    columns, odd_cells, odd, filled = _columns(names, units, kept, mark, notes)
+    # A line with a word and hardly a number, between lines of numbers, is no row.
+    message = odd & (filled <= 1)
+    if message.any():
+        stray = sorted([*stray, *(kept[k] for k in np.flatnonzero(message))])
+        columns = {name: values[~message] for name, values in columns.items()}
+        odd_cells = {
+            name: cells for name, cells in odd_cells.items() if not message[cells[0]].all()
+        }
+    if len(stray) > max(_STRAY_LINES, _STRAY * len(kept)):
+        raise InputError(
+            f"{file}, line {stray[0][0]}: {len(stray)} of {len(rows) - start} lines are no rows of "
+            f"at most {width} numbers, such as {' '.join(stray[0][1])[:60]!r}; remove them, or "
+            "give --separator"
+        )
+    if odd_cells:
+        said = [f"{name}: {len(at)} cells, such as {cell!r}" for name, (at, cell) in
+                odd_cells.items()]  # fmt: skip
+        notes.append(f"Cells that are no numbers are blank ({'; '.join(said)}).")
+    for number, cells in stray[:3]:
+        notes.append(f"Line {number} is no row and was left out: {' '.join(cells)[:60]!r}.")
+    if len(stray) > 3:
+        notes.append(f"So were {len(stray) - 3} more lines, the last of them {stray[-1][0]}.")
+    numbers = np.array([number for number, _ in kept], np.int64)[~message]
+    notes.insert(0, f"{note}, first row in line {numbers[0]}.")
+    return Table(file, columns, units, numbers, _rate(looked_at[:start], mark), tuple(notes))
+
+
+def _width(cells: list[str]) -> int:
+    """Number of cells up to the last one that is not blank."""
+    return max((k + 1 for k, cell in enumerate(cells) if cell), default=0)
+
+
+def _header(
+    file: str, above: list[_Row], width: int, packed: bool
+) -> tuple[list[str], dict[str, str], list[str]]:
     """Names and units from the lines above the numbers."""
-    rows = [row for row in before if len(row) == width]
-    if not rows:
+    texts = [
+        [cell.strip("'\"").lstrip("#%").strip() for cell in cells[: _width(cells)]]
+        for _, cells in above
+    ]
+    while texts and (sum(map(bool, texts[-1])) < min(2, width) or _mostly_numbers(texts[-1])):
+        texts.pop()
+    if not texts:
         return [str(k + 1) for k in range(width)], {}, ["There is no header; columns are 1, 2, ..."]
-    names_row, units_row = rows[-1], None
-    if len(rows) > 1 and all(re.fullmatch(r"[\[(]?[\w%/.µ° -]{0,10}[\])]?", c) for c in rows[-1]):
-        known = sum(unit_of(f"x [{cell}]")[1] in _all_units() for cell in rows[-1] if cell)
-        if known >= 1:  # a line of units below the line of names
-            names_row, units_row = rows[-2], rows[-1]
-    names, units = [], {}
-    for k, cell in enumerate(names_row):
-        name, unit = unit_of(cell.strip().strip("'\"").lstrip("#").strip())
+    units_row: list[str] = []
+    known = sum(is_unit(cell) for cell in texts[-1])
+    if len(texts) > 1 and known and 2 * known >= sum(map(bool, texts[-1])):
+        units_row = texts.pop()
+    # The names are the last line of as many cells as columns; an alarm may stand below them.
+    cells = next((text for text in reversed(texts) if sum(map(bool, text)) == width), texts[-1])
+    if packed and len(cells) != width:
+        raise InputError(
+            f"{file}: {len(cells)} names stand above {width} columns that blanks separate; put "
+            "names of one word there, or map numbers after removing the line"
+        )
+    if width == len(cells) + 1 and not units_row:  # names of R's write.table have no row's own
+        cells = ["row", *cells]
+    cells = cells + [""] * (width - len(cells))
+    names: list[str] = []
+    units: dict[str, str] = {}
+    for k, cell in enumerate(cells):
+        name, unit = unit_of(cell)
         name = name or str(k + 1)
         while name in names:
             name += "_"
         names.append(name)
-        if units_row is not None and units_row[k]:
-            unit = unit_of(f"x [{units_row[k].strip('[]()')}]")[1]
+        if k < len(units_row) and units_row[k]:
+            unit = spelled(units_row[k])
         if unit:
             units[name] = unit
-    skipped = len(before) - len(rows) + (len(rows) - 1 - (units_row is not None))
-    notes = [f"{skipped} lines above the header were skipped."] if skipped > 0 else []
-    return names, units, notes
+    skipped = len(texts) - 1
+    return names, units, [f"{skipped} lines above the header were skipped."] if skipped else []
 
 
-def _all_units() -> set[str]:
+def _mostly_numbers(cells: list[str]) -> bool:
+    values = sum(_is_value(cell, ".") or _is_value(cell, ",") for cell in cells if cell)
+    return 2 * values >= sum(map(bool, cells))
 
-    return {unit for units in UNITS.values() for unit in units} - {"1"}
+
+def _rate(above: list[_Row], mark: str) -> float | None:
+    """Sampling rate, Hz, that a line above the table states."""
+    for _, cells in above:
+        line = re.split(r"[\s,;:=|]+", " ".join(cells).replace(mark, ".").strip(" #%\"'"))
+        for k in range(1, len(line)):
+            name = re.sub(r"[^a-z]|hz", "", "".join(line[:k]).lower())
+            if name in _RATES and re.fullmatch(r"\d+\.?\d*", line[k]) and float(line[k]) > 0:
+                return float(line[k]) * (1000.0 if line[k + 1 : k + 2] == ["kHz"] else 1.0)
+    return None
 
 
-def _column(cells: NDArray[Any], decimal: str) -> tuple[NDArray[Any], tuple[int, str] | None]:
-    """Numbers of a column, and how many cells are none; text where none is a number."""
+def _columns(
+    names: list[str], units: dict[str, str], rows: list[_Row], mark: str, notes: list[str]
+) -> tuple[
+    dict[str, NDArray[Any]], dict[str, tuple[NDArray[Any], str]], NDArray[Any], NDArray[Any]
+]:
+    """Values by name; rows with odd cells and one of them by name; rows with any; and values."""
     import pandas as pd
 
-    plain = np.char.strip(cells.astype(str))
-    numbers = np.char.replace(plain, ",", ".") if decimal == "," else plain
-    values = np.array(pd.to_numeric(pd.Series(numbers), errors="coerce"), float)
+    columns: dict[str, NDArray[Any]] = {}
+    odd_cells: dict[str, tuple[NDArray[Any], str]] = {}
+    any_odd, filled = np.zeros(len(rows), bool), np.zeros(len(rows), int)
+    for k, name in enumerate(names):
+        cells = pd.Series([row[k] if k < len(row) else "" for _, row in rows], dtype=str)
+        values, grouped = _values(cells, mark)
+        odd = np.isnan(values) & ~cells.str.lower().isin(_BLANKS).to_numpy()
+        if odd.any() and not np.isfinite(values).any():
+            clock = _clock(cells)
+            if clock is None:
+                columns[name] = cells.to_numpy(str)
+                continue
+            values, units[name] = clock, "s"
+            odd = np.isnan(values) & (cells != "").to_numpy()
+            notes.append(f"{name}: times such as {cells[0]!r} were counted in seconds.")
+        if grouped:
+            notes.append(f"{name}: {grouped} cells have thousands apart.")
+        if odd.any():
+            odd_cells[name] = np.flatnonzero(odd), str(cells[int(np.argmax(odd))])
+        any_odd |= odd
+        filled += np.isfinite(values)
+        columns[name] = values
+    return columns, odd_cells, any_odd, filled
+
+
+def _values(cells: Any, mark: str) -> tuple[NDArray[np.float64], int]:
+    """Numbers of a column, NaN for other cells; and how many have thousands apart."""
+    import pandas as pd
+
+    other = "," if mark == "." else "."
+    apart = cells.str.contains(rf"[{re.escape(other)} '’\u00a0\u202f]") & cells.str.fullmatch(
+        _NUMBER[mark].pattern
+    )
+    if mark == "," and not cells.str.contains(",", regex=False).any():
+        apart &= False  # a column of a file with decimal commas that has points itself
+    if apart.any():
+        cells = cells.mask(
+            apart, cells.str.replace(rf"[{re.escape(other)} '’\u00a0\u202f]", "", regex=True)
+        )
+    plain = cells.str.replace(",", ".", regex=False) if mark == "," else cells
+    values = np.array(pd.to_numeric(plain, errors="coerce"), float)
     values[~np.isfinite(values)] = np.nan
-    blank = np.isin(np.char.lower(plain), _BLANKS)
-    odd = np.isnan(values) & ~blank
-    if odd.any() and not np.isfinite(values).any():
-        return plain, None
-    return values, (int(odd.sum()), str(plain[odd][0])) if odd.any() else None
+    return values, int(apart.sum())
+
+
+def _clock(cells: Any) -> NDArray[np.float64] | None:
+    """Seconds of times of day, on over midnight; None if hardly any cell is one."""
+    parts = cells.str.extract(rf"^{_CLOCK.pattern}$")
+    hours, minutes = (parts[k].astype(float).to_numpy(float, na_value=np.nan) for k in (0, 1))
+    if np.isfinite(hours).mean() < 0.9:
+        return None
+    seconds = parts[2].astype(float).to_numpy(float, na_value=np.nan)
+    stopwatch = np.isnan(seconds)  # 05:23.450 is minutes and seconds
+    hours, minutes, seconds = (
+        np.where(stopwatch, 0.0, hours), np.where(stopwatch, hours, minutes),
+        np.where(stopwatch, minutes, seconds),
+    )  # fmt: skip
+    digits = parts[4].fillna("0")
+    # After a colon stand milliseconds, after a mark decimals.
+    scale = np.where(parts[3] == ":", 1000.0, 10.0 ** digits.str.len().to_numpy(float))
+    seconds = seconds + digits.astype(float).to_numpy(float) / scale
+    half = parts[5].str.lower()
+    hours = np.where(half.notna(), hours % 12 + 12 * (half == "pm"), hours)
+    out = 3600.0 * hours + 60.0 * minutes + seconds
+    known = np.flatnonzero(np.isfinite(out))
+    back = np.diff(out[known], prepend=out[known[0]]) < -43200.0
+    out[known] += 86400.0 * np.cumsum(back)
+    return np.round(out, 9)
+
+
+def _delimited_breaths(file: str, lines: list[str], encoding: str) -> Table:
+    """Breaths between lines BS and BE, flow and pressure a line, 50 times a second."""
+    rows: list[tuple[int, float, float, float]] = []
+    breath, begun, cut = 0, 0, 0
+    inside = False
+    for number, line in enumerate(lines, 1):
+        if re.match(r"\s*BS\b", line):
+            if inside:  # the breath before has no end
+                cut += 1
+                del rows[begun:]
+            breath, begun, inside = breath + 1, len(rows), True
+        elif re.match(r"\s*BE\b", line):
+            inside = False
+        elif inside:
+            try:
+                flow, pressure = (float(cell) for cell in line.strip(" ,").split(",")[:2])
+            except ValueError:
+                raise InputError(
+                    f"{file}, line {number}: flow and pressure are wanted between BS and BE, not "
+                    f"{line.strip()[:40]!r}"
+                ) from None
+            rows.append((number, flow, pressure, breath))
+    if inside:
+        cut += 1
+        del rows[begun:]
+    if not rows:
+        raise InputError(f"{file}: no breath stands between a line BS and a line BE")
+    numbers, flows, pressures, breaths = np.array(rows).T
+    notes = [
+        f"Text ({encoding}) with breaths between BS and BE (Puritan Bennett 840 and 980): flow in "
+        "L/min, pressure in cmH2O, 50 Hz."
+    ]
+    if cut:
+        notes.append(f"{cut} breaths without an end were left out.")
+    columns = {"flow": flows, "pressure": pressures, "breath": breaths}
+    units = {"flow": "L/min", "pressure": "cmH2O"}
+    return Table(file, columns, units, numbers.astype(np.int64), 50.0, tuple(notes))
+
+
+def _spreadsheet(file: str) -> Table:
+    import zipfile
+
+    import pandas as pd
+
+    try:
+        with zipfile.ZipFile(file) as archive:
+            if "xl/workbook.xml" not in archive.namelist():
+                raise InputError(f"{file} is a zip archive; unpack it and name the file in it")
+        frame = pd.read_excel(file, header=None, dtype=object)
+    except zipfile.BadZipFile as error:
+        raise InputError(f"{file} cannot be unpacked ({error}); copy it again") from None
+    except ImportError:
+        raise InputError(
+            f"{file} is a spreadsheet: `pip install openpyxl`, or save it as CSV"
+        ) from None
+    cells = frame.astype(str).mask(frame.isna(), "").to_numpy(str)
+    rows = [(k + 1, list(row)) for k, row in enumerate(cells.tolist()) if any(row)]
+    return _table(file, rows, ".", "First sheet of a spreadsheet")
 
 
 def _parquet(file: str) -> Table:
@@ -279,14 +474,14 @@ def _parquet(file: str) -> Table:
             units[name] = unit
     if not columns or len(frame) == 0:
         raise InputError(f"{file} holds no rows")
-    return Table(file, columns, units, None, {}, ("Parquet.",))
+    return Table(file, columns, units, None, None, ("Parquet.",))
 
 
 def _matlab(file: str) -> Table:
     from scipy.io import loadmat
 
     try:
-        content = loadmat(file, squeeze_me=True, struct_as_record=True)
+        content = loadmat(file, simplify_cells=True)
     except (ValueError, NotImplementedError, OSError, TypeError) as error:
         raise InputError(f"{file} cannot be read as a MATLAB file ({error})") from None
     flat: dict[str, NDArray[Any]] = {}
@@ -315,144 +510,32 @@ def _matlab(file: str) -> Table:
     notes = [f"MATLAB file with {len(columns)} columns of {length} rows."]
     if others:
         notes.append(f"Columns of other lengths were left out ({', '.join(others[:5])}).")
-    return Table(file, columns, {}, None, scalars, tuple(notes))
+    named = {re.sub(r"[^a-z]", "", n.rpartition(".")[2].lower()): v for n, v in scalars.items()}
+    rate = next((named[name] for name in _RATES if named.get(name, 0.0) > 0.0), None)
+    return Table(file, columns, {}, None, rate, tuple(notes))
 
 
 def _flatten(
     name: str, value: Any, flat: dict[str, NDArray[Any]], scalars: dict[str, float]
 ) -> None:
     """Collect the columns and single numbers of a MATLAB variable."""
-    array = np.asarray(value)
-    if array.dtype.names:  # a struct, or an array of records
-        for key in array.dtype.names:
-            inner = array[key]
-            if inner.dtype == object and inner.ndim == 0:
-                _flatten(f"{name}.{key}", inner.item(), flat, scalars)
-            elif inner.dtype == object:
-                try:
-                    _flatten(f"{name}.{key}", np.array([float(x) for x in inner]), flat, scalars)
-                except (TypeError, ValueError):
-                    continue
-            else:
-                _flatten(f"{name}.{key}", inner, flat, scalars)
-    elif array.dtype.kind in "iufb":
-        if array.ndim == 0:
-            scalars[name] = float(array)
-        elif array.ndim == 1 and len(array) > 1:
-            flat[name] = array.astype(float)
-        elif array.ndim == 2:
-            rows = array if array.shape[0] >= array.shape[1] else array.T
-            for k in range(rows.shape[1]):
-                flat[f"{name}.{k + 1}"] = rows[:, k].astype(float)
-
-
-#: Pascal in a centimetre of water (conventional, at 4 degrees Celsius) and of other units.
-_PASCAL = {
-    "cmH2O": Fraction("98.0665"),
-    "mbar": Fraction(100),
-    "hPa": Fraction(100),
-    "kPa": Fraction(1000),
-    "Pa": Fraction(1),
-    "mmHg": Fraction("133.322387415"),
-    "psi": Fraction("6894.757293168"),
-}
-
-#: Factors to the schema's unit, which is the first of each role.
-UNITS: dict[str, dict[str, Fraction]] = {
-    "pressure": {name: value / _PASCAL["cmH2O"] for name, value in _PASCAL.items()},
-    "flow": {
-        "mL/s": Fraction(1),
-        "L/s": Fraction(1000),
-        "L/min": Fraction(50, 3),
-        "mL/min": Fraction(1, 60),
-        "L/h": Fraction(5, 18),
-    },
-    "volume": {"mL": Fraction(1), "L": Fraction(1000)},
-    "time": {
-        "s": Fraction(1),
-        "ms": Fraction(1, 1000),
-        "us": Fraction(1, 1_000_000),
-        "min": Fraction(60),
-    },
-    "u_in": {"%": Fraction(1), "1": Fraction(100)},
-}
-
-_SPELLINGS = {
-    "lpm": "L/min", "slpm": "L/min", "l/min": "L/min", "lps": "L/s", "l/s": "L/s", "ml/s": "mL/s",
-    "ml/min": "mL/min", "cmh2o": "cmH2O", "cm h2o": "cmH2O", "cmh20": "cmH2O", "ml": "mL",
-    "l": "L", "sec": "s", "seconds": "s", "msec": "ms", "µs": "us", "percent": "%", "0..1": "1",
-    "0-1": "1", "hpa": "hPa", "kpa": "kPa", "pa": "Pa", "mmhg": "mmHg", "l/h": "L/h",
-}  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Conversion:
-    """An exact change of units.
-
-    Attributes:
-        unit: unit in the file.
-        to: unit of the schema.
-        factor: one ``unit`` in ``to``; its reciprocal is the exact way back.
-    """
-
-    unit: str
-    to: str
-    factor: Fraction
-
-    def apply(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert; one rounding to the nearest number at most for each of two integers."""
-        return _times(values, self.factor)
-
-    def invert(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert back to the unit of the file."""
-        return _times(values, 1 / self.factor)
-
-    def __str__(self) -> str:
-        """The change in words, with the way back."""
-        if self.factor == 1:
-            return self.to
-        return f"{self.unit} -> {self.to}, x {_in_words(self.factor)} (back: x {_in_words(1 / self.factor)})"  # noqa: E501
-
-
-def conversion(role: str, unit: str | None) -> Conversion:
-    """Return the change from a unit to the schema's.
-
-    Args:
-        role: ``pressure``, ``flow``, ``volume``, ``time`` or ``u_in``.
-        unit: unit in the file; that of the schema if None.
-
-    Raises:
-        InputError: if the role has no such unit.
-    """
-    known = UNITS[role]
-    to = next(iter(known))
-    name = to if unit is None else spelled(unit)
-    if name not in known:
-        raise InputError(
-            f"{unit!r} is no unit of {role} that is known; choose one of {', '.join(known)}"
-        )
-    return Conversion(name, to, known[name])
-
-
-def spelled(unit: str) -> str:
-    """Return the usual spelling of a unit."""
-    plain = re.sub(r"\s+", " ", unit.strip().strip("[]()")).strip()
-    return _SPELLINGS.get(plain.lower(), plain)
-
-
-def unit_of(header: str) -> tuple[str, str | None]:
-    """Split a header such as ``Flow [L/min]`` into its name and its unit, if it has one."""
-    match = re.fullmatch(r"\s*(.*?)\s*[\[(]([^\])]*)[\])]\s*", header)
-    if match is None or not match[1]:
-        return header.strip(), None
-    return match[1], spelled(match[2])
-
-
-def _times(values: NDArray[np.float64], factor: Fraction) -> NDArray[np.float64]:
-    return np.asarray(values, float) * factor.numerator / factor.denominator
-
-
-def _in_words(factor: Fraction) -> str:
-    if factor.denominator == 1 or factor.numerator == 1 or factor.denominator < 1000:
-        return str(factor)
-    return f"{float(factor):.10g}"
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _flatten(f"{name}.{key}", inner, flat, scalars)
+        return
+    if isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
+        for key in value[0]:  # an array of records
+            _flatten(f"{name}.{key}", [row.get(key) for row in value], flat, scalars)
+        return
+    try:
+        array = np.squeeze(np.asarray(value, float))
+    except (TypeError, ValueError):
+        return
+    if array.ndim == 0:
+        scalars[name] = float(array)
+    elif array.ndim == 1 and len(array) > 1:
+        flat[name] = array
+    elif array.ndim == 2:
+        rows = array if array.shape[0] >= array.shape[1] else array.T
+        for k in range(rows.shape[1]):
+            flat[f"{name}.{k + 1}"] = rows[:, k]

@@ -1,0 +1,402 @@
+"""Whether columns are what they are called: roles against the physics of a ventilated lung.
+
+Every figure is one number a breath, so that a file of any size is judged block by block. The sign
+of the flow needs no valve: over whole breaths a ventilator does work on a passive lung, so that
+pressure and flow correlate; where they do the opposite, flow is counted from the patient.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.errors import InputError
+from ventbench.recordings.breaths import Breaths
+
+Floats = NDArray[np.float64]
+
+SLOW = 0.5
+"""Median sampling interval, s, above which times are not in seconds."""
+
+#: Usual sampling intervals, s; shares of inspiration; PEEP and PIP, cmH2O.
+_INTERVALS, _INSPIRATION, _PEEP, _PIP = (0.001, 0.05), (0.1, 0.7), (-3.0, 30.0), (5.0, 80.0)
+
+#: Share of the breaths that must agree on a role that looks wrong.
+_MOST = 0.8
+
+#: Least range of pressure in a breath, cmH2O: below the first there is nothing to identify.
+_FLAT, _MOVES = 0.02, 1.0
+
+#: Correlation of flow and pressure below which the sign of the flow is the opposite.
+_OPPOSITE = -0.25
+
+#: Share of a breath that is its end, and of its range of pressure above which it ends at its peak.
+_END, _PEAK = 0.1, 0.6
+
+#: Saturation: fewest readings and share of them at the level, times as many as at the next level,
+#: and largest step from it as a share of the range (a square wave leaves its top by a larger one).
+_READINGS, _SHARE, _TIMES, _STEP = 10, 0.004, 3.0, 0.15
+
+#: Breaths that a diagnosis and a simulator of one's own need at least.
+_DIAGNOSIS, _TRAINING = 4, 10
+
+#: Agreement of R and C with an exchanged label, as a ratio, and largest agreement with the label.
+_EXCHANGED, _HELD = 1.35, 1.6
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something about a column that no ventilator and no lung does.
+
+    Attributes:
+        column: name in the schema.
+        what: a phrase without a full stop.
+        advice: a sentence that names the option that mends it.
+        level: ``refused`` where nothing can be done with the recording, else ``suspicious``.
+        value: the figure that shows it.
+    """
+
+    column: str
+    what: str
+    advice: str
+    level: str = "suspicious"
+    value: float = float("nan")
+
+    def __str__(self) -> str:
+        """The finding in one line."""
+        return f"{self.what}. {self.advice}"
+
+
+@dataclass(frozen=True)
+class Saturation:
+    """A level at which the readings of a sensor end.
+
+    Attributes:
+        column: ``pressure`` or ``flow``.
+        level: the level, in the unit of the schema.
+        upper: whether readings end above it, else below it.
+        count: readings at the level.
+        share: share of all readings of the column.
+    """
+
+    column: str
+    level: float
+    upper: bool
+    count: int
+    share: float
+
+    def __str__(self) -> str:
+        """The saturation as a phrase."""
+        unit = {"pressure": "cmH2O", "flow": "mL/s"}[self.column]
+        what = "readings of pressure saturate" if self.column == "pressure" else "flow is clipped"
+        return f"{what} at {self.level:.4g} {unit} in {100 * self.share:.2g} % of the samples"
+
+
+def breath_figures(
+    time: Floats, samples: Mapping[str, np.ndarray], starts: NDArray[np.int64]
+) -> dict[str, Floats]:
+    """Reduce breaths to the numbers that :func:`findings` and :func:`saturations` judge.
+
+    Args:
+        time: s, NaN where unknown, ``(m,)``.
+        samples: ``pressure`` (cmH2O), ``u_in`` (%), ``u_out`` and perhaps ``flow`` (mL/s), NaN
+            where blank, ``(m,)`` each.
+        starts: first sample of each breath, ``(k,)``.
+
+    Returns:
+        Figures by name, ``(k,)`` each.
+    """
+    lengths = np.diff(starts, append=len(time))
+    breath = np.repeat(np.arange(len(starts)), lengths)
+    left = (starts + lengths)[breath] - np.arange(len(time))  # samples to the end of the breath
+    pressure, u_in = samples["pressure"], np.nan_to_num(samples["u_in"])
+    inside = samples["u_out"] == 0
+
+    def mean(values: Floats, where: NDArray[np.bool_]) -> Floats:
+        where = where & np.isfinite(values)
+        count = np.add.reduceat(where.astype(float), starts)
+        return _ratio(np.add.reduceat(np.where(where, values, 0.0), starts), count)
+
+    out = {
+        "inspiration": np.add.reduceat(inside.astype(float), starts) / lengths,
+        "end": mean(pressure, left <= _END * lengths[breath]),
+        "inside": mean(pressure, inside),
+        "outside": mean(pressure, ~inside),
+        "u_in_inside": mean(u_in, inside),
+        "u_in_outside": mean(u_in, ~inside),
+        "u_in": np.maximum.reduceat(u_in, starts),
+    }
+    for name in ("pressure", "flow"):
+        if name in samples:
+            for side, sign in (("high", 1.0), ("low", -1.0)):
+                for key, values in _ends(sign * samples[name], starts, breath).items():
+                    out[f"{name}_{side}{key}"] = values
+            out[f"{name}_count"] = np.add.reduceat(np.isfinite(samples[name]) * 1.0, starts)
+    if "flow" in samples:
+        out |= _regression(time, pressure, samples["flow"], starts, breath)
+    return out
+
+
+def _ends(
+    values: Floats, starts: NDArray[np.int64], breath: NDArray[np.int64]
+) -> dict[str, Floats]:
+    """Largest value of each breath, how often, the next one, how often, and the step to the top."""
+    with np.errstate(invalid="ignore"):
+        top = np.fmax.reduceat(values, starts)
+        at = values == top[breath]
+        below = np.where(at, np.nan, values)
+        second = np.fmax.reduceat(below, starts)
+        next_to_it = values == second[breath]
+        steps = np.full(len(values), np.nan)
+        edge = (at[1:] != at[:-1]) & (breath[1:] == breath[:-1])
+        steps[1:][edge] = np.abs(values[1:] - values[:-1])[edge]
+        step = np.fmin.reduceat(steps, starts)
+    return {
+        "": top,
+        "_often": np.add.reduceat(at * 1.0, starts),
+        "_next": np.add.reduceat(next_to_it * 1.0, starts),
+        "_step": step,
+    }
+
+
+def _regression(
+    time: Floats, pressure: Floats, flow: Floats, starts: NDArray[np.int64],
+    breath: NDArray[np.int64],
+) -> dict[str, Floats]:  # fmt: skip
+    """Correlation of pressure and flow, and the cross products of p = R Q + V / C + p0."""
+    known = np.isfinite(pressure) & np.isfinite(flow) & np.isfinite(time)
+    q = np.where(known, flow, 0.0)
+    same = np.diff(breath, prepend=-1) == 0
+    dt = np.where(same, np.nan_to_num(np.diff(time, prepend=time[:1])), 0.0)
+    volume = np.cumsum(0.5 * dt * (q + np.roll(q, 1)))
+    volume -= volume[starts][breath]
+    columns = {"q": q, "v": volume, "1": np.ones(len(q)), "p": np.where(known, pressure, 0.0)}
+    sums = {
+        a + b: np.add.reduceat(columns[a] * columns[b] * known, starts)
+        for a, b in ("qq", "qv", "q1", "vv", "v1", "11", "qp", "vp", "1p", "pp")
+    }
+    n = np.maximum(sums["11"], 1.0)
+    covariance = sums["qp"] / n - sums["q1"] * sums["1p"] / n**2
+    variances = (sums["qq"] / n - (sums["q1"] / n) ** 2) * (sums["pp"] / n - (sums["1p"] / n) ** 2)
+    sums["correlation"] = _ratio(covariance, np.sqrt(np.maximum(variances, 0.0)))
+    return sums
+
+
+def _ratio(a: Floats, b: Floats) -> Floats:
+    """Quotient, NaN where b is 0."""
+    return np.where(b > 0, a / np.where(b > 0, b, 1.0), np.nan)
+
+
+def saturations(figures: Mapping[str, Floats]) -> tuple[Saturation, ...]:
+    """Levels at which sensors end: reached again and again, exactly, and left by small steps.
+
+    Args:
+        figures: of all breaths, from :func:`breath_figures`.
+    """
+    found = []
+    for name in ("pressure", "flow"):
+        if not np.isfinite(figures.get(f"{name}_high", np.zeros(0))).any():
+            continue
+        span = np.nanmax(figures[f"{name}_high"]) + np.nanmax(figures[f"{name}_low"])
+        total = figures[f"{name}_count"].sum()
+        for side in ("high", "low"):
+            tops = figures[f"{name}_{side}"]
+            level = np.nanmax(tops)
+            at = tops == level
+            count, after = (figures[f"{name}_{side}_{k}"][at].sum() for k in ("often", "next"))
+            steps = figures[f"{name}_{side}_step"][at]
+            small = np.isfinite(steps).any() and np.nanmedian(steps) < _STEP * span
+            enough = count >= max(_READINGS, _SHARE * total) and count >= 2 * at.sum()
+            if span > _FLAT and small and enough and count >= _TIMES * after:
+                signed = float(level if side == "high" else -level)
+                found.append(
+                    Saturation(name, signed, side == "high", int(count), float(count / total))
+                )
+    return tuple(found)
+
+
+def findings(
+    figures: Mapping[str, Floats], interval: Floats, R: Floats, C: Floats
+) -> tuple[Finding, ...]:
+    """What about the roles of columns contradicts physics, the worst first.
+
+    Args:
+        figures: of all breaths, from :func:`breath_figures`.
+        interval: mean sampling interval of each breath, s, NaN if unknown, ``(k,)``.
+        R: labelled resistance, cmH2O/(L/s), ``(k,)``.
+        C: labelled compliance, mL/cmH2O, ``(k,)``.
+    """
+    found: list[Finding] = []
+    low, high = -figures["pressure_low"], figures["pressure_high"]
+    if not np.isfinite(high).any():
+        return ()
+    spans = high - low
+    moves = spans > _MOVES
+    if np.nanmax(spans) < _FLAT:
+        what = f"pressure stays at {np.nanmedian(high):.4g} cmH2O, so there is nothing to identify"
+        advice = "Say which column is the pressure with --map NAME=pressure."
+        return (Finding("pressure", what, advice, "refused", float(np.nanmedian(high))),)
+    found += _times(interval)
+    if _agree(figures.get("correlation", np.zeros(0)), _OPPOSITE):
+        what = "flow goes out while pressure is high, so it is counted from the patient"
+        found.append(Finding("flow", what, "Pass --invert flow to `ventbench data import`.",
+                             "refused", float(np.nanmedian(figures["correlation"]))))  # fmt: skip
+    inverted = _agree((figures["inside"] - figures["outside"])[moves], 0.0)
+    if inverted and not any(f.column == "flow" for f in found):
+        what = "pressure is higher while u_out is 1 than while it is 0, so 0 and 1 are exchanged"
+        advice = "Pass --invert u_out to `ventbench data import`."
+        found.append(Finding("u_out", what, advice))
+    elif not inverted:
+        found += _commands(figures)
+        found += _phases(figures, low, spans, moves)
+    found += _pressures(float(np.nanmedian(low)), float(np.nanmedian(high)))
+    found += [
+        Finding(s.column, str(s), "What lies beyond the sensor is unknown: widen its range, or "
+                "judge the other samples only.", value=s.level)
+        for s in saturations(figures)
+    ]  # fmt: skip
+    if not any(f.level == "refused" for f in found):
+        found += _labels(figures, R, C)
+    return tuple(sorted(found, key=lambda f: f.level))  # what is refused comes first
+
+
+def few_breaths(count: int) -> str | None:
+    """What fewer breaths than everything needs can still be used for; None if they are enough."""
+    if not 0 < count < _TRAINING:
+        return None
+    use = "`ventbench open-loop` and, with flow, `ventbench mechanics`"
+    need = f"`train simulator` needs {_TRAINING}"
+    if count >= _DIAGNOSIS:
+        use = f"`ventbench diagnose`, {use}"
+    else:
+        need += f", `diagnose` {_DIAGNOSIS} of a lung"
+    return f"{count} breath{'s' if count > 1 else ''}: enough for {use} only; {need}."
+
+
+def _agree(values: Floats, limit: float) -> bool:
+    """Whether nearly all of the known values are below a limit."""
+    known = values[np.isfinite(values)]
+    return len(known) > 0 and bool((known < limit).mean() >= _MOST)
+
+
+def _times(interval: Floats) -> list[Finding]:
+    if not np.isfinite(interval).any():
+        return []
+    median = float(np.nanmedian(interval))
+    if _INTERVALS[0] * 0.99 <= median <= _INTERVALS[1] * 1.01:
+        return []
+    what = f"the median sampling interval is {median:g} s"
+    unit = "ms" if median > _INTERVALS[1] else "min"
+    advice = f"Rates are 20 to 1000 Hz: pass --time-unit {unit} (or --rate) to "
+    level = "refused" if median > SLOW else "suspicious"
+    return [Finding("time_step", what, f"{advice}`ventbench data import`.", level, median)]
+
+
+def _commands(figures: Mapping[str, Floats]) -> list[Finding]:
+    largest = float(figures["u_in"].max())
+    if 0.0 < largest <= 1.0:
+        what = f"u_in is {largest:.3g} % at most, so it looks like 0 to 1"
+        return [Finding("u_in", what, "Pass --u-in-unit 1 to `ventbench data import`.",
+                        value=largest)]  # fmt: skip
+    inside, outside = figures["u_in_inside"], figures["u_in_outside"]
+    if largest > 0.0 and _agree(inside - outside, 0.0):
+        what = "u_in is larger while the expiratory valve is open than in inspiration"
+        advice = "Say which column is the inspiratory valve with --map NAME=u_in, or pass "
+        return [Finding("u_in", what, f"{advice}--invert u_in if 100 % is shut.")]
+    return []
+
+
+def _phases(
+    figures: Mapping[str, Floats], low: Floats, spans: Floats, moves: NDArray[np.bool_]
+) -> list[Finding]:
+    share = float(np.nanmedian(figures["inspiration"]))
+    height = _ratio(figures["end"] - low, spans)[moves]
+    if _agree(-height, -_PEAK):
+        what = "breaths end at their highest pressure, so their number changes at expiration"
+        return [Finding("breath_id", what, "Pass --split-breaths to `ventbench data import`.")]
+    if _INSPIRATION[0] <= share <= _INSPIRATION[1]:
+        return []
+    what = f"inspiration (u_out = 0) is {100 * share:.3g} % of a breath; 10 to 70 % are usual"
+    advice = "Pass --split-breaths, or say which column is the valve with --map NAME=u_out."
+    return [Finding("u_out", what, advice, value=share)]
+
+
+def _pressures(peep: float, pip: float) -> list[Finding]:
+    if _PEEP[0] <= peep <= _PEEP[1] and _PIP[0] <= pip <= _PIP[1]:
+        return []
+    what = f"PEEP {peep:.2g} and PIP {pip:.3g} cmH2O (medians) are no ventilator's"
+    unit = "kPa" if pip < _PIP[0] else "Pa"
+    advice = f"If the unit is another one, pass such as --pressure-unit {unit} to "
+    return [Finding("pressure", what, f"{advice}`ventbench data import`.", value=pip)]
+
+
+def _labels(figures: Mapping[str, Floats], R: Floats, C: Floats) -> list[Finding]:
+    """Labels whose R and C are exchanged, by a regression of pressure on flow and volume."""
+    found = []
+    pairs = np.unique(np.stack([R, C], axis=1), axis=0) if "qq" in figures else []
+    for labelled_R, labelled_C in pairs:
+        own = (labelled_R == R) & (labelled_C == C)
+        s = {k: float(figures[k][own].sum()) for k in
+             ("qq", "qv", "q1", "vv", "v1", "11", "qp", "vp", "1p")}  # fmt: skip
+        A = np.array([[s["qq"], s["qv"], s["q1"]], [s["qv"], s["vv"], s["v1"]],
+                      [s["q1"], s["v1"], s["11"]]])  # fmt: skip
+        if s["qq"] == 0.0 or np.linalg.matrix_rank(A) < 3:
+            continue
+        r, e, _ = np.linalg.solve(A, np.array([s["qp"], s["vp"], s["1p"]]))
+        if r <= 0.0 or e <= 0.0:
+            continue
+        fit = np.log([1000.0 * r, 1.0 / e])
+        label, swapped = np.log([labelled_R, labelled_C]), np.log([labelled_C, labelled_R])
+        if np.abs(fit - swapped).max() < np.log(_EXCHANGED) and np.abs(fit - label).max() > np.log(
+            _HELD
+        ):
+            what = (
+                f"R and C look exchanged: the label is R{labelled_R:g}C{labelled_C:g}, pressure "
+                f"and flow ask for R {1000.0 * r:.3g} and C {1.0 / e:.3g}"
+            )
+            advice = f"Pass --lung R{labelled_C:g}C{labelled_R:g} to `ventbench data import`."
+            found.append(Finding("R", what, advice, value=float(labelled_R)))
+    return found
+
+
+def opposite_sign(pressure: Floats, flow: Floats) -> bool:
+    """Whether flow is counted from the patient, by whole breaths of both, ``(m,)`` each."""
+    known = np.isfinite(pressure) & np.isfinite(flow)
+    if known.sum() < 3 or np.ptp(pressure[known]) < _FLAT or np.ptp(flow[known]) == 0.0:
+        return False
+    return bool(np.corrcoef(pressure[known], flow[known])[0, 1] < _OPPOSITE)
+
+
+def check_roles(breaths: Breaths) -> tuple[Finding, ...]:
+    """Check the roles of columns of breaths in memory; see :func:`findings`."""
+    lengths = breaths.valid.sum(axis=1)
+    last = breaths.time[np.arange(len(breaths)), lengths - 1]
+    return findings(_figures_of(breaths), last / np.maximum(lengths - 1, 1), breaths.R, breaths.C)
+
+
+def find_saturation(breaths: Breaths) -> tuple[Saturation, ...]:
+    """Find the levels at which sensors of a recording end; see :class:`Saturation`."""
+    return saturations(_figures_of(breaths))
+
+
+def require_roles(breaths: Breaths) -> None:
+    """Refuse breaths whose columns are not what they are called.
+
+    Raises:
+        InputError: with what is wrong and the option that mends it.
+    """
+    refused = [f for f in check_roles(breaths) if f.level == "refused"]
+    if refused:
+        raise InputError("\n".join(f"column {f.column}: {f}" for f in refused))
+
+
+def _figures_of(breaths: Breaths) -> dict[str, Floats]:
+    names = ("pressure", "u_in", "u_out", "flow")
+    arrays = {name: getattr(breaths, name) for name in names}
+    lengths = breaths.valid.sum(axis=1)
+    flat = {name: a[breaths.valid] for name, a in arrays.items() if a is not None}
+    starts = (np.cumsum(lengths) - lengths).astype(np.int64)
+    return breath_figures(breaths.time[breaths.valid], flat, starts)

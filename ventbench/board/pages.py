@@ -167,7 +167,7 @@ def hardware_shown(row: HardwareRow) -> dict[str, Any]:
     """A hardware record for the templates."""
     record, header = row.record, row.record.header
     kind = "emulator" if record.emulated else header.device.name
-    spread = "" if math.isnan(record.spread) else f" ± {figure(record.spread)}"
+    spread = "" if math.isnan(record.spread) else f" (SD {figure(record.spread)})"
     return {
         "name": record.name,
         "sha256": record.sha256,

@@ -15,7 +15,15 @@ from typer.testing import CliRunner
 from ventbench.cli.data import app
 from ventbench.errors import InputError
 from ventbench.mechanics import identify
-from ventbench.recordings import check, check_roles, find_saturation, load, make_breaths, write
+from ventbench.recordings import (
+    check,
+    check_roles,
+    find_saturation,
+    load,
+    make_breaths,
+    require_roles,
+    write,
+)
 from ventbench.recordings.foreign import import_recording
 
 R, C, PEEP, RATE, PERIOD = 12.0, 40.0, 5.0, 100.0, 3.0
@@ -313,10 +321,12 @@ def test_saturation_is_the_share_of_samples():
     assert find_saturation(square) == ()  # a constant flow is no clipped one
 
 
-def test_reversed_flow_is_refused_everywhere(tmp_path):
+def test_reversed_flow_is_said_everywhere(tmp_path):
     reversed_flow = recording(flow=-FLOW)
     with pytest.raises(InputError, match="--invert flow"):
-        identify(reversed_flow)
+        require_roles(reversed_flow)
+    (lung_found,) = identify(reversed_flow)
+    assert "--invert flow" in " ".join(lung_found.notes)
     write(reversed_flow, tmp_path / "a.csv")
     assert not check(tmp_path / "a.csv").ok
     with pytest.raises(InputError, match="--invert flow"):

@@ -325,7 +325,7 @@ def test_reversed_flow_is_said_everywhere(tmp_path):
     reversed_flow = recording(flow=-FLOW)
     with pytest.raises(InputError, match="--invert flow"):
         require_roles(reversed_flow)
-    (lung_found,) = identify(reversed_flow)
+    (lung_found,) = identify(reversed_flow.select([0, 1]))
     assert "--invert flow" in " ".join(lung_found.notes)
     write(reversed_flow, tmp_path / "a.csv")
     assert not check(tmp_path / "a.csv").ok
@@ -343,12 +343,12 @@ HEADERS = {"time": ["Time", "t", "Zeit", "time_step"], "flow": ["Flow", "flow", 
            "pressure": ["Paw", "Pressure", "P_aw", "airway pressure"]}  # fmt: skip
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
+@pytest.mark.parametrize("separator", [",", ";", "\t", "|"])
+@settings(max_examples=8, deadline=None, derandomize=True)
 @given(data=st.data())
-def test_the_same_breaths_come_out(tmp_path_factory, data):
+def test_the_same_breaths_come_out(tmp_path_factory, separator, data):
     """Any separator, decimal mark, header, unit, order, encoding and line end."""
     made = lung(3.5)
-    separator = data.draw(st.sampled_from([",", ";", "\t", "|"]), "separator")
     decimal = data.draw(st.sampled_from([".", ","] if separator != "," else ["."]), "decimal")
     names, columns = [], []
     for role in data.draw(st.permutations(["time", "pressure", "flow"]), "order"):

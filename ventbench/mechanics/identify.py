@@ -41,7 +41,7 @@ from ventbench.mechanics.term_selection import (
     select_terms,
 )
 from ventbench.recordings.breaths import Breaths
-from ventbench.recordings.roles import check_roles, require_roles
+from ventbench.recordings.roles import check_roles
 from ventbench.system_id.fit import t_quantile
 
 Floats = NDArray[np.float64]
@@ -134,10 +134,8 @@ def identify(
             lungs that are identified, and a share of those of the lung under way.
 
     Raises:
-        InputError: if neither is recorded, too little of a lung to tell R from C, or the flow is
-            counted from the patient.
+        InputError: if neither is recorded, or too little of a lung to tell R from C.
     """
-    require_roles(breaths)
     lungs, done = [], 0
     for name, part in breaths.by_lung().items():
 

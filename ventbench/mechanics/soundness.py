@@ -13,6 +13,7 @@ import numpy as np
 
 from ventbench.mechanics.labels import Estimate
 from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.roles import find_saturation
 
 #: Compliances, mL/cmH2O, and resistances, cmH2O/(L/s), that lungs and test lungs have, with room
 #: for errors: from a neonate's lung to a large patient's.
@@ -55,6 +56,9 @@ def problem_with(breaths: Breaths, resistance: Estimate, compliance: Estimate) -
 def _symptom(breaths: Breaths) -> str:
     """What is wrong with flow or volume, in words."""
     what = "flow" if breaths.flow is not None else "volume"
+    for saturation in find_saturation(breaths):
+        if saturation.column == what:
+            return str(saturation)
     into, out, together = [], [], []
     for i in range(len(breaths)):
         known = breaths.valid[i] & np.isfinite(breaths.pressure[i])

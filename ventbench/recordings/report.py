@@ -82,9 +82,6 @@ class RecordingReport:
     def notes(self) -> tuple[str, ...]:
         """What was inferred, changed or ignored, a sentence each."""
         notes = [str(problem) for problem in self.suspicious]
-        few = few_breaths(self.breaths)
-        if few is not None:
-            notes.append(few)
         if self.time_inferred:
             listed = [f"breath {i}: {1e3 * dt:.1f} ms" for i, dt in self.time_inferred.items()]
             more = f" and {len(listed) - 10} more" if len(listed) > 10 else ""
@@ -103,7 +100,8 @@ class RecordingReport:
         notes += [str(warning) for warning in self.warnings]
         if self.warning_count > len(self.warnings):
             notes.append(f"... and {self.warning_count - len(self.warnings)} more warnings.")
-        return tuple(notes)
+        few = few_breaths(self.breaths)
+        return (*notes, few) if few is not None else tuple(notes)
 
     def lines(self) -> list[str]:
         """The report as lines of text."""

@@ -447,9 +447,10 @@ def _sound(
         wrong = np.flatnonzero(low | (own > column.high) | (np.isnan(own) & (not column.blank)))
         if len(wrong):
             problems.append(
-                f"{table.file}, column {by_role.get(name, name)}: {len(wrong)} of {len(own)} values "
-                f"are outside {column.span}, the first in {table.place(int(rows[wrong[0]]))} "
-                f"({own[wrong[0]]:g}). Check the unit (such as --flow-unit L/min) and the map."
+                f"{table.file}, column {by_role.get(name, name)}: {len(wrong)} of {len(own)} "
+                f"values are outside {column.span}, the first in "
+                f"{table.place(int(rows[wrong[0]]))} ({own[wrong[0]]:g}). Check the unit (such as "
+                "--flow-unit L/min) and the map."
             )
         for at in wrong[np.unique(owner[wrong], return_index=True)[1]]:
             bad.setdefault(int(owner[at]), f"{name} is {own[at]:g}")

@@ -183,6 +183,8 @@ def _dialect(
             if mark == own and not quoted:
                 continue
             score = sum(sum(_is_value(cell, mark) for cell in c) / len(c) for c in split)
+            if own == " ":  # words of lines above are apart by blanks too
+                score *= 0.85
             # Between equals: "7,736" alone is a decimal comma, and integers have no mark.
             if mark == ",":
                 score += 1e-6 if any("," in cell for cells in split for cell in cells) else -1e-6

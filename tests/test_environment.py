@@ -37,7 +37,7 @@ def test_nominal_scenario():
 
 def test_start_of_a_breath(plant):
     bench = env.start_breath(plant, cell(start=6.0, peep=4.5))
-    np.testing.assert_array_equal(bench.pressure, 6.0)
+    np.testing.assert_array_equal(bench.signals.reading, 6.0)
     np.testing.assert_allclose(bench.previous, 5.0 * (1.0 - np.exp(-5.0 * (99 * 0.03 - 1.5))))
     np.testing.assert_array_equal(bench.plant.peep, 4.5)
 
@@ -80,14 +80,14 @@ def test_delay_mixes_with_the_command_before(plant):
     bench = replace(env.start_breath(plant, cells), previous=jnp.full(2, 20.0))
     after, _ = env.inspire(plant, cells, bench, jnp.full(2, 10.0))
     flow = 22.8e-3 * (0.7 * 10 + 0.3 * 20)
-    np.testing.assert_allclose(after.pressure, 5 + 5 * flow + flow * 0.03 / 0.02)
+    np.testing.assert_allclose(after.signals.reading, 5 + 5 * flow + flow * 0.03 / 0.02)
 
 
 def test_expiration_uses_the_hard_coded_controller(plant):
     cells = cell()
     after, u_in = env.expire(plant, cells, env.start_breath(plant, cells), 60)
     np.testing.assert_allclose(u_in, 5 * (1 - np.exp(-5 * 0.3)))
-    assert np.all(after.pressure > 5.0)
+    assert np.all(after.signals.reading > 5.0)
 
 
 def test_vary(plant):

@@ -85,7 +85,7 @@ def test_the_error_is_the_one_that_was_put_in(breaths):
 
 @pytest.mark.parametrize("kind", ["frozen", "hybrid", "physics"])
 def test_each_kind_is_what_it_says(simulators, breaths, kind):
-    kinds = {"physics": single_compartments}
+    kinds: dict[str, Any] = {"physics": single_compartments}
     error = open_loop_report.errors(kinds.get(kind, simulators.for_breaths), breaths)
     result = as_json(breaths, kind)
     assert result["plant"] == kind

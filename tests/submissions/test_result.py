@@ -33,9 +33,10 @@ class Pretender:
         pass
 
 
-def scored(plants, **options):
+def scored(plants, runner=None, **options):
     rigs = plants if isinstance(plants, Rigs) else Rigs(LUNGS, plants, about=frozen.load().about())
-    return run_protocol(open_submission("pid_robust"), rigs, **{"runner": Pretender()} | options)
+    runner = runner or Pretender()
+    return run_protocol(open_submission("pid_robust"), rigs, runner=runner, **options)
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -35,7 +35,7 @@ class Rigs:
     lungs: tuple[Lung, ...]
     plants: Plant
     sessions: tuple[tuple[int, ...], ...] | None = None
-    about: Mapping[str, Any] | None = None
+    about: Mapping[str, Any] = field(default_factory=dict)
     sha256: str | None = None
     held_out: tuple[int | None, ...] = ()
 

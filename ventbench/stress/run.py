@@ -145,8 +145,9 @@ def step_through(
         each = (np.asarray(getattr(part, name)) for part in parts)
         return np.stack([x.reshape(*shape, *x.shape[1:]) for x in each], axis=2)
 
-    names = ("pressure", "requested", "u_in", "volume")
-    return StressRun(*(joined(name) for name in names), failures)
+    return StressRun(
+        joined("pressure"), joined("requested"), joined("u_in"), joined("volume"), failures
+    )
 
 
 def _only(draws: StressDraws, draw: int) -> StressDraws:

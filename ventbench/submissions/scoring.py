@@ -123,7 +123,7 @@ def run_protocol(
         raise InputError(f"{draws} draws: there cannot be fewer than none")
     if pips == protocol.PIPS:
         about = None if drawn is None else drawn.about()
-        reference = reference_of(rigs.about or {}, about, reference)
+        reference = reference_of(rigs.about, about, reference)
     with precision.float64():
         plants, cells = rigs.cells(drawn, pips)
         plants = as_float64(plants, len(names))

@@ -78,8 +78,8 @@ def analytic(u_in: float, R: float, C: float, gain: float, draw: Any, noise: flo
         volume += flow * 0.03
     pressure = np.array(pressures) + draw.normal(0.0, noise, len(pressures))
     pressure = np.round(pressure / 0.0703) * 0.0703
-    time = 0.03 * np.arange(len(pressures))
-    return Driven(time, pressure, *([time] * 5), (), False, 0)
+    time = 0.03 * np.arange(len(pressures), dtype=float)
+    return Driven(time, pressure, time, time, time, time, time, (), False, 0)
 
 
 @pytest.mark.parametrize("noise", [0.1, 0.2, 0.3])
@@ -99,10 +99,10 @@ def test_the_sweep_knows_its_error_rates(noise: float) -> None:
 @pytest.mark.parametrize(("fall", "go"), [(0.0, True), (1.5, True), (5.0, False), (-5.0, False)])
 def test_the_leak_is_judged_by_its_error(fall: float, go: bool) -> None:
     draw, right = np.random.default_rng(1), 0
-    time = 0.03 * np.arange(selftest_module._FILL + selftest_module._WATCH)
+    time = 0.03 * np.arange(selftest_module._FILL + selftest_module._WATCH, dtype=float)
     for _ in range(200):
         pressure = 20.0 - fall * time + draw.normal(0.0, 0.3, len(time))
-        held = Driven(time, pressure, *([time] * 5), (), False, 0)
+        held = Driven(time, pressure, time, time, time, time, time, (), False, 0)
         right += selftest_module._closed(held, 0.3)[0].ok is go
     assert right >= 198
 

@@ -135,6 +135,7 @@ def interrupts(wanted: float) -> float:
 FAULTS = (
     Fault("sensor stuck", (FaultKind.SENSOR_STUCK, 1.0)),
     Fault("sensor noisy (3 cmH2O)", (FaultKind.SENSOR_NOISY, 3.0)),
+    Fault("sensor's bus blocked", (FaultKind.BUS_BLOCKED, 1.0)),
     Fault("sensor gives nothing", (FaultKind.SENSOR_LOST, 1.0)),
     Fault("sensor 25 cmH2O too high", (FaultKind.SENSOR_OFFSET, 25.0)),
     Fault("sensor 10 cmH2O too low", (FaultKind.SENSOR_OFFSET, -10.0)),

@@ -64,11 +64,14 @@ LIMITS: dict[str, Limit] = {
     ),
     "leak": Limit(
         -3.0, 3.0, "cmH2O/s",
-        "Fall of a closed lung at 20 cmH2O; tight benches show less than 1.5, with relaxation.",
+        "Fall of a closed lung filled towards 20 cmH2O; tight benches show less than 1.5, with "
+        "relaxation. Counts beyond 2.6 standard errors of the noise at rest.",
     ),
     "valve_sweep": Limit(
         1.0, 1.0, "of steps up",
-        "Each larger opening must give more pressure; else the valve sticks or is unplugged.",
+        "Each larger opening must give a quarter of the nominal valve's further rise at least, "
+        "within 2.6 standard errors of the noise at rest, and the largest one a rise beyond them; "
+        "else the valve sticks or is unplugged.",
     ),
     "valve_gain": Limit(
         0.4, 2.0, "of nominal",
@@ -299,6 +302,19 @@ _PROBES = ((15.0, 1.0, 2.0), (25.0, 1.0, 2.0), (15.0, 3.0, 1.0), (25.0, 0.3, 4.0
 _SWEEP = (5.0, 10.0, 20.0, 40.0)
 _PUFF = 3
 
+#: Steps at rest before a puff, with both valves closed after it, and of those that count.
+_LEAD, _STILL, _SETTLED = 10, 10, 7
+
+#: Least share of the nominal valve's rise.
+_LEAST_RISE = 0.25
+
+#: Standard errors beyond which a value counts: of a right lung one in 200 is.
+_SIGMAS = 2.6
+
+#: Rest before each part: time constants of the labelled lung behind valve and hose, whose
+#: resistance together may be this, cmH2O/(L/s); and its bounds, s.
+_TIME_CONSTANTS, _OUTLET, _REST = 5.0, 10.0, (3.0, 8.0)
+
 #: Pressure at which the closed lung is watched, cmH2O, and the steps of filling and of watching.
 _HELD, _FILL, _WATCH = 20.0, 25, 45
 
@@ -324,7 +340,9 @@ def selftest(bench: Bench, lung: str, *, simulator: Any = "frozen") -> Sheet:
         EmergencyStop: if the operator pressed the key.
         LinkError: if the device is lost.
     """
-    bench = replace(bench, rest=min(bench.rest, 3.0))
+    label = parse_lung(lung)
+    empties = _TIME_CONSTANTS * 1e-3 * label.C * (label.R + _OUTLET)
+    bench = replace(bench, rest=float(np.clip(empties, *_REST)))
     driven: list[Driven] = []
     repeated = 0
 
@@ -340,14 +358,13 @@ def selftest(bench: Bench, lung: str, *, simulator: Any = "frozen") -> Sheet:
         driven.append(done)
         return done
 
-    findings = _at_rest(run(lambda: lambda step, pressure: (0.0, 1), 34, 10.0))
+    findings, noise = _at_rest(run(lambda: lambda step, pressure: (0.0, 1), 34, 10.0))
     if not any(x.trips for x in driven):
-        findings += _closed(run(_fill_and_hold, _FILL + _WATCH, 30.0))
+        findings += _closed(run(_fill_and_hold, _FILL + _WATCH, 30.0), noise)
     if not any(x.trips for x in driven):
-        findings += _sweep(
-            [run(partial(_puff, u), _PUFF + 8, 30.0) for u in _SWEEP],
-            run(partial(_puff, 0.0), _PUFF + 8, 30.0),
-        )
+        steps = _LEAD + _PUFF + _STILL
+        puffs = [run(partial(_puff, u), steps, 30.0) for u in (0.0, *_SWEEP)]
+        findings += _sweep(puffs, noise, label.C)
     probes: list[Driven] = []
     for pip, P, I in _PROBES:  # noqa: E741 - the field's names
         if any(x.trips for x in driven):
@@ -382,16 +399,17 @@ def _finding(name: str, value: float, text: str) -> Finding:
     return Finding(name, value, bool(limit.low - 1e-12 <= value <= limit.high + 1e-12), text)
 
 
-def _at_rest(rest: Driven) -> list[Finding]:
+def _at_rest(rest: Driven) -> tuple[list[Finding], float]:
+    """Findings, and the standard deviation of the noise, cmH2O."""
     settled = rest.pressure[len(rest.pressure) // 2 :]
     if not settled.size or not np.isfinite(settled).all():
-        return [Finding("sensor_zero", math.nan, False, "the sensor gives no pressure")]
+        return [Finding("sensor_zero", math.nan, False, "the sensor gives no pressure")], 0.0
     noise = float(np.std(np.diff(settled)) / math.sqrt(2.0))
     mean = float(settled.mean())
     return [
         _finding("sensor_zero", mean, f"{mean:.2f} cmH2O at rest"),
         _finding("sensor_noise", noise, f"{noise:.2f} cmH2O of noise"),
-    ]
+    ], noise
 
 
 def _fill_and_hold() -> Commands:
@@ -407,30 +425,41 @@ def _fill_and_hold() -> Commands:
     return commands
 
 
-def _closed(held: Driven) -> list[Finding]:
+def _closed(held: Driven, noise: float) -> list[Finding]:
     watched = held.pressure[_FILL + 15 :]
     if len(watched) < 10:
         return [Finding("leak", math.nan, False, "the lung could not be filled")]
-    fall = -float(np.polyfit(held.time[_FILL + 15 :], watched, 1)[0])
-    return [
-        _finding(
-            "leak", fall, f"falls by {fall:.2f} cmH2O/s from {watched[0]:.1f} cmH2O when closed"
-        )
-    ]
+    time = held.time[_FILL + 15 :]
+    fall = -float(np.polyfit(time, watched, 1)[0])
+    error = noise / math.sqrt(float(np.sum((time - time.mean()) ** 2)))
+    told = (
+        f"falls by {fall:.2f} (SE {error:.2f}) cmH2O/s from {watched.max():.1f} cmH2O when closed"
+    )
+    beyond = abs(fall) - _SIGMAS * error > LIMITS["leak"].high
+    return [Finding("leak", fall, not beyond, told)]
 
 
 def _puff(u_in: float) -> Commands:
-    return lambda step, pressure: (u_in, 0) if step < _PUFF else (0.0, 0)
+    def commands(step: int, pressure: float) -> tuple[float, int]:
+        return (u_in if _LEAD <= step < _LEAD + _PUFF else 0.0), int(step < _LEAD)
+
+    return commands
 
 
-def _sweep(puffs: list[Driven], still: Driven) -> list[Finding]:
-    if not all(puff.pressure.size for puff in (*puffs, still)):
+def _sweep(puffs: list[Driven], noise: float, C: float) -> list[Finding]:
+    """Compare the rises of the puffs, of no opening and of :data:`_SWEEP`, with the noise."""
+    if not all(puff.pressure.size == _LEAD + _PUFF + _STILL for puff in puffs):
         return [Finding("valve_sweep", math.nan, False, "the sweep was stopped")]
-    rises = [float(puff.pressure[-1] - puff.pressure[0]) for puff in puffs]
-    base = float(still.pressure[-1] - still.pressure[0])
-    steps = np.diff([base, *rises]) > 0.0
-    text = ", ".join(f"{u:g} % {rise:+.2f}" for u, rise in zip(_SWEEP, rises, strict=True))
-    return [_finding("valve_sweep", float(np.mean(steps)), f"{text} cmH2O")]
+    rises = [
+        float(puff.pressure[-_SETTLED:].mean() - puff.pressure[1:_LEAD].mean()) for puff in puffs
+    ]
+    error = noise * math.sqrt(2.0 * (1.0 / _SETTLED + 1.0 / (_LEAD - 1)))  # of a difference of two
+    nominal = VALVE_GAIN * np.diff([0.0, *_SWEEP]) * _PUFF * protocol.DT / C
+    further = np.diff(rises) > _LEAST_RISE * nominal - _SIGMAS * error
+    opens = rises[-1] - rises[0] > _SIGMAS * error
+    text = ", ".join(f"{u:g} % {rise:+.2f}" for u, rise in zip(_SWEEP, rises[1:], strict=True))
+    share = float(np.mean([*further, opens]))
+    return [_finding("valve_sweep", share, f"{text} cmH2O (SE {error / math.sqrt(2.0):.2f})")]
 
 
 def _probe(pip: float, P: float, I: float) -> Commands:  # noqa: E741 - the field's names

@@ -6,11 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from hardware_eval.bench import selftest as selftest_module
 from hardware_eval.bench.collect import collect
 from hardware_eval.bench.loop import Bench, SilentOperator
-from hardware_eval.bench.selftest import LIMITS, selftest
+from hardware_eval.bench.selftest import LIMITS, Driven, selftest
 from hardware_eval.emulation.faults import LineFault, LineFaultKind
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import FaultKind, LungFault
@@ -59,6 +61,50 @@ def test_a_wrongly_set_lung_is_a_no_go_that_names_it(bench: Bench) -> None:
     sheet = selftest(bench, "R20C50", simulator="physics")
     assert not sheet.go
     assert any(f"is the lung set to {LUNG}?" in problem for problem in sheet.problems())
+
+
+#: Settings of a QuickLung, by analysis: no simulator of the library has seen them.
+SETTINGS = [(R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.0)]
+
+
+def analytic(u_in: float, R: float, C: float, gain: float, draw: Any, noise: float) -> Driven:
+    """A puff into a lung of R and C, seen by the converter of the PVP."""
+    volume, pressures = 0.0, []
+    commands = selftest_module._puff(u_in)
+    for step in range(selftest_module._LEAD + selftest_module._PUFF + selftest_module._STILL):
+        command, u_out = commands(step, 0.0)
+        flow = 0.0 if u_out else gain * 22.8 * command
+        pressures.append(5.0 + volume / C + R * flow / 1000.0)
+        volume += flow * 0.03
+    pressure = np.array(pressures) + draw.normal(0.0, noise, len(pressures))
+    pressure = np.round(pressure / 0.0703) * 0.0703
+    time = 0.03 * np.arange(len(pressures), dtype=float)
+    return Driven(time, pressure, time, time, time, time, time, (), False, 0)
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.2, 0.3])
+def test_the_sweep_knows_its_error_rates(noise: float) -> None:
+    draw, trials = np.random.default_rng(0), 100
+    for R, C in SETTINGS:
+        go = {"right": 0, "stuck": 0}
+        for kind, gain in (("right", 0.87), ("stuck", 0.0)):
+            for _ in range(trials):
+                puffs = [analytic(u, R, C, gain, draw, noise) for u in (0.0, 5.0, 10, 20, 40)]
+                measured = noise * (1.0 + draw.normal(0.0, 0.17))  # from 17 samples
+                go[kind] += selftest_module._sweep(puffs, measured, C)[0].ok
+        assert go["right"] >= trials - 4  # 1 % and its chance
+        assert go["stuck"] <= 0.05 * trials
+
+
+@pytest.mark.parametrize(("fall", "go"), [(0.0, True), (1.5, True), (5.0, False), (-5.0, False)])
+def test_the_leak_is_judged_by_its_error(fall: float, go: bool) -> None:
+    draw, right = np.random.default_rng(1), 0
+    time = 0.03 * np.arange(selftest_module._FILL + selftest_module._WATCH, dtype=float)
+    for _ in range(200):
+        pressure = 20.0 - fall * time + draw.normal(0.0, 0.3, len(time))
+        held = Driven(time, pressure, time, time, time, time, time, (), False, 0)
+        right += selftest_module._closed(held, 0.3)[0].ok is go
+    assert right >= 198
 
 
 FAULTS = {

@@ -44,7 +44,7 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         "word.csv": "u_in,u_out\n5,0\nopen,0\n",
         "over.csv": "u_in,u_out\n5,0\n140,0\n",
         "run/score.json": "{",
-        "board/chain.jsonl": '{"x":',
+        "board/attestations.toml": "keys = 3",
     }
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
@@ -93,7 +93,7 @@ CASES = {
     "view folder": "contains no scored run; make one with",
     "report run": "it is no .npz archive; score the submission again",
     "board show --folder folder": "holds no record; add one with",
-    "board show --folder board": "chain.jsonl",
+    "board show --folder board": "attestations.toml",
     "board records --folder nosuch": "nosuch",
     "board add noise.json --folder folder": "noise.json is not JSON: it is no text",
     "board add other.json --folder folder": "other.json",

@@ -181,7 +181,7 @@ def test_a_little_of_what_every_rig_has_is_compared_with_but_not_named():
     evaluator = small.split(small.made(turbulent, little, base=rig, noise=0.1, seed=3))
     selected, _ = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
     assert selected.names == ("turbulent_resistance", "circuit_compliance")
-    named, gains = _supported(evaluator, selected, None)
+    named, gains, _ = _supported(evaluator, selected, None)
     assert named.names == tuple(gains) == ("turbulent_resistance",)
 
 
@@ -303,7 +303,7 @@ def test_a_small_term_that_hides_others_is_compared_with_and_not_named():
     evaluator = small.split(breaths)
     selected, _ = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), quiet)
     assert set(selected.names) == {"valve_delay", "valve_curve", "circuit_compliance"}
-    named, _ = _supported(evaluator, selected, None)
+    named, _, _ = _supported(evaluator, selected, None)
     assert set(named.names) == {"valve_delay", "valve_curve"}
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ventbench.errors import InputError
+from ventbench.interfaces import Signals
 from ventbench.plants.catalog import load_simulators
 from ventbench.plants.python_simulator import is_jax_plant
 
@@ -169,10 +170,13 @@ class Untraceable:
     R: float
 
     def init(self, pressure, peep=None):
-        return pressure
+        return pressure, Signals(pressure)
 
     def step(self, state, u_in, u_out, dt):
-        return state, float(u_in) * self.R
+        return state, Signals(float(u_in) * self.R)
+
+    def vary(self, r_scale, c_scale):
+        return self
 
 
 def test_a_registered_class_in_numpy_is_told_apart(breaths):

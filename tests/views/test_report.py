@@ -63,7 +63,7 @@ def score_file(run: Trajectories, **more: Any) -> dict[str, Any]:
         }
         for lung, row in zip(run.lungs, cells, strict=True)
     }
-    return {"protocol": 1, "score": float(cells.mean()), "lungs": lungs, **more}
+    return {"score": float(cells.mean()), "lungs": lungs, **more}
 
 
 def test_report(best: Trajectories, robust: Trajectories, tmp_path: Path) -> None:
@@ -81,7 +81,6 @@ def test_report(best: Trajectories, robust: Trajectories, tmp_path: Path) -> Non
             assert f"{lung} at PIP {pip:g} cmH2O" in alt
             assert f"pid_best {errors[i, j]:.2f} cmH2O; pid_robust" in alt
     assert f"{errors.mean():.2f}" in page.text
-    assert "protocol 1" in page.text
     ids = [attrs["id"] for _, attrs in page.tags if "id" in attrs]
     assert len(ids) == len(set(ids))
     pointed = {

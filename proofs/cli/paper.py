@@ -26,9 +26,6 @@ def paper(
     seeds: Annotated[
         int, typer.Option(min=1, max=32, help="Trainings of each method and part with --full.")
     ] = 5,
-    version: Annotated[
-        int, typer.Option("--protocol", min=1, max=2, help="Version of the protocol.")
-    ] = 2,
     workers: Workers = 0,
     scheduler: Scheduler = None,
     page: Annotated[
@@ -62,7 +59,7 @@ def paper(
     with bars() as shown:
         task = shown.add_task("paper", total=1.0)
         result, stored = reproduce_paper(
-            protocol_version=version, recordings=recordings, full=full, out=out, seeds=seeds,
+            recordings=recordings, full=full, out=out, seeds=seeds,
             workers=workers, scheduler=scheduler,
             progress=lambda what, share: shown.update(task, completed=share, description=what),
         )  # fmt: skip

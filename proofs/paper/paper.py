@@ -72,7 +72,6 @@ class StudySizes:
 
 def reproduce_paper(
     *,
-    protocol_version: int = 2,
     recordings: Path | str | None = None,
     full: bool = False,
     out: Path | str = "runs/paper",
@@ -87,7 +86,6 @@ def reproduce_paper(
     """Set the paper's tables, figures and claims beside ours.
 
     Args:
-        protocol_version: 2 scores airway pressure on the reference rigs; 1 the first simulators.
         recordings: folder of the public recordings: errors by horizon are measured again.
         full: run the studies again too: learning curves, parts of the controller and, with
             ``recordings``, architectures; hours on 2 cores.
@@ -106,15 +104,13 @@ def reproduce_paper(
         The comparison, and what ``proofs/paper/stored.json`` should hold after this run.
 
     Raises:
-        InputError: if the version is unknown, a recording is malformed, or ``out`` is of other
+        InputError: if a recording is malformed, or ``out`` is of other
             studies.
 
     Examples:
         >>> page, _ = reproduce_paper()  # doctest: +SKIP
         >>> print(page)  # doctest: +SKIP
     """
-    if protocol_version not in (1, 2):
-        raise InputError(f"protocol {protocol_version} is not known; the versions are 1 and 2")
     tell = progress or (lambda what, share: None)
     official = frozen.load()
     kept = dict(load_stored() if stored is None else stored)
@@ -133,7 +129,7 @@ def reproduce_paper(
             gains=gains,
             pool=pool,
         )
-        jobs = {name: (*entry, protocol_version) for name, entry in ENTRIES.items()}
+        jobs = dict(ENTRIES)
         scored: dict[str, tuple[Floats, Floats]] = {}
         for name, result in results(pool, _scored, jobs):
             scored[name] = result
@@ -155,7 +151,6 @@ def reproduce_paper(
     )
     about = {
         "ventbench": ventbench.__version__,
-        "protocol": protocol_version,
         "simulators": official.manifest_sha256[:12],
     }
     return Reproduction(about, sections, published.NOT_REPRODUCED), kept
@@ -174,9 +169,9 @@ def load_stored(path: Path | None = None) -> dict[str, Any]:
         raise InputError(f"{path} cannot be read: {error}") from error
 
 
-def _scored(name: str, track: str, version: int) -> tuple[Floats, Floats]:
+def _scored(name: str, track: str) -> tuple[Floats, Floats]:
     """Errors and pressures of a bundled entry without noise, by lung and PIP."""
-    result = score(name, track=track, sandbox=False, protocol=version)
+    result = score(name, track=track, sandbox=False)
     return result.nominal, result.trajectories.pressure
 
 

@@ -164,11 +164,6 @@ def test_the_html_page_is_whole_and_escapes():
     assert text == html(small_page())
 
 
-def test_an_unknown_protocol_is_refused():
-    with pytest.raises(InputError, match="protocol 3"):
-        paper.reproduce_paper(protocol_version=3)
-
-
 def test_stored_results_must_be_readable(tmp_path):
     (tmp_path / "x.json").write_text("{")
     with pytest.raises(InputError, match="cannot be read"):
@@ -188,7 +183,7 @@ def test_the_whole_page_agrees_with_scores_and_manifest(tmp_path, monkeypatch):
     assert result.exit_code == 0, result.output
     sections = {s["id"]: s for s in json.loads((tmp_path / "paper.json").read_text())["sections"]}
     rows = {row[0]: row for row in sections["reinforcement"]["tables"][0]["rows"]}
-    entry = score("residual_mlp", track="performance", sandbox=False, protocol=2)
+    entry = score("residual_mlp", track="performance", sandbox=False)
     for name, error in zip(LUNG_IDS, entry.by_lung, strict=True):
         assert rows[name][1] == pytest.approx(error, abs=1e-9)
     official = frozen.load().lungs()

@@ -36,7 +36,7 @@ def test_what_a_slow_line_spoils_is_repeated(bench: Bench, device: LoopbackDevic
     # Silent for 0.3 s within the first part, and for a step within the second.
     device.line.faults = tuple(
         LineFault(LineFaultKind.SILENT, now + start, now + start + length)
-        for start, length in ((2.6, 0.3), (9.2, 0.02))
+        for start, length in ((4.0, 0.3), (16.0, 0.02))
     )
     sheet = selftest(bench, LUNG, simulator="physics")
     assert sheet.go, str(sheet)

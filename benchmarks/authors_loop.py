@@ -6,8 +6,8 @@ written anew: a scan over all 300 steps with a float clock, from which target an
 lung keeps windows of normalised pressures and commands; ``lax.switch`` selects the boundary or the
 general network by the step of the breath; while the expiratory valve is open the windows start
 anew. It is compiled once and mapped over trajectories, which their code does not do. *Ours* is
-:func:`ventbench.rollouts.closed_loop`, which selects without branches and runs inspirations only,
-as no score depends on expirations; and with them (*whole*).
+:func:`ventbench.task.rollouts.closed_loop`, which selects without branches and runs inspirations
+only, as no score depends on expirations; and with them (*whole*).
 
 Prints milliseconds of one run, seconds of the paper's grid of 2,400 trajectories, and ratios.
 Runs alternate, the best of each counts, and the clock is the processor time of this process.
@@ -28,12 +28,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ventbench import protocol
+from ventbench.base.files import write_json
 from ventbench.controllers.pid import PID, TIME_CONSTANT
-from ventbench.environment import nominal_scenario
-from ventbench.files import write_json
 from ventbench.plants.learned import REFERENCE_DT, Architecture, Learned, learned
-from ventbench.rollouts import closed_loop
+from ventbench.task import protocol
+from ventbench.task.environment import nominal_scenario
+from ventbench.task.rollouts import closed_loop
 
 #: Seconds of a breath, of its inspiration at PIP, and at which the target reaches PEEP.
 BREATH_S, HOLD_S, FALL_S = 3.0, 1.0, 1.5

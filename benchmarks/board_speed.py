@@ -18,14 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ventbench import draws as draw_tables
 from ventbench.board import build, canonical, create, record, store
 from ventbench.board.replay import ReplayPlants, replay
 from ventbench.board.verify import verify
+from ventbench.entries.folder import open_submission
+from ventbench.entries.scoring import run_protocol
 from ventbench.plants import frozen
 from ventbench.plants.rigs import rigs_of
-from ventbench.submissions.folder import open_submission
-from ventbench.submissions.scoring import run_protocol
+from ventbench.task import draws as draw_tables
 
 #: Largest times for 1,000 records, s.
 BUILD_LIMIT_S, VERIFY_LIMIT_S = 10.0, 300.0

@@ -21,9 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ventbench.base.precision import float64
 from ventbench.physics import library, parameter, paths
 from ventbench.physics.catalogue import basis_terms
-from ventbench.precision import float64
 from ventbench.recordings import Breaths
 from ventbench.system_id import Predictor, make_data, parameter_values
 from ventbench.system_id import predictor as predictor_module

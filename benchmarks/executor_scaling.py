@@ -21,9 +21,9 @@ from concurrent.futures import Executor
 from contextlib import contextmanager
 from typing import Any
 
-from ventbench.executor import executor, in_order
+from ventbench.base.executor import executor, in_order
+from ventbench.entries.scoring import score
 from ventbench.stress.score import score_stress
-from ventbench.submissions.scoring import score
 
 #: Entry that is scored again and again, and entries of the cost that is worked out.
 ENTRY, MANY = "pid_robust", 10_000

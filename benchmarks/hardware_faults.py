@@ -31,7 +31,7 @@ from hardware_eval.emulation.simulated import simulated_lung
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.errors import LinkError, NoAnswerError
 from hardware_eval.wire.messages import Reading
-from ventbench import protocol
+from ventbench.task import protocol
 
 #: Time at rest before each run, s.
 REST = 2.0

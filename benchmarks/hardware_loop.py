@@ -27,7 +27,7 @@ from hardware_eval.bench.loop import ON_TIME_S, answer_by
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.errors import NoAnswerError, RefusedError
 from hardware_eval.wire.link import Link
-from ventbench import protocol, waveform
+from ventbench.task import protocol, waveform
 
 #: Late steps that are shown.
 _SHOWN = 20

@@ -30,20 +30,22 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import draws, files, precision, protocol, recordings, rollouts
+from ventbench import recordings
+from ventbench.base import files, precision
+from ventbench.base.resume import WorkFolder
 from ventbench.controllers.pid import PID
 from ventbench.diagnosis.diagnose import diagnose
-from ventbench.environment import nominal_scenario
-from ventbench.interfaces import Controller, Plant
-from ventbench.lungs import lung
-from ventbench.metrics.score import run_error
 from ventbench.physics import physics
-from ventbench.resume import WorkFolder
-from ventbench.training import pid_grid
-from ventbench.training.exploration import ExplorationRanges, SimulatedVentilator, explore
-from ventbench.training.residual import ResidualConfig, train_residual
-from ventbench.training.rigs.fit import FitConfig
-from ventbench.training.rigs.train import RigConfig, train_rigs
+from ventbench.task import draws, protocol, rollouts
+from ventbench.task.environment import nominal_scenario
+from ventbench.task.interfaces import Controller, Plant
+from ventbench.task.lungs import lung
+from ventbench.task.metrics.score import run_error
+from ventbench.train import pid_grid
+from ventbench.train.exploration import ExplorationRanges, SimulatedVentilator, explore
+from ventbench.train.residual import ResidualConfig, train_residual
+from ventbench.train.rigs.fit import FitConfig
+from ventbench.train.rigs.train import RigConfig, train_rigs
 
 Floats = NDArray[np.float64]
 

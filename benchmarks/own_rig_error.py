@@ -24,22 +24,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from ventbench import compilation, precision
-from ventbench.lungs import LUNG_IDS
-from ventbench.metrics.open_loop import WIDE_OPEN
+from ventbench.base import compilation, precision
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import Hybrid
 from ventbench.recordings import Breaths, recordings_dir
-from ventbench.training.rigs.data import (
+from ventbench.task.lungs import LUNG_IDS
+from ventbench.task.metrics.open_loop import WIDE_OPEN
+from ventbench.train.rigs.data import (
     InspirationData,
     RigRecordings,
     groups_of,
     inspirations,
     load_rig_recordings,
 )
-from ventbench.training.rigs.fit import FitConfig, Noise, fit, simulate
-from ventbench.training.rigs.parameters import Scales, centre, plants
-from ventbench.training.rigs.train import UNRECORDED_SLOPE
+from ventbench.train.rigs.fit import FitConfig, Noise, fit, simulate
+from ventbench.train.rigs.parameters import Scales, centre, plants
+from ventbench.train.rigs.train import UNRECORDED_SLOPE
 
 Floats = NDArray[np.float64]
 

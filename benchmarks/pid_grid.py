@@ -18,13 +18,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from ventbench import protocol
-from ventbench.files import write_json
-from ventbench.lungs import LUNG_IDS, LUNGS
+from ventbench.base.files import write_json
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
-from ventbench.training import pid_grid
+from ventbench.task import protocol
+from ventbench.task.lungs import LUNG_IDS, LUNGS
+from ventbench.train import pid_grid
 
 #: Best gains P, I on the physical lung (paper, appendix); D is 0.
 PAPER = {

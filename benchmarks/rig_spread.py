@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import draws, protocol
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import VALVE_KNOTS
 from ventbench.plants.rigs import rigs_of
-from ventbench.training.rigs.label_test import resistance_and_compliance
+from ventbench.task import draws, protocol
+from ventbench.train.rigs.label_test import resistance_and_compliance
 
 Floats = NDArray[np.float64]
 

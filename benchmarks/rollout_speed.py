@@ -28,18 +28,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ventbench import protocol
+from ventbench.base.files import write_json
 from ventbench.controllers.pid import PID
-from ventbench.environment import Scenario, nominal_scenario
-from ventbench.files import write_json
-from ventbench.interfaces import Plant
-from ventbench.lungs import LUNGS
 from ventbench.plants import frozen
 from ventbench.plants.learned import Architecture, Learned, learned
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import take
 from ventbench.plants.two_balloon import two_balloon
-from ventbench.rollouts import closed_loop
+from ventbench.task import protocol
+from ventbench.task.environment import Scenario, nominal_scenario
+from ventbench.task.interfaces import Plant
+from ventbench.task.lungs import LUNGS
+from ventbench.task.rollouts import closed_loop
 
 #: Environment steps of one run without and with its expirations.
 STEPS = protocol.BREATHS * protocol.INSPIRATION_STEPS

@@ -13,13 +13,13 @@ import time
 
 import numpy as np
 
-from ventbench import protocol
-from ventbench.interfaces import Task
-from ventbench.lungs import LUNG_IDS
+from ventbench.entries.folder import open_submission
+from ventbench.entries.runner import InProcessRunner, Runner
 from ventbench.sandbox.child.cell import ROW
 from ventbench.sandbox.runner import SandboxRunner
-from ventbench.submissions.folder import open_submission
-from ventbench.submissions.runner import InProcessRunner, Runner
+from ventbench.task import protocol
+from ventbench.task.interfaces import Task
+from ventbench.task.lungs import LUNG_IDS
 
 
 def measure(runner: Runner, entry: str, cells: int) -> dict[str, float]:

@@ -16,12 +16,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ventbench import compilation
+from ventbench.base import compilation
 from ventbench.board.frames import load_tracks
+from ventbench.pages.stress import write_stress_chart
 from ventbench.stress.results import DRAWS, StressTables
 from ventbench.stress.score import score_stress
 from ventbench.stress.stressors import CATEGORIES
-from ventbench.views.stress import write_stress_chart
 
 ENTRIES = ("pid_robust", "residual_mlp_all", "ppo", "dqn", "adaptive_pid")
 DOCS = Path(__file__).parents[1] / "docs"

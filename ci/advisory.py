@@ -11,11 +11,11 @@ from pathlib import Path
 
 from ci import workflow
 from ci.take import TakeError, changed_submissions, take
+from ventbench.entries import contract
+from ventbench.entries.folder import open_submission
+from ventbench.entries.runner import Runner
+from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
-from ventbench.submissions import contract
-from ventbench.submissions.folder import open_submission
-from ventbench.submissions.runner import Runner
-from ventbench.submissions.scoring import run_protocol
 
 TITLE = "Advisory score (not official)"
 #: Most submissions checked in one pull request.

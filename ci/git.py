@@ -11,7 +11,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 #: Who commits records and pages.
 AUTHOR = {

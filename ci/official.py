@@ -14,17 +14,17 @@ from pathlib import Path
 
 from ci import workflow
 from ci.take import TakeError, Taken, take
-from ventbench import draws as draw_tables
+from ventbench.base.errors import InputError
 from ventbench.board import create
 from ventbench.board.replay import ReplayPlants
-from ventbench.errors import InputError
+from ventbench.entries import contract
+from ventbench.entries.folder import open_submission
+from ventbench.entries.manifest import TRACKS
+from ventbench.entries.runner import Runner
+from ventbench.entries.scoring import run_protocol
 from ventbench.headroom.reference import Reference
 from ventbench.plants.rigs import rigs_of
-from ventbench.submissions import contract
-from ventbench.submissions.folder import open_submission
-from ventbench.submissions.manifest import TRACKS
-from ventbench.submissions.runner import Runner
-from ventbench.submissions.scoring import run_protocol
+from ventbench.task import draws as draw_tables
 
 TITLE = "Official score"
 

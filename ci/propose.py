@@ -15,10 +15,10 @@ from pathlib import Path
 from ci import workflow
 from ci.git import AUTHOR, Git
 from ci.take import submission_name
+from ventbench.base.errors import InputError
 from ventbench.board import attestation, create, record, store
 from ventbench.board.record import Record
 from ventbench.board.replay import ReplayPlants
-from ventbench.errors import InputError
 
 TITLE = "Record"
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from ci import workflow
 from ci.git import AUTHOR, Git, GitError
+from ventbench.base.errors import InputError
 from ventbench.board import canonical
-from ventbench.errors import InputError
 
 TITLE = "Pages"
 LEADERBOARD = "leaderboard"

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ci.git import Git, GitError, fetch
-from ventbench.errors import InputError
-from ventbench.submissions.errors import printable
-from ventbench.submissions.file_checks import collisions, kind_problem, path_problem
-from ventbench.submissions.folder import MAX_BYTES, MAX_FILES
-from ventbench.submissions.manifest import NAME, NAME_RULE
+from ventbench.base.errors import InputError
+from ventbench.entries.errors import printable
+from ventbench.entries.file_checks import collisions, kind_problem, path_problem
+from ventbench.entries.folder import MAX_BYTES, MAX_FILES
+from ventbench.entries.manifest import NAME, NAME_RULE
 
 #: Folder of all submissions in the repository.
 PARENT = "submissions"

@@ -6,8 +6,8 @@ import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from ventbench.errors import InputError
-from ventbench.text import plain
+from ventbench.base.errors import InputError
+from ventbench.base.text import plain
 
 
 def required(name: str) -> str:

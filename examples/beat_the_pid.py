@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import ventbench
-from ventbench.training.residual import ResidualConfig
+from ventbench.train.residual import ResidualConfig
 
 UPDATES = int(sys.argv[1]) if len(sys.argv) > 1 else 400
 OUT = Path("runs/beat_the_pid")

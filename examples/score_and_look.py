@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import ventbench
-from ventbench import views
+from ventbench import pages
 
 OUT = Path("runs/score_and_look")
 
@@ -33,5 +33,5 @@ print(f"this controller {score.score:.3f}, pid_robust {baseline.score:.3f} cmH2O
 
 OUT.mkdir(parents=True, exist_ok=True)
 runs = [score.trajectories, baseline.trajectories]
-print("wrote", views.write_figure(OUT / "pi.png", runs))
-print("wrote", views.write_rerun(OUT / "pi.rrd", runs))
+print("wrote", pages.write_figure(OUT / "pi.png", runs))
+print("wrote", pages.write_rerun(OUT / "pi.rrd", runs))

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ventbench import __version__
+from ventbench.base.errors import InputError
+from ventbench.base.text import plain
 from ventbench.cli import options
 from ventbench.cli.options import JsonFile, emit
-from ventbench.errors import InputError
-from ventbench.text import plain
 
 if TYPE_CHECKING:
     from hardware_eval.bench.console import ConsoleOperator
@@ -148,7 +148,8 @@ def run(
     from hardware_eval.bench.safety import SafetySettings
     from hardware_eval.bench.selftest import selftest as run_selftest
     from hardware_eval.results import evaluate as ev
-    from ventbench import files, protocol
+    from ventbench.base import files
+    from ventbench.task import protocol
 
     chosen = [*(pip or ()), *_numbers("--pips", pips)] or list(protocol.PIPS)
     entries, track = ev.open_entries(submissions, track)
@@ -250,7 +251,7 @@ def selftest(
     from hardware_eval.bench.safety import DEFAULT
     from hardware_eval.bench.selftest import selftest as run_selftest
     from hardware_eval.results import evaluate as ev
-    from ventbench.lungs import scored_lung
+    from ventbench.task.lungs import scored_lung
 
     label = scored_lung(lung).id
     person = ConsoleOperator(yes=True)
@@ -335,10 +336,10 @@ def collect(
     from hardware_eval.bench.loop import Bench
     from hardware_eval.bench.safety import DEFAULT
     from hardware_eval.results import evaluate as ev
-    from ventbench import protocol
     from ventbench.cli.options import bars
-    from ventbench.lungs import scored_lung
-    from ventbench.training.exploration import Limits
+    from ventbench.task import protocol
+    from ventbench.task.lungs import scored_lung
+    from ventbench.train.exploration import Limits
 
     label = scored_lung(lung).id
     highest = protocol.SAFETY_PRESSURE

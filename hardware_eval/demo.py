@@ -33,10 +33,10 @@ from hardware_eval.results import evaluate as ev
 from hardware_eval.results.compare import Comparison, compare, scored_plants
 from hardware_eval.results.evaluate import Evaluation, Line
 from hardware_eval.wire.client import Client
-from ventbench import files
-from ventbench.errors import InputError
-from ventbench.interfaces import Plant
-from ventbench.submissions.folder import open_submission
+from ventbench.base import files
+from ventbench.base.errors import InputError
+from ventbench.entries.folder import open_submission
+from ventbench.task.interfaces import Plant
 
 #: PIPs of the demo, cmH2O: few, so that it takes minutes.
 PIPS = (10.0, 20.0, 30.0)

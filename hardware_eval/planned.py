@@ -31,13 +31,14 @@ from jax import Array
 from numpy.typing import NDArray
 
 from hardware_eval.emulation.simulated import breath_begun
-from ventbench import environment as env
-from ventbench import precision, protocol
+from ventbench.base import precision
 from ventbench.controllers.pid import TIME_CONSTANT
-from ventbench.environment import Scenario
+from ventbench.entries.scaffold import contents
 from ventbench.headroom import attainable as bound
-from ventbench.interfaces import Plant, Signals
-from ventbench.submissions.scaffold import contents
+from ventbench.task import environment as env
+from ventbench.task import protocol
+from ventbench.task.environment import Scenario
+from ventbench.task.interfaces import Plant, Signals
 
 Floats = NDArray[np.float64]
 

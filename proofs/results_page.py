@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from proofs import code_version
 from proofs.challenge.figures import full_answer
-from ventbench import files
-from ventbench.errors import InputError
+from ventbench.base import files
+from ventbench.base.errors import InputError
 
 if TYPE_CHECKING:
     from proofs.challenge.reveal import ChallengeResult

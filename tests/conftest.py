@@ -42,7 +42,7 @@ QUICK_COMPILER = (
 GARBAGE_THRESHOLDS = (50_000, 20, 50)
 
 #: Slow tests that come last, the longest at the end: should time run out, the others have run.
-LAST = ("tests/training/", "tests/training/test_simulator.py::test_leads_to_the_frozen_simulators")
+LAST = ("tests/train/", "tests/train/test_simulator.py::test_leads_to_the_frozen_simulators")
 
 #: Seconds of compiling from which the result is kept for other workers and later runs.
 KEPT_FROM_S = 0.1

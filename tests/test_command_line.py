@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from ventbench import cli
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.sandbox.runner import SandboxRunner
 
 STOPPED = """
@@ -19,7 +19,7 @@ from ventbench import cli
 def work(folder: str) -> None:
     if folder != "none":
         from pathlib import Path
-        from ventbench.resume import WorkFolder
+        from ventbench.base.resume import WorkFolder
         WorkFolder(Path(folder), {"seed": 0})
     raise KeyboardInterrupt
 
@@ -99,7 +99,7 @@ def test_completion_is_offered():
 
 
 def test_without_the_extra_a_report_is_refused_before_anything_is_scored(monkeypatch, tmp_path):
-    from ventbench.submissions import scoring
+    from ventbench.entries import scoring
 
     monkeypatch.setattr(scoring, "score", lambda *_, **__: pytest.fail("scored first"))
     for missing in ("jinja2", "rerun"):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ventbench.controllers.pid import PID
-from ventbench.interfaces import Observation
+from ventbench.task.interfaces import Observation
 
 ROOT = Path(__file__).parents[1]
 SCRIPTS = sorted((ROOT / "examples").glob("*.py"))

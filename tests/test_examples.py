@@ -8,8 +8,9 @@ import tomllib
 import numpy as np
 import pytest
 
-from ventbench import files, recordings
-from ventbench.files import example
+from ventbench import recordings
+from ventbench.base import files
+from ventbench.base.files import example
 
 FOLDER = example("manifest.toml").parent
 MANIFEST = tomllib.loads((FOLDER / "manifest.toml").read_text("utf-8"))

@@ -35,7 +35,7 @@ def loaded_after(code: str) -> set[str]:
 def test_importing_is_light():
     heavy = {"jax", "pandas", "numpy", "scipy", "flax", "pyarrow", "typer"}
     assert not heavy & loaded_after("import ventbench; dir(ventbench)")
-    assert not heavy & loaded_after("import ventbench.interfaces")
+    assert not heavy & loaded_after("import ventbench.task.interfaces")
 
 
 def test_the_help_of_the_command_line_needs_nothing_heavy():

@@ -7,15 +7,17 @@ import warnings
 import numpy as np
 import pytest
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
 
-from ventbench import environment, gym_env, precision, protocol, rollouts  # noqa: E402
+from ventbench import gym_env  # noqa: E402
+from ventbench.base import precision  # noqa: E402
 from ventbench.controllers.script import Script  # noqa: E402
-from ventbench.lungs import LUNG_IDS  # noqa: E402
-from ventbench.metrics.score import run_error  # noqa: E402
 from ventbench.plants import frozen  # noqa: E402
+from ventbench.task import environment, protocol, rollouts  # noqa: E402
+from ventbench.task.lungs import LUNG_IDS  # noqa: E402
+from ventbench.task.metrics.score import run_error  # noqa: E402
 
 NAME = "ventbench.gym_env:ventbench/Ventilator-v1"
 

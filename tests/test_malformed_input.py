@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from ventbench.base.errors import InputError
+from ventbench.base.files import example
 from ventbench.cli import app
-from ventbench.errors import InputError
-from ventbench.files import example
 
 RUN = CliRunner()
 SOUND = str(example("sound.csv"))

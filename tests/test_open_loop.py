@@ -12,17 +12,17 @@ import pytest
 from typer.testing import CliRunner
 
 from ventbench import open_loop_report
+from ventbench.base.errors import InputError
+from ventbench.base.precision import float64
 from ventbench.cli import app
-from ventbench.errors import InputError
-from ventbench.lungs import LUNG_IDS, RECORDED_LUNGS, lung
 from ventbench.open_loop_report import Misfit, OpenLoopReport
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import nominal_plants
-from ventbench.precision import float64
 from ventbench.recordings import Breaths, load, make_breaths, write
-from ventbench.rollouts import open_loop
-from ventbench.training.learned import MEASURED
+from ventbench.task.lungs import LUNG_IDS, RECORDED_LUNGS, lung
+from ventbench.task.rollouts import open_loop
+from ventbench.train.learned import MEASURED
 
 single_compartments = partial(nominal_plants, single_compartment)
 

@@ -17,15 +17,16 @@ import pytest
 from typer.testing import CliRunner
 
 import ventbench
-from ventbench import precision, protocol
+from ventbench.base import precision
+from ventbench.base.errors import InputError
 from ventbench.cli import app
-from ventbench.errors import InputError
-from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
 from ventbench.plants.stacking import take
-from ventbench.rollouts import open_loop
 from ventbench.simulation import read_controls, simulate
-from ventbench.training.rigs import train as rigs
+from ventbench.task import protocol
+from ventbench.task.lungs import LUNG_IDS
+from ventbench.task.rollouts import open_loop
+from ventbench.train.rigs import train as rigs
 
 #: Records of the published leaderboard.
 RECORDS = Path(__file__).resolve().parents[1] / "leaderboard" / "records"

@@ -8,10 +8,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from ventbench import precision
-from ventbench.lungs import LUNGS, Lung
+from ventbench.base import precision
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
 from ventbench.plants.stacking import stack
+from ventbench.task.lungs import LUNGS, Lung
 
 
 class Textbook:

@@ -10,9 +10,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from ventbench import precision
-from ventbench.interfaces import Signals
-from ventbench.lungs import LUNGS, Lung
+from ventbench.base import precision
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import (
     SingleCompartment,
@@ -20,6 +18,8 @@ from ventbench.plants.single_compartment import (
     single_compartment,
 )
 from ventbench.plants.stacking import stack
+from ventbench.task.interfaces import Signals
+from ventbench.task.lungs import LUNGS, Lung
 
 #: What the sensor shows above the airway pressure, cmH2O.
 OFFSET = 0.4

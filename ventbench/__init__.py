@@ -18,17 +18,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ventbench.base.errors import InputError as InputError
+    from ventbench.base.files import example as example
     from ventbench.board.frames import load_board as load_board
     from ventbench.diagnosis.diagnose import diagnose as diagnose
     from ventbench.diagnosis.result import Diagnosis as Diagnosis
-    from ventbench.errors import InputError as InputError
-    from ventbench.files import example as example
-    from ventbench.interfaces import Controller as Controller
-    from ventbench.interfaces import Observation as Observation
-    from ventbench.interfaces import Plant as Plant
-    from ventbench.interfaces import Task as Task
-    from ventbench.lungs import LUNGS as LUNGS
-    from ventbench.lungs import Lung as Lung
+    from ventbench.entries.result import Score as Score
+    from ventbench.entries.scoring import score as score
     from ventbench.open_loop_report import OpenLoopReport as OpenLoopReport
     from ventbench.open_loop_report import open_loop as open_loop
     from ventbench.plants.catalog import load_simulators as load_simulators
@@ -40,13 +36,17 @@ if TYPE_CHECKING:
     from ventbench.simulation import simulate as simulate
     from ventbench.stress.score import StressScore as StressScore
     from ventbench.stress.score import score_stress as score_stress
-    from ventbench.submissions.result import Score as Score
-    from ventbench.submissions.scoring import score as score
-    from ventbench.training.pid_grid import tune_pid as tune_pid
-    from ventbench.training.residual import train_residual as train_residual
-    from ventbench.training.rigs.train import train_rigs as train_rigs
-    from ventbench.training.rl.train import train_dqn as train_dqn
-    from ventbench.training.rl.train import train_ppo as train_ppo
+    from ventbench.task.interfaces import Controller as Controller
+    from ventbench.task.interfaces import Observation as Observation
+    from ventbench.task.interfaces import Plant as Plant
+    from ventbench.task.interfaces import Task as Task
+    from ventbench.task.lungs import LUNGS as LUNGS
+    from ventbench.task.lungs import Lung as Lung
+    from ventbench.train.pid_grid import tune_pid as tune_pid
+    from ventbench.train.residual import train_residual as train_residual
+    from ventbench.train.rigs.train import train_rigs as train_rigs
+    from ventbench.train.rl.train import train_dqn as train_dqn
+    from ventbench.train.rl.train import train_ppo as train_ppo
     from ventbench.trajectories import Trajectories as Trajectories
     from ventbench.trajectories import rollout as rollout
 
@@ -55,36 +55,36 @@ __version__ = "0.1.0"
 #: Module and attribute of each name.
 _SOURCES = {
     "Breaths": ("recordings", "Breaths"),
-    "Controller": ("interfaces", "Controller"),
+    "Controller": ("task.interfaces", "Controller"),
     "Diagnosis": ("diagnosis.result", "Diagnosis"),
-    "InputError": ("errors", "InputError"),
-    "LUNGS": ("lungs", "LUNGS"),
-    "Lung": ("lungs", "Lung"),
-    "Observation": ("interfaces", "Observation"),
+    "InputError": ("base.errors", "InputError"),
+    "LUNGS": ("task.lungs", "LUNGS"),
+    "Lung": ("task.lungs", "Lung"),
+    "Observation": ("task.interfaces", "Observation"),
     "OpenLoopReport": ("open_loop_report", "OpenLoopReport"),
-    "Plant": ("interfaces", "Plant"),
-    "Score": ("submissions.result", "Score"),
+    "Plant": ("task.interfaces", "Plant"),
+    "Score": ("entries.result", "Score"),
     "Simulation": ("simulation", "Simulation"),
     "Simulators": ("plants.simulators", "Simulators"),
     "StressScore": ("stress.score", "StressScore"),
-    "Task": ("interfaces", "Task"),
+    "Task": ("task.interfaces", "Task"),
     "Trajectories": ("trajectories", "Trajectories"),
     "diagnose": ("diagnosis.diagnose", "diagnose"),
-    "example": ("files", "example"),
+    "example": ("base.files", "example"),
     "import_recording": ("recordings.foreign", "import_recording"),
     "load_board": ("board.frames", "load_board"),
     "load_recording": ("recordings", "load"),
     "load_simulators": ("plants.catalog", "load_simulators"),
     "open_loop": ("open_loop_report", "open_loop"),
     "rollout": ("trajectories", "rollout"),
-    "score": ("submissions.scoring", "score"),
+    "score": ("entries.scoring", "score"),
     "score_stress": ("stress.score", "score_stress"),
     "simulate": ("simulation", "simulate"),
-    "train_dqn": ("training.rl.train", "train_dqn"),
-    "train_ppo": ("training.rl.train", "train_ppo"),
-    "train_residual": ("training.residual", "train_residual"),
-    "train_rigs": ("training.rigs.train", "train_rigs"),
-    "tune_pid": ("training.pid_grid", "tune_pid"),
+    "train_dqn": ("train.rl.train", "train_dqn"),
+    "train_ppo": ("train.rl.train", "train_ppo"),
+    "train_residual": ("train.residual", "train_residual"),
+    "train_rigs": ("train.rigs.train", "train_rigs"),
+    "tune_pid": ("train.pid_grid", "tune_pid"),
 }
 
 __all__ = [

@@ -20,15 +20,16 @@ from gymnasium.vector.utils import batch_space
 from jax import Array
 from numpy.typing import NDArray
 
-from ventbench import environment as env
-from ventbench import precision, protocol
-from ventbench.draws import random_scenarios
-from ventbench.environment import Scenario
-from ventbench.errors import InputError
-from ventbench.interfaces import Plant
-from ventbench.lungs import LUNG_IDS, scored_lung
+from ventbench.base import precision
+from ventbench.base.errors import InputError
 from ventbench.plants import frozen
-from ventbench.training.rl import episodes
+from ventbench.task import environment as env
+from ventbench.task import protocol
+from ventbench.task.draws import random_scenarios
+from ventbench.task.environment import Scenario
+from ventbench.task.interfaces import Plant
+from ventbench.task.lungs import LUNG_IDS, scored_lung
+from ventbench.train.rl import episodes
 
 #: What an observation holds, in order, each of the order of 1: pressure / 40, target / 40, the
 #: next ten targets / 40, command before / 50 - 1, time in s, control step / 0.03.

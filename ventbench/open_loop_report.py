@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.interfaces import Plant
-from ventbench.lungs import RECORDED_LUNGS
-from ventbench.metrics import bootstrap
-from ventbench.metrics.open_loop import mae
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators, names
 from ventbench.plants.stacking import PlantsFor, open_loop_breaths
 from ventbench.recordings import Breaths, load
+from ventbench.task.interfaces import Plant
+from ventbench.task.lungs import RECORDED_LUNGS
+from ventbench.task.metrics import bootstrap
+from ventbench.task.metrics.open_loop import mae
 
 if TYPE_CHECKING:
     import pandas as pd

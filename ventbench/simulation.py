@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench import protocol
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.plants.catalog import Given, load_simulators
+from ventbench.task import protocol
 
 if TYPE_CHECKING:
     import pandas as pd

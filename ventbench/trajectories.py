@@ -13,15 +13,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import files, protocol, waveform
-from ventbench.errors import InputError
-from ventbench.metrics.score import run_error
+from ventbench.base import files
+from ventbench.base.errors import InputError
+from ventbench.task import protocol, waveform
+from ventbench.task.metrics.score import run_error
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from ventbench.interfaces import Controller, Plant
     from ventbench.plants.catalog import Given
+    from ventbench.task.interfaces import Controller, Plant
 
 Floats = NDArray[np.float64]
 
@@ -162,8 +163,9 @@ def rollout(
     import jax
     import jax.numpy as jnp
 
-    from ventbench import environment, precision, rollouts
+    from ventbench.base import precision
     from ventbench.plants.catalog import load_simulators
+    from ventbench.task import environment, rollouts
 
     simulators = load_simulators(simulator)
     names = [entry.id for entry in simulators.lungs] if lungs is None else list(lungs)

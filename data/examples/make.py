@@ -17,7 +17,7 @@ import tomli_w
 
 from hardware_eval.emulation.cases import Base, Case, Effect
 from proofs.challenge.first.rig import record
-from ventbench import files
+from ventbench.base import files
 from ventbench.recordings import Breaths, make_breaths, write
 
 #: Version of the examples; it changes with any byte of a recording.

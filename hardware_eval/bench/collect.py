@@ -1,6 +1,6 @@
 """Training recordings from a bench: the paper's targeted exploration with safe PIDs.
 
-The exploration is that of :mod:`ventbench.training.exploration`, breath by breath, with its ranges
+The exploration is that of :mod:`ventbench.train.exploration`, breath by breath, with its ranges
 (paper, section 4.2 and table) and its limits; here it drives a device, watched by the same checks
 as a session. Each breath starts from a lung at rest, as those of a simulator do.
 """
@@ -23,12 +23,12 @@ from hardware_eval.bench.loop import Bench, BreathLog, EmergencyStop, answer_by
 from hardware_eval.bench.raw_log import RawLog, lines, recording
 from hardware_eval.bench.safety import SafetySample
 from hardware_eval.wire.errors import LinkError, NoAnswerError, RefusedError
-from ventbench import protocol
-from ventbench.errors import InputError
-from ventbench.lungs import lung as parse_lung
+from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.write import write
-from ventbench.training.exploration import RANGES, ExplorationRanges, Limits, explore
+from ventbench.task import protocol
+from ventbench.task.lungs import lung as parse_lung
+from ventbench.train.exploration import RANGES, ExplorationRanges, Limits, explore
 
 Floats = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ import numpy as np
 from hardware_eval.bench.loop import BreathLog, EmergencyStop
 from hardware_eval.bench.plan import PlannedRun
 from hardware_eval.emulation.faults import parse
-from ventbench import protocol
+from ventbench.task import protocol
 
 if TYPE_CHECKING:
     from hardware_eval.emulation.loopback import LoopbackDevice
@@ -177,7 +177,7 @@ class RerunView:
     """
 
     def __init__(self, target: str) -> None:
-        from ventbench import errors
+        from ventbench.base import errors
 
         errors.require("rerun")
         import rerun as rr

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hardware_eval.bench.plan import CONTROL_GAINS, PlannedRun
 from hardware_eval.realtime import take_priority
-from ventbench.interfaces import Task
+from ventbench.task.interfaces import Task
 
 Floats = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ class LiveController(Protocol):
         """Ask for the next command.
 
         Args:
-            row: the observation, as :func:`ventbench.submissions.runner.pack` lays it out.
+            row: the observation, as :func:`ventbench.entries.runner.pack` lays it out.
             budget: time for the answer, s.
 
         Returns:
@@ -58,7 +58,7 @@ class SubmissionController:
     """A submission in its process, asked by a thread so that the loop need not wait for it.
 
     Args:
-        runner: as in scoring; see :class:`ventbench.submissions.runner.Runner`.
+        runner: as in scoring; see :class:`ventbench.entries.runner.Runner`.
         submission: whose code runs.
         task: what the controller is told.
         real_time: whether ``budget`` holds; else answers are waited for.

@@ -29,8 +29,8 @@ from hardware_eval.clock import Clock
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.errors import LinkError, NoAnswerError, RefusedError
 from hardware_eval.wire.messages import CAUSES, Flag, Reading
-from ventbench import protocol, waveform
-from ventbench.lungs import lung as parse_lung
+from ventbench.task import protocol, waveform
+from ventbench.task.lungs import lung as parse_lung
 
 Floats = NDArray[np.float64]
 

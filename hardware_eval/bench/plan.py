@@ -15,9 +15,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ventbench import protocol
-from ventbench.errors import InputError
-from ventbench.lungs import LUNG_IDS, scored_lung
+from ventbench.base.errors import InputError
+from ventbench.task import protocol
+from ventbench.task.lungs import LUNG_IDS, scored_lung
 
 #: Kinds of runs: PIP rises step by step before an entry is scored on a lung; scored; the PID
 #: between them; with a leak or a pinched tube at an announced moment; exploring for recordings.

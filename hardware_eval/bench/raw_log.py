@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from ventbench.errors import InputError
-from ventbench.lungs import lung as parse_lung
+from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths, make_breaths
+from ventbench.task.lungs import lung as parse_lung
 
 #: First line of every log.
 FORMAT = "ventbench-hardware-log-1"

@@ -16,9 +16,9 @@ import math
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
-from ventbench import protocol
-from ventbench.errors import InputError
-from ventbench.lungs import Lung
+from ventbench.base.errors import InputError
+from ventbench.task import protocol
+from ventbench.task.lungs import Lung
 
 #: Flow of the fully open PVP inspiratory valve, mL/s per % of command (137 L/min).
 VALVE_GAIN = 22.8

@@ -29,10 +29,10 @@ from hardware_eval.bench.loop import (
 )
 from hardware_eval.bench.safety import VALVE_GAIN, SafetySample
 from hardware_eval.wire.errors import LinkError, NoAnswerError, RefusedError
-from ventbench import protocol
-from ventbench.lungs import LUNGS
-from ventbench.lungs import lung as parse_lung
-from ventbench.metrics.open_loop import mae
+from ventbench.task import protocol
+from ventbench.task.lungs import LUNGS
+from ventbench.task.lungs import lung as parse_lung
+from ventbench.task.metrics.open_loop import mae
 
 Floats = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from hardware_eval.device import deadman
 from hardware_eval.device.port import Guard, Port
 from hardware_eval.device.program import DeviceService, DeviceSettings
 from hardware_eval.wire.link import BAUD_RATE
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 
 def serial_line(path: str, baud_rate: int = BAUD_RATE) -> Callable[[], int | None]:

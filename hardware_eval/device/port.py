@@ -19,7 +19,7 @@ from collections.abc import Callable
 from queue import Empty, SimpleQueue
 
 from hardware_eval.device.program import PERIOD, DeviceService
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 _CHUNK = 4096
 

@@ -37,7 +37,7 @@ from hardware_eval.wire.messages import (
     milliseconds,
 )
 from hardware_eval.wire.parser import Fault, ParserState, feed_bytes
-from ventbench import protocol
+from ventbench.task import protocol
 
 #: Version of this program: what a device tells as its firmware.
 FIRMWARE = (1, 0, 0)

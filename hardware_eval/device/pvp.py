@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from hardware_eval.device.hal import Identity, Sample
 from hardware_eval.wire.messages import Capability
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 #: Registers of the ADS1015, and its configuration: continuous, 3300 samples/s, +-4.096 V, no alert.
 _CONVERSION, _CONFIGURATION = 0x00, 0x01

@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from ventbench.errors import InputError
-from ventbench.lungs import LUNGS, Lung
+from ventbench.base.errors import InputError
+from ventbench.task.lungs import LUNGS, Lung
 
 Strength = Literal["mild", "strong"]
 Style = Literal["pi", "mixed"]

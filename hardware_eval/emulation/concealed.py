@@ -14,13 +14,13 @@ from typing import Any
 
 from hardware_eval.emulation.cases import LIBRARY, Effect, draw_case, draw_effect, draw_grid
 from hardware_eval.emulation.seal import commitment, encrypt, random_generator, unseal
-from ventbench import files
-from ventbench.errors import InputError
-from ventbench.interfaces import Plant
-from ventbench.lungs import Lung, lung
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.physics.model import physics
 from ventbench.plants.catalog import load_simulators
 from ventbench.plants.corrected import Corrected
+from ventbench.task.interfaces import Plant
+from ventbench.task.lungs import Lung, lung
 
 _FORMAT = "ventbench-concealed-1"
 

@@ -29,7 +29,7 @@ from hardware_eval import realtime
 from hardware_eval.device import deadman
 from hardware_eval.device.hal import Hal, Identity, Sample
 from hardware_eval.emulation.faults import FaultKind, LungFault, active
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 if TYPE_CHECKING:
     from hardware_eval.emulation.simulated import SimulatedHal

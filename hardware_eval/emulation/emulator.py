@@ -30,7 +30,7 @@ from hardware_eval.device.program import DeviceService, DeviceSettings
 from hardware_eval.emulation.faults import AnyFault, Line, LineFault, LungFault, parse
 from hardware_eval.emulation.loopback import Actuation
 from hardware_eval.wire.messages import Flag
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 #: Changes of the valves that are remembered.
 _REMEMBERED = 100_000

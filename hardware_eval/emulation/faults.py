@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 
 class FaultKind(Enum):

@@ -6,7 +6,7 @@ import hashlib
 
 import numpy as np
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 #: Begins what random numbers are drawn from; another text would change every case ever sealed.
 _FORMAT = "ventbench-challenge-1"

@@ -20,11 +20,11 @@ from jax.flatten_util import ravel_pytree
 from hardware_eval.device.hal import Identity, Sample
 from hardware_eval.emulation.faults import FaultKind, LungFault, active
 from hardware_eval.wire.messages import Capability
-from ventbench import protocol
-from ventbench.errors import InputError
-from ventbench.interfaces import Plant
+from ventbench.base.errors import InputError
 from ventbench.physics.model import PhysicsState
 from ventbench.plants.catalog import load_simulators
+from ventbench.task import protocol
+from ventbench.task.interfaces import Plant
 
 #: A command that does not change is taken into the plant's state after this time, s; above the
 #: control step, so that a loop decides when, and within the dead times that plants remember.

@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 
 from hardware_eval.bench.raw_log import recording
 from hardware_eval.results.evaluate import LOG
-from ventbench import files
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.board import record as records
 from ventbench.board.record import HardwareRecord
-from ventbench.errors import InputError
-from ventbench.metrics.open_loop import by_horizon, distance, mae
 from ventbench.plants.catalog import load_simulators
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths, join
 from ventbench.recordings.read import load
+from ventbench.task.metrics.open_loop import by_horizon, distance, mae
 
 if TYPE_CHECKING:
     from ventbench.diagnosis.result import Diagnosis

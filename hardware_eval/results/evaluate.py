@@ -28,14 +28,14 @@ from hardware_eval.clock import Clock, RealClock
 from hardware_eval.results import record as records
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.messages import Capability
-from ventbench import protocol
+from ventbench.base.errors import InputError
 from ventbench.board import record
 from ventbench.board.record import HardwareRecord
-from ventbench.errors import InputError
-from ventbench.interfaces import Task
+from ventbench.entries.errors import SubmissionError
+from ventbench.entries.folder import Submission, open_submission
 from ventbench.recordings.write import write
-from ventbench.submissions.errors import SubmissionError
-from ventbench.submissions.folder import Submission, open_submission
+from ventbench.task import protocol
+from ventbench.task.interfaces import Task
 
 if TYPE_CHECKING:
     from hardware_eval.emulation.loopback import LoopbackDevice
@@ -212,7 +212,7 @@ def make_runner(sandbox: bool) -> Any:
 
         # A run lasts 9 s and the loop does not wait; a controller silent for 2 s has failed.
         return SandboxRunner(allowance=Allowance(patience_s=2.0, total_s=120.0))
-    from ventbench.submissions.runner import InProcessRunner
+    from ventbench.entries.runner import InProcessRunner
 
     return InProcessRunner()
 

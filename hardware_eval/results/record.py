@@ -18,13 +18,14 @@ import numpy as np
 from hardware_eval.bench.loop import ON_TIME_S
 from hardware_eval.bench.plan import CONTROL, Plan, make_plan, progress
 from hardware_eval.bench.raw_log import LoggedBreath, breaths, lines
-from ventbench import files, protocol
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.board import canonical, create, record, schema
 from ventbench.board.record import TRACK, HardwareRecord
-from ventbench.errors import InputError
-from ventbench.lungs import LUNG_IDS
-from ventbench.metrics.score import passes_safety_gate
-from ventbench.submissions.folder import Submission, combined_hash, file_hashes
+from ventbench.entries.folder import Submission, combined_hash, file_hashes
+from ventbench.task import protocol
+from ventbench.task.lungs import LUNG_IDS
+from ventbench.task.metrics.score import passes_safety_gate
 
 #: Longest reason of a stopped run in a record, characters.
 _REASON = 1000

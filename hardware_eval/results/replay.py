@@ -14,10 +14,11 @@ from hardware_eval.bench.plan import PlannedRun, progress
 from hardware_eval.bench.raw_log import breaths, lines
 from hardware_eval.results.evaluate import LOG
 from hardware_eval.results.record import Jitter, jitter, plan_of
-from ventbench import files, protocol, waveform
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.board import record as records
 from ventbench.board.record import HardwareRecord
-from ventbench.errors import InputError
+from ventbench.task import protocol, waveform
 
 
 @dataclass(frozen=True)

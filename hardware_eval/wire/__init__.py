@@ -2,7 +2,7 @@
 
 from importlib.util import find_spec
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 if missing := [package for package in ("cobs", "serial") if find_spec(package) is None]:
     raise InputError(

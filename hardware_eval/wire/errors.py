@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from hardware_eval.wire.messages import Refusal
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 
 class LinkError(InputError):

@@ -14,9 +14,9 @@ from typing import Any, Protocol
 from proofs import code_version
 from proofs.challenge import requests
 from proofs.challenge.folder import ChallengeFolder
-from ventbench import compilation, files
-from ventbench.errors import InputError
-from ventbench.executor import executor, results
+from ventbench.base import compilation, files
+from ventbench.base.errors import InputError
+from ventbench.base.executor import executor, results
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import load
 

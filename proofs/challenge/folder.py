@@ -14,8 +14,8 @@ from hardware_eval.emulation.cases import Base, Case, Effect
 from hardware_eval.emulation.seal import random_generator, unseal
 from proofs.challenge.questions import DrawnCase
 from proofs.challenge.stranger.effects import StrangerCase
-from ventbench import files
-from ventbench.errors import InputError
+from ventbench.base import files
+from ventbench.base.errors import InputError
 
 _FORMAT = "ventbench-challenge-1"
 

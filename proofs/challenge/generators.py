@@ -10,7 +10,7 @@ from proofs.challenge.first import plan, rig
 from proofs.challenge.questions import DrawnCase
 from proofs.challenge.stranger import effects as stranger
 from proofs.challenge.stranger import laboratory
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 
 

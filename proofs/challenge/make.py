@@ -14,9 +14,9 @@ from proofs.challenge.detectability import log_likelihood_loss
 from proofs.challenge.folder import ChallengeFolder, encode_answers
 from proofs.challenge.generators import generator, generator_of
 from proofs.challenge.questions import DrawnCase, Kind
-from ventbench import files
-from ventbench.errors import InputError
-from ventbench.executor import executor, results
+from ventbench.base import files
+from ventbench.base.errors import InputError
+from ventbench.base.executor import executor, results
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.schema import COLUMNS
 from ventbench.recordings.write import write

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from hardware_eval.emulation.seal import random_generator
 from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.generators import generator_of
-from ventbench import files
-from ventbench.errors import InputError
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import join
 from ventbench.recordings.read import load
 from ventbench.recordings.write import write as write_recording

@@ -20,8 +20,8 @@ from proofs.challenge.figures import (
 from proofs.challenge.folder import ChallengeFolder, Truth
 from proofs.challenge.judge import JudgedCase, judge, library_names
 from proofs.challenge.stranger.effects import StrangerCase
-from ventbench.errors import InputError
-from ventbench.executor import executor, results
+from ventbench.base.errors import InputError
+from ventbench.base.executor import executor, results
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import load
 

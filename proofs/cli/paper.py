@@ -54,7 +54,7 @@ def paper(
     from rich.table import Table
 
     from proofs.paper.paper import reproduce_paper
-    from ventbench import files
+    from ventbench.base import files
 
     with bars() as shown:
         task = shown.add_task("paper", total=1.0)

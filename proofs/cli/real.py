@@ -57,7 +57,7 @@ def rig(
 
     from proofs.real.rig import prove
     from proofs.results_page import proof_section, write_section
-    from ventbench import compilation, errors
+    from ventbench.base import compilation, errors
 
     errors.require("jinja2", "rerun")
     folder = recordings_folder(recordings)
@@ -140,7 +140,7 @@ def pairs(
     """
     from proofs.real import comparisons as work
     from proofs.results_page import pairs_section, write_section
-    from ventbench import compilation, files
+    from ventbench.base import compilation, files
 
     folder = recordings_folder(recordings)
     compilation.keep()

@@ -54,8 +54,8 @@ def samples(
     from rich.console import Console
 
     from proofs.studies import samples as work
-    from ventbench import errors, files
-    from ventbench.lungs import scored_lung
+    from ventbench.base import errors, files
+    from ventbench.task.lungs import scored_lung
 
     errors.require("matplotlib")
     with bars() as shown:
@@ -132,7 +132,7 @@ def controllers(
     """
     from proofs.studies import controllers as work
     from ventbench.plants import frozen
-    from ventbench.training.residual import ResidualConfig
+    from ventbench.train.residual import ResidualConfig
 
     config = ResidualConfig(updates=updates)
     known = work.variants(config)
@@ -179,7 +179,7 @@ def networks(
     Example: `python -m proofs study networks --recordings ../shared/recordings`
     """
     from proofs.studies import networks as work
-    from ventbench.training import learned as simulator
+    from ventbench.train import learned as simulator
 
     folder = recordings_folder(recordings)
     _check(only, work.variants(simulator.ARCHITECTURE))
@@ -203,7 +203,7 @@ def networks(
 
 
 def _check(only: list[str] | None, known: dict[str, Any]) -> None:
-    from ventbench.errors import InputError
+    from ventbench.base.errors import InputError
 
     for name in only or ():
         if name not in known:

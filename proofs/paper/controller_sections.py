@@ -20,13 +20,14 @@ from proofs.paper.report import (
     Table,
     Verdict,
 )
-from ventbench import environment, precision, protocol, rollouts, waveform
+from ventbench.base import precision
+from ventbench.base.errors import InputError
 from ventbench.controllers.pid import PID
-from ventbench.errors import InputError
-from ventbench.lungs import LUNG_IDS
-from ventbench.metrics import step_response
 from ventbench.plants import frozen
-from ventbench.training import pid_grid
+from ventbench.task import environment, protocol, rollouts, waveform
+from ventbench.task.lungs import LUNG_IDS
+from ventbench.task.metrics import step_response
+from ventbench.train import pid_grid
 
 Floats = NDArray[np.float64]
 AnyFloats = NDArray[np.floating]

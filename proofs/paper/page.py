@@ -10,9 +10,10 @@ import numpy as np
 
 import ventbench
 from proofs.paper.report import Chart, HeatMap, Reproduction
-from ventbench import files, palette
-from ventbench.errors import require
-from ventbench.views import graphics
+from ventbench import palette
+from ventbench.base import files
+from ventbench.base.errors import require
+from ventbench.pages import graphics
 
 #: Size of a chart and of its plot: left, top, right and bottom margins.
 WIDTH, HEIGHT = 640.0, 280.0
@@ -50,11 +51,11 @@ def write_reproduction(path: Path | str, reproduction: Reproduction) -> Path:
 
 def html(reproduction: Reproduction) -> str:
     """Return the page; see :func:`write_reproduction`."""
-    from ventbench.text import page_templates
+    from ventbench.base.text import page_templates
 
     # From a string, so that the style sheet of reports is found.
     source = Path(__file__).with_name("page.html.j2").read_text("utf-8")
-    page = page_templates("ventbench.views").from_string(source)
+    page = page_templates("ventbench.pages").from_string(source)
     return page.render(
         about=reproduction.about,
         summary=reproduction.summary(),

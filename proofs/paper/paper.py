@@ -21,14 +21,14 @@ from proofs.paper import controller_sections as controllers
 from proofs.paper import published
 from proofs.paper import simulator_sections as simulators
 from proofs.paper.report import Reproduction
-from ventbench.errors import InputError
-from ventbench.executor import executor, results
-from ventbench.lungs import LUNG_IDS, lung
+from ventbench.base.errors import InputError
+from ventbench.base.executor import executor, results
+from ventbench.entries.scoring import score
 from ventbench.plants import frozen
 from ventbench.plants.stacking import take
-from ventbench.submissions.scoring import score
-from ventbench.training import pid_grid
-from ventbench.training.learned import MEASURED
+from ventbench.task.lungs import LUNG_IDS, lung
+from ventbench.train import pid_grid
+from ventbench.train.learned import MEASURED
 
 Floats = NDArray[np.float64]
 
@@ -181,8 +181,8 @@ def _studies(
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
     """Run the studies of minutes again, as JSON values; ``parallel``: workers and scheduler."""
     from proofs.studies import controllers, networks, samples
-    from ventbench.training.learned import ARCHITECTURE
-    from ventbench.training.residual import ResidualConfig
+    from ventbench.train.learned import ARCHITECTURE
+    from ventbench.train.residual import ResidualConfig
 
     kept: dict[str, dict[str, Any]] = {}
     curves = samples.sample_efficiency(

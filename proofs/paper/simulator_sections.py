@@ -22,15 +22,15 @@ from proofs.paper.report import (
     Table,
     Verdict,
 )
-from ventbench import files, precision
-from ventbench.lungs import LUNG_IDS
-from ventbench.metrics import open_loop
+from ventbench.base import files, precision
 from ventbench.plants import frozen
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import nominal_plants, open_loop_breaths, take
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.recordings import load
-from ventbench.training.exploration import RANGES, SimulatedVentilator, explore
+from ventbench.task.lungs import LUNG_IDS
+from ventbench.task.metrics import open_loop
+from ventbench.train.exploration import RANGES, SimulatedVentilator, explore
 
 Floats = NDArray[np.float64]
 AnyFloats = NDArray[np.floating]

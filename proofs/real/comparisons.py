@@ -19,13 +19,13 @@ import ventbench
 from proofs.challenge.figures import wilson
 from proofs.real.pairs import KINDS, Material, Pair, Split, load, pairs
 from proofs.real.parts import slower_sensor
-from ventbench import files
-from ventbench.errors import InputError
-from ventbench.lungs import Lung
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.mechanics.identify import Mechanics, Term, identify
 from ventbench.mechanics.labels import TOLERANCE_C, TOLERANCE_R, Estimate
 from ventbench.physics.model import Physics
 from ventbench.recordings.breaths import Breaths
+from ventbench.task.lungs import Lung
 
 #: Names that are right for what is added, and rivals that act alike where flow is measured before
 #: the circuit: the tubing delays flow as the sensor delays pressure.

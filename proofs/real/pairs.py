@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Literal
 
 from ventbench import recordings
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.mechanics.identify import Mechanics, identify
 from ventbench.mechanics.respiraworks import breaths_of
 from ventbench.recordings.breaths import Breaths
@@ -198,7 +198,7 @@ def _pressure_pairs(material: Material) -> Iterator[Pair]:
 
 def changed(first: str, second: str) -> str:
     """What of R and C differs between two labels, in words."""
-    from ventbench.lungs import lung
+    from ventbench.task.lungs import lung
 
     a, b = lung(first), lung(second)
     parts = [

@@ -17,9 +17,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import files, precision
-from ventbench.interfaces import Plant
-from ventbench.lungs import LUNG_IDS, LUNGS
+from ventbench.base import files, precision
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter
 from ventbench.physics.model import Physics
 from ventbench.plants import frozen
@@ -29,6 +27,8 @@ from ventbench.plants.plant_files import load_plants
 from ventbench.plants.sessions import Sessions
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.recordings.breaths import Breaths
+from ventbench.task.interfaces import Plant
+from ventbench.task.lungs import LUNG_IDS, LUNGS
 
 Floats = NDArray[np.float64]
 

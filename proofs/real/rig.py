@@ -23,11 +23,12 @@ from proofs.real.parts import (
     by_names_alone,
     has_unnamed,
 )
-from ventbench import files, recordings
+from ventbench import recordings
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.diagnosis.diagnose import diagnose as diagnose_recording
 from ventbench.diagnosis.residual_analysis import open_loop_error
 from ventbench.diagnosis.result import Diagnosis
-from ventbench.errors import InputError
 from ventbench.plants.catalog import load_simulators
 from ventbench.recordings.breaths import Breaths
 

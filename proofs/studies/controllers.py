@@ -14,17 +14,18 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from proofs.studies.networks import Progress, Tell, finish
-from ventbench import files, precision, protocol, rollouts
+from ventbench.base import files, precision
+from ventbench.base.resume import WorkFolder
 from ventbench.board.replay import spread
-from ventbench.interfaces import Controller
-from ventbench.lungs import LUNG_IDS, LUNGS
-from ventbench.metrics.score import passes_safety_gate, run_error
 from ventbench.plants import frozen
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.stacking import take
-from ventbench.resume import WorkFolder
-from ventbench.training import pid_grid
-from ventbench.training.residual import ResidualConfig, fit
+from ventbench.task import protocol, rollouts
+from ventbench.task.interfaces import Controller
+from ventbench.task.lungs import LUNG_IDS, LUNGS
+from ventbench.task.metrics.score import passes_safety_gate, run_error
+from ventbench.train import pid_grid
+from ventbench.train.residual import ResidualConfig, fit
 
 #: Published draws to score on.
 DRAWS = 20

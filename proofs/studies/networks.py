@@ -16,16 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from ventbench import files, open_loop_report
-from ventbench.executor import InProcess, executor, results
-from ventbench.lungs import LUNG_IDS, RECORDED_LUNGS
-from ventbench.metrics import bootstrap
+from ventbench import open_loop_report
+from ventbench.base import files
+from ventbench.base.executor import InProcess, executor, results
+from ventbench.base.resume import WorkFolder
 from ventbench.plants.learned import Architecture
 from ventbench.plants.stacking import VmappedPlant
 from ventbench.recordings import Breaths
-from ventbench.resume import WorkFolder
-from ventbench.training import learned as simulator
-from ventbench.training.learned import LearnedConfig
+from ventbench.task.lungs import LUNG_IDS, RECORDED_LUNGS
+from ventbench.task.metrics import bootstrap
+from ventbench.train import learned as simulator
+from ventbench.train.learned import LearnedConfig
 
 #: Name of the variant that all others are compared with.
 BASE = "base"

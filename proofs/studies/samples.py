@@ -14,16 +14,17 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench import files, protocol
-from ventbench.errors import require
-from ventbench.lungs import LUNG_IDS, Lung
-from ventbench.metrics import bootstrap
+from ventbench.base import files
+from ventbench.base.errors import require
 from ventbench.palette import RUNS
 from ventbench.plants import frozen
-from ventbench.training import pid_grid
-from ventbench.training.rl import episodes
-from ventbench.training.rl.policy_gradient import PolicyGradient
-from ventbench.training.rl.train import METHODS, Method, TrainedPolicies, method_for, train
+from ventbench.task import protocol
+from ventbench.task.lungs import LUNG_IDS, Lung
+from ventbench.task.metrics import bootstrap
+from ventbench.train import pid_grid
+from ventbench.train.rl import episodes
+from ventbench.train.rl.policy_gradient import PolicyGradient
+from ventbench.train.rl.train import METHODS, Method, TrainedPolicies, method_for, train
 
 Floats = NDArray[np.float64]
 

@@ -13,19 +13,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench import draws as draw_tables
-from ventbench import protocol
 from ventbench.board import build, canonical, create, record, store, verify
 from ventbench.board.record import Record
 from ventbench.board.replay import ReplayPlants, replay
+from ventbench.entries.errors import Failure
+from ventbench.entries.folder import open_submission, resolve
+from ventbench.entries.result import CellFailure, Score
+from ventbench.entries.scoring import run_protocol
 from ventbench.headroom import reference as references
-from ventbench.lungs import LUNG_IDS
 from ventbench.plants import frozen
 from ventbench.stress.score import StressScore
-from ventbench.submissions.errors import Failure
-from ventbench.submissions.folder import open_submission, resolve
-from ventbench.submissions.result import CellFailure, Score
-from ventbench.submissions.scoring import run_protocol
+from ventbench.task import draws as draw_tables
+from ventbench.task import protocol
+from ventbench.task.lungs import LUNG_IDS
 
 from ..textbook_rigs import TextbookRigs
 

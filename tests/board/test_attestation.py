@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from ventbench.base.errors import InputError
 from ventbench.board import attestation, build, canonical, frames, store
 from ventbench.board.verify import verify
-from ventbench.errors import InputError
 
 from .conftest import accept, put
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from ventbench.base.errors import InputError
 from ventbench.board import frames, store
 from ventbench.cli import app
-from ventbench.errors import InputError
 from ventbench.plants import frozen
 
 from ..textbook_rigs import TextbookRigs

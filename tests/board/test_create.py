@@ -10,11 +10,12 @@ import jax
 import numpy as np
 import pytest
 
-from ventbench import draws as draw_tables
-from ventbench import files, precision, protocol
+from ventbench.base import files, precision
+from ventbench.base.errors import InputError
 from ventbench.board import actions, create, ranking, record, schema
 from ventbench.board.record import Record
-from ventbench.errors import InputError
+from ventbench.task import draws as draw_tables
+from ventbench.task import protocol
 
 from ..textbook_rigs import TextbookRigs
 from .conftest import SANDBOX, opened
@@ -69,8 +70,8 @@ def test_replay_agrees_with_the_scorer(drafts, scores) -> None:
 
 
 def test_spread_is_the_deviation_of_the_ensemble(drafts, scores, simulators: TextbookRigs) -> None:
+    from ventbench.entries.stepping import as_float64, replay
     from ventbench.plants.stacking import take
-    from ventbench.submissions.stepping import as_float64, replay
 
     pressures = []
     with precision.float64():

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from ventbench.base.errors import InputError
 from ventbench.board import canonical, create, ranking, replay, store
 from ventbench.board.verify import verify
 from ventbench.cli import app
-from ventbench.errors import InputError
 
 from .conftest import opened, put
 

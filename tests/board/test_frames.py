@@ -11,9 +11,9 @@ import pandas as pd
 import pytest
 
 import ventbench.board
+from ventbench.base.errors import InputError
 from ventbench.board import frames, store
-from ventbench.errors import InputError
-from ventbench.lungs import LUNG_IDS
+from ventbench.task.lungs import LUNG_IDS
 
 
 def test_a_row_an_entry(full: Path, site: Path) -> None:

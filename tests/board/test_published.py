@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from ventbench.base.errors import InputError
 from ventbench.board import store
 from ventbench.board.verify import verify
-from ventbench.errors import InputError
 from ventbench.plants import frozen
 
 from .test_verify import flip

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from ventbench.base.errors import InputError
 from ventbench.board import store
 from ventbench.board import verify as rerun
 from ventbench.board.verify import verify
 from ventbench.cli import app
-from ventbench.errors import InputError
+from ventbench.entries.runner import InProcessRunner
 from ventbench.plants import frozen
-from ventbench.submissions.runner import InProcessRunner
 
 from ..textbook_rigs import TextbookRigs
 from .conftest import entry_folder, put

@@ -7,8 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
-from ventbench import draws as draw_tables
-from ventbench import protocol
+from ventbench.base.errors import InputError
 from ventbench.board import (
     build,
     canonical,
@@ -20,10 +19,11 @@ from ventbench.board import (
     verify,
 )
 from ventbench.board.replay import differences, replay
-from ventbench.errors import InputError
 from ventbench.stress.results import DRAWS, pip_columns
 from ventbench.stress.score import StressScore
 from ventbench.stress.stressors import conditions
+from ventbench.task import draws as draw_tables
+from ventbench.task import protocol
 
 from .conftest import SANDBOX, accept, opened, put
 

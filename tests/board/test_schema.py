@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ventbench.base.errors import InputError
 from ventbench.board import canonical, record
-from ventbench.errors import InputError
 
 
 def _without(key: str):

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
+from ventbench.base.errors import InputError
 from ventbench.board import actions, canonical, create, ranking, store
 from ventbench.board.verify import verify
-from ventbench.errors import InputError
 
 from ..textbook_rigs import TextbookRigs
 from .conftest import put

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ventbench.base.errors import InputError
 from ventbench.board import actions, canonical, record, store
 from ventbench.board.verify import Report, verify
-from ventbench.errors import InputError
 
 from ..textbook_rigs import TextbookRigs
 from .conftest import accept

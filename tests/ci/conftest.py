@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ventbench import draws as draw_tables
+from ventbench.entries.scaffold import contents
 from ventbench.headroom.reference import Reference, settings
-from ventbench.submissions.scaffold import contents
+from ventbench.task import draws as draw_tables
 
 from ..textbook_rigs import TextbookRigs
 

@@ -3,8 +3,8 @@
 import pytest
 
 from ci import advisory
+from ventbench.entries.runner import InProcessRunner
 from ventbench.sandbox.runner import SandboxRunner
-from ventbench.submissions.runner import InProcessRunner
 
 from .conftest import PATH
 
@@ -29,7 +29,7 @@ def test_a_good_one_is_scored_in_the_sandbox(repository, demo, advise):
 
 
 def test_problems_of_the_folder_and_of_the_code(repository, demo, advise):
-    outside = demo | {"ventbench/protocol.py": b"PIPS = ()"}
+    outside = demo | {"ventbench/task/protocol.py": b"PIPS = ()"}
     ready, lines = advise(repository.commit(outside, repository.base))
     assert not ready
     assert "ventbench is changed as well" in lines[0]

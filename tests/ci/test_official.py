@@ -8,11 +8,11 @@ import pytest
 from ci import official, propose, publish, workflow
 from ci.git import Git, GitError, environment
 from ci.take import TakeError, take
+from ventbench.base.errors import InputError
 from ventbench.board import attestation, build, canonical, record, store
-from ventbench.errors import InputError
+from ventbench.entries.runner import InProcessRunner
+from ventbench.entries.scaffold import contents
 from ventbench.sandbox.runner import SandboxRunner
-from ventbench.submissions.runner import InProcessRunner
-from ventbench.submissions.scaffold import contents
 
 from .conftest import PATH
 

@@ -9,7 +9,7 @@ import pytest
 
 from ci import publish
 from ci.git import Git
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 RECORD, OTHER = "a" * 64, "b" * 64
 

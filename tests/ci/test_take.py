@@ -7,7 +7,7 @@ import pytest
 
 from ci import git
 from ci.take import PARENT, TakeError, changed_submissions, take
-from ventbench.submissions.folder import MAX_BYTES, open_submission
+from ventbench.entries.folder import MAX_BYTES, open_submission
 
 from .conftest import PATH
 
@@ -119,7 +119,7 @@ def test_another_history(repository, demo, refused):
 
 @pytest.mark.parametrize(
     "path",
-    ["ventbench/a.py", "ventbench/protocol.py", ".github/workflows/x.yml", ".gitattributes",
+    ["ventbench/a.py", "ventbench/task/protocol.py", ".github/workflows/x.yml", ".gitattributes",
      "submissions/other/controller.py", "submissions/README.md", "submissions/demo2/x.md",
      "submissions/Demo/controller.py", "leaderboard/index.html", ".gitmodules"],
 )  # fmt: skip

@@ -3,7 +3,7 @@
 import pytest
 
 from ci import workflow
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 HOSTILE = ["::set-output name=x::y", "```", "<script>x</script>", "| a | b |", "a\n::error::b"]
 

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from jax import Array
 
-from ventbench import protocol
+from ventbench.base.precision import float64
 from ventbench.controllers.registry import CONTROLLERS
-from ventbench.environment import nominal_scenario
-from ventbench.interfaces import Controller, Observation
-from ventbench.lungs import lung
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.precision import float64
-from ventbench.rollouts import Inspirations, closed_loop
+from ventbench.task import protocol
+from ventbench.task.environment import nominal_scenario
+from ventbench.task.interfaces import Controller, Observation
+from ventbench.task.lungs import lung
+from ventbench.task.rollouts import Inspirations, closed_loop
 
 PIPS = np.array([15.0, 20.0, 35.0])
 LUNG = lung("R20C20")

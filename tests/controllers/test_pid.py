@@ -3,10 +3,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import precision
+from ventbench.base import precision
 from ventbench.controllers.pid import PID
 from ventbench.controllers.script import Script
-from ventbench.interfaces import Controller, Observation
+from ventbench.task.interfaces import Controller, Observation
 
 
 def plain(p, i, d, pressures, target, dt):

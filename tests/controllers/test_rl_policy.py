@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import precision, rollouts
+from ventbench.base import precision
 from ventbench.controllers.rl_policy import (
     CHOICES,
     GaussianPolicy,
@@ -19,13 +19,14 @@ from ventbench.controllers.rl_policy import (
     init_parameters,
     save_weights,
 )
-from ventbench.lungs import LUNG_IDS, LUNGS
+from ventbench.entries.folder import open_submission
+from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
-from ventbench.protocol import PIPS
-from ventbench.submissions.folder import open_submission
-from ventbench.submissions.scoring import run_protocol
+from ventbench.task import rollouts
+from ventbench.task.lungs import LUNG_IDS, LUNGS
+from ventbench.task.protocol import PIPS
 
 HERE = Path(__file__).parents[2] / "submissions"
 KINDS = {"ppo": (GaussianPolicy, 1), "dqn": (GreedyPolicy, len(CHOICES))}

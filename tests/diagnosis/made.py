@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from ventbench import precision
+from ventbench.base import precision
 from ventbench.diagnosis.findings import (
     BreathRequest,
     MissingMechanism,
@@ -18,10 +18,10 @@ from ventbench.diagnosis.findings import (
 )
 from ventbench.diagnosis.residual_analysis import locate
 from ventbench.diagnosis.result import Diagnosis
-from ventbench.lungs import lung
 from ventbench.mechanics.labels import Estimate, LungMatch
 from ventbench.physics import physics
 from ventbench.recordings.breaths import Breaths
+from ventbench.task.lungs import lung
 
 NOISE, GAIN, R_EX, PEEP, FINE = 0.2, 22.8, 5.0, 5.0, 32
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ventbench import precision
+from ventbench.base import precision
 from ventbench.diagnosis import corrected as module
 from ventbench.diagnosis.corrected import choose, correct, fit_open_loop
 from ventbench.diagnosis.evaluator import make_evaluator
@@ -20,12 +20,12 @@ from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.identification import split
 from ventbench.diagnosis.residual_analysis import compare_open_loop
 from ventbench.diagnosis.settings import DEFAULT
-from ventbench.interfaces import Plant
-from ventbench.lungs import lung
 from ventbench.physics import paths, physics
 from ventbench.plants.catalog import load_simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Noise, make_data
+from ventbench.task.interfaces import Plant
+from ventbench.task.lungs import lung
 
 from . import made, small
 

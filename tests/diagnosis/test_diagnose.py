@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench import precision
+from ventbench.base import precision
+from ventbench.base.errors import InputError
 from ventbench.diagnosis.diagnose import _Comparison, diagnose
 from ventbench.diagnosis.result import Diagnosis
-from ventbench.errors import InputError
-from ventbench.interfaces import Plant
-from ventbench.lungs import lung
 from ventbench.physics import physics
 from ventbench.plants.catalog import load_simulators
 from ventbench.plants.plant_files import save_plants
 from ventbench.recordings import join
 from ventbench.recordings.breaths import Breaths
+from ventbench.task.interfaces import Plant
+from ventbench.task.lungs import lung
 
 from . import small
 

@@ -14,8 +14,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from ventbench.base.errors import InputError
 from ventbench.cli import diagnose as command
-from ventbench.errors import InputError
 from ventbench.plants.plant_files import load_plants
 from ventbench.recordings import write
 

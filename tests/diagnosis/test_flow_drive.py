@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from ventbench.base.errors import InputError
 from ventbench.diagnosis import flow_drive
 from ventbench.diagnosis.diagnose import diagnose
 from ventbench.diagnosis.settings import DEFAULT
-from ventbench.errors import InputError
 from ventbench.plants.catalog import load_simulators
 from ventbench.recordings.breaths import Breaths, make_breaths
 

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ventbench.base.errors import InputError
 from ventbench.diagnosis import identification
 from ventbench.diagnosis.identification import held_out, split, usable
 from ventbench.diagnosis.settings import DEFAULT
-from ventbench.errors import InputError
 
 from . import made
 

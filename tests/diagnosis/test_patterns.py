@@ -18,7 +18,7 @@ from proofs.challenge.stranger.laboratory import record
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
 from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
 from ventbench.diagnosis.selection.forward import forward_selection
-from ventbench.lungs import lung
+from ventbench.task.lungs import lung
 
 from . import small
 

@@ -11,13 +11,13 @@ from ventbench.diagnosis.identification import split
 from ventbench.diagnosis.residual_analysis import open_loop_error
 from ventbench.diagnosis.rig_fit import fit_rigs
 from ventbench.diagnosis.settings import RigSettings
-from ventbench.lungs import LUNG_IDS
 from ventbench.physics import paths
 from ventbench.plants import frozen
 from ventbench.recordings import load
 from ventbench.system_id import Noise, make_data
 from ventbench.system_id.noise import robust_noise
 from ventbench.system_id.problem import parameter_of
+from ventbench.task.lungs import LUNG_IDS
 
 from . import small
 

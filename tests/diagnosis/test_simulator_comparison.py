@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench import precision
+from ventbench.base import precision
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.conclusion import Conclusion
 from ventbench.diagnosis.hypothesis import Hypothesis
@@ -25,12 +25,12 @@ from ventbench.diagnosis.simulator_comparison import (
     with_mechanisms_of,
     with_sensor_noise,
 )
-from ventbench.lungs import lung
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics import mechanism, physics
 from ventbench.plants.catalog import load_simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Noise, make_data
+from ventbench.task.lungs import lung
 
 from . import made, small
 

@@ -17,7 +17,7 @@ from _pytest.mark.structures import ParameterSet
 
 from proofs import __main__ as proofs
 from ventbench.cli import app
-from ventbench.interfaces import Observation, Task
+from ventbench.task.interfaces import Observation, Task
 
 ROOT = Path(__file__).parents[2]
 PROOFS = "python -m proofs"

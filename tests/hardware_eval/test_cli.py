@@ -22,9 +22,9 @@ from hardware_eval.results import evaluate
 from hardware_eval.results.evaluate import Line
 from hardware_eval.wire.client import Client
 from tests.hardware_eval.stand_in import Bench
+from ventbench.base.errors import InputError
 from ventbench.board import record
 from ventbench.board.record import HardwareRecord
-from ventbench.errors import InputError
 
 MANUAL = Path(cli.__file__).parent / "README.md"
 

@@ -12,11 +12,11 @@ from hardware_eval.demo import error_on
 from hardware_eval.emulation.simulated import SimulatedHal
 from hardware_eval.planned import PlannedController, plan_controller
 from ventbench.controllers.pid import TIME_CONSTANT
-from ventbench.interfaces import Plant, Task
-from ventbench.lungs import lung
+from ventbench.entries.folder import open_submission
+from ventbench.entries.runner import InProcessRunner
 from ventbench.physics.model import physics
-from ventbench.submissions.folder import open_submission
-from ventbench.submissions.runner import InProcessRunner
+from ventbench.task.interfaces import Plant, Task
+from ventbench.task.lungs import lung
 
 LUNG, PIPS = "R20C10", (10.0, 20.0)
 

@@ -4,13 +4,13 @@ import jax
 import numpy as np
 import pytest
 
-from ventbench import precision
-from ventbench.environment import nominal_scenario
+from ventbench.base import precision
 from ventbench.headroom import attainable
 from ventbench.headroom.attainable import second_optimum
-from ventbench.lungs import LUNGS
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
+from ventbench.task.environment import nominal_scenario
+from ventbench.task.lungs import LUNGS
 
 PIPS = (10.0, 20.0, 35.0)
 

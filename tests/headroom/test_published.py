@@ -4,11 +4,12 @@ import jax
 import numpy as np
 import pytest
 
-from ventbench import precision, protocol
+from ventbench.base import precision
 from ventbench.headroom import attainable
 from ventbench.headroom import reference as references
-from ventbench.metrics.score import LEAST_HEADROOM
 from ventbench.plants.rigs import load_rigs
+from ventbench.task import protocol
+from ventbench.task.metrics.score import LEAST_HEADROOM
 
 
 @pytest.fixture(scope="module")

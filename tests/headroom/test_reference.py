@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from ventbench import protocol
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
+from ventbench.entries.folder import submission_of
+from ventbench.entries.scoring import run_protocol
 from ventbench.headroom import reference as references
-from ventbench.submissions.folder import submission_of
-from ventbench.submissions.scoring import run_protocol
+from ventbench.task import protocol
 
 from ..textbook_rigs import TextbookRigs
 

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from ventbench import mechanics
-from ventbench.errors import InputError
-from ventbench.lungs import lung
+from ventbench.base.errors import InputError
 from ventbench.mechanics.labels import (
     Estimate,
     LungMatch,
@@ -22,6 +21,7 @@ from ventbench.mechanics.labels import (
     value_text,
 )
 from ventbench.recordings import Breaths, make_breaths
+from ventbench.task.lungs import lung
 
 SENSORS = ("flow", "volume")
 

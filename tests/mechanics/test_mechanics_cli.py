@@ -13,8 +13,8 @@ import typer
 from typer.testing import CliRunner
 
 from tests.diagnosis import made
+from ventbench.base.errors import InputError
 from ventbench.cli import mechanics as command
-from ventbench.errors import InputError
 from ventbench.mechanics import identify
 from ventbench.recordings import Breaths, join, load, write
 

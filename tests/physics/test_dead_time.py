@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ventbench.base.precision import float64
 from ventbench.physics.dead_time import window_weights
-from ventbench.precision import float64
 
 POINTS = 20_000
 

@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import precision
-from ventbench.lungs import Lung
+from ventbench.base import precision
 from ventbench.physics.catalogue import events, library
 from ventbench.physics.model import Physics, physics
-from ventbench.rollouts import open_loop
+from ventbench.task.lungs import Lung
+from ventbench.task.rollouts import open_loop
 
 STEPS = 40
 

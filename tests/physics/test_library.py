@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.errors import InputError
-from ventbench.lungs import Lung
+from ventbench.base.errors import InputError
+from ventbench.base.precision import float64
 from ventbench.physics import library, mechanism, parameter, paths, physics, strength_path
 from ventbench.physics.catalogue import basis_terms, special_cases
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
-from ventbench.precision import float64
-from ventbench.rollouts import open_loop
+from ventbench.task.lungs import Lung
+from ventbench.task.rollouts import open_loop
 
 from . import cases
 

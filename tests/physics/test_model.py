@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ventbench import precision
-from ventbench.errors import InputError
-from ventbench.interfaces import Plant
-from ventbench.lungs import LUNGS, Lung
+from ventbench.base import precision
+from ventbench.base.errors import InputError
 from ventbench.physics import library, parameter, paths, physics, resolution
 from ventbench.plants.plant_files import load_plant, save_plant
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.rollouts import open_loop
+from ventbench.task.interfaces import Plant
+from ventbench.task.lungs import LUNGS, Lung
+from ventbench.task.rollouts import open_loop
 
 N, T = 4, 50
 

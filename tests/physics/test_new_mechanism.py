@@ -6,18 +6,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ventbench.base.errors import InputError
+from ventbench.base.precision import float64
 from ventbench.diagnosis.evaluator import make_evaluator
 from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise, fit_with_white_noise
 from ventbench.diagnosis.selection.screening import screen_mechanisms
 from ventbench.diagnosis.settings import DEFAULT
-from ventbench.errors import InputError
-from ventbench.lungs import Lung
 from ventbench.physics import Description, Mechanism, Parameter, library, paths, physics
 from ventbench.physics.catalogue import extended
-from ventbench.precision import float64
-from ventbench.rollouts import open_loop
 from ventbench.system_id import Predictor, fit, interval, make_data
+from ventbench.task.lungs import Lung
+from ventbench.task.rollouts import open_loop
 
 from . import cases
 

@@ -6,17 +6,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
+from ventbench.base.precision import float64
 from ventbench.physics import library, mechanism, parameter, paths, strength_path
 from ventbench.physics.catalogue import basis_terms, special_cases
 from ventbench.physics.component_curves import component_curves
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.plants.plant_files import load_plant, save_plant
-from ventbench.precision import float64
-from ventbench.rollouts import open_loop
 from ventbench.system_id import Predictor, fit, make_data, parameter_values
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.problem import free_paths, make_unknowns
+from ventbench.task.rollouts import open_loop
 
 from . import cases
 

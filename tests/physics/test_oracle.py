@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.lungs import Lung
+from ventbench.base.precision import float64
 from ventbench.physics import library, physics
-from ventbench.precision import float64
+from ventbench.task.lungs import Lung
 
 from . import cases
 

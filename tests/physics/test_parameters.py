@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.physics import Parameter, parameter, paths
 
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ventbench.lungs import lung
 from ventbench.recordings import Breaths, make_breaths
+from ventbench.task.lungs import lung
 
 #: Samples of a breath; about as many as the recordings have.
 SAMPLES = 80

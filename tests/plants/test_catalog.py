@@ -10,10 +10,8 @@ import jax
 import numpy as np
 import pytest
 
-from ventbench import files, precision
-from ventbench.errors import InputError
-from ventbench.interfaces import Plant
-from ventbench.lungs import LUNGS, Lung, lung
+from ventbench.base import files, precision
+from ventbench.base.errors import InputError
 from ventbench.plants import frozen
 from ventbench.plants.catalog import load_simulators, names
 from ventbench.plants.plant_files import save_plants
@@ -21,6 +19,8 @@ from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import nominal_plants, open_loop_breaths
 from ventbench.plants.two_balloon import two_balloon
 from ventbench.recordings import write
+from ventbench.task.interfaces import Plant
+from ventbench.task.lungs import LUNGS, Lung, lung
 
 single_compartments = partial(nominal_plants, single_compartment)
 two_balloons = partial(nominal_plants, two_balloon)
@@ -160,7 +160,7 @@ def test_a_function_that_fails_is_told_by_its_breath(breaths):
 def test_module_and_name(breaths, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my_simulators.py").write_text(
-        "from ventbench.lungs import lung\n"
+        "from ventbench.task.lungs import lung\n"
         "from ventbench.plants.single_compartment import single_compartment\n"
         "def linear(u_in, u_out, dt, *, R, C, initial_pressure):\n"
         "    return initial_pressure + 0.1 * u_in\n"

@@ -22,9 +22,9 @@ from hypothesis.extra import numpy as hnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ventbench import protocol, waveform
-from ventbench.interfaces import Plant, Signals
-from ventbench.lungs import LUNG_IDS, Lung, lung
+from ventbench.base.precision import float64
+from ventbench.entries import scoring
+from ventbench.entries.folder import open_submission
 from ventbench.physics import physics
 from ventbench.plants import frozen
 from ventbench.plants.catalog import load_simulators
@@ -34,10 +34,10 @@ from ventbench.plants.plant_files import save_plants
 from ventbench.plants.registry import FAMILIES, PlantFamily
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.precision import float64
-from ventbench.rollouts import open_loop
-from ventbench.submissions import scoring
-from ventbench.submissions.folder import open_submission
+from ventbench.task import protocol, waveform
+from ventbench.task.interfaces import Plant, Signals
+from ventbench.task.lungs import LUNG_IDS, Lung, lung
+from ventbench.task.rollouts import open_loop
 
 SMALL = Architecture(pressures=3, controls=4, width=16, depth=3, boundaries=2, boundary_width=8)
 SELU = Architecture(width=24, depth=4, boundaries=0, activation="selu")

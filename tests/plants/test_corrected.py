@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.lungs import lung
+from ventbench.base.precision import float64
 from ventbench.physics import physics
 from ventbench.plants import frozen
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.plant_files import load_plants, save_plants
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import take
-from ventbench.precision import float64
-from ventbench.rollouts import open_loop
+from ventbench.task.lungs import lung
+from ventbench.task.rollouts import open_loop
 
 LUNG = lung("R20C50")
 T = 50

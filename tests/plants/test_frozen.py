@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import files
-from ventbench.errors import InputError
-from ventbench.lungs import LUNG_IDS, LUNGS, RECORDED_LUNGS
+from ventbench.base import files
+from ventbench.base.errors import InputError
+from ventbench.base.precision import float64
 from ventbench.plants import frozen
 from ventbench.plants.frozen import BY_ALL, Seen, fingerprints
-from ventbench.precision import float64
+from ventbench.task.lungs import LUNG_IDS, LUNGS, RECORDED_LUNGS
 
 NAMES = (frozen.MEMBERS, frozen.SEEN)
 

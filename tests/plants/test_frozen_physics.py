@@ -16,12 +16,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import ArrayLike
 
-from ventbench import protocol, waveform
-from ventbench.lungs import LUNG_IDS
+from ventbench.base.precision import float64
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import RELIEF, RELIEF_ROOM, Hybrid
-from ventbench.precision import float64
-from ventbench.rollouts import open_loop
+from ventbench.task import protocol, waveform
+from ventbench.task.lungs import LUNG_IDS
+from ventbench.task.rollouts import open_loop
 
 T = 40
 ROWS = 4

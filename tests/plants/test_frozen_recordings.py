@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from ventbench import open_loop_report
-from ventbench.lungs import LUNG_IDS
+from ventbench.base.precision import float64
 from ventbench.plants import frozen
 from ventbench.plants.frozen import BY_NONE, fingerprints
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import nominal_plants
 from ventbench.plants.two_balloon import two_balloon
-from ventbench.precision import float64
 from ventbench.recordings import load
-from ventbench.training.learned import MEASURED, RECONSTRUCTED
-from ventbench.training.rigs.data import load_rig_recordings
+from ventbench.task.lungs import LUNG_IDS
+from ventbench.train.learned import MEASURED, RECONSTRUCTED
+from ventbench.train.rigs.data import load_rig_recordings
 
 single_compartments = partial(nominal_plants, single_compartment)
 two_balloons = partial(nominal_plants, two_balloon)

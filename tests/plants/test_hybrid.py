@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from ventbench.base.precision import float64
 from ventbench.plants.hybrid import (
     DIRECTION_WIDTH,
     ELASTIC_KNOTS,
@@ -20,8 +21,7 @@ from ventbench.plants.hybrid import (
     VALVE_KNOTS,
     Hybrid,
 )
-from ventbench.precision import float64
-from ventbench.rollouts import open_loop
+from ventbench.task.rollouts import open_loop
 
 #: Practically no lag, s.
 NONE = 1e-9

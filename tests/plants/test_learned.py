@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.lungs import lung
 from ventbench.plants.learned import HIGHEST, LOWEST, Architecture, Normalisation, learned, mlp
 from ventbench.plants.single_compartment import single_compartment
-from ventbench.rollouts import open_loop
+from ventbench.task.lungs import lung
+from ventbench.task.rollouts import open_loop
 
 SMALL = Architecture(pressures=3, controls=4, width=16, depth=3, boundaries=2, boundary_width=8)
 

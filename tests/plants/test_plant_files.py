@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ventbench import files as whole_files
-from ventbench import precision
+from ventbench.base import files as whole_files
+from ventbench.base import precision
+from ventbench.base.errors import InputError
 from ventbench.cli import app
-from ventbench.errors import InputError
-from ventbench.lungs import LUNGS, lung
 from ventbench.physics import physics
 from ventbench.plants import frozen, registry
 from ventbench.plants.corrected import Corrected
@@ -24,6 +23,7 @@ from ventbench.plants.plant_files import load_plant, load_plants, save_plant, sa
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, stack_heterogeneous, take
 from ventbench.plants.two_balloon import two_balloon
+from ventbench.task.lungs import LUNGS, lung
 
 SMALL = Architecture(pressures=3, controls=4, width=8, depth=2, boundaries=1, boundary_width=4)
 PLANTS = {
@@ -188,9 +188,9 @@ def run(*arguments: object) -> tuple[int, str]:
 
 def test_score_on_the_plants_of_a_file(tmp_path: Path) -> None:
     """Its lungs are those of the file, and the score is that of the same plants elsewhere."""
+    from ventbench.entries.folder import open_submission
+    from ventbench.entries.scoring import run_protocol
     from ventbench.plants.rigs import Rigs
-    from ventbench.submissions.folder import open_submission
-    from ventbench.submissions.scoring import run_protocol
 
     plants = {name: single_compartment(lung(name)) for name in ("R20C20", "R5C10")}
     path = tmp_path / "corrected.json"

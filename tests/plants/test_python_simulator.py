@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.errors import InputError
-from ventbench.interfaces import Signals
+from ventbench.base.errors import InputError
 from ventbench.plants.catalog import load_simulators
 from ventbench.plants.python_simulator import is_jax_plant
+from ventbench.task.interfaces import Signals
 
 SETTINGS = ["R20C50", "R5C10"]
 

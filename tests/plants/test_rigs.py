@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import protocol
-from ventbench.lungs import LUNGS
+from ventbench.base.precision import float64
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import RELIEF, RELIEF_ROOM, Hybrid
-from ventbench.precision import float64
-from ventbench.rollouts import open_loop
+from ventbench.task import protocol
+from ventbench.task.lungs import LUNGS
+from ventbench.task.rollouts import open_loop
 
 
 @pytest.fixture(scope="module")

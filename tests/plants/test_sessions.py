@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.plants.sessions import Session, Sessions, find, sample_timing
 
 TABLE = Sessions(

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ventbench import precision
-from ventbench.lungs import LUNGS, Lung
+from ventbench.base import precision
 from ventbench.plants.single_compartment import single_compartment
+from ventbench.task.lungs import LUNGS, Lung
 
 
 def airway(lung, alveolar, u_in, u_out, peep, r_ex=5.0, gain=22.8):

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import precision
-from ventbench.errors import InputError
-from ventbench.lungs import LUNGS, lung
+from ventbench.base import precision
+from ventbench.base.errors import InputError
+from ventbench.base.precision import float64
 from ventbench.physics import physics
 from ventbench.plants.learned import Architecture, learned
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
@@ -24,8 +24,8 @@ from ventbench.plants.stacking import (
     take,
 )
 from ventbench.plants.two_balloon import two_balloon
-from ventbench.precision import float64
-from ventbench.rollouts import open_loop
+from ventbench.task.lungs import LUNGS, lung
+from ventbench.task.rollouts import open_loop
 
 single_compartments = partial(nominal_plants, single_compartment)
 two_balloons = partial(nominal_plants, two_balloon)

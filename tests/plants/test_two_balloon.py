@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench.lungs import lung
+from ventbench.base.precision import float64
 from ventbench.plants.two_balloon import BALLOON_PRESSURE, PEAK, two_balloon
-from ventbench.precision import float64
+from ventbench.task.lungs import lung
 
 
 @pytest.mark.parametrize("pressure", [-5.0, 0.0, 5.0, 35.0, 59.0])

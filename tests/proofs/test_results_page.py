@@ -18,7 +18,7 @@ from proofs.results_page import (
     write_section,
 )
 from tests.proofs.challenge.truths import answer, drawn, mechanism
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 
 def test_a_section_is_replaced_and_the_rest_stays(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.recordings import Breaths, iter_breaths, join, load, make_breaths, write
 from ventbench.recordings.csv_source import CsvSource
 from ventbench.recordings.problems import ProblemLog

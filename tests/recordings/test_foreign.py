@@ -11,8 +11,8 @@ from scipy.io import savemat
 from typer.testing import CliRunner
 
 import ventbench
+from ventbench.base.errors import InputError
 from ventbench.cli.data import app
-from ventbench.errors import InputError
 from ventbench.recordings import check, load, write
 from ventbench.recordings.foreign import import_recording
 from ventbench.recordings.foreign.units import UNITS, conversion

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+from ventbench.base.errors import InputError
 from ventbench.cli.data import app
-from ventbench.errors import InputError
 from ventbench.mechanics import identify
 from ventbench.recordings import (
     check,

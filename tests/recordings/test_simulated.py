@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 import ventbench
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.plants.catalog import load_simulated
 from ventbench.recordings import load
 from ventbench.recordings.simulated import read_simulated

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.recordings import (
     Split,
     folds,

@@ -3,9 +3,9 @@ import sys
 
 import pytest
 
-from ventbench.interfaces import Observation, Task
 from ventbench.sandbox.child.cell import ROW, Cell, Failed, controller_class, unpack
 from ventbench.sandbox.child.failures import SubmissionError, printable
+from ventbench.task.interfaces import Observation, Task
 
 ROBUSTNESS = Task("robustness", None, 0.03, 34)
 ROWS = [float(i) for i in range(ROW)]

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from ventbench import protocol
-from ventbench.interfaces import Task
 from ventbench.sandbox.child import libc
 from ventbench.sandbox.runner import SandboxRunner
+from ventbench.task import protocol
+from ventbench.task.interfaces import Task
 
 from .conftest import PATIENT
 

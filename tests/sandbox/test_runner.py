@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ventbench import precision, protocol
-from ventbench.interfaces import Task
-from ventbench.lungs import LUNGS
+from ventbench.base import precision
+from ventbench.entries.errors import SubmissionError
+from ventbench.entries.folder import open_submission
+from ventbench.entries.runner import InProcessRunner
+from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
@@ -20,10 +22,9 @@ from ventbench.sandbox import runner as runner_module
 from ventbench.sandbox.child.cell import ROW
 from ventbench.sandbox.configuration import Allowance, SandboxError
 from ventbench.sandbox.runner import SandboxRunner, layers
-from ventbench.submissions.errors import SubmissionError
-from ventbench.submissions.folder import open_submission
-from ventbench.submissions.runner import InProcessRunner
-from ventbench.submissions.scoring import run_protocol
+from ventbench.task import protocol
+from ventbench.task.interfaces import Task
+from ventbench.task.lungs import LUNGS
 
 from .conftest import PATIENT
 

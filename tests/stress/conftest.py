@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from ventbench.entries.folder import submission_of
 from ventbench.plants.rigs import load_rigs
 from ventbench.stress.run import StressDraws, draw_cells
 from ventbench.stress.score import StressScore, chosen_conditions, run_stress
 from ventbench.stress.stressors import Condition
-from ventbench.submissions.folder import submission_of
 
 #: Stressors of the shared run.
 NAMES = ("leak", "sensor_low", "disconnection")

@@ -8,9 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from ventbench import precision
-from ventbench.lungs import LUNGS
-from ventbench.metrics.score import run_error
+from ventbench.base import precision
 from ventbench.plants import frozen
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.hybrid import VALVE_KNOTS
@@ -18,6 +16,8 @@ from ventbench.stress.plants import reference_physics, stressed_plants
 from ventbench.stress.run import StressDraws
 from ventbench.stress.score import StressScore
 from ventbench.stress.stressors import Condition, conditions
+from ventbench.task.lungs import LUNGS
+from ventbench.task.metrics.score import run_error
 
 
 def _of(score: StressScore, name: str) -> int:
@@ -60,8 +60,8 @@ def test_nothing_is_changed_without_a_stressor(
     score: StressScore, draws: StressDraws, chosen: tuple[Condition, ...]
 ) -> None:
     """The same commands on the scored rig alone give the same pressures."""
-    from ventbench import environment, rollouts
     from ventbench.controllers.script import Script
+    from ventbench.task import environment, rollouts
 
     with precision.float64():
         plant, cells = jax.tree.map(

@@ -9,14 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ventbench import precision, protocol, rollouts
+from ventbench.base import precision
 from ventbench.controllers.pid import PID
-from ventbench.metrics.score import run_error
 from ventbench.plants import frozen
 from ventbench.plants.rigs import load_rigs, rigs_of
 from ventbench.stress.run import StressDraws, draw_cells, flat
 from ventbench.stress.score import StressScore
 from ventbench.stress.stressors import Condition
+from ventbench.task import protocol, rollouts
+from ventbench.task.metrics.score import run_error
 
 
 def scanned(plants: Any, gains: PID, scenario: Any) -> Any:

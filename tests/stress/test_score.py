@@ -12,15 +12,15 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.stress.conftest import NAMES, Controller
+from ventbench.base.errors import InputError
 from ventbench.cli import app
-from ventbench.errors import InputError
-from ventbench.interfaces import Task
+from ventbench.entries.errors import SubmissionError
+from ventbench.entries.folder import open_submission, submission_of
 from ventbench.plants.rigs import load_rigs
 from ventbench.stress.run import StressDraws, StressRun, draw_cells
 from ventbench.stress.score import StressScore, assess, chosen_conditions, run_stress
 from ventbench.stress.stressors import Condition
-from ventbench.submissions.errors import SubmissionError
-from ventbench.submissions.folder import open_submission, submission_of
+from ventbench.task.interfaces import Task
 
 
 def _made(draws: StressDraws, pressure: np.ndarray) -> StressScore:
@@ -131,7 +131,7 @@ def test_json_and_tables_say_the_same(score: StressScore, tmp_path: Path) -> Non
 
 
 def test_the_chart_has_every_condition(score: StressScore, tmp_path: Path) -> None:
-    from ventbench.views.stress import stress_chart_png, write_stress_chart
+    from ventbench.pages.stress import stress_chart_png, write_stress_chart
 
     values = score.to_json()
     path = write_stress_chart(tmp_path / "stress.png", [values])

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ventbench import protocol
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.physics.catalogue import events, library, parameter
 from ventbench.stress.stressors import (
     CATEGORIES,
@@ -21,6 +20,7 @@ from ventbench.stress.stressors import (
     stressor,
     table,
 )
+from ventbench.task import protocol
 
 
 def test_every_mechanism_of_the_library_has_a_line_or_a_reason() -> None:

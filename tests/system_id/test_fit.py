@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from tests.physics import cases
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
+from ventbench.base.precision import float64
 from ventbench.physics import library, parameter, paths, strength_path
-from ventbench.precision import float64
-from ventbench.rollouts import open_loop
 from ventbench.system_id import (
     START,
     Noise,
@@ -20,6 +19,7 @@ from ventbench.system_id import (
     make_data,
     refit_breath_parameters,
 )
+from ventbench.task.rollouts import open_loop
 
 BREATHS, NOISE = 8, 0.2
 #: Efforts in some of the breaths: amplitude, cmH2O, and onset, s.

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from tests.physics import cases
+from ventbench.base.precision import float64
 from ventbench.physics import parameter, paths
-from ventbench.precision import float64
-from ventbench.rollouts import open_loop
 from ventbench.system_id import START, Predictor, make_data, parameter_values
 from ventbench.system_id import predictor as predictor_module
+from ventbench.task.rollouts import open_loop
 
 ORDER = (*paths(), START)
 

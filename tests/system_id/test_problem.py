@@ -10,7 +10,7 @@ import pytest
 from scipy import optimize, stats
 
 from tests.physics import cases
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.system_id import Noise, Unknowns, fit, make_data, make_unknowns, robust_noise
 from ventbench.system_id.fit import t_quantile
 from ventbench.system_id.levenberg_marquardt import minimise

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import protocol
+from ventbench.base.errors import InputError
 from ventbench.board import canonical
-from ventbench.errors import InputError
+from ventbench.task import protocol
 
 if TYPE_CHECKING:
     from ventbench.board.record import Record

@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
-from ventbench import files
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.board import canonical, schema
 from ventbench.board.canonical import ATTESTATIONS, RECORDS, SIGNATURE_SUFFIX
-from ventbench.errors import InputError
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey

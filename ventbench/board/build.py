@@ -20,15 +20,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ventbench import files, protocol
+from ventbench.base import files
+from ventbench.base.text import number
 from ventbench.board import canonical, frames, pages, ranking, store
 from ventbench.board.frames import Line
 from ventbench.board.ranking import BASELINES, Row, Track
 from ventbench.board.record import Floats, Record
 from ventbench.board.schema import ScoreHeader
 from ventbench.board.store import Store
-from ventbench.lungs import lung as parse_lung
-from ventbench.text import number
+from ventbench.task import protocol
+from ventbench.task.lungs import lung as parse_lung
 
 if TYPE_CHECKING:
     import jinja2

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 #: Folder of records, commands and signatures within the leaderboard's.
 RECORDS = "records"

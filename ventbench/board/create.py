@@ -21,17 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ventbench
-from ventbench import draws as draw_tables
-from ventbench import files
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.board import actions, canonical, record, schema
 from ventbench.board.record import HardwareRecord
 from ventbench.board.replay import TRACE_BREATH, Replayed, ReplayPlants, differences, replay
-from ventbench.draws import Draws
-from ventbench.errors import InputError
+from ventbench.entries.folder import combined_hash, file_hashes
+from ventbench.entries.result import CellFailure, Score
 from ventbench.stress import stressors
 from ventbench.stress.score import StressScore
-from ventbench.submissions.folder import combined_hash, file_hashes
-from ventbench.submissions.result import CellFailure, Score
+from ventbench.task import draws as draw_tables
+from ventbench.task.draws import Draws
 
 #: How many failures keep their whole text, and how much of it the others keep, characters.
 _IN_FULL, _SHORT = 40, 240

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from ventbench.base.errors import InputError
+from ventbench.base.text import plain
 from ventbench.board import pages, ranking, store
 from ventbench.board.ranking import Interval, Row, Track
 from ventbench.board.record import Record, Withdrawal, created_of
-from ventbench.errors import InputError
-from ventbench.submissions.manifest import TRACKS
-from ventbench.text import plain
+from ventbench.entries.manifest import TRACKS
 
 if TYPE_CHECKING:
     import pandas as pd

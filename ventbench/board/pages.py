@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ventbench import palette
+from ventbench.base.text import number, page_templates, plain
 from ventbench.board.ranking import HardwareRow, Interval, StressRow
 from ventbench.stress.stressors import CATEGORIES, SEVERITIES, Condition, conditions, stressor
-from ventbench.text import number, page_templates, plain
 
 if TYPE_CHECKING:
     import jinja2

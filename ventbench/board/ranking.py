@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from ventbench.board.record import AnyRecord, HardwareRecord, Record, Withdrawal
 from ventbench.board.store import Store
-from ventbench.metrics import bootstrap
+from ventbench.entries.manifest import TRACKS
 from ventbench.stress.results import StressTables
-from ventbench.submissions.manifest import TRACKS
+from ventbench.task.metrics import bootstrap
 
 Floats = NDArray[np.float64]
 

@@ -18,13 +18,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import protocol
+from ventbench.base.errors import InputError
 from ventbench.board import canonical, schema
-from ventbench.errors import InputError
-from ventbench.metrics.score import normalised
 from ventbench.stress.results import StressTables
 from ventbench.stress.stressors import VERSION as STRESSORS_VERSION
 from ventbench.stress.stressors import condition_of
+from ventbench.task import protocol
+from ventbench.task.metrics.score import normalised
 
 Floats = NDArray[np.float64]
 

@@ -17,24 +17,25 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench import draws as draw_tables
-from ventbench import environment as env
-from ventbench import precision, protocol, rollouts
+from ventbench.base import precision
+from ventbench.base.errors import InputError
 from ventbench.board.record import Record
 from ventbench.board.schema import ScoreHeader
-from ventbench.draws import Draws
-from ventbench.environment import Scenario
-from ventbench.errors import InputError
-from ventbench.interfaces import Plant
-from ventbench.metrics.score import (
+from ventbench.entries.stepping import as_float64
+from ventbench.plants.rigs import rigs_of
+from ventbench.task import draws as draw_tables
+from ventbench.task import environment as env
+from ventbench.task import protocol, rollouts
+from ventbench.task.draws import Draws
+from ventbench.task.environment import Scenario
+from ventbench.task.interfaces import Plant
+from ventbench.task.metrics.score import (
     controllable_error,
     longest_run,
     passes_safety_gate,
     run_error,
     safety_limit,
 )
-from ventbench.plants.rigs import rigs_of
-from ventbench.submissions.stepping import as_float64
 
 Floats = NDArray[np.float64]
 

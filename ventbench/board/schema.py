@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import msgspec
 
-from ventbench import protocol
+from ventbench.base.errors import InputError
+from ventbench.base.text import plain
 from ventbench.board import actions
-from ventbench.errors import InputError
-from ventbench.lungs import LUNG_IDS
-from ventbench.submissions.folder import CONTROLLER, combined_hash
-from ventbench.submissions.manifest import FAMILIES, MANIFEST, NAME, TRACKS
-from ventbench.text import plain
+from ventbench.entries.folder import CONTROLLER, combined_hash
+from ventbench.entries.manifest import FAMILIES, MANIFEST, NAME, TRACKS
+from ventbench.task import protocol
+from ventbench.task.lungs import LUNG_IDS
 
 if TYPE_CHECKING:
     from ventbench.board.record import HardwareContent
@@ -88,7 +88,7 @@ class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RecordedManifest(_Table, frozen=True):
-    """What the authors say about a submission; see :class:`ventbench.submissions.manifest`."""
+    """What the authors say about a submission; see :class:`ventbench.entries.manifest`."""
 
     name: EntryName
     authors: list[Text]

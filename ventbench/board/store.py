@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ventbench import files
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.board import actions, attestation, canonical, record, schema
 from ventbench.board.canonical import RECORDS
 from ventbench.board.record import AnyRecord, HardwareRecord, Record, Withdrawal
-from ventbench.errors import InputError
 
 if TYPE_CHECKING:
     from ventbench.board.replay import ReplayPlants

@@ -18,7 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import files
+from ventbench.base import files
+from ventbench.base.errors import InputError
+from ventbench.base.executor import executor, results
+from ventbench.base.resume import WorkFolder
 from ventbench.board import actions, attestation, canonical, create, ranking, store
 from ventbench.board.canonical import ATTESTATIONS, RECORDS
 from ventbench.board.record import AnyRecord, Record, RecordStress
@@ -31,19 +34,16 @@ from ventbench.board.replay import (
     replay,
 )
 from ventbench.board.store import Store
-from ventbench.draws import Draws
-from ventbench.errors import InputError
-from ventbench.executor import executor, results
+from ventbench.entries.folder import Submission, file_hashes, open_submission
+from ventbench.entries.runner import Runner
+from ventbench.entries.scoring import run_protocol
 from ventbench.headroom.reference import published, reference_of
-from ventbench.metrics.score import normalised
 from ventbench.plants.rigs import rigs_of
-from ventbench.resume import WorkFolder
 from ventbench.stress import stressors
 from ventbench.stress.run import draw_cells
 from ventbench.stress.score import StressScore, run_stress
-from ventbench.submissions.folder import Submission, file_hashes, open_submission
-from ventbench.submissions.runner import Runner
-from ventbench.submissions.scoring import run_protocol
+from ventbench.task.draws import Draws
+from ventbench.task.metrics.score import normalised
 
 Floats = NDArray[np.float64]
 

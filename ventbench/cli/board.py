@@ -58,8 +58,8 @@ def add(
 
     Example: `ventbench board add runs/record/3f2a....json --source commit=9c1e5d0`
     """
+    from ventbench.base.errors import InputError
     from ventbench.board import create, store
-    from ventbench.errors import InputError
     from ventbench.plants import frozen
 
     parts = [text.partition("=") for text in source or ()]
@@ -114,8 +114,8 @@ def sign(
     """
     import os
 
+    from ventbench.base.errors import InputError
     from ventbench.board import attestation, store
-    from ventbench.errors import InputError
 
     secret = os.environ.get(attestation.SECRET, "")
     if not secret:
@@ -203,10 +203,10 @@ def verify(
 
     from rich.console import Console
 
+    from ventbench.base.errors import InputError
+    from ventbench.base.text import plain
     from ventbench.board import verify as verifier
-    from ventbench.errors import InputError
     from ventbench.plants import frozen
-    from ventbench.text import plain
 
     if records and not rerun:
         raise InputError("records are chosen for --rerun; without it all are verified")
@@ -280,8 +280,8 @@ def show(
     """
     from rich.console import Console
 
+    from ventbench.base.text import plain
     from ventbench.board import frames
-    from ventbench.text import plain
 
     tracks = frames.load_tracks(folder)
     rows = [
@@ -314,8 +314,8 @@ def list_records(folder: Folder = FOLDER, json: JsonFile = None) -> None:
     """
     from rich.console import Console
 
+    from ventbench.base.text import plain
     from ventbench.board import frames
-    from ventbench.text import plain
 
     rows = frames.record_index(folder)
     emit({"records": rows}, json)

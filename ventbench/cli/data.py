@@ -165,7 +165,7 @@ def import_(
 
 def _pairs(given: list[str] | None, option: str) -> dict[str, str]:
     """Split ``NAME=VALUE``."""
-    from ventbench.errors import InputError
+    from ventbench.base.errors import InputError
 
     pairs = {}
     for text in given or ():
@@ -178,7 +178,7 @@ def _pairs(given: list[str] | None, option: str) -> dict[str, str]:
 
 def _offsets(given: list[str] | None) -> dict[str, float]:
     """Numbers of ``ROLE=VALUE``."""
-    from ventbench.errors import InputError
+    from ventbench.base.errors import InputError
 
     pairs = _pairs(given, "--offset")
     try:
@@ -209,7 +209,7 @@ def explore(
     """
     from ventbench import recordings
     from ventbench.plants.catalog import load_simulators
-    from ventbench.training import exploration
+    from ventbench.train import exploration
 
     chosen = load_simulators(plant).plant(lung)
     ventilator = exploration.SimulatedVentilator(

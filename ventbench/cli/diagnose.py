@@ -73,9 +73,9 @@ def diagnose(
     """
     from rich.console import Console
 
-    from ventbench import errors
     from ventbench import recordings as files
-    from ventbench.errors import InputError
+    from ventbench.base import errors
+    from ventbench.base.errors import InputError
 
     if drive not in ("auto", "valve", "flow"):
         raise InputError(f"--drive {drive}: choose auto, valve or flow")
@@ -110,7 +110,7 @@ def _diagnose(
     """Diagnose with a progress bar that says what is done and how long it will take."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from ventbench import compilation
+    from ventbench.base import compilation
     from ventbench.diagnosis.diagnose import diagnose as find
     from ventbench.plants.catalog import load_simulated, load_simulators
 

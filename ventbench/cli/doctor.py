@@ -87,7 +87,7 @@ def _version(package: str) -> str:
 
 
 def _sandbox(problems: list[str]) -> str:
-    from ventbench.errors import InputError
+    from ventbench.base.errors import InputError
     from ventbench.sandbox.runner import SandboxRunner
 
     try:
@@ -105,7 +105,7 @@ def _sandbox(problems: list[str]) -> str:
 
 
 def _simulators(problems: list[str]) -> str:
-    from ventbench.errors import InputError
+    from ventbench.base.errors import InputError
     from ventbench.plants import frozen
 
     try:
@@ -134,7 +134,7 @@ def _recordings() -> str:
 
 
 def _cache(problems: list[str]) -> str:
-    from ventbench import compilation
+    from ventbench.base import compilation
 
     folder = compilation.folder()
     existing = next(path for path in (folder, *folder.parents) if path.exists())

@@ -40,11 +40,11 @@ def headroom(
     import numpy as np
     from rich.console import Console
 
-    from ventbench import draws, protocol
-    from ventbench.executor import executor
+    from ventbench.base.executor import executor
     from ventbench.headroom import reference as references
     from ventbench.plants.rigs import load_rigs
-    from ventbench.training import pid_grid
+    from ventbench.task import draws, protocol
+    from ventbench.train import pid_grid
 
     console = Console(stderr=str(json) == "-")
     rigs = load_rigs()

@@ -66,7 +66,7 @@ def _is_respiraworks(path: Path) -> bool:
 
 
 def _survey(path: Path, progress: Callable[[int, int], None]) -> tuple[SurveyedRun, ...]:
-    from ventbench.errors import InputError
+    from ventbench.base.errors import InputError
     from ventbench.mechanics import survey
 
     runs = survey(path, progress)
@@ -77,7 +77,7 @@ def _survey(path: Path, progress: Callable[[int, int], None]) -> tuple[SurveyedR
 
 def _identify(path: Path, *, clip: bool, pad: bool) -> tuple[Mechanics, ...]:
     from ventbench import recordings
-    from ventbench.errors import InputError
+    from ventbench.base.errors import InputError
     from ventbench.mechanics import identify
 
     with bars() as shown:
@@ -99,7 +99,7 @@ def _lung(mechanics: Mechanics) -> dict[str, Any]:
     """Return JSON values; numbers that are not finite become null."""
     import dataclasses
 
-    from ventbench import files
+    from ventbench.base import files
 
     plain = dataclasses.asdict(mechanics) | {
         "settings": [setting.id for setting in mechanics.settings]

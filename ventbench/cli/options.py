@@ -16,21 +16,21 @@ from typing import TYPE_CHECKING, Annotated, NoReturn, TypeVar
 
 import typer
 
-from ventbench.errors import InputError
-from ventbench.text import plain
+from ventbench.base.errors import InputError
+from ventbench.base.text import plain
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, ProgressColumn
 
-    from ventbench.submissions.folder import Submission
+    from ventbench.entries.folder import Submission
 
 ResultT = TypeVar("ResultT")
 
 
 def claim_out(folder: Path | None) -> Path | None:
     """Check a folder of results before anything is computed; see ``files.claim_folder``."""
-    from ventbench import files
+    from ventbench.base import files
 
     if folder is not None:
         files.claim_folder(folder)
@@ -43,7 +43,7 @@ def claim_json(path: Path | None) -> Path | None:
     Raises:
         InputError: if it is a folder, or lies in what is none.
     """
-    from ventbench.errors import InputError
+    from ventbench.base.errors import InputError
 
     if path is None or str(path) == "-":
         return path
@@ -103,7 +103,7 @@ def recordings_folder(given: Path | None) -> Path:
     Raises:
         InputError: if there is none.
     """
-    from ventbench.errors import InputError
+    from ventbench.base.errors import InputError
     from ventbench.recordings import recordings_dir
 
     folder = given or recordings_dir()
@@ -115,7 +115,7 @@ def recordings_folder(given: Path | None) -> Path:
 
 def emit(value: object, target: Path | None) -> None:
     """Write the result of a command to the file of ``--json``, atomically."""
-    from ventbench import files
+    from ventbench.base import files
 
     if target is None:
         return
@@ -190,7 +190,7 @@ def of_each_entry(
 ) -> list[ResultT]:
     """Compute something of entries: one job after the other with a bar each, or side by side.
 
-    What JAX compiles for it is kept from one run to the next, see ``ventbench.compilation``.
+    What JAX compiles for it is kept from one run to the next, see ``ventbench.base.compilation``.
 
     Args:
         what: is done, such as ``scoring``.
@@ -203,8 +203,8 @@ def of_each_entry(
     """
     from functools import partial
 
-    from ventbench import compilation
-    from ventbench.executor import executor, in_order
+    from ventbench.base import compilation
+    from ventbench.base.executor import executor, in_order
 
     if not workers and scheduler is None:
         compilation.keep()
@@ -221,7 +221,7 @@ def of_each_entry(
 
 def _keeping(work: Callable[..., ResultT], *job: object) -> ResultT:
     """Do a job in another process, which keeps what it compiles too."""
-    from ventbench import compilation
+    from ventbench.base import compilation
 
     compilation.keep()
     return work(*job)
@@ -272,7 +272,7 @@ def run(app: Callable[[], object], program: str, *, stopped: str = "") -> None:
 
 def _stop(program: str, stopped: str) -> NoReturn:
     """End after Ctrl-C, and say whether the same command goes on from here."""
-    resume = sys.modules.get("ventbench.resume")
+    resume = sys.modules.get("ventbench.base.resume")
     kept = resume.opened() if resume else None
     print(
         f"{program}: stopped"

@@ -23,10 +23,10 @@ from ventbench.cli.options import (
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from ventbench.entries.folder import Submission
+    from ventbench.entries.result import Score
+    from ventbench.entries.runner import Progress
     from ventbench.stress.score import StressScore
-    from ventbench.submissions.folder import Submission
-    from ventbench.submissions.result import Score
-    from ventbench.submissions.runner import Progress
 
 Track = Literal["performance", "robustness", "stress", "all"]
 
@@ -109,11 +109,11 @@ def score(
 
     from rich.console import Console
 
-    from ventbench import errors
-    from ventbench.errors import InputError
+    from ventbench.base import errors
+    from ventbench.base.errors import InputError
+    from ventbench.entries.folder import open_submission
+    from ventbench.entries.result import Score
     from ventbench.plants.catalog import load_simulators
-    from ventbench.submissions.folder import open_submission
-    from ventbench.submissions.result import Score
 
     if track == "stress":
         from ventbench.cli.stress import score_entries
@@ -200,7 +200,7 @@ def _run(
         return score_stress(
             entry, simulator=simulator, draws=DRAWS, sandbox=sandbox, progress=progress
         )
-    from ventbench.submissions import scoring
+    from ventbench.entries import scoring
 
     return scoring.score(
         entry,
@@ -284,16 +284,16 @@ def _keep(
     for name, own in stressed.items():
         own.save(out / name)
     if report and stressed:
-        from ventbench.views.stress import write_stress_chart
+        from ventbench.pages.stress import write_stress_chart
 
         values = [own.to_json() for own in stressed.values()]
         written.append(write_stress_chart(out / "stress.png", values))
     if report:
-        from ventbench import views
+        from ventbench import pages
 
         values = [result.to_json() for result in scores]
-        written.append(views.write_report(out / "report.html", runs, values))
-        written.append(views.write_rerun(out / "scores.rrd", runs))
+        written.append(pages.write_report(out / "report.html", runs, values))
+        written.append(pages.write_rerun(out / "scores.rrd", runs))
     return written
 
 
@@ -321,10 +321,10 @@ def transfer(
     from rich.console import Console
     from rich.table import Table
 
+    from ventbench.entries import transfer as transfers
+    from ventbench.entries.folder import open_submission
+    from ventbench.entries.runner import CountingRunner, InProcessRunner, Runner
     from ventbench.plants.rigs import load_rigs
-    from ventbench.submissions import transfer as transfers
-    from ventbench.submissions.folder import open_submission
-    from ventbench.submissions.runner import CountingRunner, InProcessRunner, Runner
 
     runner: Runner = InProcessRunner()
     if not in_process:
@@ -377,7 +377,7 @@ def new(
 
     Example: `ventbench new demo && ventbench check demo && ventbench score demo`
     """
-    from ventbench.submissions import scaffold
+    from ventbench.entries import scaffold
 
     path = scaffold.create(name, family, folder)
     typer.echo(f"wrote {path}: " + ", ".join(sorted(entry.name for entry in path.iterdir())))
@@ -400,8 +400,8 @@ def check(
 
     Example: `ventbench check submissions/mine --json check.json`
     """
-    from ventbench.submissions import contract
-    from ventbench.submissions.runner import InProcessRunner
+    from ventbench.entries import contract
+    from ventbench.entries.runner import InProcessRunner
 
     with bars() as shown:
         report = contract.check(

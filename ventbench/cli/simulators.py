@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from ventbench import protocol
 from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, bars, counted, emit, notes
+from ventbench.task import protocol
 
 
 def lungs(json: JsonFile = None) -> None:
@@ -67,11 +67,11 @@ def coverage(
     from rich.console import Console
     from rich.table import Table
 
+    from ventbench.base.errors import InputError
     from ventbench.board import actions
     from ventbench.board import record as records
-    from ventbench.errors import InputError
-    from ventbench.metrics import open_loop
     from ventbench.plants import frozen
+    from ventbench.task.metrics import open_loop
 
     entry = records.load(record)
     if not isinstance(entry, records.Record):
@@ -110,7 +110,7 @@ def simulate(
 
     Example: `ventbench simulate --lung R20C50 --controls commands.csv`
     """
-    from ventbench import files
+    from ventbench.base import files
     from ventbench.simulation import simulate as work
 
     text = work(controls, lung=lung, simulator=plant, start=start).to_csv()
@@ -144,7 +144,7 @@ def open_loop(
 
     from ventbench import open_loop_report
     from ventbench import recordings as files
-    from ventbench.errors import InputError
+    from ventbench.base.errors import InputError
 
     said = notes()
     with bars() as shown:

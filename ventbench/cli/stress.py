@@ -12,8 +12,8 @@ from ventbench.cli.options import JsonFile, emit, of_each_entry
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from ventbench.entries.folder import Submission
     from ventbench.stress.score import StressScore
-    from ventbench.submissions.folder import Submission
 
 
 def score_entries(
@@ -39,10 +39,10 @@ def score_entries(
     import numpy as np
     from rich.console import Console
 
-    from ventbench.errors import InputError
+    from ventbench.base.errors import InputError
+    from ventbench.entries.folder import open_submission
     from ventbench.stress.results import DRAWS
     from ventbench.stress.score import score_stress
-    from ventbench.submissions.folder import open_submission
 
     if report and out is None:
         raise InputError("--report needs --out DIR to write to")
@@ -69,7 +69,7 @@ def score_entries(
         for folder, result in zip(written, scores, strict=True):
             result.save(folder)
         if report:
-            from ventbench.views.stress import write_stress_chart
+            from ventbench.pages.stress import write_stress_chart
 
             written.append(write_stress_chart(out / "stress.png", results))
         for path in written:
@@ -126,10 +126,10 @@ def _write_records(
     """Score the robustness track too, and write records with both."""
     from functools import partial
 
-    from ventbench import draws
     from ventbench.board import create
+    from ventbench.entries import scoring
     from ventbench.plants import frozen
-    from ventbench.submissions import scoring
+    from ventbench.task import draws
 
     work = partial(
         scoring.score,

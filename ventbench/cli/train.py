@@ -74,7 +74,7 @@ def simulator(
 
     Example: `ventbench train simulator --recordings my-recordings --out runs/my-rig`
     """
-    from ventbench.training.rigs.train import RigConfig, train_rigs
+    from ventbench.train.rigs.train import RigConfig, train_rigs
 
     folder = recordings_folder(recordings)
     listed = None if lungs is None else [name.strip() for name in lungs.split(",")]
@@ -144,9 +144,9 @@ def residual(
     """
     from rich.console import Console
 
-    from ventbench.errors import InputError
-    from ventbench.training.plants import ALL
-    from ventbench.training.residual import ResidualConfig
+    from ventbench.base.errors import InputError
+    from ventbench.train.plants import ALL
+    from ventbench.train.residual import ResidualConfig
 
     if lung is not None and every:
         raise InputError("give --lung ID or --all, not both")
@@ -168,7 +168,7 @@ def residual(
 def _train_residual(
     names: tuple[str, ...] | None, out: Path, config: Any, seed: int, plant: str
 ) -> dict[str, Any]:
-    from ventbench.training.residual import train_residual
+    from ventbench.train.residual import train_residual
 
     with bars() as shown:
         tasks: dict[str, Any] = {}
@@ -262,9 +262,9 @@ def _train_policies(
 ) -> None:
     from rich.console import Console
 
-    from ventbench.errors import InputError
-    from ventbench.training.plants import ALL
-    from ventbench.training.rl.train import train_dqn, train_ppo
+    from ventbench.base.errors import InputError
+    from ventbench.train.plants import ALL
+    from ventbench.train.rl.train import train_dqn, train_ppo
 
     if lung is not None and all_lungs:
         raise InputError("give --lung ID or --all, not both; neither trains all seven networks")

@@ -71,8 +71,8 @@ def pid(
     """
     from rich.console import Console
 
-    from ventbench.errors import InputError
-    from ventbench.training.pid_grid import RESULT, TABLE, tune_pid
+    from ventbench.base.errors import InputError
+    from ventbench.train.pid_grid import RESULT, TABLE, tune_pid
 
     if (lung is not None) + every + robust != 1:
         raise InputError("give exactly one of --lung LUNG, --all and --robust")
@@ -97,9 +97,9 @@ def pid(
 
 def _plot(path: Path, grid: Any, each: bool, single: bool) -> list[str]:
     """Draw the picture if matplotlib is installed."""
-    from ventbench import files
-    from ventbench.errors import InputError
-    from ventbench.views.gain_map import gain_map_png
+    from ventbench.base import files
+    from ventbench.base.errors import InputError
+    from ventbench.pages.gain_map import gain_map_png
 
     try:
         picture = gain_map_png(grid, each=each, single=single)

@@ -23,7 +23,7 @@ def _read(folders: list[Path]) -> tuple[list[Trajectories], list[dict[str, Any]]
     import json
 
     from ventbench import trajectories
-    from ventbench.errors import InputError
+    from ventbench.base.errors import InputError
 
     runs, scores = [], []
     for folder in folders:
@@ -53,13 +53,13 @@ def view(
 
     Example: `ventbench view runs/demo/pid_best runs/demo/pid_robust`
     """
-    from ventbench import views
+    from ventbench import pages
 
     path = out or runs[0] / "scores.rrd"
-    views.write_rerun(path, _read(runs)[0])
+    pages.write_rerun(path, _read(runs)[0])
     typer.echo(f"wrote {path}")
     if show:
-        views.open_viewer(path)
+        pages.open_viewer(path)
 
 
 def report(
@@ -76,12 +76,12 @@ def report(
 
     Example: `ventbench report runs/demo/pid_best runs/demo/pid_robust`
     """
-    from ventbench import views
+    from ventbench import pages
 
     loaded, scores = _read(runs)
-    typer.echo(f"wrote {views.write_report(out or runs[0] / 'report.html', loaded, scores)}")
+    typer.echo(f"wrote {pages.write_report(out or runs[0] / 'report.html', loaded, scores)}")
     if figure is not None:
-        typer.echo(f"wrote {views.write_figure(figure, loaded)}")
+        typer.echo(f"wrote {pages.write_figure(figure, loaded)}")
 
 
 def register(app: typer.Typer) -> None:

@@ -6,7 +6,7 @@ import flax.struct
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.interfaces import Observation
+from ventbench.task.interfaces import Observation
 
 #: Time constant of the exponential averages, s (authors' code; the recordings obey it).
 TIME_CONSTANT = 0.5

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from ventbench import protocol
 from ventbench.controllers import residual, rl_policy
 from ventbench.controllers.pid import PID
 from ventbench.controllers.script import Script
-from ventbench.interfaces import Controller
+from ventbench.task import protocol
+from ventbench.task.interfaces import Controller
 
 
 def _residual() -> Controller:

@@ -18,10 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench import files, protocol, waveform
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.controllers.pid import PID, PIDState
-from ventbench.errors import InputError
-from ventbench.interfaces import Observation
+from ventbench.task import protocol, waveform
+from ventbench.task.interfaces import Observation
 
 #: Scales that bring the features to the order of 1: cmH2O of errors and of targets, % of commands,
 #: shares of the control step.

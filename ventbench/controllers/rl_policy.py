@@ -19,11 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ventbench import protocol
+from ventbench.base.files import write_atomically
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import Residual, ResidualState, inputs
-from ventbench.files import write_atomically
-from ventbench.interfaces import Observation
+from ventbench.task import protocol
+from ventbench.task.interfaces import Observation
 
 #: The PID that is corrected: the best single one of the grid for all six lungs, (P, I, D).
 GAINS = (6.0, 6.0, 0.3)

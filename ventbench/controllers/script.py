@@ -6,7 +6,7 @@ import flax.struct
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.interfaces import Observation
+from ventbench.task.interfaces import Observation
 
 
 @flax.struct.dataclass

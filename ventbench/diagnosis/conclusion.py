@@ -16,6 +16,7 @@ from functools import cache
 
 import numpy as np
 
+from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.plausibility import is_consistent
@@ -49,7 +50,6 @@ from ventbench.diagnosis.selection.refinement import (
 )
 from ventbench.diagnosis.selection.screening import component_of
 from ventbench.diagnosis.selection.shape_parameters import free_shape_parameters
-from ventbench.executor import parallel_map
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import Noise
 

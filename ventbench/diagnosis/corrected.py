@@ -31,12 +31,12 @@ from ventbench.diagnosis.residual_analysis import open_loop_error
 from ventbench.diagnosis.rig_fit import RigFit, fit_rigs
 from ventbench.diagnosis.settings import CorrectionSettings
 from ventbench.diagnosis.simulator_comparison import less_unmodelled, refit_base_parameters
-from ventbench.interfaces import Plant
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.problem import parameter_of, parameter_values
+from ventbench.task.interfaces import Plant
 
 #: Plants of the lungs, by label.
 Plants = dict[str, Plant]

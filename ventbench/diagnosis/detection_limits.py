@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, varies_by_breath
 from ventbench.diagnosis.linearisation import Linearisation, linearise
 from ventbench.diagnosis.settings import DetectionSettings
-from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import mechanism, strength_path
 
 

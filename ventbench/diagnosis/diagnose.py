@@ -11,6 +11,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates, flow_drive
 from ventbench.diagnosis.adequacy import check_residuals
 from ventbench.diagnosis.conclusion import Conclusion
@@ -52,8 +53,6 @@ from ventbench.diagnosis.simulator_comparison import (
     missing_mechanisms,
     refit_at_simulator_parameters,
 )
-from ventbench.errors import InputError
-from ventbench.lungs import lung as parse_lung
 from ventbench.mechanics.labels import LungMatch
 from ventbench.physics.catalogue import parameter
 from ventbench.plants.catalog import Given, load_simulators
@@ -63,6 +62,7 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.decimation import decimate, is_fast
 from ventbench.recordings.roles import require_roles
 from ventbench.system_id import Data, Fit, Noise, make_data
+from ventbench.task.lungs import lung as parse_lung
 
 #: Receives the current step in words, and the share of the whole that is done.
 Progress: TypeAlias = Callable[[str, float], None]

@@ -17,7 +17,6 @@ from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY, Lat
 from ventbench.diagnosis.remaining_error import UnnamedEffect
 from ventbench.diagnosis.selection.screening import component_of
 from ventbench.diagnosis.settings import EstimateSettings
-from ventbench.interfaces import Plant
 from ventbench.mechanics.labels import Estimate, LungMatch
 from ventbench.physics.catalogue import (
     library,
@@ -33,6 +32,7 @@ from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import ConfidenceInterval, Fit, fit, interval, profile_interval
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.predictor import START, Predictor
+from ventbench.task.interfaces import Plant
 
 #: What a latent input is, by the place where it enters.
 _LATENT_INPUTS = {

@@ -17,11 +17,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, make_partition
 from ventbench.diagnosis.linearisation import linearise
 from ventbench.diagnosis.patient_effort import BreathTerm, breath_term
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
-from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import library
 from ventbench.system_id import problem as problems
 from ventbench.system_id.data import Data, Floats

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from ventbench.diagnosis.candidate_breaths import Family, Rig, families
 from ventbench.diagnosis.findings import BreathRequest
 from ventbench.diagnosis.settings import DEFAULT, ExperimentSettings
-from ventbench.lungs import Lung
 from ventbench.physics.catalogue import parameter, strength_path
 from ventbench.system_id.data import Data, Floats
 from ventbench.system_id.levenberg_marquardt import Minimum
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.predictor import START, Predictor
 from ventbench.system_id.problem import Problem, parameter_of
+from ventbench.task.lungs import Lung
 
 #: Share of the diagonal that keeps a Hessian invertible where data say nothing.
 _RIDGE = 1e-9

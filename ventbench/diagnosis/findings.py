@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
-from ventbench.interfaces import Plant
 from ventbench.mechanics.labels import Estimate, LungMatch
 from ventbench.recordings.breaths import Breaths
+from ventbench.task.interfaces import Plant
 
 Floats = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.base.errors import InputError
 from ventbench.diagnosis.settings import SelectionConfig
-from ventbench.errors import InputError
 from ventbench.physics.catalogue import basis_terms, parameter
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates
 from ventbench.diagnosis.conclusion import Conclusion, conclude, without_name, without_term
 from ventbench.diagnosis.evaluator import Evaluator, make_evaluator
@@ -25,13 +26,12 @@ from ventbench.diagnosis.hypothesis import (
 from ventbench.diagnosis.plausibility import excludes_neutral, is_weak
 from ventbench.diagnosis.selection.screening import all_parameter_paths, library_paths
 from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
-from ventbench.errors import InputError
-from ventbench.interfaces import Plant
 from ventbench.physics.catalogue import mechanism, special_cases
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit
 from ventbench.system_id.data import Data, Floats
+from ventbench.task.interfaces import Plant
 
 #: A breath needs more inspiratory samples with a pressure than these.
 _INSPIRATORY = 3

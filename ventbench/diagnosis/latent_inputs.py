@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import optimize
 
+from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.gaussian_process import (
     Kernel,
@@ -27,7 +28,6 @@ from ventbench.diagnosis.gaussian_process import (
 )
 from ventbench.diagnosis.hypothesis import FittedModel, Partition
 from ventbench.diagnosis.settings import LatentInputSettings
-from ventbench.executor import parallel_map
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import LEAST_SIGMA, MOST_AR, Noise
 

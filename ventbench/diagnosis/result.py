@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import ventbench
-from ventbench import errors, files
+from ventbench.base import errors, files
 from ventbench.diagnosis import report_text
 from ventbench.diagnosis.findings import (
     BreathRequest,
@@ -37,7 +37,7 @@ FORMAT = "ventbench-diagnosis-1"
 RECORD_NEXT = "record_next.csv"
 
 #: Pictures lie above the diagnosis; they are imported only when they are asked for.
-_VIEWS = "ventbench.views.diagnosis"
+_VIEWS = "ventbench.pages.diagnosis"
 
 #: Columns of :meth:`Diagnosis.to_frame`.
 _COLUMNS = (

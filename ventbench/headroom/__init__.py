@@ -3,5 +3,5 @@
 - :mod:`~ventbench.headroom.attainable`: commands optimised for a cell, everything known, with a
   certificate;
 - :mod:`~ventbench.headroom.reference`: that and the lung's best PID for all cells of a score,
-  computed, stored and checked. The PIDs are found by :mod:`ventbench.training.pid_grid`.
+  computed, stored and checked. The PIDs are found by :mod:`ventbench.train.pid_grid`.
 """

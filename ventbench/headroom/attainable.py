@@ -36,11 +36,12 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import linprog
 
-from ventbench import environment as env
-from ventbench import precision, protocol, rollouts
-from ventbench.draws import DEVELOPMENT_SEED, uniforms
-from ventbench.environment import Scenario
-from ventbench.interfaces import Plant
+from ventbench.base import precision
+from ventbench.task import environment as env
+from ventbench.task import protocol, rollouts
+from ventbench.task.draws import DEVELOPMENT_SEED, uniforms
+from ventbench.task.environment import Scenario
+from ventbench.task.interfaces import Plant
 
 #: Commands that act before the last scored pressure, and pressures that they can change.
 COMMANDS = protocol.INSPIRATION_STEPS - 1

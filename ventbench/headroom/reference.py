@@ -23,16 +23,17 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench import files, precision, rollouts
+from ventbench.base import files, precision
+from ventbench.base.errors import InputError
+from ventbench.base.executor import InProcess, results
+from ventbench.base.resume import ARRAY, WorkFolder, fingerprint
 from ventbench.controllers.pid import PID
-from ventbench.environment import Scenario
-from ventbench.errors import InputError
-from ventbench.executor import InProcess, results
 from ventbench.headroom import attainable
 from ventbench.headroom.attainable import second_optimum
-from ventbench.interfaces import Plant
-from ventbench.metrics import score as metric
-from ventbench.resume import ARRAY, WorkFolder, fingerprint
+from ventbench.task import rollouts
+from ventbench.task.environment import Scenario
+from ventbench.task.interfaces import Plant
+from ventbench.task.metrics import score as metric
 
 #: The published file for the development draws.
 FILE = "bounds-v2.npz"
@@ -58,7 +59,7 @@ class Reference:
     """Reference errors of L lungs, nominal cells in front of K draws, and P PIPs.
 
     All errors leave the first step of an inspiration out, see
-    :func:`ventbench.metrics.score.controllable_error`.
+    :func:`ventbench.task.metrics.score.controllable_error`.
 
     Attributes:
         about: hashes of the simulators, and name, commitment and number of the draws.
@@ -105,7 +106,7 @@ def settings(simulators: Mapping[str, Any], draws: Mapping[str, Any] | None) -> 
 
     Args:
         simulators: version and hashes of the simulators.
-        draws: what :meth:`ventbench.draws.Draws.about` says; None for nominal cells alone.
+        draws: what :meth:`ventbench.task.draws.Draws.about` says; None for nominal cells alone.
     """
     about = {"simulators": simulators.get("manifest_sha256"), "draws": draws}
     return json.loads(json.dumps(about))

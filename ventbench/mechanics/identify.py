@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.errors import InputError
-from ventbench.lungs import Lung
+from ventbench.base.errors import InputError
 from ventbench.mechanics.labels import (
     Estimate,
     LungMatch,
@@ -43,6 +42,7 @@ from ventbench.mechanics.term_selection import (
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.roles import check_roles
 from ventbench.system_id.fit import t_quantile
+from ventbench.task.lungs import Lung
 
 Floats = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ventbench.lungs import RECORDED_LUNGS, Lung
+from ventbench.task.lungs import RECORDED_LUNGS, Lung
 
 if TYPE_CHECKING:
     from ventbench.system_id import Fit

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from types import ModuleType
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.physics import events as event_modules
 from ventbench.physics import mechanisms, nonparametric
 from ventbench.physics.mechanism import Mechanism

@@ -15,11 +15,11 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
+from ventbench.base.precision import float64
 from ventbench.physics.catalogue import mechanism
 from ventbench.physics.mechanism import Mechanism, Values
 from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import BASE_PARAMETERS
-from ventbench.precision import float64
 
 Floats = NDArray[np.float64]
 

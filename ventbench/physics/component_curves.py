@@ -8,12 +8,12 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
+from ventbench.base.precision import float64
 from ventbench.physics.catalogue import basis_terms
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.physics.nonparametric.basis import BasisTerm, Curve
 from ventbench.physics.parameters import BASE_PARAMETERS
-from ventbench.precision import float64
 
 
 def component_curves(

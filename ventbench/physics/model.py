@@ -18,13 +18,13 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ventbench.errors import InputError
-from ventbench.interfaces import Signals
-from ventbench.lungs import Lung
+from ventbench.base.errors import InputError
 from ventbench.physics import dead_time, solver
 from ventbench.physics.catalogue import everything, parameter, paths
 from ventbench.physics.mechanism import Assembly, assemble
 from ventbench.physics.solver import ContinuousState
+from ventbench.task.interfaces import Signals
+from ventbench.task.lungs import Lung
 
 
 @flax.struct.dataclass
@@ -75,7 +75,7 @@ class Physics:
     divisions: int = flax.struct.field(pytree_node=False, default=1)
 
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[PhysicsState, Signals]:
-        """Lung at rest, expiratory valve open; see :class:`~ventbench.interfaces.Plant`.
+        """Lung at rest, expiratory valve open; see :class:`~ventbench.task.interfaces.Plant`.
 
         ``pressure`` is what the sensor shows; :meth:`reading_of` gives that of an airway pressure.
         Without ``peep``, the parameter ``PEEP`` is taken, and without that the pressure.
@@ -107,7 +107,7 @@ class Physics:
         dt: Array,
         divisions: int | Array | None = None,
     ) -> tuple[PhysicsState, Signals]:
-        """Hold one command; see :class:`~ventbench.interfaces.Plant`.
+        """Hold one command; see :class:`~ventbench.task.interfaces.Plant`.
 
         Args:
             state: state from ``init`` or ``step``.

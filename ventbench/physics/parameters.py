@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 #: Flow of the PVP's inspiratory valve, mL/s per % (137 L/min fully open).
 VALVE_GAIN = 22.8

@@ -34,10 +34,9 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench import files, precision, recordings
-from ventbench.errors import InputError
-from ventbench.interfaces import Plant
-from ventbench.lungs import LUNGS, Lung, lung
+from ventbench import recordings
+from ventbench.base import files, precision
+from ventbench.base.errors import InputError
 from ventbench.physics import physics
 from ventbench.plants import frozen
 from ventbench.plants.plant_files import load_plants, origin
@@ -53,6 +52,8 @@ from ventbench.plants.stacking import (
 )
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.simulated import read_simulated
+from ventbench.task.interfaces import Plant
+from ventbench.task.lungs import LUNGS, Lung, lung
 
 Floats = NDArray[np.float64]
 

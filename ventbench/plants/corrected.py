@@ -7,7 +7,7 @@ from typing import Any
 import flax.struct
 from jax import Array
 
-from ventbench.interfaces import Signals
+from ventbench.task.interfaces import Signals
 
 
 @flax.struct.dataclass
@@ -31,7 +31,7 @@ class Corrected:
     def init(
         self, pressure: Array, peep: Array | None = None
     ) -> tuple[tuple[Any, Any, Any], Signals]:
-        """All three plants at rest; see :class:`~ventbench.interfaces.Plant`."""
+        """All three plants at rest; see :class:`~ventbench.task.interfaces.Plant`."""
         parts = (self.simulator, self.with_mechanisms, self.without_mechanisms)
         states, signals = zip(*(part.init(pressure, peep) for part in parts), strict=True)
         return states, corrected_signals(*signals)
@@ -39,7 +39,7 @@ class Corrected:
     def step(
         self, state: tuple[Any, Any, Any], u_in: Array, u_out: Array, dt: Array
     ) -> tuple[tuple[Any, Any, Any], Signals]:
-        """Hold one command; see :class:`~ventbench.interfaces.Plant`."""
+        """Hold one command; see :class:`~ventbench.task.interfaces.Plant`."""
         simulator, shown = self.simulator.step(state[0], u_in, u_out, dt)
         wanted, more = self.with_mechanisms.step(state[1], u_in, u_out, dt)
         own, less = self.without_mechanisms.step(state[2], u_in, u_out, dt)

@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import files
-from ventbench.errors import InputError
-from ventbench.files import data_path
+from ventbench.base import files
+from ventbench.base.errors import InputError
+from ventbench.base.files import data_path
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.plant_files import load_plant
 from ventbench.plants.sessions import Sessions

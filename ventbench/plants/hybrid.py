@@ -16,7 +16,7 @@ import flax.struct
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench.interfaces import Signals
+from ventbench.task.interfaces import Signals
 
 #: Knots of the valve's piecewise linear curve, %; the last segment ends at infinity.
 VALVE_KNOTS = (0.0, 1.0, 2.0, 3.5, 5.0, 7.0, 10.0, 14.0, 19.0, 26.0, 36.0, 50.0, 70.0)
@@ -136,7 +136,7 @@ class Hybrid:
         return pressure, slope
 
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[HybridState, Signals]:
-        """Lung at the end of an expiration; see :class:`~ventbench.interfaces.Plant`.
+        """Lung at the end of an expiration; see :class:`~ventbench.task.interfaces.Plant`.
 
         The expiratory valve is open and the resting command holds the pressure, as before every
         inspiration on the rig.
@@ -163,7 +163,7 @@ class Hybrid:
     def step(
         self, state: HybridState, u_in: Array, u_out: Array, dt: Array
     ) -> tuple[HybridState, Signals]:
-        """Hold one command; see :class:`~ventbench.interfaces.Plant`.
+        """Hold one command; see :class:`~ventbench.task.interfaces.Plant`.
 
         Each substep is an exponential step of the drop over the airway, with the airway's
         resistance and the elastic slope of its start.

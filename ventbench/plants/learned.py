@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ventbench import protocol
-from ventbench.interfaces import Signals
+from ventbench.task import protocol
+from ventbench.task.interfaces import Signals
 
 #: Interval at which the network's rate output is an increment, s (mean of the recordings').
 REFERENCE_DT = 0.033
@@ -253,7 +253,7 @@ class Learned:
     windows: tuple[int, int] = flax.struct.field(pytree_node=False)
 
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[LearnedState, Signals]:
-        """Lung at rest; see :class:`~ventbench.interfaces.Plant`."""
+        """Lung at rest; see :class:`~ventbench.task.interfaces.Plant`."""
         pressure = jnp.asarray(pressure) * 1.0
         behind = pressure if peep is None else jnp.broadcast_to(peep, pressure.shape)
         return self._rest(pressure, behind.astype(pressure.dtype)), Signals(pressure)
@@ -332,7 +332,7 @@ def _bend(pressure: Array) -> Array:
 def learned(
     key: Array, architecture: Architecture, normalisation: Normalisation | None = None
 ) -> Learned:
-    """Draw an untrained learned plant; :func:`ventbench.training.learned.fit` trains one.
+    """Draw an untrained learned plant; :func:`ventbench.train.learned.fit` trains one.
 
     Args:
         key: a JAX key that is used for nothing else.

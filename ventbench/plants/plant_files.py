@@ -17,11 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ventbench import files
-from ventbench.errors import InputError
-from ventbench.interfaces import Plant
-from ventbench.lungs import lung
+from ventbench.base import files
+from ventbench.base.errors import InputError
 from ventbench.plants import registry
+from ventbench.task.interfaces import Plant
+from ventbench.task.lungs import lung
 
 FORMAT = "ventbench-plants-1"
 

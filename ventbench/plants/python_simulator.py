@@ -5,7 +5,7 @@ A simulator may be
 - a function ``f(u_in, u_out, dt, *, R, C, initial_pressure)`` that returns the pressures; it may
   leave out what it does not need, and may also ask for ``time`` or ``flow`` by name;
 - a class or an object with ``init(pressure)`` and ``step(state, u_in, u_out, dt)``, which returns
-  the next state and the pressure, as :class:`~ventbench.interfaces.Plant` says, but with numbers;
+  the next state and the pressure, all of them numbers;
 - a class or an object with ``step(u_in, u_out, dt)``, which returns the pressure and keeps its
   state itself. ``reset(...)`` is called before each breath; a class without it is made anew.
 
@@ -23,8 +23,8 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench.errors import InputError
-from ventbench.interfaces import Plant
+from ventbench.base.errors import InputError
+from ventbench.task.interfaces import Plant
 
 Floats = NDArray[np.float64]
 

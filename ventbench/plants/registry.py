@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ventbench.interfaces import Plant
-from ventbench.lungs import Lung
 from ventbench.physics.model import Physics
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.learned import MLP, Boundary, Learned
 from ventbench.plants.single_compartment import SingleCompartment, single_compartment
 from ventbench.plants.two_balloon import TwoBalloon, two_balloon
+from ventbench.task.interfaces import Plant
+from ventbench.task.lungs import Lung
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,14 @@ from typing import Any
 
 import jax
 
-from ventbench import draws as draw_tables
-from ventbench import protocol
-from ventbench.draws import Draws
-from ventbench.environment import Scenario
-from ventbench.interfaces import Plant
-from ventbench.lungs import LUNGS, Lung
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators
+from ventbench.task import draws as draw_tables
+from ventbench.task import protocol
+from ventbench.task.draws import Draws
+from ventbench.task.environment import Scenario
+from ventbench.task.interfaces import Plant
+from ventbench.task.lungs import LUNGS, Lung
 
 
 @dataclass(frozen=True, eq=False)

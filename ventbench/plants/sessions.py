@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 
 #: Median intervals at which the rigs run, ms, from and to; others are not regular.

@@ -12,15 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import precision
-from ventbench.errors import InputError
-from ventbench.interfaces import Plant
-from ventbench.lungs import Lung, lung
+from ventbench.base import precision
+from ventbench.base.errors import InputError
 from ventbench.plants import frozen
 from ventbench.plants.python_simulator import PythonSimulator
 from ventbench.plants.stacking import PlantsFor, VmappedPlant, open_loop_breaths, take
 from ventbench.recordings.breaths import Breaths
-from ventbench.rollouts import open_loop
+from ventbench.task.interfaces import Plant
+from ventbench.task.lungs import Lung, lung
+from ventbench.task.rollouts import open_loop
 
 Floats = NDArray[np.float64]
 

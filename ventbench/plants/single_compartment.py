@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ventbench.interfaces import Signals
-from ventbench.lungs import Lung
 from ventbench.physics.parameters import EXPIRATORY_RESISTANCE, VALVE_GAIN
+from ventbench.task.interfaces import Signals
+from ventbench.task.lungs import Lung
 
 
 @flax.struct.dataclass
@@ -44,7 +44,7 @@ class SingleCompartment:
     def init(
         self, pressure: Array, peep: Array | None = None
     ) -> tuple[SingleCompartmentState, Signals]:
-        """Lung at rest; see :class:`~ventbench.interfaces.Plant`."""
+        """Lung at rest; see :class:`~ventbench.task.interfaces.Plant`."""
         state = SingleCompartmentState(pressure, pressure if peep is None else peep)
         return state, Signals(pressure, pressure, 0.0 * pressure, self.C * pressure)
 

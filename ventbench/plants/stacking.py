@@ -13,13 +13,13 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from ventbench import precision
-from ventbench.errors import InputError
-from ventbench.interfaces import Plant, Signals
-from ventbench.lungs import Lung
+from ventbench.base import precision
+from ventbench.base.errors import InputError
 from ventbench.physics.model import Physics
 from ventbench.recordings.breaths import Breaths
-from ventbench.rollouts import open_loop
+from ventbench.task.interfaces import Plant, Signals
+from ventbench.task.lungs import Lung
+from ventbench.task.rollouts import open_loop
 
 PlantT = TypeVar("PlantT")
 
@@ -137,7 +137,7 @@ class VmappedPlant:
     plants: Any
 
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[Any, Signals]:
-        """Lungs at rest; see :class:`~ventbench.interfaces.Plant`."""
+        """Lungs at rest; see :class:`~ventbench.task.interfaces.Plant`."""
 
         def init(plant: Plant, pressure: Array, peep: Array) -> Any:
             return plant.init(pressure, peep)

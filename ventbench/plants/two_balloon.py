@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ventbench import protocol
-from ventbench.interfaces import Signals
-from ventbench.lungs import Lung
 from ventbench.plants.single_compartment import EXPIRATORY_RESISTANCE, VALVE_GAIN
+from ventbench.task import protocol
+from ventbench.task.interfaces import Signals
+from ventbench.task.lungs import Lung
 
 #: Pressure scale of the balloon, cmH2O: PC / r0^3 of the authors' code (40 cmH2O L, 1.5 L at rest).
 BALLOON_PRESSURE = 111.7
@@ -67,7 +67,7 @@ class TwoBalloon:
     supply: Array
 
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[TwoBalloonState, Signals]:
-        """Lung at rest; see :class:`~ventbench.interfaces.Plant`.
+        """Lung at rest; see :class:`~ventbench.task.interfaces.Plant`.
 
         Pressures outside -K/2 to 98 % of the balloon's peak become these.
         """

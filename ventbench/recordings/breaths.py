@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ventbench.errors import InputError
-from ventbench.lungs import Lung
+from ventbench.base.errors import InputError
+from ventbench.task.lungs import Lung
 
 
 @dataclass(frozen=True, eq=False)

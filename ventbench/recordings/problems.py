@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 SHOWN = 20
 """Number of problems that are kept and shown; further ones are only counted."""

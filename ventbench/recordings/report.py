@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ventbench.lungs import Lung
 from ventbench.recordings.problems import ProblemLog, RecordingProblem
 from ventbench.recordings.roles import breath_figures, few_breaths, findings
 from ventbench.recordings.scan import Block
 from ventbench.recordings.times import IntervalTable, interval_table
+from ventbench.task.lungs import Lung
 
 PAD_LIMIT = 10
 """Largest factor by which padding may enlarge a file in memory."""

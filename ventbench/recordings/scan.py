@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ventbench.files import sha256
+from ventbench.base.files import sha256
 from ventbench.recordings.checks import (
     check_ids,
     check_lung,

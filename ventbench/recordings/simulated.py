@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 
 #: Names of the column of simulated pressures, in the order in which they are looked for.

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ventbench.errors import InputError
-from ventbench.files import write_text
+from ventbench.base.errors import InputError
+from ventbench.base.files import write_text
 from ventbench.recordings.breaths import Breaths
 
 FORMAT = "ventbench-split-1"

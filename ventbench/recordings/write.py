@@ -10,8 +10,8 @@ from typing import IO, TYPE_CHECKING, cast
 
 import numpy as np
 
-from ventbench.errors import InputError
-from ventbench.files import write_atomically
+from ventbench.base.errors import InputError
+from ventbench.base.files import write_atomically
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.schema import COLUMNS, OPTIONAL
 

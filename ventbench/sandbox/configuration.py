@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.sandbox.child.failures import SubmissionError
 from ventbench.sandbox.child.zygote import NUMPY
 from ventbench.sandbox.reader import UnreadableError, read_apart

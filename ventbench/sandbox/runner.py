@@ -9,7 +9,6 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ventbench.interfaces import Task
 from ventbench.sandbox.child import landlock, lockdown, wire
 from ventbench.sandbox.child.lockdown import OFFICIAL
 from ventbench.sandbox.child.wire import Reply
@@ -17,6 +16,7 @@ from ventbench.sandbox.configuration import Allowance, SandboxError, configurati
 from ventbench.sandbox.pipes import Clock, Pipes
 from ventbench.sandbox.session import SandboxSession, SubmittedFolder, said
 from ventbench.sandbox.zygote import ZygoteClient
+from ventbench.task.interfaces import Task
 
 _PROBE_S = 30.0
 
@@ -48,7 +48,7 @@ def layers() -> tuple[str, ...]:
 
 
 class SandboxRunner:
-    """Runs controllers apart: a :class:`ventbench.submissions.runner.Runner`.
+    """Runs controllers apart: a :class:`ventbench.entries.runner.Runner`.
 
     Args:
         require_official: refuse to run where a layer is missing that official results need.
@@ -92,7 +92,7 @@ class SandboxRunner:
         }
 
     def start(self, submission: SubmittedFolder, tasks: Sequence[Task]) -> SandboxSession:
-        """Start the cells of a submission, as :class:`ventbench.submissions.runner.Runner` says.
+        """Start the cells of a submission, as :class:`ventbench.entries.runner.Runner` says.
 
         Raises:
             SandboxError: if a cell does not show the layers of :attr:`sandbox`.

@@ -19,14 +19,14 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import protocol
-from ventbench.interfaces import Task
 from ventbench.sandbox.child import libc, lockdown, wire
 from ventbench.sandbox.child.failures import Failure, SubmissionError, printable
 from ventbench.sandbox.child.wire import Reply
 from ventbench.sandbox.configuration import Allowance, SandboxError, configuration
 from ventbench.sandbox.pipes import Clock, Outcome, Pipes
 from ventbench.sandbox.zygote import ZygoteClient, signal_name
+from ventbench.task import protocol
+from ventbench.task.interfaces import Task
 
 Floats = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ class SubmittedFolder(Protocol):
 class SandboxSession:
     """Fresh, locked-down controllers, one process each.
 
-    It is a :class:`ventbench.submissions.runner.ControllerSession`.
+    It is a :class:`ventbench.entries.runner.ControllerSession`.
 
     Args:
         submission: whose code runs.

@@ -16,7 +16,6 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from ventbench.interfaces import Task
 from ventbench.sandbox.child.zygote import (
     ENDED,
     INTERRUPT,
@@ -29,6 +28,7 @@ from ventbench.sandbox.child.zygote import (
 )
 from ventbench.sandbox.configuration import SandboxError
 from ventbench.sandbox.reader import ENVIRONMENT, OPTIONS, ROOT, SITE
+from ventbench.task.interfaces import Task
 
 _BOOT = (
     "import sys; sys.path.insert(0, sys.argv[2]); from ventbench.sandbox.child import zygote; "

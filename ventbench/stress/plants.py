@@ -18,14 +18,14 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from ventbench import protocol
-from ventbench.interfaces import Plant, Signals
-from ventbench.lungs import Lung
 from ventbench.physics.catalogue import parameter, paths
 from ventbench.physics.model import Physics
 from ventbench.plants.corrected import corrected_signals
 from ventbench.plants.hybrid import ELASTIC_KNOTS, RELIEF, VALVE_KNOTS, Hybrid
 from ventbench.stress.stressors import Condition, Severity, Stressor, stressor
+from ventbench.task import protocol
+from ventbench.task.interfaces import Plant, Signals
+from ventbench.task.lungs import Lung
 
 Floats = NDArray[np.float64]
 
@@ -56,7 +56,7 @@ class Stressed:
     physics: Physics
 
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[tuple[Any, Any], Signals]:
-        """Lung at rest at a true pressure; see :class:`~ventbench.interfaces.Plant`."""
+        """Lung at rest at a true pressure; see :class:`~ventbench.task.interfaces.Plant`."""
         behind = pressure if peep is None else peep
         shown = self.physics.reading_of(pressure)
         state, _ = self.physics.init(shown, behind)

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import protocol
-from ventbench.errors import InputError
-from ventbench.lungs import LUNG_IDS
-from ventbench.metrics.bootstrap import resampled_scores
+from ventbench.base.errors import InputError
 from ventbench.stress.stressors import CATEGORIES, Condition, conditions, stressor
+from ventbench.task import protocol
+from ventbench.task.lungs import LUNG_IDS
+from ventbench.task.metrics.bootstrap import resampled_scores
 
 if TYPE_CHECKING:
     import pandas as pd

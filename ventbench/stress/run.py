@@ -15,21 +15,22 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import draws as draw_tables
-from ventbench import precision, protocol
-from ventbench.draws import Draws
-from ventbench.environment import Scenario
-from ventbench.interfaces import Plant, Task
-from ventbench.lungs import Lung
+from ventbench.base import precision
+from ventbench.entries import stepping
+from ventbench.entries.errors import Failure
+from ventbench.entries.folder import Submission
+from ventbench.entries.runner import Runner
+from ventbench.entries.stepping import ProtocolRun
 from ventbench.plants.rigs import Rigs
 from ventbench.stress.plants import Stressed, stressed_plants
 from ventbench.stress.results import DRAWS, pip_columns
 from ventbench.stress.stressors import Condition
-from ventbench.submissions import stepping
-from ventbench.submissions.errors import Failure
-from ventbench.submissions.folder import Submission
-from ventbench.submissions.runner import Runner
-from ventbench.submissions.stepping import ProtocolRun
+from ventbench.task import draws as draw_tables
+from ventbench.task import protocol
+from ventbench.task.draws import Draws
+from ventbench.task.environment import Scenario
+from ventbench.task.interfaces import Plant, Task
+from ventbench.task.lungs import Lung
 
 Floats = NDArray[np.float64]
 

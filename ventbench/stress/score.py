@@ -17,26 +17,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench import files, protocol
-from ventbench.draws import Draws
-from ventbench.metrics.figures import time_above_alarm
-from ventbench.metrics.score import passes_safety_gate, run_error
-from ventbench.metrics.step_response import steady_error
-from ventbench.plants.catalog import Given
-from ventbench.plants.rigs import load_rigs
-from ventbench.stress.results import DRAWS, StressTables
-from ventbench.stress.run import TRACK, StressDraws, StressRun, draw_cells, step_through
-from ventbench.stress.stressors import VERSION, Condition, conditions, stressor
-from ventbench.submissions.errors import Failure, SubmissionError
-from ventbench.submissions.folder import Submission, as_submission
-from ventbench.submissions.result import package_versions
-from ventbench.submissions.runner import (
+from ventbench.base import files
+from ventbench.entries.errors import Failure, SubmissionError
+from ventbench.entries.folder import Submission, as_submission
+from ventbench.entries.result import package_versions
+from ventbench.entries.runner import (
     CountingRunner,
     InProcessRunner,
     Progress,
     Runner,
     runner_of,
 )
+from ventbench.plants.catalog import Given
+from ventbench.plants.rigs import load_rigs
+from ventbench.stress.results import DRAWS, StressTables
+from ventbench.stress.run import TRACK, StressDraws, StressRun, draw_cells, step_through
+from ventbench.stress.stressors import VERSION, Condition, conditions, stressor
+from ventbench.task import protocol
+from ventbench.task.draws import Draws
+from ventbench.task.metrics.figures import time_above_alarm
+from ventbench.task.metrics.score import passes_safety_gate, run_error
+from ventbench.task.metrics.step_response import steady_error
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -236,7 +237,7 @@ def run_stress(
     """Run a submission on drawn cells, by any runner; see :func:`score_stress`.
 
     Args:
-        submission: from :func:`ventbench.submissions.folder.open_submission`.
+        submission: from :func:`ventbench.entries.folder.open_submission`.
         draws: from :func:`ventbench.stress.run.draw_cells`.
         chosen: conditions; the first must be none.
         runner: runs the controllers; in this process if not given.

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from ventbench import protocol
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
+from ventbench.task import protocol
 
 #: Version of the table: stressors, strengths and pairs. Stress scores of two versions are not
 #: compared.

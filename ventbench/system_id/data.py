@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 
 Floats = NDArray[np.float64]

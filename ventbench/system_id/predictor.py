@@ -16,12 +16,12 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench.executor import parallel_map
+from ventbench.base.executor import parallel_map
+from ventbench.base.precision import float64
 from ventbench.physics.catalogue import mechanism, parameter
 from ventbench.physics.dead_time import resolution_of
 from ventbench.physics.mechanism import Mechanism
 from ventbench.physics.model import Physics
-from ventbench.precision import float64
 from ventbench.system_id.data import Data, Floats
 
 Ints = NDArray[np.int_]
@@ -107,7 +107,7 @@ class Predictor:
     A simulation is one breath at one point. Those of all points are lined up, and computed in
     blocks of a compiled size, whatever breath or point a block begins with: few breaths at many
     points fill it as well as many breaths do. Blocks are computed in parallel; see
-    :func:`~ventbench.executor.parallel_map`.
+    :func:`~ventbench.base.executor.parallel_map`.
 
     Attributes:
         names: paths of the parameters in the order of the columns of ``values``, whose last column

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.physics.catalogue import mechanism, parameter, paths, strength_path
 from ventbench.physics.parameters import REFITTED, Parameter
 from ventbench.system_id.data import Data, Floats

@@ -19,8 +19,8 @@ from hardware_eval.emulation.cases import (
     rotate,
 )
 from proofs.challenge.questions import CLASSES, KINDS, DrawnCase, Kind
-from ventbench.errors import InputError
-from ventbench.lungs import LUNGS, Lung
+from ventbench.base.errors import InputError
+from ventbench.task.lungs import LUNGS, Lung
 
 #: Share of each kind in a challenge of all kinds.
 SHARES: dict[Kind, float] = {

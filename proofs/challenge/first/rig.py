@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, draw_base
 from proofs.challenge.first.circuit import READING, Circuit, Disturbances
 from proofs.challenge.first.instruments import Floats, Sensor, Valve
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 
 #: Means of the sampling interval that a breath may have, s.

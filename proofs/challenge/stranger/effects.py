@@ -23,8 +23,8 @@ import numpy as np
 
 from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, Effect, EffectFamily, Strength
 from proofs.challenge.questions import DrawnCase, Kind
-from ventbench.errors import InputError
-from ventbench.lungs import Lung
+from ventbench.base.errors import InputError
+from ventbench.task.lungs import Lung
 
 #: Form of an effect whose parameter means the same as the library's of that name.
 SAME = "library"

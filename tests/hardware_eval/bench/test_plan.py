@@ -12,7 +12,7 @@ import pytest
 from hardware_eval.bench import plan as plans
 from hardware_eval.bench.plan import CONTROL, make_plan, progress
 from hardware_eval.bench.raw_log import RawLog, lines
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 
 def test_every_cell_is_repeated_and_the_control_runs_in_between() -> None:

@@ -9,9 +9,9 @@ import pytest
 
 from hardware_eval.bench import safety
 from hardware_eval.bench.safety import DEFAULT, SafetySample, SafetyState
-from ventbench import protocol
-from ventbench.errors import InputError
-from ventbench.lungs import lung
+from ventbench.base.errors import InputError
+from ventbench.task import protocol
+from ventbench.task.lungs import lung
 
 DT = protocol.DT
 LUNG = lung("R20C20")

@@ -16,7 +16,7 @@ from hardware_eval.bench.selftest import LIMITS, Driven, selftest
 from hardware_eval.emulation.faults import LineFault, LineFaultKind
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import FaultKind, LungFault
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 LUNG = "R5C20"
 

@@ -22,8 +22,9 @@ from hardware_eval.emulation.faults import LineFault, LineFaultKind
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import FaultKind, LungFault
 from hardware_eval.wire.errors import LinkError
-from ventbench import protocol, rollout
+from ventbench import rollout
 from ventbench.controllers.pid import PID
+from ventbench.task import protocol
 
 LUNG = "R5C20"
 GAINS = (2.0, 5.0, 0.0)
@@ -322,7 +323,7 @@ def test_six_lungs_survive_three_crashes_and_two_cables(tmp_path: Path) -> None:
     from hardware_eval.emulation.loopback import loopback
     from hardware_eval.emulation.simulated import simulated_lung
     from hardware_eval.wire.client import Client
-    from ventbench.lungs import LUNG_IDS
+    from ventbench.task.lungs import LUNG_IDS
 
     lungs = {name: simulated_lung(name, "physics") for name in LUNG_IDS}
     device = loopback(simulated_lung(LUNG, "physics"))

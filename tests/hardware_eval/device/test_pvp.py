@@ -22,7 +22,7 @@ from hardware_eval.wire.client import Client
 from hardware_eval.wire.link import Link
 from hardware_eval.wire.messages import Mode
 from tests.hardware_eval.stand_in import Bench
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 CONFIGURATION = """\
 name = "bench 3"

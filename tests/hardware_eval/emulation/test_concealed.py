@@ -8,7 +8,7 @@ import pytest
 
 from hardware_eval.emulation.cases import LIBRARY
 from hardware_eval.emulation.concealed import _LEFT_OUT, conceal, reveal
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.plants.corrected import Corrected
 
 

@@ -30,7 +30,7 @@ from hardware_eval.wire.errors import (
 from hardware_eval.wire.link import Link, ReconnectPolicy
 from hardware_eval.wire.messages import Flag, Mode, Packet, Vent, encode
 from tests.hardware_eval.stand_in import Bench
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 #: Patience with a busy machine, s; a healthy one needs a thousandth of it.
 PATIENCE = 20.0

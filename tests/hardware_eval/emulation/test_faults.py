@@ -22,12 +22,12 @@ from hardware_eval.wire.client import Client
 from hardware_eval.wire.errors import DisconnectedError, NoAnswerError
 from hardware_eval.wire.messages import Capability, Flag, Mode
 from tests.hardware_eval.stand_in import Bench
-from ventbench import protocol
-from ventbench.errors import InputError
-from ventbench.interfaces import Signals
-from ventbench.lungs import lung
+from ventbench.base.errors import InputError
 from ventbench.plants.catalog import load_simulators
 from ventbench.plants.single_compartment import single_compartment
+from ventbench.task import protocol
+from ventbench.task.interfaces import Signals
+from ventbench.task.lungs import lung
 
 STEPS = 34
 

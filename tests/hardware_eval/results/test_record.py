@@ -17,10 +17,10 @@ from hardware_eval.results import record as records
 from hardware_eval.results.compare import compare, recorded_breaths
 from hardware_eval.results.evaluate import Line
 from hardware_eval.results.replay import replay
+from ventbench.base.errors import InputError
 from ventbench.board import build, canonical, frames, record, store
 from ventbench.board.record import HardwareRecord
-from ventbench.errors import InputError
-from ventbench.submissions.folder import open_submission
+from ventbench.entries.folder import open_submission
 
 #: Page of the board.
 BOARD = "index.html"

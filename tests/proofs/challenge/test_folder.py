@@ -7,7 +7,7 @@ import pytest
 from hardware_eval.emulation.seal import commitment, encrypt, random_generator, unseal
 from proofs.challenge.first.plan import draw
 from proofs.challenge.folder import decode_answers, encode_answers
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 
 def answers(secret="s"):

@@ -12,7 +12,7 @@ from proofs.challenge.first.rig import record as record_finely
 from proofs.challenge.make import PRESSURE, record_within_limits
 from proofs.challenge.questions import DrawnCase
 from tests.proofs.challenge.truths import drawn
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 # The steps need not be fine here.
 record = partial(record_finely, steps=8)

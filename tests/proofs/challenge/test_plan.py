@@ -10,7 +10,7 @@ from hardware_eval.emulation.cases import LIBRARY
 from proofs.challenge.first.plan import CLASSES, OUTSIDE, draw
 from proofs.challenge.judge import has_library_form
 from proofs.challenge.questions import KINDS
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.physics import library
 
 

@@ -6,7 +6,7 @@ import pytest
 from hardware_eval.emulation.cases import Base, Case, Effect
 from proofs.challenge.first.rig import record
 from proofs.challenge.reveal import oracle_rmse
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 LEAK = Effect("leak", "strong", "library", {"conductance": 20.0})
 

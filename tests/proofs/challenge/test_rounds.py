@@ -19,8 +19,8 @@ from proofs.challenge.first.rig import record
 from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.make import make
 from proofs.challenge.reveal import pool, reveal
-from ventbench.errors import InputError
-from ventbench.executor import InProcess
+from ventbench.base.errors import InputError
+from ventbench.base.executor import InProcess
 from ventbench.recordings import load
 
 from .truths import GivenDiagnosis, mechanism, request, sees_nothing

@@ -18,7 +18,7 @@ from proofs.challenge.stranger import effects as stranger
 from proofs.challenge.stranger.effects import SAME, StrangerCase, draw
 from proofs.challenge.stranger.laboratory import record, replay
 from proofs.challenge.stranger.rig import Rig
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.plants.catalog import load_simulators
 from ventbench.recordings.breaths import Breaths, make_breaths
 

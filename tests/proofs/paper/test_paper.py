@@ -14,13 +14,13 @@ from typer.testing import CliRunner
 from proofs.__main__ import app
 from proofs.paper import controller_sections, paper, published, simulator_sections
 from proofs.paper.report import Chart, HeatMap, Line, Reproduction, Section, Table
-from ventbench import protocol
-from ventbench.errors import InputError
-from ventbench.lungs import LUNG_IDS
+from ventbench.base.errors import InputError
 from ventbench.plants import frozen
 from ventbench.plants.learned import Architecture
-from ventbench.training.learned import LearnedConfig
-from ventbench.training.pid_grid import PIDGrid
+from ventbench.task import protocol
+from ventbench.task.lungs import LUNG_IDS
+from ventbench.train.learned import LearnedConfig
+from ventbench.train.pid_grid import PIDGrid
 
 GAINS = np.array([(2.0, 0.0, 0.0), *published.BEST_PID.values(), (0.0, 4.0, 0.0), (5.0, 10.0, 1.0)])
 
@@ -173,7 +173,7 @@ def test_stored_results_must_be_readable(tmp_path):
 @pytest.mark.slow
 def test_the_whole_page_agrees_with_scores_and_manifest(tmp_path, monkeypatch):
     """The figures of the command are those of a score and of the simulators' manifest."""
-    from ventbench.submissions.scoring import score
+    from ventbench.entries.scoring import score
 
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(

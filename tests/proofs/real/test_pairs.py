@@ -11,7 +11,7 @@ import pytest
 from proofs.real import comparisons, pairs
 from proofs.real.comparisons import Answered, with_leak
 from proofs.real.pairs import Material, Pair, changed
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.mechanics.identify import identify
 from ventbench.recordings.breaths import Breaths, make_breaths
 

@@ -27,15 +27,15 @@ from proofs.real.parts import (
 )
 from proofs.real.rig import RECORDING, claims, cut, figures, prove
 from tests.diagnosis import made
-from ventbench import files, precision
+from ventbench.base import files, precision
+from ventbench.base.errors import InputError
 from ventbench.diagnosis.findings import OpenLoopError
 from ventbench.diagnosis.result import Diagnosis
-from ventbench.errors import InputError
-from ventbench.lungs import LUNG_IDS, LUNGS, lung
 from ventbench.physics import physics
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.plant_files import save_plants
 from ventbench.recordings import join, write
+from ventbench.task.lungs import LUNG_IDS, LUNGS, lung
 
 
 def keep(out: Path, found: Diagnosis) -> list[Path]:

@@ -11,20 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from tests.training.conftest import synthetic
 from typer.testing import CliRunner
 
 from proofs.__main__ import app
 from proofs.studies import controllers, networks
-from tests.training.conftest import synthetic
-from ventbench.errors import InputError
-from ventbench.lungs import LUNGS
+from ventbench.base.errors import InputError
 from ventbench.plants.learned import Architecture
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.recordings import write
-from ventbench.training import learned as simulator
-from ventbench.training.learned import LearnedConfig
-from ventbench.training.residual import ResidualConfig
+from ventbench.task.lungs import LUNGS
+from ventbench.train import learned as simulator
+from ventbench.train.learned import LearnedConfig
+from ventbench.train.residual import ResidualConfig
 
 SMALL = ResidualConfig(
     updates=2, copies=1, widths=(8,), pressures=2, commands=2, ahead=2, members=2

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
 from ventbench.diagnosis.plausibility import is_plausible
@@ -19,7 +20,6 @@ from ventbench.diagnosis.selection.candidate_comparison import (
 )
 from ventbench.diagnosis.selection.held_out_test import passes_heldout_test
 from ventbench.diagnosis.selection.screening import screen_mechanisms
-from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id.data import Floats
 

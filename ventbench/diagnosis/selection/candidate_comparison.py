@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.selection.screening import Candidate
@@ -22,7 +23,6 @@ from ventbench.diagnosis.selection.shape_parameters import (
     shapes_at_default,
 )
 from ventbench.diagnosis.settings import ForwardSelectionSettings
-from ventbench.executor import parallel_map
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import Noise, robust_noise
 

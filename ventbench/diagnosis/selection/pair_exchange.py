@@ -10,6 +10,7 @@ from functools import partial
 from itertools import combinations, product
 from typing import Any
 
+from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.plausibility import is_plausible
@@ -26,7 +27,6 @@ from ventbench.diagnosis.selection.shape_parameters import (
     shape_starts,
     shapes_at_default,
 )
-from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import mechanism
 
 

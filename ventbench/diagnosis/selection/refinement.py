@@ -22,6 +22,7 @@ from operator import itemgetter
 
 import numpy as np
 
+from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.latent_inputs import (
@@ -46,7 +47,6 @@ from ventbench.diagnosis.selection.screening import (
     screen_mechanisms,
 )
 from ventbench.diagnosis.settings import RefinementSettings
-from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import special_cases
 
 

@@ -13,11 +13,11 @@ from itertools import product
 
 import numpy as np
 
+from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
 from ventbench.diagnosis.linearisation import Linearisation, linearise
 from ventbench.diagnosis.patient_effort import breath_term
 from ventbench.diagnosis.settings import ScreeningSettings, SelectionConfig
-from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter, paths
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.system_id.data import Floats

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
-from ventbench.executor import parallel_map
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id.noise import Noise
 from ventbench.system_id.problem import parameter_of

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.errors import InputError
-from ventbench.lungs import Lung
+from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
 from ventbench.recordings.foreign.breath_onsets import expiratory_valve, find_breaths
 from ventbench.recordings.foreign.layouts import LAYOUTS, ROLES, USUAL, Layout, recognise
@@ -25,6 +24,7 @@ from ventbench.recordings.foreign.tables import Table, read_table
 from ventbench.recordings.foreign.units import Conversion, conversion, in_file_unit, stem
 from ventbench.recordings.roles import SLOW, check_roles, few_breaths, opposite_sign
 from ventbench.recordings.schema import COLUMNS
+from ventbench.task.lungs import Lung
 
 Floats = NDArray[np.float64]
 
@@ -383,7 +383,7 @@ def _time(
 
 def _lung(given: str | None, other: Mapping[str, Floats], count: int) -> tuple[Floats, Floats, str]:
     """R and C of each row."""
-    from ventbench.lungs import lung as parse
+    from ventbench.task.lungs import lung as parse
 
     if given is not None:
         label: Lung = parse(given)

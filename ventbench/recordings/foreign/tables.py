@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 from ventbench.recordings.foreign.units import is_unit, spelled, unit_of
 
 #: Lines that decide on separator, decimal mark and header, and of those, the ones that are split.

@@ -9,7 +9,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 #: Pascal in a centimetre of water (conventional, at 4 degrees Celsius) and of other units.
 _PASCAL = {

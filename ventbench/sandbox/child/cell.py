@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from ventbench.interfaces import Observation, Task
-from ventbench.protocol import TARGETS_AHEAD
+from ventbench.task.interfaces import Observation, Task
+from ventbench.task.protocol import TARGETS_AHEAD
 
 from .failures import Failure, SubmissionError, printable
 

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from ventbench.errors import InputError
+from ventbench.base.errors import InputError
 
 
 def printable(text: str, length: int = 300) -> str:

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import CodeType, FrameType
 from typing import NamedTuple, NoReturn
 
-from ventbench.interfaces import Task
+from ventbench.task.interfaces import Task
 
 from . import lockdown, wire
 from .cell import Cell, Failed, controller_class, describe, source_text

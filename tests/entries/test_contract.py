@@ -1,0 +1,409 @@
+"""`ventbench check` by running: what the contract asks of a controller.
+
+In this process where the answer is that of the sandbox, which is slower to start.
+"""
+
+import itertools
+import json
+import pickle
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from ventbench.cli import app
+from ventbench.entries import contract
+from ventbench.entries.contract_runs import STEPS
+from ventbench.entries.errors import SubmissionError
+from ventbench.entries.file_checks import check_files
+from ventbench.entries.runner import InProcessRunner
+from ventbench.entries.static_checks import check_sources
+from ventbench.sandbox.configuration import Allowance
+from ventbench.sandbox.runner import SandboxRunner
+
+from .conftest import MANIFEST
+
+#: No machine is so busy that one of these is met.
+PATIENT = Allowance(start_patience_s=300.0, patience_s=300.0, total_s=600.0)
+
+
+def ticking(act_s=1e-4):
+    """A clock by which every call of ``act`` takes as long."""
+    return itertools.count(step=act_s).__next__
+
+
+@pytest.fixture
+def check(make):
+    """Check a submission of this source, or of this body of act; apart or in this process."""
+
+    def run(source=None, *, apart=False, act_s=1e-4, **options):
+        folder = make(source, **options)
+        (folder / "README.md").write_text("A test.")
+        runner = SandboxRunner(allowance=PATIENT) if apart else InProcessRunner()
+        return contract.check(str(folder), runner, ticking(act_s))
+
+    return run
+
+
+def only(report, group):
+    (finding,) = report.problems
+    assert finding.group == group
+    return finding
+
+
+def test_a_good_one(check):
+    report = check(act="return observation.target", apart=True)
+    assert report.ok
+    assert report.findings == ()
+    assert report.left_out == ()
+    assert report.sandbox is not None
+    assert report.act_us == pytest.approx((100.0, 100.0))
+
+
+@pytest.mark.parametrize("name", ["pid_best", "pid_robust"])
+def test_our_own_are_ready(name):
+    report = contract.check(name, SandboxRunner(allowance=PATIENT), ticking())
+    assert report.ok, "\n".join(report.lines())
+    contract.assert_ready(name, InProcessRunner())
+
+
+def test_progress_ends_when_all_rounds_are_done():
+    told = []
+    contract.check("pid_robust", InProcessRunner(), progress=lambda *counts: told.append(counts))
+    assert told[-1][0] == told[-1][1] == len(told)
+
+
+def test_assert_ready_says_all(make):
+    folder = make(act="return 'a'")
+    with pytest.raises(AssertionError) as caught:
+        contract.assert_ready(str(folder), InProcessRunner())
+    text = str(caught.value)
+    assert "README.md: is missing" in text
+    assert "act returned a str ('a'); it must return one number" in text
+    assert "2 problems; not ready to submit" in text
+
+
+def test_no_such_folder(tmp_path):
+    with pytest.raises(SubmissionError, match="no such folder"):
+        contract.check(str(tmp_path / "none"))
+
+
+def test_a_failure_everywhere_is_said_once_with_its_place(check):
+    finding = only(check(act="x = 1\nreturn observation.nothing"), "run")
+    assert (finding.file, finding.line) == ("controller.py", 6)
+    assert "raised AttributeError at step 1 of breath 1 (lung hidden)" in finding.what
+    assert finding.what.endswith("(and in 16 other runs)")
+
+
+def test_failing_on_one_lung_names_it(check):
+    source = """
+        class Controller:
+            def reset(self, task):
+                self.gain = {None: 1.0, "R5C10": 1.0, "R5C20": 1.0, "R5C50": 1.0,
+                             "R20C10": 1.0, "R20C20": 1.0}[task.lung]
+            def act(self, observation):
+                return self.gain
+        """
+    finding = only(check(source), "run")
+    assert "KeyError in reset (lung R20C50): 'R20C50'" in finding.what
+    assert finding.line == 4
+
+
+@pytest.mark.parametrize(
+    ("act", "said"),
+    [
+        ("return float('nan')", "act returned nan at step 1 of breath 1"),
+        ("return 1e308 * 10", "act returned inf"),
+        ("return None", "act returned None"),
+        ("return True", "act returned a bool (True)"),
+        ("import numpy\nreturn numpy.zeros(1)", "act returned an array of shape (1,)"),
+        ("return 10 ** 400", "act returned an integer too large"),
+    ],
+)
+def test_answers_that_are_no_numbers(check, act, said):
+    assert only(check(act=act), "run").what.startswith(said)
+
+
+def test_a_process_that_ends_itself(check):
+    finding = only(check(act="import os\nos._exit(3)\nreturn 1.0", apart=True), "run")
+    assert finding.what.startswith("the controller ended its process (exit code 3)")
+
+
+@pytest.mark.parametrize(
+    ("act", "said"),
+    [
+        ("return 1 / (observation.pressure + 20)", "ZeroDivisionError with a pressure of -20"),
+        ("return observation.pressure ** 0.5 + 0.0", "with a pressure of -20 cmH2O"),
+        ("assert observation.dt < 0.05\nreturn 1.0", "with a control step of 60 ms"),
+        ("assert observation.dt > 0.02\nreturn 1.0", "with a control step of 10 ms"),
+        ("return 5 / observation.target", "with a pressure and a target of 0 cmH2O"),
+        ("return [1.0][round(observation.time / observation.dt) - round(observation.time / 0.03)]",
+         "with a control step of 10 ms"),
+    ],
+)  # fmt: skip
+def test_unusual_inputs_are_tried_and_named(check, act, said):
+    report = check(act=act)
+    assert {finding.group for finding in report.problems} == {"run"}
+    assert said in report.problems[0].what
+
+
+def test_chance_is_found(check):
+    finding = only(
+        check("""
+            import random
+            class Controller:
+                def reset(self, task): pass
+                def act(self, observation): return random.Random().random()
+            """),
+        "repeat",
+    )
+    assert "the same run in another process gave" in finding.what
+    assert "seed" in finding.advice
+
+
+def test_a_seed_is_enough(check):
+    report = check("""
+        import random
+        class Controller:
+            def reset(self, task): self.random = random.Random(1)
+            def act(self, observation): return self.random.random()
+        """)
+    assert report.ok
+
+
+def test_a_reset_that_forgets_something_is_found(check):
+    finding = only(
+        check("""
+            class Controller:
+                def __init__(self): self.sum = 0.0
+                def reset(self, task): pass
+                def act(self, observation):
+                    self.sum += 0.01 * (observation.target - observation.pressure)
+                    return self.sum
+            """),
+        "repeat",
+    )
+    assert finding.what.startswith("reset does not clear what it keeps: it gave ")
+    assert finding.what.endswith("at step 1 of breath 1")
+
+
+@pytest.mark.parametrize("keep", ["Controller.count", "STATE[0]"])
+def test_memory_beyond_one_controller_is_found(check, keep):
+    finding = only(
+        check(
+            f"""
+            STATE = [0]
+            class Controller:
+                count = 0
+                def reset(self, task): pass
+                def act(self, observation):
+                    {keep} += 1
+                    return {keep} / 100
+            """,
+            apart=True,
+        ),
+        "repeat",
+    )
+    assert finding.what.startswith("a second Controller() remembers the first")
+
+
+def test_a_failure_while_repeating_leaves_that_out(check):
+    report = check(
+        """
+        class Controller:
+            count = 0
+            def reset(self, task):
+                Controller.count += 1
+                if Controller.count > 1:
+                    raise RuntimeError("again?")
+            def act(self, observation): return 1.0
+        """,
+        apart=True,
+    )
+    assert "again?" in only(report, "run").what
+    assert report.left_out == ("repeat", "time")
+
+
+def test_an_import_that_fails(check):
+    report = check("import helper\n" + "class Controller: pass", helper="1 / 0\n")
+    # The class is empty, but what is read comes first.
+    assert {finding.group for finding in report.problems} == {"source"}
+    report = check(
+        """
+        import helper
+        class Controller:
+            def reset(self, task): pass
+            def act(self, observation): return 1.0
+        """,
+        helper="x = 1\n1 / 0\n",
+    )
+    finding = only(report, "run")
+    assert (finding.file, finding.line) == ("helper.py", 2)
+    assert "ZeroDivisionError while it was imported" in finding.what
+    assert report.left_out == ("repeat", "time")
+
+
+def test_a_class_that_comes_from_elsewhere_is_asked_in_the_run(check):
+    finding = only(check("from helper import Controller", helper="Controller = 3"), "run")
+    assert "Controller in controller.py is a int, no class" in finding.what
+
+
+def test_clipping_is_noted(check):
+    report = check(act="return 120.0")
+    assert report.ok
+    (note,) = report.notes
+    assert note.what.startswith("asked for 120 to 120 %, outside of 0 to 100 % at 476 of 476")
+
+
+def test_slowness_is_found(check):
+    finding = only(check(act="return 1.0", act_s=0.02), "time")
+    assert "times faster: 450 s are the limit" in finding.advice
+
+
+def test_time_limits():
+    assert contract.ACTS == 756 * 102
+    assert list(contract.time_findings(np.full(9, 1e-3))) == []
+    (note,) = contract.time_findings(np.full(9, 10e-3))
+    assert not note.problem
+    (problem,) = contract.time_findings(np.full(9, 20e-3))
+    assert problem.problem
+    assert problem.what == (
+        "act takes 20 ms on average, the 77112 calls of a score 771 s on 2 cores"
+    )
+
+
+def test_repetition_is_exact():
+    run = np.linspace(0.0, 50.0, STEPS)
+    between = np.zeros(1)
+    thrice = np.concatenate([run, between, run, between, run])
+    assert list(contract.repetition_findings(run, run, thrice)) == []
+    (finding,) = contract.repetition_findings(run, np.nextafter(run, 100.0), thrice)
+    assert "another process" in finding.what
+
+
+def test_the_lines_of_the_author_keep_their_numbers(check):
+    source = (
+        "class Controller:\n    def reset(self, task): pass\n    def act(self, o): return 1 / 0"
+    )
+    assert only(check(source), "run").line == 3
+
+
+def test_the_submission_itself_is_not_touched(make):
+    folder = make(act="open(__file__, 'a')\nreturn 1.0")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    contract.check(str(folder), SandboxRunner(allowance=PATIENT))
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_cheats_meet_the_same_sandbox(check):
+    finding = only(check(act="open('/etc/passwd')\nreturn 1.0", apart=True), "run")
+    assert "PermissionError" in finding.what or "FileNotFoundError" in finding.what
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        "return observation.nothing",
+        "return None",
+        "return 120.0",
+        "return 5 / observation.target",
+        "self.n = getattr(self, 'n', 0) + 1\nreturn self.n",
+        "return {None: 1.0}[self.task.lung]",
+    ],
+)
+def test_in_process_finds_the_same(check, act):
+    report, apart = check(act=act), check(act=act, apart=True)
+    assert report.findings == apart.findings != ()
+    assert report.left_out == apart.left_out
+    assert report.sandbox is None
+    assert apart.sandbox is not None
+
+
+def command(*words):
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def test_command_line(make, tmp_path):
+    folder = make(act="return 1.0")
+    (folder / "README.md").write_text("A test.")
+    good = command("check", folder, "--json", tmp_path / "r.json")
+    assert good.exit_code == 0, good.output
+    assert "no problems; ready to submit" in good.output
+    assert json.loads((tmp_path / "r.json").read_text())["ok"] is True
+    (folder / "submission.toml").write_text(MANIFEST + "x = 1\n")
+    bad = command("check", folder, "--json", tmp_path / "r.json")
+    assert bad.exit_code == 1
+    assert "submission.toml line 8: key x is not known" in bad.output
+    (problem,) = json.loads((tmp_path / "r.json").read_text())["problems"]
+    assert problem == {
+        "group": "manifest",
+        "file": "submission.toml",
+        "line": 8,
+        "column": None,
+        "what": "key x is not known",
+        "advice": "remove or rename it",
+    }
+    none = command("check", tmp_path / "none")
+    assert isinstance(none.exception, SubmissionError)
+
+
+def test_command_new(tmp_path):
+    made = command("new", "demo", "--family", "dqn", "--dir", tmp_path)
+    assert made.exit_code == 0, made.output
+    assert "network.py, submission.toml, weights.npz" in made.output
+    assert command("new", "demo", "--family", "nothing").exit_code == 2
+
+
+def test_everything_at_once(demo):
+    (demo / "README.md").unlink()
+    (demo / "weights.npz").write_bytes(pickle.dumps([1]))
+    (demo / "link").symlink_to("/etc/passwd")
+    (demo / ".hidden").write_text("")
+    manifest = demo / "submission.toml"
+    manifest.write_text(manifest.read_text().replace('"ppo"', '"pop"').replace("name", "nam", 1))
+    (demo / "network.py").write_text("import torch\nimport socket\n")
+    (demo / "controller.py").write_text("from network import x\nclass Controler: pass\n")
+    report = contract.check(str(demo))
+    assert not report.ok
+    assert report.left_out == ("run", "repeat", "time")
+    where = {(f.file, f.line, f.group) for f in report.problems}
+    assert where == {
+        ("README.md", None, "files"),
+        ("weights.npz", None, "files"),
+        ("link", None, "files"),
+        (".hidden", None, "files"),
+        ("submission.toml", 1, "manifest"),
+        ("submission.toml", None, "manifest"),
+        ("submission.toml", 5, "manifest"),
+        ("network.py", 1, "source"),
+        ("network.py", 2, "source"),
+        ("controller.py", 2, "source"),
+    }
+    assert all(finding.advice for finding in report.problems)
+    text = "\n".join(report.lines())
+    assert "10 problems; not ready to submit" in text
+    assert "did you mean Controler?" in text
+    assert "'pop' is not one of pid, residual, ppo, dqn, other; did you mean ppo?" in text
+
+
+def test_nothing_is_run_or_imported(demo, tmp_path):
+    bomb = f"open({str(tmp_path / 'ran')!r}, 'w')\n"
+    (demo / "controller.py").write_text(bomb + (demo / "controller.py").read_text())
+    (demo / "network.py").write_text(bomb)
+    check_sources(demo)
+    contract._opened(str(demo))
+    check_files(demo)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_output_cannot_disguise_itself(demo):
+    (demo / "a\x1b[31m\u202e.txt").write_text("")
+    (demo / "submission.toml").write_text('name = "\\u001b[2J"')
+    text = "\n".join(contract.check(str(demo)).lines())
+    assert "\x1b" not in text
+    assert "\u202e" not in text
+
+
+def test_scaffold_has_nothing(demo):
+    assert check_files(demo) == []
+    assert check_sources(demo) == []

@@ -1,0 +1,174 @@
+"""`ventbench new`: every family can be checked and scored at once."""
+
+import math
+import os
+import re
+import stat
+
+import numpy as np
+import pytest
+
+from ventbench.base.errors import InputError
+from ventbench.entries import contract
+from ventbench.entries.folder import open_submission
+from ventbench.entries.manifest import FAMILIES
+from ventbench.entries.runner import InProcessRunner
+from ventbench.entries.scaffold import contents, create, initial_weights
+from ventbench.entries.scoring import run_protocol
+from ventbench.plants.rigs import Rigs
+from ventbench.task.lungs import LUNGS
+
+# Observations of a controller: time, dt, pressure, target, ahead, command before.
+NETWORKS = ("residual", "ppo", "dqn")
+
+
+@pytest.fixture(scope="module")
+def one_lung():
+    from ventbench.base import precision
+    from ventbench.plants.single_compartment import single_compartment
+    from ventbench.plants.stacking import stack
+
+    with precision.float64():
+        return stack([single_compartment(LUNGS[0])])
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_is_ready_and_scores(family, tmp_path, one_lung):
+    folder = create("demo", family, tmp_path)
+    report = contract.check(str(folder))
+    assert report.ok, "\n".join(report.lines())
+    assert report.notes[0].what == "key authors still says Your Name"
+    result = run_protocol(
+        open_submission(str(folder)), Rigs(LUNGS[:1], one_lung), pips=(20.0,), track="robustness"
+    )
+    assert not result.failures
+    # A lung that is left alone at PEEP would be 15 off.
+    assert 0.1 < result.score < 5.0
+
+
+def test_residual_starts_as_its_pi_controller(tmp_path, one_lung):
+    def scored(folder):
+        return run_protocol(
+            open_submission(str(folder)),
+            Rigs(LUNGS[:1], one_lung),
+            pips=(20.0,),
+            track="robustness",
+        ).requested
+
+    residual = scored(create("residual", "residual", tmp_path))
+    plain = create("plain", "pid", tmp_path)
+    text = (plain / "controller.py").read_text()
+    assert "(6.0, 6.0, 0.3)" in text
+    (plain / "controller.py").write_text(text.replace("(6.0, 6.0, 0.3)", "(1.0, 10.0, 0.0)"))
+    np.testing.assert_allclose(residual, scored(plain), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("family", NETWORKS)
+def test_weights_are_the_same_every_time_and_small(family):
+    first, second = contents("demo", family), contents("demo", family)
+    assert len(first["weights.npz"]) < 10_000
+    for key, value in initial_weights(family).items():
+        assert value.dtype == np.float32
+        np.testing.assert_array_equal(value, initial_weights(family)[key])
+    assert {k: v for k, v in first.items() if k != "weights.npz"} == {
+        k: v for k, v in second.items() if k != "weights.npz"
+    }
+
+
+@pytest.mark.parametrize("family", NETWORKS)
+def test_an_untrained_network_is_not_called_trained(family):
+    manifest = contents("demo", family)["submission.toml"].decode()
+    assert "untrained" in manifest
+    assert "none yet" in manifest
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_files_have_no_blanks_left(family):
+    for name, content in contents("demo", family).items():
+        if not name.endswith(".npz"):
+            assert "$" not in content.decode(), name
+
+
+def test_refuses_to_overwrite(tmp_path):
+    folder = create("demo", "pid", tmp_path)
+    (folder / "README.md").write_text("mine")
+    with pytest.raises(InputError, match="exists; choose another name or --dir"):
+        create("demo", "dqn", tmp_path)
+    assert (folder / "README.md").read_text() == "mine"
+    assert not (folder / "network.py").exists()
+    (tmp_path / "link").symlink_to("nowhere")
+    with pytest.raises(InputError, match="exists"):
+        create("link", "pid", tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["demo", "link"]
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("My PID!", "how about my_pid?"),
+        ("Rö-2", "how about ro_2?"),
+        ("9lives", None),
+        ("", None),
+        ("../x", "how about x?"),
+        ("a" * 41, "how about"),
+        ("x\n", "how about x?"),
+    ],
+)
+def test_says_what_a_name_may_be(name, hint, tmp_path):
+    with pytest.raises(InputError, match="must be lower-case letters") as caught:
+        create(name, "pid", tmp_path)
+    assert hint is None or hint in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_refusals(tmp_path):
+    with pytest.raises(InputError, match="belongs to a submission of ventbench"):
+        create("pid_best", "pid", tmp_path)
+    with pytest.raises(InputError, match="did you mean residual"):
+        create("demo", "residuals", tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r"file"):
+        create("demo", "pid", tmp_path / "file")
+
+
+@pytest.mark.skipif(os.getuid() == 0, reason="root may write everywhere")
+def test_a_closed_folder_is_said_so(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(PermissionError):
+        create("demo", "pid", tmp_path)
+
+
+def test_modes_are_those_of_any_new_file(tmp_path):
+    folder = create("demo", "ppo", tmp_path / "new")
+    umask = os.umask(0)
+    os.umask(umask)
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o777 & ~umask
+    assert all(stat.S_IMODE(p.stat().st_mode) == 0o666 & ~umask for p in folder.iterdir())
+
+
+@pytest.mark.parametrize("family", ["ppo", "dqn"])
+def test_networks_act_as_a_pi_controller(family, tmp_path, one_lung):
+    """P = 1, I = 10, to the resolution of 51 commands for dqn, within 0 to 100 %."""
+    from ventbench.sandbox.child.cell import controller_class
+
+    network = controller_class(create("net", family, tmp_path))()
+    network.reset(None)
+    observed = open_submission(str(tmp_path / "net"))
+    session = InProcessRunner().start(observed, [contract.plain(["robustness"])[0].task])
+    integral, dt = 0.0, 0.03
+    for step in range(30):
+        pressure = 5.0 + step / 2
+        error = 20.0 - pressure
+        integral += dt / (dt + 0.5) * (error - integral)
+        expected = min(max(error + 10 * integral, 0.0), 100.0)
+        row = np.array([[step * dt, dt, pressure, 20.0, *[20.0] * 10, 5.0]])
+        (command,) = session.act(row)
+        tolerance = 1.01 if family == "dqn" else 1e-3
+        assert math.isclose(command, expected, abs_tol=tolerance), step
+    assert not session.failures
+
+
+def test_readme_names_files_that_are_there(tmp_path):
+    folder = create("demo", "residual", tmp_path)
+    named = set(re.findall(r"^\| `([\w.]+)` \|", (folder / "README.md").read_text(), re.M))
+    assert named == {path.name for path in folder.iterdir()} - {"README.md"}

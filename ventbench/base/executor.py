@@ -1,0 +1,219 @@
+"""Independent computations in parallel: by threads, by processes, or on a Dask cluster.
+
+:func:`parallel_map` uses threads, which suffice for fits: nearly all of their time is spent in
+compiled code, which all threads share. :func:`executor` opens a
+:class:`concurrent.futures.Executor` in this process, in processes beside it or on a cluster; its
+jobs must be functions of a module with small arguments made of numpy arrays.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import multiprocessing.connection
+import os
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent import futures
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, TypeVar
+
+from ventbench.base.errors import InputError
+
+ArgumentT = TypeVar("ArgumentT")
+ResultT = TypeVar("ResultT")
+
+#: Environment variable with the most threads.
+THREADS = "VENTBENCH_THREADS"
+
+#: Most threads unless told otherwise: more would wait for each other.
+_MOST = 4
+
+_outermost: ContextVar[bool] = ContextVar("_outermost", default=True)
+
+#: How long a cluster may take to answer, s.
+PATIENCE = "15s"
+
+
+class InProcess(futures.Executor):
+    """Runs each job at once, where it is handed in."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> futures.Future[Any]:
+        """Run the job; its exception, unless it ends the program, is kept for who asks."""
+        future: futures.Future[Any] = futures.Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@contextmanager
+def executor(workers: int = 0, scheduler: str | None = None) -> Iterator[futures.Executor]:
+    """Open an executor; what has not begun when the block is left by an error never runs.
+
+    An interrupt also ends the jobs that run in processes of this machine.
+
+    Args:
+        workers: processes on this machine; 0 for none but this one.
+        scheduler: address of a Dask scheduler instead, such as ``tcp://host:8786``.
+
+    Raises:
+        InputError: if both are given, or the scheduler cannot be reached, or Dask is missing.
+    """
+    if scheduler is not None:
+        if workers:
+            raise InputError(
+                f"--workers {workers} and --scheduler {scheduler}: give one of the two"
+            )
+        with _dask(scheduler) as pool:
+            yield pool
+        return
+    if workers < 0:
+        raise InputError(f"--workers {workers} must not be negative")
+    if workers == 0:
+        yield InProcess()
+        return
+    others = set(multiprocessing.active_children())
+    # Not forked: JAX has threads, whose locks a fork would leave closed.
+    pool = futures.ProcessPoolExecutor(
+        workers, multiprocessing.get_context("spawn"), initializer=_end_with_parent
+    )
+    try:
+        yield pool
+    except KeyboardInterrupt:
+        # An interrupt may reach this process alone, and a job may run for minutes.
+        for worker in set(multiprocessing.active_children()) - others:
+            worker.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """End this worker when its parent ends, however that ends: nobody would take the results."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch(sentinel: int) -> None:
+        multiprocessing.connection.wait([sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, args=(parent.sentinel,), daemon=True).start()
+
+
+@contextmanager
+def _dask(scheduler: str) -> Iterator[futures.Executor]:
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise InputError(
+            "--scheduler needs Dask: install ventbench[dask] (pip install 'ventbench[dask]'); "
+            f"import failed with: {error}"
+        ) from error
+    try:
+        client = Client(scheduler, timeout=PATIENCE)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"no Dask scheduler answers at {scheduler}: {error}; start one with `dask scheduler`"
+        ) from error
+    with client:
+        pool = client.get_executor(pure=False)
+        try:
+            yield pool
+        finally:
+            pool.shutdown(wait=False)
+
+
+def results(
+    pool: futures.Executor,
+    function: Callable[..., ResultT],
+    jobs: Mapping[str, tuple[Any, ...]],
+) -> Iterator[tuple[str, ResultT]]:
+    """Run jobs and yield the name and the result of each as it ends.
+
+    Args:
+        pool: executor.
+        function: what every job runs.
+        jobs: arguments of each job, by name.
+
+    Raises:
+        InputError: if a worker process has died.
+        Exception: whatever a job raises.
+    """
+    # One at a time where a job runs as it is handed in, so that its result is told before the next.
+    window = 1 if isinstance(pool, InProcess) else max(len(jobs), 1)
+    waiting, running = list(jobs.items())[::-1], {}
+    while waiting or running:
+        while waiting and len(running) < window:
+            name, arguments = waiting.pop()
+            running[pool.submit(function, *arguments)] = name
+        done, _ = futures.wait(running, return_when=futures.FIRST_COMPLETED)
+        for future in done:
+            try:
+                result = future.result()
+            except futures.BrokenExecutor as error:
+                raise InputError(
+                    "a worker process died (out of memory?); what was finished is kept: run the "
+                    "same command again, with fewer --workers"
+                ) from error
+            yield running.pop(future), result
+
+
+def in_order(
+    pool: futures.Executor,
+    function: Callable[..., ResultT],
+    arguments: Iterable[tuple[Any, ...]],
+    progress: Callable[[int, int], None] | None = None,
+) -> list[ResultT]:
+    """Return the results of jobs in the order of their arguments.
+
+    Args:
+        pool: executor.
+        function: what every job runs.
+        arguments: of each job.
+        progress: called with the number of jobs that are done and the number of all.
+
+    Raises:
+        InputError: if a worker process has died.
+        Exception: whatever a job raises.
+    """
+    jobs = {str(index): own for index, own in enumerate(arguments)}
+    kept: dict[str, ResultT] = {}
+    for name, result in results(pool, function, jobs):
+        kept[name] = result
+        if progress is not None:
+            progress(len(kept), len(jobs))
+    return [kept[name] for name in jobs]
+
+
+def parallel_map(
+    work: Callable[[ArgumentT], ResultT], arguments: Iterable[ArgumentT]
+) -> list[ResultT]:
+    """Return ``[work(argument) for argument in arguments]``, computed in parallel.
+
+    Args:
+        work: may run at the same time as itself; a ``parallel_map`` inside it runs serially.
+        arguments: one for each call.
+    """
+    arguments = list(arguments)
+    count = min(thread_count(), len(arguments))
+    if count < 2 or not _outermost.get():
+        return [work(argument) for argument in arguments]
+
+    def nested(argument: ArgumentT) -> ResultT:
+        _outermost.set(False)
+        return work(argument)
+
+    with futures.ThreadPoolExecutor(count) as pool:
+        return list(pool.map(nested, arguments))
+
+
+def thread_count() -> int:
+    """Number of threads that :func:`parallel_map` uses, at least one."""
+    given = os.environ.get(THREADS, "")
+    if given.isdigit() and int(given) > 0:
+        return int(given)
+    can = getattr(os, "sched_getaffinity", None)
+    return min(_MOST, len(can(0)) if can else os.cpu_count() or 1)

@@ -1,0 +1,64 @@
+"""Numbers and foreign text as reports, pages and messages show them; templates of pages."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from ventbench.base.errors import require
+
+if TYPE_CHECKING:
+    import jinja2
+
+
+def number(value: float | None, digits: int = 2, sign: bool = False) -> str:
+    """Text of a figure; a dash for none, "failed" for NaN; a true minus sign."""
+    if value is None:
+        return "–"
+    if not math.isfinite(value):
+        return "failed"
+    # + 0.0 turns -0.0, which rounding may leave, into 0.0.
+    return f"{round(value, digits) + 0.0:{'+' if sign else ''}.{digits}f}".replace("-", "−")
+
+
+def plain(text: str) -> str:
+    """Text in which nothing is invisible or turns the reading direction; not escaped."""
+    if text.isprintable():
+        return text
+    return "".join(
+        c if c.isprintable() else " " if c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in text
+    )
+
+
+def escape_markdown(text: str) -> str:
+    """Make text plain in Markdown: no link, image, table or heading can come from it."""
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(text.split()))
+
+
+def page_templates(
+    package: str, *, shown: Callable[[Any], Any] | None = None
+) -> jinja2.Environment:
+    """Environment of the templates in ``templates/`` of a package, with one set of rules.
+
+    Text is escaped, and a missing value is an error.
+
+    Args:
+        package: such as ``"ventbench.pages"``.
+        shown: what a value is passed through before it is escaped.
+
+    Raises:
+        InputError: if jinja2 is not installed.
+    """
+    require("jinja2")
+    import jinja2
+
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader(package),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=shown,
+    )

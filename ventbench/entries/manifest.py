@@ -1,0 +1,376 @@
+"""``submission.toml``: what an author says about an entry, read and checked."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import re
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ventbench.entries.errors import Finding, SubmissionError
+from ventbench.task.interfaces import API_VERSION
+
+#: Name of the file.
+MANIFEST = "submission.toml"
+
+#: Stands for the author until the author fills in a name.
+AUTHOR = "Your Name"
+
+#: What kinds of controller the board distinguishes.
+FAMILIES = ("pid", "residual", "ppo", "dqn", "other")
+
+#: The two boards.
+TRACKS = ("performance", "robustness")
+
+_MAX_BYTES = 64_000
+_MAX_TEXT = 2000
+_MAX_SHOWN = 120
+_MAX_SEED = 1 << 64
+
+#: Names that an entry may have, and the rule in words.
+NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
+NAME_RULE = (
+    "must be lower-case letters, digits and underscores, "
+    "begin with a letter and have at most 40 characters"
+)
+
+
+@dataclass(frozen=True)
+class Training:
+    """Table ``[training]``: where the parameters come from; every key may be left out.
+
+    Attributes:
+        data: what they were learned or tuned on.
+        simulators: version of the frozen simulators used; empty if none.
+        seeds: those of all runs.
+        compute: such as ``"20 min on 2 CPU cores"``.
+        per_lung: whether there is one set of parameters for each lung.
+    """
+
+    data: str = ""
+    simulators: str = ""
+    seeds: tuple[int, ...] = ()
+    compute: str = ""
+    per_lung: bool = False
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The content of ``submission.toml``.
+
+    Attributes:
+        name: lower-case letters, digits and underscores, at most 40.
+        authors: at least one.
+        licence: SPDX identifier, such as ``"Apache-2.0"``.
+        api_version: version of the submission interface, now 1.
+        family: one of :data:`FAMILIES`.
+        tracks: one or both of :data:`TRACKS`; the first is scored if none is asked for.
+        description: a sentence or two.
+        training: see :class:`Training`.
+    """
+
+    name: str
+    authors: tuple[str, ...]
+    licence: str
+    api_version: int
+    family: str
+    tracks: tuple[str, ...]
+    description: str
+    training: Training = field(default_factory=Training)
+
+
+# A check takes a TOML value and returns the value to keep, or raises ValueError with what is wrong.
+ValueCheck = Callable[[Any], Any]
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or not value.strip():
+        raise ValueError("must be text in quotes")
+    if len(value) > _MAX_TEXT:
+        raise ValueError(f"is longer than {_MAX_TEXT} characters")
+    if not all(c.isprintable() or c in "\n\t" for c in value):
+        raise ValueError("contains characters that cannot be printed")
+    return value.strip()
+
+
+def _name(value: Any) -> str:
+    if not NAME.fullmatch(_text(value)):
+        raise ValueError(f"{_shown(value)} {NAME_RULE}")
+    return value
+
+
+def _shown(value: Any) -> str:
+    """Return a value of a hostile file for a message: short, and never an error itself."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer of thousands of digits; a deep list
+        return f"such a {type(value).__name__}"
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
+
+
+def _one_of(choices: tuple[str, ...]) -> ValueCheck:
+    def check(value: Any) -> str:
+        if value not in choices:
+            raise ValueError(
+                f"{_shown(value)} is not one of {', '.join(choices)}{_hint(value, choices)}"
+            )
+        return value
+
+    return check
+
+
+def _version(value: Any) -> int:
+    if type(value) is not int or value != API_VERSION:
+        raise ValueError(
+            f"{_shown(value)} is not supported; this ventbench speaks version {API_VERSION}"
+        )
+    return value
+
+
+def _many(check: ValueCheck, *, least: int) -> ValueCheck:
+    def checked(value: Any) -> tuple[Any, ...]:
+        if not isinstance(value, list) or len(value) < least:
+            raise ValueError("must be a list" + (" that is not empty" if least else ""))
+        entries = tuple(check(entry) for entry in value)
+        if len(set(entries)) < len(entries):
+            raise ValueError("contains something twice")
+        return entries
+
+    return checked
+
+
+def _typed(kind: type, text: str) -> ValueCheck:
+    def check(value: Any) -> Any:
+        if type(value) is not kind:
+            raise ValueError(f"must be {text}, not {_shown(value)}")
+        return value
+
+    return check
+
+
+def _seed(value: Any) -> int:
+    seed = _typed(int, "an integer")(value)
+    if abs(seed) >= _MAX_SEED:
+        raise ValueError("must be an integer of at most 64 bits")
+    return seed
+
+
+_TRAINING: dict[str, ValueCheck] = {
+    "data": _text,
+    "simulators": _text,
+    "seeds": _many(_seed, least=0),
+    "compute": _text,
+    "per_lung": _typed(bool, "true or false"),
+}
+_REQUIRED: dict[str, ValueCheck] = {
+    "name": _name,
+    "authors": _many(_text, least=1),
+    "licence": _text,
+    "api_version": _version,
+    "family": _one_of(FAMILIES),
+    "tracks": _many(_one_of(TRACKS), least=1),
+    "description": _text,
+}
+
+
+def _hint(value: Any, choices: tuple[str, ...]) -> str:
+    text = value[:_MAX_SHOWN] if isinstance(value, str) else ""
+    close = difflib.get_close_matches(text, choices, n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def _checked(
+    table: dict[str, Any], checks: dict[str, ValueCheck], where: str, problems: list[str]
+) -> dict[str, Any]:
+    kept = {}
+    for key, value in table.items():
+        if key not in checks:
+            problems.append(f"{where}{_shown(key)} is not known{_hint(key, tuple(checks))}")
+            continue
+        try:
+            kept[key] = checks[key](value)
+        except ValueError as error:
+            problems.append(f"{where}{key}: {error}")
+    return kept
+
+
+def read_manifest(path: Path, label: str | None = None) -> Manifest:
+    """Read and check a manifest.
+
+    Args:
+        path: the ``submission.toml``.
+        label: how messages name it; the path if not given.
+
+    Raises:
+        SubmissionError: naming every problem with file and key.
+    """
+    label, problems = label or str(path), []
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise SubmissionError(f"{label}: larger than {_MAX_BYTES // 1000} kB")
+        content = tomllib.loads(path.read_bytes().decode())
+    except UnicodeDecodeError as error:
+        raise SubmissionError(f"{label}: not UTF-8 text (byte {error.start})") from None
+    except (ValueError, RecursionError) as error:  # ValueError: an integer of 5,000 digits too
+        raise SubmissionError(f"{label}: not TOML: {error}") from None
+    except OSError as error:
+        raise SubmissionError(f"{label}: cannot be read: {error.strerror}") from None
+
+    training = content.pop("training", {})
+    if not isinstance(training, dict):
+        problems.append(f"{label}, key training: must be a table, [training]")
+        training = {}
+    kept = _checked(content, _REQUIRED, f"{label}, key ", problems)
+    problems += [f"{label}, key {key}: is missing" for key in _REQUIRED if key not in content]
+    trained = _checked(training, _TRAINING, f"{label}, key training.", problems)
+    if problems:
+        raise SubmissionError(*problems)
+    return Manifest(**kept, training=Training(**trained))
+
+
+def read_as_json(folder: str, label: str) -> dict[str, Any]:
+    """Read the manifest of a folder, for a process that answers in JSON.
+
+    Args:
+        folder: the submission's.
+        label: how messages name the file.
+
+    Returns:
+        ``manifest``, for :func:`manifest_from_json`, or None; and ``problems``, in words.
+    """
+    try:
+        manifest = read_manifest(Path(folder, MANIFEST), label)
+    except SubmissionError as error:
+        return {"manifest": None, "problems": error.problems}
+    return {"manifest": dataclasses.asdict(manifest), "problems": ()}
+
+
+def manifest_from_json(values: dict[str, Any]) -> Manifest:
+    """Return the manifest of what :func:`read_as_json` answered."""
+    training = {**values["training"], "seeds": tuple(values["training"]["seeds"])}
+    lists = {key: tuple(values[key]) for key in ("authors", "tracks")}
+    return Manifest(**{**values, **lists, "training": Training(**training)})
+
+
+#: SPDX identifiers that most authors use.
+LICENCES = (
+    *("0BSD", "AGPL-3.0-only", "AGPL-3.0-or-later", "Apache-2.0", "Artistic-2.0", "BSD-2-Clause"),
+    *("BSD-3-Clause", "BSL-1.0", "CC-BY-4.0", "CC-BY-SA-4.0", "CC0-1.0", "ECL-2.0", "EPL-2.0"),
+    *("EUPL-1.2", "GPL-2.0-only", "GPL-2.0-or-later", "GPL-3.0-only", "GPL-3.0-or-later", "ISC"),
+    *("LGPL-2.1-only", "LGPL-2.1-or-later", "LGPL-3.0-only", "LGPL-3.0-or-later", "MIT", "MIT-0"),
+    *("MPL-2.0", "MulanPSL-2.0", "NCSA", "OSL-3.0", "PostgreSQL", "UPL-1.0", "Unlicense", "Zlib"),
+)
+_SPDX = re.compile(r"\(?[A-Za-z0-9.+-]+\)?( (AND|OR|WITH) \(?[A-Za-z0-9.+-]+\)?)*")
+
+_EXAMPLES = {
+    "name": 'write name = "my_controller"',
+    "authors": 'write authors = ["A. Name", "B. Name"]',
+    "licence": 'write licence = "Apache-2.0"',
+    "api_version": f"write api_version = {API_VERSION}",
+    "family": f"write one of {', '.join(FAMILIES)} in quotes",
+    "tracks": f"write tracks = {list(TRACKS)}, or one of them".replace("'", '"'),
+    "description": 'write description = "What it does, in a sentence or two."',
+    "training": "write a line [training], and its keys below it",
+    "training.data": 'write data = "what it was learned or tuned on"',
+    "training.simulators": 'write simulators = "1", or leave it out',
+    "training.seeds": "write seeds = [0, 1, 2], or leave it out",
+    "training.compute": 'write compute = "20 min on 2 CPU cores", or leave it out',
+    "training.per_lung": "write per_lung = true or false, or leave it out",
+}
+_OTHER_ADVICE = "see submission.toml in submissions/README.md for the keys and their values"
+
+# How read_manifest names a key, and tomllib a place.
+_KEY = re.compile(
+    rf"{re.escape(MANIFEST)}, key (?P<table>training\.)?(?P<key>\w+|(['\"]).*?\3)"
+    r"(: (?P<what>.*)| (?P<unknown>is not .*))",
+    re.DOTALL,
+)
+_TOML_PLACE = re.compile(r" \(at line (\d+), column (\d+)\)")
+
+
+def check_manifest(folder: Path) -> tuple[list[Finding], Manifest | None]:
+    """Read the manifest and look at what it says.
+
+    Args:
+        folder: the submission's folder.
+
+    Returns:
+        The findings, and the manifest unless it cannot be read.
+    """
+    path = folder / MANIFEST
+    if not path.is_file():
+        return [], None  # reported by check_files
+    try:
+        manifest = read_manifest(path, MANIFEST)
+    except SubmissionError as error:
+        lines = _lines(path)
+        return [_explained(problem, lines) for problem in error.problems], None
+    return list(_consistency(manifest, folder, _lines(path))), manifest
+
+
+def _explained(problem: str, lines: list[str]) -> Finding:
+    """A finding of one of the manifest's problems, whose text names the key."""
+    known = _KEY.fullmatch(problem)
+    if known is None:
+        text = problem.removeprefix(f"{MANIFEST}: ")
+        at = _TOML_PLACE.search(text)
+        line, column = (int(at[1]), int(at[2])) if at else (None, None)
+        what = _TOML_PLACE.sub("", text)
+        return Finding("manifest", MANIFEST, what, _OTHER_ADVICE, line, column)
+    key = (known["table"] or "") + known["key"].strip("'\"")
+    advice = "remove or rename it" if known["unknown"] else _EXAMPLES.get(key, _OTHER_ADVICE)
+    what = f"key {key} {known['unknown'] or known['what']}"
+    return Finding("manifest", MANIFEST, what, advice, _line(lines, key))
+
+
+def _line(lines: list[str], key: str) -> int | None:
+    table, _, name = key.rpartition(".")
+    pattern = re.compile(rf"\s*[\"']?{re.escape(name)}[\"']?\s*=|\s*\[\s*{re.escape(name)}\s*\]")
+    table_here = ""
+    for number, line in enumerate(lines, 1):
+        if pattern.match(line) and table_here == table:
+            return number
+        header = re.match(r"\s*\[\s*(\w+)\s*\]", line)
+        table_here = header[1] if header else table_here
+    return None
+
+
+def _lines(path: Path) -> list[str]:
+    small = path.stat().st_size < 100_000
+    return path.read_text(errors="replace").splitlines() if small else []
+
+
+def _consistency(manifest: Manifest, folder: Path, lines: list[str]) -> Iterator[Finding]:
+    def finding(key: str, what: str, advice: str, *, problem: bool = False) -> Finding:
+        text = f"key {key} {what}"
+        return Finding("manifest", MANIFEST, text, advice, _line(lines, key), problem=problem)
+
+    if not _SPDX.fullmatch(manifest.licence):
+        what = f"{manifest.licence!r} is not an SPDX identifier{_licence_hint(manifest.licence)}"
+        yield finding("licence", what, _EXAMPLES["licence"], problem=True)
+    else:
+        for name in re.split(r" (?:AND|OR|WITH) ", manifest.licence):
+            if name.strip("()") not in LICENCES:
+                what = f"{name!r} is not a well-known SPDX identifier{_licence_hint(name)}"
+                advice = "make sure that it allows others to run and publish the submission"
+                yield finding("licence", what, advice)
+    if manifest.name != folder.name:
+        what = f"is {manifest.name}, the folder is {folder.name}"
+        yield finding("name", what, f"a pull request must put it into submissions/{manifest.name}/")
+    if AUTHOR in manifest.authors:
+        yield finding("authors", f"still says {AUTHOR}", "write your name")
+    if manifest.training.per_lung and "robustness" in manifest.tracks:
+        what = "is true, but task.lung is None on the robustness track"
+        advice = "make sure that it can do without, or leave it out"
+        yield finding("training.per_lung", what, advice)
+    if manifest.family not in ("pid", "other") and not manifest.training.data:
+        yield finding("training.data", "is missing", "say what it was trained on")
+
+
+def _licence_hint(licence: str) -> str:
+    close = difflib.get_close_matches(licence.strip("()"), LICENCES, n=1, cutoff=0.5)
+    return f"; did you mean {close[0]}?" if close else ""

@@ -1,0 +1,207 @@
+"""Who runs the controllers: an interface that a sandbox fills, and the plain way in this process.
+
+A runner starts one fresh controller for each cell and then answers a batch of observations at a
+time. Only numbers cross: a :class:`Task` for each cell at the start, then at every step
+:data:`~ventbench.sandbox.child.cell.ROW` floats to each controller and one float back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.entries.errors import Failure
+from ventbench.entries.folder import Submission
+from ventbench.sandbox.child.cell import Cell, Failed, controller_class
+from ventbench.task import protocol
+from ventbench.task.interfaces import Observation, Task
+
+Floats = NDArray[np.float64]
+
+#: Called with rounds of commands that are done, and all of them.
+Progress = Callable[[int, int], None]
+
+
+class ControllerSession(Protocol):
+    """Controllers of all cells of one submission, between start and close."""
+
+    @property
+    def failures(self) -> Mapping[int, Failure]:
+        """What went wrong up to now, by index of the cell; a failed cell stays failed."""
+        ...
+
+    def act(self, observations: Floats) -> Floats:
+        """Ask every controller for its next command.
+
+        Called once for each step of each inspiration, in order.
+
+        Args:
+            observations: one row a cell, see :func:`pack`, shape ``(cells, ROW)``.
+
+        Returns:
+            ``u_in``, %, shape ``(cells,)``: finite, 0 for a failed cell, not clipped.
+        """
+        ...
+
+    def close(self) -> None:
+        """End all controllers; may be called more than once."""
+        ...
+
+
+class Runner(Protocol):
+    """Starts sessions.
+
+    Attributes:
+        sandbox: the layers that keep a submission apart, as they go into the record; None if there
+            is none, and the result then is not official.
+    """
+
+    @property
+    def sandbox(self) -> Mapping[str, Any] | None:
+        """Layers for the record, or None."""
+        ...
+
+    def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
+        """Make and reset one fresh controller for each cell.
+
+        A controller that cannot be made or reset is a failure of its cell, found in the session.
+
+        Args:
+            submission: whose folder holds the code.
+            tasks: one for each cell.
+
+        Raises:
+            SubmissionError: if the code cannot be imported or lacks what it must have.
+        """
+        ...
+
+
+def pack(observation: Observation) -> Floats:
+    """Lay a batch of observations out as rows.
+
+    Args:
+        observation: fields of shape ``(...)``, ``targets_ahead`` ``(..., TARGETS_AHEAD)``.
+
+    Returns:
+        float64, shape ``(cells, ROW)``: the fields in their order, batch axes flattened.
+    """
+    shape = np.shape(observation.pressure)
+    columns = [
+        np.broadcast_to(np.asarray(field, float), shape)[..., None]
+        if name != "targets_ahead"
+        else np.asarray(field, float)
+        for name, field in zip(Observation._fields, observation, strict=True)
+    ]
+    rows = np.concatenate(columns, axis=-1)
+    return rows.reshape(-1, rows.shape[-1])
+
+
+class InProcessSession:
+    """Controllers of all cells in this process; :class:`InProcessRunner` starts them."""
+
+    def __init__(self, submission: Submission, tasks: Sequence[Task]):
+        controller = submission.controller
+        source = None if controller is None else submission.label
+        if controller is None:
+            controller = controller_class(submission.folder, submission.label)
+        self.failures: dict[int, Failure] = {}
+        self._count = len(tasks)
+        self._cells: dict[int, Cell] = {}
+        for index, task in enumerate(tasks):
+            try:
+                self._cells[index] = Cell(controller, task, submission.folder, source)
+            except Failed as failed:
+                self.failures[index] = failed.failure
+
+    def act(self, observations: Floats) -> Floats:
+        """Ask every controller for its next command; see :class:`ControllerSession`."""
+        commands = np.zeros(self._count)
+        rows = observations.tolist()
+        for index, cell in list(self._cells.items()):
+            try:
+                commands[index] = cell.act(rows[index])
+            except Failed as failed:
+                self.failures[index] = failed.failure
+                del self._cells[index]
+        return commands
+
+    def close(self) -> None:
+        """Forget the controllers."""
+        self._cells.clear()
+
+
+class InProcessRunner:
+    """Runs controllers in this process, with all of its rights: for code that you trust.
+
+    Quick, and good for one's own development. Nothing stops a submission from reading the
+    simulators or keeping state from cell to cell, so results carry ``"sandbox": null`` and
+    ``"official": false``.
+    """
+
+    sandbox: Mapping[str, Any] | None = None
+
+    def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
+        """Make and reset one fresh controller for each cell; see :class:`Runner`."""
+        return InProcessSession(submission, tasks)
+
+
+def runner_of(submission: Submission, *, sandbox: bool) -> Runner:
+    """Choose how a submission runs.
+
+    Args:
+        submission: a folder, or a class or function, which always runs in this process.
+        sandbox: run a folder in locked-down processes.
+
+    Raises:
+        SandboxError: if this machine cannot run submissions apart.
+    """
+    if not sandbox or submission.controller is not None:
+        return InProcessRunner()
+    from ventbench.sandbox.runner import SandboxRunner
+
+    return SandboxRunner()
+
+
+class CountingRunner:
+    """Runs controllers as another runner does, and tells after each round how far it is.
+
+    Args:
+        runner: does the work.
+        progress: called with rounds done and all rounds.
+        sessions: how many sessions the whole score starts, each of one run of all breaths.
+    """
+
+    def __init__(self, runner: Runner, progress: Progress, sessions: int = 1):
+        self._runner, self._progress, self._done = runner, progress, 0
+        self._total = sessions * protocol.BREATHS * protocol.INSPIRATION_STEPS
+
+    @property
+    def sandbox(self) -> Mapping[str, Any] | None:
+        """Layers for the record, or None."""
+        return self._runner.sandbox
+
+    def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
+        """Make and reset one fresh controller for each cell; see :class:`Runner`."""
+        return _CountingSession(self._runner.start(submission, tasks), self._count)
+
+    def _count(self) -> None:
+        self._done += 1
+        self._progress(self._done, self._total)
+
+
+class _CountingSession:
+    def __init__(self, session: ControllerSession, count: Callable[[], None]):
+        self._session, self._count = session, count
+        self.close = session.close
+
+    @property
+    def failures(self) -> Mapping[int, Failure]:
+        return self._session.failures
+
+    def act(self, observations: Floats) -> Floats:
+        commands = self._session.act(observations)
+        self._count()
+        return commands

@@ -1,0 +1,194 @@
+"""The loop between plants and controllers: all cells together, only numbers between them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from ventbench.base import precision
+from ventbench.controllers.script import Script
+from ventbench.entries.errors import Failure
+from ventbench.entries.folder import Submission
+from ventbench.entries.runner import Runner, pack
+from ventbench.task import environment as env
+from ventbench.task import protocol, rollouts
+from ventbench.task.environment import Scenario
+from ventbench.task.interfaces import Observation, Plant, PlantT, Task
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ProtocolRun:
+    """Inspirations of all cells; arrays of shape ``(L, ..., BREATHS, INSPIRATION_STEPS)``.
+
+    L lungs; ``(...)`` is the batch shape of the scenario.
+
+    Attributes:
+        pressure: airway pressure at each step, which is scored, cmH2O.
+        requested: what the controllers asked for, %; 0 once a cell has failed.
+        u_in: what was applied, %.
+        volume: gas in the lung, mL; None where the plants have no such signal.
+        failures: what failed, by cell, index ``(lung, ...)``.
+        act_seconds: time that one ``act`` took on average, s, for each round of all cells, shape
+            ``(BREATHS * INSPIRATION_STEPS,)``.
+    """
+
+    pressure: Floats
+    requested: Floats
+    u_in: Floats
+    volume: Floats | None
+    failures: Mapping[tuple[int, ...], Failure]
+    act_seconds: Floats
+
+
+def as_float64(plants: PlantT, count: int) -> PlantT:
+    """Return stacked plants with 64-bit leaves.
+
+    Args:
+        plants: one plant whose leaves have the lungs on their leading axis.
+        count: number of lungs.
+
+    Raises:
+        ValueError: if a leaf has another leading axis.
+    """
+
+    def convert(leaf: Any) -> Array:
+        leaf = jnp.asarray(leaf)
+        if leaf.shape[:1] != (count,):
+            raise ValueError(
+                f"a plant's parameter of shape {leaf.shape} is not stacked over {count} lungs"
+            )
+        return leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+
+    return jax.tree.map(convert, plants)
+
+
+def _strong(tree: Any) -> Any:
+    """Drop weak types, which would make the second step compile anew."""
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), tree)
+
+
+@jax.jit
+def _begin(plants: Plant, scenario: Scenario) -> tuple[Plant, env.LoopState]:
+    def begin(plant: Plant, scenario: Scenario) -> tuple[Plant, env.LoopState]:
+        varied = env.vary(plant, scenario)
+        return varied, env.start_breath(varied, scenario)
+
+    return _strong(jax.vmap(begin)(plants, scenario))
+
+
+@jax.jit
+def _observe(scenario: Scenario, loop: env.LoopState, breath: Array, step: Array) -> Observation:
+    return jax.vmap(env.observe, in_axes=(0, 0, None, None))(scenario, loop, breath, step)
+
+
+@jax.jit
+def _inspire(
+    plants: Plant, scenario: Scenario, loop: env.LoopState, u_in: Array
+) -> tuple[env.LoopState, Array]:
+    return _strong(jax.vmap(env.inspire)(plants, scenario, loop, u_in))
+
+
+class PlantError(FloatingPointError):
+    """A plant answered with NaN or infinity.
+
+    Attributes:
+        index: of the plant on the leading axis.
+    """
+
+    def __init__(self, index: int) -> None:
+        super().__init__(f"simulator {index} answered with NaN or infinity")
+        self.index = index
+
+
+def step_through(
+    plants: Plant,
+    scenario: Scenario,
+    runner: Runner,
+    submission: Submission,
+    tasks: Sequence[Task],
+    *,
+    changing: bool = False,
+) -> ProtocolRun:
+    """Run a submission on every lung and cell. Call it within ``precision.float64()``.
+
+    Args:
+        plants: from :func:`as_float64`, L lungs; leaves may have the cells' batch shape too,
+            ``(L, ..., )`` with axes of length 1 where cells share a plant.
+        scenario: cells of each lung, batch shape ``(L, ...)``.
+        runner: runs the controllers.
+        submission: whose they are.
+        tasks: what is told of each lung, length L.
+        changing: the plants are others in each breath: leaves ``(L, BREATHS, ...)``.
+
+    Raises:
+        SubmissionError: if the submission cannot be run at all.
+        PlantError: if a plant answers with NaN or infinity.
+    """
+    batch = np.shape(scenario.pip)
+    cells = int(np.prod(batch))
+    shape = (*batch, protocol.BREATHS, protocol.INSPIRATION_STEPS)
+    pressure, requested, applied, volume = (np.zeros(shape) for _ in range(4))
+    seconds, has_volume = [], True
+    each = [task for task in tasks for _ in range(cells // len(tasks))]
+    with precision.float32():  # a submission that uses JAX finds it as it is elsewhere
+        session = runner.start(submission, each)
+    try:
+        for breath in range(protocol.BREATHS):
+            if changing or breath == 0:
+                now = jax.tree.map(lambda x, k=breath: x[:, k], plants) if changing else plants
+                varied, rest = _begin(now, scenario)
+            loop = rest
+            for step in range(protocol.INSPIRATION_STEPS):
+                rows = pack(_observe(scenario, loop, breath, step))
+                live = max(1, cells - len(session.failures))
+                start = time.perf_counter()
+                with precision.float32():
+                    commands = session.act(rows)
+                seconds.append((time.perf_counter() - start) / live)
+                commands = commands.reshape(batch)
+                at = (..., breath, step)
+                pressure[at], requested[at] = loop.signals.scored, commands
+                has_volume = loop.signals.volume is not None
+                if has_volume:
+                    volume[at] = loop.signals.volume
+                loop, applied[at] = _inspire(varied, scenario, loop, commands)
+        failures = dict(session.failures)
+    finally:
+        session.close()
+    broken = np.flatnonzero(~np.isfinite(pressure).reshape(len(tasks), -1).all(axis=1))
+    if broken.size:
+        raise PlantError(int(broken[0]))
+    by_cell = {tuple(int(i) for i in np.unravel_index(k, batch)): v for k, v in failures.items()}
+    kept = volume if has_volume else None
+    return ProtocolRun(pressure, requested, applied, kept, by_cell, np.array(seconds))
+
+
+def replay(
+    plants: Plant, scenario: Scenario, requested: Floats
+) -> tuple[rollouts.Inspirations, rollouts.Expirations]:
+    """Apply recorded commands again, with the expirations. Call it within ``float64()``.
+
+    Args:
+        plants: from :func:`as_float64`, L lungs.
+        scenario: cells, as in :func:`step_through`.
+        requested: as in :class:`ProtocolRun`.
+
+    Returns:
+        Arrays of shape ``(L, ..., BREATHS, steps)``, cmH2O and %.
+    """
+
+    def run(plant: Plant, scenario: Scenario, commands: Array) -> Any:
+        return rollouts.closed_loop(plant, Script(commands), scenario, whole=True)
+
+    commands = jnp.asarray(requested.reshape(*requested.shape[:-2], -1))
+    return jax.vmap(run)(plants, scenario, commands)

@@ -1,0 +1,414 @@
+"""Charts of a diagnosis as numbers for the template: lines, bands and ticks in picture units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ventbench.diagnosis.findings import BreathRequest, NonparametricTerm, Traces
+from ventbench.diagnosis.residual_analysis import Profile, profiles
+from ventbench.diagnosis.residual_axes import EDGE
+from ventbench.diagnosis.result import Diagnosis
+from ventbench.pages import graphics
+from ventbench.pages.runs import Floats
+from ventbench.physics.characteristics import Characteristic
+
+#: Room for the labels: left, right, top, bottom, picture units.
+LEFT, RIGHT, TOP, BOTTOM = 40.0, 16.0, 16.0, 30.0
+
+#: The three simulators in the order of the legend: key, text, class of the line.
+STAGES = (
+    ("before", "simulator as given", "before"),
+    ("refit", "R and C refitted", "refit"),
+    ("after", "corrected", "after"),
+)
+
+#: Breaths that are shown of either kind.
+WORST = 3
+
+#: Left end of the logarithmic axis of the time since an edge, s.
+_FIRST_EDGE_TIME = 0.01
+
+#: Time that the magnified part of a breath shows before and after its largest error, s.
+_BEFORE, _AFTER = 0.12, 0.28
+
+#: Colour class of a characteristic without and with its mechanism.
+_WITHOUT, _WITH = "refit", "after"
+
+#: Breaths of a request that are drawn.
+REQUESTED = 4
+
+
+@dataclass
+class Chart:
+    """Axes with linear scales, or a logarithmic horizontal one; y of the picture runs downwards.
+
+    Attributes:
+        x: ends of the horizontal axis.
+        y: ends of the vertical axis.
+        x_label: label under the frame, with the unit.
+        y_label: label above the frame, with the unit.
+        alt: description of the picture for those who cannot see it.
+        width: width of the picture.
+        height: height of the picture.
+        paths: class and path data of lines, the lowest first.
+        areas: class and path data of filled areas, below the lines.
+        bands: left end and width of shaded ranges.
+        log: whether the horizontal axis is logarithmic; smaller values stand at its left end.
+    """
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    x_label: str
+    y_label: str
+    alt: str
+    width: float = 300.0
+    height: float = 170.0
+    paths: list[tuple[str, str]] = field(default_factory=list)
+    areas: list[tuple[str, str]] = field(default_factory=list)
+    bands: list[tuple[float, float]] = field(default_factory=list)
+    log: bool = False
+
+    @property
+    def frame(self) -> tuple[float, float, float, float]:
+        """Left, top, right and bottom of the frame, picture units."""
+        return LEFT, TOP, self.width - RIGHT, self.height - BOTTOM
+
+    @property
+    def x_ticks(self) -> list[tuple[str, float]]:
+        """Texts and places of the ticks, picture units."""
+        values, texts = log_ticks(*self.x) if self.log else ticks(*self.x, 6)
+        return [(t, round(float(self.at_x(v)), 1)) for t, v in zip(texts, values, strict=True)]
+
+    @property
+    def y_ticks(self) -> list[tuple[str, float]]:
+        """Texts and places of the ticks, picture units."""
+        values, texts = ticks(*self.y, 4)
+        return [(t, round(float(self.at_y(v)), 1)) for t, v in zip(texts, values, strict=True)]
+
+    @property
+    def zero(self) -> float | None:
+        """Place of y = 0, or None if it is outside."""
+        return round(float(self.at_y(0.0)), 1) if self.y[0] < 0 < self.y[1] else None
+
+    def at_x(self, value: ArrayLike) -> Floats:
+        """Place on the horizontal axis."""
+        left, _, right, _ = self.frame
+        value, (low, high) = np.asarray(value, float), self.x
+        if self.log:
+            value, low, high = np.log(np.maximum(value, low)), np.log(low), np.log(high)
+        share = (value - low) / (high - low)
+        return left + share * (right - left)
+
+    def at_y(self, value: ArrayLike) -> Floats:
+        """Place on the vertical axis; values far outside stay near the frame."""
+        _, top, _, bottom = self.frame
+        share = (np.asarray(value, float) - self.y[0]) / (self.y[1] - self.y[0])
+        return bottom - np.clip(share, -0.5, 1.5) * (bottom - top)
+
+    def line(self, look: str, x: ArrayLike, y: ArrayLike) -> None:
+        """Add a line, which breaks where a point is NaN."""
+        self.paths.append((look, graphics.path(self._points(x, y))))
+
+    def stairs(self, look: str, edges: ArrayLike, y: ArrayLike) -> None:
+        """Add one level for each of k ranges with ``k + 1`` edges."""
+        edges = np.asarray(edges, float)
+        self.line(look, np.repeat(edges, 2)[1:-1], np.repeat(np.asarray(y, float), 2))
+
+    def boxes(self, look: str, edges: ArrayLike, low: ArrayLike, high: ArrayLike) -> None:
+        """Add an area from low to high in each of k ranges."""
+        edges, parts = np.asarray(edges, float), []
+        bounds = zip(np.asarray(low, float), np.asarray(high, float), strict=True)
+        for k, (bottom, top) in enumerate(bounds):
+            if np.isfinite(bottom) and np.isfinite(top):
+                ends = edges[[k, k + 1]]
+                upper, lower = self._points(ends, [top, top]), self._points(ends, [bottom, bottom])
+                parts.append(graphics.area(upper, lower))
+        if parts:
+            self.areas.append((look, "".join(parts)))
+
+    def band(self, low: float, high: float) -> None:
+        """Shade a range."""
+        ends = self.at_x(np.clip([low, high], *self.x))
+        left, right = float(ends[0]), float(ends[1])
+        self.bands.append((round(left, 1), round(max(right - left, 1.0), 1)))
+
+    def _points(self, x: ArrayLike, y: ArrayLike) -> Floats:
+        return np.stack([self.at_x(x), self.at_y(y)], axis=-1)
+
+
+def ticks(low: float, high: float, count: int) -> tuple[list[float], list[str]]:
+    """Ticks: about ``count`` round numbers from ``low`` to ``high``, and their texts."""
+    wanted = max(high - low, 1e-9) / count
+    scale = 10.0 ** np.floor(np.log10(wanted))
+    step = float(scale * next(x for x in (1, 2, 5, 10) if x * scale >= 0.999 * wanted))
+    first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
+    values = [step * k for k in range(first, last + 1)]
+    places = max(0, -int(np.floor(np.log10(step) + 1e-9)))
+    return values, [f"{v + 0.0:.{places}f}" for v in values]
+
+
+def log_ticks(low: float, high: float) -> tuple[list[float], list[str]]:
+    """Ticks of a logarithmic axis at 1, 2 and 5 times powers of ten, and their texts."""
+    powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+    values = [digit * 10.0**power for power in powers for digit in (1.0, 2.0, 5.0)]
+    values = [value for value in values if low * (1 - 1e-9) <= value <= high * (1 + 1e-9)]
+    return values, [f"{value:.6g}" for value in values]
+
+
+def limits(*arrays: ArrayLike, around: float = 0.06, least: float = 0.0) -> tuple[float, float]:
+    """Ends of an axis that holds all finite values with some air.
+
+    Args:
+        arrays: arrays of any shape.
+        around: air at either end, as a share of the height.
+        least: height at least.
+    """
+    flat = np.concatenate([np.ravel(np.asarray(array, float)) for array in arrays])
+    flat = flat[np.isfinite(flat)]
+    if flat.size == 0:
+        return 0.0, max(least, 1.0)
+    low, high = float(flat.min()), float(flat.max())
+    missing = max(least - (high - low), 0.0) or (1.0 if high == low else 0.0)
+    low, high = low - 0.5 * missing, high + 0.5 * missing
+    return low - around * (high - low), high + around * (high - low)
+
+
+@dataclass(frozen=True, eq=False)
+class BreathPanel:
+    """One breath.
+
+    Attributes:
+        title: title, such as ``breath 17``.
+        why: reason why the breath is shown.
+        errors: root mean square over the inspiration by stage, cmH2O.
+        pressure: chart of the pressure.
+        near: the part of it where the refitted simulator errs most, magnified.
+        error: chart of recorded minus simulated pressure.
+        valve: chart of the command.
+    """
+
+    title: str
+    why: str
+    errors: dict[str, float]
+    pressure: Chart
+    near: Chart
+    error: Chart
+    valve: Chart
+
+
+def rmse(traces: Traces, simulated: Floats) -> Floats:
+    """Root mean square error of each breath's inspiration, cmH2O, ``(n,)``; NaN without any."""
+    error = traces.breaths.pressure - simulated
+    use = traces.breaths.inspiratory & np.isfinite(error)
+    total = np.where(use, error**2, 0.0).sum(axis=1)
+    count = use.sum(axis=1)
+    return np.sqrt(np.divide(total, count, out=np.full(len(total), np.nan), where=count > 0))
+
+
+def worst(diagnosis: Diagnosis) -> list[tuple[int, str]]:
+    """Held-out breaths with the largest errors of the refit, and of the correction."""
+    traces = diagnosis.traces
+    held = traces.held_out if traces.held_out.any() else np.ones(len(traces.held_out), bool)
+    corrected = diagnosis.verdict != "nothing_missing"
+    kinds = [(traces.refit, "worst before the correction" if corrected else "worst")]
+    if corrected:
+        kinds.append((traces.after, "worst after the correction"))
+    chosen: dict[int, str] = {}
+    for simulated, why in kinds:
+        error = np.where(held, rmse(traces, simulated), -np.inf)
+        order = np.argsort(-np.nan_to_num(error, nan=-np.inf), kind="stable")
+        fresh = [i for i in order.tolist() if np.isfinite(error[i]) and i not in chosen]
+        chosen |= dict.fromkeys(fresh[:WORST], why)
+    return list(chosen.items())
+
+
+def panels(diagnosis: Diagnosis) -> list[BreathPanel]:
+    """Charts of the breaths of :func:`worst`."""
+    traces = diagnosis.traces
+    by_stage = {key: rmse(traces, getattr(traces, key)) for key, _, _ in STAGES}
+    several = len(traces.breaths.by_lung_index) > 1
+    shown = []
+    for i, why in worst(diagnosis):
+        name = f"breath {traces.breaths.breath_id[i]}"
+        if several:
+            name += f", {traces.breaths.lung_ids[i]}"
+        errors = {key: float(values[i]) for key, values in by_stage.items()}
+        shown.append(_panel(traces, i, name, why, errors, diagnosis.verdict != "nothing_missing"))
+    return shown
+
+
+def _panel(
+    traces: Traces, i: int, name: str, why: str, errors: dict[str, float], corrected: bool
+) -> BreathPanel:
+    """Charts of one breath."""
+    breath = traces.breaths
+    looks = [(key, look) for key, _, look in STAGES if look != "after" or corrected]
+    end = _end(traces, i)
+    use = breath.valid[i] & (breath.time[i] <= end)
+    time, recorded = breath.time[i][use], breath.pressure[i][use]
+    simulated = {key: getattr(traces, key)[i][use] for key, _ in looks}
+    pressure = Chart(
+        (0.0, end), limits(recorded, traces.refit[i][use], traces.after[i][use]), "", "cmH2O",
+        f"Pressure of {name}: recorded, and simulated before, after refit and corrected.",
+        height=140.0,
+    )  # fmt: skip
+    low, high = window(time, recorded, simulated["refit"])
+    pressure.band(low, high)
+    within = (time >= low - 1e-9) & (time <= high + 1e-9)
+    seen = [recorded[within], *(simulated[key][within] for key, _ in looks if key != "before")]
+    near = Chart(
+        (low, high), limits(*seen), "", "magnified, cmH2O",
+        f"{name[:1].upper() + name[1:]} from {low:.2f} to {high:.2f} s, magnified.", height=130.0,
+    )  # fmt: skip
+    for chart, part in ((pressure, slice(None)), (near, within)):
+        chart.line("seen", time[part], recorded[part])
+        for key, look in looks:
+            chart.line(look, time[part], simulated[key][part])
+    left = {key: recorded - values for key, values in simulated.items()}
+    error = Chart(
+        (0.0, end), limits(*(left[key] for key, _ in looks if key != "before"), least=1.0), "",
+        "recorded − simulated, cmH2O",
+        f"Error of {name}, recorded minus simulated: as given, refitted and corrected.",
+        height=110.0,
+    )  # fmt: skip
+    for key, look in looks:
+        error.line(look, time, left[key])
+    valve = command(time, breath.u_in[i][use], end, f"Commands of {name}.", 84.0)
+    return BreathPanel(name, why, errors, pressure, near, error, valve)
+
+
+def window(time: Floats, recorded: Floats, simulated: Floats) -> tuple[float, float]:
+    """Ends of the part of a breath around its largest error, s.
+
+    Args:
+        time: of the samples, s, ``(T,)``.
+        recorded: pressure, cmH2O, NaN where it is unknown, ``(T,)``.
+        simulated: pressure, cmH2O, ``(T,)``.
+    """
+    size = np.nan_to_num(np.abs(recorded - simulated), nan=0.0)
+    # Two neighbours together: a single outlier is no place.
+    both = size + 0.5 * (np.append(size[1:], 0.0) + np.append(0.0, size[:-1]))
+    middle, end = float(time[int(np.argmax(both))]), float(time[-1])
+    low = min(max(middle - _BEFORE, 0.0), max(end - _BEFORE - _AFTER, 0.0))
+    return low, min(low + _BEFORE + _AFTER, end)
+
+
+def _end(traces: Traces, i: int) -> float:
+    """End of the drawn part, s: a little after the inspiration."""
+    breath = traces.breaths
+    last = np.max(breath.time[i], initial=0.0, where=breath.valid[i])
+    inspired = np.max(breath.time[i], initial=0.0, where=breath.inspiratory[i])
+    return float(max(min(last, inspired + 0.6), 0.1))
+
+
+def command(time: Floats, u_in: Floats, end: float, alt: str, height: float) -> Chart:
+    """The inspiratory valve over time; a command holds until the next sample."""
+    top = max(10.0, float(np.max(u_in, initial=0.0)))
+    chart = Chart((0.0, end), (-0.04 * top, 1.08 * top), "s", "u_in, %", alt, height=height)
+    chart.line("u", np.repeat(time, 2)[1:], np.repeat(u_in, 2)[:-1])
+    return chart
+
+
+def by_axis(diagnosis: Diagnosis) -> list[Chart]:
+    """Mean errors of the refitted and of the corrected simulator along each axis."""
+    traces = diagnosis.traces
+    inputs = (traces.breaths, traces.refit, traces.flow, traces.volume)
+    refitted = profiles(*inputs)
+    # Sorted by what the refitted one did, so that both are over the same samples.
+    corrected = profiles(*inputs, simulated=traces.after)
+    return [_axis(diagnosis, a, b) for a, b in zip(refitted, corrected, strict=True)]
+
+
+def _axis(diagnosis: Diagnosis, refit: Profile, after: Profile) -> Chart:
+    axis = refit.axis
+    used = np.flatnonzero(refit.breaths > 0)
+    edges = axis.edges[used[0] : used[-1] + 2] if used.size else axis.edges
+    inside = slice(used[0], used[-1] + 1) if used.size else slice(None)
+    mean, half, corrected = refit.mean[inside], refit.half[inside], after.mean[inside]
+    half = np.where(np.isfinite(half), half, 0.0)
+    y = limits(mean, corrected, [0.0], _near(mean - half, mean), _near(mean + half, mean))
+    places = [place for place in diagnosis.location if place.axis == axis.name]
+    unit = "" if axis.unit == "1" else f", {axis.unit}"
+    where = "; ".join(f"{p.low:.6g} to {p.high:.6g}" for p in places) or "none"
+    chart = Chart(
+        (float(edges[0]), float(edges[-1])),
+        y if y[1] - y[0] > 0.2 else limits(y, least=0.2, around=0.0),
+        f"{axis.name}{unit}",
+        "recorded − simulated, cmH2O",
+        f"Mean error along {axis.name}{unit}; significant ranges: {where}.",
+        width=330.0,
+        height=190.0,
+    )
+    if axis.name == EDGE:
+        # Half of what matters happens in the first two samples after an edge.
+        chart.log, chart.x = True, (_FIRST_EDGE_TIME, max(float(edges[-1]), 2 * _FIRST_EDGE_TIME))
+    for place in places:
+        # The first breath's number is 1, the axis begins at 0.
+        chart.band(place.low - (axis.name == "breath number"), place.high)
+    chart.boxes("refit", edges, mean - half, mean + half)
+    chart.stairs("refit", edges, mean)
+    if diagnosis.verdict != "nothing_missing":
+        chart.stairs("after", edges, corrected)
+    return chart
+
+
+def _near(end: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Ends of intervals, cut where they are so wide that they would hide everything else."""
+    reach = 2.0 * np.nanmax(np.abs(mean), initial=0.1)
+    return np.clip(end, -reach, reach)
+
+
+def own_signal(name: str, shown: Characteristic) -> Chart:
+    """What a mechanism does to its own quantity, without it and with it."""
+    chart = Chart(
+        (float(shown.x.min()), float(shown.x.max())),
+        limits(shown.without, shown.acting),
+        shown.x_label,
+        shown.y_label,
+        f"{shown.y_label} over {shown.x_label}, without and with {name}.",
+        width=360.0,
+        height=200.0,
+    )
+    chart.line(_WITHOUT, shown.x, shown.without)
+    chart.line(_WITH, shown.x, shown.acting)
+    return chart
+
+
+def nonparametric_term(shape: NonparametricTerm) -> Chart:
+    """The curve of a nonparametric term."""
+    chart = Chart(
+        (float(shape.x.min()), float(shape.x.max())),
+        limits(shape.y, [0.0]),
+        shape.x_unit,
+        shape.y_unit,
+        f"Shape of {shape.name}: {shape.y_unit} over {shape.x_unit}.",
+        width=420.0,
+        height=220.0,
+    )
+    chart.line("after", shape.x, shape.y)
+    return chart
+
+
+def request(wanted: BreathRequest) -> list[Chart]:
+    """The first breaths to record next."""
+    charts = []
+    for k in range(min(len(wanted.u_in), REQUESTED)):
+        time = np.concatenate([[0.0], np.cumsum(wanted.dt[k][:-1])])
+        chart = command(
+            time, wanted.u_in[k], float(time[-1]), f"Commands of breath {k + 1} to record.", 130.0
+        )
+        for start, end in _open(time, wanted.u_out[k]):
+            chart.band(start, end)
+        charts.append(chart)
+    return charts
+
+
+def _open(time: np.ndarray, u_out: np.ndarray) -> list[tuple[float, float]]:
+    """Times during which the expiratory valve is open."""
+    is_open = np.concatenate([[False], u_out > 0.5, [False]])
+    changes = np.flatnonzero(np.diff(is_open.astype(int)))
+    ends = np.append(time, time[-1])
+    return [(float(ends[a]), float(ends[b])) for a, b in changes.reshape(-1, 2)]

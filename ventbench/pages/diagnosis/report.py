@@ -1,0 +1,321 @@
+"""The HTML report of a diagnosis: one file, no script, nothing from the network.
+
+Its diagram shows the rig and the lung: parts by their place in the physics, the guilty ones lit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+import ventbench
+from ventbench import palette
+from ventbench.base.text import page_templates
+from ventbench.diagnosis import number_text, report_text
+from ventbench.diagnosis.findings import (
+    ErrorRegion,
+    MissingMechanism,
+    NonparametricTerm,
+    OpenLoopError,
+)
+from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY
+from ventbench.diagnosis.result import RECORD_NEXT, Diagnosis
+from ventbench.pages import mathml
+from ventbench.pages.diagnosis import charts
+from ventbench.physics import Physics, mechanism
+from ventbench.physics.characteristics import characteristic
+from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
+
+#: Places that are told in words; the charts show all.
+PLACES = 6
+
+
+def html(diagnosis: Diagnosis) -> str:
+    """Return the whole page; equal input gives equal text."""
+    listed = entries(diagnosis)
+    lead = [report_text.effect(diagnosis), report_text.remaining(diagnosis)]
+    lead += [report_text.scatter(diagnosis)]
+    page = page_templates("ventbench.pages.diagnosis").get_template("diagnosis.html.j2")
+    return page.render(
+        headline=report_text.headline(diagnosis),
+        facts=facts(diagnosis),
+        lead=[text for text in lead if text],
+        entries=listed,
+        parts=parts(listed),
+        diagram_alt=description(listed),
+        would_change=report_text.would_change(diagnosis),
+        visible=[
+            (report_text.title(name), name, limit or "not at any strength")
+            for name, limit in report_text.visible_strengths(diagnosis).items()
+        ],
+        commands_file=RECORD_NEXT,
+        plant=diagnosis.simulator,
+        light=(palette.RUNS[0], palette.GREY, *palette.RUNS[1:]),
+        dark=(palette.RUNS_DARK[0], palette.GREY_DARK, *palette.RUNS_DARK[1:]),
+        mechanisms=[_named(diagnosis, missing) for missing in diagnosis.mechanisms],
+        alternatives=report_text.alternatives(diagnosis),
+        bars=bars(diagnosis),
+        groups=groups(diagnosis),
+        corrected=diagnosis.verdict != "nothing_missing",
+        held_out=len(diagnosis.open_loop.held_out_breaths),
+        stages=_stages(diagnosis),
+        panels=charts.panels(diagnosis),
+        places=[_place(diagnosis, place) for place in diagnosis.location[:PLACES]],
+        remaining=[_place(diagnosis, place) for place in diagnosis.remaining[:PLACES]],
+        more=max(len(diagnosis.location) - PLACES, 0),
+        axes=charts.by_axis(diagnosis),
+        slot=diagnosis.form or diagnosis.nonparametric,
+        open_loop=report_text.open_loop(diagnosis),
+        slot_words=report_text.nonparametric_term(diagnosis),
+        slot_title="The form of what is missing"
+        if diagnosis.form is not None
+        else "An effect outside the library",
+        slot_chart=None
+        if (shown := diagnosis.form or diagnosis.nonparametric) is None
+        else charts.nonparametric_term(shown),
+        request=diagnosis.request,
+        request_words=report_text.request(diagnosis),
+        request_charts=[] if diagnosis.request is None else charts.request(diagnosis.request),
+        lungs=[report_text.lung(match) for match in diagnosis.lungs],
+        notes=diagnosis.notes,
+        about=_about(diagnosis),
+        version=ventbench.__version__,
+    )
+
+
+def facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    """What a reader asks first: the question, the answer in short, and a line beneath it."""
+    errors, count = diagnosis.open_loop, len(diagnosis.open_loop.held_out_breaths)
+    told = []
+    if sure := report_text.sureness(diagnosis):
+        decided, _, breaths = sure.partition(" on ")
+        each = "each, " if sure.startswith("each at ") else ""
+        told.append(("How sure?", decided.removeprefix("each at "), f"{each}on {breaths}"))
+        if sure.startswith("uncertain"):
+            told[-1] = ("How sure?", "uncertain", sure.removeprefix("uncertain: "))
+    after = _number(errors.after.rmse)
+    if diagnosis.verdict == "nothing_missing":
+        told.append(("How far off?", f"{after} cmH2O", f"root mean square on {count} breaths"))
+    else:
+        worth = f"{_number(errors.refit.rmse)} → {after} cmH2O"
+        told.append(("What is mending it worth?", worth, f"error on {count} breaths set aside"))
+    noise = f"beyond the measurement's noise of {_number(errors.noise_floor)}"
+    if errors.gain_error:
+        noise += f" and the {_number(errors.gain_error)} of the valve's scattering gain"
+    told.append(("What stays unexplained?", f"{_number(errors.unexplained)} cmH2O", noise))
+    return told
+
+
+def bars(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Root-mean-square errors as bars: text, class, value and width in %."""
+    distance = diagnosis.open_loop
+    rows = [
+        ("as given", "before", distance.before.rmse),
+        ("R and C refitted", "refit", distance.refit.rmse),
+    ]
+    if diagnosis.verdict != "nothing_missing":
+        rows.append(("corrected", "after", distance.after.rmse))
+    rows.append(("noise of the measurement", "noise", distance.noise_floor))
+    top = max((value for *_, value in rows if np.isfinite(value)), default=1.0) or 1.0
+    return [
+        {
+            "name": name,
+            "look": look,
+            "value": _number(value),
+            "width": round(100 * value / top, 1) if np.isfinite(value) else 0.0,
+        }
+        for name, look, value in rows
+    ]
+
+
+def groups(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Rows of the table of open-loop errors: all breaths first, then each part."""
+    distance = diagnosis.open_loop
+    everything = {"before": distance.before, "refit": distance.refit, "after": distance.after}
+    rows = [("all", everything), *distance.groups.items()]
+    keys = [key for key, _, _ in _stages(diagnosis)]
+    return [
+        {"name": name, "cells": [_cell(values.get(key)) for key in keys]} for name, values in rows
+    ]
+
+
+def _stages(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    return [x for x in charts.STAGES if x[0] != "after" or diagnosis.verdict != "nothing_missing"]
+
+
+def _cell(distance: OpenLoopError | None) -> dict[str, str]:
+    if distance is None:
+        return {"rmse": "–", "mae": "–"}
+    return {"rmse": _number(distance.rmse), "mae": _number(distance.mae)}
+
+
+def _named(diagnosis: Diagnosis, missing: MissingMechanism) -> dict[str, Any]:
+    """A missing mechanism with its formula, its parameters and its own signal."""
+    about = mechanism(missing.name).description
+    meanings = {parameter.name: parameter.meaning for parameter in about.parameters}
+    breaths = diagnosis.traces.breaths
+    largest = float(np.max(breaths.u_in, initial=10.0, where=breaths.valid))
+    shown = characteristic(missing.name, _values(diagnosis, missing), largest_command=largest)
+    return {
+        "name": missing.name,
+        "heading": about.title[:1].upper() + about.title[1:],
+        "simulator": {
+            key: number_text.quantity_like(value, missing.parameters[key], f"{missing.name}.{key}")
+            for key, value in missing.simulator_values.items()
+            if key in missing.parameters
+        },
+        "equation": [Markup(clause) for clause in mathml.equation(about.equation)],
+        "signature": about.signature,
+        "changed": missing.changed,
+        "confidence": f"{100 * missing.confidence:.0f} %",
+        "nats": f"{missing.nats:.0f}",
+        "alternatives": missing.alternatives,
+        "chart": None if shown is None else charts.own_signal(about.title, shown),
+        "parameters": [
+            (key, meanings.get(key, key), number_text.quantity(value, f"{missing.name}.{key}"))
+            for key, value in missing.parameters.items()
+        ],
+    }
+
+
+def _values(diagnosis: Diagnosis, missing: MissingMechanism) -> dict[str, float]:
+    """Values of a mechanism's parameters by short name, and of the base model's."""
+    values: dict[str, float] = {}
+    plant: Any = next(iter(diagnosis.plants.values()), None)
+    plant = getattr(plant, "with_mechanisms", plant)
+    if isinstance(plant, Physics):
+        for path, value in zip(plant.names, plant.values, strict=True):
+            owner, _, short = path.rpartition(".")
+            if owner in ("", missing.name):
+                values[short] = float(np.mean(np.asarray(value)))
+    elif diagnosis.lungs and np.isfinite(diagnosis.lungs[0].fitted_R):
+        values |= {"R": diagnosis.lungs[0].fitted_R, "C": diagnosis.lungs[0].fitted_C}
+    return values | {name: estimate.value for name, estimate in missing.parameters.items()}
+
+
+def _place(diagnosis: Diagnosis, place: ErrorRegion) -> dict[str, str]:
+    return {
+        "text": number_text.error_region(place, diagnosis.noise[0]),
+        "share": f"{100 * place.share:.0f} %",
+        "p": number_text.probability(place.p_value),
+    }
+
+
+def _about(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+    recorded = diagnosis.traces.breaths
+    held = int(np.count_nonzero(diagnosis.traces.held_out))
+    sd, correlation = diagnosis.noise
+    rows = [
+        ("ventbench", ventbench.__version__),
+        ("simulator", diagnosis.simulator),
+        ("recording", recorded.source or "in memory"),
+        ("its SHA-256", recorded.sha256 or ""),
+        ("breaths", f"{len(recorded)}, of which {held} were held out of every fit"),
+        ("lungs", ", ".join(recorded.by_lung_index)),
+        ("noise", f"{sd:.3g} cmH2O, correlation of neighbouring samples {correlation:.2f}"),
+        ("computed in", f"{diagnosis.seconds:.0f} s"),
+    ]
+    return [(name, text) for name, text in rows if text]
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}" if np.isfinite(value) else "–"
+
+
+#: Names of the parts, by their place in the physics.
+PARTS = {
+    "supply": "supply",
+    "command": "command",
+    "inspiratory valve": "inspiratory valve",
+    "circuit": "circuit",
+    "sensor": "sensor",
+    "expiratory valve": "expiratory valve",
+    "airway": "airway",
+    "alveolus": "lung",
+}
+
+#: Places of latent inputs.
+_LATENT = {ALVEOLUS: "alveolus", SUPPLY: "supply", MEASUREMENT: "sensor"}
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of the picture.
+
+    Attributes:
+        name: its name in the picture.
+        look: class: ``"lit"`` if a named mechanism acts there, ``"suspect"`` if an effect acts
+            there that the library does not have, else ``""``.
+        badge: numbers of the entries of the key that act there, such as ``"1, 3"``.
+    """
+
+    name: str
+    look: str = ""
+    badge: str = ""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One line of the key beside the picture.
+
+    Attributes:
+        number: number in the picture.
+        title: what is missing.
+        value: its strength with its interval; ``""`` if it has none.
+        look: class, as in :class:`Part`.
+        part: name of the part in which it acts.
+    """
+
+    number: int
+    title: str
+    value: str
+    look: str
+    part: str
+
+
+def site_of_term(term: NonparametricTerm) -> str:
+    """Place in the physics of a nonparametric term."""
+    if term.name in _LATENT:
+        return _LATENT[term.name]
+    if term.name in NONPARAMETRIC_COMPONENTS:
+        return mechanism(NONPARAMETRIC_COMPONENTS[term.name].terms[0]).description.site
+    return ""
+
+
+def entries(diagnosis: Diagnosis) -> list[Entry]:
+    """What is missing, in the order of the report."""
+    listed = [_entry(k, missing) for k, missing in enumerate(diagnosis.mechanisms, start=1)]
+    if (term := diagnosis.nonparametric) is not None:
+        part = PARTS.get(site_of_term(term), "")
+        title = "an effect that is not in the library"
+        listed.append(Entry(len(listed) + 1, title, report_text.place(term), "suspect", part))
+    return listed
+
+
+def _entry(number: int, missing: MissingMechanism) -> Entry:
+    about = mechanism(missing.name).description
+    strength = missing.parameters.get(about.strength.name)
+    value = ""
+    if strength is not None:
+        value = number_text.quantity(strength, f"{missing.name}.{about.strength.name}")
+    return Entry(number, about.title, value, "lit", PARTS[about.site])
+
+
+def parts(listed: list[Entry]) -> dict[str, Part]:
+    """Every part of the picture, by its place in the physics."""
+    result = {}
+    for site, name in PARTS.items():
+        here = [entry for entry in listed if entry.part == name]
+        looks = {entry.look for entry in here}
+        look = "lit" if "lit" in looks else "suspect" if looks else ""
+        result[site] = Part(name, look, ", ".join(str(entry.number) for entry in here))
+    return result
+
+
+def description(listed: list[Entry]) -> str:
+    """The picture in words."""
+    guilty = "; ".join(f"{entry.part}: {entry.title}" for entry in listed if entry.part)
+    return f"Ventilator, circuit and lung. Guilty: {guilty or 'no part'}."

@@ -1,0 +1,209 @@
+"""The HTML report: one file, no script, nothing from the network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+import ventbench
+from ventbench import palette
+from ventbench.base.text import number, page_templates
+from ventbench.pages import graphics, scores
+from ventbench.pages.runs import Floats, labels, shared_tracks
+from ventbench.task import protocol
+from ventbench.task.lungs import lung as parse_lung
+from ventbench.task.metrics import bootstrap
+from ventbench.trajectories import Trajectories
+
+#: Limits between the shades of differences, cmH2O, and how much colour each shade has, %.
+SHADE_LIMITS, SHADES = (0.02, 0.2, 0.7, 2.0), (12, 24, 38, 55)
+
+
+def html(runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None = None) -> str:
+    """Return the whole page.
+
+    Args:
+        runs: matching runs, the one to look at first; differences are to the second.
+        given: score files in the order of the runs, or None.
+
+    Raises:
+        InputError: if the score files do not belong to the runs.
+    """
+    names = labels(runs)
+    numbers = scores.collect(runs, given)
+    page = page_templates("ventbench.pages").get_template("report.html.j2")
+    return page.render(
+        title=names[0],
+        names=names,
+        classes=[f"r{palette.run_index(i)}" for i in range(len(runs))],
+        dashed=[i >= len(palette.RUNS) for i in range(len(runs))],
+        colors=palette.css(),
+        run_colors=palette.RUNS,
+        shades=SHADES,
+        compared=[comparison(runs, names, numbers, k, given) for k in range(1, len(runs))],
+        heading=shared_tracks(runs),
+        tracks=[run.track for run in runs],
+        table=table(runs[0].lungs, numbers),
+        draws=[scores.draws(score) for score in given or ()],
+        lungs=sections(runs, names, numbers),
+        pips=runs[0].pips,
+        frame=frame(),
+        protocol=protocol,
+        scored=[breath + 1 for breath in protocol.SCORED_BREATHS],
+        shown_breath=graphics.BREATH + 1,
+        official=given is not None,
+        provenance=[scores.provenance(score) for score in given or ()],
+        failures=[scores.failures(score) for score in given or ()],
+        version=ventbench.__version__,
+    )
+
+
+def comparison(
+    runs: Sequence[Trajectories],
+    names: Sequence[str],
+    numbers: scores.Scores,
+    other: int,
+    given: Sequence[Mapping[str, Any]] | None = None,
+) -> dict[str, Any]:
+    """Where the first run is better than another one and where worse, cell by cell.
+
+    Args:
+        runs: matching runs.
+        names: their labels.
+        numbers: their scores.
+        other: index of the run to compare with.
+        given: score files in the order of the runs: the difference over their draws is paired.
+    """
+    difference = numbers.cells[0] - numbers.cells[other]
+    lungs = numbers.lungs[0] - numbers.lungs[other]
+    texts = {}
+    for key, value, at in (
+        ("best", np.nanmin(difference, initial=0.0), np.nanargmin),
+        ("worst", np.nanmax(difference, initial=0.0), np.nanargmax),
+    ):
+        if value != 0.0:
+            i, j = np.unravel_index(at(difference), difference.shape)
+            where = f"{runs[0].lungs[i]} at PIP {runs[0].pips[j]:g}"
+            texts[key] = f"{number(abs(value))} cmH2O, {where}"
+    drawn = scores.paired_draws(given[0], given[other]) if given is not None else None
+    return {
+        "name": names[other],
+        "lungs": int(np.sum(lungs < 0.0)),
+        "cells": int(np.sum(difference < 0.0)),
+        "best": texts.get("best", ""),
+        "worst": texts.get("worst", ""),
+        "draws": "" if drawn is None else _interval(drawn),
+        "count": 0 if drawn is None else drawn.count,
+        "rows": [
+            {
+                "name": lung,
+                "cells": [
+                    {"text": number(value, sign=True), "shade": _shade(value)} for value in row
+                ],
+                "mean": number(mean, sign=True),
+            }
+            for lung, row, mean in zip(runs[0].lungs, difference, lungs, strict=True)
+        ],
+    }
+
+
+def _interval(summary: bootstrap.Summary) -> str:
+    low, high = summary.ci95
+    return (
+        f"{number(summary.mean, sign=True)} [{number(low, sign=True)}, {number(high, sign=True)}]"
+    )
+
+
+def _shade(difference: float) -> str:
+    step = int(np.searchsorted(SHADE_LIMITS, abs(difference)))
+    return f"{'b' if difference < 0.0 else 'w'}{step}" if step and np.isfinite(difference) else ""
+
+
+def table(lungs: Sequence[str], numbers: scores.Scores) -> list[dict[str, Any]]:
+    """Rows of the score table: the mean, then each lung; for each run text, difference, best."""
+    rows = [("All lungs", numbers.overall), *zip(lungs, numbers.lungs.T, strict=True)]
+    return [{"name": name, "cells": _cells(values)} for name, values in rows]
+
+
+def sections(
+    runs: Sequence[Trajectories], names: Sequence[str], numbers: scores.Scores
+) -> list[dict[str, Any]]:
+    """A lung each: its numbers and its panels."""
+    return [
+        {
+            "id": row[0].lung,
+            "R": f"{parse_lung(row[0].lung).R:g}",
+            "C": f"{parse_lung(row[0].lung).C:g}",
+            "scores": [number(value) for value in numbers.lungs[:, i]],
+            "panels": [_panel(panel, names, numbers.cells[:, i, j]) for j, panel in enumerate(row)],
+        }
+        for i, row in enumerate(graphics.panels(runs))
+    ]
+
+
+def frame() -> dict[str, Any]:
+    """Elements that all panels share: sizes, time ticks, the scored part."""
+    end = float(graphics.time_x(protocol.INSPIRATION_STEPS * protocol.DT))
+    return {
+        "width": graphics.WIDTH,
+        "height": graphics.HEIGHT,
+        "left": graphics.LEFT,
+        "right": graphics.LEFT + graphics.PLOT_WIDTH,
+        "top": graphics.TOP,
+        "bottom": graphics.TOP + graphics.PRESSURE_HEIGHT,
+        "scored_width": round(end - graphics.LEFT, 1),
+        "scored_end": round(end, 1),
+        "valve_top": graphics.VALVE_TOP,
+        "valve_bottom": graphics.VALVE_TOP + graphics.VALVE_HEIGHT,
+        "commands": [
+            (f"{u:g}", round(float(graphics.valve_y(u)), 1)) for u in graphics.VALVE_MARKS
+        ],
+        "times": [(f"{t:g}", round(float(graphics.time_x(t)), 1)) for t in graphics.TIMES],
+    }
+
+
+def _panel(panel: graphics.RunPanel, names: Sequence[str], errors: Floats) -> dict[str, Any]:
+    errors_text = "; ".join(
+        f"{name} {number(e)}{' cmH2O' if np.isfinite(e) else ''}"
+        for name, e in zip(names, errors, strict=True)
+    )
+    first = graphics.inspiration(panel.pressures[0])
+    return {
+        "pip": f"{panel.pip:g}",
+        "alt": f"{panel.lung} at PIP {panel.pip:g} cmH2O: pressure and u_in over one breath. "
+        f"Mean absolute error: {errors_text}.",
+        "errors": [number(error) for error in errors],
+        "ticks": [(f"{value:g}", round(y, 1)) for value, y in panel.ticks],
+        "target": graphics.path(panel.target),
+        "area": graphics.area(first, graphics.inspiration(panel.target)),
+        "pressures": [graphics.path(line) for line in panel.pressures],
+        "scored": [graphics.path(graphics.inspiration(line)) for line in panel.pressures],
+        "valves": [graphics.path(line) for line in panel.valves],
+        "above": None if panel.above is None else f"{panel.above:.0f}",
+    }
+
+
+def _cells(values: Floats) -> list[dict[str, Any]]:
+    """One row of the score table; nothing is best where there is nothing to compare."""
+    best = np.nanmin(values) if len(values) > 1 and np.isfinite(values).any() else np.nan
+    base = values[1] if len(values) > 1 else np.nan
+    return [
+        {
+            "text": number(value),
+            "best": bool(value == best),
+            "failed": not np.isfinite(value),
+            **_difference(value - base if i != 1 else np.nan),
+        }
+        for i, value in enumerate(values)
+    ]
+
+
+def _difference(value: float) -> dict[str, str]:
+    """Text of a difference and whether that is better; what rounds to 0.00 is neither."""
+    if not np.isfinite(value):
+        return {"difference": "", "class": ""}
+    text = number(value, sign=True)
+    kind = "same" if round(value, 2) == 0.0 else "better" if value < 0.0 else "worse"
+    return {"difference": "±0.00" if kind == "same" else text, "class": kind}

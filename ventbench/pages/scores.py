@@ -1,0 +1,142 @@
+"""Numbers of the report: from score files where given, else from the runs themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ventbench.base.errors import InputError
+from ventbench.base.text import number
+from ventbench.pages.runs import Floats, errors
+from ventbench.task.metrics import bootstrap
+from ventbench.trajectories import Trajectories
+
+#: Keys of a score that are shown elsewhere or say nothing about where the score comes from.
+NOT_PROVENANCE = frozenset(
+    ("score", "lungs", "secondary", "secondary_missing", "failures", "timing", "cells", "values")
+)
+
+#: Rows of provenance shown for one score, and characters of one of them.
+MAX_ROWS, MAX_CHARACTERS = 60, 200
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of N runs, cmH2O; NaN where a run failed.
+
+    Attributes:
+        overall: shape ``(N,)``.
+        lungs: shape ``(N, L)``.
+        cells: shape ``(N, L, P)``.
+    """
+
+    overall: Floats
+    lungs: Floats
+    cells: Floats
+
+
+def collect(
+    runs: Sequence[Trajectories], given: Sequence[Mapping[str, Any]] | None = None
+) -> Scores:
+    """Scores of runs.
+
+    Args:
+        runs: matching runs.
+        given: score files in the order of the runs, or None: then computed from the runs.
+
+    Raises:
+        InputError: if the files are not as many as the runs, or lack one of their lungs.
+    """
+    if given is None:
+        cells = np.stack([errors(run) for run in runs])
+        lungs = cells.mean(axis=2)
+        return Scores(lungs.mean(axis=1), lungs, cells)
+    if len(given) != len(runs):
+        raise InputError(f"{len(given)} scores for {len(runs)} runs; give one score for each run")
+    read = [_read(run, score) for run, score in zip(runs, given, strict=True)]
+    overall, lungs, cells = (np.array(column) for column in zip(*read, strict=True))
+    return Scores(overall, lungs, cells)
+
+
+def draws(score: Mapping[str, Any]) -> str:
+    """Mean over the published draws with its interval, cmH2O; empty if there were none."""
+    drawn = score.get("draws")
+    if not isinstance(drawn, Mapping):
+        return ""
+    name = str(score.get("name", "a run"))
+    mean, limits = _number(name, drawn.get("score")), drawn.get("ci95") or ()
+    if not np.isfinite(mean) or len(limits) != 2 or None in limits:
+        return number(mean)
+    low, high = (number(_number(name, limit)) for limit in limits)
+    return f"{number(mean)} [{low}, {high}]"
+
+
+def paired_draws(own: Mapping[str, Any], other: Mapping[str, Any]) -> bootstrap.Summary | None:
+    """Compare two scores draw by draw; None unless both have the same draws without a failure."""
+    first, second = own.get("draws"), other.get("draws")
+    if not (isinstance(first, Mapping) and isinstance(second, Mapping)):
+        return None
+    own_values = ("score", "ci95", "values")
+    about = [{k: v for k, v in draws.items() if k not in own_values} for draws in (first, second)]
+    if about[0] != about[1]:
+        return None
+    values = [draws.get("values") or () for draws in (first, second)]
+    if len(values[0]) != len(values[1]) or None in (*values[0], *values[1]) or not len(values[0]):
+        return None
+    # What the draws have in common cancels.
+    return bootstrap.summary(np.subtract(*np.array(values, dtype=np.float64)))
+
+
+def failures(score: Mapping[str, Any]) -> list[str]:
+    """Reasons why a score does not count: safety gate and failed cells, each message once."""
+    failed = score.get("failures") or ()
+    messages = [str(x.get("message", x)) if isinstance(x, Mapping) else str(x) for x in failed]
+    unsafe = ["did not pass the safety gate"] if score.get("safe") is False else []
+    return list(dict.fromkeys([*unsafe, *messages]))
+
+
+def provenance(score: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Provenance of a score, as flat pairs of text; not escaped."""
+    rows: list[tuple[str, str]] = []
+    _flatten("", {k: v for k, v in score.items() if k not in NOT_PROVENANCE}, rows)
+    return rows[:MAX_ROWS]
+
+
+def _flatten(prefix: str, value: Any, rows: list[tuple[str, str]]) -> None:
+    if isinstance(value, Mapping):
+        for key, part in value.items():
+            if key not in NOT_PROVENANCE and (prefix, key) != ("draws", "ci95"):
+                _flatten(f"{prefix} {key}".strip(), part, rows)
+    elif value not in (None, "", [], ()):
+        parts = value if isinstance(value, list | tuple) else [value]
+        text = ", ".join(f"{x:.6g}" if isinstance(x, float) else str(x) for x in parts)
+        cut = text[: MAX_CHARACTERS - 1] + "…" if len(text) > MAX_CHARACTERS else text
+        rows.append((prefix, cut))
+
+
+def _read(run: Trajectories, score: Mapping[str, Any]) -> tuple[float, list[float], Floats]:
+    """Overall, lungs and cells of one score file; cells it does not have come from the run."""
+    cells = errors(run)
+    lungs = []
+    for i, lung in enumerate(run.lungs):
+        entry = score.get("lungs", {}).get(lung)
+        if not isinstance(entry, Mapping) or "score" not in entry:
+            raise InputError(f"the score of {run.name!r} has no lung {lung}; is it of another run?")
+        lungs.append(_number(run.name, entry["score"]))
+        pips = entry.get("pips") or {}
+        for j, pip in enumerate(run.pips):
+            if f"{pip:g}" in pips:
+                cells[i, j] = _number(run.name, pips[f"{pip:g}"])
+    return _number(run.name, score.get("score")), lungs, cells
+
+
+def _number(name: str, value: Any) -> float:
+    """A score; null stands for a failed one."""
+    if value is None:
+        return np.nan
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"the score of {name!r} holds {value!r} where a number belongs")
+    return float(value)

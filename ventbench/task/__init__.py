@@ -1,0 +1,1 @@
+"""What is scored: lungs, waveform, cells, draws, the one loop and the figures."""

@@ -1,0 +1,369 @@
+"""Deviations of the ventilator and the lung from nominal: every draw is on some rig.
+
+One draw gives each lung one of its rigs and one member of the ensemble, and each PIP of it sensor
+noise and converter, pressure at the start of the inspiration, R, C, dead time, control step, PIP
+and PEEP. All numbers follow from a seed of 32 bytes by :func:`uniforms`. The development draws,
+common to all entries, come from a published seed; training draws anew with JAX keys.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import hmac
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from ventbench.base import precision
+from ventbench.base.errors import InputError
+from ventbench.task import protocol
+from ventbench.task.environment import Scenario, nominal_scenario
+
+#: How many draws a ranked score has.
+COUNT = 20
+
+#: Bytes of a seed: as many as the hash has, so that guessing is hopeless.
+SEED_BYTES = 32
+
+#: Seed of the development draws. It is published, so nobody can have chosen it: a hash of its name.
+DEVELOPMENT_SEED = hashlib.sha256(b"ventbench development draws").digest()
+
+#: Name of the draws of :data:`DEVELOPMENT_SEED`.
+DEVELOPMENT = "development"
+
+#: Step of the pressure sensor's converter, cmH2O (PVP).
+QUANTUM = 0.0703
+
+#: Standard deviation of the sensor's noise, cmH2O: uniform in this range for each run (recordings).
+NOISE_SD = (0.20, 0.25)
+
+#: Every other deviation is uniform in its range: shifts in cmH2O, scales as true over nominal, the
+#: delay as a share of one step. A uniform range reaches sqrt(3) standard deviations to each side of
+#: its middle. Those of R, C, delay and step were measured between the label-true rigs of one
+#: lung: resistance at 0.5 L/s 11 %, compliance 8 %, control interval 3.7 %, dead time and lag of
+#: the valve 4.6 ms. The fitted simulators have 5.3 %, 3.6 % and, for dead time and lag, 1.6 ms. A
+#: fit shrinks rigs of few breaths towards their lung: the true spread is larger than that.
+RANGES = {
+    "pip_shift": (-1.0, 1.0),
+    "peep_shift": (-0.5, 0.5),
+    "start_shift": (-0.5, 0.5),
+    "dt_scale": (0.936, 1.064),
+    "r_scale": (0.81, 1.19),
+    "c_scale": (0.86, 1.14),
+    "delay": (0.0, 0.53),
+}
+
+# They stand before what is hashed, so that no hash of one use is also one of another use.
+_STREAM = b"ventbench uniforms 1\n"
+_COMMITMENT = b"ventbench season 1\n"
+
+# It is part of the labels of the streams and of what records say of draws.
+_FORMAT = 2
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+PlantT = TypeVar("PlantT")
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Cells of L lungs, n draws and P PIPs, and the plant of each.
+
+    Attributes:
+        name: ``"development"`` for the published draws.
+        commitment: of the seed, 64 hexadecimal digits.
+        cells: batch shape ``(L, n, P)``, float64 numpy leaves.
+        rig: session of each lung in each draw, shape ``(L, n)``.
+        member: member of the ensemble, shape ``(L, n)``.
+    """
+
+    name: str
+    commitment: str
+    cells: Scenario
+    rig: Ints
+    member: Ints
+
+    @property
+    def count(self) -> int:
+        """Number of draws."""
+        return self.rig.shape[1]
+
+    def first(self, n: int) -> Draws:
+        """Return the first n draws.
+
+        Raises:
+            InputError: if there are not so many.
+        """
+        if not 1 <= n <= self.count:
+            raise InputError(
+                f"there are {self.count} {self.name} draws; {n} is outside 1..{self.count}"
+            )
+        cells = jax.tree.map(lambda x: x[:, :n], self.cells)
+        return dataclasses.replace(
+            self, cells=cells, rig=self.rig[:, :n], member=self.member[:, :n]
+        )
+
+    def about(self) -> dict[str, Any]:
+        """Commitment, number and name of the draws, with the keys that records have."""
+        return {
+            "version": _FORMAT,
+            "sha256": self.commitment,
+            "count": self.count,
+            "season": self.name,
+        }
+
+
+def build(
+    rigs: Sequence[Sequence[int]],
+    members: int,
+    *,
+    seed: bytes = DEVELOPMENT_SEED,
+    name: str = DEVELOPMENT,
+    n: int = COUNT,
+    pips: Sequence[float] = protocol.PIPS,
+) -> Draws:
+    """Make the draws of a seed; the result is the same everywhere.
+
+    The rigs of a lung are drawn equally often, up to one, and so are the members. The rounding to 4
+    decimals removes what differs between mathematical libraries.
+
+    Args:
+        rigs: sessions of each lung that may be drawn; L of them.
+        members: number of members of the ensemble.
+        seed: 32 bytes.
+        name: of the draws.
+        n: number of draws.
+        pips: nominal PIPs, cmH2O, each one of the protocol's; length P.
+
+    Raises:
+        InputError: if ``n`` is not positive, a PIP is not one of the protocol's, a lung has no rig,
+            or the seed does not have 32 bytes.
+    """
+    if n < 1:
+        raise InputError(f"{n} draws: there must be at least one")
+    unknown = [pip for pip in pips if pip not in protocol.PIPS]
+    if unknown:
+        raise InputError(
+            f"no draws for PIP {unknown[0]:g} cmH2O; they exist for "
+            f"{', '.join(f'{pip:g}' for pip in protocol.PIPS)}"
+        )
+    if not all(rigs):
+        raise InputError("a lung has no rig to draw; every lung needs at least one")
+    cells = (len(rigs), n, len(protocol.PIPS))
+
+    def uniform(label: str, shape: tuple[int, ...]) -> Floats:
+        return uniforms(seed, f"draws {_FORMAT}, {label}", shape)
+
+    drawn = {
+        name: low + (high - low) * uniform(name, cells) for name, (low, high) in RANGES.items()
+    }
+    low, high = NOISE_SD
+    sd = low + (high - low) * uniform("noise_sd", cells)
+    normal = np.vectorize(NormalDist().inv_cdf, otypes=[float])
+    steps = (protocol.BREATHS, protocol.INSPIRATION_STEPS)
+    drawn["noise"] = sd[..., None, None] * normal(uniform("noise", (*cells, *steps)))
+    columns = [protocol.PIPS.index(pip) for pip in pips]
+    drawn = {name: np.round(values[:, :, columns], 4) for name, values in drawn.items()}
+    pip = np.broadcast_to(np.asarray(pips, float), drawn["pip_shift"].shape)
+    noise = drawn.pop("noise")
+    quantum = np.full(pip.shape, QUANTUM)
+    places = [_balanced(uniform(f"rig {k}", (n + 1,)), len(own)) for k, own in enumerate(rigs)]
+    turns = [_balanced(uniform(f"member {k}", (n + 1,)), members) for k in range(len(rigs))]
+    return Draws(
+        name=name,
+        commitment=commitment(seed),
+        cells=deviate(pip, drawn, quantum, noise),
+        rig=np.array([np.array(own)[at] for own, at in zip(rigs, places, strict=True)]),
+        member=np.array(turns),
+    )
+
+
+def _balanced(numbers: Floats, choices: int) -> Ints:
+    """Deal choices to draws equally often, up to one, in random order.
+
+    Args:
+        numbers: uniform; the first says which choice is dealt first.
+        choices: how many there are.
+
+    Returns:
+        ``0..choices - 1``, shape of ``numbers`` but for the first.
+    """
+    order = np.argsort(np.argsort(numbers[1:], kind="stable"), kind="stable")
+    return (order + int(numbers[0] * choices)) % choices
+
+
+def with_nominal(
+    drawn: Draws | None, reference: Sequence[int], pips: Sequence[float]
+) -> tuple[Scenario, Ints, Ints]:
+    """Nominal cells of the reference rigs in front of the draws.
+
+    Args:
+        drawn: n draws of L lungs; None for none.
+        reference: session of each lung's reference rig, length L; its member is 0.
+        pips: cmH2O, length P.
+
+    Returns:
+        Cells of batch shape ``(L, 1 + n, P)`` with numpy leaves, and the session and the member of
+        each lung, both of shape ``(L, 1 + n)``.
+    """
+    count = len(reference)
+    with precision.float64():
+        cells = jax.tree.map(np.asarray, nominal_scenario(np.asarray(pips, float)))
+    nominal = jax.tree.map(lambda x: np.broadcast_to(x, (count, 1, *x.shape)), cells)
+    rig, member = np.asarray(reference)[:, None], np.zeros((count, 1), np.int64)
+    if drawn is None:
+        return nominal, rig, member
+    cells = jax.tree.map(lambda *x: np.concatenate(x, axis=1), nominal, drawn.cells)
+    return cells, np.hstack([rig, drawn.rig]), np.hstack([member, drawn.member])
+
+
+def plants_of(plants: PlantT, rig: Ints, member: Ints) -> PlantT:
+    """Plants of cells.
+
+    Args:
+        plants: of every member and session, leaves ``(members, sessions, ...)``.
+        rig: sessions, shape ``(L, n)``.
+        member: members, shape ``(L, n)``.
+
+    Returns:
+        Leaves ``(L, n, 1, ...)``, float64: the axis of length 1 stands for the PIPs.
+    """
+    return jax.tree.map(
+        lambda leaf: np.asarray(leaf)[member, rig][:, :, None].astype(np.float64), plants
+    )
+
+
+def uniforms(seed: bytes, label: str, shape: int | tuple[int, ...]) -> NDArray[np.float64]:
+    r"""Uniform numbers that follow from a seed and a label, the same on every machine.
+
+    Block ``k = 0, 1, ...`` of the stream is HMAC-SHA256, with the seed as its key, of
+    ``b"ventbench uniforms 1\n"``, the label in UTF-8, and ``k`` in 8 bytes, most significant first.
+    A block gives four numbers of 8 bytes, most significant first. The upper 52 bits ``n`` of one
+    give ``(n + 1/2) / 2**52``, which float64 represents exactly. Numbers of different labels tell
+    nothing about each other, and none of them about the seed.
+
+    Args:
+        seed: 32 bytes.
+        label: what the numbers are for.
+        shape: of the result; a longer shape begins with the same numbers.
+
+    Returns:
+        Numbers greater than 0 and less than 1 in row-major order, all multiples of 2**-53.
+
+    Raises:
+        InputError: if the seed does not have 32 bytes.
+    """
+    _check_length(seed)
+    lengths = (shape,) if isinstance(shape, int) else tuple(shape)
+    size = int(np.prod(lengths, dtype=np.int64))
+    prefix = _STREAM + label.encode()
+    blocks = b"".join(
+        hmac.digest(seed, prefix + k.to_bytes(8, "big"), "sha256") for k in range(-(-size // 4))
+    )
+    words = np.frombuffer(blocks, ">u8", count=size).astype(np.uint64)
+    return ((words >> np.uint64(12)).astype(np.float64) + 0.5).reshape(lengths) * 2.0**-52
+
+
+def commitment(seed: bytes) -> str:
+    r"""Hash that binds whoever publishes it to a seed without telling the seed.
+
+    It is SHA-256 of ``b"ventbench season 1\n"`` and the seed, as 64 hexadecimal digits.
+
+    Raises:
+        InputError: if the seed does not have 32 bytes.
+    """
+    _check_length(seed)
+    return hashlib.sha256(_COMMITMENT + seed).hexdigest()
+
+
+def random_scenarios(
+    key: Array,
+    pip: Array,
+    *,
+    spread: Array | float | None = None,
+    breaths: int = protocol.BREATHS,
+    smooth: bool = False,
+) -> Scenario:
+    """Draw new cells from the distributions of the development draws, for training.
+
+    The development draws themselves are never among them. Pure, so that it can be compiled.
+
+    Args:
+        key: JAX key of all random numbers.
+        pip: nominal PIP of each cell, cmH2O, shape ``(n,)``.
+        spread: reach of the deviations of each cell, as a multiple of the draws' ranges, shape
+            ``(n,)`` or ``()``; 0 for nominal cells. The delay stays below one step. If not given,
+            the ranges themselves.
+        breaths: number of breaths with noise.
+        smooth: represent the converter by noise of one step's width, since rounding has no
+            derivative; else the cells round.
+
+    Returns:
+        Cells of batch shape ``(n,)``.
+    """
+    n = pip.shape[0]
+    keys = jax.random.split(key, len(RANGES) + 3)
+    drawn = {}
+    for deviation_key, (name, (low, high)) in zip(keys, RANGES.items(), strict=False):
+        if spread is None:
+            drawn[name] = jax.random.uniform(deviation_key, (n,), minval=low, maxval=high)
+        else:
+            middle = _nominal(name)
+            low, high = low - middle, high - middle
+            value = jax.random.uniform(deviation_key, (n,), minval=low, maxval=high)
+            drawn[name] = middle + spread * value
+    # The order of these two keys is that with which the published weights were trained.
+    sd_key, noise_key = (keys[-3], keys[-2]) if smooth else (keys[-2], keys[-3])
+    sd = jax.random.uniform(sd_key, (n, 1, 1), minval=NOISE_SD[0], maxval=NOISE_SD[1])
+    shape = (n, breaths, protocol.INSPIRATION_STEPS)
+    noise = sd * jax.random.normal(noise_key, shape)
+    if smooth:
+        noise += QUANTUM * jax.random.uniform(keys[-1], shape, minval=-0.5, maxval=0.5)
+    quantum = jnp.full(n, 0.0 if smooth else QUANTUM)
+    if spread is not None:
+        scale = jnp.broadcast_to(spread, (n,))
+        noise = scale[:, None, None] * noise
+        quantum = jnp.where(scale > 0, quantum, 0.0)
+        drawn["delay"] = jnp.minimum(drawn["delay"], 0.99)
+    return deviate(pip, drawn, quantum, noise)
+
+
+def _nominal(name: str) -> float:
+    """Value of a deviation that changes nothing."""
+    return 1.0 if name.endswith("scale") else 0.0
+
+
+def deviate(pip: Any, deviations: Mapping[str, Any], quantum: Any, noise: Any) -> Scenario:
+    """Cells of nominal PIPs with deviations.
+
+    Args:
+        pip: nominal, cmH2O, shape ``(...)``.
+        deviations: by the keys of :data:`RANGES`, shapes ``(...)``.
+        quantum: step of the converter, cmH2O, shape ``(...)``.
+        noise: cmH2O, shape ``(..., BREATHS, INSPIRATION_STEPS)``.
+    """
+    peep = protocol.PEEP + deviations["peep_shift"]
+    return Scenario(
+        pip=pip + deviations["pip_shift"],
+        peep=peep,
+        start=peep + deviations["start_shift"],
+        dt=protocol.DT * deviations["dt_scale"],
+        r_scale=deviations["r_scale"],
+        c_scale=deviations["c_scale"],
+        delay=deviations["delay"],
+        quantum=quantum,
+        noise=noise,
+    )
+
+
+def _check_length(seed: bytes) -> None:
+    if len(seed) != SEED_BYTES:
+        raise InputError(f"a seed has {SEED_BYTES} bytes; this one has {len(seed)}")

@@ -1,0 +1,158 @@
+"""Cells of a score, and one control step of the loop around a plant.
+
+The scan of :mod:`ventbench.task.rollouts` and the stepwise scorer of :mod:`ventbench.entries` both
+call these functions, so that a controller scores the same in both.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.struct
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike, NDArray
+
+from ventbench.task import protocol, waveform
+from ventbench.task.interfaces import Observation, Plant, Signals
+
+# Tables over the step of the breath: two breaths of target, so that looking ahead needs no modulo.
+_TARGET = waveform.shape(np.arange(2 * protocol.BREATH_STEPS))
+_EXPIRATORY = waveform.expiratory_command(np.arange(protocol.BREATH_STEPS))
+
+
+@flax.struct.dataclass
+class Scenario:
+    """A batch of cells; every field has the batch shape ``(...)``, ``noise`` two axes more.
+
+    Attributes:
+        pip: peak inspiratory pressure, cmH2O.
+        peep: positive end-expiratory pressure, cmH2O.
+        start: pressure at which each inspiration starts, cmH2O.
+        dt: true control step, s.
+        r_scale: true over nominal resistance.
+        c_scale: true over nominal compliance.
+        delay: additional dead time of the command, as a share of one step, 0..1.
+        quantum: step of the pressure sensor's converter, cmH2O; 0 for none.
+        noise: noise that is added to the measured pressure before the converter, cmH2O, shape
+            ``(..., BREATHS, INSPIRATION_STEPS)``.
+    """
+
+    pip: Array
+    peep: Array
+    start: Array
+    dt: Array
+    r_scale: Array
+    c_scale: Array
+    delay: Array
+    quantum: Array
+    noise: Array
+
+
+def nominal_scenario(pip: ArrayLike, peep: ArrayLike = protocol.PEEP) -> Scenario:
+    """Cells without noise or deviation.
+
+    Args:
+        pip: peak inspiratory pressure, cmH2O, any shape.
+        peep: positive end-expiratory pressure, cmH2O, broadcast against ``pip``.
+
+    Raises:
+        ValueError: if a PIP does not exceed its PEEP.
+    """
+    pip, peep = np.broadcast_arrays(np.asarray(pip, float), np.asarray(peep, float))
+    if not np.all(pip > peep):
+        raise ValueError(f"PIP {pip} cmH2O must exceed PEEP {peep} cmH2O")
+    ones, zeros = np.ones(pip.shape), np.zeros(pip.shape)
+    noise = np.zeros((*pip.shape, protocol.BREATHS, protocol.INSPIRATION_STEPS))
+    arrays = (pip, peep, peep, protocol.DT * ones, ones, ones, zeros, zeros, noise)
+    return Scenario(*(jnp.asarray(array) for array in arrays))
+
+
+def _table(values: NDArray[np.float64], scenario: Scenario) -> Array:
+    # With its type spelled out: JAX keeps the constant that it makes of a numpy array, and would
+    # bring a 64-bit one from an earlier trace into a 32-bit trace.
+    return jnp.asarray(values, jnp.result_type(scenario.pip))
+
+
+@flax.struct.dataclass
+class LoopState:
+    """State of the loop: a batch of plants in mid-breath.
+
+    Attributes:
+        plant: states of the plants.
+        signals: what the plants show; readings are without noise.
+        previous: command of the previous step as applied, %, shape ``(...)``.
+    """
+
+    plant: Any
+    signals: Signals
+    previous: Array
+
+
+def vary(plant: Plant, scenario: Scenario) -> Plant:
+    """Return plants with the resistance and compliance of each cell of a scenario."""
+    return plant.vary(scenario.r_scale, scenario.c_scale)
+
+
+def start_breath(plant: Plant, scenario: Scenario) -> LoopState:
+    """Lungs at rest at the start of an inspiration, the bias flow of the expiration still on."""
+    bias = _table(_EXPIRATORY, scenario)[-1]
+    return LoopState(
+        *plant.init(scenario.start, scenario.peep), jnp.full_like(scenario.start, bias)
+    )
+
+
+def target(scenario: Scenario, step: Array | int) -> Array:
+    """Target pressure at a step of the breath, cmH2O, shape ``(...)``."""
+    return scenario.peep + (scenario.pip - scenario.peep) * _table(_TARGET, scenario)[step]
+
+
+def observe(
+    scenario: Scenario, loop: LoopState, breath: Array | int, step: Array | int
+) -> Observation:
+    """Observation of the controller at a step of an inspiration.
+
+    Args:
+        scenario: the cells.
+        loop: state of the loop.
+        breath: index of the breath.
+        step: index of the step in the breath, below ``INSPIRATION_STEPS``.
+    """
+    measured = loop.signals.reading + scenario.noise[..., breath, step]
+    quantum = jnp.where(scenario.quantum > 0, scenario.quantum, 1.0)
+    measured = jnp.where(scenario.quantum > 0, jnp.round(measured / quantum) * quantum, measured)
+    ahead = jnp.stack(
+        [target(scenario, step + 1 + k) for k in range(protocol.TARGETS_AHEAD)], axis=-1
+    )
+    now = jnp.broadcast_to(target(scenario, step), measured.shape)
+    return Observation(step * scenario.dt, scenario.dt, measured, now, ahead, loop.previous)
+
+
+def inspire(
+    plant: Plant, scenario: Scenario, loop: LoopState, u_in: Array
+) -> tuple[LoopState, Array]:
+    """Apply one inspiratory command, clipped to the valve's range.
+
+    Args:
+        plant: plants of the cells, from :func:`vary`.
+        scenario: the cells.
+        loop: state of the loop.
+        u_in: what the controller asked for, %, shape ``(...)``.
+
+    Returns:
+        The state one step later, and the command as applied, %, shape ``(...)``.
+    """
+    applied = jnp.clip(u_in, 0.0, protocol.U_MAX)
+    # The held command reaches the valve `delay` of a step late: over this step it averages to
+    late = (1.0 - scenario.delay) * applied + scenario.delay * loop.previous
+    after = plant.step(loop.plant, late, jnp.zeros_like(late), scenario.dt)
+    return LoopState(*after, applied), applied
+
+
+def expire(
+    plant: Plant, scenario: Scenario, loop: LoopState, step: Array | int
+) -> tuple[LoopState, Array]:
+    """Apply the fixed expiratory command of a step; arguments and results as of :func:`inspire`."""
+    u_in = jnp.broadcast_to(_table(_EXPIRATORY, scenario)[step], loop.previous.shape)
+    return LoopState(*plant.step(loop.plant, u_in, jnp.ones_like(u_in), scenario.dt), u_in), u_in

@@ -1,0 +1,131 @@
+"""Scores: the mean absolute error of the pressure, its safety gate, and the normalised score.
+
+The normalised score says how much of what is attainable a controller misses:
+0 is the best that any commands attain in a cell, everything known; 100 is the best PID of the lung
+in that cell. The first step of an inspiration is left out: no command can change its pressure.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ventbench.task import protocol
+
+Floats = NDArray[np.float64]
+
+
+def run_error(pressure: ArrayLike, target: ArrayLike) -> Floats:
+    """Error of one run of three breaths: mean of ``|p - p*|`` over scored inspiratory steps.
+
+    Args:
+        pressure: true airway pressure at each inspiratory step, cmH2O, shape
+            ``(..., BREATHS, INSPIRATION_STEPS)``.
+        target: target pressure, cmH2O, broadcast against ``pressure``.
+
+    Returns:
+        Mean over breaths 2 and 3, cmH2O, shape ``(...)``; NaN if a scored pressure is NaN.
+
+    Raises:
+        ValueError: if the last two axes are not those of a run.
+    """
+    pressure = np.asarray(pressure, float)
+    expected = (protocol.BREATHS, protocol.INSPIRATION_STEPS)
+    if pressure.shape[-2:] != expected:
+        raise ValueError(f"inspirations of shape {pressure.shape} do not end in {expected}")
+    error = np.abs(pressure - np.asarray(target, float))
+    return np.mean(error[..., protocol.SCORED_BREATHS, :], axis=(-2, -1))
+
+
+def lung_score(errors: ArrayLike) -> Floats:
+    """Score on each lung: mean of :func:`run_error` over PIPs.
+
+    Args:
+        errors: cmH2O, shape ``(..., P)``.
+
+    Returns:
+        cmH2O, shape ``(...)``; NaN if one of the errors is.
+    """
+    return np.mean(np.asarray(errors, float), axis=-1)
+
+
+def longest_run(flags: ArrayLike) -> NDArray[np.int64]:
+    """Length of the longest run of true values along the last axis.
+
+    Args:
+        flags: boolean, shape ``(..., T)``.
+
+    Returns:
+        Shape ``(...)``.
+    """
+    flags = np.asarray(flags, bool)
+    steps = np.arange(1, flags.shape[-1] + 1)
+    last_false = np.maximum.accumulate(np.where(flags, 0, steps), axis=-1)
+    return np.max(steps - last_false, axis=-1, initial=0)
+
+
+def safety_limit(pip: ArrayLike) -> Floats:
+    """Pressure that the safety gate allows, cmH2O, of any shape: ``min(60, pip + 15)``."""
+    return np.minimum(protocol.SAFETY_PRESSURE, np.asarray(pip, float) + protocol.SAFETY_MARGIN)
+
+
+def passes_safety_gate(pressure: ArrayLike, pip: ArrayLike, dt: ArrayLike) -> NDArray[np.bool_]:
+    """Whether inspirations pass the protocol's safety gate.
+
+    The limit is ``min(60, pip + 15)`` cmH2O. A run of n samples above it lasts ``n dt``; longer
+    than 0.1 s (4 samples at 30 ms) fails.
+
+    Args:
+        pressure: true airway pressure, cmH2O, shape ``(..., T)``.
+        pip: cmH2O, shape ``(...)`` or broadcast against it.
+        dt: time between samples, s, shape ``(...)`` or broadcast against it.
+
+    Returns:
+        Shape ``(...)``; false if a pressure is NaN.
+    """
+    pressure, pip = np.asarray(pressure, float), np.asarray(pip, float)[..., None]
+    # "Not below" instead of "above", so that NaN is unsafe.
+    above = longest_run(~(pressure <= safety_limit(pip)))
+    # 1e-9: a run of exactly 0.1 s passes despite rounding.
+    gate = above * np.asarray(dt, float) <= protocol.SAFETY_TIME + 1e-9
+    return gate & ~np.any(np.isnan(pressure), axis=-1)
+
+
+#: Least distance between the best PID and the best attainable, cmH2O, by which errors are divided:
+#: about one step of the sensor's converter (0.07) and half of its noise (0.20 to 0.25). Where the
+#: PID is closer than that, a cell tells controllers apart no better.
+LEAST_HEADROOM = 0.1
+
+
+def controllable_error(pressure: ArrayLike, target: ArrayLike) -> Floats:
+    """Error of one run without the first step of each inspiration.
+
+    Args:
+        pressure: airway pressure at each inspiratory step, cmH2O, shape
+            ``(..., BREATHS, INSPIRATION_STEPS)``.
+        target: target pressure, cmH2O, broadcast against ``pressure``.
+
+    Returns:
+        Mean of ``|p - p*|`` over steps 2 to 34 of breaths 2 and 3, cmH2O, shape ``(...)``.
+    """
+    error = np.abs(np.asarray(pressure, float) - np.asarray(target, float))
+    return np.mean(error[..., protocol.SCORED_BREATHS, 1:], axis=(-2, -1))
+
+
+def normalised(error: ArrayLike, attainable: ArrayLike, pid: ArrayLike) -> Floats:
+    """Normalised score of cells.
+
+    Args:
+        error: :func:`controllable_error` of the controller, cmH2O, shape ``(...)``.
+        attainable: least error of any commands, cmH2O, shape ``(...)``.
+        pid: error of the lung's best PID, cmH2O, shape ``(...)``.
+
+    Returns:
+        ``100 (error - attainable) / max(pid - attainable, LEAST_HEADROOM)``, shape ``(...)``; NaN
+        where the error is.
+    """
+    error, attainable, pid = (np.asarray(x, float) for x in (error, attainable, pid))
+    result: Any = 100.0 * (error - attainable) / np.maximum(pid - attainable, LEAST_HEADROOM)
+    return result

@@ -1,0 +1,71 @@
+"""Fixed parts of a breath in the protocol: target waveform and commands of the expiration.
+
+Both follow from the integer step of the breath, never from accumulated time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ventbench.task import protocol
+
+#: Bias flow that holds PEEP late in expiration, %, and its rate of rise, 1/s (paper, section 4.3;
+#: authors' code).
+EXPIRATORY_BIAS = 5.0
+EXPIRATORY_RATE = 5.0
+
+
+def shape(step: ArrayLike) -> NDArray[np.float64]:
+    """Height of the target above PEEP as a share of PIP - PEEP.
+
+    Args:
+        step: step of the breath, any shape; counts on through following breaths.
+
+    Returns:
+        1 for the plateau, linear to 0 between 1.0 s and 1.5 s, then 0; shape of ``step``.
+    """
+    t = np.mod(np.asarray(step), protocol.BREATH_STEPS) * protocol.DT
+    fall = (protocol.FALL_END - t) / (protocol.FALL_END - protocol.FALL_START)
+    # 1e-9: a step that lands on a key point (1.5 s = step 50) belongs to it despite rounding.
+    return np.where(t < protocol.FALL_START - 1e-9, 1.0, np.clip(fall, 0.0, 1.0))
+
+
+def target(step: ArrayLike, pip: ArrayLike, peep: ArrayLike = protocol.PEEP) -> NDArray[np.float64]:
+    """Target airway pressure, cmH2O.
+
+    Args:
+        step: step of the breath, any shape.
+        pip: peak inspiratory pressure, cmH2O; broadcast against ``step``.
+        peep: positive end-expiratory pressure, cmH2O; broadcast against ``step``.
+    """
+    pip, peep = np.asarray(pip, float), np.asarray(peep, float)
+    return peep + (pip - peep) * shape(step)
+
+
+def targets_ahead(
+    step: int, pip: ArrayLike, peep: ArrayLike = protocol.PEEP
+) -> NDArray[np.float64]:
+    """Return the next :data:`~ventbench.task.protocol.TARGETS_AHEAD` targets after ``step``, cmH2O.
+
+    Returns:
+        Shape of ``pip`` with one axis more, of length ``TARGETS_AHEAD``.
+    """
+    steps = step + 1 + np.arange(protocol.TARGETS_AHEAD)
+    return target(steps, np.asarray(pip, float)[..., None], np.asarray(peep, float)[..., None])
+
+
+def expiratory_command(step: ArrayLike) -> NDArray[np.float64]:
+    """Fixed command of the inspiratory valve during expiration, %.
+
+    The expiratory valve is open throughout.
+
+    Args:
+        step: step of the breath, from ``INSPIRATION_STEPS`` on; any shape.
+
+    Returns:
+        0 until 1.5 s, then ``5 (1 - exp(5 (1.5 s - t)))``.
+    """
+    t = np.mod(np.asarray(step), protocol.BREATH_STEPS) * protocol.DT
+    late = np.minimum(protocol.FALL_END - t, 0.0)
+    return EXPIRATORY_BIAS * (1.0 - np.exp(EXPIRATORY_RATE * late))

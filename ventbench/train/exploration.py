@@ -1,0 +1,272 @@
+"""Breaths to learn a simulator from: a safe PID with the paper's disturbances, on any ventilator.
+
+Paper, section 4.2 and its table. A *boundary* disturbance falls linearly to zero from the start of
+the breath. A *triangular* one rises linearly from zero at a first time and falls back to zero at a
+second one. Where the paper's text ends at "t_min", t_max is meant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.base.errors import InputError
+from ventbench.controllers.pid import TIME_CONSTANT
+from ventbench.recordings import Breaths, make_breaths
+from ventbench.task import protocol, waveform
+from ventbench.task.interfaces import Plant
+from ventbench.task.lungs import lung as parse_lung
+from ventbench.task.metrics.score import safety_limit
+
+Floats = NDArray[np.float64]
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class ExplorationRanges:
+    """Exploration of one lung.
+
+    Attributes:
+        gains: P, I, D of the PID, %/cmH2O.
+        boundary_u: what is added at the start of a breath, %.
+        boundary_s: time in which the boundary disturbance falls to zero, s.
+        triangular_u: the largest of what is added, %.
+        triangular_s: start and end of the triangular disturbance, s.
+        boundary_share: share of breaths with the boundary disturbance.
+    """
+
+    gains: tuple[float, float, float]
+    boundary_u: Range
+    boundary_s: Range
+    triangular_u: Range
+    triangular_s: Range = (0.1, 0.5)
+    boundary_share: float = 0.25
+
+
+#: The paper's table, by lung id.
+RANGES = {
+    "R5C10": ExplorationRanges((1.0, 0.5, 0.0), (50.0, 100.0), (0.3, 0.6), (-20.0, 40.0)),
+    "R5C20": ExplorationRanges((1.0, 3.0, 0.0), (50.0, 100.0), (0.4, 0.8), (-20.0, 60.0)),
+    "R5C50": ExplorationRanges((2.0, 4.0, 0.0), (75.0, 100.0), (1.0, 1.5), (-20.0, 60.0)),
+    "R20C10": ExplorationRanges((1.0, 0.5, 0.0), (50.0, 100.0), (0.3, 0.6), (-20.0, 40.0)),
+    "R20C20": ExplorationRanges((0.0, 3.0, 0.0), (30.0, 60.0), (0.5, 1.0), (-20.0, 40.0)),
+    "R20C50": ExplorationRanges((0.0, 4.0, 0.0), (70.0, 100.0), (1.0, 1.5), (-20.0, 40.0)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Disturbance:
+    """Disturbances of n breaths; every array has shape ``(n,)``.
+
+    Attributes:
+        boundary: whether it is a boundary disturbance; else a triangular one.
+        u: the largest of what is added, %.
+        begin: start of the disturbance, s; 0 for a boundary.
+        end: end of the disturbance, s.
+    """
+
+    boundary: NDArray[np.bool_]
+    u: Floats
+    begin: Floats
+    end: Floats
+
+    def at(self, time: float) -> Floats:
+        """Disturbance at a time of the breath, s, added to the PID's command, %, ``(n,)``."""
+        width = self.end - self.begin
+        falling = (self.end - time) / width
+        rising = (time - self.begin) / width
+        tent = 2.0 * np.minimum(rising, falling)
+        return self.u * np.clip(np.where(self.boundary, falling, tent), 0.0, 1.0)
+
+
+def draw_disturbances(
+    random: np.random.Generator, ranges: ExplorationRanges, n: int
+) -> Disturbance:
+    """Draw n disturbances; a triangular one lies between two times drawn from its range."""
+    boundary = random.random(n) < ranges.boundary_share
+    u = np.where(
+        boundary, random.uniform(*ranges.boundary_u, n), random.uniform(*ranges.triangular_u, n)
+    )
+    ends = np.sort(random.uniform(*ranges.triangular_s, (n, 2)), axis=1)
+    ends[:, 1] = np.maximum(ends[:, 1], ends[:, 0] + 1e-3)  # never of no width
+    fall = random.uniform(*ranges.boundary_s, n)
+    return Disturbance(
+        boundary, u, np.where(boundary, 0.0, ends[:, 0]), np.where(boundary, fall, ends[:, 1])
+    )
+
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Pressures at which exploring is interrupted.
+
+    Attributes:
+        ease: the valve closes while the measured pressure is above ``min(60, PIP + 15)`` cmH2O or
+            this, cmH2O.
+        vent: pressure above which the expiratory valve opens for the rest of the inspiration, as it
+            does where a pressure is not a number, cmH2O.
+        vented: breaths that ended so, after which exploring stops.
+    """
+
+    ease: float = protocol.SAFETY_PRESSURE
+    vent: float = protocol.SAFETY_PRESSURE
+    vented: int = 3
+
+
+class VentilatorInterface(Protocol):
+    """A ventilator, real or simulated, or several side by side.
+
+    Attributes:
+        width: number of lungs side by side; 1 for a real ventilator.
+        dt: control step, s.
+    """
+
+    width: int
+    dt: float
+
+    def start(self, peep: float) -> Floats:
+        """Bring the lungs to rest at PEEP, cmH2O; returns measured pressures, ``(width,)``."""
+        ...
+
+    def step(self, u_in: Floats, u_out: Floats) -> Floats:
+        """Hold commands, % and 0/1, for a step; returns the pressures then, ``(width,)``."""
+        ...
+
+
+class SimulatedVentilator:
+    """A plant as a ventilator.
+
+    Args:
+        plant: plant of one lung.
+        width: breaths side by side.
+        noise: standard deviation of the sensor's noise, cmH2O.
+        seed: seed of the noise.
+    """
+
+    def __init__(self, plant: Plant, width: int, *, noise: float = 0.0, seed: int = 0) -> None:
+        self.width, self.dt = width, protocol.DT
+        self._plant, self._noise = plant, noise
+        self._random = np.random.default_rng(seed)
+        self._step = jax.jit(lambda plant, *rest: plant.step(*rest))
+        self._state: Any = None
+
+    def start(self, peep: float) -> Floats:
+        """Lungs at rest."""
+        pressure = jnp.full(self.width, peep)
+        self._state, signals = self._plant.init(pressure)
+        return self._measured(signals.reading)
+
+    def step(self, u_in: Floats, u_out: Floats) -> Floats:
+        """One control step."""
+        commands = (jnp.asarray(u_in, jnp.float32), jnp.asarray(u_out, jnp.float32))
+        dt = jnp.full(self.width, self.dt)
+        self._state, signals = self._step(self._plant, self._state, *commands, dt)
+        return self._measured(signals.reading)
+
+    def _measured(self, pressure: Any) -> Floats:
+        return np.asarray(pressure, float) + self._noise * self._random.standard_normal(self.width)
+
+
+def explore(
+    ventilator: VentilatorInterface,
+    lung_id: str,
+    breaths: int,
+    *,
+    seed: int = 0,
+    ranges: ExplorationRanges | None = None,
+    limits: Limits | None = None,
+    pips: tuple[float, ...] = protocol.PIPS,
+    peep: float = protocol.PEEP,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> Breaths:
+    """Explore a ventilator; the PIPs take turns.
+
+    Args:
+        ventilator: see :class:`VentilatorInterface`.
+        lung_id: the setting of its lung, written with the breaths.
+        breaths: number of breaths.
+        seed: seed of all disturbances, which are the same for the same seed and width.
+        ranges: the paper's for that lung if not given.
+        limits: see :class:`Limits`.
+        pips: cmH2O.
+        peep: cmH2O.
+        progress: called with how many breaths are done, and how many were asked for.
+
+    Returns:
+        Whole breaths; fewer than asked for, with a note, where the limits ended it.
+
+    Raises:
+        InputError: if there are no ranges for the lung, or not one breath was asked for.
+    """
+    if ranges is None and lung_id not in RANGES:
+        raise InputError(f"no ranges to explore {lung_id} in; they exist for {', '.join(RANGES)}")
+    if breaths < 1:
+        raise InputError(f"{breaths} breaths to explore: ask for one at least")
+    setting, ranges, limits = parse_lung(lung_id), ranges or RANGES[lung_id], limits or Limits()
+    random = np.random.default_rng(seed)
+    columns: list[tuple[Floats, Floats, Floats]] = []
+    done = vented = 0
+    while done < breaths and vented < limits.vented:
+        pip = np.array([pips[(done + k) % len(pips)] for k in range(ventilator.width)])
+        added = draw_disturbances(random, ranges, ventilator.width)
+        made = _breaths(ventilator, pip, peep, ranges, limits, added)
+        columns.append(made)
+        done += ventilator.width
+        progress(min(done, breaths), breaths)
+        vented += int(np.sum(made[1][:, : protocol.INSPIRATION_STEPS].any(axis=1)))
+    together = zip(*columns, strict=True)
+    u_in, u_out, pressure = (np.concatenate(column)[:breaths] for column in together)
+    n = len(u_in)
+    time = np.tile(ventilator.dt * np.arange(protocol.BREATH_STEPS), (n, 1))
+    made = make_breaths(
+        np.arange(n) + 1, np.full(n, setting.R), np.full(n, setting.C), time, u_in, u_out, pressure
+    )
+    if vented < limits.vented:
+        return made
+    note = f"exploring stopped: {vented} breaths were vented, above {limits.vent:g} cmH2O"
+    return replace(made, notes=(note,))
+
+
+def _breaths(
+    ventilator: VentilatorInterface,
+    pip: Floats,
+    peep: float,
+    ranges: ExplorationRanges,
+    limits: Limits,
+    added: Disturbance,
+) -> tuple[Floats, Floats, Floats]:
+    """One breath on each lung of the ventilator: u_in, u_out and pressure, ``(width, steps)``."""
+    ease = np.minimum(safety_limit(pip), limits.ease)
+    vented = np.zeros(ventilator.width, bool)
+    before = integral = derivative = np.zeros(ventilator.width)
+    a = ventilator.dt / (ventilator.dt + TIME_CONSTANT)
+    P, I, D = ranges.gains  # noqa: E741
+    pressure, rows = ventilator.start(peep), []
+    for step in range(protocol.BREATH_STEPS):
+        if step < protocol.INSPIRATION_STEPS:
+            # A sensor that gives no number must not poison the averages; it vents, see below.
+            error = pip - np.where(np.isfinite(pressure), pressure, pip)
+            integral = integral + a * (error - integral)
+            derivative = derivative + a * (error - before - derivative)
+            before = error
+            wanted = P * error + I * integral + D * derivative + added.at(step * ventilator.dt)
+            # "Not below" instead of "above", so that a sensor that gives no number is unsafe.
+            vented |= ~(pressure <= limits.vent)
+            closed = vented | ~(pressure <= ease)
+            u_in = np.where(closed, 0.0, np.clip(wanted, 0.0, protocol.U_MAX))
+            u_out = vented.astype(float)
+        else:
+            u_in = np.full(ventilator.width, float(waveform.expiratory_command(step)))
+            u_out = np.ones(ventilator.width)
+        rows.append((u_in, u_out, pressure))
+        pressure = ventilator.step(u_in, u_out)
+    u_in, u_out, pressure = (np.stack(column, axis=1) for column in zip(*rows, strict=True))
+    return u_in, u_out, pressure

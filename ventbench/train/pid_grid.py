@@ -1,0 +1,447 @@
+"""The exhaustive search for PID gains: every PID of the paper's grid on every lung and PIP.
+
+Without noise each breath of a run is the same, as each begins at rest and the PID starts anew, so
+one inspiration stands for all. The search is dealt out in parts, which run in this process, in
+others or on a cluster; a finished part is never computed twice.
+
+The best of a grid then run on draws, whose noise a high gain amplifies, and the least mean error
+wins. On all scored rigs and the development draws this gives the 100 of normalised scores
+(:func:`best_pids`); on the rigs and draws that are for tuning, the gains of the entries
+``pid_best`` and ``pid_robust`` (:func:`tune_pid`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+from jax import Array
+from numpy.typing import ArrayLike, NDArray
+
+from ventbench.base import files, precision
+from ventbench.base.errors import InputError
+from ventbench.base.executor import InProcess, executor, in_order, results
+from ventbench.base.resume import ARRAY, WorkFolder, fingerprint
+from ventbench.controllers.pid import PID
+from ventbench.plants.catalog import Given
+from ventbench.plants.rigs import Rigs, load_rigs
+from ventbench.task import draws as draw_tables
+from ventbench.task import environment as env
+from ventbench.task import protocol, rollouts
+from ventbench.task.draws import Draws
+from ventbench.task.environment import Scenario, nominal_scenario
+from ventbench.task.interfaces import Plant
+from ventbench.task.metrics.score import controllable_error
+from ventbench.train.plants import check_names, plants_to_train_on
+
+#: The paper's twenty values of P, I and D, %/cmH2O.
+VALUES = (*(round(0.1 * i, 1) for i in range(10)), *(float(i) for i in range(1, 11)))
+
+#: Gains that are run together.
+BATCH = 2000
+
+#: How many PIDs of each lung run on the draws.
+FINALISTS = 100
+
+#: Finalists that are run together: bounds memory.
+TOGETHER = 20
+
+#: Draws that gains are tuned on; none of them is ever scored.
+TUNING = "tuning"
+TUNING_SEED = hashlib.sha256(b"ventbench, draws for tuning").digest()
+
+Floats = NDArray[np.float64]
+
+#: Files of a search in its folder.
+TABLE, RESULT, PARTS = "grid.parquet", "best.json", "parts"
+
+#: Called with the number of trajectories done, and of all.
+Progress = Callable[[int, int], None]
+
+_GAINS = ["P", "I", "D"]
+
+
+def paper_gains() -> NDArray[np.float64]:
+    """All combinations of :data:`VALUES`, P slowest, D fastest, shape ``(8000, 3)``."""
+    return np.array(list(itertools.product(VALUES, VALUES, VALUES)))
+
+
+@jax.jit
+def _errors(plant: Plant, gains: Array, cells: Scenario) -> Array:
+    cells = jax.tree.map(
+        lambda x: jnp.broadcast_to(jnp.asarray(x, gains.dtype), (len(gains), *jnp.shape(x))), cells
+    )
+    controller = PID(gains[:, :1], gains[:, 1:2], gains[:, 2:])
+
+    def record(before: env.LoopState, *_: Any) -> Array:
+        return jnp.abs(before.signals.scored - cells.pip)
+
+    policy, state = rollouts.controlled_by(controller), controller.init(cells.pip.shape)
+    _, _, error = rollouts.inspiration(env.vary(plant, cells), cells, policy, state, record=record)
+    return error.mean(axis=0)
+
+
+def errors(
+    plants: Plant,
+    gains: NDArray[np.float64],
+    pips: tuple[float, ...] = protocol.PIPS,
+    batch: int = BATCH,
+) -> NDArray[np.float32]:
+    """Nominal error of each PID on each lung at each PIP.
+
+    Args:
+        plants: leaves stacked over L lungs.
+        gains: P, I and D, %/cmH2O, shape ``(G, 3)``.
+        pips: cmH2O, P of them.
+        batch: gains that are run together.
+
+    Returns:
+        Mean ``|pressure - target|`` of an inspiration, cmH2O, shape ``(L, G, P)``; float32, which
+        differs from the score by less than 1e-4.
+    """
+    lungs = jax.tree.leaves(plants)[0].shape[0]
+    count = len(gains)
+    out = np.empty((lungs, count, len(pips)), np.float32)
+    cells = nominal_scenario(np.asarray(pips))
+    batch = min(batch, count)
+    for lung in range(lungs):
+        plant = jax.tree.map(lambda x, lung=lung: jnp.asarray(x[lung], jnp.float32), plants)
+        for first in range(0, count, batch):
+            # The last batch is padded with the last gains, so that all compile once.
+            index = np.minimum(np.arange(first, first + batch), count - 1)
+            some = jnp.asarray(gains[index], jnp.float32)
+            out[lung, index] = np.asarray(_errors(plant, some, cells))
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class PIDGrid:
+    """Errors of every PID.
+
+    Attributes:
+        lungs: ids, L of them.
+        pips: cmH2O, N of them.
+        gains: P, I and D, %/cmH2O, shape ``(G, 3)``.
+        error: mean ``|pressure - PIP|`` of an inspiration, cmH2O, float32, shape ``(L, G, N)``.
+    """
+
+    lungs: tuple[str, ...]
+    pips: tuple[float, ...]
+    gains: NDArray[np.float64]
+    error: NDArray[np.float32]
+
+    def best(self, lung: str | None = None) -> tuple[tuple[float, float, float], float]:
+        """Gains with the lowest mean error on a lung, or over all lungs, and that error, cmH2O.
+
+        The first in the order of the grid wins a tie.
+        """
+        error = self.error.mean(axis=-1, dtype=np.float64)
+        mean = error.mean(axis=0) if lung is None else error[self.lungs.index(lung)]
+        at = int(np.argmin(mean))
+        P, I, D = self.gains[at].tolist()  # noqa: E741
+        return (P, I, D), float(mean[at])
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row a lung and PID: ``lung, P, I, D``, an error a PIP, and ``error``, their mean."""
+        columns: dict[str, Any] = {
+            "lung": np.repeat(self.lungs, len(self.gains)),
+            **dict(zip(_GAINS, np.tile(self.gains, (len(self.lungs), 1)).T, strict=True)),
+        }
+        flat = self.error.reshape(-1, len(self.pips))
+        columns |= {f"error_pip_{pip:g}": flat[:, n] for n, pip in enumerate(self.pips)}
+        return pd.DataFrame(columns | {"error": flat.mean(axis=1)})
+
+    def save(self, path: Path) -> None:
+        """Write :meth:`to_frame` as Parquet, in one step."""
+        table = self.to_frame()
+        files.write_atomically(path, lambda file: table.to_parquet(file, index=False))
+
+
+def search(
+    plants: Mapping[str, Plant],
+    *,
+    settings: Mapping[str, Any],
+    folder: Path | None = None,
+    gains: NDArray[np.float64] | None = None,
+    pool: Executor | None = None,
+    part: int = BATCH,
+    progress: Progress | None = None,
+    errors_of: Callable[[Plant, NDArray[np.float64]], NDArray[np.float32]] | None = None,
+) -> PIDGrid:
+    """Run the grid of gains on plants without noise.
+
+    Args:
+        plants: one plant a lung, by its id.
+        settings: JSON values that identify the plants.
+        folder: folder in which finished parts are kept, so that an interrupted search continues;
+            nowhere if not given.
+        gains: P, I and D, shape ``(G, 3)``; the paper's if not given.
+        pool: executor that computes the parts; this process if not given.
+        part: gains of a part.
+        progress: see :data:`Progress`.
+        errors_of: computes a part: errors of gains on one plant, shape ``(g, N)``; by
+            :func:`errors` if not given.
+
+    Raises:
+        InputError: if the folder holds parts of another search, or a worker died.
+    """
+    grid = paper_gains() if gains is None else gains
+    firsts = range(0, len(grid), part)
+    total = len(plants) * len(grid) * len(protocol.PIPS)
+    about = {"simulators": dict(settings), "gains": fingerprint(grid), "part": part}
+    work = None if folder is None else WorkFolder(folder, about)
+    finished: dict[str, NDArray[np.float32]] = {}
+    jobs = {}
+    for lung, plant in plants.items():
+        plain = jax.tree.map(np.asarray, plant)
+        for first in firsts:
+            name, some = f"{lung}-{first}", grid[first : first + part]
+            if work is not None and work.has(name, ARRAY):
+                finished[name] = _read_part(work, name, len(some))
+            else:
+                jobs[name] = (plain, some)
+    done = sum(error.size for error in finished.values())
+    report = progress or (lambda done, total: None)
+    report(done, total)
+    for name, error in results(pool or InProcess(), errors_of or _part_errors, jobs):
+        if name in finished:
+            raise RuntimeError(f"part {name} came back twice")
+        finished[name] = error
+        if work is not None:
+            work.put(name, error, ARRAY)
+        done += error.size
+        report(done, total)
+    error = np.stack(
+        [np.concatenate([finished[f"{lung}-{first}"] for first in firsts]) for lung in plants]
+    )
+    return PIDGrid(tuple(plants), protocol.PIPS, grid, error)
+
+
+def _part_errors(plant: Plant, gains: NDArray[np.float64]) -> NDArray[np.float32]:
+    stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], plant)
+    return errors(stacked, gains)[0]
+
+
+def _read_part(work: WorkFolder, name: str, gains: int) -> NDArray[np.float32]:
+    error, shape = work.read(name, ARRAY), (gains, len(protocol.PIPS))
+    if error.shape != shape or error.dtype != np.float32:
+        path = work.path(name, ARRAY)
+        raise InputError(f"{path} holds {error.dtype} {error.shape}, not float32 {shape}")
+    return error
+
+
+@jax.jit
+def _pressures(plant: Plant, gains: Array, cells: Scenario) -> Array:
+    def run(gains: Array) -> Array:
+        return rollouts.closed_loop(plant, PID(*gains), cells)[0].pressure
+
+    return jax.vmap(run)(gains)
+
+
+def _nominal_plants(rigs: Rigs, lung: int) -> Plant:
+    """Plants of a lung's scored rigs, member 0."""
+    at = slice(lung, lung + 1) if rigs.sessions is None else (0, list(rigs.sessions[lung]))
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[at], rigs.plants)
+
+
+def _nominal_grid(rigs: Rigs, lungs: Sequence[int], gains: Floats, **options: Any) -> PIDGrid:
+    """Mean error without noise over the rigs of some lungs, member 0; see :func:`search`."""
+    plants = {rigs.lungs[at].id: _nominal_plants(rigs, at) for at in lungs}
+    settings = dict(rigs.about) | {"rigs": rigs.sessions}
+    return search(plants, settings=settings, gains=gains, errors_of=_mean_errors, **options)
+
+
+def _mean_errors(plants: Plant, gains: Floats) -> NDArray[np.float32]:
+    return errors(plants, gains).mean(axis=0, dtype=np.float64).astype(np.float32)
+
+
+def drawn_errors(rigs: Rigs, drawn: Draws, lung: int, gains: Floats) -> Floats:
+    """Error of PIDs on draws of one lung, without the first step.
+
+    Args:
+        rigs: that the draws are of.
+        drawn: K draws.
+        lung: index of the lung.
+        gains: P, I, D, %/cmH2O, shape ``(G, 3)``.
+
+    Returns:
+        Mean over the draws, cmH2O, shape ``(G, P)``.
+    """
+    plants, cells = rigs.cells(drawn, protocol.PIPS)
+    own = jax.tree.map(lambda x: np.asarray(x)[lung], plants)
+    if rigs.sessions is not None:  # without the nominal cells
+        own = jax.tree.map(lambda x: x[1:], own)
+    cell = jax.tree.map(lambda x: np.asarray(x)[lung, 1:], cells)
+    errors = []
+    for first in range(0, len(gains), TOGETHER):
+        # The last batch is padded, so that all compile once.
+        index = np.minimum(np.arange(first, first + TOGETHER), len(gains) - 1)
+        with precision.float64():
+            arrays = jax.tree.map(jnp.asarray, (own, gains[index], cell))
+            pressure = np.asarray(_pressures(*arrays))
+        error = controllable_error(pressure, cell.pip[..., None, None]).mean(axis=1)
+        errors.append(error[: len(gains) - first])
+    return np.concatenate(errors)
+
+
+def tune_pid(
+    lungs: Sequence[str] | None = None,
+    out: Path | str | None = None,
+    *,
+    gains: ArrayLike | None = None,
+    draws: int = draw_tables.COUNT,
+    workers: int = 0,
+    scheduler: str | None = None,
+    each: bool = True,
+    single: bool | None = None,
+    simulator: Given = "frozen",
+    progress: Progress | None = None,
+) -> tuple[PIDGrid, dict[str, Any]]:
+    """Run every PID of a grid on simulators without noise, the best on draws, and name the best.
+
+    Neither the development draws nor the rigs that are held out have a part in the choice. What
+    decides is the error weighted as in the normalised score: by the inverse of what there is to
+    gain at a PIP of a lung.
+
+    Args:
+        lungs: ids; all lungs of the simulators if not given.
+        out: folder for ``grid.parquet``, the whole grid, and ``best.json``, the result; parts of an
+            interrupted search lie there too, and the same call continues from them. Nothing is
+            written if not given.
+        gains: P, I, D, %/cmH2O, shape ``(G, 3)``; the paper's 8,000 if not given.
+        draws: number of draws for tuning that decide among the :data:`FINALISTS` best; 0 to decide
+            without noise, as in the paper.
+        workers: processes; 0 for this one alone, which uses all cores.
+        scheduler: address of a Dask scheduler instead, such as ``tcp://host:8786``.
+        each: put the best gains of each lung into the result.
+        single: put the best gains for all lungs together into the result; if not given, where there
+            are several lungs.
+        simulator: simulators with plants of these lungs; see :func:`ventbench.load_simulators`. Of
+            the frozen ones each lung has all its rigs but the held-out one.
+        progress: see :data:`Progress`.
+
+    Returns:
+        The grid, of errors without noise, and the content of ``best.json``: the best gains and
+        their errors without weights, on the draws without the first step if there are any.
+
+    Raises:
+        InputError: if a lung or a simulator is unknown, ``out`` holds an unfinished search with
+            other settings, or a worker died.
+
+    Examples:
+        >>> from ventbench import tune_pid
+        >>> gains = [(2.0, 4.0, 0.0), (5.0, 5.0, 0.0)]  # %/cmH2O
+        >>> grid, result = tune_pid(["R20C50"], simulator="physics", gains=gains, draws=0)
+        >>> result["lungs"]["R20C50"]["gains"]
+        [2.0, 4.0, 0.0]
+    """
+    trained_on = plants_to_train_on(simulator)
+    names = check_names(lungs, trained_on, all_lungs=False)
+    where = [trained_on.names.index(name) for name in names]
+    weights, single = trained_on.weights[where], len(names) > 1 if single is None else single
+    rigs = _training_rigs(load_rigs(simulator))
+    parts = None if out is None else Path(out) / PARTS
+    count = FINALISTS if draws else 1
+    with executor(workers, scheduler) as pool:
+        grid = _nominal_grid(
+            rigs,
+            where,
+            paper_gains() if gains is None else np.asarray(gains, float),
+            folder=parts,
+            pool=pool,
+            progress=progress,
+        )
+        weighted = np.einsum("lgp,lp->lg", grid.error.astype(float), weights)
+        common = np.argsort(weighted.sum(axis=0), kind="stable")[: count if single else 0]
+        own = np.argsort(weighted, axis=1, kind="stable")[:, : count if each else 0]
+        lists = [np.concatenate([row, common]) for row in own]
+        if draws:
+            sessions = rigs.sessions or tuple((0,) for _ in rigs.lungs)
+            drawn = draw_tables.build(
+                sessions, rigs.members, seed=TUNING_SEED, name=TUNING, n=draws
+            )
+            jobs = [
+                (rigs, drawn, lung, grid.gains[some])
+                for lung, some in zip(where, lists, strict=True)
+            ]
+            found = in_order(pool, drawn_errors, jobs)
+        else:
+            found = [
+                error[some] for error, some in zip(grid.error.astype(float), lists, strict=True)
+            ]
+    result: dict[str, Any] = {
+        "trajectories": int(grid.error.size),
+        "pips": list(grid.pips),
+        "draws": draws,
+    }
+    if each:
+        result["lungs"] = {}
+        for lung, row, error, weight in zip(names, own, found, weights, strict=True):
+            best = int(np.argmin(error[: len(row)] @ weight))
+            entry = {"gains": grid.gains[row[best]].tolist(), "error": float(error[best].mean())}
+            result["lungs"][lung] = entry
+    if single:
+        together = np.stack([error[len(row) :] for row, error in zip(own, found, strict=True)])
+        best = int(np.argmin(np.einsum("lgp,lp->g", together, weights)))
+        on_each = together[:, best].mean(axis=-1)
+        result["single"] = {
+            "gains": grid.gains[common[best]].tolist(),
+            "error": float(on_each.mean()),
+            "lungs": dict(zip(names, on_each.tolist(), strict=True)),
+        }
+    result["simulators"] = dict(trained_on.about)
+    if out is not None:
+        grid.save(Path(out) / TABLE)
+        files.write_json(Path(out) / RESULT, result)
+        shutil.rmtree(Path(out) / PARTS)
+    return grid, result
+
+
+def _training_rigs(scored: Rigs) -> Rigs:
+    """The same without the rigs that are held out."""
+    if scored.sessions is None:
+        return scored
+    pairs = zip(scored.sessions, scored.held_out, strict=True)
+    sessions = tuple(tuple(rig for rig in own if rig != apart) for own, apart in pairs)
+    return replace(scored, sessions=sessions)
+
+
+def best_pids(
+    rigs: Rigs,
+    *,
+    gains: Floats | None = None,
+    draws: int = 20,
+    progress: Progress | None = None,
+) -> tuple[Floats, Floats]:
+    """Find the best PID of each lung.
+
+    Args:
+        rigs: L lungs, all of whose scored rigs count alike.
+        gains: P, I, D, %/cmH2O, shape ``(G, 3)``; the paper's 8,000 if not given.
+        draws: number of development draws that decide among the best.
+        progress: see :data:`Progress`.
+
+    Returns:
+        Gains, shape ``(L, 3)``, and their mean errors over the draws without the first step, cmH2O,
+        shape ``(L,)``.
+    """
+    grid = paper_gains() if gains is None else np.asarray(gains, float)
+    drawn = rigs.draws(draws)
+    nominal = _nominal_grid(rigs, range(len(rigs.lungs)), grid, progress=progress)
+    chosen, least = [], []
+    for lung, error in enumerate(nominal.error.mean(axis=-1, dtype=np.float64)):
+        finalists = grid[np.argsort(error, kind="stable")[:FINALISTS]]
+        on_draws = drawn_errors(rigs, drawn, lung, finalists).mean(axis=-1)
+        chosen.append(finalists[np.argmin(on_draws)])
+        least.append(on_draws.min())
+    return np.array(chosen), np.array(least)

@@ -1,0 +1,461 @@
+"""Training of the residual controller: gradients through the simulators, Adam, one compiled scan.
+
+The paper's objective, the mean of ``|pressure - PIP| + lambda |correction|`` over inspirations, is
+differentiated through the controller, the valve and the simulator. Each update runs every lung at
+every PIP, several times: on any training rig and member, with deviations drawn as those of the
+scored draws are. Errors are divided by what there is to gain in the cell, as in the normalised
+score. :func:`train_residual` takes the gains of the PIDs from the grid.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+from numpy.typing import ArrayLike, NDArray
+
+from ventbench.base import files, precision
+from ventbench.base.resume import Checkpoint, fingerprint
+from ventbench.controllers.pid import PID
+from ventbench.controllers.residual import Residual, save_weights, untrained
+from ventbench.plants.catalog import Given
+from ventbench.plants.stacking import take
+from ventbench.task import draws, protocol, rollouts
+from ventbench.task import environment as env
+from ventbench.task.environment import Scenario, nominal_scenario
+from ventbench.task.interfaces import Controller, Plant
+from ventbench.task.metrics.score import run_error
+from ventbench.train.pid_grid import tune_pid
+from ventbench.train.plants import ALL, TrainedControllers, check_names, plants_to_train_on
+
+
+@dataclass(frozen=True)
+class ResidualConfig:
+    """Settings of the training of residual controllers; hashable, since they are static in ``jit``.
+
+    Attributes:
+        updates: number of updates of the network; the schedule stretches over them.
+        copies: runs of each lung at each PIP in an update.
+        learning_rate: peak of the cosine schedule of Adam.
+        weight_decay: decay of the network's weights.
+        lam: weight of the mean absolute correction, cmH2O for each %; the paper's lambda.
+        first_breath: weight of the breath that is not scored; each scored breath has 1.
+        widths: units of the network's hidden layers.
+        pressures: number of earlier errors that it sees.
+        commands: number of earlier commands that it sees.
+        ahead: number of steps of the previous breath that it sees; 0 for none.
+        limit: largest correction, %.
+        members: plants of each lung that are trained on, the nominal one first; all if None.
+        spread: reach of the deviations, as a multiple of the draws' ranges; 0 for none.
+        round_robin: whether each update takes one lung at one PIP, in turn, as in the paper,
+            instead of all of them.
+    """
+
+    updates: int = 3000
+    copies: int = 6
+    learning_rate: float = 4e-3
+    weight_decay: float = 1e-5
+    lam: float = 0.0
+    first_breath: float = 0.1
+    widths: tuple[int, ...] = (64, 64)
+    pressures: int = 5
+    commands: int = 6
+    ahead: int = 6
+    limit: float = 100.0
+    members: int | None = None
+    spread: float = 1.0
+    round_robin: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that cannot work.
+
+        Raises:
+            ValueError: naming the field and its value.
+        """
+        for name in ("updates", "copies", "learning_rate", "limit", "members"):
+            if getattr(self, name) is not None and not getattr(self, name) > 0:
+                raise ValueError(f"training: {name} = {getattr(self, name)} must be positive")
+        for name in (
+            "weight_decay",
+            "lam",
+            "first_breath",
+            "pressures",
+            "commands",
+            "ahead",
+        ):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"training: {name} = {getattr(self, name)} must not be negative")
+        if not 0 <= self.spread <= 4:
+            raise ValueError(f"training: spread = {self.spread} is outside 0..4")
+
+
+@jax.custom_vjp
+def valve(u_in: Array) -> Array:
+    """Clip a command to the valve's range, %, with a derivative where it leads back into it."""
+    return jnp.clip(u_in, 0.0, protocol.U_MAX)
+
+
+def _valve_forward(u_in: Array) -> tuple[Array, Array]:
+    return valve(u_in), u_in
+
+
+def _valve_backward(u_in: Array, gradient: Array) -> tuple[Array]:
+    # Beyond an end of the range only a gradient that leads back into it passes.
+    stuck = ((u_in > protocol.U_MAX) & (gradient < 0)) | ((u_in < 0) & (gradient > 0))
+    return (jnp.where(stuck, 0.0, gradient),)
+
+
+valve.defvjp(_valve_forward, _valve_backward)
+
+
+@flax.struct.dataclass
+class DifferentiableRun:
+    """One run of three inspirations; every array ``(..., BREATHS, INSPIRATION_STEPS)``.
+
+    Attributes:
+        pressure: airway pressure, cmH2O.
+        correction: correction of the PID's command, %.
+        u_in: command as applied, %.
+    """
+
+    pressure: Array
+    correction: Array
+    u_in: Array
+
+
+def run(controller: Residual, plant: Plant, cell: Scenario) -> DifferentiableRun:
+    """Run a controller through three inspirations.
+
+    Args:
+        controller: the controller.
+        plant: plant of one lung.
+        cell: one cell, batch shape ``()``.
+    """
+    varied = env.vary(plant, cell)
+    rest = env.start_breath(varied, cell)
+
+    def policy(state: Any, seen: Any, _: Any) -> tuple[Any, Array]:
+        inner, base, correction = controller.parts(state[0], seen)
+        return (inner, correction), valve(base + correction)
+
+    def step(carry: tuple[env.LoopState, Any], at: tuple[Array, Array]) -> tuple[Any, Any]:
+        # In one scan over all breaths: half the compilation of a scan of scans.
+        start = jax.tree.map(lambda new, old: jnp.where(at[1] == 0, new, old), rest, carry[0])
+        (after, state), (pressure, applied) = rollouts.control_step(
+            varied, cell, policy, lambda before, _, __, u: (before.signals.scored, u),
+            (start, carry[1]), (*at, None),
+        )  # fmt: skip
+        return (after, state), DifferentiableRun(pressure, state[1], applied)
+
+    count = jnp.arange(protocol.BREATHS * protocol.INSPIRATION_STEPS)
+    at = (count // protocol.INSPIRATION_STEPS, count % protocol.INSPIRATION_STEPS)
+    begin = (rest, (controller.init(()), jnp.zeros_like(cell.pip)))
+    _, steps = jax.lax.scan(step, begin, at)
+    shape = (protocol.BREATHS, protocol.INSPIRATION_STEPS)
+    return jax.tree.map(lambda leaf: leaf.reshape(shape), steps)
+
+
+def objective(
+    controller: Residual,
+    plants: Plant,
+    cells: Scenario,
+    first_breath: float,
+    lam: float,
+    *,
+    weight: Array | float = 1.0,
+) -> Array:
+    """Mean of ``|pressure - PIP| + lam |correction|`` over inspirations and runs.
+
+    Args:
+        controller: the controller.
+        plants: leaves ``(n, ...)``.
+        cells: batch shape ``(n,)``.
+        first_breath: weight of the first breath; the others have 1.
+        lam: cmH2O for each %.
+        weight: of each run, shape ``(n,)`` or ``()``.
+
+    Returns:
+        The loss, cmH2O.
+    """
+    runs = jax.vmap(run, (None, 0, 0))(controller, plants, cells)
+    scored = jnp.isin(jnp.arange(protocol.BREATHS), jnp.array(protocol.SCORED_BREATHS))
+    breath = jnp.where(scored, 1.0, first_breath)[:, None]
+    each = jnp.abs(runs.pressure - cells.pip[:, None, None]) + lam * jnp.abs(runs.correction)
+    total = jnp.mean(each * breath * jnp.reshape(weight, (-1, 1, 1)))
+    return total / jnp.mean(breath)
+
+
+#: Called with the number of updates done, the number of all updates, and the mean loss since the
+#: last call, cmH2O.
+FitProgress = Callable[[int, int, float], None]
+
+#: Updates compiled into one scan; a checkpoint or a Ctrl-C falls between two of them.
+CHUNK = 50
+
+
+def _optimiser(config: ResidualConfig) -> optax.GradientTransformation:
+    warm = max(config.updates // 50, 1)
+    schedule = optax.warmup_cosine_decay_schedule(
+        0.0, config.learning_rate, warm, max(config.updates, warm + 1)
+    )
+    return optax.chain(
+        optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=config.weight_decay)
+    )
+
+
+def _cells(number: Array, lungs: int, pips: int, config: ResidualConfig) -> tuple[Array, Array]:
+    """Lung and PIP of each run of an update."""
+    if config.round_robin:
+        cell = jnp.full(config.copies, number % (lungs * pips))
+    else:
+        cell = jnp.repeat(jnp.arange(lungs * pips), config.copies)
+    return cell // pips, cell % pips
+
+
+@partial(jax.jit, static_argnames="config")
+def _advance(
+    carry: tuple[Any, Any],
+    controller: Residual,
+    plants: Plant,
+    key: Array,
+    first: Array,
+    weights: Array,
+    config: ResidualConfig,
+) -> tuple[tuple[Any, Any], Array]:
+    """``CHUNK`` updates, fewer at the end; returns layers, the optimiser's state and mean loss."""
+    optimiser = _optimiser(config)
+    members, lungs = jax.tree.leaves(plants)[0].shape[:2]
+    pips = jnp.asarray(protocol.PIPS, jnp.float32)
+
+    def update(carry: tuple[Any, Any], number: Array) -> tuple[tuple[Any, Any], Array]:
+        layers, state = carry
+        member_key, scenario_key = jax.random.split(jax.random.fold_in(key, number))
+        lung, pip = _cells(number, lungs, len(protocol.PIPS), config)
+        member = jax.random.randint(member_key, lung.shape, 0, members)
+        cells = draws.random_scenarios(
+            scenario_key,
+            pips[pip],
+            spread=config.spread,
+            smooth=True,
+        )
+        those = jax.tree.map(lambda leaf: leaf[member, lung], plants)
+
+        def value(layers: Any) -> Array:
+            corrected = controller.replace(layers=layers)  # type: ignore[attr-defined]
+            return objective(
+                corrected, those, cells, config.first_breath, config.lam, weight=weights[lung, pip]
+            )
+
+        mean, gradient = jax.value_and_grad(value)(layers)
+        updates, state = optimiser.update(gradient, state, layers)
+        new = (optax.apply_updates(layers, updates), state)
+        last = number >= config.updates
+        return jax.tree.map(lambda a, b: jnp.where(last, a, b), carry, new), mean
+
+    carry, losses = jax.lax.scan(update, carry, first + jnp.arange(CHUNK))
+    inside = first + jnp.arange(CHUNK) < config.updates
+    return carry, jnp.sum(losses * inside) / jnp.maximum(jnp.sum(inside), 1)
+
+
+def fit(
+    plants: Plant,
+    gains: tuple[float, float, float],
+    *,
+    config: ResidualConfig | None = None,
+    seed: int = 0,
+    checkpoint: Path | None = None,
+    progress: FitProgress | None = None,
+    keep: bool = False,
+    weights: ArrayLike | None = None,
+    start: Residual | None = None,
+) -> Residual:
+    """Train the correction of a PID on one lung, or on several at once.
+
+    Bit-reproducible on one machine: every random number comes from ``seed`` and the number of
+    the update, so that an interrupted training continues as if it had not been.
+
+    Args:
+        plants: simulators, leaves ``(members, lungs, ...)``; members beyond the settings' are left
+            out.
+        gains: P, I, D of the PID, %/cmH2O; they stay.
+        config: settings of the training.
+        seed: seed of the weights and the random deviations.
+        checkpoint: file that the training is saved to every ``CHUNK`` updates and resumed from;
+            deleted at the end.
+        progress: called after every ``CHUNK`` updates.
+        keep: leave the checkpoint, so that a finished training is read from it.
+        weights: weight of each lung's error at each PIP, shape ``(lungs, P)``; 1 if not given.
+        start: trained controller with the same gains and windows to go on from; a new network if
+            not given.
+
+    Returns:
+        The controller, float32.
+
+    Raises:
+        InputError: if the checkpoint belongs to another training.
+        FloatingPointError: if the loss is not finite; the checkpoint stays at the last good one.
+    """
+    config = config or ResidualConfig()
+    plants = jax.tree.map(lambda leaf: jnp.asarray(leaf[: config.members], jnp.float32), plants)
+    lungs = jax.tree.leaves(plants)[0].shape[1]
+    shape = (lungs, len(protocol.PIPS))
+    weights = jnp.broadcast_to(jnp.asarray(1.0 if weights is None else weights, jnp.float32), shape)
+    start_key, key = jax.random.split(jax.random.key(seed))
+    like = Residual(
+        PID(*(jnp.asarray(gain, jnp.float32) for gain in gains)),
+        (),
+        pressures=config.pressures,
+        commands=config.commands,
+        ahead=config.ahead,
+        limit=config.limit,
+    )
+    controller = untrained(start_key, like, config.widths)
+    if start is not None:
+        layers = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), start.layers)
+        controller = controller.replace(layers=layers)  # type: ignore[attr-defined]
+    carry: Any = (controller.layers, _optimiser(config).init(controller.layers))
+    settings = {
+        "config": dataclasses.asdict(config), "gains": list(gains), "seed": seed,
+        "simulators": fingerprint(plants), "weights": fingerprint(weights),
+        "start": None if start is None else fingerprint(start.layers),
+    }  # fmt: skip
+    stored = Checkpoint(checkpoint, settings)
+    carry, first = stored.restore(carry)
+    while first < config.updates:
+        new, loss = _advance(carry, like, plants, key, jnp.asarray(first), weights, config)
+        loss = float(loss)
+        if not np.isfinite(loss):
+            raise FloatingPointError(
+                f"training diverged between updates {first} and {first + CHUNK}"
+            )
+        carry, first = new, min(first + CHUNK, config.updates)
+        stored.save(carry, first)
+        if progress is not None:
+            progress(first, config.updates, loss)
+    if not keep:
+        stored.delete()
+    return controller.replace(layers=carry[0])  # type: ignore[attr-defined]
+
+
+#: Files that are written.
+WEIGHTS, RESULT, PARTS = "weights.npz", "training.json", "parts"
+
+#: Called with the name of the step, and its progress: updates done, updates in all, loss in cmH2O.
+Progress = Callable[[str, tuple[int, int, float] | None], None]
+
+
+def train_residual(
+    networks: Sequence[str] | None = None,
+    out: Path | str = "runs/residual",
+    *,
+    config: ResidualConfig | None = None,
+    seed: int = 0,
+    gains: NDArray[np.float64] | None = None,
+    simulator: Given = "frozen",
+    progress: Progress | None = None,
+) -> TrainedControllers:
+    """Train corrections of the best PIDs by differentiating through simulators.
+
+    Writes ``weights.npz``, as ``submissions/residual_mlp`` reads it, and ``training.json``. An
+    interrupted training continues where it was; a finished one is repeated, to the same bytes.
+
+    Example::
+
+        trained = ventbench.train_residual(["R20C50"], "runs/mine")
+        trained.report["networks"]["R20C50"]["error"]  # cmH2O, by lung
+
+    Args:
+        networks: ids of lungs, a network each, or ``"all"`` for one network that serves all; a
+            network for each lung of the simulators if not given.
+        out: folder.
+        config: settings of the training.
+        seed: seed of the weights and the random deviations, common to all networks.
+        gains: grid of P, I, D, %/cmH2O, shape ``(G, 3)``, of which each network corrects the best
+            PID; the paper's grid if not given.
+        simulator: simulators with plants to train through, see :func:`ventbench.load_simulators`;
+            of the frozen ones all members of all training rigs.
+        progress: see :data:`Progress`.
+
+    Returns:
+        The controllers, float32, and the report.
+
+    Raises:
+        InputError: if a network's name or a simulator is unknown, or ``out`` holds an unfinished
+            training with other settings.
+        FloatingPointError: if a training diverges.
+    """
+    config, progress = config or ResidualConfig(), progress or (lambda what, how_far: None)
+    trained_on, out = plants_to_train_on(simulator), Path(out)
+    names, known = check_names(networks, trained_on), list(trained_on.names)
+    progress("PID grid", None)
+    official = trained_on.nominal
+    lungs = {name: take(official, index) for index, name in enumerate(known)}
+    _, tuned = tune_pid(known if ALL in names else names, gains=gains, simulator=simulator)
+    controllers, about = {}, {}
+    for name in names:
+        best = tuple(tuned["single"]["gains"] if name == ALL else tuned["lungs"][name]["gains"])
+        where = list(range(len(known))) if name == ALL else [known.index(name)]
+        plants = jax.tree.map(
+            lambda leaf, where=where: np.asarray(leaf)[:, where], trained_on.plants
+        )
+        started = time.perf_counter()
+        with precision.float32():
+            controllers[name] = fit(
+                plants,
+                best,
+                config=config,
+                seed=seed,
+                checkpoint=_checkpoint(out, name),
+                progress=lambda *how_far, name=name: progress(f"network {name}", how_far),
+                keep=True,
+                weights=trained_on.weights[where],
+            )
+        about[name] = {
+            "gains": list(best),
+            "seconds": round(time.perf_counter() - started, 1),
+            "error_pid": _errors(PID(*best), lungs, where),
+            "error": _errors(controllers[name], lungs, where),
+        }
+    save_weights(out / WEIGHTS, controllers)
+    report = {
+        "networks": about,
+        "recipe": dataclasses.asdict(config),
+        "seed": seed,
+        "simulators": dict(trained_on.about),
+        "weights_sha256": files.sha256(out / WEIGHTS),
+    }
+    files.write_json(out / RESULT, report)
+    for name in names:
+        _checkpoint(out, name).unlink(missing_ok=True)
+    return TrainedControllers(controllers, report, out)
+
+
+def _checkpoint(out: Path, name: str) -> Path:
+    return out / PARTS / f"{name}.npz"
+
+
+def _errors(
+    controller: Controller, lungs: Mapping[str, Plant], where: list[int]
+) -> dict[str, float]:
+    """Nominal error on the reference plant of each lung, float64, cmH2O."""
+    errors = {}
+    with precision.float64():
+        cells = nominal_scenario(np.array(protocol.PIPS))
+        wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), controller)
+        for name in [list(lungs)[index] for index in where]:
+            plant = jax.tree.map(jnp.asarray, lungs[name])
+            inspirations, _ = rollouts.closed_loop(plant, wide, cells)
+            error = run_error(inspirations.pressure, np.asarray(cells.pip)[:, None, None])
+            errors[name] = round(float(error.mean()), 6)
+    return errors

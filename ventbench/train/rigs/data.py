@@ -1,0 +1,244 @@
+"""Recordings of rigs for a training: breaths, folds and labels, and arrays that the fits take."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import flax.struct
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from ventbench.base.errors import InputError
+from ventbench.plants.frozen import fingerprints
+from ventbench.plants.sessions import Sessions
+from ventbench.recordings import Breaths, RecordingError, join, load
+from ventbench.recordings import folds as assign_folds
+from ventbench.task.lungs import Lung, lung
+from ventbench.train.rigs.parameters import Groups
+
+_SUFFIXES = (".csv", ".csv.gz", ".parquet")
+
+
+@dataclass(frozen=True)
+class RigRecordings:
+    """Recordings of a training.
+
+    Attributes:
+        breaths: n breaths, the measured ones first.
+        measured: number of breaths without a blank pressure, m. Reconstructed breaths have blanks,
+            if only in their expiration.
+        fold: fold of each measured breath, ``(m,)``.
+        labels: the settings that occur, by R and C.
+        sources: SHA-256 and number of breaths of each file, by name.
+        skipped: files that are not in the public schema.
+    """
+
+    breaths: Breaths
+    measured: int
+    fold: NDArray[np.int64]
+    labels: tuple[Lung, ...]
+    sources: dict[str, dict[str, Any]]
+    skipped: tuple[str, ...]
+
+    @property
+    def measured_breaths(self) -> Breaths:
+        """The measured breaths."""
+        return self.breaths.select(np.arange(self.measured))
+
+
+def load_rig_recordings(folder: Path, *, folds: int, seed: int) -> RigRecordings:
+    """Read every recording of a folder that is in the public schema.
+
+    A breath that is there twice counts once. Breaths get new ids, in order.
+
+    Args:
+        folder: folder with ``.csv``, ``.csv.gz`` and ``.parquet`` files.
+        folds: folds of the cross-validation.
+        seed: seed of the folds.
+
+    Raises:
+        InputError: if a recording is malformed, or there are too few measured breaths.
+        OSError: if a file cannot be read.
+    """
+    parts, sources, skipped = [], {}, []
+    for path in sorted(folder.iterdir()):
+        if not path.name.lower().endswith(_SUFFIXES):
+            continue
+        try:
+            part = load(path)
+        except RecordingError as error:
+            if not _other_schema(error):
+                raise
+            skipped.append(path.name)
+            continue
+        parts.append(part)
+        sources[path.name] = {"sha256": part.sha256, "breaths": len(part)}
+    if not parts:
+        raise InputError(
+            f"{folder} holds no recording in the public schema; put CSV or Parquet files with the "
+            "columns id,breath_id,R,C,time_step,u_in,u_out,pressure there"
+        )
+    breaths = join(parts)
+    _, first = np.unique(fingerprints(breaths), return_index=True)
+    breaths = breaths.select(np.sort(first))
+    blank = breaths.valid & ~np.isfinite(breaths.pressure)
+    whole = ~blank.any(axis=1)
+    usable = (breaths.inspiratory & np.isfinite(breaths.pressure))[:, 1:].any(axis=1)
+    order = np.concatenate([np.flatnonzero(whole & usable), np.flatnonzero(~whole & usable)])
+    breaths = breaths.select(order)
+    breaths = replace(breaths, breath_id=np.arange(1, len(order) + 1))
+    count = int(np.count_nonzero(whole & usable))
+    if count < 2 * folds:
+        raise InputError(
+            f"{folder} holds {count} breaths without a blank pressure; {2 * folds} or more "
+            f"are needed, two for each of {folds} folds"
+        )
+    measured = breaths.select(np.arange(count))
+    fold = assign_folds(measured, count=folds, seed=seed)
+    labels = tuple(sorted({lung(name) for name in breaths.lung_ids.tolist()}))
+    return RigRecordings(breaths, count, fold, labels, sources, tuple(skipped))
+
+
+def _other_schema(error: RecordingError) -> bool:
+    """Whether a file has another header, which is no mistake in a folder of mixed files."""
+    return "column" in str(error).lower() and "missing" in str(error).lower()
+
+
+#: Samples of an inspiration that are used; the longest in the recordings has 32.
+SAMPLES = 33
+
+
+@flax.struct.dataclass
+class InspirationData:
+    """n inspirations of S samples, float64; samples after the inspiration do not count.
+
+    Attributes:
+        groups: setting, kind of rig and session.
+        start: first pressure, cmH2O, ``(n,)``; 0 where unknown.
+        start_known: whether it was measured, ``(n,)``.
+        u_in: commands, %, ``(n, S - 1)``.
+        dt: time for which each command is held, s, ``(n, S - 1)``.
+        pressure: pressure at the end of each command, cmH2O, ``(n, S - 1)``; 0 where it has
+            no weight.
+        share: weight of each pressure in the mean of its breath, ``(n, S - 1)``; the weights
+            of a breath add up to one.
+    """
+
+    groups: Groups
+    start: Array
+    start_known: Array
+    u_in: Array
+    dt: Array
+    pressure: Array
+    share: Array
+
+
+def groups_of(breaths: Breaths, sessions: Sessions, labels: Sequence[Lung]) -> Groups:
+    """Setting, kind of rig and session of each breath; settings are numbered as in ``labels``.
+
+    Raises:
+        InputError: a lung was never recorded.
+    """
+    session = sessions.assign(breaths)
+    ids = [lung.id for lung in labels]
+    lung = np.array([ids.index(name) for name in breaths.lung_ids.tolist()], np.int64)
+    return Groups(jnp.asarray(lung), jnp.asarray(sessions.rigs()[session]), jnp.asarray(session))
+
+
+def groups_of_sessions(sessions: Sessions, labels: Sequence[Lung]) -> Groups:
+    """Groups of one breath of each session, to build the sessions' plants."""
+    ids = [lung.id for lung in labels]
+    lung = np.array([ids.index(session.lung) for session in sessions.table])
+    index = np.arange(len(sessions))
+    return Groups(jnp.asarray(lung), jnp.asarray(sessions.rigs()), jnp.asarray(index))
+
+
+def inspirations(
+    breaths: Breaths,
+    sessions: Sessions,
+    labels: Sequence[Lung],
+    samples: int = SAMPLES,
+) -> InspirationData:
+    """Arrange breaths for the fit; the pressure of each inspiratory sample but the first counts.
+
+    Args:
+        breaths: n breaths.
+        sessions: sessions by whose sampling times breaths belong together.
+        labels: the settings, as they are numbered.
+        samples: samples of an inspiration that are used.
+
+    Raises:
+        InputError: as :func:`groups_of`, or a breath has no pressure to learn from, or too few
+            samples.
+    """
+    if breaths.pressure.shape[1] < 2:
+        raise InputError("breaths of one sample hold nothing to learn")
+    counted = breaths.inspiratory & np.isfinite(breaths.pressure)
+    counted[:, 0] = False
+    counted = _first(counted, False, samples)[:, 1:]
+    total = counted.sum(axis=1, keepdims=True)
+    if not total.all():
+        number = int(np.flatnonzero(total == 0)[0])
+        raise InputError(f"breath {breaths.breath_id[number]} has no inspiratory pressure to fit")
+    start = breaths.pressure[:, 0]
+    pressure = _first(breaths.pressure, np.nan, samples)[:, 1:]
+    arrays = {
+        "start": np.nan_to_num(start),
+        "start_known": np.isfinite(start) * 1.0,
+        "u_in": _first(breaths.u_in, 0.0, samples)[:, :-1],
+        "dt": _first(breaths.dt, 0.03, samples)[:, :-1],
+        "pressure": np.where(counted, pressure, 0.0),
+        "share": counted / total,
+    }
+    return InspirationData(
+        groups_of(breaths, sessions, labels),
+        **{name: jnp.asarray(value, float) for name, value in arrays.items()},
+    )
+
+
+@flax.struct.dataclass
+class WholeBreaths:
+    """n measured breaths of T samples, float64; pressure 0 where none is known.
+
+    Attributes:
+        groups: setting, kind of rig and session.
+        pressure: cmH2O, shape ``(n, T)``.
+        u_in: inspiratory valve, %, shape ``(n, T)``.
+        u_out: expiratory valve, 0/1, shape ``(n, T)``.
+        dt: time for which each command is held, s, shape ``(n, T)``.
+        share: weight of each sample in the error of its breath, shape ``(n, T)``: the inspiration
+            adds up to one, and so does the expiration; all 0 for a breath that cannot be used.
+    """
+
+    groups: Groups
+    pressure: Array
+    u_in: Array
+    u_out: Array
+    dt: Array
+    share: Array
+
+
+def whole_breaths(breaths: Breaths, sessions: Sessions, labels: Sequence[Lung]) -> WholeBreaths:
+    """Arrange whole breaths; a breath without a first pressure or an expiration has no weight."""
+    known = breaths.valid & np.isfinite(breaths.pressure)
+    opened = known & (breaths.u_out == 1)
+    usable = known[:, :1] & opened.any(axis=1, keepdims=True)
+    share = np.zeros(known.shape)
+    for part in (opened, known & (breaths.u_out == 0)):
+        share += usable * part / np.maximum(part.sum(axis=1, keepdims=True), 1)
+    arrays = (np.nan_to_num(breaths.pressure), breaths.u_in, breaths.u_out, breaths.dt, share)
+    return WholeBreaths(
+        groups_of(breaths, sessions, labels), *(jnp.asarray(array, float) for array in arrays)
+    )
+
+
+def _first(values: NDArray, fill: float, samples: int) -> NDArray:
+    """The first samples, padded to ``samples``."""
+    missing = max(0, samples - values.shape[1])
+    padded = np.pad(values, ((0, 0), (0, missing)), constant_values=fill)
+    return padded[:, :samples]

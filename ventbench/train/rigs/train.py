@@ -1,0 +1,537 @@
+"""Simulators of rigs: from any folder of recordings to the files of a version, resumably.
+
+Fits: one to all breaths, the scored one; one without each fold of the measured breaths; a few to
+resampled breaths, for the intervals of R and C; and one without some rigs of every lung, so that
+each rig is held out once. The last are made twice: then nothing is learned from the session
+of each lung that fits its label worst, so that it cannot make the others look wrong.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from ventbench import open_loop_report
+from ventbench.base import files, precision
+from ventbench.base.errors import InputError
+from ventbench.base.resume import Format, WorkFolder
+from ventbench.plants import frozen, sessions
+from ventbench.plants.frozen import BY_ALL, seen
+from ventbench.plants.hybrid import Hybrid
+from ventbench.plants.plant_files import save_plant
+from ventbench.plants.sessions import Sessions
+from ventbench.recordings import Breaths
+from ventbench.task.lungs import LUNG_IDS, Lung, lung
+from ventbench.task.metrics.open_loop import WIDE_OPEN, command_counts
+from ventbench.train.rigs.data import (
+    SAMPLES,
+    InspirationData,
+    RigRecordings,
+    WholeBreaths,
+    groups_of,
+    groups_of_sessions,
+    inspirations,
+    load_rig_recordings,
+    whole_breaths,
+)
+from ventbench.train.rigs.fit import FitConfig, Fitted, Noise, fit, fit_expiration
+from ventbench.train.rigs.label_test import LabelTest, label_errors, label_tests
+from ventbench.train.rigs.parameters import (
+    LAMINAR_SHARE,
+    SHEET_FLOW,
+    Centre,
+    Pooled,
+    Scales,
+    centre,
+    full_flow,
+    plants,
+)
+
+#: Called with what is being done and the share of all that is done, 0..1.
+Progress = Callable[[str, float], None]
+
+#: Version of the recipe, written into the manifest.
+VERSION = 2
+
+#: Packages that have a part in the numbers.
+PACKAGES = ("flax", "jax", "jaxlib", "numpy", "optax")
+
+#: Rigs that must have passed before one of them is held out.
+HELD_OUT_FROM = 3
+
+#: Standard deviation between members of the logarithm of the valve's slope where it is hardly
+#: recorded: from what the recordings say at 100 % it reaches to the data sheet.
+UNRECORDED_SLOPE = 0.4
+
+# Iterations of a fit that starts at the fit to all breaths.
+_RESAMPLED_ITERATIONS = 100
+
+
+@dataclass(frozen=True)
+class RigConfig:
+    """Settings of the training.
+
+    Attributes:
+        folds: folds of the cross-validation, and members of the ensemble beside the scored one.
+        resamples: fits to resampled breaths, for intervals.
+        reconstructed: weight of a breath whose pressure is partly blank; a measured one has 1.
+        unlisted: weight of a breath of a lung that is not listed.
+        seed: seed of folds, drawn priors and resampling.
+        laminar_share: part of the labelled resistance that does not depend on the flow, around
+            which the prior of the resistances lies: 0.4 as in a QuickLung, 1 for a linear resistor.
+        fit: settings of the optimisation.
+    """
+
+    folds: int = 5
+    resamples: int = 3
+    reconstructed: float = 0.4
+    unlisted: float = 0.2
+    seed: int = 0
+    laminar_share: float = LAMINAR_SHARE
+    fit: FitConfig = field(default_factory=FitConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse a share that is none.
+
+        Raises:
+            InputError: naming it.
+        """
+        if not 0.0 <= self.laminar_share <= 1.0:
+            raise InputError(f"laminar share {self.laminar_share:g} is outside 0..1")
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Recordings arranged once, so that all fits share one compilation."""
+
+    data: RigRecordings
+    listed: tuple[str, ...]
+    table: Sessions
+    inspirations: InspirationData
+    whole: WholeBreaths
+    weight: NDArray[np.float64]
+    centre: Centre
+    scales: Scales
+    noise: Noise
+
+    @property
+    def session(self) -> NDArray[np.int64]:
+        return np.asarray(self.inspirations.groups.session)
+
+    @property
+    def rounds(self) -> list[list[int]]:
+        """Sessions to leave out together: one of each listed lung, and all in the end.
+
+        Lungs that are not listed may lose more than one, so that they cost no round of their own.
+        """
+        by_lung = {
+            label.id: [i for i, row in enumerate(self.table.table) if row.lung == label.id]
+            for label in self.data.labels
+        }
+        several = [own for own in by_lung.values() if len(own) > 1]
+        listed = [len(by_lung[name]) for name in self.listed if len(by_lung[name]) > 1]
+        count = max(listed, default=0)
+        return [[i for own in several for i in own[turn::count]] for turn in range(count)]
+
+
+def train_rigs(
+    folder: Path | str,
+    out: Path | str = "runs/simulators",
+    *,
+    lungs: Sequence[str] | None = None,
+    config: RigConfig | None = None,
+    progress: Progress | None = None,
+) -> frozen.Frozen:
+    """Learn simulators from any folder of recordings in the public schema.
+
+    The result is a folder that every ``--plant`` takes. Finished fits are kept in ``out/parts``
+    until all is done, so that an interrupted training goes on. On one machine with the same
+    packages the files are the same byte for byte.
+
+    Example::
+
+        simulators = ventbench.train_rigs("my-recordings", "runs/my-rig")
+        ventbench.tune_pid(simulator="runs/my-rig")
+
+    Args:
+        folder: folder of recordings; any labels R and C.
+        out: folder for the files; existing ones are replaced at the end.
+        lungs: ids of the lungs to be listed; others only help to learn what all share. By default
+            every lung that was recorded.
+        config: settings of the training.
+        progress: see :data:`Progress`.
+
+    Returns:
+        The simulators, read back.
+
+    Raises:
+        InputError: if a recording is malformed, there are too few breaths, or ``out`` holds parts
+            of another training.
+        OSError: if a file cannot be read or written.
+    """
+    folder, out = Path(folder), Path(out)
+    config, report = config or RigConfig(), progress or (lambda what, share: None)
+    report("reading the recordings", 0.0)
+    data = load_rig_recordings(folder, folds=config.folds, seed=config.seed)
+    listed = _listed(data, lungs)
+    # Clocks alone tell sessions apart; no pressure is looked at.
+    table = sessions.find(data.breaths)
+    scales, noise = Scales(), Noise()
+    about = _provenance(data, listed, config, scales, noise)
+    parts = WorkFolder(out / "parts", about)
+    with precision.float32():  # enough for a fit to noisy recordings, and twice as fast
+        problem = _arrange(data, table, listed, config, scales, noise)
+        fits = _fits(problem, config, parts, report)
+        manifest, members = _assess(problem, listed, fits, out)
+    _write(out, about | manifest, members, data)
+    parts.delete()
+    report("done", 1.0)
+    return frozen.load(path=out)
+
+
+def _listed(data: RigRecordings, lungs: Sequence[str] | None) -> tuple[str, ...]:
+    recorded = tuple(label.id for label in data.labels)
+    missing = [name for name in lungs or () if lung(name).id not in recorded]
+    if missing:
+        raise InputError(f"lung {missing[0]} was not recorded; recorded are {', '.join(recorded)}")
+    # Six lungs of the protocol first, in the order of every table.
+    wanted = recorded if lungs is None else tuple(lung(name).id for name in lungs)
+    return (
+        *(name for name in LUNG_IDS if name in wanted),
+        *(name for name in wanted if name not in LUNG_IDS),
+    )
+
+
+def _arrange(
+    data: RigRecordings, table: Sessions, listed: tuple[str, ...], config: RigConfig,
+    scales: Scales, noise: Noise,
+) -> _Problem:  # fmt: skip
+    weight = np.where(np.arange(len(data.breaths)) < data.measured, 1.0, config.reconstructed)
+    weight = weight * np.where(np.isin(data.breaths.lung_ids, listed), 1.0, config.unlisted)
+    longest = int(np.count_nonzero(data.breaths.inspiratory, axis=1).max())
+    samples = max(SAMPLES, longest + 1)
+    return _Problem(
+        data,
+        listed,
+        table,
+        inspirations(data.breaths, table, data.labels, samples),
+        whole_breaths(data.measured_breaths, table, data.labels),
+        weight,
+        centre(data.labels, len(table), config.laminar_share),
+        scales,
+        noise,
+    )
+
+
+@dataclass(frozen=True)
+class _Fits:
+    """All fits of a training.
+
+    Attributes:
+        scored: fit to all breaths.
+        members: fits without each fold.
+        resampled: fits to resampled breaths.
+        without_rigs: fits without the sessions of each round.
+        tests: tests of the labels of all sessions.
+    """
+
+    scored: Fitted
+    members: list[Fitted]
+    resampled: list[Fitted]
+    without_rigs: list[Fitted]
+    tests: list[LabelTest]
+
+
+def _fits(problem: _Problem, config: RigConfig, parts: WorkFolder, report: Progress) -> _Fits:
+    rng = np.random.default_rng(config.seed)
+    m, n = problem.data.measured, len(problem.weight)
+    template = Fitted(
+        problem.centre.pooled, jnp.zeros(n), jnp.zeros(n), jnp.zeros(len(problem.table))
+    )
+    stored = _fitted_format(template)
+    total = 1.0 + config.folds + 2.0 * len(problem.rounds) + 0.5 * config.resamples
+    done = 0.0
+
+    def run(
+        name: str, what: str, weight: NDArray[np.float64], *, expiration: bool = False,
+        start: Fitted | None = None,
+    ) -> Fitted:  # fmt: skip
+        nonlocal done
+        cost = 0.5 if start is not None else 1.0
+
+        def compute() -> Fitted:
+            settings = config.fit
+            if start is not None:
+                shorter = min(config.fit.iterations, _RESAMPLED_ITERATIONS)
+                settings = dataclasses.replace(config.fit, iterations=shorter)
+            fitted, _ = fit(
+                problem.inspirations, jnp.asarray(weight), problem.centre, problem.scales,
+                problem.noise, settings, start,
+                lambda share: report(what, 0.95 * (done + cost * share) / total),
+            )  # fmt: skip
+            if expiration:
+                pooled = fit_expiration(fitted.pooled, problem.whole, jnp.asarray(weight[:m]))
+                fitted = dataclasses.replace(fitted, pooled=pooled)
+            return fitted
+
+        report(what, 0.95 * done / total)
+        result = parts.get(name, compute, stored)
+        done += cost
+        return result
+
+    scored = run("all", "all breaths", problem.weight, expiration=True)
+    members = []
+    for fold in range(config.folds):
+        weight = problem.weight.copy()
+        weight[:m][problem.data.fold == fold] = 0.0
+        members.append(run(f"member-{fold}", f"member {fold + 1}", weight, expiration=True))
+    resampled = []
+    for turn in range(config.resamples):
+        weight = problem.weight * rng.exponential(size=n)
+        what = f"resampled breaths, {turn + 1}"
+        resampled.append(run(f"resample-{turn}", what, weight, start=scored))
+
+    def without_rigs(name: str, doubtful: Sequence[int]) -> list[Fitted]:
+        out = []
+        for turn, left_out in enumerate(problem.rounds):
+            silent = np.isin(problem.session, [*left_out, *doubtful])
+            weight = np.where(silent, 0.0, problem.weight)
+            out.append(run(f"{name}-{turn}", f"rigs held out, {name} {turn + 1}", weight))
+        return out
+
+    first = without_rigs("rigs", [])
+    doubtful = _worst(_label_tests(problem, scored, resampled, first))
+    second = without_rigs("again", doubtful) if doubtful else first
+    tests = _label_tests(problem, scored, resampled, second)
+    return _Fits(scored, members, resampled, second, tests)
+
+
+def _worst(tests: Sequence[LabelTest]) -> list[int]:
+    """Of each lung the session that failed with the largest error under its own label."""
+    failed: dict[str, LabelTest] = {}
+    for test in tests:
+        known = failed.get(test.lung.id)
+        if test.reasons and (known is None or test.error_own_label > known.error_own_label):
+            failed[test.lung.id] = test
+    return sorted(test.session for test in failed.values())
+
+
+def _label_tests(
+    problem: _Problem, scored: Fitted, resampled: Sequence[Fitted], without_rigs: Sequence[Fitted]
+) -> list[LabelTest]:
+    data, table = problem.data, problem.table
+    errors: dict[int, Sequence[float]] = {}
+    for left_out, part in zip(problem.rounds, without_rigs, strict=True):
+        errors |= label_errors(
+            part.pooled, left_out, problem.inspirations, data.labels, problem.scales
+        )
+    alone = [index for index in range(len(table)) if index not in errors]
+    if alone:  # the only session of its lung cannot be left out
+        errors |= label_errors(
+            scored.pooled, alone, problem.inspirations, data.labels, problem.scales
+        )
+    counts = [
+        np.bincount(part, minlength=len(table))
+        for part in (problem.session[: data.measured], problem.session)
+    ]
+    return label_tests(
+        scored.pooled, [part.pooled for part in resampled], errors, table, data.labels,
+        (counts[0], counts[1]), groups_of_sessions(table, data.labels),
+    )  # fmt: skip
+
+
+def _widened(pooled: Pooled, member: int, count: int) -> Pooled:
+    """Spread the members where the valve is hardly recorded: its last slope, above 70 %.
+
+    Member k of the folds gets the quantile of rank k + 1/2 of a normal distribution of logarithms.
+    """
+    shift = UNRECORDED_SLOPE * float(ndtri((member + 0.5) / count))
+    return dataclasses.replace(pooled, slopes=pooled.slopes.at[-1].add(shift))
+
+
+def _fitted_format(template: Fitted) -> Format:
+    """Arrays of a fit in the order of its leaves, which the settings determine."""
+    structure = jax.tree.structure(template)
+
+    def write(path: Path, fitted: Fitted) -> None:
+        arrays = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(fitted))}
+        files.write_atomically(path, lambda file: np.savez(file, **arrays))  # pyright: ignore[reportArgumentType]
+
+    def read(path: Path) -> Fitted:
+        with np.load(path, allow_pickle=False) as arrays:
+            leaves = [jnp.asarray(arrays[f"leaf{i}"]) for i in range(structure.num_leaves)]
+        return jax.tree.unflatten(structure, leaves)
+
+    return Format(".npz", write, read)
+
+
+def _assess(
+    problem: _Problem, listed: tuple[str, ...], fits: _Fits, out: Path
+) -> tuple[dict[str, Any], Hybrid]:
+    """Choice of rigs and held-out errors; and the plants of all members."""
+    data, table, tests = problem.data, problem.table, fits.tests
+    of_sessions = groups_of_sessions(table, data.labels)
+    pooled = [fits.scored.pooled] + [
+        _widened(part.pooled, k, len(fits.members)) for k, part in enumerate(fits.members)
+    ]
+    members = jax.tree.map(
+        lambda *leaves: np.stack([np.asarray(leaf, np.float64) for leaf in leaves]),
+        *(plants(part, of_sessions) for part in pooled),
+    )
+    of_measured = problem.session[: data.measured]
+    rigs = {name: choose_rigs([t for t in tests if t.lung.id == name], table) for name in listed}
+
+    measured = data.measured_breaths
+    known = seen(data.breaths, _seen_by(data))
+    simulators = frozen.Frozen(out, {}, "", table, members, known)
+    own = open_loop_report.errors(simulators.cross_fitted, measured)
+    unseen = np.full(data.measured, np.nan)
+    for left_out, part in zip(problem.rounds, fits.without_rigs, strict=True):
+        shared = partial(_shared_plants, part.pooled, table, data.labels)
+        which = np.isin(of_measured, left_out)
+        unseen[which] = open_loop_report.errors(shared, measured)[which]
+    lungs = {}
+    for name in listed:
+        index = measured.by_lung_index.get(name, np.empty(0, np.int64))
+        scored = index[np.isin(of_measured[index], rigs[name]["rigs"])]
+        reference = index[of_measured[index] == rigs[name]["session"]]
+        lungs[name] = {
+            "R": lung(name).R,
+            "C": lung(name).C,
+            **rigs[name],
+            **_figures("own_rig_", own[scored]),
+            **_figures("reference_rig_", own[reference]),
+            **_figures("unseen_rig_", unseen[scored]),
+            **_figures("held_out_", own[index]),
+            "recorded_commands": _recorded_commands(problem, rigs[name]["rigs"]),
+        }
+    return {
+        "lungs": lungs,
+        "valve": _valve(problem, pooled, fits),
+        "label_tests": [test.as_dict() for test in tests],
+        "sessions": table.to_list(),
+    }, members
+
+
+def _seen_by(data: RigRecordings) -> NDArray[np.int64]:
+    """Member that has not seen each breath; the members of the folds follow the scored one."""
+    rest = len(data.breaths) - data.measured
+    return np.append(data.fold + 1, np.full(rest, BY_ALL))
+
+
+def _shared_plants(
+    pooled: Pooled, table: Sessions, labels: Sequence[Lung], breaths: Breaths
+) -> Hybrid:
+    wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), pooled)
+    return plants(wide, groups_of(breaths, table, labels))
+
+
+def choose_rigs(tests: Sequence[LabelTest], table: Sessions) -> dict[str, Any]:
+    """Choose the rigs of one lung: those that passed, the reference first, and the held-out one.
+
+    The reference has the most measured breaths. Held out is one on another kind of ventilator if
+    there is such, with as many measured breaths as possible. If no session passed, the one with the
+    most measured breaths stands for the lung, and ``label_test`` says so.
+
+    Args:
+        tests: tests of all its sessions.
+        table: the sessions.
+    """
+
+    def recorded(test: LabelTest) -> tuple[int, int, int]:
+        return -test.measured, -test.breaths, test.session
+
+    passed = sorted((test for test in tests if not test.reasons), key=recorded)
+    chosen = passed or sorted(tests, key=recorded)[:1]
+    reference, rest = chosen[0], chosen[1:]
+    out: dict[str, Any] = {
+        "session": reference.session,
+        "rigs": [reference.session, *sorted(test.session for test in rest)],
+        "label_test": "passed" if passed else "no session passed",
+    }
+    if len(chosen) >= HELD_OUT_FROM:
+        kind = table.table[reference.session].rig
+        apart = min(rest, key=lambda t: (table.table[t.session].rig == kind, *recorded(t)))
+        out["held_out_rig"] = apart.session
+    return out
+
+
+def _recorded_commands(problem: _Problem, rigs: Sequence[int]) -> list[int]:
+    """Number of commands in each range whose effect was recorded on some rigs."""
+    counted = np.asarray(problem.inspirations.share) > 0
+    counted = counted & np.isin(problem.session, rigs)[:, None]
+    return command_counts(np.asarray(problem.inspirations.u_in)[counted]).tolist()
+
+
+def _figures(prefix: str, error: NDArray[np.float64]) -> dict[str, Any]:
+    """Summary to 1e-6 cmH2O, empty where there is no breath, as TOML knows no null."""
+    summary = open_loop_report.summary(prefix, error)
+    if not summary[f"{prefix}breaths"]:
+        return {}
+    return jax.tree.map(lambda x: round(x, 6) if isinstance(x, float) else x, summary)
+
+
+def _valve(problem: _Problem, members: Sequence[Pooled], fits: _Fits) -> dict[str, Any]:
+    """What the recordings say about the valve where it is wide open."""
+    counted = np.asarray(problem.inspirations.share) > 0
+    high = np.asarray(problem.inspirations.u_in) >= WIDE_OPEN
+    measured = np.arange(len(counted)) < problem.data.measured
+    flows = [round(float(np.exp(full_flow(part))), 3) for part in members]
+    again = [round(float(np.exp(full_flow(part.pooled))), 3) for part in fits.resampled]
+    return {
+        "wide_open_from": WIDE_OPEN,
+        "samples": int(counted.sum()),
+        "samples_above": int((counted & high).sum()),
+        "measured_samples_above": int((counted & high)[measured].sum()),
+        "data_sheet_flow": SHEET_FLOW,
+        "flow_at_100": flows[0],
+        "flow_at_100_members": flows[1:],
+        "flow_at_100_resampled": again,
+    }
+
+
+def _provenance(
+    data: RigRecordings, listed: tuple[str, ...], config: RigConfig, scales: Scales, noise: Noise
+) -> dict[str, Any]:
+    settings = dataclasses.asdict(config)
+    if config.laminar_share == LAMINAR_SHARE:
+        # Not told, so that the public recordings give the official manifest again to the byte.
+        del settings["laminar_share"]
+    return {
+        "format": frozen.FORMAT,
+        "version": VERSION,
+        "kind": "hybrid",
+        "packages": {name: metadata.version(name) for name in PACKAGES},
+        "recordings": data.sources,
+        "skipped": list(data.skipped),
+        "listed": list(listed),
+        "split": {"by": "breath", "seed": config.seed, "folds": config.folds},
+        "recipe": {
+            "rigs": settings,
+            "scales": dataclasses.asdict(scales),
+            "noise": dataclasses.asdict(noise),
+        },
+    }
+
+
+def _write(out: Path, manifest: dict[str, Any], members: Hybrid, data: RigRecordings) -> None:
+    known = seen(data.breaths, _seen_by(data))
+    save_plant(out / frozen.MEMBERS, members)
+    files.write_atomically(
+        out / frozen.SEEN, lambda file: np.savez(file, key=known.key, fold=known.fold)
+    )
+    names = (frozen.MEMBERS, frozen.SEEN)
+    hashes = {"files": {name: {"sha256": files.sha256(out / name)} for name in names}}
+    files.write_text(out / frozen.MANIFEST, tomli_w.dumps(manifest | hashes))

@@ -1,0 +1,173 @@
+"""PPO: proximal policy optimisation of a Gaussian correction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+
+from ventbench.controllers import rl_policy
+from ventbench.controllers.rl_policy import (
+    SCALE,
+    GaussianPolicy,
+    TanhNetwork,
+)
+from ventbench.task import protocol
+from ventbench.train.rl import episodes
+
+
+@flax.struct.dataclass
+class PPOState:
+    """One training: parameters of both networks and the spread, optimiser, key, iteration."""
+
+    parameters: dict[str, Any]
+    optimiser: Any
+    key: Array
+    iteration: Array
+
+
+@flax.struct.dataclass
+class PPOBatch:
+    """Steps of breaths; ``features`` ``(N, features)``, all others ``(N,)``."""
+
+    features: Array
+    action: Array
+    log_probability: Array
+    advantage: Array
+    value: Array
+
+
+def log_probability(action: Array, mean: Array, log_spread: Array) -> Array:
+    """Logarithm of a Gaussian density, up to a constant."""
+    return -0.5 * ((action - mean) / jnp.exp(log_spread)) ** 2 - log_spread
+
+
+def clipped_loss(ratio: Array, advantage: Array, clip: float) -> Array:
+    """PPO's loss of each step: no gain from going further than ``clip`` from the old policy."""
+    limited = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
+    return -jnp.minimum(ratio * advantage, limited * advantage)
+
+
+@dataclass(frozen=True)
+class PPO:
+    """Settings; one iteration is one batch of breaths, used ``epochs`` times.
+
+    Attributes:
+        breaths: breaths of an iteration, three an episode.
+        iterations: iterations of a training, over which the learning rate falls to zero.
+        learning_rate: initial learning rate of Adam.
+        vary: draw cells with noise and deviations; false for nominal ones.
+        widths: hidden layers of both networks.
+        epochs: passes over a batch.
+        minibatches: minibatches of a pass.
+        discount: factor of a reward one step later.
+        trace: lambda of the generalised advantage estimates.
+        clip: limit of the change of the ratio of probabilities.
+        spread: initial standard deviation of the policy, in units of ``SCALE``.
+        entropy: weight of the entropy in the loss.
+    """
+
+    breaths: int = 96
+    iterations: int = 600
+    learning_rate: float = 1e-3
+    vary: bool = True
+    widths: tuple[int, ...] = (32, 32)
+    epochs: int = 6
+    minibatches: int = 4
+    discount: float = 0.95
+    trace: float = 0.9
+    clip: float = 0.2
+    spread: float = 0.3
+    entropy: float = 0.0
+
+    @property
+    def network(self) -> TanhNetwork:
+        """Network of the policy's mean."""
+        return TanhNetwork(self.widths, 1)
+
+    @property
+    def _critic(self) -> TanhNetwork:
+        return TanhNetwork(self.widths, 1, first=1.0)
+
+    @property
+    def _optimiser(self) -> optax.GradientTransformation:
+        updates = self.iterations * self.epochs * self.minibatches
+        schedule = optax.linear_schedule(self.learning_rate, 0.0, updates)
+        return optax.chain(optax.clip_by_global_norm(0.5), optax.adam(schedule, eps=1e-5))
+
+    def init(self, key: Array) -> PPOState:
+        """Return the state at the start of a training."""
+        actor_key, critic_key, key = jax.random.split(key, 3)
+        parameters = {
+            "actor": rl_policy.init_parameters(self.network, actor_key),
+            "critic": rl_policy.init_parameters(self._critic, critic_key),
+            "log_spread": jnp.log(jnp.asarray(self.spread)),
+        }
+        return PPOState(parameters, self._optimiser.init(parameters), key, jnp.zeros((), jnp.int32))
+
+    def iterate(self, state: PPOState, plants: episodes.Lungs) -> PPOState:
+        """Collect breaths on lungs and learn from them."""
+        collect_key, learn_key, key = jax.random.split(state.key, 3)
+        batch = self._collect(state, plants, collect_key)
+
+        def epoch(carry: Any, key: Array) -> tuple[Any, None]:
+            order = jax.random.permutation(key, batch.action.size)
+            parts = jax.tree.map(
+                lambda x: x[order].reshape(self.minibatches, -1, *x.shape[1:]), batch
+            )
+            return jax.lax.scan(self._update, carry, parts)
+
+        keys = jax.random.split(learn_key, self.epochs)
+        (parameters, optimiser), _ = jax.lax.scan(epoch, (state.parameters, state.optimiser), keys)
+        return PPOState(parameters, optimiser, key, state.iteration + 1)
+
+    def policy(self, state: PPOState) -> GaussianPolicy:
+        """The learned policy: its mean."""
+        return GaussianPolicy(state.parameters["actor"], self.network)
+
+    def _mean(self, parameters: Any, x: Array) -> Array:
+        return self.network.apply(parameters["actor"], x)[..., 0]  # type: ignore[index]
+
+    def _value(self, parameters: Any, x: Array) -> Array:
+        return self._critic.apply(parameters["critic"], x)[..., 0]  # type: ignore[index]
+
+    def _collect(self, state: PPOState, plants: episodes.Lungs, key: Array) -> PPOBatch:
+        parameters = state.parameters
+        cells_key, roll_key = jax.random.split(key)
+        count = self.breaths // protocol.BREATHS
+        first = state.iteration * max(count // plants.count, 1)
+        drawn = episodes.draw(cells_key, plants, count, first, self.vary)
+
+        def act(key: Array, x: Array, base: Array) -> tuple[Array, tuple[Array, Array]]:
+            mean = self._mean(parameters, x)
+            log_spread = parameters["log_spread"]
+            action = mean + jnp.exp(log_spread) * jax.random.normal(key, mean.shape)
+            return base + SCALE * action, (action, log_probability(action, mean, log_spread))
+
+        x, (action, before), rewards = episodes.roll(drawn, act, roll_key)
+        value = self._value(parameters, x)
+        advantage = episodes.advantages(rewards, value, self.discount, self.trace)
+        batch = PPOBatch(x, action, before, advantage, value)
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
+
+    def _update(self, carry: Any, part: PPOBatch) -> tuple[Any, None]:
+        parameters, optimiser = carry
+        gradient = jax.grad(self._loss)(parameters, part)
+        updates, optimiser = self._optimiser.update(gradient, optimiser, parameters)
+        return (optax.apply_updates(parameters, updates), optimiser), None
+
+    def _loss(self, parameters: Any, part: PPOBatch) -> Array:
+        log_spread = parameters["log_spread"]
+        now = log_probability(part.action, self._mean(parameters, part.features), log_spread)
+        advantage = part.advantage - jnp.mean(part.advantage)
+        advantage = advantage / (jnp.std(advantage) + 1e-6)
+        ratio = jnp.exp(now - part.log_probability)
+        policy = jnp.mean(clipped_loss(ratio, advantage, self.clip))
+        wanted = part.value + part.advantage
+        critic = jnp.mean((self._value(parameters, part.features) - wanted) ** 2)
+        return policy + 0.5 * critic - self.entropy * log_spread

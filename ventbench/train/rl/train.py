@@ -1,0 +1,454 @@
+"""Networks for the lungs by PPO or DQN: settings, trainings of several seeds, weights, a report.
+
+:func:`train` runs several trainings side by side in one compiled step, with their learning curves.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from ventbench.base import files, precision
+from ventbench.base.errors import InputError
+from ventbench.base.resume import Checkpoint, fingerprint
+from ventbench.controllers import rl_policy
+from ventbench.controllers.pid import PID
+from ventbench.plants.catalog import Given
+from ventbench.task import protocol
+from ventbench.task.environment import nominal_scenario
+from ventbench.train.plants import (
+    ALL,
+    TrainedControllers,
+    TrainingPlants,
+    check_names,
+    plants_to_train_on,
+)
+from ventbench.train.rl import episodes
+from ventbench.train.rl.dqn import DQN
+from ventbench.train.rl.policy_gradient import PolicyGradient
+from ventbench.train.rl.ppo import PPO
+
+
+class Learner(Protocol):
+    """Settings of a way of learning: hashable, static in ``jit``; its methods are pure."""
+
+    @property
+    def breaths(self) -> int:
+        """Episodes in an iteration."""
+        ...
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of a training."""
+        ...
+
+    def init(self, key: Array) -> Any:
+        """State at the start."""
+        ...
+
+    def iterate(self, state: Any, plants: episodes.Lungs) -> Any:
+        """State one iteration later."""
+        ...
+
+    def policy(self, state: Any) -> Any:
+        """The policy learned so far, as a pure controller."""
+        ...
+
+
+#: Cells on each lung by which the best policy of a training is chosen, and the seed they come from.
+VALIDATION_CELLS, VALIDATION_SEED = 48, 2021
+
+#: At least this many seconds lie between two checkpoints: what an interruption may cost.
+SAVE_SECONDS = 5.0
+
+#: Called with the share that is done and the lowest error of each run, cmH2O, shape ``(R,)``.
+RunsProgress = Callable[[float, NDArray[np.float32]], None]
+
+
+@flax.struct.dataclass
+class _Run:
+    """One training under way; ``best`` is the policy with the lowest validation error so far."""
+
+    state: Any
+    best: Any
+    error: Array
+
+
+@dataclass(frozen=True)
+class TrainedPolicies:
+    """R finished trainings.
+
+    Attributes:
+        policies: the best of each, leaves ``(R, ...)``.
+        validation: errors of the policies on fresh cells with noise, cmH2O, ``(R,)``.
+        episodes: breaths that a run had seen at each point of its curve, ``(points,)``.
+        curves: nominal error of the policy then, cmH2O, ``(R, points)``.
+        validation_curves: error of the policy on the fresh cells, cmH2O, ``(R, points)``.
+        seconds: computing time of all runs together until each point, without compiling,
+            ``(points,)``.
+        compile_seconds: time of compiling, which comes first, with the chunk that is run for it, s.
+    """
+
+    policies: Any
+    validation: NDArray[np.float32]
+    episodes: NDArray[np.int64]
+    curves: NDArray[np.float32]
+    validation_curves: NDArray[np.float32]
+    seconds: NDArray[np.float64]
+    compile_seconds: float
+
+
+def nominal_error(lungs: episodes.Lungs, policy: Any) -> Array:
+    """Score without noise of a policy on the nominal plants of lungs, cmH2O.
+
+    The mean over lungs and PIPs, without weights.
+    """
+    pips = np.repeat(np.asarray(protocol.PIPS), lungs.count)
+    which = jnp.arange(len(pips)) % lungs.count
+    cells = nominal_scenario(pips)
+    each = jax.tree.map(lambda leaf: jnp.asarray(leaf)[which], lungs.nominal)
+    drawn = episodes.Episodes(each, cells, jnp.ones(len(pips)))
+    return jnp.mean(episodes.errors(drawn, policy))
+
+
+def _fresh_error(lungs: episodes.Lungs, policy: Any) -> Array:
+    """Error on fresh cells, weighted as in the training."""
+    count = VALIDATION_CELLS * lungs.count
+    key = jax.random.key(VALIDATION_SEED)
+    return jnp.mean(episodes.errors(episodes.draw(key, lungs, count), policy))
+
+
+@partial(jax.jit, static_argnames=("method", "count"))
+def _advance(method: Learner, runs: _Run, plants: episodes.Lungs, count: int) -> tuple[_Run, Array]:
+    """``count`` iterations of each run, then both errors, shape ``(R, 2)``."""
+
+    def advance(run: _Run, plant: episodes.Lungs) -> tuple[_Run, Array]:
+        def iterate(state: Any, _: None) -> tuple[Any, None]:
+            return method.iterate(state, plant), None
+
+        state, _ = jax.lax.scan(iterate, run.state, None, length=count)
+        policy = method.policy(state)
+        fresh = _fresh_error(plant, policy)
+        better = fresh < run.error
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), policy, run.best)
+        errors = jnp.stack([nominal_error(plant, policy), fresh])
+        return _Run(state, best, jnp.where(better, fresh, run.error)), errors
+
+    return jax.vmap(advance)(runs, plants)
+
+
+def _start(
+    method: Learner, seeds: Sequence[int], plants: episodes.Lungs
+) -> tuple[_Run, NDArray[np.float32]]:
+    numbers = jnp.asarray(np.asarray(seeds, np.uint32))
+    keys = jax.vmap(jax.random.key)(numbers)
+    states = jax.vmap(method.init)(keys)
+    best = jax.vmap(method.policy)(states)
+    errors = np.asarray(jax.jit(jax.vmap(nominal_error))(plants, best))
+    return _Run(states, best, jnp.full(len(seeds), jnp.inf)), errors
+
+
+def train(
+    method: Learner,
+    plants: episodes.Lungs,
+    seeds: Sequence[int],
+    *,
+    chunk: int,
+    about: str = "",
+    file: Path | None = None,
+    progress: RunsProgress | None = None,
+    save_seconds: float = SAVE_SECONDS,
+) -> TrainedPolicies:
+    """Train R policies side by side.
+
+    Bit-reproducible on one machine: all random numbers come from the seeds, and an interrupted
+    training goes on as if it had not been.
+
+    Args:
+        method: the recipe, common to all.
+        plants: lungs of each run, an axis ``(R, ...)`` in front of all leaves; taken in float32.
+        seeds: one for each run.
+        chunk: iterations between two points of the curves.
+        about: text that tells one training from another, such as the simulators' hash.
+        file: checkpoint that is resumed from and written to; kept at the end.
+        progress: see :data:`RunsProgress`.
+        save_seconds: least time between two checkpoints, s.
+
+    Raises:
+        InputError: if the checkpoint belongs to another training.
+        FloatingPointError: if a policy diverges.
+    """
+    with precision.float32():
+        plants = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), plants)
+        runs, first = _start(method, seeds, plants)
+        points = -(-method.iterations // chunk)
+        curves = np.full((len(seeds), points + 1, 2), np.nan, np.float32)
+        curves[:, 0, 0] = first
+        seconds, compiling = np.zeros(points + 1), np.zeros(())
+        carry: Any = (runs, curves, seconds, compiling)
+        settings = {
+            "method": type(method).__name__,
+            "recipe": asdict(method),  # type: ignore[call-overload]
+            "seeds": list(map(int, seeds)),
+            "chunk": chunk,
+            "about": about,
+            "jax": jax.__version__,
+        }
+        stored = Checkpoint(file, settings)
+        (runs, curves, seconds, compiling), done = stored.restore(carry)
+        began = time.perf_counter()
+        if done < points:  # once for nothing, so that no point's time contains the compiling
+            jax.block_until_ready(_advance(method, runs, plants, chunk))
+        saved = now = time.perf_counter()
+        compiling = compiling + (now - began)
+        while done < points:
+            runs, errors = _advance(method, runs, plants, chunk)
+            done += 1
+            curves[:, done] = np.asarray(errors)
+            before, now = now, time.perf_counter()
+            seconds[done] = seconds[done - 1] + now - before
+            if not np.isfinite(curves[:, done]).all():
+                raise FloatingPointError(f"training diverged before point {done} of {points}")
+            if now - saved > save_seconds or done == points:
+                stored.save((runs, curves, seconds, compiling), done)
+                saved = time.perf_counter()
+            if progress is not None:
+                progress(done / points, np.asarray(runs.error))
+        return TrainedPolicies(
+            policies=jax.tree.map(np.asarray, runs.best),
+            validation=np.asarray(runs.error),
+            episodes=np.arange(points + 1) * chunk * method.breaths,
+            curves=curves[..., 0],
+            validation_curves=curves[..., 1],
+            seconds=seconds,
+            compile_seconds=float(compiling),
+        )
+
+
+#: Names of the methods, as commands and tables have them.
+METHODS = ("policy-gradient", "ppo", "dqn")
+
+#: Iterations between two points of a learning curve.
+CHUNKS = {"policy-gradient": 10, "ppo": 10, "dqn": 50}
+
+Method = PolicyGradient | PPO | DQN
+
+_ONE_LUNG: dict[str, Method] = {"policy-gradient": PolicyGradient(), "ppo": PPO(), "dqn": DQN()}
+_ALL_LUNGS: dict[str, Method] = {
+    "policy-gradient": PolicyGradient(breaths=36),
+    "ppo": PPO(breaths=288, widths=(64, 64)),
+    "dqn": DQN(breaths=72, memory=7200, widths=(128, 128)),
+}
+
+#: Called with what is trained, the share that is done and the best error so far, cmH2O.
+Progress = Callable[[str, float, float], None]
+
+
+def train_ppo(
+    networks: Sequence[str] | None = None,
+    out: Path | str = "runs/ppo",
+    *,
+    seeds: Sequence[int] = (0, 1),
+    steps: int | None = None,
+    method: PPO | None = None,
+    simulator: Given = "frozen",
+    progress: Progress | None = None,
+) -> TrainedControllers:
+    """Train corrections of a PID by proximal policy optimisation.
+
+    Writes ``weights.npz``, as ``submissions/ppo`` reads it, and ``training.json``. Of the trainings
+    of a network the one with the lowest error on freshly drawn cells is kept; the published draws
+    have no part in that choice. An interrupted training continues where it was.
+
+    Example::
+
+        trained = ventbench.train_ppo(["R20C50"], "runs/mine", steps=60_000)
+        trained.report["networks"]["R20C50"]["error_fresh"]  # cmH2O, by seed
+
+    Args:
+        networks: ids of lungs, a network each, or ``"all"`` for one network that serves all; if not
+            given, a network for each lung of the simulators and one for all of several.
+        out: folder; checkpoints lie there until all is done.
+        seeds: seeds of the trainings of each network.
+        steps: control steps of experience of each training; those of the method if not given.
+        method: settings of every training; the published ones, which differ for one lung and for
+            all six, if not given.
+        simulator: simulators with plants, see :func:`ventbench.load_simulators`.
+        progress: see :data:`Progress`.
+
+    Returns:
+        The best policy of each network, float32, and the report.
+
+    Raises:
+        InputError: if a network's name is unknown, ``steps`` do not make one iteration, or ``out``
+            holds an unfinished training with other settings.
+        FloatingPointError: if a training diverges.
+    """
+    return _train("ppo", networks, out, seeds, steps, method, simulator, progress)
+
+
+def train_dqn(
+    networks: Sequence[str] | None = None,
+    out: Path | str = "runs/dqn",
+    *,
+    seeds: Sequence[int] = (0, 1),
+    steps: int | None = None,
+    method: DQN | None = None,
+    simulator: Given = "frozen",
+    progress: Progress | None = None,
+) -> TrainedControllers:
+    """Train a choice among 19 corrections of a PID by deep Q-learning.
+
+    Writes ``weights.npz``, as ``submissions/dqn`` reads it, and ``training.json``. Arguments,
+    the choice of the best seed and errors are those of :func:`train_ppo`.
+
+    Example::
+
+        trained = ventbench.train_dqn(["R20C50"], "runs/mine", steps=60_000)
+        trained.report["networks"]["R20C50"]["error_fresh"]  # cmH2O, by seed
+    """
+    return _train("dqn", networks, out, seeds, steps, method, simulator, progress)
+
+
+def method_for(name: str, lungs: int, steps: int | None = None) -> Method:
+    """Return the published settings of a method.
+
+    Args:
+        name: one of :data:`METHODS`.
+        lungs: on which one network is trained: 1 or 6.
+        steps: control steps of experience; those of the published settings if not given.
+
+    Raises:
+        InputError: if the steps do not make one iteration.
+    """
+    method = (_ONE_LUNG if lungs == 1 else _ALL_LUNGS)[name]
+    return _shortened(method, name, steps)
+
+
+def _shortened(method: Method, name: str, steps: int | None) -> Method:
+    if steps is None:
+        return method
+    iterations = steps // (method.breaths * episodes.STEPS)
+    if iterations < 1:
+        raise InputError(
+            f"{steps} steps are less than one iteration of {name}, "
+            f"{method.breaths} breaths of {episodes.STEPS} steps"
+        )
+    return replace(method, iterations=iterations)
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Networks that are trained side by side: of ``names``, each on ``lungs`` lungs."""
+
+    names: tuple[str, ...]
+    lungs: int
+
+
+def _groups(names: Sequence[str], lungs: int) -> list[_Group]:
+    """Split networks to train into those of one lung and that of all lungs."""
+    single = tuple(name for name in names if name != ALL)
+    groups = [_Group(single, 1)] if single else []
+    return [*groups, _Group((ALL,), lungs)] if ALL in names else groups
+
+
+def _train(
+    name: str, networks: Sequence[str] | None, out: Path | str, seeds: Sequence[int],
+    steps: int | None, method: Method | None, simulator: Given,
+    progress: Progress | None,
+) -> TrainedControllers:  # fmt: skip
+    began = time.perf_counter()
+    trained_on, out = plants_to_train_on(simulator), Path(out)
+    known = list(trained_on.names)
+    names = check_names(networks, trained_on)
+    if networks is None and len(known) > 1:
+        names = (*names, ALL)
+    groups = _groups(names, len(known))
+    methods = [
+        method_for(name, group.lungs, steps) if method is None else _shortened(method, name, steps)
+        for group in groups
+    ]
+    report = progress or (lambda *_: None)
+    policies, about, checkpoints, used = {}, {}, [], {}
+    for group, settings in zip(groups, methods, strict=True):
+        label, kind = ", ".join(group.names), "all" if ALL in group.names else "one"
+        checkpoints.append(out / f".{name}-{kind}.npz")
+        plants = _lungs(trained_on, group, len(seeds))
+        trained = train(
+            settings,
+            plants,
+            [seed for _ in group.names for seed in seeds],
+            chunk=CHUNKS[name],
+            about=f"{group.names} {fingerprint(plants)}",
+            file=checkpoints[-1],
+            progress=lambda share, best, label=label: report(label, share, float(best.mean())),
+        )
+        pids = _pid_errors(plants)
+        used[kind] = asdict(settings)
+        for index, network in enumerate(group.names):
+            about[network], best = _best_run(trained, index, seeds)
+            about[network]["error_pid"] = pids[index * len(seeds)]
+            policies[network] = jax.tree.map(lambda leaf, best=best: leaf[best], trained.policies)
+    result = {
+        "method": name,
+        "recipes": used,
+        "networks": about,
+        "simulators": dict(trained_on.about),
+        "jax": jax.__version__,
+        "seconds": round(time.perf_counter() - began, 1),
+    }
+    rl_policy.save_weights(out / "weights.npz", policies)
+    files.write_json(out / "training.json", result)
+    for checkpoint in checkpoints:
+        checkpoint.unlink(missing_ok=True)
+    return TrainedControllers(policies, result, out)
+
+
+def _lungs(trained_on: TrainingPlants, group: _Group, seeds: int) -> episodes.Lungs:
+    """Lungs of each run, an axis of R in front: the seeds of a network in a row."""
+    known = list(trained_on.names)
+    if ALL in group.names:
+        where = np.repeat([list(range(len(known)))], seeds, axis=0)
+    else:
+        where = np.repeat([[known.index(name)] for name in group.names], seeds, axis=0)
+    plants = jax.tree.map(lambda leaf: np.asarray(leaf)[:, where], trained_on.plants)
+    # (plants, runs, lungs, ...) -> (runs, plants, lungs, ...)
+    plants = jax.tree.map(lambda leaf: np.moveaxis(leaf, 1, 0), plants)
+    return episodes.Lungs(plants, jnp.asarray(trained_on.weights[where]))
+
+
+def _pid_errors(lungs: episodes.Lungs) -> list[float]:
+    """Nominal error of the PID that is corrected, on the lungs of each run, cmH2O."""
+    with precision.float32():
+        lungs = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), lungs)
+        pid = PID(*rl_policy.GAINS)
+        errors = jax.jit(jax.vmap(lambda own: nominal_error(own, pid)))(lungs)
+        return [float(error) for error in errors]
+
+
+def _best_run(
+    trained: TrainedPolicies, network: int, seeds: Sequence[int]
+) -> tuple[dict[str, Any], int]:
+    """Entries of a network in the report, and the index of its best run."""
+    first = network * len(seeds)
+    rows = slice(first, first + len(seeds))
+    best = first + int(np.argmin(trained.validation[rows]))
+    about = {
+        "seed": int(seeds[best - first]),
+        "error_fresh": [float(value) for value in trained.validation[rows]],
+        "error_nominal_at_end": [float(value) for value in trained.curves[rows, -1]],
+        "breaths": int(trained.episodes[-1]),
+        "training_seconds": round(float(trained.seconds[-1]), 1),
+    }
+    return about, best

@@ -1,5 +1,0 @@
-"""Pictures of scored runs: rerun files, an HTML report, a figure (extra ``ventbench[view]``)."""
-
-from ventbench.views.write import open_viewer, write_figure, write_report, write_rerun
-
-__all__ = ["open_viewer", "write_figure", "write_report", "write_rerun"]

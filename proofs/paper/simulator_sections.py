@@ -74,7 +74,8 @@ def measure_horizon(recording: Path) -> dict[str, Any]:
     breaths = load(recording)
     breaths = breaths.select(np.flatnonzero(np.isin(breaths.lung_ids, LUNG_IDS)))
     official = frozen.load()
-    networks = json.loads(files.data_path("paper.json").read_text("utf-8"))["horizon"]["lungs"]
+    stored = json.loads(Path(__file__).with_name("stored.json").read_text("utf-8"))
+    networks = stored["horizon"]["lungs"]
     judged = {
         "hybrid": official.cross_fitted,
         "single_compartment": partial(nominal_plants, single_compartment),

@@ -163,14 +163,14 @@ def test_the_command(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_one_command_gives_all_three_scores(tmp_path: Path) -> None:
     out = tmp_path / "runs"
-    arguments = ["score", "pid_robust", "--protocol", "2", "--in-process", "--out", str(out)]
+    arguments = ["score", "pid_robust", "--stress", "--in-process", "--out", str(out)]
     result = CliRunner().invoke(app, [*arguments, "--json", "-"])
     assert result.exit_code == 0, result.output
     values = json.loads(result.stdout)
     assert values["score"] > 1.0
     assert values["normalised"]["nominal"] > 100.0
     assert values["stress"]["score"] > values["score"]
-    assert values["stress"]["draws"]["count"] == 1
+    assert values["stress"]["draws"]["count"] == 6
     assert json.loads((out / "pid_robust" / "stress.json").read_text()) == values["stress"]
     assert "Normalised score" in result.stderr
     assert "all stressors" in result.stderr

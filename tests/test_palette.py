@@ -98,7 +98,7 @@ def test_board_and_report_take_the_colours_from_here() -> None:
     from ventbench.board import pages
 
     assert palette.css() in str(pages.environment().globals["style"])
-    for room, name in (("board", "board.css"), ("views", "report.css.j2")):
+    for room, name in (("board", "board.css"), ("pages", "report.css.j2")):
         sheet = resources.files(f"ventbench.{room}").joinpath("templates", name).read_text("utf-8")
         assert "--ink:" not in sheet
         assert "--run0:" not in sheet

@@ -31,7 +31,7 @@ def test_a_record_says_where_it_comes_from(drafts, scores) -> None:
         "version": 2, "sha256": seed, "count": 20, "season": "development",
     }  # fmt: skip
     assert content["simulators"]["manifest_sha256"] == "2" * 64
-    root = Path(draw_tables.__file__).parents[1]
+    root = Path(draw_tables.__file__).parents[2]
     assert content["versions"]["requirements.lock"] == files.sha256(root / "requirements.lock")
     assert {"python", "jax", "numpy"} <= content["versions"].keys()
     machine = content["machine"]

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from tests.training.conftest import synthetic
 from typer.testing import CliRunner
 
 from proofs.__main__ import app
 from proofs.studies import controllers, networks
+from tests.train.conftest import synthetic
 from ventbench.base.errors import InputError
 from ventbench.plants.learned import Architecture
 from ventbench.plants.single_compartment import single_compartment

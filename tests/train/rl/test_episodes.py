@@ -108,7 +108,7 @@ def test_rewards_and_errors_are_the_scores(lungs):
     )
     wanted = run_error(run.pressure, np.asarray(protocol.PIPS)[:, None, None])
     np.testing.assert_allclose(errors, wanted, rtol=1e-4)
-    np.testing.assert_allclose(from_rewards, wanted, rtol=1e-3)
+    np.testing.assert_allclose(from_rewards, wanted, rtol=1e-4)
 
 
 @pytest.fixture(scope="module")

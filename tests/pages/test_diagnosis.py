@@ -131,17 +131,26 @@ def test_every_place_is_in_the_picture(place: str) -> None:
 
 @pytest.mark.parametrize("name", library())
 def test_every_mechanism_has_a_page(name: str, tmp_path: Path) -> None:
-    """Its formula as MathML, its own signal without and with it, and its part of the rig."""
+    """Its formula, its own signal without and with it, and its part of the rig."""
     about = library()[name].description
     strength = about.strength
     estimate = Estimate(strength.strong, strength.unit, (strength.mild, strength.high))
     missing = MissingMechanism(name, {strength.name: estimate}, 0.9, (), 20.0)
     shown = dataclasses.replace(made.diagnosis(12), mechanisms=(missing,), plants={})
-    page = Page(write_report(tmp_path / "r.html", shown).read_text())
-    assert any(tag == "math" for tag, _ in page.tags)
-    assert not any(tag == "code" and "^" in str(attrs) for tag, attrs in page.tags)
+    text = write_report(tmp_path / "r.html", shown).read_text()
+    page = Page(text)
+    formula = text.partition('<p class="eq">')[2].partition("</p>")[0]
+    assert "<i>" in formula
+    assert not set("^_*") & set(formula)
     figures = [attrs["aria-label"] for _, attrs in page.tags if attrs.get("role") == "img"]
     assert any(text.endswith(f"without and with {about.title}.") for text in figures)
+
+
+def test_formulas_are_typeset_and_escaped() -> None:
+    squared = "<i>P</i><sub>elastic</sub> ≤ <i>a</i> <i>x</i><sup>2</sup>"
+    assert report.typeset("P_elastic <= a x^2") == squared
+    assert report.typeset("(1 + x)^((m - 1) / 2)") == "(1 + <i>x</i>)<sup>(<i>m</i> − 1) / 2</sup>"
+    assert report.typeset("tau dy/dt > <b>") == "<i>τ</i> <i>dy</i>/<i>dt</i> &gt; &lt;<i>b</i>&gt;"
 
 
 def test_no_nan_reaches_the_page(found: Diagnosis, tmp_path: Path) -> None:

@@ -5,11 +5,12 @@ Its diagram shows the rig and the lung: parts by their place in the physics, the
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 import ventbench
 from ventbench import palette
@@ -23,7 +24,6 @@ from ventbench.diagnosis.findings import (
 )
 from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY
 from ventbench.diagnosis.result import RECORD_NEXT, Diagnosis
-from ventbench.pages import mathml
 from ventbench.pages.diagnosis import charts
 from ventbench.physics import Physics, mechanism
 from ventbench.physics.characteristics import characteristic
@@ -31,6 +31,14 @@ from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 
 #: Places that are told in words; the charts show all.
 PLACES = 6
+
+#: Powers, units, quantities with an index, and signs of the notation of ``Description.equation``.
+_SYMBOL = re.compile(
+    r"\^(?P<power>-?\w+|\((?:[^()]|\([^()]*\))*\))|(?P<unit>L/s2?|cmH2O)"
+    r"|\b(?P<quantity>[A-Za-z][A-Za-z0-9]*(?:'s)?)(?:_(?P<index>[A-Za-z0-9]+))?|(?P<sign>-\+|<=|-|\.{2,3}|.)"
+)
+_SIGNS = {"-": "−", "-+": "∓", "<=": "≤", "..": " to ", "...": "…"}
+_LETTERS = {"tau": "τ", "pi": "π", "sum": "∑"}
 
 
 def html(diagnosis: Diagnosis) -> str:
@@ -167,7 +175,7 @@ def _named(diagnosis: Diagnosis, missing: MissingMechanism) -> dict[str, Any]:
             for key, value in missing.simulator_values.items()
             if key in missing.parameters
         },
-        "equation": [Markup(clause) for clause in mathml.equation(about.equation)],
+        "equation": typeset(about.equation),
         "signature": about.signature,
         "changed": missing.changed,
         "confidence": f"{100 * missing.confidence:.0f} %",
@@ -319,3 +327,28 @@ def description(listed: list[Entry]) -> str:
     """The picture in words."""
     guilty = "; ".join(f"{entry.part}: {entry.title}" for entry in listed if entry.part)
     return f"Ventilator, circuit and lung. Guilty: {guilty or 'no part'}."
+
+
+def typeset(equation: str) -> Markup:
+    """A line of mathematics as HTML: letters in italics, indices below, powers above.
+
+    Args:
+        equation: plain text in the notation of the catalogue.
+    """
+
+    def markup(match: re.Match[str]) -> str:
+        power, unit, quantity, index, sign = match.group(
+            "power", "unit", "quantity", "index", "sign"
+        )
+        if power is not None:
+            return f"<sup>{typeset(power[1:-1] if power.startswith('(') else power)}</sup>"
+        if unit is not None:
+            return unit.replace("H2O", "H<sub>2</sub>O").replace("s2", "s<sup>2</sup>")
+        if quantity is None:
+            return str(escape(_SIGNS.get(sign, sign)))
+        shown = _LETTERS.get(quantity, quantity)
+        derivative = len(quantity) == 2 and quantity[0] == "d"
+        shown = f"<i>{shown}</i>" if len(shown) == 1 or derivative else shown
+        return shown if index is None else f"{shown}<sub>{index}</sub>"
+
+    return Markup(_SYMBOL.sub(markup, equation))

@@ -42,14 +42,18 @@ def drafts(plants: ReplayPlants) -> list[create.Draft]:
     for factor in FACTORS:
         requested = result.requested * factor
         (new,) = replay(plants, result.pips, [requested], result.rig_draws)
+        errors = np.concatenate([new.nominal[None], new.drawn])
+        shape = result.runs.error.shape
         varied = dataclasses.replace(
             result,
-            requested=requested,
-            nominal=new.nominal,
-            drawn=new.drawn,
+            runs=dataclasses.replace(
+                result.runs,
+                error=np.moveaxis(errors, 0, 1).reshape(shape),
+                peak=np.moveaxis(new.peak, 0, 1).reshape(shape),
+                safe=np.broadcast_to(new.safe[None, :, None], shape),
+                requested=requested.reshape(*shape, *requested.shape[3:]),
+            ),
             controllable=np.moveaxis(new.controllable, 0, 1),
-            safe=new.safe,
-            peak=new.peak.max(axis=(0, 2)),
             sandbox=SANDBOX,
         )
         made.append(create.create(varied, plants))

@@ -22,14 +22,11 @@ from contextlib import contextmanager
 from typing import Any
 
 from ventbench.base.executor import executor, in_order
+from ventbench.entries.runs import DRAWS
 from ventbench.entries.scoring import score
-from ventbench.stress.score import score_stress
 
 #: Entry that is scored again and again, and entries of the cost that is worked out.
 ENTRY, MANY = "pid_robust", 10_000
-
-#: Draws of the official stress track.
-STRESS_DRAWS = 6
 
 
 def processor_seconds() -> float:
@@ -41,9 +38,7 @@ def processor_seconds() -> float:
 def scored(draws: int, stress: bool) -> float:
     """Score one entry; returns the processor time that it took, s."""
     begun = processor_seconds()
-    score(ENTRY, draws=draws)
-    if stress:
-        score_stress(ENTRY, draws=STRESS_DRAWS if draws else 1)
+    score(ENTRY, draws=draws, stress=stress * (DRAWS if draws else 1))
     return processor_seconds() - begun
 
 

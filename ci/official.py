@@ -20,9 +20,9 @@ from ventbench.board.replay import ReplayPlants
 from ventbench.entries import contract
 from ventbench.entries.folder import open_submission
 from ventbench.entries.manifest import TRACKS
+from ventbench.entries.reference import Reference
 from ventbench.entries.runner import Runner
 from ventbench.entries.scoring import run_protocol
-from ventbench.headroom.reference import Reference
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import draws as draw_tables
 

@@ -8,7 +8,7 @@ lung that leaks, and feedback corrects that late. So it shows what a better simu
 PID tuned on it hardly does, as its gains serve many lungs.
 
 **Feedforward.** Commands of least error, by sequential linear programming
-(:mod:`ventbench.headroom.attainable`). What is planned is the reading of the sensor, which is all
+(:mod:`ventbench.task.attainable`). What is planned is the reading of the sensor, which is all
 that a bench measures and scores. And it is planned for the second breath of a run and those after
 it, which a bench scores: a slow lung has not emptied since the breath before.
 
@@ -34,7 +34,7 @@ from hardware_eval.emulation.simulated import breath_begun
 from ventbench.base import precision
 from ventbench.controllers.pid import TIME_CONSTANT
 from ventbench.entries.scaffold import contents
-from ventbench.headroom import attainable as bound
+from ventbench.task import attainable as bound
 from ventbench.task import environment as env
 from ventbench.task import protocol
 from ventbench.task.environment import Scenario

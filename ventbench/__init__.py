@@ -4,8 +4,8 @@ Everything that a notebook needs is an attribute of this package and is imported
 
 - recordings: ``load_recording``, ``import_recording``, ``example``, ``Breaths``;
 - simulators: ``load_simulators``, ``simulate``, ``open_loop``, the protocol ``Plant``;
-- controllers: ``score``, ``score_stress``, ``rollout``, ``tune_pid``, ``train_residual``,
-  ``train_ppo``, ``train_dqn``, the protocol ``Controller``;
+- controllers: ``score``, ``rollout``, ``tune_pid``, ``train_residual``, ``train_ppo``,
+  ``train_dqn``, the protocol ``Controller``;
 - missing physics: ``diagnose``, ``Diagnosis``;
 - learned simulators: ``train_rigs``; the leaderboard: ``load_board``.
 
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from ventbench.recordings.foreign import import_recording as import_recording
     from ventbench.simulation import Simulation as Simulation
     from ventbench.simulation import simulate as simulate
-    from ventbench.stress.score import StressScore as StressScore
-    from ventbench.stress.score import score_stress as score_stress
     from ventbench.task.interfaces import Controller as Controller
     from ventbench.task.interfaces import Observation as Observation
     from ventbench.task.interfaces import Plant as Plant
@@ -66,7 +64,6 @@ _SOURCES = {
     "Score": ("entries.result", "Score"),
     "Simulation": ("simulation", "Simulation"),
     "Simulators": ("plants.simulators", "Simulators"),
-    "StressScore": ("stress.score", "StressScore"),
     "Task": ("task.interfaces", "Task"),
     "Trajectories": ("trajectories", "Trajectories"),
     "diagnose": ("diagnosis.diagnose", "diagnose"),
@@ -78,7 +75,6 @@ _SOURCES = {
     "open_loop": ("open_loop_report", "open_loop"),
     "rollout": ("trajectories", "rollout"),
     "score": ("entries.scoring", "score"),
-    "score_stress": ("stress.score", "score_stress"),
     "simulate": ("simulation", "simulate"),
     "train_dqn": ("train.rl.train", "train_dqn"),
     "train_ppo": ("train.rl.train", "train_ppo"),
@@ -100,7 +96,6 @@ __all__ = [
     "Score",
     "Simulation",
     "Simulators",
-    "StressScore",
     "Task",
     "Trajectories",
     "__version__",
@@ -113,7 +108,6 @@ __all__ = [
     "open_loop",
     "rollout",
     "score",
-    "score_stress",
     "simulate",
     "train_dqn",
     "train_ppo",

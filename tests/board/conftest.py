@@ -15,14 +15,14 @@ import pytest
 
 from ventbench.board import build, canonical, create, record, store, verify
 from ventbench.board.record import Record
-from ventbench.board.replay import ReplayPlants, replay
+from ventbench.board.replay import Replayed, ReplayPlants, replay
+from ventbench.entries import reference as references
 from ventbench.entries.errors import Failure
 from ventbench.entries.folder import open_submission, resolve
-from ventbench.entries.result import CellFailure, Score
+from ventbench.entries.result import Score
+from ventbench.entries.runs import CellFailure, Runs
 from ventbench.entries.scoring import run_protocol
-from ventbench.headroom import reference as references
 from ventbench.plants import frozen
-from ventbench.stress.score import StressScore
 from ventbench.task import draws as draw_tables
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
@@ -71,8 +71,9 @@ def scores(simulators: TextbookRigs, reference: references.Reference) -> dict[st
         result = run_protocol(
             open_submission(name), simulators.scored(), draws=draw_tables.COUNT, reference=reference
         )
-        official = frozen.load().manifest_sha256
-        found[name] = dataclasses.replace(result, sandbox=SANDBOX, frozen_sha256=official)
+        rigs = dataclasses.replace(result.protocol.rigs, sha256=frozen.load().manifest_sha256)
+        protocol = dataclasses.replace(result.protocol, rigs=rigs)
+        found[name] = dataclasses.replace(result, sandbox=SANDBOX, protocol=protocol)
     return found
 
 
@@ -95,7 +96,7 @@ def draft(
         failed: int = 0,
         wide_open: bool = False,
         change: Callable[[np.ndarray], None] | None = None,
-        stress: Callable[[Score], StressScore] | None = None,
+        stress: Callable[[Score], Runs] | None = None,
         **about: Any,
     ) -> create.Draft:
         score = scores[base]
@@ -123,16 +124,33 @@ def draft(
             nominal[i, j] = controllable[0, i, j] = np.nan
             what = Failure("act", texts or "raised ValueError", texts or "", 1, 2)
             message = what.message(str(folder), LUNG_IDS[i])
-            failures.append(CellFailure(LUNG_IDS[i], score.pips[j], None, what, message))
+            failures.append(CellFailure("none", LUNG_IDS[i], score.pips[j], None, what, message))
         varied = dataclasses.replace(
-            score, submission=opened, requested=requested, nominal=nominal, drawn=found.drawn,
-            safe=found.safe, peak=found.peak.max(axis=(0, 2)), sandbox=sandbox,
-            failures=tuple(failures), controllable=np.moveaxis(controllable, 0, 1),
+            score, submission=opened, sandbox=sandbox, controllable=np.moveaxis(controllable, 0, 1),
+            runs=rerun(score.runs, np.concatenate([nominal[None], found.drawn]), found, requested,
+                       failures),
         )  # fmt: skip
         own = None if stress is None else stress(varied)
-        return create.create(varied, simulators, stress=own, now=NOW, **about)
+        varied = dataclasses.replace(varied, stressed=own)
+        return create.create(varied, simulators, now=NOW, **about)
 
     return make
+
+
+def rerun(
+    runs: Runs, errors: np.ndarray, found: Replayed, requested: np.ndarray, failures: Any = ()
+) -> Runs:
+    """Runs with other errors, (1 + K, L, P), pressures and commands."""
+
+    def flat(values: np.ndarray) -> np.ndarray:
+        return np.moveaxis(values, 0, 1).reshape(runs.error.shape)
+
+    safe = np.broadcast_to(found.safe[None, :, None], runs.error.shape)
+    commands = requested.reshape(1, 6, -1, *requested.shape[3:])
+    return dataclasses.replace(
+        runs, error=flat(errors), peak=flat(found.peak), safe=safe, requested=commands,
+        failures=failures,
+    )  # fmt: skip
 
 
 def entry_folder(folder: Path, base: str, name: str) -> Path:

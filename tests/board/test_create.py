@@ -100,12 +100,16 @@ def test_every_failure_is_there(draft) -> None:
 
 
 def test_an_incomplete_score_makes_no_record(scores, simulators: TextbookRigs) -> None:
-    score = dataclasses.replace(scores["pid_best"], drawn=scores["pid_best"].drawn[:3])
+    whole = scores["pid_best"]
+    drawn = whole.rig_draws.first(3)
+    score = dataclasses.replace(whole, protocol=dataclasses.replace(whole.protocol, drawn=drawn))
     with pytest.raises(InputError, match="--draws 20"):
         create.create(score, simulators)
 
 
 def test_a_wrong_score_makes_no_record(scores, simulators: TextbookRigs) -> None:
-    score = dataclasses.replace(scores["pid_best"], nominal=scores["pid_best"].nominal * 0.999)
+    whole = scores["pid_best"]
+    lower = dataclasses.replace(whole.runs, error=whole.runs.error * 0.999)
+    score = dataclasses.replace(whole, runs=lower)
     with pytest.raises(InputError, match=r"does not replay: key errors\.nominal"):
         create.create(score, simulators)

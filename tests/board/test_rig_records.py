@@ -19,13 +19,12 @@ from ventbench.board import (
     verify,
 )
 from ventbench.board.replay import differences, replay
-from ventbench.stress.results import DRAWS, pip_columns
-from ventbench.stress.score import StressScore
-from ventbench.stress.stressors import conditions
+from ventbench.entries.runs import DRAWS, Runs, pip_columns
 from ventbench.task import draws as draw_tables
 from ventbench.task import protocol
+from ventbench.task.stressors import conditions
 
-from .conftest import SANDBOX, accept, opened, put
+from .conftest import accept, opened, put
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +44,7 @@ def stressed():
         apart = np.random.default_rng(5).normal(size=shape[1:])
         error += noise * (apart - apart.mean())
         commands = np.full((*shape, protocol.BREATHS, protocol.INSPIRATION_STEPS), level)
-        return StressScore(
+        return Runs(
             conditions=chosen,
             lungs=score.lungs,
             pips=np.array(protocol.PIPS)[pip_columns(6, DRAWS)],
@@ -57,14 +56,8 @@ def stressed():
             alarm_s=0.1 * error,
             peak=30.0 + error,
             volume=400.0 + error,
-            submission=score.submission,
-            drawn=drawn,
-            plateau_error=error,
+            draw=np.arange(1, DRAWS + 1),
             requested=commands,
-            failures={},
-            sandbox=SANDBOX,
-            simulators=None,
-            timing={},
         )
 
     return make
@@ -229,17 +222,11 @@ def test_a_second_stress_run_is_compared(drafts, stressed, score):
     assert "stressors are version" in verify.stress_difference(newer, again)
 
 
-def test_a_record_takes_no_stress_score_of_another_submission(simulators, score, stressed):
-    stress = stressed(score, 1.0)
-    entry = dataclasses.replace(stress.submission, sha256="0" * 64)
-    with pytest.raises(InputError, match="changed between"):
-        create.create(score, simulators, stress=dataclasses.replace(stress, submission=entry))
-    few = dataclasses.replace(stress, conditions=stress.conditions[:5], error=stress.error[:5])
-    with pytest.raises(InputError, match="all conditions and draws"):
-        create.create(score, simulators, stress=few)
-    home = dataclasses.replace(stress, sandbox=None)
-    with pytest.raises(InputError, match="full sandbox"):
-        create.create(score, simulators, stress=home)
+def test_a_record_needs_all_stressors_or_none(simulators, score, stressed):
+    whole = stressed(score, 1.0)
+    few = dataclasses.replace(whole, conditions=whole.conditions[:5], error=whole.error[:5])
+    with pytest.raises(InputError, match="all stressors on 6 draws, or none"):
+        create.create(dataclasses.replace(score, stressed=few), simulators)
 
 
 def test_everything_verifies(board, simulators):

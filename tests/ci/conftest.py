@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ventbench.entries.reference import Reference, settings
 from ventbench.entries.scaffold import contents
-from ventbench.headroom.reference import Reference, settings
 from ventbench.task import draws as draw_tables
 
 from ..textbook_rigs import TextbookRigs

@@ -46,9 +46,17 @@ def textbook(plants):
 
 @pytest.fixture(scope="module")
 def official(textbook):
-    """The nominal part, as if it had been run on the frozen simulators."""
-    frozen_ones = {"frozen_sha256": frozen.MANIFEST_SHA256}
-    return dataclasses.replace(textbook, drawn=textbook.drawn[:0], rig_draws=None, **frozen_ones)
+    """As if it had been run on the frozen simulators."""
+    return changed(textbook, sha256=frozen.MANIFEST_SHA256)
+
+
+def changed(score, *, sha256=None, **protocol):
+    """A score of another protocol."""
+    rigs = score.protocol.rigs
+    rigs = dataclasses.replace(rigs, sha256=sha256 or rigs.sha256)
+    return dataclasses.replace(
+        score, protocol=dataclasses.replace(score.protocol, rigs=rigs, **protocol)
+    )
 
 
 @pytest.mark.slow
@@ -65,40 +73,38 @@ def test_the_frozen_simulators_are_those_of_the_published_hash():
 def test_official_needs_everything(official):
     assert official.official
     assert official.not_official_because == ()
-    without = dataclasses.replace(official, reference=None)
-    assert without.to_json()["official"] is True
+    assert changed(official, reference=None).to_json()["official"] is True
 
 
 @pytest.mark.parametrize(
-    ("changed", "reason"),
+    ("sandbox", "protocol", "reason"),
     [
-        ({"sandbox": None}, "no full sandbox"),
-        ({"sandbox": {**FULL, "official": False}}, "no full sandbox"),
-        ({"sandbox": {**FULL, "official": 1}}, "no full sandbox"),
-        ({"frozen_sha256": None}, "not on the frozen simulators"),
-        ({"frozen_sha256": "0" * 64}, "not on the frozen simulators"),
-        ({"pips": (10.0,)}, "not all lungs and PIPs"),
-        ({"lungs": ("R5C10",)}, "not all lungs and PIPs"),
-        ({"drawn": np.ones((1, 6, 6))}, "other draws than the published ones"),
+        (None, {}, "no full sandbox"),
+        ({**FULL, "official": False}, {}, "no full sandbox"),
+        ({**FULL, "official": 1}, {}, "no full sandbox"),
+        (FULL, {"sha256": "0" * 64}, "not on the frozen simulators"),
+        (FULL, {"pips": (10.0,)}, "not all lungs and PIPs"),
         (
-            {"drawn": np.ones((1, 6, 6)), "rig_draws": draws.build([[0]], 1, seed=bytes(32))},
+            FULL,
+            {"drawn": draws.build([[0]], 1, seed=bytes(32))},
             "other draws than the published ones",
         ),
     ],
 )
-def test_lacking_one_thing_it_is_not(official, changed, reason):
-    result = dataclasses.replace(official, **changed)
+def test_lacking_one_thing_it_is_not(official, sandbox, protocol, reason):
+    result = changed(dataclasses.replace(official, sandbox=sandbox), **protocol)
     assert result.not_official_because == (reason,)
     assert not result.official
 
 
-def test_published_draws_are_official(official):
-    drawn = {"drawn": np.ones((20, 6, 6)), "rig_draws": draws.build([[0]], 1)}
-    assert dataclasses.replace(official, **drawn).official
+def test_some_lungs_alone_are_not_official(official):
+    few = dataclasses.replace(official.runs, lungs=("R5C10",))
+    result = dataclasses.replace(official, runs=few)
+    assert result.not_official_because == ("not all lungs and PIPs",)
 
 
 def test_words_of_the_caller_make_no_simulators_frozen(textbook):
-    assert textbook.simulators == frozen.load().about()
+    assert textbook.protocol.simulators == frozen.load().about()
     assert textbook.sandbox == FULL
     assert not textbook.official
     assert textbook.to_json()["official"] is False
@@ -106,7 +112,7 @@ def test_words_of_the_caller_make_no_simulators_frozen(textbook):
 
 def test_a_frame_has_every_cell(textbook):
     frame = textbook.to_frame()
-    assert list(frame) == ["lung", "pip_cmH2O", "draw", "error_cmH2O"]
+    assert list(frame)[:4] == ["condition", "lung", "pip_cmH2O", "draw"]
     assert len(frame) == 6 * 6 * 3
     one = frame.query("lung == 'R20C10' and pip_cmH2O == 25 and draw == 2")
     assert one.error_cmH2O.item() == textbook.drawn[1, 3, 3]
@@ -127,7 +133,6 @@ def test_it_shows_itself(textbook, official):
     assert "(not official: not on the frozen simulators)" in said
     assert "R20C50" in said
     assert "(official)" in str(official)
-    assert "draws_cmH2O" not in str(official)
     page = textbook._repr_html_()
     assert page.count("<tr") == 7
     assert "pid_robust" in page

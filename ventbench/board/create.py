@@ -27,10 +27,10 @@ from ventbench.board import actions, canonical, record, schema
 from ventbench.board.record import HardwareRecord
 from ventbench.board.replay import TRACE_BREATH, Replayed, ReplayPlants, differences, replay
 from ventbench.entries.folder import combined_hash, file_hashes
-from ventbench.entries.result import CellFailure, Score
-from ventbench.stress import stressors
-from ventbench.stress.score import StressScore
+from ventbench.entries.result import Score
+from ventbench.entries.runs import DRAWS, CellFailure, Runs
 from ventbench.task import draws as draw_tables
+from ventbench.task import stressors
 from ventbench.task.draws import Draws
 
 #: How many failures keep their whole text, and how much of it the others keep, characters.
@@ -71,7 +71,6 @@ def create(
     score: Score,
     simulators: ReplayPlants,
     *,
-    stress: StressScore | None = None,
     official: bool = True,
     source: Mapping[str, Any] | None = None,
     supersedes: str | None = None,
@@ -83,7 +82,6 @@ def create(
     Args:
         score: over all lungs, PIPs and published draws.
         simulators: that it was scored on.
-        stress: the same submission on the stress track, for a record of the robustness track.
         official: whether to call it so if its sandbox allows that.
         source: where the submission came from, such as commit and pull request.
         supersedes: SHA-256 of the record that this one corrects.
@@ -95,7 +93,7 @@ def create(
             or the score does not replay.
     """
     label, sandbox = score.submission.label, score.sandbox
-    if not score.complete or len(score.drawn) < draw_tables.COUNT or score.rig_draws is None:
+    if not score.complete or score.rig_draws is None or score.rig_draws.count < draw_tables.COUNT:
         raise InputError(
             f"{label}: a record needs all lungs, all PIPs and all {draw_tables.COUNT} draws; "
             f"score it with --draws {draw_tables.COUNT}"
@@ -126,7 +124,7 @@ def create(
         "simulators": dict(simulators.about()),
         "draws": score.rig_draws.about(),
         **_headroom(score, score.rig_draws),
-        **_stressed(score, stress),
+        **_stressed(score),
         "lungs": list(score.lungs),
         "pips": list(score.pips),
         "errors": {"nominal": _plain(score.nominal), "drawn": _plain(score.drawn)},
@@ -167,12 +165,12 @@ def create(
 
 def _headroom(score: Score, drawn: Draws) -> dict[str, Any]:
     """Rigs of the draws, and what the score is relative to."""
-    if score.reference is None or score.controllable is None:
+    reference = score.protocol.reference
+    if reference is None:
         raise InputError(
             f"{score.submission.label}: there are no reference errors of these simulators and "
             "draws; make them with `ventbench headroom`"
         )
-    reference = score.reference
     tables = {
         "error": score.controllable,
         "attainable": reference.attainable,
@@ -184,21 +182,15 @@ def _headroom(score: Score, drawn: Draws) -> dict[str, Any]:
     }
 
 
-def _stressed(score: Score, stress: StressScore | None) -> dict[str, Any]:
-    """What the stress track adds to a record."""
+def _stressed(score: Score) -> dict[str, Any]:
+    """What missing physics adds to a record."""
+    stress = score.stressed
     if stress is None:
         return {}
-    label = score.submission.label
-    if stress.submission.sha256 != score.submission.sha256:
-        raise InputError(f"{label} was changed between its score and its stress score")
-    if score.rig_draws is None or (
-        stress.drawn.about() | {"count": 0} != score.rig_draws.about() | {"count": 0}
-    ):
-        raise InputError(f"{label}: score and stress score are of different draws")
     if not stress.complete:
-        raise InputError(f"{label}: a record needs all conditions and draws of the stress track")
-    if score.official and (stress.sandbox or {}).get("official") is not True:
-        raise InputError(f"{label}: the stress score was not made in the full sandbox")
+        raise InputError(
+            f"{score.submission.label}: a record needs all stressors on {DRAWS} draws, or none"
+        )
     return {
         "stress": {
             "stressors": stressors.VERSION,
@@ -210,21 +202,20 @@ def _stressed(score: Score, stress: StressScore | None) -> dict[str, Any]:
             "above_alarm_ms": np.round(1e3 * stress.alarm_s).astype(int).tolist(),
             "peak_centi_cmH2O": np.round(100.0 * stress.peak).astype(int).tolist(),
             "volume_mL": np.round(stress.volume).astype(int).tolist(),
-            "commands_sha256": stress_digest(stress.requested),
+            "commands_sha256": stress_digest(stress),
         }
     }
 
 
-def stress_digest(requested: NDArray[np.float64]) -> str:
-    """SHA-256 of the commands of the stress track."""
-    return canonical.digest(np.ascontiguousarray(requested, "<f8").tobytes())
+def stress_digest(stressed: Runs) -> str:
+    """SHA-256 of the commands of stressed runs."""
+    return canonical.digest(np.ascontiguousarray(stressed.requested, "<f8").tobytes())
 
 
 def keep(
     folder: Path,
     scores: Sequence[Score],
     simulators: ReplayPlants,
-    stress: Mapping[str, StressScore] | None = None,
 ) -> list[Path]:
     """Write the records of some scores.
 
@@ -232,7 +223,6 @@ def keep(
         folder: for records and commands.
         scores: over all lungs, PIPs and published draws.
         simulators: that they were scored on.
-        stress: stress scores by the name of the submission, for records of the robustness track.
 
     Returns:
         Paths of the records, for ``ventbench board add``.
@@ -240,12 +230,7 @@ def keep(
     Raises:
         InputError: as of :func:`create`; nothing has then been written.
     """
-    stressed = {
-        score: (stress or {}).get(score.submission.manifest.name)
-        for score in scores
-        if score.track == "robustness"
-    }
-    drafts = [create(score, simulators, stress=stressed.get(score)) for score in scores]
+    drafts = [create(score, simulators) for score in scores]
     return [draft.save(folder) for draft in drafts]
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from ventbench import palette
 from ventbench.base.text import number, page_templates, plain
 from ventbench.board.ranking import HardwareRow, Interval, StressRow
-from ventbench.stress.stressors import CATEGORIES, SEVERITIES, Condition, conditions, stressor
+from ventbench.task.stressors import CATEGORIES, SEVERITIES, Condition, conditions, stressor
 
 if TYPE_CHECKING:
     import jinja2

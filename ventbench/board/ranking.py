@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ventbench.board.record import AnyRecord, HardwareRecord, Record, Withdrawal
 from ventbench.board.store import Store
 from ventbench.entries.manifest import TRACKS
-from ventbench.stress.results import StressTables
+from ventbench.entries.runs import Runs
 from ventbench.task.metrics import bootstrap
 
 Floats = NDArray[np.float64]
@@ -163,7 +163,7 @@ class StressRow:
     """
 
     row: Row
-    tables: StressTables
+    tables: Runs
     score: Interval | None = None
     rank: int | None = None
     ranks: tuple[int, int] | None = None

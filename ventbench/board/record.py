@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from ventbench.base.errors import InputError
 from ventbench.board import canonical, schema
-from ventbench.stress.results import StressTables
-from ventbench.stress.stressors import VERSION as STRESSORS_VERSION
-from ventbench.stress.stressors import condition_of
+from ventbench.entries.runs import Runs
 from ventbench.task import protocol
 from ventbench.task.metrics.score import normalised
+from ventbench.task.stressors import VERSION as STRESSORS_VERSION
+from ventbench.task.stressors import condition_of
 
 Floats = NDArray[np.float64]
 
@@ -79,7 +79,7 @@ class RecordStress:
     """
 
     stressors: int
-    tables: StressTables
+    tables: Runs
     commands_sha256: str
 
 
@@ -386,7 +386,7 @@ def _stress(values: schema.ScoreContent, label: str) -> RecordStress | None:
             f"{label}, key stress.conditions: must begin with none and name each condition once"
         )
     draws = len(own.pips[0])
-    tables = StressTables(
+    tables = Runs(
         conditions=chosen,
         lungs=tuple(values.lungs),
         pips=np.array(own.pips, float),
@@ -398,6 +398,7 @@ def _stress(values: schema.ScoreContent, label: str) -> RecordStress | None:
         alarm_s=np.array(own.above_alarm_ms) / 1e3,
         peak=np.array(own.peak_centi_cmH2O) / 100.0,
         volume=np.array(own.volume_mL, float),
+        draw=np.arange(1, draws + 1),
     )
     if own.stressors == STRESSORS_VERSION and not tables.complete:
         raise InputError(

@@ -35,13 +35,12 @@ from ventbench.board.replay import (
 )
 from ventbench.board.store import Store
 from ventbench.entries.folder import Submission, file_hashes, open_submission
+from ventbench.entries.reference import published, reference_of
 from ventbench.entries.runner import Runner
+from ventbench.entries.runs import Runs
 from ventbench.entries.scoring import run_protocol
-from ventbench.headroom.reference import published, reference_of
 from ventbench.plants.rigs import rigs_of
-from ventbench.stress import stressors
-from ventbench.stress.run import draw_cells
-from ventbench.stress.score import StressScore, run_stress
+from ventbench.task import stressors
 from ventbench.task.draws import Draws
 from ventbench.task.metrics.score import normalised
 
@@ -434,16 +433,14 @@ def _run(
 ) -> Outcome:
     """Run the code of one record and compare."""
     begun = time.perf_counter()
-    stress: StressScore | None = None
     try:
         submission = open_submission(str(code))
         _check_same(submission, score)
-        drawn, rigs = draws_of(score.header, simulators), rigs_of(simulators)
-        result = run_protocol(submission, rigs, track=score.track, drawn=drawn, runner=runner)
-        if score.stress is not None:
-            cells = draw_cells(rigs, score.stress.tables.pips.shape[1], drawn=drawn)
-            chosen = score.stress.tables.conditions
-            stress = run_stress(submission, cells, chosen, runner=runner)
+        stress = 0 if score.stress is None else score.stress.tables.pips.shape[1]
+        result = run_protocol(
+            submission, rigs_of(simulators), track=score.track, stress=stress, runner=runner,
+            drawn=draws_of(score.header, simulators),
+        )  # fmt: skip
         _check_same(open_submission(str(code)), score)
         recorded = actions.load(score, folder / RECORDS)
         detail = difference(score, recorded, result.requested)
@@ -451,9 +448,10 @@ def _run(
         failed = {(x.lung, x.pip, x.draw) for x in result.failures}
         if not detail and failed != {(x.lung, x.pip, x.draw) for x in score.header.failures}:
             detail = f"{len(failed)} cells failed, {score.header.failed_cells} in the record"
-        if not detail and score.stress is not None and stress is not None:
-            detail = stress_difference(score.stress, stress)
-            closeness += _stress_closeness(score.stress, stress)
+        if not detail and score.stress is not None and result.stressed is not None:
+            detail = stress_difference(score.stress, result.stressed)
+            same = create.stress_digest(result.stressed) == score.stress.commands_sha256
+            closeness += f", stress {'to the bit' if same else 'within tolerance'}"
     except (InputError, FloatingPointError) as error:
         detail, closeness = f"its code cannot be run: {error}", ""
     seconds = round(time.perf_counter() - begun, 1)
@@ -467,7 +465,7 @@ def _check_same(submission: Submission, score: Record) -> None:
         raise InputError(f"{submission.label} was changed while it ran")
 
 
-def stress_difference(recorded: RecordStress, again: StressScore) -> str:
+def stress_difference(recorded: RecordStress, again: Runs) -> str:
     """Describe how runs of the stress track differ from the recorded ones; empty if they do not.
 
     Args:
@@ -492,13 +490,6 @@ def stress_difference(recorded: RecordStress, again: StressScore) -> str:
         if off.max() > tolerance:
             return f"stress.{key}: differs by up to {off.max():.3g} from the record"
     return ""
-
-
-def _stress_closeness(recorded: RecordStress, again: StressScore) -> str:
-    """Say whether the commands of the stress track, of which a record has the hash, are equal."""
-    if create.stress_digest(again.requested) == recorded.commands_sha256:
-        return ", stress to the bit"
-    return ", stress within tolerance"
 
 
 def _closeness(recorded: Floats, again: Floats) -> str:

@@ -21,7 +21,6 @@ from ventbench.cli import (
     options,
     score,
     simulators,
-    stress,
     train,
     tune,
     view,
@@ -59,7 +58,6 @@ headroom.register(app)
 simulators.register(app)
 tune.register(app)
 train.register(app)
-stress.register(app)
 view.register(app)
 board.register(app)
 diagnose.register(app)

@@ -41,7 +41,7 @@ def headroom(
     from rich.console import Console
 
     from ventbench.base.executor import executor
-    from ventbench.headroom import reference as references
+    from ventbench.entries import reference as references
     from ventbench.plants.rigs import load_rigs
     from ventbench.task import draws, protocol
     from ventbench.train import pid_grid

@@ -184,7 +184,7 @@ def counted(shown: Progress, text: str) -> Callable[[int, int], None]:
 def of_each_entry(
     what: str,
     work: Callable[..., ResultT],
-    jobs: Sequence[tuple[Submission, *tuple[str, ...]]],
+    jobs: Sequence[tuple[Submission, str, *tuple[object, ...]]],
     workers: int = 0,
     scheduler: str | None = None,
 ) -> list[ResultT]:
@@ -196,7 +196,7 @@ def of_each_entry(
         what: is done, such as ``scoring``.
         work: takes what a job holds, and ``progress`` in this process; side by side, a function of
             a module with arguments that can be sent.
-        jobs: an entry each, with what else the work is told, such as a track; in the order of the
+        jobs: an entry each, its track, and what else the work is told; in the order of the
             results.
         workers: processes; 0 for this one.
         scheduler: address of a Dask scheduler instead.
@@ -210,9 +210,9 @@ def of_each_entry(
         compilation.keep()
         done = []
         for job in jobs:
-            title = ", ".join((job[0].label, *job[1:]))
             with bars() as shown:
-                done.append(work(*job, progress=counted(shown, f"{what} {title}")))
+                progress = counted(shown, f"{what} {job[0].label}, {job[1]}")
+                done.append(work(*job, progress=progress))
         return done
     with bars() as shown, executor(workers, scheduler) as pool:
         progress = counted(shown, f"{what}, {len(jobs)} jobs")

@@ -1,4 +1,4 @@
-"""``ventbench score``, ``transfer``, ``new`` and ``check``: write, check and score submissions."""
+"""``ventbench score``, ``stressors``, ``transfer``, ``new`` and ``check``: work on submissions."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from ventbench.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from ventbench.entries.folder import Submission
     from ventbench.entries.result import Score
     from ventbench.entries.runner import Progress
-    from ventbench.stress.score import StressScore
 
-Track = Literal["performance", "robustness", "stress", "all"]
+Track = Literal["performance", "robustness", "all"]
 
 
 def score(
@@ -39,8 +39,8 @@ def score(
     track: Annotated[
         Track | None,
         typer.Option(
-            help="Track to score; default: the first of the submission. `stress` runs it under "
-            "missing physics that it is not told of; `all` scores each track that it enters."
+            help="Track to score; default: the first of the submission, or with --stress the "
+            "robustness track. `all` scores each track that it enters."
         ),
     ] = None,
     draws: Annotated[
@@ -48,8 +48,7 @@ def score(
         typer.Option(
             min=0,
             max=20,
-            help="Number of the 20 published draws to run as well; on the stress track, of cells "
-            "of each lung under each condition (6 if not given).",
+            help="Number of the 20 published draws to run as well.",
         ),
     ] = 0,
     out: Annotated[
@@ -64,7 +63,7 @@ def score(
         bool,
         typer.Option(
             "--report",
-            help="Also write report.html and scores.rrd (stress track: stress.png) to the folder "
+            help="Also write report.html, scores.rrd and, with --stress, stress.png to the folder "
             "of --out.",
         ),
     ] = False,
@@ -73,15 +72,17 @@ def score(
         typer.Option(
             metavar="DIR",
             help="Write a record of each track for `board add` here; needs --draws 20. Records of "
-            "the robustness track hold the stress score too.",
+            "the robustness track hold the score under missing physics too.",
         ),
     ] = None,
     plant: PlantName = "frozen",
     stress: Annotated[
-        bool | None,
+        int | None,
         typer.Option(
-            help="Also run entries of the robustness track under missing physics, six draws of "
-            "each lung; default: with --draws 20."
+            min=0,
+            max=20,
+            help="On the robustness track: number of draws to run under missing physics that the "
+            "controller is not told of; default: 6 with --draws 20, else 0.",
         ),
     ] = None,
     in_process: Annotated[
@@ -112,17 +113,11 @@ def score(
     from ventbench.base import errors
     from ventbench.base.errors import InputError
     from ventbench.entries.folder import open_submission
-    from ventbench.entries.result import Score
+    from ventbench.entries.runs import DRAWS
     from ventbench.plants.catalog import load_simulators
 
-    if track == "stress":
-        from ventbench.cli.stress import score_entries
-
-        return score_entries(
-            names, draws, out, report, plant, in_process, json, record, (workers, scheduler)
-        )
-    if record is not None and draws < 20:
-        raise InputError("--record needs all published draws: add --draws 20")
+    if record is not None and (draws < 20 or stress not in (None, 0, DRAWS)):
+        raise InputError(f"--record needs all published draws: add --draws 20 --stress {DRAWS}")
     if report and out is None:
         raise InputError("--report needs --out DIR to write to")
     if report:
@@ -134,90 +129,61 @@ def score(
     if record is not None and plant != "frozen":
         raise InputError("--record needs the official simulators: leave out --plant")
     load_simulators(plant)  # whatever is wrong with it is told before anything runs
-    tracks = [
-        entry.manifest.tracks if track == "all" else (track or entry.manifest.tracks[0],)
-        for entry in opened
-    ]
-    jobs = [(entry, each) for entry, own in zip(opened, tracks, strict=True) for each in own]
-    # Stress takes longest: beside other work it comes first.
-    stress = draws >= 20 if stress is None else stress
-    under_stress = [(entry, "stress") for entry in opened if stress]
-    jobs = [job for job in under_stress if _has_stress_score(job[0])] + jobs
+    if stress and track is None:
+        track = "robustness"
+    if stress is None:
+        stress = DRAWS if draws >= 20 else 0
+    jobs = []
+    for entry in opened:
+        entered = entry.manifest.tracks
+        for each in entered if track == "all" else (track or entered[0],):
+            jobs.append((entry, each, stress if each == "robustness" else 0))
+        if stress and not any(job[0] is entry and job[2] for job in jobs):
+            notes().print(f"{entry.manifest.name} is told its lung: no score under missing physics")
     work = partial(_run, simulator=plant, draws=draws, sandbox=not in_process)
-    done = of_each_entry("scoring", work, jobs, workers, scheduler)
-    scores = [result for result in done if isinstance(result, Score)]
-    stressed = {
-        result.submission.manifest.name: result for result in done if not isinstance(result, Score)
-    }
+    scores = of_each_entry("scoring", work, jobs, workers, scheduler)
     results = [result.to_json() for result in scores]
-    for values in results:
-        own = stressed.get(values["name"])
-        values["stress"] = None if own is None else own.to_json()
     emit(results[0] if len(results) == 1 else {"submissions": results}, json)
     console = Console(stderr=str(json) == "-")
     console.print(_table(results))
     if all(entry["normalised"] is not None for entry in results):
         console.print(_normalised_table(results))
-    if stressed:
-        from ventbench.cli.stress import stress_table
-
-        console.print(stress_table([own.to_json() for own in stressed.values()]))
+    if any(values["stress"] for values in results):
+        console.print(_stress_table([values["stress"] for values in results if values["stress"]]))
+        _compare(console, scores)
     because = dict.fromkeys(reason for result in scores for reason in result.not_official_because)
     if because:
         Console(stderr=True).print(
             f"These scores are not official: {', '.join(because)}.", style="yellow"
         )
-    for result in scores:
-        for failure in result.failures[:3]:
-            Console(stderr=True).print(failure.message, style="red", markup=False)
+    failures = [
+        failure
+        for result in scores
+        for failures in (result.failures, result.stressed.failures if result.stressed else ())
+        for failure in failures[:3]
+    ]
+    for failure in failures:
+        Console(stderr=True).print(failure.message, style="red", markup=False)
     if out is not None:
-        for path in _keep(out, scores, stressed, report):
+        for path in _keep(out, scores, report):
             console.print(f"wrote {path}", markup=False, highlight=False)
     if record is not None:
         from ventbench.board import create
         from ventbench.plants import frozen
 
-        for path in create.keep(record, scores, frozen.load(), stressed):
+        for path in create.keep(record, scores, frozen.load()):
             console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
-    if any(result.failures for result in (*scores, *stressed.values())):
+    if failures:
         raise typer.Exit(1)
 
 
 def _run(
-    entry: Submission,
-    track: str | None,
-    *,
-    simulator: str,
-    draws: int,
-    sandbox: bool,
-    progress: Progress | None = None,
-) -> Score | StressScore:
-    """Score an entry on a track, which may be ``"stress"``; in this process or in another one."""
-    if track == "stress":
-        from ventbench.stress.results import DRAWS
-        from ventbench.stress.score import score_stress
-
-        return score_stress(
-            entry, simulator=simulator, draws=DRAWS, sandbox=sandbox, progress=progress
-        )
+    entry: Submission, track: str, stress: int, *, progress: Progress | None = None, **options: Any
+) -> Score:
+    """Score an entry on a track; in this process or in another one."""
     from ventbench.entries import scoring
 
-    return scoring.score(
-        entry,
-        simulator=simulator,
-        track=track,
-        draws=draws,
-        sandbox=sandbox,
-        progress=progress,
-    )
-
-
-def _has_stress_score(entry: Submission) -> bool:
-    """Whether an entry need not be told its lung; says so if it must."""
-    if "robustness" in entry.manifest.tracks:
-        return True
-    notes().print(f"{entry.manifest.name} must be told its lung: it has no stress score")
-    return False
+    return scoring.score(entry, track=track, stress=stress, progress=progress, **options)
 
 
 def _table(scores: list[dict[str, Any]]) -> Table:
@@ -267,9 +233,52 @@ def _normalised_table(scores: list[dict[str, Any]]) -> Table:
     return table
 
 
-def _keep(
-    out: Path, scores: list[Score], stressed: dict[str, StressScore], report: bool
-) -> list[Path]:
+def _stress_table(scores: list[dict[str, Any]]) -> Table:
+    """Return a table of scores under missing physics: figures, then a row for each category."""
+    from rich.table import Table
+
+    def show(value: float | None, digits: int = 2) -> str:
+        return "failed" if value is None else f"{value:.{digits}f}"
+
+    table = Table(title="Missing physics: mean |airway pressure - PIP|, cmH2O (lower is better)")
+    table.add_column("")
+    for entry in scores:
+        table.add_column(entry["name"], justify="right", overflow="fold")
+    table.add_row("all stressors", *(show(entry["score"], 3) for entry in scores), style="bold")
+    limits = [entry["ci95"] for entry in scores]
+    if None not in limits[0]:
+        table.add_row("95 % interval", *("..".join(map(show, ends)) for ends in limits))
+    table.add_row("without stressors", *(show(entry["unstressed"], 3) for entry in scores))
+    table.add_row("runs survived", *(f"{100 * entry['survived']:.1f} %" for entry in scores))
+    table.add_row("unsafe runs", *(f"{e['unsafe_runs']} of {e['stressed_runs']}" for e in scores))
+    table.add_row("longest above PIP + 15 %, mean, s", *(show(e["above_alarm_s"]) for e in scores))
+    table.add_row("worst", *(f"{show(e['worst_error'])}\n{e['worst_condition']}" for e in scores))
+    table.add_section()
+    for category in scores[0]["categories"]:
+        each = [entry["categories"][category] for entry in scores]
+        shown = (f"{show(e['error_cmH2O'])}, {100 * e['survived']:.0f} % survived" for e in each)
+        table.add_row(category, *shown)
+    return table
+
+
+def _compare(console: Console, scores: list[Score]) -> None:
+    """Paired differences under missing physics to the first entry."""
+    import math
+
+    first, *others = [score for score in scores if score.stressed is not None]
+    assert first.stressed is not None
+    for score in others:
+        assert score.stressed is not None
+        difference, (low, high) = score.stressed.difference(first.stressed)
+        if math.isfinite(difference):
+            console.print(
+                f"{score.submission.manifest.name} less {first.submission.manifest.name}: "
+                f"{difference:+.3f} cmH2O, paired 95 % interval {low:+.3f}..{high:+.3f}",
+                highlight=False,
+            )
+
+
+def _keep(out: Path, scores: list[Score], report: bool) -> list[Path]:
     """Write a folder for each entry, with one for each track in it where there are several."""
     from dataclasses import replace
 
@@ -281,20 +290,43 @@ def _keep(
         written.append(out / name / result.track if several else out / name)
         runs.append(replace(run, name=f"{name}, {result.track}") if several else run)
         result.save(written[-1])
-    for name, own in stressed.items():
-        own.save(out / name)
-    if report and stressed:
-        from ventbench.pages.stress import write_stress_chart
-
-        values = [own.to_json() for own in stressed.values()]
-        written.append(write_stress_chart(out / "stress.png", values))
     if report:
         from ventbench import pages
+        from ventbench.pages.stress import write_stress_chart
 
         values = [result.to_json() for result in scores]
         written.append(pages.write_report(out / "report.html", runs, values))
         written.append(pages.write_rerun(out / "scores.rrd", runs))
+        stressed = [value["stress"] for value in values if value["stress"]]
+        if stressed:
+            written.append(write_stress_chart(out / "stress.png", stressed))
     return written
+
+
+def stressors(json: JsonFile = None) -> None:
+    """List the stressors, which are missing physics, and their strengths.
+
+    Example: `ventbench stressors`
+    """
+    import dataclasses
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from ventbench.task.stressors import PAIRS, STRESSORS, VERSION
+
+    lines = [dataclasses.asdict(line) for line in STRESSORS]
+    emit({"version": VERSION, "stressors": lines, "pairs": [list(pair) for pair in PAIRS]}, json)
+    table = Table(title=f"Stressors, version {VERSION}")
+    for name in ("category", "stressor", "what happens", "changes", "mild", "strong"):
+        table.add_column(name, justify="right" if name in ("mild", "strong") else "left")
+    for line in STRESSORS:
+        strengths = (f"{value:.3g}" for value in (line.mild, line.strong))
+        how = {"add": "", "scale": " (factor)", "label": " (label)"}[line.rule]
+        table.add_row(line.category, line.name, line.title, line.strength + how, *strengths)
+    console = Console(stderr=str(json) == "-")
+    console.print(table)
+    console.print("Pairs, both mild: " + ", ".join(" + ".join(pair) for pair in PAIRS))
 
 
 def transfer(
@@ -303,7 +335,8 @@ def transfer(
         typer.Argument(metavar="SUBMISSION...", help="Folders or names of bundled submissions."),
     ],
     track: Annotated[
-        Track | None, typer.Option(help="Track to score; default: the first of the submission.")
+        Literal["performance", "robustness"] | None,
+        typer.Option(help="Track to score; default: the first of the submission."),
     ] = None,
     in_process: Annotated[
         bool,
@@ -332,29 +365,30 @@ def transfer(
 
         runner = SandboxRunner()
     opened = [open_submission(name) for name in names]
-    rigs = load_rigs()
-    results = []
+    rigs, results = load_rigs(), []
     for entry in opened:
+        chosen = track or entry.manifest.tracks[0]
         with bars() as shown:
             counting = CountingRunner(runner, counted(shown, f"running {entry.label}"))
-            results.append(transfers.transfer(entry, rigs, track=track, runner=counting))
-    emit({"entries": [result.to_json() for result in results]}, json)
+            runs = transfers.transfer(entry, rigs, track=chosen, runner=counting)
+        groups = transfers.by_group(runs, rigs)
+        results.append({"name": entry.manifest.name, "track": chosen, "groups": groups})
+    emit({"entries": results}, json)
     table = Table(title="Mean |pressure - target| on rigs, cmH2O (lower is better)")
     table.add_column("entry")
+    best = {}
     for group in transfers.GROUPS:
-        plants = int(results[0].plants[group].sum())
-        table.add_column(f"{group}\n{plants} plants", justify="right")
-    best = {
-        group: min((result.mean(group) for result in results), default=0.0)
-        for group in transfers.GROUPS
-    }
+        own = [result["groups"][group] for result in results]
+        table.add_column(f"{group}\n{own[0]['plants']} plants", justify="right")
+        errors = [one["error_cmH2O"] for one in own if one["error_cmH2O"] is not None]
+        best[group] = min(errors, default=None)
     for result in results:
         cells = []
         for group in transfers.GROUPS:
-            value = result.mean(group)
-            text = f"{value:.3f}" if value == value else "-"
+            value = result["groups"][group]["error_cmH2O"]
+            text = "-" if value is None else f"{value:.3f}"
             cells.append(f"[bold]{text}[/bold]" if value == best[group] else text)
-        table.add_row(f"{result.name}, {result.track}", *cells)
+        table.add_row(f"{result['name']}, {result['track']}", *cells)
     Console(stderr=str(json) == "-").print(table)
 
 
@@ -419,6 +453,7 @@ def check(
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     app.command()(score)
+    app.command()(stressors)
     app.command()(transfer)
     app.command()(new)
     app.command()(check)

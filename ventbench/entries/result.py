@@ -17,15 +17,16 @@ from numpy.typing import NDArray
 
 import ventbench
 from ventbench.base import files
-from ventbench.entries.errors import Failure
+from ventbench.entries.cells import Protocol
 from ventbench.entries.folder import Submission
-from ventbench.headroom.reference import Reference
+from ventbench.entries.runs import CellFailure, Runs, number
 from ventbench.plants import frozen
 from ventbench.task import protocol
 from ventbench.task.draws import DEVELOPMENT_SEED, Draws, commitment
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.metrics import bootstrap
 from ventbench.task.metrics.score import lung_score
+from ventbench.task.stressors import VERSION
 from ventbench.trajectories import Trajectories
 
 if TYPE_CHECKING:
@@ -36,88 +37,96 @@ Floats = NDArray[np.float64]
 #: Commitment of the published draws.
 PUBLISHED = commitment(DEVELOPMENT_SEED)
 
-#: Failures that a printed score names; the JSON has all.
-_FAILURES_SHOWN = 3
-
-
-@dataclass(frozen=True)
-class CellFailure:
-    """A failure and its cell.
-
-    Attributes:
-        lung: id; also where the submission did not know it.
-        pip: nominal PIP, cmH2O.
-        draw: counted from 1; None for the nominal cell.
-        failure: what went wrong.
-        message: the failure in one sentence for a person.
-    """
-
-    lung: str
-    pip: float
-    draw: int | None
-    failure: Failure
-    message: str
+#: Failures and stressed conditions that a printed score names; the JSON has all.
+_FAILURES_SHOWN, _CONDITIONS_SHOWN = 3, 10
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Score:
     """Scores of one submission on one track; L lungs, P PIPs, K draws, cmH2O.
 
-    ``print(score)`` and a notebook show one row a lung. The JSON holds all but ``requested``, which
-    is what a record is replayed from, and ``trajectories``.
+    ``print(score)`` and a notebook show one row a lung, and what stressors cost most. The JSON
+    holds all but the commands, which a record is replayed from, and ``trajectories``.
 
     Attributes:
         submission: what was scored.
         track: ``"performance"`` or ``"robustness"``.
-        lungs: ids, length L.
-        pips: nominal PIPs, cmH2O, length P.
-        nominal: error of each nominal run, shape ``(L, P)``; NaN where the controller failed.
-        drawn: error of each drawn run, shape ``(K, L, P)``; NaN where the controller failed.
-        safe: whether all runs of a lung passed the safety gate, shape ``(L,)``.
-        peak: highest pressure of a lung in any run, cmH2O, shape ``(L,)``.
+        protocol: on what: rigs, cells, bounds.
+        runs: figures of the nominal cells and the draws, ``(1 + K) P`` cells of each lung.
+        stressed: figures under missing physics; None if not run.
+        controllable: error of each run without the first step of an inspiration, nominal runs
+            first, cmH2O, shape ``(L, 1 + K, P)``.
         figures: secondary figures of the scored nominal inspirations by name, shape
             ``(L, P, scored breaths)``; NaN where one does not exist.
         below: nominal commands below 0 %, shape ``(L,)``.
         above: nominal commands above 100 %, shape ``(L,)``.
-        commands: nominal commands on each lung.
-        failures: what failed, in all cells.
-        requested: all commands, nominal cells first, %, shape
-            ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``; 0 once a cell has failed.
-        sandbox: the runner's layers; None in this process.
-        simulators: what the caller says about the plants (version, hashes); goes into the JSON.
-        frozen_sha256: hash of the frozen simulators' manifest if the plants that ran are exactly
-            those, to the bit; else None, whatever the caller says about them.
         trajectories: nominal runs with their expirations.
+        sandbox: the runner's layers; None in this process.
         timing: seconds, by name; the only numbers that differ from run to run.
-        controllable: error of each run without the first step of an inspiration, nominal runs
-            first, cmH2O, shape ``(L, 1 + K, P)``.
-        rig_draws: the draws; None without draws.
-        reference: best attainable and best PID of the same runs; None where it was not computed for
-            these simulators and draws.
     """
 
     submission: Submission
     track: str
-    lungs: tuple[str, ...]
-    pips: tuple[float, ...]
-    nominal: Floats
-    drawn: Floats
-    safe: NDArray[np.bool_]
-    peak: Floats
+    protocol: Protocol
+    runs: Runs
+    stressed: Runs | None
+    controllable: Floats
     figures: Mapping[str, Floats]
     below: NDArray[np.int64]
     above: NDArray[np.int64]
-    commands: int
-    failures: tuple[CellFailure, ...]
-    requested: Floats
-    sandbox: Mapping[str, Any] | None
-    simulators: Mapping[str, Any] | None
-    frozen_sha256: str | None
     trajectories: Trajectories
+    sandbox: Mapping[str, Any] | None
     timing: Mapping[str, float]
-    controllable: Floats
-    rig_draws: Draws | None = None
-    reference: Reference | None = None
+
+    @property
+    def lungs(self) -> tuple[str, ...]:
+        """Ids, length L."""
+        return self.runs.lungs
+
+    @property
+    def pips(self) -> tuple[float, ...]:
+        """Nominal PIPs, cmH2O, length P."""
+        return self.protocol.pips
+
+    def _by_draw(self, values: NDArray[Any]) -> NDArray[Any]:
+        """From ``(1, L, (1 + K) P, ...)`` to ``(L, 1 + K, P, ...)``."""
+        return values[0].reshape(*self.controllable.shape, *values.shape[3:])
+
+    @property
+    def nominal(self) -> Floats:
+        """Error of each nominal run, shape ``(L, P)``; NaN where the controller failed."""
+        return self._by_draw(self.runs.error)[:, 0]
+
+    @property
+    def drawn(self) -> Floats:
+        """Error of each drawn run, shape ``(K, L, P)``; NaN where the controller failed."""
+        return np.moveaxis(self._by_draw(self.runs.error)[:, 1:], 1, 0)
+
+    @property
+    def safe(self) -> NDArray[np.bool_]:
+        """Whether all runs of a lung passed the safety gate, shape ``(L,)``."""
+        return self.runs.safe[0].all(axis=-1)
+
+    @property
+    def peak(self) -> Floats:
+        """Highest pressure of a lung in any run, cmH2O, shape ``(L,)``."""
+        return self.runs.peak[0].max(axis=-1)
+
+    @property
+    def requested(self) -> Floats:
+        """All commands, %, shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``; nominal first."""
+        assert self.runs.requested is not None
+        return self._by_draw(self.runs.requested)
+
+    @property
+    def failures(self) -> tuple[CellFailure, ...]:
+        """What failed in the nominal cells and the draws."""
+        return tuple(self.runs.failures)
+
+    @property
+    def rig_draws(self) -> Draws | None:
+        """The draws; None without draws."""
+        return self.protocol.drawn
 
     @property
     def by_lung(self) -> Floats:
@@ -135,11 +144,10 @@ class Score:
         """Normalised score of each run, nominal runs first, shape ``(L, 1 + K, P)``.
 
         0 is the best that any commands attain, 100 the lung's best PID; NaN where the controller
-        failed; None where there is no :attr:`reference`.
+        failed; None where the bounds were not computed.
         """
-        if self.reference is None:
-            return None
-        return self.reference.normalised(self.controllable)
+        reference = self.protocol.reference
+        return None if reference is None else reference.normalised(self.controllable)
 
     @property
     def official(self) -> bool:
@@ -151,10 +159,10 @@ class Score:
         """Everything that an official score needs and this one lacks, in words."""
         reasons = {
             "no full sandbox": (self.sandbox or {}).get("official") is not True,
-            "not on the frozen simulators": self.frozen_sha256 != frozen.MANIFEST_SHA256,
+            "not on the frozen simulators": self.protocol.rigs.sha256 != frozen.MANIFEST_SHA256,
             "not all lungs and PIPs": not self.complete,
-            "other draws than the published ones": len(self.drawn) > 0
-            and (self.rig_draws is None or self.rig_draws.commitment != PUBLISHED),
+            "other draws than the published ones": self.rig_draws is not None
+            and self.rig_draws.commitment != PUBLISHED,
         }
         return tuple(reason for reason, holds in reasons.items() if holds)
 
@@ -167,7 +175,7 @@ class Score:
         """Return the score as JSON values, in the order in which a person reads it."""
         manifest = self.submission.manifest
         return {
-            "score": _number(self.score),
+            "score": number(self.score),
             "name": manifest.name,
             "track": self.track,
             "official": self.official,
@@ -178,46 +186,41 @@ class Score:
             "lungs": {lung: self._lung(i) for i, lung in enumerate(self.lungs)},
             **self._secondary(slice(None)),
             "clipped": self._clipped(slice(None)),
-            "failures": [_failure(failure) for failure in self.failures],
+            "failures": [failure.to_json() for failure in self.failures],
+            "stress": self._stress(),
             "sandbox": None if self.sandbox is None else dict(self.sandbox),
             "submission": {
                 "sha256": self.submission.sha256,
                 **dataclasses.asdict(manifest),
             },
-            "simulators": None if self.simulators is None else dict(self.simulators),
+            "simulators": dict(self.protocol.simulators),
             "versions": package_versions(),
             "timing": dict(self.timing),
         }
 
     def save(self, folder: Path) -> None:
-        """Write ``score.json`` and ``trajectories.npz``, creating the folder if it is missing.
+        """Write ``score.json``, ``trajectories.npz`` and, one row a stressed run, ``stress.csv``.
+
+        The folder is created if it is missing.
 
         Raises:
             OSError: if they cannot be written.
         """
         files.write_json(folder / "score.json", self.to_json())
         self.trajectories.save(folder / "trajectories.npz")
+        if self.stressed is not None:
+            table = self.stressed.to_frame().to_csv(index=False, lineterminator="\n").encode()
+            files.write_atomically(folder / "stress.csv", lambda file: file.write(table))
 
     def to_frame(self) -> pd.DataFrame:
-        """Errors of all runs as a table, one row a cell.
+        """Figures of all runs, one row each, stressed ones last.
 
-        Returns:
-            Columns ``lung`` (id), ``pip_cmH2O``, ``draw`` (0 for the nominal run, then 1..K) and
-            ``error_cmH2O`` (mean |pressure - target|; NaN where the controller failed);
-            ``L * P * (1 + K)`` rows.
+        See :meth:`ventbench.entries.runs.Runs.to_frame`; under stress ``draw`` counts from 1 too.
         """
         import pandas as pd
 
-        errors = np.concatenate([self.nominal[None], self.drawn])
-        draw, lung, pip = (axis.ravel() for axis in np.indices(errors.shape))
-        return pd.DataFrame(
-            {
-                "lung": np.array(self.lungs)[lung],
-                "pip_cmH2O": np.array(self.pips)[pip],
-                "draw": draw,
-                "error_cmH2O": errors.ravel(),
-            }
-        )
+        parts = [runs for runs in (self.runs, self.stressed) if runs is not None]
+        return pd.concat([runs.to_frame() for runs in parts], ignore_index=True)
 
     def summary(self) -> pd.DataFrame:
         """One row a lung, indexed by its id.
@@ -248,27 +251,67 @@ class Score:
     def __repr__(self) -> str:
         return f"<Score of {self._headline()}>"
 
-    def __str__(self) -> str:
-        rows = self.summary().reset_index()
-        table = rows.to_string(index=False, float_format="{:.3f}".format, na_rep="failed")
+    def _said(self) -> list[str]:
+        """Headline, failures, and the headline of the stressed runs."""
         failures = [failure.message for failure in self.failures[:_FAILURES_SHOWN]]
         more = len(self.failures) - len(failures)
-        return "\n".join([self._headline(), table, *failures, *([f"... {more} more"] * (more > 0))])
+        said = [*failures, *([f"... {more} more"] * (more > 0))]
+        if (runs := self.stressed) is not None:
+            low, high = runs.interval(runs.by_lung_and_draw)
+            failed = f"failed in {len(runs.failures)} runs"
+            said.append(
+                f"Under missing physics: {failed}"
+                if math.isnan(runs.score)
+                else f"Under missing physics: {runs.score:.3f} cmH2O [{low:.3f}, {high:.3f}], "
+                f"{runs.unstressed:.3f} without; {100 * runs.survived_share:.0f} % survived, "
+                f"{int(np.sum(~runs.safe[1:]))} of {runs.safe[1:].size} runs unsafe. What costs "
+                "most:"
+            )
+        return said
+
+    def _worst(self) -> pd.DataFrame | None:
+        """Conditions that cost most."""
+        if self.stressed is None:
+            return None
+        columns = ["error_cmH2O", "rise_cmH2O", "survived", "unsafe_runs", "volume_ratio"]
+        table = self.stressed.summary().iloc[1:].sort_values("error_cmH2O", ascending=False)
+        return table[columns].head(_CONDITIONS_SHOWN).reset_index()
+
+    def __str__(self) -> str:
+        rows = self.summary().reset_index()
+        lines = [rows.to_string(index=False, float_format="{:.3f}".format, na_rep="failed")]
+        if (worst := self._worst()) is not None:
+            lines += [worst.to_string(index=False, float_format="{:.2f}".format)]
+        return "\n".join([self._headline(), lines[0], *self._said(), *lines[1:]])
 
     def _repr_html_(self) -> str:
         rows = self.summary().reset_index()
-        table = rows.to_html(index=False, float_format="{:.3f}".format, na_rep="failed")
-        failures = [failure.message for failure in self.failures[:_FAILURES_SHOWN]]
-        said = "".join(f"<p>{html.escape(text)}</p>" for text in (self._headline(), *failures))
-        return f"<div>{said}{table}</div>"
+        tables = [rows.to_html(index=False, float_format="{:.3f}".format, na_rep="failed")]
+        if (worst := self._worst()) is not None:
+            tables += [worst.to_html(index=False, float_format="{:.2f}".format)]
+        said = "".join(f"<p>{html.escape(text)}</p>" for text in self._said())
+        headline = f"<p>{html.escape(self._headline())}</p>"
+        return f"<div>{headline}{tables[0]}{said}{''.join(tables[1:])}</div>"
+
+    def _stress(self) -> dict[str, Any] | None:
+        """What missing physics does, as JSON values."""
+        if self.stressed is None:
+            return None
+        return {
+            "name": self.submission.manifest.name,
+            "stressors_version": VERSION,
+            **self.stressed.headline(),
+            "draws": self.stressed.pips.shape[1],
+            "failures": [failure.to_json() for failure in self.stressed.failures],
+        }
 
     def _lung(self, i: int) -> dict[str, Any]:
         pips = zip(self.pips, self.nominal[i], strict=True)
         return {
-            "score": _number(self.by_lung[i]),
-            "pips": {f"{pip:g}": _number(error) for pip, error in pips},
+            "score": number(self.by_lung[i]),
+            "pips": {f"{pip:g}": number(error) for pip, error in pips},
             "safe": bool(self.safe[i]),
-            "peak_pressure_cmH2O": _number(self.peak[i]),
+            "peak_pressure_cmH2O": number(self.peak[i]),
             "draws": self._draws(lung_score(self.drawn)[:, i : i + 1], first=i),
             **self._normalised(i),
             **self._secondary(slice(i, i + 1)),
@@ -288,25 +331,25 @@ class Score:
         score, ci95 = self._over_rigs(values, first) if finite else (math.nan, (math.nan,) * 2)
         about = self.rig_draws.about()
         return {
-            "score": _number(score),
-            "ci95": [_number(limit) for limit in ci95],
-            "values": [_number(value) for value in means],
+            "score": number(score),
+            "ci95": [number(limit) for limit in ci95],
+            "values": [number(value) for value in means],
             **(about if published else {}),
         }
 
     def _normalised(self, lung: int | None = None) -> dict[str, Any]:
         """Normalised score of a lung or of all; null without a reference."""
-        values = self.normalised
-        if values is None or self.reference is None:
+        values, reference = self.normalised, self.protocol.reference
+        if values is None or reference is None:
             return {"normalised": None}
         lungs = slice(None) if lung is None else slice(lung, lung + 1)
         drawn = lung_score(values[lungs, 1:]).T
         return {
             "normalised": {
-                "nominal": _number(np.mean(values[lungs, 0])),
+                "nominal": number(np.mean(values[lungs, 0])),
                 "draws": self._draws(drawn, first=lung or 0),
-                "attainable_cmH2O": float(self.reference.attainable[lungs].mean()),
-                "pid_cmH2O": float(self.reference.pid[lungs].mean()),
+                "attainable_cmH2O": float(reference.attainable[lungs].mean()),
+                "pid_cmH2O": float(reference.pid[lungs].mean()),
             }
         }
 
@@ -323,14 +366,14 @@ class Score:
         means, missing = {}, {}
         for name, values in self.figures.items():
             there = values[lungs][~np.isnan(values[lungs])]
-            means[name] = _number(np.mean(there)) if there.size else None
+            means[name] = number(np.mean(there)) if there.size else None
             missing[name] = int(values[lungs].size - there.size)
         missing = {name: count for name, count in missing.items() if count}
         return {"secondary": means, "secondary_missing": missing}
 
     def _clipped(self, lungs: slice) -> dict[str, Any]:
         below, above = int(self.below[lungs].sum()), int(self.above[lungs].sum())
-        total = self.commands * len(self.below[lungs])
+        total = self.requested[0, 0].size * len(self.below[lungs])
         return {
             "below": below,
             "above": above,
@@ -346,12 +389,3 @@ def package_versions() -> dict[str, str]:
         "python": platform.python_version(),
         **{name: version(name) for name in ("jax", "jaxlib", "numpy")},
     }
-
-
-def _number(value: float | np.floating) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def _failure(failure: CellFailure) -> dict[str, Any]:
-    cell = {"lung": failure.lung, "pip": failure.pip, "draw": failure.draw}
-    return {**cell, **failure.failure.to_json(), "message": failure.message}

@@ -13,9 +13,10 @@ import jax
 import numpy as np
 
 from ventbench.base import precision
-from ventbench.base.errors import InputError
-from ventbench.entries.assembly import assemble, enter
+from ventbench.entries.cells import Cells, protocol_of
+from ventbench.entries.errors import SubmissionError
 from ventbench.entries.folder import Submission, as_submission
+from ventbench.entries.reference import Reference
 from ventbench.entries.result import Score
 from ventbench.entries.runner import (
     CountingRunner,
@@ -24,13 +25,17 @@ from ventbench.entries.runner import (
     Runner,
     runner_of,
 )
-from ventbench.entries.stepping import as_float64, replay, step_through
-from ventbench.headroom.reference import Reference, reference_of
+from ventbench.entries.runs import PLATEAU_SHARE, PLATEAU_TOLERANCE, CellFailure, Runs
+from ventbench.entries.stepping import ProtocolRun, as_float64, replay, run_cells
 from ventbench.plants.catalog import Given
 from ventbench.plants.rigs import Rigs, load_rigs
 from ventbench.task import protocol
 from ventbench.task.draws import Draws
-from ventbench.task.metrics.score import controllable_error
+from ventbench.task.interfaces import Task
+from ventbench.task.metrics.figures import InspirationSignals, figures, time_above_alarm
+from ventbench.task.metrics.score import controllable_error, passes_safety_gate, run_error
+from ventbench.task.metrics.step_response import steady_error
+from ventbench.trajectories import end_to_end
 
 
 def score(
@@ -39,6 +44,8 @@ def score(
     simulator: Given = "frozen",
     track: str | None = None,
     draws: int = 0,
+    stress: int = 0,
+    stressors: Sequence[str] = (),
     sandbox: bool = True,
     progress: Progress | None = None,
 ) -> Score:
@@ -55,6 +62,9 @@ def score(
         track: ``"performance"`` (the controller is told the lung) or ``"robustness"``; the first
             that the submission enters if not given.
         draws: how many of the 20 development draws to run besides the nominal cells.
+        stress: how many of them to run under missing physics that the controller is not told of,
+            one PIP of each lung and draw; the robustness track only, 6 for an official score.
+        stressors: names of some stressors alone, such as ``["leak", "sensor_low"]``.
         sandbox: run a folder in locked-down processes. Without it, its code runs in this process
             with all rights: only for code that you trust, and never official.
         progress: called after each round of commands with rounds done and all rounds.
@@ -80,8 +90,16 @@ def score(
     entry = as_submission(submission)
     runner: Runner = runner_of(entry, sandbox=sandbox)
     if progress is not None:
-        runner = CountingRunner(runner, progress)
-    return run_protocol(entry, load_rigs(simulator), track=track, draws=draws, runner=runner)
+        runner = CountingRunner(runner, progress, sessions=1 + stress)
+    return run_protocol(
+        entry,
+        load_rigs(simulator),
+        track=track,
+        draws=draws,
+        stress=stress,
+        stressors=stressors,
+        runner=runner,
+    )
 
 
 def run_protocol(
@@ -93,6 +111,8 @@ def run_protocol(
     drawn: Draws | None = None,
     reference: Reference | None = None,
     pips: Sequence[float] = protocol.PIPS,
+    stress: int = 0,
+    stressors: Sequence[str] = (),
     runner: Runner | None = None,
 ) -> Score:
     """Run a submission through the protocol, on any rigs and by any runner.
@@ -101,11 +121,12 @@ def run_protocol(
         submission: from :func:`ventbench.entries.folder.open_submission`.
         rigs: from :func:`ventbench.plants.rigs.load_rigs`.
         track: ``"performance"`` or ``"robustness"``; the manifest's first if not given.
-        draws: how many of the development draws to run besides the nominal cells.
+        draws: see :func:`ventbench.entries.cells.protocol_of`, as of what follows.
         drawn: other draws instead.
-        reference: best attainable and best PID of these simulators and draws; the published one if
-            not given and it is of these.
+        reference: best attainable and best PID of these simulators and draws.
         pips: cmH2O.
+        stress: how many draws to run under missing physics.
+        stressors: names of the stressors; all conditions if empty.
         runner: runs the controllers; in this process if not given.
 
     Raises:
@@ -116,41 +137,154 @@ def run_protocol(
     """
     started = time.perf_counter()
     runner = runner or InProcessRunner()
-    names, pips = tuple(lung.id for lung in rigs.lungs), tuple(float(pip) for pip in pips)
+    names = tuple(lung.id for lung in rigs.lungs)
     track, tasks = enter(submission, track, names, runner)
-    if drawn is None and draws:
-        drawn = rigs.draws(draws, pips)
-    elif draws < 0:
-        raise InputError(f"{draws} draws: there cannot be fewer than none")
-    if pips == protocol.PIPS:
-        about = None if drawn is None else drawn.about()
-        reference = reference_of(rigs.about, about, reference)
-    with precision.float64():
-        plants, cells = rigs.cells(drawn, pips)
-        plants = as_float64(plants, len(names))
-        run = step_through(plants, cells, runner, submission, tasks)
-        nominal = jax.tree.map(lambda x: x[:, 0], cells)
-        own = plants
-        if rigs.sessions is not None:
-            own = jax.tree.map(lambda leaf: leaf[:, 0, 0], plants)
-        replayed = replay(own, nominal, run.requested[:, 0])
-    pip = np.asarray(cells.pip)[..., None, None]
-    controllable = controllable_error(run.pressure, pip)
-    for cell in run.failures:
-        controllable[cell] = np.nan
-    return assemble(
-        submission,
-        tasks,
-        names,
-        pips,
-        cells,
-        run,
-        replayed,
-        seconds=time.perf_counter() - started,
-        sandbox=runner.sandbox,
-        simulators=rigs.about,
-        frozen_sha256=rigs.sha256,
-        rig_draws=drawn,
-        controllable=controllable,
+    if stress and track != "robustness":
+        raise SubmissionError(
+            f"{submission.label}: submission.toml, key tracks: is scored for {track}; missing "
+            "physics does not tell the lung and needs an entry of the robustness track"
+        )
+    what = protocol_of(
+        rigs, draws=draws, drawn=drawn, pips=pips, stress=stress, stressors=stressors,
         reference=reference,
+    )  # fmt: skip
+    with precision.float64():
+        run = run_cells(what.cells, runner, submission, tasks)
+        under_stress = None
+        if what.stressed is not None:
+            stressed = run_cells(what.stressed, runner, submission, tasks)
+            under_stress = runs_of(stressed, what.stressed, submission, tasks)
+        # The expirations are run for the picture only; no score depends on them.
+        own = as_float64(what.cells.plants, len(names))
+        if rigs.sessions is not None:
+            own = jax.tree.map(lambda leaf: leaf[:, 0, 0], own)
+        nominal = jax.tree.map(lambda x: x[:, 0], what.cells.scenario)
+        replayed = replay(own, nominal, run.requested[0, :, 0])
+    scenario = what.cells.scenario
+    joined = [
+        np.concatenate([getattr(part, name) for part in replayed], axis=-1)
+        for name in ("pressure", "u_in")
+    ]
+    # The target of every inspiratory step is PIP.
+    pip = np.asarray(scenario.pip)
+    controllable = controllable_error(run.pressure[0], pip[..., None, None])
+    for _, *cell in run.failures:
+        controllable[tuple(cell)] = np.nan
+    requested = run.requested[0, :, 0]
+    signals = (
+        x[0, :, 0][:, :, protocol.SCORED_BREATHS, :]
+        for x in (run.pressure, run.u_in, run.requested)
+    )
+    levels = (
+        np.broadcast_to(np.asarray(x), pip.shape)[:, 0, :, None]
+        for x in (scenario.peep, pip, scenario.dt)
+    )
+    return Score(
+        submission=submission,
+        track=track,
+        protocol=what,
+        runs=runs_of(run, what.cells, submission, tasks),
+        stressed=under_stress,
+        controllable=controllable,
+        figures=figures(InspirationSignals(*signals, *levels)),
+        below=np.sum(requested < 0.0, axis=(1, 2, 3)),
+        above=np.sum(requested > protocol.U_MAX, axis=(1, 2, 3)),
+        trajectories=end_to_end(submission.manifest.name, track, names, what.pips, *joined),
+        sandbox=runner.sandbox,
+        timing={
+            "seconds": time.perf_counter() - started,
+            "act_median_us": 1e6 * float(np.median(run.act_seconds)),
+            "act_max_us": 1e6 * float(np.max(run.act_seconds)),
+        },
+    )
+
+
+def enter(
+    submission: Submission, track: str | None, lungs: Sequence[str], runner: Runner
+) -> tuple[str, list[Task]]:
+    """Say what a submission is told of each lung on a track.
+
+    Args:
+        submission: that is to be scored.
+        track: ``"performance"`` or ``"robustness"``; the manifest's first if not given.
+        lungs: ids.
+        runner: that will run it.
+
+    Returns:
+        The track, and a task for each lung.
+
+    Raises:
+        SubmissionError: if it does not enter the track, or the runner cannot run it.
+    """
+    if submission.controller is not None and runner.sandbox is not None:
+        raise SubmissionError(f"{submission.label}: only a folder can run in a sandbox")
+    entered = submission.manifest.tracks
+    track = track or entered[0]
+    if track not in entered:
+        raise SubmissionError(
+            f"{submission.label}: submission.toml, key tracks: enters {', '.join(entered)}; "
+            f"it cannot be scored for {track}"
+        )
+    known = track == "performance"
+    return track, [
+        Task(track, name if known else None, protocol.DT, protocol.INSPIRATION_STEPS)
+        for name in lungs
+    ]
+
+
+def runs_of(run: ProtocolRun, cells: Cells, submission: Submission, tasks: Sequence[Task]) -> Runs:
+    """Compute the figures of a run.
+
+    Args:
+        run: batch shape ``(S, L, n, P)``.
+        cells: that ran.
+        submission: that ran.
+        tasks: what it was told of each lung.
+    """
+    pip, dt = (
+        np.broadcast_to(np.asarray(x), cells.pips.shape)
+        for x in (cells.scenario.pip, cells.scenario.dt)
+    )
+    by_breath = (run.pressure, pip[..., None], dt[..., None])
+    safe = np.all(passes_safety_gate(*by_breath), axis=-1)
+    plateau = steady_error(run.pressure[..., -1, :], pip)
+    error = run_error(run.pressure, pip[..., None, None])
+    survived = safe & (plateau <= PLATEAU_TOLERANCE + PLATEAU_SHARE * pip)
+    for cell in run.failures:
+        error[cell], plateau[cell], survived[cell] = np.nan, np.nan, False
+    volume = np.full(error.shape, np.nan)
+    if run.volume is not None:
+        volume = run.volume[..., protocol.SCORED_BREATHS, -1].mean(axis=-1)
+    lungs = tuple(lung.id for lung in cells.lungs)
+    count, (draws, pips) = len(lungs), cells.pips.shape[1:]
+
+    def flat(values: Any) -> Any:
+        return values.reshape(len(cells.conditions), count, draws * pips, *values.shape[4:])
+
+    return Runs(
+        conditions=cells.conditions,
+        lungs=lungs,
+        pips=cells.pips.reshape(count, -1),
+        rig=np.repeat(cells.rig, pips, axis=1),
+        member=np.repeat(cells.member, pips, axis=1),
+        error=flat(error),
+        safe=flat(safe),
+        survived=flat(survived),
+        alarm_s=flat(time_above_alarm(*by_breath).max(axis=-1)),
+        peak=flat(run.pressure.max(axis=(-2, -1))),
+        volume=flat(volume),
+        draw=np.repeat(cells.draw, pips),
+        plateau_error=flat(plateau),
+        requested=flat(run.requested),
+        failures=[
+            CellFailure(
+                cells.conditions[s].id,
+                lungs[lung],
+                float(cells.pips[lung, draw, at]),
+                int(cells.draw[draw]) or None,
+                failure,
+                failure.message(submission.label, tasks[lung].lung),
+            )
+            for (s, lung, draw, at), failure in sorted(run.failures.items())
+        ],
     )

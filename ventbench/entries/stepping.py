@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ventbench.base import precision
 from ventbench.controllers.script import Script
+from ventbench.entries.cells import Cells
 from ventbench.entries.errors import Failure
 from ventbench.entries.folder import Submission
 from ventbench.entries.runner import Runner, pack
@@ -28,16 +29,16 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ProtocolRun:
-    """Inspirations of all cells; arrays of shape ``(L, ..., BREATHS, INSPIRATION_STEPS)``.
+    """Inspirations of all cells; arrays of shape ``(..., BREATHS, INSPIRATION_STEPS)``.
 
-    L lungs; ``(...)`` is the batch shape of the scenario.
+    ``(...)`` is the batch shape of the cells, lungs first, or conditions and then lungs.
 
     Attributes:
         pressure: airway pressure at each step, which is scored, cmH2O.
         requested: what the controllers asked for, %; 0 once a cell has failed.
         u_in: what was applied, %.
         volume: gas in the lung, mL; None where the plants have no such signal.
-        failures: what failed, by cell, index ``(lung, ...)``.
+        failures: what failed, by index of the cell.
         act_seconds: time that one ``act`` took on average, s, for each round of all cells, shape
             ``(BREATHS * INSPIRATION_STEPS,)``.
     """
@@ -171,6 +172,68 @@ def step_through(
     by_cell = {tuple(int(i) for i in np.unravel_index(k, batch)): v for k, v in failures.items()}
     kept = volume if has_volume else None
     return ProtocolRun(pressure, requested, applied, kept, by_cell, np.array(seconds))
+
+
+def run_cells(
+    cells: Cells, runner: Runner, submission: Submission, tasks: Sequence[Task]
+) -> ProtocolRun:
+    """Run a submission on cells, batch shape ``(S, L, n, P)``. Call it within ``float64()``.
+
+    Without stressors all cells run together; else the draws run one after the other, all
+    conditions and lungs of one together.
+
+    Args:
+        cells: S conditions, L lungs, n draws, P PIPs.
+        runner: runs the controllers.
+        submission: whose they are.
+        tasks: what is told of each lung, length L.
+
+    Raises:
+        SubmissionError: if the submission cannot be run at all.
+        PlantError: if a plant answers with NaN or infinity.
+    """
+    lungs, conditions = len(cells.lungs), len(cells.conditions)
+    if conditions == 1:
+        plants = as_float64(cells.plants, lungs)
+        run = step_through(plants, cells.scenario, runner, submission, tasks)
+        return _reshaped(run, lambda x: x[None], lambda at: (0, *at))
+    runs = []
+    for draw in range(len(cells.draw)):
+        plants, scenario = cells.stressed(draw)
+        each = list(tasks) * conditions
+        try:
+            run = step_through(plants, scenario, runner, submission, each, changing=True)
+        except PlantError as error:
+            name = cells.conditions[error.index // lungs].id
+            raise FloatingPointError(
+                f"the plant under {name} answered with NaN or infinity"
+            ) from error
+        runs.append(
+            _reshaped(
+                run,
+                lambda x: x.reshape(conditions, lungs, 1, *x.shape[1:]),
+                lambda at, draw=draw: (*divmod(at[0], lungs), draw, 0),
+            )
+        )
+
+    def joined(name: str) -> Floats:
+        return np.stack([getattr(run, name) for run in runs], axis=2)
+
+    failures = {at: failure for run in runs for at, failure in run.failures.items()}
+    seconds = np.concatenate([run.act_seconds for run in runs])
+    pressure, requested, u_in, volume = map(joined, ("pressure", "requested", "u_in", "volume"))
+    return ProtocolRun(pressure, requested, u_in, volume, failures, seconds)
+
+
+def _reshaped(
+    run: ProtocolRun,
+    shape: Callable[[Floats], Floats],
+    index: Callable[[tuple[int, ...]], tuple[int, ...]],
+) -> ProtocolRun:
+    volume = None if run.volume is None else shape(run.volume)
+    failures = {index(at): failure for at, failure in run.failures.items()}
+    pressure, requested, u_in = map(shape, (run.pressure, run.requested, run.u_in))
+    return ProtocolRun(pressure, requested, u_in, volume, failures, run.act_seconds)
 
 
 def replay(

@@ -7,79 +7,31 @@ no entry of ours was trained on.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import dataclasses
 from typing import Any
 
-import jax
 import numpy as np
-from numpy.typing import NDArray
 
 from ventbench.base import precision
 from ventbench.base.errors import InputError
-from ventbench.entries.assembly import enter
+from ventbench.entries.cells import Cells
 from ventbench.entries.folder import Submission
 from ventbench.entries.runner import InProcessRunner, Runner
-from ventbench.entries.stepping import as_float64, step_through
+from ventbench.entries.runs import Runs, number
+from ventbench.entries.scoring import enter, runs_of
+from ventbench.entries.stepping import run_cells
 from ventbench.plants.rigs import Rigs
 from ventbench.task import draws, protocol
-from ventbench.task.metrics.score import run_error
+from ventbench.task.environment import nominal_scenario
+from ventbench.task.stressors import Condition
 
 #: Where an entry is tried, in the order of the table.
 GROUPS = ("reference rig", "other members", "other rigs", "held-out rig")
 
-Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Transfer:
-    """Errors of one entry; L lungs.
-
-    Attributes:
-        name: of the submission.
-        track: ``"performance"`` or ``"robustness"``.
-        lungs: ids.
-        errors: by group, mean error over its plants and the PIPs, cmH2O, shape ``(L,)``; NaN where
-            a lung has no such plant or the controller failed.
-        plants: by group, number of plants of each lung, shape ``(L,)``.
-    """
-
-    name: str
-    track: str
-    lungs: tuple[str, ...]
-    errors: dict[str, Floats]
-    plants: dict[str, NDArray[np.int64]]
-
-    def mean(self, group: str) -> float:
-        """Mean over the lungs that have such plants, cmH2O; NaN if the controller failed there."""
-        own = self.errors[group][self.plants[group] > 0]
-        return float(own.mean()) if own.size else float("nan")
-
-    def to_json(self) -> dict[str, Any]:
-        """Values of the table, with null where there is none."""
-
-        def number(value: float) -> float | None:
-            return float(value) if np.isfinite(value) else None
-
-        return {
-            "name": self.name,
-            "track": self.track,
-            "groups": {
-                group: {
-                    "error_cmH2O": number(self.mean(group)),
-                    "plants": int(self.plants[group].sum()),
-                    "lungs": {
-                        lung: number(error)
-                        for lung, error in zip(self.lungs, self.errors[group], strict=True)
-                    },
-                }
-                for group in GROUPS
-            },
-        }
-
 
 def transfer(
     submission: Submission, rigs: Rigs, *, track: str | None = None, runner: Runner | None = None
-) -> Transfer:
+) -> Runs:
     """Run an entry on all plants of all scored rigs, without noise.
 
     Args:
@@ -88,6 +40,10 @@ def transfer(
         track: ``"performance"`` or ``"robustness"``; the manifest's first if not given.
         runner: runs the controllers; in this process if not given.
 
+    Returns:
+        Figures of all PIPs on all plants; where a lung has fewer than another, its reference runs
+        again in their place.
+
     Raises:
         SubmissionError: if the submission cannot be run, or does not enter the track.
         InputError: if each lung has one rig only.
@@ -95,38 +51,49 @@ def transfer(
     if rigs.sessions is None:
         raise InputError("these simulators have one rig a lung: there is nothing to transfer to")
     runner = runner or InProcessRunner()
-    names = tuple(lung.id for lung in rigs.lungs)
-    track, tasks = enter(submission, track, names, runner)
-    wanted = [_places(rigs, lung) for lung in range(len(names))]
-    # Lungs with fewer plants run their first one again, so that all fit into one array.
-    most = max(map(len, wanted))
-    padded = [places + [places[0]] * (most - len(places)) for places in wanted]
-    rig = np.array([[place[1] for place in places] for places in padded])
-    member = np.array([[place[2] for place in places] for places in padded])
+    track, tasks = enter(submission, track, tuple(lung.id for lung in rigs.lungs), runner)
+    most = rigs.members - 1 + max(map(len, rigs.sessions))
+    places = []
+    for own in rigs.sessions:
+        every = [(own[0], member) for member in range(rigs.members)]
+        every += [(rig, 0) for rig in own[1:]]
+        places.append(every + [every[0]] * (most - len(every)))
+    rig, member = np.moveaxis(np.array(places), -1, 0)
+    pips = np.broadcast_to(np.array(protocol.PIPS), (*rig.shape, len(protocol.PIPS)))
     with precision.float64():
-        cells, _, _ = draws.with_nominal(None, rig[:, 0].tolist(), protocol.PIPS)
-        cells = jax.tree.map(lambda x: np.repeat(x, most, axis=1), cells)
-        plants = as_float64(draws.plants_of(rigs.plants, rig, member), len(names))
-        run = step_through(plants, cells, runner, submission, tasks)
-    errors = run_error(run.pressure, np.asarray(cells.pip)[..., None, None])
-    for cell in run.failures:
-        errors[cell] = np.nan
-    groups: dict[str, Floats] = {}
-    counts: dict[str, NDArray[np.int64]] = {}
-    for group in GROUPS:
-        at = [[k for k, place in enumerate(places) if place[0] == group] for places in wanted]
-        counts[group] = np.array([len(own) for own in at])
-        means = [errors[i, own].mean() if own else np.nan for i, own in enumerate(at)]
-        groups[group] = np.array(means)
-    return Transfer(submission.manifest.name, track, names, groups, counts)
+        plants = draws.plants_of(rigs.plants, rig, member)
+        scenario, every = nominal_scenario(pips), np.zeros(most, np.int64)
+        cells = Cells(rigs.lungs, (Condition(),), plants, scenario, pips, every, rig, member)
+        run = run_cells(cells, runner, submission, tasks)
+    return dataclasses.replace(runs_of(run, cells, submission, tasks), requested=None)
 
 
-def _places(rigs: Rigs, lung: int) -> list[tuple[str, int, int]]:
-    """Group, session and member of every plant of a lung, the reference first."""
+def by_group(runs: Runs, rigs: Rigs) -> dict[str, Any]:
+    """Errors of an entry by group and lung, as JSON values.
+
+    Args:
+        runs: from :func:`transfer`.
+        rigs: on which it ran.
+
+    Returns:
+        For each of :data:`GROUPS` the mean over the lungs that have such plants, the number of
+        plants, and the mean of each lung over its plants and the PIPs; null where a lung has no
+        such plant or the controller failed. cmH2O.
+    """
+    table = runs.to_frame().drop_duplicates(["lung", "pip_cmH2O", "rig", "member"])
     assert rigs.sessions is not None
-    reference, *others = rigs.sessions[lung]
-    apart = rigs.held_out[lung] if rigs.held_out else None
-    places = [(GROUPS[0], reference, 0)]
-    places += [(GROUPS[1], reference, member) for member in range(1, rigs.members)]
-    places += [(GROUPS[2], rig, 0) for rig in others if rig != apart]
-    return places + [(GROUPS[3], rig, 0) for rig in others if rig == apart]
+    reference = {lung: own[0] for lung, own in zip(runs.lungs, rigs.sessions, strict=True)}
+    apart = dict(zip(runs.lungs, rigs.held_out, strict=False))
+    at_home = table.rig == table.lung.map(reference)
+    kinds = [at_home & (table.member == 0), at_home, table.rig != table.lung.map(apart)]
+    table["group"] = np.select(kinds, GROUPS[:3], GROUPS[3])
+    groups = {}
+    for group in GROUPS:
+        own = table[table.group == group].groupby("lung", sort=False).error_cmH2O
+        lungs = own.agg(lambda errors: errors.mean(skipna=False))
+        groups[group] = {
+            "error_cmH2O": number(lungs.mean(skipna=False)),
+            "plants": int(own.size().sum()) // len(protocol.PIPS),
+            "lungs": {lung: number(lungs.get(lung, np.nan)) for lung in runs.lungs},
+        }
+    return groups

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from ventbench.base import files
 from ventbench.base.errors import InputError, require
-from ventbench.stress.stressors import CATEGORIES, SEVERITIES, stressor
+from ventbench.task.stressors import CATEGORIES, SEVERITIES, stressor
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ventbench.base import files
 from ventbench.base.errors import InputError
-from ventbench.headroom import reference
+from ventbench.entries import reference
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators
 from ventbench.task import protocol

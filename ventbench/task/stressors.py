@@ -1,9 +1,9 @@
 """The stressors: one line of a table each.
 
-A stressor changes parameters of the physics in ``with - without`` (see
-:mod:`ventbench.stress.plants`). Most are mechanisms of the library at a strength; some are events,
-some are other settings of the test lung, some change from breath to breath. A new mechanism of the
-library becomes a stress test by a line of :data:`STRESSORS`.
+A stressor changes parameters of the physics in ``with - without`` (see ``plants/stressed.py``).
+Most are mechanisms of the library at a strength; some are events, some are other settings of the
+test lung, some change from breath to breath. A new mechanism of the library becomes a stress test
+by a line of :data:`STRESSORS`.
 """
 
 from __future__ import annotations
@@ -308,26 +308,3 @@ def conditions() -> tuple[Condition, ...]:
     """All conditions of the track: nothing first, then each stressor twice, then the pairs."""
     single = [Condition((s.name,), severity) for s in STRESSORS for severity in SEVERITIES]
     return (Condition(), *single, *(Condition(pair, "mild") for pair in PAIRS))
-
-
-def table() -> str:
-    """The table of stressors as Markdown, as it stands in ``docs/stress.md``."""
-    from ventbench.physics.catalogue import parameter  # brings JAX, which reading records needs not
-
-    lines = [
-        "| stressor | what happens | changes | mild | strong | why these strengths |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
-    for line in STRESSORS:
-        unit = "" if line.rule == "scale" else f" {parameter(line.strength).unit}"
-        unit = unit.replace(" 1/", " /").removesuffix(" 1")
-        sign = {"add": "+", "scale": "x ", "label": ""}[line.rule]
-        mild, strong = (
-            f"{sign if value > 0 else ''}{float(f'{value:.3g}'):g}{unit}"
-            for value in (line.mild, line.strong)
-        )
-        lines.append(
-            f"| `{line.name}` | {line.title} | `{line.strength}` | {mild} | {strong} "
-            f"| {line.reason} |"
-        )
-    return "\n".join(lines)

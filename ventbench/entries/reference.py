@@ -28,9 +28,8 @@ from ventbench.base.errors import InputError
 from ventbench.base.executor import InProcess, results
 from ventbench.base.resume import ARRAY, WorkFolder, fingerprint
 from ventbench.controllers.pid import PID
-from ventbench.headroom import attainable
-from ventbench.headroom.attainable import second_optimum
-from ventbench.task import rollouts
+from ventbench.task import attainable, rollouts
+from ventbench.task.attainable import second_optimum
 from ventbench.task.environment import Scenario
 from ventbench.task.interfaces import Plant
 from ventbench.task.metrics import score as metric
@@ -67,7 +66,7 @@ class Reference:
         attainable: error that :attr:`commands` attain, cmH2O, shape ``(L, 1 + K, P)``.
         lower: error of the rise alone, below which none can be, cmH2O, shape ``(L, 1 + K, P)``.
         stationarity: first-order decrease that is left, cmH2O, shape ``(L, 1 + K, P)``; see
-            :class:`ventbench.headroom.attainable.Attainable`.
+            :class:`ventbench.task.attainable.Attainable`.
         pid: error of the best PID with the noise of the draw, cmH2O, shape ``(L, 1 + K, P)``.
         commands: of one inspiration, %, shape ``(L, 1 + K, P, COMMANDS)``.
     """
@@ -231,7 +230,7 @@ def compute(
         gains: of each lung's best PID, %/cmH2O, shape ``(L, 3)``.
         about: what the reference belongs to, see :func:`settings`.
         folder: for finished parts; nothing is kept if not given.
-        starts: see :data:`ventbench.headroom.attainable.STARTS`.
+        starts: see :data:`ventbench.task.attainable.STARTS`.
         pool: executor of the draws; this process if not given.
         progress: called with the number of cells done, and of all.
 

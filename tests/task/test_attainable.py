@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from ventbench.base import precision
-from ventbench.headroom import attainable
-from ventbench.headroom.attainable import second_optimum
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
+from ventbench.task import attainable
+from ventbench.task.attainable import second_optimum
 from ventbench.task.environment import nominal_scenario
 from ventbench.task.lungs import LUNGS
 

@@ -1,4 +1,4 @@
-"""Tables of the stress track: error, safety and volume of every run, and what follows from them.
+"""Figures of runs under every condition: error, safety and volume, and what follows from them.
 
 A run is *survived* if the controller did not fail, passed the protocol's safety gate in every
 breath, and held the plateau of the last breath (mean of its last 0.3 s) within
@@ -9,6 +9,7 @@ pressure; the last breath, because a controller may take two breaths to notice.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -17,26 +18,57 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base.errors import InputError
-from ventbench.stress.stressors import CATEGORIES, Condition, conditions, stressor
+from ventbench.entries.errors import Failure
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.metrics.bootstrap import resampled_scores
+from ventbench.task.stressors import CATEGORIES, Condition, conditions, stressor
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Floats = NDArray[np.float64]
 
-#: Number of draws of an official score: each lung has each PIP once under every condition.
+#: Number of draws of an official score under stress: each lung has each PIP once.
 DRAWS = 6
 
 #: Place of the PIP of the first lung in each draw; the other lungs follow it.
 _TURNS = (0, 3, 1, 4, 2, 5)
 
+#: Tolerance of the plateau, cmH2O and share of PIP: "2 cmH2O + 4 % of the actual reading", as data
+#: sheets of intensive-care ventilators declare for airway pressure.
+PLATEAU_TOLERANCE, PLATEAU_SHARE = 2.0, 0.04
+
+
+@dataclass(frozen=True)
+class CellFailure:
+    """A failure and its cell.
+
+    Attributes:
+        condition: id of the condition.
+        lung: id; also where the submission did not know it.
+        pip: nominal PIP, cmH2O.
+        draw: counted from 1; None for the nominal cell.
+        failure: what went wrong.
+        message: the failure in one sentence for a person.
+    """
+
+    condition: str
+    lung: str
+    pip: float
+    draw: int | None
+    failure: Failure
+    message: str
+
+    def to_json(self) -> dict[str, Any]:
+        """The cell and the failure as JSON values."""
+        cell = {"condition": self.condition, "lung": self.lung, "pip": self.pip, "draw": self.draw}
+        return {**cell, **self.failure.to_json(), "message": self.message}
+
 
 @dataclass(frozen=True, eq=False, repr=False)
-class StressTables:
-    """Figures of every run of an entry; S conditions, L lungs, n draws.
+class Runs:
+    """Figures of every run of an entry; S conditions, L lungs, n cells of each lung.
 
     The first condition is none: the same cells without a stressor.
 
@@ -44,7 +76,7 @@ class StressTables:
         conditions: length S.
         lungs: ids, length L.
         pips: nominal PIP, cmH2O, ``(L, n)``.
-        rig: session of each lung in each draw, ``(L, n)``.
+        rig: session of each lung in each cell, ``(L, n)``.
         member: member of the ensemble, ``(L, n)``.
         error: mean |airway pressure - PIP| over the scored inspirations, cmH2O, ``(S, L, n)``; NaN
             where the controller failed.
@@ -52,7 +84,14 @@ class StressTables:
         survived: see the module, ``(S, L, n)``.
         alarm_s: time above PIP + 15 % in a breath, the longest of the run, s, ``(S, L, n)``.
         peak: highest pressure, cmH2O, ``(S, L, n)``.
-        volume: volume in the lung at the end of the scored inspirations, mean, mL, ``(S, L, n)``.
+        volume: volume in the lung at the end of the scored inspirations, mean, mL, ``(S, L, n)``;
+            NaN where the plants have no such signal.
+        draw: of each cell, counted from 1; 0 without deviations, ``(n,)``.
+        plateau_error: |mean of the last 0.3 s - PIP| of the last breath, cmH2O, ``(S, L, n)``; not
+            in records.
+        requested: all commands, %, ``(S, L, n, BREATHS, INSPIRATION_STEPS)``, 0 once a cell has
+            failed; not in records.
+        failures: what failed; not in records.
     """
 
     conditions: tuple[Condition, ...]
@@ -66,10 +105,14 @@ class StressTables:
     alarm_s: Floats
     peak: Floats
     volume: Floats
+    draw: NDArray[np.int64]
+    plateau_error: Floats | None = None
+    requested: Floats | None = None
+    failures: Sequence[CellFailure] = ()
 
     @property
     def score(self) -> float:
-        """Stress score, cmH2O: mean error over all stressed conditions, NaN if any cell failed."""
+        """Mean error over all stressed conditions, cmH2O; NaN if any cell failed."""
         return float(np.mean(self.error[1:]))
 
     @property
@@ -134,7 +177,7 @@ class StressTables:
         low, high = np.quantile(self.resampled(values), (0.025, 0.975))
         return float(low), float(high)
 
-    def comparable(self, other: StressTables) -> bool:
+    def comparable(self, other: Runs) -> bool:
         """Whether another entry was run under the same conditions on the same draws."""
         return (
             self.conditions == other.conditions
@@ -145,7 +188,7 @@ class StressTables:
             )
         )
 
-    def difference(self, other: StressTables) -> tuple[float, tuple[float, float]]:
+    def difference(self, other: Runs) -> tuple[float, tuple[float, float]]:
         """Stress score less that of another entry, cmH2O, and its paired 95 % interval.
 
         Raises:
@@ -155,6 +198,41 @@ class StressTables:
             raise InputError("these entries were run under different conditions or draws")
         change = self.by_lung_and_draw - other.by_lung_and_draw
         return float(change.mean()), self.interval(change)
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row a run.
+
+        Returns:
+            Columns ``condition`` (id), ``lung`` (id), ``pip_cmH2O``, ``draw`` (0 without
+            deviations, then 1..K), ``rig``, ``member``, ``error_cmH2O`` (mean |pressure - target|;
+            NaN where the controller failed), ``rise_cmH2O``, ``plateau_error_cmH2O``, ``survived``,
+            ``safe``, ``above_alarm_s``, ``peak_cmH2O``, ``volume_mL`` and ``volume_ratio``.
+        """
+        import pandas as pd
+
+        s, lung, cell = (axis.ravel() for axis in np.indices(self.error.shape))
+        missing = np.full(self.error.shape, np.nan)
+        return pd.DataFrame(
+            {
+                "condition": np.array([c.id for c in self.conditions])[s],
+                "lung": np.array(self.lungs)[lung],
+                "pip_cmH2O": self.pips[lung, cell],
+                "draw": self.draw[cell],
+                "rig": self.rig[lung, cell],
+                "member": self.member[lung, cell],
+                "error_cmH2O": self.error.ravel(),
+                "rise_cmH2O": self.rise.ravel(),
+                "plateau_error_cmH2O": (
+                    missing if self.plateau_error is None else self.plateau_error
+                ).ravel(),
+                "survived": self.survived.ravel(),
+                "safe": self.safe.ravel(),
+                "above_alarm_s": self.alarm_s.ravel(),
+                "peak_cmH2O": self.peak.ravel(),
+                "volume_mL": self.volume.ravel(),
+                "volume_ratio": self.volume_ratio.ravel(),
+            }
+        )
 
     def summary(self) -> pd.DataFrame:
         """One row a condition, by its id: means over cells, and the worst run."""

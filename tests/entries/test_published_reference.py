@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 
 from ventbench.base import precision
-from ventbench.headroom import attainable
-from ventbench.headroom import reference as references
+from ventbench.entries import reference as references
 from ventbench.plants.rigs import load_rigs
-from ventbench.task import protocol
+from ventbench.task import attainable, protocol
 from ventbench.task.metrics.score import LEAST_HEADROOM
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from ventbench.base.errors import InputError
+from ventbench.entries import reference as references
 from ventbench.entries.folder import submission_of
 from ventbench.entries.scoring import run_protocol
-from ventbench.headroom import reference as references
 from ventbench.task import protocol
 
 from ..textbook_rigs import TextbookRigs

@@ -22,10 +22,10 @@ from ventbench.physics.catalogue import parameter, paths
 from ventbench.physics.model import Physics
 from ventbench.plants.corrected import corrected_signals
 from ventbench.plants.hybrid import ELASTIC_KNOTS, RELIEF, VALVE_KNOTS, Hybrid
-from ventbench.stress.stressors import Condition, Severity, Stressor, stressor
 from ventbench.task import protocol
 from ventbench.task.interfaces import Plant, Signals
 from ventbench.task.lungs import Lung
+from ventbench.task.stressors import Condition, Severity, Stressor, stressor
 
 Floats = NDArray[np.float64]
 

@@ -36,9 +36,9 @@ from ventbench.controllers.pid import TIME_CONSTANT
 from ventbench.entries.scaffold import contents
 from ventbench.task import attainable as bound
 from ventbench.task import environment as env
-from ventbench.task import protocol
+from ventbench.task import protocol, rollouts
 from ventbench.task.environment import Scenario
-from ventbench.task.interfaces import Plant, Signals
+from ventbench.task.interfaces import Observation, Plant, Signals
 
 Floats = NDArray[np.float64]
 
@@ -166,6 +166,9 @@ class _Breathing:
     def vary(self, r_scale: Array, c_scale: Array) -> _Breathing:
         return _Breathing(self.plant.vary(r_scale, c_scale), self.state)
 
+    def parameters(self) -> Any:
+        return self.plant.parameters()
+
 
 def plan_controller(plant: Plant, pips: tuple[float, ...]) -> PlannedController:
     """Plan a controller on a simulator.
@@ -210,14 +213,8 @@ def plan_controller(plant: Plant, pips: tuple[float, ...]) -> PlannedController:
 @jax.vmap
 def _breath_after(plant: _Breathing, cell: Scenario, commands: Array) -> tuple[Any, Array]:
     """State and reading after a breath, when the next inspiration begins."""
-    steps = jnp.arange(protocol.INSPIRATION_STEPS, protocol.BREATH_STEPS)
-    loop, _ = jax.lax.scan(
-        lambda loop, command: (env.inspire(plant, cell, loop, command)[0], None),
-        env.start_breath(plant, cell), commands,
-    )  # fmt: skip
-    loop, _ = jax.lax.scan(
-        lambda loop, step: (env.expire(plant, cell, loop, step)[0], None), loop, steps
-    )
+    loop, _, _ = rollouts.inspiration(plant, cell, rollouts.commanded, inputs=commands)
+    loop, _ = rollouts.expiration(plant, cell, loop)
     return breath_begun(loop.plant, jnp.ones(())), loop.signals.reading
 
 
@@ -243,20 +240,17 @@ def _errors(
     def error(gain: Array, cell: Scenario, state: Any, commands: Array, pressures: Array) -> Array:
         varied = env.vary(_Breathing(plant, state), cell)
 
-        def step(carry: tuple[Any, Array, Array], planned: tuple[Array, Array]) -> tuple[Any, None]:
-            loop, integral, total = carry
+        def feedback(integral: Array, seen: Observation, planned: Any) -> tuple[Array, Array]:
             command, pressure = planned
-            missing = pressure - loop.signals.reading
+            missing = pressure - seen.pressure
             integral = integral + share * (missing - integral)
-            total = total + jnp.abs(loop.signals.reading - cell.pip)
-            asked = command + gain[0] * missing + gain[1] * integral
-            loop, _ = env.inspire(varied, cell, loop, asked)
-            return (loop, integral, total), None
+            return integral, command + gain[0] * missing + gain[1] * integral
 
-        start = env.start_breath(varied, cell)
-        zero = jnp.zeros_like(start.previous)
-        (_, _, total), _ = jax.lax.scan(step, (start, zero, zero), (commands, pressures))
-        return total / protocol.INSPIRATION_STEPS
+        _, _, off = rollouts.inspiration(
+            varied, cell, feedback, jnp.zeros_like(cell.start), inputs=(commands, pressures),
+            record=lambda before, *_: jnp.abs(before.signals.reading - cell.pip),
+        )  # fmt: skip
+        return off.mean(axis=0)
 
     of_pips = jax.vmap(error, (None, 0, 0, 0, 0))
     of_departures = jax.vmap(of_pips, (None, 0, None, None, None))

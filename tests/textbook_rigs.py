@@ -48,6 +48,9 @@ class OffsetLung:
     def vary(self, r_scale: Array, c_scale: Array) -> OffsetLung:
         return OffsetLung(self.lung.vary(r_scale, c_scale))
 
+    def parameters(self) -> dict[str, Array]:
+        return self.lung.parameters()
+
 
 class TextbookRigs:
     """What :func:`ventbench.plants.frozen.load` returns for version 2, as far as it is needed."""

@@ -263,11 +263,29 @@ def test_nominal_variation_changes_nothing(name):
     np.testing.assert_array_equal(pressures(plant, u_in), pressures(plant.vary(one, one), u_in))
 
 
+@every_plant
+def test_its_parameters_are_physics_that_answer_alike(name):
+    plant = PLANTS[name]()
+    known = plant.parameters()
+    if known is None:
+        assert name.startswith(("learned", "two_balloon"))
+        return
+    u_in = np.where(np.arange(T) < 20, 18.0, 12.0)
+    said = physics(lung("R5C10")).having(**known)
+    off = np.abs(pressures(said, u_in) - pressures(plant, u_in))
+    # A learned rig knows more than the library; its parameters say most of it.
+    assert off.max() < (4.0 if name in FROZEN else 0.05)
+    varied = plant.vary(jnp.asarray(2.0), jnp.asarray(0.5)).parameters()
+    assert varied is not None
+    for path, factor in (("R", 2.0), ("C", 0.5)):
+        np.testing.assert_allclose(varied[path], factor * known[path], rtol=1e-6)
+
+
 @flax.struct.dataclass
 class FirstOrder:
     """A toy family: pressure follows the command with a time constant; PEEP when the valve opens.
 
-    All that a family needs: ``init``, ``step``, ``vary`` and a lung at its label.
+    All that a family needs: ``init``, ``step``, ``vary``, ``parameters``, a lung at its label.
     """
 
     gain: Array
@@ -288,6 +306,9 @@ class FirstOrder:
 
     def vary(self, r_scale, c_scale):
         return FirstOrder(self.gain * r_scale, self.tau * r_scale * c_scale)
+
+    def parameters(self):
+        return None
 
 
 def first_order(label: Lung) -> FirstOrder:

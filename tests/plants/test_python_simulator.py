@@ -178,6 +178,9 @@ class Untraceable:
     def vary(self, r_scale, c_scale):
         return self
 
+    def parameters(self):
+        return None
+
 
 def test_a_registered_class_in_numpy_is_told_apart(breaths):
     plant: Any = Untraceable(R=2.0).replace(R=jnp.asarray(2.0))  # type: ignore[attr-defined]

@@ -172,6 +172,10 @@ class Physics:
         ]
         return self.replace(values=tuple(varied))  # type: ignore[attr-defined]
 
+    def parameters(self) -> dict[str, Array]:
+        """Its own by path; see :class:`~ventbench.task.interfaces.Plant`."""
+        return dict(zip(self.names, self.values, strict=True))
+
     def get(self, name: str) -> Array:
         """Value of a parameter; its neutral value if it is not named."""
         if name in self.names:
@@ -184,7 +188,7 @@ class Physics:
         Raises:
             InputError: if there is no such parameter.
         """
-        named = dict(zip(self.names, self.values, strict=True))
+        named = self.parameters()
         named |= {name: jnp.asarray(value, float) for name, value in values.items()}
         names = tuple(name for name in paths(tuple(everything())) if name in named)
         if unknown := set(named) - set(names):
@@ -194,8 +198,7 @@ class Physics:
         )
 
     def _assembly(self) -> Assembly:
-        named = dict(zip(self.names, self.values, strict=True))
-        return assemble(named, everything(), self.skip_idle)
+        return assemble(self.parameters(), everything(), self.skip_idle)
 
 
 def physics(

@@ -50,6 +50,10 @@ class Corrected:
         parts = (self.simulator, self.with_mechanisms, self.without_mechanisms)
         return Corrected(*(part.vary(r_scale, c_scale) for part in parts))
 
+    def parameters(self) -> dict[str, Array] | None:
+        """Those with the mechanisms; see :class:`~ventbench.task.interfaces.Plant`."""
+        return self.with_mechanisms.parameters()
+
 
 def corrected_signals(simulator: Signals, more: Signals, less: Signals) -> Signals:
     """Signals of a simulator plus the difference of two physics.

@@ -14,6 +14,7 @@ from itertools import pairwise
 
 import flax.struct
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ventbench.task.interfaces import Signals
@@ -32,6 +33,17 @@ DIRECTION_WIDTH = 0.4
 
 #: The relief opens here and holds the pressure below the sum, cmH2O. No recording goes above 61.4.
 RELIEF, RELIEF_ROOM = 60.0, 10.0
+
+#: Conductance of the relief valve in the reference physics of a rig, mL/s per cmH2O: the fully open
+#: valve ends within the room that a rig's own relief leaves.
+RELIEF_CONDUCTANCE = 200.0
+
+#: Command at which the basis term ``valve_shape`` holds the valve's gain, %, and those at which it
+#: has a coefficient.
+_VALVE_AT, _VALVE_SHAPE = 20.0, (1.0, 3.0, 6.0, 12.0, 35.0, 60.0, 100.0)
+
+#: Recoils at which the elastic curve of a rig is compared with that of the library, cmH2O.
+_RECOILS = np.linspace(2.0, 40.0, 39)
 
 #: Samples whose commands are remembered; at 10 ms they reach back as far as the longest dead time.
 MEMORY = 6
@@ -242,6 +254,38 @@ class Hybrid:
         return self.replace(  # type: ignore[attr-defined]
             R=self.R * r_scale, K2=self.K2 * r_scale, E=self.E / c_scale
         )
+
+    def parameters(self) -> dict[str, Array]:
+        """Read off the rig; the valve's curve is exact at the knots of the basis term."""
+        knots = np.asarray(VALVE_KNOTS)
+
+        def valve(u_in: float) -> Array:
+            return self.slopes @ np.clip(u_in - knots, 0.0, np.append(np.diff(knots), np.inf))
+
+        gain = valve(_VALVE_AT) / _VALVE_AT
+        # Least squares of the recoil's departure from a line by the first term of its series.
+        above = np.maximum(_RECOILS[:, None] - np.asarray(ELASTIC_KNOTS), 0.0)
+        departure = self.stiffening @ above.T
+        squares = 0.5 * _RECOILS**2
+        ones = 1.0 + 0.0 * self.R
+        return {
+            "R": self.R,
+            "C": 1e3 / self.E,
+            "gain": 1e3 * gain,
+            "R_ex": 1.0 / self.closing_conductance,
+            "rest": self.rest,
+            "offset": self.offset,
+            "turbulent_resistance.quadratic": self.K2,
+            "nonlinear_compliance.stiffening": departure @ squares / (squares @ squares),
+            "valve_delay.delay": self.valve_delay,
+            "valve_lag.tau": self.valve_lag,
+            "circuit_compliance.compliance": 1e3 * self.circuit_compliance,
+            "sensor_lag.tau": self.sensor_lag,
+            "exhalation_valve_delay.closing": self.closing_delay,
+            "relief_valve.conductance": RELIEF_CONDUCTANCE * ones,
+            "relief_valve.opening": RELIEF * ones,
+            **{f"valve_shape.c{k}": valve(u) / gain - u for k, u in enumerate(_VALVE_SHAPE, 1)},
+        }
 
 
 def _delayed(

@@ -322,6 +322,9 @@ class Learned:
             time_scale=self.time_scale * r_scale * c_scale,
         )
 
+    def parameters(self) -> None:
+        """Nothing is known of its physics; see :class:`~ventbench.task.interfaces.Plant`."""
+
 
 def _bend(pressure: Array) -> Array:
     """Bend towards ``LOWEST`` and ``HIGHEST``, the identity between."""

@@ -72,6 +72,10 @@ class SingleCompartment:
         """Return the same lung with other R and C."""
         return self.replace(R=self.R * r_scale, C=self.C * c_scale)  # type: ignore[attr-defined]
 
+    def parameters(self) -> dict[str, Array]:
+        """Its own by path; see :class:`~ventbench.task.interfaces.Plant`."""
+        return {"R": self.R, "C": self.C, "gain": self.gain, "R_ex": self.R_ex}
+
 
 def single_compartment(
     lung: Lung, *, gain: ArrayLike = VALVE_GAIN, R_ex: ArrayLike = EXPIRATORY_RESISTANCE

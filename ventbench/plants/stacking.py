@@ -158,6 +158,9 @@ class VmappedPlant:
             jax.vmap(lambda plant, *x: plant.vary(*x))(self.plants, r_scale, c_scale)
         )
 
+    def parameters(self) -> None:
+        """Nothing is known of its physics; see :class:`~ventbench.task.interfaces.Plant`."""
+
 
 def open_loop_breaths(
     plants_for: PlantsFor, breaths: Breaths, progress: Callable[[int], object] | None = None

@@ -1,8 +1,8 @@
 """Stressed plants: the scored plant, plus what physics with a stressor does and without does not.
 
 The physics *without* is the reference physics of the scored plant: what the library can say of it.
-For a learned rig (:class:`~ventbench.plants.hybrid.Hybrid`) its parameters are read off the rig, so
-that the difference is taken where the rig works; for another plant they are those of the label.
+A plant says it by its ``parameters``, so that the difference is taken where a learned rig works;
+for a plant that says nothing they are those of the label.
 The physics *with* has the strength of the stressor in addition. Both are one model with the same
 parameters, so that all cells of all conditions run in one batch, without a branch.
 """
@@ -21,24 +21,13 @@ from numpy.typing import NDArray
 from ventbench.physics.catalogue import parameter, paths
 from ventbench.physics.model import Physics
 from ventbench.plants.corrected import corrected_signals
-from ventbench.plants.hybrid import ELASTIC_KNOTS, RELIEF, VALVE_KNOTS, Hybrid
+from ventbench.plants.hybrid import RELIEF, RELIEF_CONDUCTANCE
 from ventbench.task import protocol
 from ventbench.task.interfaces import Plant, Signals
 from ventbench.task.lungs import Lung
 from ventbench.task.stressors import Condition, Severity, Stressor, stressor
 
 Floats = NDArray[np.float64]
-
-#: Conductance of the relief valve of the reference physics, mL/s per cmH2O: the fully open valve
-#: of a rig ends within the room that a rig's own relief leaves.
-_RELIEF_CONDUCTANCE = 200.0
-
-#: Command at which the basis term ``valve_shape`` holds the valve's gain, %, and those at which it
-#: has a coefficient.
-_VALVE_AT, _VALVE_SHAPE = 20.0, (1.0, 3.0, 6.0, 12.0, 35.0, 60.0, 100.0)
-
-#: Recoils at which the elastic curve of a rig is compared with that of the library, cmH2O.
-_RECOILS = np.linspace(2.0, 40.0, 39)
 
 
 @flax.struct.dataclass
@@ -79,6 +68,10 @@ class Stressed:
         """Return the same lung with another resistance and compliance."""
         return Stressed(self.simulator.vary(r_scale, c_scale), self.physics.vary(r_scale, c_scale))
 
+    def parameters(self) -> dict[str, Array]:
+        """Those with the stressor; see :class:`~ventbench.task.interfaces.Plant`."""
+        return {path: value[..., 0] for path, value in self.physics.parameters().items()}
+
 
 def reference_physics(plant: Plant, lungs: Sequence[Lung]) -> dict[str, Floats]:
     """Parameters of the library's physics that say most of what a plant does.
@@ -88,52 +81,18 @@ def reference_physics(plant: Plant, lungs: Sequence[Lung]) -> dict[str, Floats]:
         lungs: labels, length L.
 
     Returns:
-        Parameters by path, shape ``(L, ...)``: for a learned rig and for physics the batch shape of
-        the plant; for other plants ``(L,)``.
+        Parameters by path: what the plant says, of its batch shape; for a plant that says nothing
+        those of the label, shape ``(L,)``.
     """
-    if isinstance(plant, Hybrid):
-        return _of_hybrid(plant)
-    if isinstance(plant, Physics):
-        return {path: np.asarray(plant.get(path), float) for path in plant.names}
+    wide: Any = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), plant)
+    known = wide.parameters()
+    if known is not None:
+        return {path: np.asarray(value) for path, value in known.items()}
     return {
         "R": np.array([lung.R for lung in lungs]),
         "C": np.array([lung.C for lung in lungs]),
-        "relief_valve.conductance": np.full(len(lungs), _RELIEF_CONDUCTANCE),
+        "relief_valve.conductance": np.full(len(lungs), RELIEF_CONDUCTANCE),
         "relief_valve.opening": np.full(len(lungs), RELIEF),
-    }
-
-
-def _of_hybrid(plant: Hybrid) -> dict[str, Floats]:
-    """Read the parameters off learned rigs; the valve's curve is exact at the knots of the term."""
-    rig: Any = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), plant)
-    knots = np.asarray(VALVE_KNOTS)
-
-    def valve(u_in: float) -> Floats:
-        return rig.slopes @ np.clip(u_in - knots, 0.0, np.append(np.diff(knots), np.inf))
-
-    gain = valve(_VALVE_AT) / _VALVE_AT
-    # Least squares of the recoil's departure from a line by the first term of its series.
-    above = np.maximum(_RECOILS[:, None] - np.asarray(ELASTIC_KNOTS), 0.0)
-    departure = rig.stiffening @ above.T
-    squares = 0.5 * _RECOILS**2
-    ones = np.ones(rig.R.shape)
-    return {
-        "R": rig.R,
-        "C": 1e3 / rig.E,
-        "gain": 1e3 * gain,
-        "R_ex": 1.0 / rig.closing_conductance,
-        "rest": rig.rest,
-        "offset": rig.offset,
-        "turbulent_resistance.quadratic": rig.K2,
-        "nonlinear_compliance.stiffening": departure @ squares / (squares @ squares),
-        "valve_delay.delay": rig.valve_delay,
-        "valve_lag.tau": rig.valve_lag,
-        "circuit_compliance.compliance": 1e3 * rig.circuit_compliance,
-        "sensor_lag.tau": rig.sensor_lag,
-        "exhalation_valve_delay.closing": rig.closing_delay,
-        "relief_valve.conductance": _RELIEF_CONDUCTANCE * ones,
-        "relief_valve.opening": RELIEF * ones,
-        **{f"valve_shape.c{k}": valve(u) / gain - u for k, u in enumerate(_VALVE_SHAPE, 1)},
     }
 
 

@@ -117,6 +117,9 @@ class TwoBalloon:
         """Return the same lung with other R and C."""
         return replace(self, R=self.R * r_scale, C=self.C * c_scale)
 
+    def parameters(self) -> None:
+        """Nothing is known of its physics; see :class:`~ventbench.task.interfaces.Plant`."""
+
 
 def two_balloon(
     lung: Lung,

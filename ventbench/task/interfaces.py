@@ -8,6 +8,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from jax import Array
 
 #: Version of the submission interface (:class:`Task`, :class:`Observation`, ``reset``, ``act``).
@@ -81,6 +83,14 @@ class Plant(Protocol):
 
     def vary(self, r_scale: Array, c_scale: Array) -> Plant:
         """Return the same lung with resistance and compliance times these factors."""
+        ...
+
+    def parameters(self) -> Mapping[str, Any] | None:
+        """What the physics of :mod:`ventbench.physics` can say of this plant.
+
+        Returns:
+            Parameters by path, of the shape of the plant's own; None where nothing is known.
+        """
         ...
 
 

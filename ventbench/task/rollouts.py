@@ -148,6 +148,25 @@ def inspiration(
     return loop, state, out
 
 
+def expiration(plant: Plant, scenario: Scenario, loop: LoopState) -> tuple[LoopState, Expirations]:
+    """Run the fixed commands of an expiration.
+
+    Args:
+        plant: plants of the cells, from :func:`ventbench.task.environment.vary`.
+        scenario: the cells.
+        loop: state at the end of the inspiration.
+
+    Returns:
+        State of the loop afterwards, and what it shows, steps first.
+    """
+
+    def expire(loop: LoopState, step: Array) -> tuple[LoopState, Expirations]:
+        after, u_in = env.expire(plant, scenario, loop, step)
+        return after, Expirations(loop.signals.scored, u_in)
+
+    return jax.lax.scan(expire, loop, jnp.arange(INSPIRATION, protocol.BREATH_STEPS))
+
+
 def controlled_by(controller: Controller) -> Policy:
     """Return a pure controller as a policy."""
     return lambda state, observation, _: controller.step(state, observation)
@@ -187,13 +206,7 @@ def closed_loop(
         varied = env.vary(own if changing else plant, scenario)
         loop, state, inspired = inspiration(varied, scenario, policy, state, breath=breath)
 
-        def expire(loop: LoopState, step: Array) -> tuple[LoopState, Expirations]:
-            after, u_in = env.expire(varied, scenario, loop, step)
-            return after, Expirations(loop.signals.scored, u_in)
-
-        expired = None
-        if whole:
-            _, expired = jax.lax.scan(expire, loop, jnp.arange(INSPIRATION, protocol.BREATH_STEPS))
+        expired = expiration(varied, scenario, loop)[1] if whole else None
         return state, (inspired, expired)
 
     breaths = (jnp.arange(BREATHS), plant if changing else None)

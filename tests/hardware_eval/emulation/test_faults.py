@@ -108,6 +108,9 @@ class _Rigid:
     def vary(self, r_scale: Any, c_scale: Any) -> Any:
         return _Rigid(self.gain * r_scale)
 
+    def parameters(self) -> None:
+        return None
+
 
 def test_a_plant_without_flow_says_so() -> None:
     hal = SimulatedHal(_Rigid(1.0))

@@ -25,7 +25,7 @@ from ventbench.diagnosis.findings import (
 from ventbench.diagnosis.latent_inputs import ALVEOLUS, MEASUREMENT, SUPPLY
 from ventbench.diagnosis.result import RECORD_NEXT, Diagnosis
 from ventbench.pages.diagnosis import charts
-from ventbench.physics import Physics, mechanism
+from ventbench.physics import mechanism
 from ventbench.physics.characteristics import characteristic
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 
@@ -193,9 +193,9 @@ def _values(diagnosis: Diagnosis, missing: MissingMechanism) -> dict[str, float]
     """Values of a mechanism's parameters by short name, and of the base model's."""
     values: dict[str, float] = {}
     plant: Any = next(iter(diagnosis.plants.values()), None)
-    plant = getattr(plant, "with_mechanisms", plant)
-    if isinstance(plant, Physics):
-        for path, value in zip(plant.names, plant.values, strict=True):
+    known = None if plant is None else plant.parameters()
+    if known is not None:
+        for path, value in known.items():
             owner, _, short = path.rpartition(".")
             if owner in ("", missing.name):
                 values[short] = float(np.mean(np.asarray(value)))

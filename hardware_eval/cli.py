@@ -120,9 +120,10 @@ def run(
     largest_rise: Annotated[
         float, typer.Option(help="Largest rise of the command in one step, %.")
     ] = 100.0,
-    sandbox: Annotated[
-        bool, typer.Option(help="Run entries as in scoring; --no-sandbox only for trusted code.")
-    ] = True,
+    in_process: Annotated[
+        bool,
+        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
+    ] = False,
     dry_run: Annotated[
         bool, typer.Option(help="Run the plan on the frozen simulators first.")
     ] = True,
@@ -173,9 +174,9 @@ def run(
     try:
         with _keys(person):
             done = ev.evaluate(
-                entries, line, out, person, plan=plan, view=views, sandbox=sandbox, dry=dry_run,
-                before_lung=before_lung, settings=settings, operator_name=operator, notes=notes,
-                rest=rest,
+                entries, line, out, person, plan=plan, view=views, sandbox=not in_process,
+                dry=dry_run, before_lung=before_lung, settings=settings, operator_name=operator,
+                notes=notes, rest=rest,
             )  # fmt: skip
     finally:
         line.client.close()
@@ -388,7 +389,10 @@ def demo(
     plant: Annotated[
         str, typer.Option(help="Simulators that lack the concealed physics: physics or frozen.")
     ] = "physics",
-    sandbox: Annotated[bool, typer.Option(help="Run entries as in scoring.")] = True,
+    in_process: Annotated[
+        bool,
+        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
+    ] = False,
     json: JsonFile = None,
 ) -> None:
     """Close the loop on an emulated lung that conceals physics: find it, correct, control better.
@@ -399,8 +403,8 @@ def demo(
 
     to = sys.stderr if str(json) == "-" else sys.stdout
     done = run_demo(
-        conceal, out, breaths=breaths, simulator=plant, real_time=not fast, sandbox=sandbox,
-        tell=lambda text: print(text, file=to, flush=True),
+        conceal, out, breaths=breaths, simulator=plant, real_time=not fast,
+        sandbox=not in_process, tell=lambda text: print(text, file=to, flush=True),
     )  # fmt: skip
     emit(done.as_dict(), json)
     print(f"\n{done}", file=to)

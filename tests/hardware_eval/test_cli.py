@@ -43,7 +43,7 @@ def test_run_makes_a_record_and_replay_agrees(on_line: Line, tmp_path: Path) -> 
     out, result = tmp_path / "out", tmp_path / "result.json"
     done = invoke(
         "run", "pid_best", "--port", "p", "--lung", "R5C20", "--pips", "10", "--repeats", "1",
-        "--control-every", "0", "--no-dry-run", "--no-selftest", "--no-sandbox", "--rest", "0.5",
+        "--control-every", "0", "--no-dry-run", "--no-selftest", "--in-process", "--rest", "0.5",
         "--yes", "--out", str(out), "--json", str(result),
     )  # fmt: skip
     assert done.exit_code == 0, done.output
@@ -58,7 +58,7 @@ def test_run_makes_a_record_and_replay_agrees(on_line: Line, tmp_path: Path) -> 
 
 def test_without_a_terminal_and_without_yes_nothing_moves(on_line: Line, tmp_path: Path) -> None:
     done = invoke(
-        "run", "pid_best", "--port", "p", "--lung", "R5C20", "--no-dry-run", "--no-sandbox",
+        "run", "pid_best", "--port", "p", "--lung", "R5C20", "--no-dry-run", "--in-process",
         "--out", str(tmp_path / "out"),
     )  # fmt: skip
     assert done.exit_code == 1
@@ -81,7 +81,7 @@ def test_an_entry_of_which_every_run_failed_has_no_score(
     out, result = tmp_path / "out", tmp_path / "result.json"
     done = invoke(
         "run", "pid_best", "--port", "p", "--lung", "R5C20", "--pips", "10", "--repeats", "1",
-        "--control-every", "0", "--no-dry-run", "--no-selftest", "--no-sandbox", "--rest", "0.5",
+        "--control-every", "0", "--no-dry-run", "--no-selftest", "--in-process", "--rest", "0.5",
         "--yes", "--out", str(out), "--json", str(result),
     )  # fmt: skip
     assert done.exit_code == 1, done.output

@@ -108,8 +108,8 @@ def test_weights_modules_and_prints(written):
 
 
 def test_official_fails_closed(monkeypatch):
-    monkeypatch.setattr(runner_module, "layers", lambda: ("rlimits", "seccomp"))
-    with pytest.raises(SandboxError, match=r"missing here: .*landlock"):
+    monkeypatch.setattr(runner_module, "layers", lambda: ("landlock", "seccomp"))
+    with pytest.raises(SandboxError, match=r"missing here: .*empty-root"):
         SandboxRunner(require_official=True)
     assert SandboxRunner().sandbox["official"] is False
 

@@ -11,7 +11,6 @@ In a test of your own::
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -25,6 +24,7 @@ from ventbench.entries.contract_runs import (
     driven,
     joined,
     plain,
+    processor_time,
     repeated,
     run_all,
     unusual,
@@ -39,7 +39,7 @@ from ventbench.entries.errors import (
 )
 from ventbench.entries.folder import CONTROLLER, Submission, open_submission, resolve
 from ventbench.entries.review import inspect_folder
-from ventbench.entries.runner import Runner
+from ventbench.entries.runner import ControllerSession, Runner
 from ventbench.task import draws, protocol
 from ventbench.task.lungs import LUNGS
 
@@ -73,7 +73,7 @@ _ROUNDS = STEPS + STEPS + 3 * STEPS + 2
 def check(
     name: str,
     runner: Runner | None = None,
-    clock: Callable[[], float] = time.perf_counter,
+    clock: Callable[[ControllerSession], float] = processor_time,
     progress: Callable[[int, int], object] | None = None,
 ) -> CheckReport:
     """Find everything that is wrong with a submission.
@@ -84,7 +84,7 @@ def check(
     Args:
         name: path of a folder, or the name of a bundled submission.
         runner: runs the controller; the sandbox if not given.
-        clock: times the calls of ``act``, s.
+        clock: times the calls of ``act``, s; by default their processor time.
         progress: called with rounds of the runs that are done, and all of them.
 
     Raises:
@@ -92,15 +92,15 @@ def check(
         SandboxError: if nothing can be run apart on this machine.
     """
     folder = resolve(name)
-    findings = list(inspect_folder(folder))
-    opened = _opened(name)
-    if opened is None or any(f.problem for f in findings if f.group == "source"):
-        return _report(name, findings, left_out=_TO_RUN)
-    if runner is None:
+    if runner is None:  # first: a machine that cannot run it reads none of it
         from ventbench.sandbox.configuration import Allowance
         from ventbench.sandbox.runner import SandboxRunner
 
         runner = SandboxRunner(allowance=Allowance(total_s=120.0))
+    findings = list(inspect_folder(folder))
+    opened = _opened(name)
+    if opened is None or any(f.problem for f in findings if f.group == "source"):
+        return _report(name, findings, left_out=_TO_RUN)
     done = 0
 
     def count() -> None:
@@ -138,7 +138,7 @@ def _ran(
     submission: Submission,
     runner: Runner,
     findings: list[Finding],
-    clock: Callable[[], float],
+    clock: Callable[[ControllerSession], float],
     count: Callable[[], None],
 ) -> CheckReport:
     name, tracks = submission.label, submission.manifest.tracks
@@ -282,12 +282,12 @@ def time_findings(act_seconds: Floats) -> Iterator[Finding]:
     """Findings on how long ``act`` takes.
 
     Args:
-        act_seconds: duration of each call, s.
+        act_seconds: processor time of each call, s.
     """
     mean = float(act_seconds.mean())
     total = mean * ACTS / CORES
     score = f"the {ACTS} calls of a score {total:.0f} s on {CORES} cores"
-    what = f"act takes {1e3 * mean:.3g} ms on average, {score}"
+    what = f"act takes {1e3 * mean:.3g} ms of processor time on average, {score}"
     if total > LONGEST_S:
         advice = f"make it {total / LONGEST_S:.1f} times faster: {LONGEST_S:g} s are the limit"
         yield Finding("time", CONTROLLER, what, advice)

@@ -11,7 +11,6 @@ import contextlib
 import dataclasses
 import shutil
 import tempfile
-import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from ventbench.entries.errors import Failure
 from ventbench.entries.folder import CONTROLLER, Submission
-from ventbench.entries.runner import Runner
+from ventbench.entries.runner import ControllerSession, Runner
 from ventbench.sandbox.child.cell import ROW
 from ventbench.task import protocol
 from ventbench.task.interfaces import Task
@@ -210,7 +209,7 @@ class Answers:
     Attributes:
         commands: answers of each run, %, up to its end or failure.
         failures: what failed, by number of the run.
-        act_seconds: duration of one ``act`` in each round of all runs, s, without the first ones.
+        act_seconds: processor time of one ``act`` in each round, s, without the first ones.
     """
 
     commands: tuple[Floats, ...]
@@ -225,11 +224,16 @@ def joined(first: Answers, second: Answers) -> Answers:
     return Answers((*first.commands, *second.commands), failures, first.act_seconds)
 
 
+def processor_time(session: ControllerSession) -> float:
+    """Time by the system's count, s: neither an entry nor a busy machine changes it."""
+    return session.processor_time()
+
+
 def run_all(
     submission: Submission,
     runs: Sequence[ContractRun],
     runner: Runner,
-    clock: Callable[[], float] = time.perf_counter,
+    clock: Callable[[ControllerSession], float] = processor_time,
     count: Callable[[], None] = lambda: None,
 ) -> Answers:
     """Run all runs side by side.
@@ -238,7 +242,7 @@ def run_all(
         submission: whose controller is asked.
         runs: fresh ones.
         runner: runs the controllers.
-        clock: times the calls of ``act``, s.
+        clock: times the calls of ``act``, s; by default as the system counts a process's time.
         count: called after each round.
 
     Raises:
@@ -254,9 +258,9 @@ def run_all(
         while waiting:
             batch = np.array(rows)
             live = max(1, len(runs) - len(session.failures))
-            start = clock()
+            start = clock(session)
             answers = session.act(batch)
-            seconds.append((clock() - start) / live)
+            seconds.append((clock(session) - start) / live)
             count()
             for k in sorted(waiting):
                 if k in session.failures:

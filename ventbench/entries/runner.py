@@ -7,6 +7,7 @@ time. Only numbers cross: a :class:`Task` for each cell at the start, then at ev
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -44,6 +45,10 @@ class ControllerSession(Protocol):
         Returns:
             ``u_in``, %, shape ``(cells,)``: finite, 0 for a failed cell, not clipped.
         """
+        ...
+
+    def processor_time(self) -> float:
+        """Processor time that the controllers have had, s, as the system counts it."""
         ...
 
     def close(self) -> None:
@@ -128,6 +133,10 @@ class InProcessSession:
                 del self._cells[index]
         return commands
 
+    def processor_time(self) -> float:
+        """Processor time of this process, s; see :class:`ControllerSession`."""
+        return time.process_time()
+
     def close(self) -> None:
         """Forget the controllers."""
         self._cells.clear()
@@ -195,7 +204,7 @@ class CountingRunner:
 class _CountingSession:
     def __init__(self, session: ControllerSession, count: Callable[[], None]):
         self._session, self._count = session, count
-        self.close = session.close
+        self.close, self.processor_time = session.close, session.processor_time
 
     @property
     def failures(self) -> Mapping[int, Failure]:

@@ -25,10 +25,11 @@ class Allowance:
     Attributes:
         memory: bytes of one cell beyond the interpreter with its libraries.
         cpu_s: seconds of processor time of one cell: import, reset and three breaths.
-        start_patience_s: while controllers are imported and reset, cells time out when none of
-            them has answered for this long.
-        patience_s: cells time out in a step when none of them has answered for this long.
-        total_s: all cells time out when a session has taken this long.
+        start_patience_s: processor time in which a controller is imported and reset.
+        patience_s: processor time of one answer. Cells that wait for something, or for a processor,
+            time out when none of them has answered for a multiple of it on the clock.
+        total_s: all cells time out when a session has taken this long on the clock, so that no
+            entry keeps others waiting for longer.
     """
 
     memory: int = 512 * MIB

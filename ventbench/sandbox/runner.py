@@ -9,8 +9,8 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ventbench.sandbox.child import landlock, lockdown, wire
-from ventbench.sandbox.child.lockdown import OFFICIAL
+from ventbench.sandbox.child import landlock, libc, lockdown, wire
+from ventbench.sandbox.child.lockdown import FLOOR, OFFICIAL
 from ventbench.sandbox.child.wire import Reply
 from ventbench.sandbox.configuration import Allowance, SandboxError, configuration
 from ventbench.sandbox.pipes import Clock, Pipes
@@ -19,6 +19,18 @@ from ventbench.sandbox.zygote import ZygoteClient
 from ventbench.task.interfaces import Task
 
 _PROBE_S = 30.0
+
+#: What submitted code could do without a line of the floor, and what gives it.
+_WITHOUT = {
+    ("empty-root", "landlock"): (
+        "read every file of this user",
+        "allow user namespaces (docs/security.md) or boot a kernel with Landlock",
+    ),
+    ("seccomp",): (
+        "reach the network and other processes",
+        "use a kernel that filters system calls, on x86-64 or ARM64",
+    ),
+}
 
 
 @functools.cache
@@ -47,8 +59,32 @@ def layers() -> tuple[str, ...]:
     return lockdown.names(reply.value)
 
 
+def check_floor(shown: Sequence[str]) -> None:
+    """Refuse to go on where cells are confined too little for any foreign code.
+
+    Args:
+        shown: layers that are in force.
+
+    Raises:
+        SandboxError: naming the missing layers first.
+    """
+    lacking = [line for line in FLOOR if not set(line) & set(shown)]
+    if lacking:
+        missing = " and ".join("/".join(line) for line in lacking)
+        could, advice = (
+            " and ".join(parts) for parts in zip(*map(_WITHOUT.get, lacking), strict=True)
+        )
+        raise SandboxError(
+            f"{missing} missing on this machine ({platform.system()} {platform.release()}): "
+            f"submitted code could {could}, so it does not run. To run it: {advice}; or use "
+            "--in-process, which gives it all your rights, for code that you trust"
+        )
+
+
 class SandboxRunner:
     """Runs controllers apart: a :class:`ventbench.entries.runner.Runner`.
+
+    It does not exist below the floor of :data:`~ventbench.sandbox.child.lockdown.FLOOR`.
 
     Args:
         require_official: refuse to run where a layer is missing that official results need.
@@ -66,9 +102,9 @@ class SandboxRunner:
         allowance: Allowance | None = None,
         clock: Clock | None = None,
     ):
-        if not hasattr(os, "fork"):
-            raise SandboxError(f"the sandbox needs Linux or macOS, this is {platform.system()}")
-        self._layers, self._allowance = layers(), allowance or Allowance()
+        self._layers = layers() if libc.LINUX else ()
+        check_floor(self._layers)
+        self._allowance = allowance or Allowance()
         self._clock = clock
         if require_official and self.missing:
             raise SandboxError(

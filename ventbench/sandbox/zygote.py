@@ -13,15 +13,17 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from ventbench.sandbox.child.zygote import (
-    ENDED,
+    CLOCK,
     INTERRUPT,
     KILL,
     PREPARED,
+    REPORT,
     REQUEST,
+    RUNNING,
     SIZE,
     START,
     TOKEN,
@@ -37,7 +39,9 @@ _BOOT = (
 
 _TASK = REQUEST.size - TOKEN - 1
 
+#: Patience with the zygote, s: until it is prepared, and for an answer on processor time.
 _START_S = 60.0
+_CLOCK_S = 60.0
 
 
 class ZygoteClient:
@@ -54,6 +58,7 @@ class ZygoteClient:
         config = {**config, "site": [SITE]}
         self._tokens: dict[int, bytes] = {}  # of each cell
         self._ended: dict[bytes, int] = {}
+        self._used: dict[bytes, float] = {}  # processor time when last reported, s
         self._data = b""
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed in close()
         self._control, theirs = socket.socketpair()
@@ -129,9 +134,29 @@ class ZygoteClient:
         Returns:
             Exit code, or minus the signal's number; None if it has not ended.
         """
-        deadline = time.monotonic() + timeout_s
         token = self._tokens[cell]
-        while token not in self._ended:
+        self._hear(lambda: token in self._ended, timeout_s)
+        return self._ended.get(token)
+
+    def processor_time(self, cells: Iterable[int]) -> dict[int, float]:
+        """Processor time of cells since they were started, s, as the kernel counts it.
+
+        Raises:
+            SandboxError: if the zygote does not answer.
+        """
+        asked = {cell: self._tokens[cell] for cell in cells}
+        for cell, token in asked.items():
+            if token not in self._ended:
+                self._used.pop(token, None)
+                self._ask(CLOCK, cell)
+        if not self._hear(lambda: set(asked.values()) <= self._used.keys(), _CLOCK_S):
+            raise SandboxError("the sandbox's process does not say how long cells have computed")
+        return {cell: self._used[token] for cell, token in asked.items()}
+
+    def _hear(self, heard: Callable[[], bool], timeout_s: float) -> bool:
+        """Take reports until what is waited for was heard; say whether it was in time."""
+        deadline = time.monotonic() + timeout_s
+        while not heard():
             self._control.settimeout(max(deadline - time.monotonic(), 1e-3))
             try:
                 data = self._control.recv(4096)
@@ -140,13 +165,14 @@ class ZygoteClient:
             finally:
                 self._control.settimeout(None)
             if not data:
-                return None
+                return False
             self._data += data
-            while len(self._data) >= ENDED.size:
-                ended, status = ENDED.unpack_from(self._data)
-                self._ended[ended] = os.waitstatus_to_exitcode(status)
-                self._data = self._data[ENDED.size :]
-        return self._ended[token]
+            while len(self._data) >= REPORT.size:
+                token, status, self._used[token] = REPORT.unpack_from(self._data)
+                if status != RUNNING:
+                    self._ended[token] = os.waitstatus_to_exitcode(status)
+                self._data = self._data[REPORT.size :]
+        return True
 
     def close(self) -> None:
         """End it and all its cells; may be called more than once."""

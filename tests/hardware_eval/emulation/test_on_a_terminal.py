@@ -97,7 +97,7 @@ def invoke(app: Any, *words: str) -> Any:
 def test_a_run_over_a_terminal(terminal: DeviceOnTerminal, tmp_path: Path) -> None:
     done = invoke(
         cli.app, "run", "pid_best", "--port", "p", "--lung", LUNG, "--pips", "10", "--repeats", "1",
-        "--control-every", "0", "--no-dry-run", "--no-selftest", "--no-sandbox", "--rest", "0.5",
+        "--control-every", "0", "--no-dry-run", "--no-selftest", "--in-process", "--rest", "0.5",
         "--yes", "--out", str(tmp_path / "out"),
     )  # fmt: skip
     assert done.exit_code == 0, done.output
@@ -115,7 +115,7 @@ def test_self_test_wrong_lung_run_and_board(terminal: DeviceOnTerminal, tmp_path
     out = tmp_path / "out"
     done = invoke(
         cli.app, "run", "pid_best", "--port", "p", "--lung", LUNG, "--pips", "10,20",
-        "--repeats", "2", "--no-sandbox", "--yes", "--out", str(out),
+        "--repeats", "2", "--in-process", "--yes", "--out", str(out),
         "--json", str(tmp_path / "done.json"),
     )  # fmt: skip
     assert done.exit_code == 0, done.output

@@ -14,6 +14,7 @@ import contextlib
 import ctypes
 import os
 import signal
+import socket
 import stat
 import sys
 from collections.abc import Iterable, Iterator
@@ -45,6 +46,9 @@ _NOT_COPIED = {
 _MODULE_FILES = ("__file__", "__cached__")
 _COPIED = (".py", ".so", f".{sys.implementation.cache_tag}.pyc")
 
+#: Name of the host, the same on every machine.
+_HOST = "cell"
+
 #: Devices of the new root.
 NULL, RANDOM = "/dev/null", "/dev/urandom"
 
@@ -64,6 +68,7 @@ def enter_namespaces() -> bool:
             libc.unshare(flags)
         except OSError:
             continue
+        socket.sethostname(_HOST)
         if flags & _USER:
             for file, text in (
                 ("uid_map", f"{user} {user} 1"),

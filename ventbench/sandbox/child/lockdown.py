@@ -32,6 +32,9 @@ LAYERS = (
     "counted-threads",
 )
 
+#: Nothing foreign runs without one layer of each line: no file of the machine, no other process.
+FLOOR = (("empty-root", "landlock"), ("seccomp",))
+
 #: A result may be called official only with these. Older records name fewer: theirs are data.
 OFFICIAL = (
     *("namespaces", "empty-root", "own-descriptors", "clean-fork", "landlock", "seccomp"),

@@ -19,6 +19,7 @@ import signal
 import socket
 import struct
 import sys
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -44,14 +45,20 @@ TOKEN = 16
 #: Request: what to do, token of the cell, its task as JSON in spaces to one length (or only
 #: spaces: lock down and end). A start brings the cell's ends of two pipes.
 REQUEST = struct.Struct(f"<c{TOKEN}s238s")
-START, INTERRUPT, KILL = b"s", b"i", b"k"
+START, INTERRUPT, KILL, CLOCK = b"s", b"i", b"k", b"c"
 
-#: Answer: a cell has ended, with this status as of ``waitpid``.
-ENDED = struct.Struct(f"<{TOKEN}si")
+#: Answer: token of the cell, its status as of ``waitpid`` or :data:`RUNNING`, and its processor
+#: time, s, as the kernel counts it.
+REPORT = struct.Struct(f"<{TOKEN}sid")
+RUNNING = -1
 
 #: Size of the configuration, before it; and the word that follows the preparation.
 SIZE = struct.Struct("<I")
 PREPARED = b"prepared"
+
+
+#: Linux's number of the clock of all threads of a process, beside the process in the clock's name.
+_PROCESS_CLOCK = 2
 
 
 class Zygote:
@@ -118,7 +125,11 @@ class Zygote:
     def _signal(self) -> None:
         what, token, _ = REQUEST.unpack(self._request)
         for process, name in self._cells.items():
-            if name == token:  # not reaped yet, hence still this process
+            if name == token and what == CLOCK:
+                with contextlib.suppress(OSError):  # it has ended, which is reported too
+                    used = time.clock_gettime(~process << 3 | _PROCESS_CLOCK)
+                    self._out += REPORT.pack(token, RUNNING, used)
+            elif name == token:  # not reaped yet, hence still this process
                 os.kill(process, signal.SIGTERM if what == INTERRUPT else signal.SIGKILL)
 
     def _forget(self, pipes: list[int]) -> serve.Start:
@@ -141,11 +152,11 @@ class Zygote:
             process, status, used = os.wait4(-1, os.WNOHANG)
             if not process:
                 return
-            if status == signal.SIGKILL and used.ru_utime + used.ru_stime >= self._cpu_s:
-                status = (
-                    signal.SIGXCPU
-                )  # ignored by the first process of a namespace, or on purpose
-            self._out += ENDED.pack(self._cells.pop(process), status)
+            seconds = used.ru_utime + used.ru_stime
+            if status == signal.SIGKILL and seconds >= self._cpu_s:
+                # Ignored by the first process of a namespace, or on purpose.
+                status = signal.SIGXCPU
+            self._out += REPORT.pack(self._cells.pop(process), status, seconds)
 
     def end(self) -> None:
         """End all cells and leave none behind."""

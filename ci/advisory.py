@@ -20,6 +20,9 @@ from ventbench.plants.rigs import Rigs
 TITLE = "Advisory score (not official)"
 #: Most submissions checked in one pull request.
 MAX_SUBMISSIONS = 3
+#: Time for all of their sessions, s, which leaves some of the job's for setting up; and sessions of
+#: one: three of the check and a score on each of two tracks.
+JOB_S, SESSIONS = 900.0, 5
 
 
 def advise(
@@ -68,6 +71,7 @@ def advise(
 def main() -> int:
     """Look at the pull request that the environment names; see ``score-pr.yml``."""
     from ventbench.plants.rigs import load_rigs
+    from ventbench.sandbox.configuration import Allowance
     from ventbench.sandbox.runner import SandboxRunner
 
     pull = workflow.required("SOURCE"), workflow.required("BASE"), workflow.required("COMMIT")
@@ -75,7 +79,10 @@ def main() -> int:
     if not names:
         workflow.summary(TITLE, ["this pull request changes no submission"])
         return 0
-    rigs, runner = load_rigs(), SandboxRunner(require_official=True)
+    # Each of the submissions gets its share of the job's time, however slow another one is.
+    share = JOB_S / (MAX_SUBMISSIONS * SESSIONS)
+    allowance = Allowance(total_s=share)
+    rigs, runner = load_rigs(), SandboxRunner(require_official=True, allowance=allowance)
     ready = len(names) <= MAX_SUBMISSIONS
     if not ready:
         text = f"{len(names)} submissions are changed; one pull request, one submission"

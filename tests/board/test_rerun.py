@@ -31,11 +31,11 @@ def states(outcomes: list[rerun.Outcome]) -> dict[str, str]:
 
 
 @pytest.fixture
-def again(simulators: TextbookRigs, tmp_path: Path):
+def again(simulators: TextbookRigs):
     """Run records of a leaderboard again, in this process."""
 
     def run(folder: Path, *sources: Path, **options) -> list[rerun.Outcome]:
-        options = {"work": tmp_path / "work", "runner": InProcessRunner, **options}
+        options = {"runner": InProcessRunner, **options}
         return rerun.rerun(folder, sources=sources, load=lambda: simulators, **options)
 
     return run
@@ -109,40 +109,40 @@ def test_changed_code_is_not_the_code(board: Path, code: Path, again) -> None:
     assert states(again(board, code))["honest"] == rerun.NOT_RERUN
 
 
-def test_what_is_finished_is_kept(board: Path, code: Path, again, tmp_path: Path) -> None:
-    again(board, code)
-
-    def absent():
-        raise AssertionError("run again")
-
+def test_nothing_of_an_earlier_run_is_believed(
+    board: Path, code: Path, again, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    files = set(tmp_path.rglob("*"))
     sha256 = sha_of(board, "honest")
-    (outcome,) = again(board, code, records=[sha256[:8]], runner=absent)
-    assert outcome.state == rerun.REPRODUCED
-    with pytest.raises(AssertionError, match="run again"):
-        again(board, code, runner=absent)  # what differed is tried anew
+    started = []
+    runner = lambda: started.append(1) or InProcessRunner()  # noqa: E731
+    for count in (1, 2):
+        (outcome,) = again(board, code, records=[sha256[:8]], runner=runner)
+        assert outcome.state == rerun.REPRODUCED
+        assert len(started) == count, "it ran"
+    assert set(tmp_path.rglob("*")) == files, "nothing is left for the next"
     with pytest.raises(InputError, match="no single record"):
         again(board, code, records=["f" * 64])
 
 
-def test_code_beside_the_leaderboard_and_the_folder_itself(
-    board: Path, code: Path, again, tmp_path: Path
-) -> None:
+def test_code_beside_the_leaderboard_and_the_folder_itself(board: Path, code: Path, again) -> None:
     (outcome,) = again(board, code / "honest", records=[sha_of(board, "honest")])
     assert outcome.state == rerun.REPRODUCED
     shutil.copytree(code / "honest", board.parent / "submissions" / "renamed")
-    (outcome,) = again(board, records=[sha_of(board, "honest")], work=tmp_path / "other")
+    (outcome,) = again(board, records=[sha_of(board, "honest")])
     assert outcome.state == rerun.REPRODUCED
 
 
 def test_the_command_says_all_three(
-    board: Path, code: Path, simulators, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    board: Path, code: Path, simulators, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(frozen, "load", lambda path=None: simulators)
     in_this_process = functools.partial(
         rerun.rerun, load=lambda: simulators, runner=InProcessRunner
     )
     monkeypatch.setattr(rerun, "rerun", in_this_process)
-    arguments = ["board", "verify", "--folder", str(board), "--out", str(tmp_path / "kept")]
+    arguments = ["board", "verify", "--folder", str(board)]
     said = CliRunner().invoke(app, [*arguments, "--rerun", "--source", str(code)])
     assert said.exit_code == 1
     text = " ".join(said.output.split())
@@ -155,11 +155,11 @@ def test_the_command_says_all_three(
 
 
 @pytest.mark.slow
-def test_published_records_are_reproduced_in_two_processes(tmp_path: Path) -> None:
+def test_published_records_are_reproduced_in_two_processes() -> None:
     """The newest records of two PIDs of this repository's leaderboard, in the sandbox."""
     folder = Path(__file__).parents[2] / "leaderboard"
     scores = [score for score in store.load(folder).scores if score.track == "performance"]
     newest = {s.name: s.sha256 for s in scores if s.name in ("pid_best", "pid_robust")}
     assert len(newest) == 2
-    outcomes = rerun.rerun(folder, records=[*newest.values()], work=tmp_path / "work", jobs=2)
+    outcomes = rerun.rerun(folder, records=[*newest.values()], jobs=2)
     assert [(x.state, x.detail) for x in outcomes if x.state != rerun.REPRODUCED] == []

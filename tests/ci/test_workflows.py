@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 import yaml
 
+from ci import advisory
+
 FOLDER = Path(__file__).resolve().parents[2] / ".github" / "workflows"
 FILES = sorted(FOLDER.glob("*.yml")) if FOLDER.is_dir() else []
 
@@ -102,6 +104,15 @@ def test_expected_workflows_are_there():
         "publish",
         "release",
     }
+
+
+def test_a_slow_entry_keeps_no_other_waiting():
+    groups = {
+        path.stem: read(path)["concurrency"]["group"] for path in FILES if "score" in path.stem
+    }
+    assert all("${{" in group for group in groups.values()), "one group for each entry"
+    (job,) = read(next(path for path in FILES if path.stem == "score-pr"))["jobs"].values()
+    assert 60 * job["timeout-minutes"] > advisory.JOB_S
 
 
 def test_a_release_needs_a_maintainer_and_runs_nothing_of_ours_with_its_identity():

@@ -2,16 +2,15 @@
 
 Nothing stops at the first problem: each names its file, and the key or line in it. Replay proves
 that errors follow from commands; :func:`rerun` runs the code of a record once more in the sandbox,
-which proves that the commands come from the code whose hashes the record names. What has been
-reproduced is kept in a folder, so that an interrupted run continues, and several processes can
-share the work.
+which proves that the commands come from the code whose hashes the record names. It trusts no file
+of an earlier run; several processes can share the work.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from numpy.typing import NDArray
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
-from ventbench.base.resume import WorkFolder
 from ventbench.board import actions, attestation, canonical, create, ranking, store
 from ventbench.board.canonical import ATTESTATIONS, RECORDS
 from ventbench.board.record import AnyRecord, Record, RecordStress
@@ -323,7 +321,6 @@ def rerun(
     *,
     records: Sequence[str] = (),
     sources: Sequence[Path] = (),
-    work: Path,
     jobs: int = 1,
     scheduler: str | None = None,
     load: Callable[[], ReplayPlants] = frozen_simulators,
@@ -336,7 +333,6 @@ def rerun(
         folder: of the leaderboard.
         records: hashes of the records, or the beginnings of them; all scores if empty.
         sources: folders with the code: of one submission, or of several.
-        work: folder for what is finished; the same one continues.
         jobs: number of processes; 1 for this one alone.
         scheduler: address of a Dask scheduler instead, whose workers see the same files.
         load: gives the simulators; outside of this process, a function of a module.
@@ -347,47 +343,32 @@ def rerun(
         One outcome a record, oldest first.
 
     Raises:
-        InputError: if a hash names no record, ``work`` belongs to other versions, or this machine
-            cannot run submissions as official scores are run, or a worker process died.
+        InputError: if a hash names no record, this machine cannot run submissions as official
+            scores are run, or a worker process died.
         OSError: if a file cannot be read or written.
     """
     board = store.load(folder)
     chosen = {store.find_record(board, sha256, Record).sha256 for sha256 in records}
     scores = [score for score in board.scores if not chosen or score.sha256 in chosen]
     about = canonical.through_json(load().about())
-    done = WorkFolder(work, {"simulators": about, "versions": create.versions()})
     outcomes: dict[str, Outcome] = {}
-    todo: list[tuple[Record, Path]] = []
+    todo: dict[str, tuple[Any, ...]] = {}
 
     def note(outcome: Outcome) -> None:
         outcomes[outcome.record] = outcome
-        # A run that differed may have met a limit of time: it is tried anew.
-        if outcome.state == REPRODUCED and not done.has(outcome.record):
-            done.put(outcome.record, asdict(outcome))
         if progress is not None:
             progress(outcome)
 
     available = list(_folders([folder.parent / "submissions", *sources]))
     for score in scores:
-        if done.has(score.sha256):
-            note(Outcome(**done.read(score.sha256)))
-            continue
         code, why = _code_of(score, available, about)
         if code is None:
             note(Outcome(score.sha256, score.name, score.track, NOT_RERUN, why))
         else:
-            todo.append((score, code))
-    if scheduler is None and (jobs == 1 or len(todo) < 2):
-        for score, code in todo:
-            note(_run(score, code, folder, load(), runner()))
-    elif todo:
-        work_of = {
-            score.sha256: (score.sha256, code.resolve(), folder.resolve(), load, runner)
-            for score, code in todo
-        }
-        with executor(jobs if scheduler is None else 0, scheduler) as pool:
-            for _, outcome in results(pool, _run_in_process, work_of):
-                note(outcome)
+            todo[score.sha256] = score.sha256, code.resolve(), folder.resolve(), load, runner
+    with executor(jobs if jobs > 1 and scheduler is None else 0, scheduler) as pool:
+        for _, outcome in results(pool, _run, todo):
+            note(outcome)
     return [outcomes[score.sha256] for score in scores]
 
 
@@ -415,30 +396,24 @@ def _code_of(
     return None, "no folder at hand has the files that it names; give --source DIR"
 
 
-def _run_in_process(
+def _run(
     sha256: str,
     code: Path,
     folder: Path,
     load: Callable[[], ReplayPlants],
     runner: Callable[[], Runner],
 ) -> Outcome:
-    """Run one record in a process of its own, which reads it again."""
+    """Run the code of one record, which is read again, and compare."""
     score = store.find_record(store.load(folder), sha256, Record)
     assert isinstance(score, Record)
-    return _run(score, code, folder, load(), runner())
-
-
-def _run(
-    score: Record, code: Path, folder: Path, simulators: ReplayPlants, runner: Runner
-) -> Outcome:
-    """Run the code of one record and compare."""
+    simulators, apart = load(), runner()
     begun = time.perf_counter()
     try:
         submission = open_submission(str(code))
         _check_same(submission, score)
         stress = 0 if score.stress is None else score.stress.tables.pips.shape[1]
         result = run_protocol(
-            submission, rigs_of(simulators), track=score.track, stress=stress, runner=runner,
+            submission, rigs_of(simulators), track=score.track, stress=stress, runner=apart,
             drawn=draws_of(score.header, simulators),
         )  # fmt: skip
         _check_same(open_submission(str(code)), score)

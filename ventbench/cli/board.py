@@ -185,9 +185,6 @@ def verify(
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes of --rerun.")] = 1,
     scheduler: Scheduler = None,
-    out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Finished runs of --rerun; it continues from them.")
-    ] = Path("runs/rerun"),
     json: JsonFile = None,
 ) -> None:
     """Check every hash and signature, and replay every record.
@@ -215,7 +212,7 @@ def verify(
         progress = counted(shown, "replaying records")
         report = verifier.verify(folder, frozen.load, progress=progress)
     if rerun and not report.problems:  # else the records are not what they were
-        _rerun(report, folder, records or [], source or [], out, jobs, scheduler)
+        _rerun(report, folder, records or [], source or [], jobs, scheduler)
     emit(dataclasses.asdict(report), json)
     for note in report.notes:
         console.print(f"note: {plain(note)}", markup=False, highlight=False)
@@ -227,7 +224,7 @@ def verify(
 
 
 def _rerun(
-    report: Report, folder: Path, records: list[str], sources: list[Path], out: Path, jobs: int,
+    report: Report, folder: Path, records: list[str], sources: list[Path], jobs: int,
     scheduler: str | None,
 ) -> None:  # fmt: skip
     """Run code again; note in the report what came of it."""
@@ -241,8 +238,8 @@ def _rerun(
             status.update(f"{report.reproduced} records reproduced")
 
         outcomes = verifier.rerun(
-            folder, records=records, sources=sources, work=out, jobs=jobs,
-            scheduler=scheduler, progress=note,
+            folder, records=records, sources=sources, jobs=jobs, scheduler=scheduler,
+            progress=note,
         )  # fmt: skip
     report.second_runs = [str(x) for x in outcomes]
     report.problems += [str(x) for x in outcomes if x.state == verifier.DIFFERENT]

@@ -152,7 +152,7 @@ def test_progress_counts_every_simulated_breath(simulators, breaths):
 
 def test_many_misfits_are_told_in_few_lines():
     misfits = tuple(Misfit(i, "R5C10", 3.0, "lung R5C20", 0.5) for i in range(25))
-    report = OpenLoopReport("frozen", {}, None, {}, misfits, (), ())
+    report = OpenLoopReport("frozen", {}, None, {}, misfits, (), (), ())
     lines = report.misfit_lines()
     assert len(lines) == 22
     assert lines[-1].endswith("5 more; --json lists all")
@@ -232,3 +232,15 @@ def test_the_public_recordings_give_the_held_out_errors_of_the_manifest(
             assert one[figure] == pytest.approx(known[figure], abs=2e-6)
         assert one["official_held_out_mae"] == pytest.approx(known["official_mae"], abs=2e-6)
         assert one["mae"] < one["held_out_mae"]
+
+
+def test_errors_on_training_breaths_exported_again_are_not_printed_as_held_out(public_recordings):
+    breaths = load(public_recordings / MEASURED)
+    breaths = breaths.select(breaths.by_lung_index["R5C20"][:6])
+    u_in, pressure = np.round(breaths.u_in, 2), np.round(breaths.pressure, 2)
+    pressure[2, 7] = np.nan
+    report = open_loop_report.open_loop(replace(breaths, u_in=u_in, pressure=pressure))
+    result = report.as_dict()
+    assert result["lungs"]["R5C20"]["official_held_out_breaths"] == 0
+    assert result["perhaps_copies"] == [int(breaths.breath_id[2])]
+    assert "1 breath is perhaps a copy of one in the training" in report.misfit_lines()[-1]

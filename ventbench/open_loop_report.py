@@ -73,6 +73,8 @@ class OpenLoopReport:
             misfits.
         misfits: breaths that something else than their label explains far better.
         not_judged: ids of breaths without a first or another inspiratory pressure.
+        perhaps_copies: ids of breaths with the commands of one of the training, of which blank
+            pressures do not tell whether they are copies: they count as such.
         notes: what a reader of the recording should know.
     """
 
@@ -82,6 +84,7 @@ class OpenLoopReport:
     lungs: dict[str, dict[str, Any]]
     misfits: tuple[Misfit, ...]
     not_judged: tuple[int, ...]
+    perhaps_copies: tuple[int, ...]
     notes: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
@@ -94,6 +97,7 @@ class OpenLoopReport:
             "lungs": self.lungs,
             "misfits": [asdict(misfit) for misfit in self.misfits],
             "not_judged": list(self.not_judged),
+            "perhaps_copies": list(self.perhaps_copies),
             "notes": list(self.notes),
         }
 
@@ -128,6 +132,13 @@ class OpenLoopReport:
             lines.append(
                 f"{len(self.not_judged)} breaths have no first pressure or no other inspiratory "
                 "one and were not judged."
+            )
+        if self.perhaps_copies:
+            count = len(self.perhaps_copies)
+            lines.append(
+                f"{count} {'breath is' if count == 1 else 'breaths are'} perhaps a copy of one in "
+                "the training: the commands are the same, and blank pressures do not tell. Their "
+                "errors are not those of new breaths."
             )
         return lines
 
@@ -198,6 +209,7 @@ def open_loop(
     error = mean_errors(tested.pressures(breaths, progress=count), breaths)
     crossed = mean_errors(tested.pressures(breaths, cross_fitted=True, progress=count), breaths)
     held_out, unseen = tested.held_out(breaths), tested.unseen(breaths)
+    perhaps = breaths.breath_id[tested.perhaps_copies(breaths)].tolist()
     doubtful: Sequence[Misfit] = ()
     if known:
         judged = breaths.select(np.sort(np.concatenate(known)))
@@ -229,6 +241,7 @@ def open_loop(
         lungs=lungs,
         misfits=tuple(doubtful),
         not_judged=tuple(breaths.breath_id[np.isnan(error)].tolist()),
+        perhaps_copies=tuple(perhaps),
         notes=breaths.notes,
     )
 

@@ -8,9 +8,8 @@ measured breath is new to one of them.
 
 from __future__ import annotations
 
-import hashlib
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.plant_files import load_plant
 from ventbench.plants.sessions import Sessions
 from ventbench.recordings.breaths import Breaths
+from ventbench.recordings.identity import Fingerprints, fingerprints, match, repetitions
 
 #: Format of the manifest.
 FORMAT = "ventbench-simulators-2"
@@ -33,6 +33,10 @@ MANIFEST, MEMBERS, SEEN = "manifest.toml", "hybrid.npz", "seen.npz"
 
 #: SHA-256 of the official manifest, which holds those of all its files.
 MANIFEST_SHA256 = "e4b214dd47b9233918260c0576bf76ce15eb1629309be0ae05cf04394fe368e9"
+
+#: SHA-256 of the official list of training breaths. No score depends on the list, so it may be
+#: another than the manifest's, which every score names.
+SEEN_SHA256 = "8c66a6c3822b18cbf24b0e8a2e8b2ad7bbdeae969dc4329eb15b72cc68b2039a"
 
 #: Fold of a breath that every member has seen, and of one that none has.
 BY_ALL, BY_NONE = -1, -2
@@ -43,18 +47,20 @@ class Seen:
     """The breaths of the training.
 
     Attributes:
-        key: :func:`fingerprints`, increasing, ``(k,)``.
+        prints: their fingerprints, of k breaths.
         fold: member that has not seen the breath, or :data:`BY_ALL`, ``(k,)``.
     """
 
-    key: NDArray[np.uint64]
+    prints: Fingerprints
     fold: NDArray[np.int8]
 
     def folds(self, breaths: Breaths) -> NDArray[np.int64]:
-        """Look breaths up: a fold, :data:`BY_ALL` or :data:`BY_NONE`, shape ``(n,)``."""
-        wanted = fingerprints(breaths)
-        at = np.minimum(np.searchsorted(self.key, wanted), len(self.key) - 1)
-        return np.where(self.key[at] == wanted, self.fold[at].astype(np.int64), BY_NONE)
+        """Look breaths up: a fold, :data:`BY_ALL` or :data:`BY_NONE`, shape ``(n,)``.
+
+        What is perhaps a copy counts as one.
+        """
+        known = match(breaths, self.prints).known
+        return np.where(known >= 0, self.fold[known].astype(np.int64), BY_NONE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +163,11 @@ class Frozen:
         """Whether the official simulators, member 0, have not seen the breath, ``(n,)``."""
         return self.seen.folds(breaths) == BY_NONE
 
+    def perhaps_copies(self, breaths: Breaths) -> NDArray[np.bool_]:
+        """Whether the breath may be one of the training, but blank pressures do not tell, (n,)."""
+        found = match(breaths, self.seen.prints)
+        return (found.known >= 0) & ~found.certain
+
     def _of(self, breaths: Breaths, member: NDArray[np.int64]) -> Hybrid:
         at = self.sessions.assign(breaths)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf[member, at]), self.members)
@@ -176,32 +187,14 @@ class Frozen:
         }
 
 
-def fingerprints(breaths: Breaths) -> NDArray[np.uint64]:
-    """Short SHA-256 of each breath's lung and inspiratory commands, shape ``(n,)``.
-
-    By these it is known which breaths were in the training, without keeping the breaths. The clock
-    of a copy may have been estimated otherwise, and a published copy may lack its pressure.
-
-    Commands are rounded to 1e-4 %, so that a copy that was written with fewer digits is known.
-    """
-    out = np.empty(len(breaths), np.uint64)
-    commands = np.round(breaths.u_in * 1e4).astype("<i8")
-    for i, (lung, inspiratory) in enumerate(
-        zip(breaths.lung_ids, breaths.inspiratory, strict=True)
-    ):
-        digest = hashlib.sha256(str(lung).encode() + commands[i, inspiratory].tobytes())
-        out[i] = int.from_bytes(digest.digest()[:8], "little")
-    return out
-
-
 def seen(breaths: Breaths, fold: NDArray[np.int64]) -> Seen:
-    """Make the list; of copies of a breath, the one seen by most members decides."""
-    key = fingerprints(breaths)
-    order = np.lexsort((fold, key))
-    first = np.append(True, np.diff(key[order]) > 0)
-    kept = order[first]
-    repeated = np.isin(key[kept], key[order[~first]])
-    return Seen(key[kept], np.where(repeated, BY_ALL, fold[kept]).astype(np.int8))
+    """Make the list; a breath of which there are copies in several folds was seen by all."""
+    copy, _ = repetitions(breaths)
+    fold = fold.astype(np.int8)
+    fold[copy[fold != fold[copy]]] = BY_ALL
+    prints, kept = fingerprints(breaths), np.flatnonzero(copy == np.arange(len(copy)))
+    kept = kept[np.argsort(prints.commands[kept, 0])]  # not in the order of the recordings
+    return Seen(prints.select(kept), fold[kept])
 
 
 def folder() -> Path:
@@ -222,7 +215,13 @@ def load(path: Path | None = None) -> Frozen:
     manifest = _manifest(path)
     members = load_plant(_checked(path, MEMBERS, manifest), as_array=np.asarray)
     with np.load(_checked(path, SEEN, manifest), allow_pickle=False) as arrays:
-        known = Seen(arrays["key"], arrays["fold"])
+        if "commands" not in arrays:
+            raise InputError(
+                f"{path / SEEN} is of an older version, which did not know copies with fewer "
+                "digits; train the simulators again"
+            )
+        names = [field.name for field in fields(Fingerprints)]
+        known = Seen(Fingerprints(*(arrays[name] for name in names)), arrays["fold"])
     table = Sessions.from_list(manifest["sessions"])
     return Frozen(path, manifest, files.sha256(path / MANIFEST), table, members, known)
 
@@ -245,7 +244,7 @@ def _checked(path: Path, name: str, manifest: dict[str, Any]) -> Path:
         digest, expected = files.sha256(path / name), manifest["files"][name]["sha256"]
     except (OSError, KeyError) as error:
         raise InputError(f"{path / name} is missing, or the manifest lacks it: {error}") from error
-    if digest != expected:
+    if digest != expected and (name, digest) != (SEEN, SEEN_SHA256):
         raise InputError(
             f"{path / name} has SHA-256 {digest[:16]}..., the manifest says {expected[:16]}...; "
             "it is damaged or changed: restore it, or reinstall ventbench"

@@ -149,6 +149,12 @@ class Simulators:
             return np.ones(len(breaths), bool)
         return self._training.unseen(breaths)
 
+    def perhaps_copies(self, breaths: Breaths) -> NDArray[np.bool_]:
+        """Whether the breath is perhaps one of the training, which blank pressures hide, (n,)."""
+        if self._training is None:
+            return np.zeros(len(breaths), bool)
+        return self._training.perhaps_copies(breaths)
+
     def pressures(
         self, breaths: Breaths, *, cross_fitted: bool = False,
         progress: Callable[[int], object] | None = None,

@@ -67,6 +67,23 @@ def test_breaths_with_blanks_are_no_measured_ones(tmp_path):
     assert np.isfinite(data.measured_breaths.pressure).all()
 
 
+def test_copies_with_fewer_digits_count_once_and_repeats_lie_in_one_fold(tmp_path):
+    breaths = recorded(OWN, 8)
+    copies = replace(breaths.select([2, 5]), pressure=np.round(breaths.pressure[[2, 5]], 2))
+    repeats = [
+        replace(breaths.select([k]), pressure=breaths.pressure[[k]] + shift)
+        for k in (0, 1, 2)
+        for shift in (0.3, -0.3)
+    ]
+    write(replace(join([breaths, *repeats]), breath_id=np.arange(14)), tmp_path / "a.csv")
+    write(copies, tmp_path / "b.csv")
+    data = load_rig_recordings(tmp_path, folds=CONFIG.folds, seed=CONFIG.seed)
+    assert len(data.breaths) == data.measured == 14
+    for k in range(3):
+        assert len(set(data.fold[[k, 8 + 2 * k, 9 + 2 * k]].tolist())) == 1
+    assert set(data.fold.tolist()) == {0, 1}
+
+
 def test_what_cannot_be_learned_from_is_told(tmp_path):
     with pytest.raises(InputError, match="no recording in the public schema"):
         load_rig_recordings(tmp_path, folds=CONFIG.folds, seed=CONFIG.seed)

@@ -14,10 +14,10 @@ from jax import Array
 from numpy.typing import NDArray
 
 from ventbench.base.errors import InputError
-from ventbench.plants.frozen import fingerprints
 from ventbench.plants.sessions import Sessions
 from ventbench.recordings import Breaths, RecordingError, join, load
 from ventbench.recordings import folds as assign_folds
+from ventbench.recordings.identity import repetitions
 from ventbench.task.lungs import Lung, lung
 from ventbench.train.rigs.parameters import Groups
 
@@ -54,7 +54,9 @@ class RigRecordings:
 def load_rig_recordings(folder: Path, *, folds: int, seed: int) -> RigRecordings:
     """Read every recording of a folder that is in the public schema.
 
-    A breath that is there twice counts once. Breaths get new ids, in order.
+    A breath that is there twice counts once, whatever its digits. Breaths with the same commands
+    and other pressures are repeats: all count, and they are in one fold. Breaths get new ids, in
+    order.
 
     Args:
         folder: folder with ``.csv``, ``.csv.gz`` and ``.parquet`` files.
@@ -84,15 +86,15 @@ def load_rig_recordings(folder: Path, *, folds: int, seed: int) -> RigRecordings
             "columns id,breath_id,R,C,time_step,u_in,u_out,pressure there"
         )
     breaths = join(parts)
-    _, first = np.unique(fingerprints(breaths), return_index=True)
-    breaths = breaths.select(np.sort(first))
     blank = breaths.valid & ~np.isfinite(breaths.pressure)
     whole = ~blank.any(axis=1)
     usable = (breaths.inspiratory & np.isfinite(breaths.pressure))[:, 1:].any(axis=1)
     order = np.concatenate([np.flatnonzero(whole & usable), np.flatnonzero(~whole & usable)])
-    breaths = breaths.select(order)
-    breaths = replace(breaths, breath_id=np.arange(1, len(order) + 1))
-    count = int(np.count_nonzero(whole & usable))
+    breaths, whole = breaths.select(order), whole[order]
+    copy, repeat = repetitions(breaths)
+    first = np.flatnonzero(copy == np.arange(len(copy)))
+    breaths, count = breaths.select(first), int(np.count_nonzero(whole[first]))
+    breaths = replace(breaths, breath_id=np.arange(1, len(first) + 1))
     if count < 2 * folds:
         raise InputError(
             f"{folder} holds {count} breaths without a blank pressure; {2 * folds} or more "
@@ -100,6 +102,7 @@ def load_rig_recordings(folder: Path, *, folds: int, seed: int) -> RigRecordings
         )
     measured = breaths.select(np.arange(count))
     fold = assign_folds(measured, count=folds, seed=seed)
+    fold = fold[np.searchsorted(first, repeat[first[:count]])]
     labels = tuple(sorted({lung(name) for name in breaths.lung_ids.tolist()}))
     return RigRecordings(breaths, count, fold, labels, sources, tuple(skipped))
 

@@ -529,9 +529,8 @@ def _provenance(
 def _write(out: Path, manifest: dict[str, Any], members: Hybrid, data: RigRecordings) -> None:
     known = seen(data.breaths, _seen_by(data))
     save_plant(out / frozen.MEMBERS, members)
-    files.write_atomically(
-        out / frozen.SEEN, lambda file: np.savez(file, key=known.key, fold=known.fold)
-    )
+    arrays = {**vars(known.prints), "fold": known.fold}
+    files.write_atomically(out / frozen.SEEN, lambda file: np.savez(file, **arrays))  # pyright: ignore[reportArgumentType]
     names = (frozen.MEMBERS, frozen.SEEN)
     hashes = {"files": {name: {"sha256": files.sha256(out / name)} for name in names}}
     files.write_text(out / frozen.MANIFEST, tomli_w.dumps(manifest | hashes))

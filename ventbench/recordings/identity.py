@@ -1,0 +1,189 @@
+"""Identity of a breath: whether a recording holds a breath that somebody has seen, exported again.
+
+A breath is its lung, its first :data:`SAMPLES` inspiratory commands and the pressures beside them.
+Its fingerprint tells it again without keeping it: the values are cut into cells of width
+:data:`CELL` on three grids, a third of a cell apart, and the cells of each grid are hashed. A copy
+with fewer digits may lie in the next cell, but by no more than :data:`TOLERANCE`, and as the grids
+are more than twice as far apart, each value is near an edge of one grid at most. So a copy is
+looked up on the grid on which fewest of its values are near an edge, under every way in which
+those could have been cut: at most 2^(SAMPLES / 3) ways. A copy is never missed, and a match means
+that all values agree to ``CELL + TOLERANCE``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.recordings.breaths import Breaths
+
+Floats = NDArray[np.float64]
+Keys = NDArray[np.uint64]
+
+#: Inspiratory samples that count; what follows may be missing from a copy.
+SAMPLES = 20
+
+#: Width of a cell, and the most that a copy may be off: two decimals, rounded twice; % and cmH2O.
+CELL, TOLERANCE = 0.04, 0.006
+
+#: Edges of the grids, in cells; 0 and 100 %, where valves rest, are near none of them.
+_GRIDS = (1 / 6, 1 / 2, 5 / 6)
+
+#: Cell of a blank, and of a sample that a short inspiration does not have.
+_BLANK, _NONE = -(2**31), -(2**31) + 1
+
+
+@dataclass(frozen=True)
+class Fingerprints:
+    """Fingerprints of n breaths; one column a grid.
+
+    Attributes:
+        commands: of lung and commands, ``(n, 3)``.
+        pressures: of the pressures, ``(n, 3)``.
+        measured: whether no pressure among them is blank, ``(n,)``.
+    """
+
+    commands: Keys
+    pressures: Keys
+    measured: NDArray[np.bool_]
+
+    def select(self, which: NDArray[np.int64]) -> Fingerprints:
+        """Return those of some of the breaths."""
+        return Fingerprints(*(getattr(self, field.name)[which] for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Which known breath each of n breaths is.
+
+    Attributes:
+        known: index of the known breath, -1 if it is none, ``(n,)``.
+        certain: whether the pressures agree too; without, they are blank in one of the two, and the
+            breath is perhaps a copy, ``(n,)``.
+    """
+
+    known: NDArray[np.int64]
+    certain: NDArray[np.bool_]
+
+
+def fingerprints(breaths: Breaths) -> Fingerprints:
+    """Fingerprints to keep of breaths."""
+    lungs, u_in, pressure = breaths.lung_ids.tolist(), *_values(breaths)
+    names = ("",) * len(lungs)
+    keys = [
+        np.array(
+            [
+                [_key(name, grid, cells) for grid, cells in enumerate(own)]
+                for name, own in zip(of, _cut(values)[0], strict=True)
+            ],
+            np.uint64,
+        ).reshape(-1, len(_GRIDS))
+        for of, values in ((lungs, u_in), (names, pressure))
+    ]
+    return Fingerprints(keys[0], keys[1], ~np.isnan(pressure).any(axis=1))
+
+
+def match(breaths: Breaths, known: Fingerprints) -> Matches:
+    """Look breaths up among known ones.
+
+    Breaths with the same commands and other measured pressures are repeats, not copies.
+
+    Args:
+        breaths: n breaths.
+        known: fingerprints of the others.
+    """
+    rows: list[dict[int, list[int]]] = [{} for _ in _GRIDS]
+    for grid, table in enumerate(rows):
+        for row, key in enumerate(known.commands[:, grid].tolist()):
+            table.setdefault(key, []).append(row)
+    found = np.full(len(breaths), -1, np.int64)
+    certain = np.zeros(len(breaths), bool)
+    lungs, u_in, pressure = breaths.lung_ids.tolist(), *_values(breaths)
+    commands, pressures = _cut(u_in), _cut(pressure)
+    measured = ~np.isnan(pressure).any(axis=1)
+    for i, lung in enumerate(lungs):
+        grid, keys = _possible(lung, commands[0][i], commands[1][i])
+        like = sorted({row for key in keys for row in rows[grid].get(key, ())})
+        if not like:
+            continue
+        grid, keys = _possible("", pressures[0][i], pressures[1][i])
+        possible = set(keys)
+        same = [row for row in like if int(known.pressures[row, grid]) in possible]
+        perhaps = [row for row in like if not (measured[i] and known.measured[row])]
+        if same or perhaps:
+            found[i], certain[i] = (same or perhaps)[0], bool(same)
+    return Matches(found, certain)
+
+
+def repetitions(breaths: Breaths) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Find breaths that are there more than once.
+
+    Returns:
+        For each breath the first one, in their order, of which it is a copy or perhaps one, and the
+        first one with the same commands, whatever its pressures: they are itself where there is
+        none, ``(n,)`` each.
+    """
+    prints = fingerprints(breaths)
+    anyhow = Fingerprints(
+        prints.commands, np.zeros_like(prints.pressures), np.zeros_like(prints.measured)
+    )
+    copy, repeat = np.arange(len(breaths)), match(breaths, anyhow).known
+    for i in np.flatnonzero(repeat != copy):
+        repeat[i] = repeat[repeat[i]]
+        earlier = np.flatnonzero(repeat[:i] == repeat[i])
+        row = int(match(breaths.select([i]), prints.select(earlier)).known[0])
+        if row >= 0:
+            copy[i] = copy[earlier[row]]
+    return copy, repeat
+
+
+def _values(breaths: Breaths) -> list[Floats]:
+    """The first commands and pressures, ``(n, SAMPLES)`` each; infinite where there is none."""
+    some = min(SAMPLES, breaths.inspiratory.shape[1])
+    at = np.argsort(~breaths.inspiratory, axis=1, kind="stable")[:, :some]
+    out = []
+    for values in (breaths.u_in, breaths.pressure):
+        first = np.full((len(breaths), SAMPLES), np.inf)
+        there = np.take_along_axis(breaths.inspiratory, at, axis=1)
+        first[:, :some] = np.where(there, np.take_along_axis(values, at, axis=1), np.inf)
+        out.append(first)
+    return out
+
+
+def _cut(values: Floats) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
+    """Cells of values ``(n, SAMPLES)`` on each grid, ``(n, 3, SAMPLES)``.
+
+    Also the neighbour that each value may have come from: -1, 0 or 1.
+    """
+    scaled = np.nan_to_num(values, posinf=0.0)[:, None] / CELL + np.array(_GRIDS)[:, None]
+    cells = np.floor(scaled)
+    inside, near = scaled - cells, TOLERANCE / CELL + 1e-9
+    other = (inside > 1.0 - near).astype(np.int8) - (inside < near).astype(np.int8)
+    cells = np.clip(cells, -(2**30), 2**30).astype("<i4")
+    values = np.broadcast_to(values[:, None], cells.shape)
+    cells = np.where(np.isnan(values), _BLANK, np.where(np.isinf(values), _NONE, cells))
+    return cells.astype("<i4"), np.where(np.isfinite(values), other, 0)
+
+
+def _possible(
+    name: str, cells: NDArray[np.int32], other: NDArray[np.int8]
+) -> tuple[int, list[int]]:
+    """The grid with fewest values near an edge, and every key that the original may have there."""
+    grid = int(np.argmin(np.count_nonzero(other, axis=1)))
+    own, shift = cells[grid].tolist(), other[grid].tolist()
+    ways = [(cell, cell + by) if by else (cell,) for cell, by in zip(own, shift, strict=True)]
+    return grid, [_key(name, grid, way) for way in product(*ways)]
+
+
+_PACK = struct.Struct(f"<{SAMPLES}i").pack
+
+
+def _key(name: str, grid: int, cells: Iterable[int]) -> int:
+    digest = hashlib.sha256(f"{name}:{grid}:".encode() + _PACK(*cells)).digest()
+    return int.from_bytes(digest[:8], "little")

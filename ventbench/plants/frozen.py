@@ -190,11 +190,11 @@ class Frozen:
 def seen(breaths: Breaths, fold: NDArray[np.int64]) -> Seen:
     """Make the list; a breath of which there are copies in several folds was seen by all."""
     copy, _ = repetitions(breaths)
-    fold = fold.astype(np.int8)
-    fold[copy[fold != fold[copy]]] = BY_ALL
+    folds = fold.astype(np.int8)
+    folds[copy[folds != folds[copy]]] = BY_ALL
     prints, kept = fingerprints(breaths), np.flatnonzero(copy == np.arange(len(copy)))
     kept = kept[np.argsort(prints.commands[kept, 0])]  # not in the order of the recordings
-    return Seen(prints.select(kept), fold[kept])
+    return Seen(prints.select(kept), folds[kept])
 
 
 def folder() -> Path:

@@ -86,7 +86,7 @@ def fingerprints(breaths: Breaths) -> Fingerprints:
         ).reshape(-1, len(_GRIDS))
         for of, values in ((lungs, u_in), (names, pressure))
     ]
-    return Fingerprints(keys[0], keys[1], ~np.isnan(pressure).any(axis=1))
+    return Fingerprints(keys[0], keys[1], _measured(pressure))
 
 
 def match(breaths: Breaths, known: Fingerprints) -> Matches:
@@ -106,7 +106,7 @@ def match(breaths: Breaths, known: Fingerprints) -> Matches:
     certain = np.zeros(len(breaths), bool)
     lungs, u_in, pressure = breaths.lung_ids.tolist(), *_values(breaths)
     commands, pressures = _cut(u_in), _cut(pressure)
-    measured = ~np.isnan(pressure).any(axis=1)
+    measured = _measured(pressure)
     for i, lung in enumerate(lungs):
         grid, keys = _possible(lung, commands[0][i], commands[1][i])
         like = sorted({row for key in keys for row in rows[grid].get(key, ())})
@@ -137,7 +137,7 @@ def repetitions(breaths: Breaths) -> tuple[NDArray[np.int64], NDArray[np.int64]]
     for i in np.flatnonzero(repeat != copy):
         repeat[i] = repeat[repeat[i]]
         earlier = np.flatnonzero(repeat[:i] == repeat[i])
-        row = int(match(breaths.select([i]), prints.select(earlier)).known[0])
+        row = int(match(breaths.select(np.array([i])), prints.select(earlier)).known[0])
         if row >= 0:
             copy[i] = copy[earlier[row]]
     return copy, repeat
@@ -154,6 +154,10 @@ def _values(breaths: Breaths) -> list[Floats]:
         first[:, :some] = np.where(there, np.take_along_axis(values, at, axis=1), np.inf)
         out.append(first)
     return out
+
+
+def _measured(pressure: Floats) -> NDArray[np.bool_]:
+    return np.count_nonzero(np.isnan(pressure), axis=1) == 0
 
 
 def _cut(values: Floats) -> tuple[NDArray[np.int32], NDArray[np.int8]]:

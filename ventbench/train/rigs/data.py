@@ -87,7 +87,7 @@ def load_rig_recordings(folder: Path, *, folds: int, seed: int) -> RigRecordings
         )
     breaths = join(parts)
     blank = breaths.valid & ~np.isfinite(breaths.pressure)
-    whole = ~blank.any(axis=1)
+    whole = np.count_nonzero(blank, axis=1) == 0
     usable = (breaths.inspiratory & np.isfinite(breaths.pressure))[:, 1:].any(axis=1)
     order = np.concatenate([np.flatnonzero(whole & usable), np.flatnonzero(~whole & usable)])
     breaths, whole = breaths.select(order), whole[order]

@@ -11,8 +11,10 @@ from ventbench.base.precision import float64
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import RELIEF, RELIEF_ROOM, Hybrid
 from ventbench.task import protocol
-from ventbench.task.lungs import LUNGS
+from ventbench.task.lungs import LUNGS, RECORDED_LUNGS
 from ventbench.task.rollouts import open_loop
+from ventbench.train.rigs.label_test import label_tests
+from ventbench.train.rigs.parameters import LAMINAR_SHARE
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +54,31 @@ def test_fitted_resistance_and_compliance_are_those_of_the_label(official):
     for lung, rigs in zip(LUNGS, official.rigs, strict=True):
         compliance = 1000.0 / plants.E[:, list(rigs)]
         np.testing.assert_allclose(np.median(compliance, axis=0), lung.C, rtol=0.2)
+
+
+def test_what_the_absolute_test_of_labels_says_of_the_scored_rigs(official):
+    """As docs/simulators.md has it; the labels' errors are those of the manifest."""
+    rows = official.manifest["label_tests"]
+    members = [jax.tree.map(lambda leaf, k=k: leaf[k], official.members) for k in range(6)]
+    errors = {}
+    for row in rows:
+        others = {row["lung"]: row["error_own_label"]}
+        others[row["best_other_label"]] = row["error_best_other_label"]
+        errors[row["session"]] = [others.get(lung.id, np.inf) for lung in RECORDED_LUNGS]
+    counts = tuple(np.array([row[key] for row in rows]) for key in ("measured", "breaths"))
+    tests = label_tests(
+        members[0], members[1:], errors, official.sessions, RECORDED_LUNGS, counts, LAMINAR_SHARE
+    )
+    scored = [tests[rig] for rigs in official.rigs for rig in rigs]
+    assert sorted(test.session for test in scored if test.label_true) == [16, 17, 18]
+    failed = {test.session: test.reasons for test in scored if test.reasons}
+    assert sorted(failed) == [3, 4, 6, 13, 14]
+    assert all("too high for the label 20" in reasons[0] for reasons in failed.values())
+    above = {t.session: round(100 * (t.C / 20 - 1)) for t in scored if t.lung.C == 20}
+    assert above == {3: 27, 4: 27, 5: 19, 6: 23, 13: 26, 14: 26}
+    R = {label: [t.R for t in scored if label == t.lung.R] for label in (5, 20)}
+    assert 2.3 < min(R[5]) < max(R[5]) < 3.65
+    assert 10.0 < min(R[20]) < max(R[20]) < 13.5
 
 
 def test_reference_plants_are_the_first_rigs(official):

@@ -125,6 +125,7 @@ class _Problem:
     centre: Centre
     scales: Scales
     noise: Noise
+    laminar_share: float
 
     @property
     def session(self) -> NDArray[np.int64]:
@@ -232,6 +233,7 @@ def _arrange(
         centre(data.labels, len(table), config.laminar_share),
         scales,
         noise,
+        config.laminar_share,
     )
 
 
@@ -346,10 +348,11 @@ def _label_tests(
         np.bincount(part, minlength=len(table))
         for part in (problem.session[: data.measured], problem.session)
     ]
+    groups = groups_of_sessions(table, data.labels)
+    fitted, *again = (plants(part.pooled, groups) for part in (scored, *resampled))
     return label_tests(
-        scored.pooled, [part.pooled for part in resampled], errors, table, data.labels,
-        (counts[0], counts[1]), groups_of_sessions(table, data.labels),
-    )  # fmt: skip
+        fitted, again, errors, table, data.labels, (counts[0], counts[1]), problem.laminar_share
+    )
 
 
 def _widened(pooled: Pooled, member: int, count: int) -> Pooled:
@@ -439,11 +442,12 @@ def _shared_plants(
 
 
 def choose_rigs(tests: Sequence[LabelTest], table: Sessions) -> dict[str, Any]:
-    """Choose the rigs of one lung: those that passed, the reference first, and the held-out one.
+    """Choose the rigs of one lung: label-true ones, the reference first, and the held-out one.
 
     The reference has the most measured breaths. Held out is one on another kind of ventilator if
-    there is such, with as many measured breaths as possible. If no session passed, the one with the
-    most measured breaths stands for the lung, and ``label_test`` says so.
+    there is such, with as many measured breaths as possible. If no session is label-true, those
+    stand for the lung whose label cannot be told, and if there is none of those either, the one
+    with the most measured breaths; ``label_test`` says so.
 
     Args:
         tests: tests of all its sessions.
@@ -453,13 +457,15 @@ def choose_rigs(tests: Sequence[LabelTest], table: Sessions) -> dict[str, Any]:
     def recorded(test: LabelTest) -> tuple[int, int, int]:
         return -test.measured, -test.breaths, test.session
 
-    passed = sorted((test for test in tests if not test.reasons), key=recorded)
-    chosen = passed or sorted(tests, key=recorded)[:1]
+    passed = sorted((test for test in tests if test.label_true), key=recorded)
+    open_ = sorted((test for test in tests if not test.reasons), key=recorded)
+    chosen = passed or open_ or sorted(tests, key=recorded)[:1]
+    verdict = "passed" if passed else "cannot be told" if open_ else "no session passed"
     reference, rest = chosen[0], chosen[1:]
     out: dict[str, Any] = {
         "session": reference.session,
         "rigs": [reference.session, *sorted(test.session for test in rest)],
-        "label_test": "passed" if passed else "no session passed",
+        "label_test": verdict,
     }
     if len(chosen) >= HELD_OUT_FROM:
         kind = table.table[reference.session].rig
@@ -505,10 +511,6 @@ def _valve(problem: _Problem, members: Sequence[Pooled], fits: _Fits) -> dict[st
 def _provenance(
     data: RigRecordings, listed: tuple[str, ...], config: RigConfig, scales: Scales, noise: Noise
 ) -> dict[str, Any]:
-    settings = dataclasses.asdict(config)
-    if config.laminar_share == LAMINAR_SHARE:
-        # Not told, so that the public recordings give the official manifest again to the byte.
-        del settings["laminar_share"]
     return {
         "format": frozen.FORMAT,
         "version": VERSION,
@@ -519,7 +521,7 @@ def _provenance(
         "listed": list(listed),
         "split": {"by": "breath", "seed": config.seed, "folds": config.folds},
         "recipe": {
-            "rigs": settings,
+            "rigs": dataclasses.asdict(config),
             "scales": dataclasses.asdict(scales),
             "noise": dataclasses.asdict(noise),
         },

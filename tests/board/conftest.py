@@ -145,7 +145,7 @@ def rerun(
     def flat(values: np.ndarray) -> np.ndarray:
         return np.moveaxis(values, 0, 1).reshape(runs.error.shape)
 
-    safe = np.broadcast_to(found.safe[None, :, None], runs.error.shape)
+    safe = found.safe[None, :, None] & np.isfinite(flat(errors))
     commands = requested.reshape(1, 6, -1, *requested.shape[3:])
     return dataclasses.replace(
         runs, error=flat(errors), peak=flat(found.peak), safe=safe, requested=commands,

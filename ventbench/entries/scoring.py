@@ -13,9 +13,11 @@ import jax
 import numpy as np
 
 from ventbench.base import precision
+from ventbench.base.errors import InputError
 from ventbench.entries.cells import Cells, protocol_of
 from ventbench.entries.errors import SubmissionError
 from ventbench.entries.folder import Submission, as_submission
+from ventbench.entries.manifest import TRACKS
 from ventbench.entries.reference import Reference
 from ventbench.entries.result import Score
 from ventbench.entries.runner import (
@@ -220,6 +222,8 @@ def enter(
         raise SubmissionError(f"{submission.label}: only a folder can run in a sandbox")
     entered = submission.manifest.tracks
     track = track or entered[0]
+    if track not in TRACKS:
+        raise InputError(f"track is {track!r}; choose {' or '.join(TRACKS)}")
     if track not in entered:
         raise SubmissionError(
             f"{submission.label}: submission.toml, key tracks: enters {', '.join(entered)}; "
@@ -250,8 +254,9 @@ def runs_of(run: ProtocolRun, cells: Cells, submission: Submission, tasks: Seque
     plateau = steady_error(run.pressure[..., -1, :], pip)
     error = run_error(run.pressure, pip[..., None, None])
     survived = safe & (plateau <= PLATEAU_TOLERANCE + PLATEAU_SHARE * pip)
-    for cell in run.failures:
-        error[cell], plateau[cell], survived[cell] = np.nan, np.nan, False
+    for cell in run.failures:  # a controller that ended gave no command to be safe with
+        error[cell], plateau[cell] = np.nan, np.nan
+        safe[cell] = survived[cell] = False
     volume = np.full(error.shape, np.nan)
     if run.volume is not None:
         volume = run.volume[..., protocol.SCORED_BREATHS, -1].mean(axis=-1)

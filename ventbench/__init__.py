@@ -14,7 +14,9 @@ Everything that a notebook needs is an attribute of this package and is imported
 
 from __future__ import annotations
 
+from functools import wraps
 from importlib import import_module
+from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
     from ventbench.plants.catalog import load_simulators as load_simulators
     from ventbench.plants.simulators import Simulators as Simulators
     from ventbench.recordings import Breaths as Breaths
-    from ventbench.recordings import load as load_recording
+    from ventbench.recordings import load as load_recording  # noqa: F401
     from ventbench.recordings.foreign import import_recording as import_recording
     from ventbench.simulation import Simulation as Simulation
     from ventbench.simulation import simulate as simulate
@@ -83,38 +85,7 @@ _SOURCES = {
     "tune_pid": ("train.pid_grid", "tune_pid"),
 }
 
-__all__ = [
-    "LUNGS",
-    "Breaths",
-    "Controller",
-    "Diagnosis",
-    "InputError",
-    "Lung",
-    "Observation",
-    "OpenLoopReport",
-    "Plant",
-    "Score",
-    "Simulation",
-    "Simulators",
-    "Task",
-    "Trajectories",
-    "__version__",
-    "diagnose",
-    "example",
-    "import_recording",
-    "load_board",
-    "load_recording",
-    "load_simulators",
-    "open_loop",
-    "rollout",
-    "score",
-    "simulate",
-    "train_dqn",
-    "train_ppo",
-    "train_residual",
-    "train_rigs",
-    "tune_pid",
-]
+__all__ = sorted((*_SOURCES, "__version__"))  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
@@ -122,9 +93,27 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'ventbench' has no attribute {name!r}")
     module, attribute = _SOURCES[name]
     value = getattr(import_module(f"ventbench.{module}"), attribute)
+    if isinstance(value, FunctionType):
+        value = _refusing_at_the_door(name, value)
     globals()[name] = value
     return value
 
 
+def _refusing_at_the_door(name: str, function: FunctionType) -> Any:
+    """Keep frames of the package out of the traceback of bad input, which the message explains."""
+    from ventbench.base.errors import InputError
+
+    @wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return function(*args, **kwargs)
+        except InputError as error:
+            raise error.with_traceback(None)  # noqa: B904
+
+    # By these, it is found again where it is unpickled.
+    call.__module__, call.__qualname__ = __name__, name
+    return call
+
+
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return __all__

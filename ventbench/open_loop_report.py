@@ -87,6 +87,11 @@ class OpenLoopReport:
     perhaps_copies: tuple[int, ...]
     notes: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        """Simulators and number of breaths."""
+        breaths = sum(figures["breaths"] for figures in self.lungs.values())
+        return f"<OpenLoopReport of {self.plant}: {breaths} breaths, {len(self.lungs)} lungs>"
+
     def as_dict(self) -> dict[str, Any]:
         """JSON values of ``ventbench open-loop --json``."""
         return {
@@ -160,7 +165,7 @@ class OpenLoopReport:
 
 
 def open_loop(
-    breaths: Breaths | Path | str, simulator: Given = "frozen",
+    breaths: Breaths | Path | str | pd.DataFrame, simulator: Given = "frozen",
     *, progress: Callable[[int, int], object] | None = None,
 ) -> OpenLoopReport:  # fmt: skip
     """Measure how far simulators stray from recorded breaths under the recorded commands.
@@ -169,7 +174,7 @@ def open_loop(
     from its first recorded pressure, cmH2O.
 
     Args:
-        breaths: n recorded breaths, or the path of a recording.
+        breaths: n recorded breaths, or what :func:`ventbench.load_recording` takes.
         simulator: a name, a file, a plant, plants by lung, a function of commands or an array of
             simulated pressures ``(n, T)``; see :func:`ventbench.load_simulators`.
         progress: called with how many breaths have been simulated and how many there are; the
@@ -187,8 +192,7 @@ def open_loop(
         >>> bool(report.to_frame().loc["R5C20", "mae"] < 1.0)
         True
     """
-    if not isinstance(breaths, Breaths):
-        breaths = load(breaths)
+    breaths = load(breaths)
     official = frozen.load()
     tested = load_simulators(simulator, breaths=breaths)
     # Whether a label is wrong can be asked where there are official simulators to compare with.

@@ -60,6 +60,10 @@ class Simulation:
     u_out: Floats
     pressure: Floats
 
+    def __repr__(self) -> str:
+        """Lung, simulators and size."""
+        return f"<Simulation of {self.lung} by {self.simulators}: {len(self.time)} samples>"
+
     def to_frame(self) -> pd.DataFrame:
         """One row a sample: ``time_step`` (s), ``u_in`` (%), ``u_out``, ``pressure`` (cmH2O)."""
         import pandas as pd

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ventbench.base import files
-from ventbench.base.errors import InputError
+from ventbench.base.errors import InputError, InputTypeError
 from ventbench.task import protocol, waveform
 from ventbench.task.metrics.score import run_error
 
@@ -54,6 +54,11 @@ class Trajectories:
     pressure: Floats
     u_in: Floats
     u_out: Floats
+
+    def __repr__(self) -> str:
+        """Name, track and size."""
+        size = f"{len(self.lungs)} lungs x {len(self.pips)} PIPs x {len(self.time)} steps"
+        return f"<Trajectories of {self.name}, {self.track}: {size}>"
 
     def to_frame(self) -> pd.DataFrame:
         """One row a step: ``lung``, ``pip``, ``time`` (s), and the four series as columns."""
@@ -167,6 +172,12 @@ def rollout(
     from ventbench.plants.catalog import load_simulators
     from ventbench.task import environment, rollouts
 
+    if not (hasattr(controller, "init") and hasattr(controller, "step")):
+        raise InputTypeError(
+            "controller", controller, "a pytree with init and step, or use ventbench.score"
+        )
+    if isinstance(lungs, str):
+        lungs = [lungs]
     simulators = load_simulators(simulator)
     names = [entry.id for entry in simulators.lungs] if lungs is None else list(lungs)
     cells = tuple(float(pip) for pip in pips)

@@ -8,8 +8,25 @@ import importlib
 class InputError(ValueError):
     """Something given to ventbench is wrong; the message says what, where, and what to do.
 
-    The command line prints the message alone and exits with 2.
+    The command line prints the message alone and exits with 2, and so does a notebook.
     """
+
+    def _render_traceback_(self) -> list[str]:
+        """What IPython shows: the message, as the place in ventbench does not matter."""
+        return [f"{type(self).__name__}: {self}"]
+
+
+class InputTypeError(InputError, TypeError):
+    """What was given is of a type that is not taken there.
+
+    Args:
+        what: was given, and for what, such as ``"recording"``.
+        given: the value.
+        wanted: what to give instead, in words.
+    """
+
+    def __init__(self, what: str, given: object, wanted: str):
+        super().__init__(f"{what} is of type {type(given).__name__}; give {wanted}")
 
 
 def require(*modules: str) -> None:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,9 +60,13 @@ from ventbench.plants.sessions import Sessions
 from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.decimation import decimate, is_fast
+from ventbench.recordings.read import load
 from ventbench.recordings.roles import require_roles
 from ventbench.system_id import Data, Fit, Noise, make_data
 from ventbench.task.lungs import lung as parse_lung
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 #: Receives the current step in words, and the share of the whole that is done.
 Progress: TypeAlias = Callable[[str, float], None]
@@ -82,12 +86,11 @@ _NOTE_ON_FLOW = (
 
 
 def diagnose(
-    breaths: Breaths,
+    breaths: Breaths | str | Path | pd.DataFrame,
     *,
     simulator: Given = "physics",
     lung: str | None = None,
     patient: bool = False,
-    passive: bool | None = None,
     drive: Drive = "auto",
     rigs: Sessions | None = None,
     progress: Progress | None = None,
@@ -100,8 +103,9 @@ def diagnose(
     missing.
 
     Args:
-        breaths: n recorded breaths. Of each lung, every third tests which terms are needed, and
-            every sixth, which nothing else sees, judges the corrected simulator.
+        breaths: n recorded breaths, or what :func:`ventbench.load_recording` takes. Of each
+            lung, every third tests which terms are needed, and every sixth, which nothing else
+            sees, judges the corrected simulator.
         simulator: what to diagnose. A name (``"physics"``, ``"frozen"``,
             ``"two_balloon"``), a path to a plant file, a plant, plants by lung id, an array of
             simulated pressures of these breaths, cmH2O, ``(n, T)``, or a Python function of one
@@ -111,7 +115,6 @@ def diagnose(
         lung: use only the breaths of this label.
         patient: True if the lung is a patient's or an active simulator's, so that somebody may
             breathe; False for a test lung, which makes no effort.
-        passive: the opposite of ``patient``; for callers of earlier versions.
         drive: what the model follows: ``"valve"``, the recorded commands; ``"flow"``, the recorded
             flow, which says nothing of the valves; ``"auto"``, the flow only if ``u_in`` is zero
             throughout, so that no command was recorded.
@@ -126,7 +129,7 @@ def diagnose(
         ``traces`` has some of the samples (see :mod:`ventbench.recordings.decimation`).
 
     Raises:
-        InputError: if there are too few breaths, or no simulator for their lung.
+        InputError: if there are too few breaths, no simulator for their lung, or no such drive.
 
     Examples:
         >>> import numpy as np
@@ -135,14 +138,13 @@ def diagnose(
         ...     volume = np.concatenate([[0.0], np.cumsum(flow * dt)[:-1]])
         ...     pressure = initial_pressure + 1000.0 * volume / C + R * flow
         ...     return np.where(u_out == 1, initial_pressure, pressure)
-        >>> diagnosis = diagnose(breaths, simulator=ideal)  # doctest: +SKIP
+        >>> diagnosis = diagnose("x.csv", simulator=ideal)  # doctest: +SKIP
         >>> print(diagnosis)  # doctest: +SKIP
     """
     began = time.perf_counter()
-    if passive is not None:
-        if patient and passive:
-            raise InputError("patient=True and passive=True contradict each other; give patient")
-        patient = not passive
+    if drive not in get_args(Drive):
+        raise InputError(f"drive is {drive!r}; choose {', '.join(get_args(Drive))}")
+    breaths = load(breaths)
     require_roles(breaths)
     tell = progress or (lambda what, share: None)
     simulators = load_simulators(simulator, breaths=breaths)

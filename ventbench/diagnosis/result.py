@@ -156,6 +156,10 @@ class Diagnosis(Findings):
         save_plants(corrected, self.plants, about)
         return [*written, corrected]
 
+    def __repr__(self) -> str:
+        """The verdict in one sentence."""
+        return f"<Diagnosis of {self.simulator}: {report_text.sentences(self)[0]}>"
+
     def __str__(self) -> str:
         """The diagnosis in sentences, the most important first."""
         return "\n".join(report_text.sentences(self))

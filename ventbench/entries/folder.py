@@ -156,10 +156,14 @@ def submission_of(controller: Any) -> Submission:
         lacks = [m for m in ("reset", "act") if not callable(getattr(controller, m, None))]
         if lacks:
             raise SubmissionError(f"class {name} has no method {' and no method '.join(lacks)}")
+        _check_calls(f"class {name}", controller, "nothing to make one")
+        for method, given in (("reset", "a task"), ("act", "an observation")):
+            _check_calls(f"{name}.{method}", getattr(controller, method), given, "self", given)
         make, tracks = controller, TRACKS
     elif callable(getattr(controller, "act", None)):
         raise SubmissionError(f"give the class {name}, not an instance: each run needs a new one")
     elif callable(controller):
+        _check_calls(name, controller, "an observation", "observation")
         function: Any = controller
         make, tracks = (lambda: _Stateless(function)), TRACKS[::-1]
     else:
@@ -177,6 +181,22 @@ def submission_of(controller: Any) -> Submission:
     description = (inspect.getdoc(controller) or "").partition("\n")[0]
     manifest = Manifest(plain, (), "", API_VERSION, "other", tracks, description)
     return Submission(name, folder, manifest, None, make)
+
+
+def _check_calls(name: str, function: Any, given: str, *arguments: str) -> None:
+    """Check that a function takes as many arguments as it will be given.
+
+    Raises:
+        SubmissionError: if it does not.
+    """
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # of compiled code
+        return
+    try:
+        signature.bind(*arguments)
+    except TypeError as error:
+        raise SubmissionError(f"{name}{signature} must take {given}: {error}") from None
 
 
 class _Stateless:

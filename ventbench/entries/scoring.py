@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from ventbench.base import precision
-from ventbench.base.errors import InputError
+from ventbench.base.errors import InputError, InputTypeError
 from ventbench.entries.cells import Cells, protocol_of
 from ventbench.entries.errors import SubmissionError
 from ventbench.entries.folder import Submission, as_submission
@@ -75,8 +75,8 @@ def score(
         The score; ``print`` and notebooks show one row a lung.
 
     Raises:
-        SubmissionError: if there is no such submission, it cannot be run at all, or it does not
-            enter the track.
+        SubmissionError: if there is no such submission, it cannot be run at all, it does not enter
+            the track, or a class or function fails in every run.
         SandboxError: if this machine cannot run submissions apart.
         InputError: if there are no such simulators or draws.
         FloatingPointError: if a plant answers with NaN or infinity.
@@ -90,10 +90,12 @@ def score(
         False
     """
     entry = as_submission(submission)
+    if not isinstance(draws, int):
+        raise InputTypeError("draws", draws, "a whole number")
     runner: Runner = runner_of(entry, sandbox=sandbox)
     if progress is not None:
         runner = CountingRunner(runner, progress, sessions=1 + stress)
-    return run_protocol(
+    result = run_protocol(
         entry,
         load_rigs(simulator),
         track=track,
@@ -102,6 +104,9 @@ def score(
         stressors=stressors,
         runner=runner,
     )
+    if len(result.failures) == result.requested[..., 0, 0].size and entry.sha256 is None:
+        raise SubmissionError(result.failures[0].message)  # a class or function that never works
+    return result
 
 
 def run_protocol(

@@ -36,7 +36,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ventbench import recordings
 from ventbench.base import files, precision
-from ventbench.base.errors import InputError
+from ventbench.base.errors import InputError, InputTypeError
 from ventbench.physics import physics
 from ventbench.plants import frozen
 from ventbench.plants.plant_files import load_plants, origin
@@ -100,6 +100,10 @@ class Stepping(Protocol):
 #: Simulators in plain Python, alone or by lung id; also plants by lung id.
 PythonGiven: TypeAlias = "Stepping | Mapping[str, Any] | Callable[..., Any]"
 
+_WANTED = (
+    "a name, a file, a plant, plants by lung id, a function of commands or an array of pressures"
+)
+
 #: All that :func:`load_simulators` takes.
 Given: TypeAlias = "str | Path | Simulators | Plant | PythonGiven | ArrayLike"
 
@@ -131,6 +135,8 @@ def load_simulators(given: Given = "frozen", *, breaths: Breaths | None = None) 
     """
     if isinstance(given, Simulators):
         return given
+    if given is None or isinstance(given, bool | int | float | Breaths):
+        raise InputTypeError("simulator", given, _WANTED)
     if isinstance(given, str | Path):
         return _by_text(str(given))
     if isinstance(given, Mapping):
@@ -374,10 +380,7 @@ def _of_array(given: Any, breaths: Breaths | None) -> Simulators:
     try:
         pressures = np.asarray(given, float)
     except (TypeError, ValueError) as error:
-        raise InputError(
-            f"a {type(given).__name__} stands for no simulators; give a name, a file, a plant, "
-            "plants by lung id, a function of commands or an array of pressures"
-        ) from error
+        raise InputTypeError("simulator", given, _WANTED) from error
     if breaths is None or pressures.shape != breaths.pressure.shape:
         wanted = "the breaths it answers to" if breaths is None else str(breaths.pressure.shape)
         raise InputError(

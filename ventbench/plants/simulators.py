@@ -60,6 +60,11 @@ class Simulators:
     _table: Mapping[int, tuple[Lung, Floats, Floats]] = field(default_factory=dict, repr=False)
     origin: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
+    def __repr__(self) -> str:
+        """Name, kind and lungs."""
+        lungs = ", ".join(lung.id for lung in self.lungs) or "lungs by their label"
+        return f"<Simulators {self.name} ({self.kind}): {lungs}>"
+
     @property
     def has_plants(self) -> bool:
         """Whether there are plants, which can be scored and corrected."""

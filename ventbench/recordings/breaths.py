@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import html
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ventbench.base.errors import InputError
+from ventbench.base.errors import InputError, require
 from ventbench.task.lungs import Lung
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +75,69 @@ class Breaths:
         lungs = len(self.by_lung_index)
         return f"Breaths({n} breaths x {samples} samples, {lungs} lungs, source={self.source!r})"
 
+    def _repr_html_(self) -> str:
+        """Return sizes, origin and notes, and a row a lung, as a notebook shows them."""
+        import pandas as pd
+
+        rows = {
+            name: {
+                "breaths": len(index),
+                "interval, ms": 1e3 * float(np.median(self.dt[index][self.valid[index]])),
+                "highest, cmH2O": _over(np.nanmax, self.pressure[index]),
+                "lowest, cmH2O": _over(np.nanmin, self.pressure[index]),
+                "u_in up to, %": float(self.u_in[index].max()),
+            }
+            for name, index in self.by_lung_index.items()
+        }
+        table = pd.DataFrame.from_dict(rows, orient="index").to_html(float_format="%.1f")
+        said = (repr(self), *self.notes)
+        return "".join(f"<p>{html.escape(text)}</p>" for text in said) + table
+
+    def __getitem__(self, which: int | str | slice | list[int] | np.ndarray) -> Breaths:
+        """Return some breaths: by place, slice, mask, places, or the id of a lung.
+
+        Raises:
+            IndexError: if there is no such breath.
+            KeyError: if there is no breath of that lung.
+        """
+        if isinstance(which, str):
+            if which not in self.by_lung_index:
+                raise KeyError(f"no breath of lung {which}; there are {', '.join(self.by_lung())}")
+            return self.select(self.by_lung_index[which])
+        return self.select([which] if isinstance(which, int | np.integer) else which)
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row a sample in the public schema, which :func:`ventbench.load_recording` takes."""
+        from ventbench.recordings.write import as_table
+
+        return as_table(self).to_pandas()
+
+    def plot(self) -> Figure:
+        """Draw pressure and commands of all breaths, a column a lung.
+
+        Returns:
+            A matplotlib figure, which a notebook shows and ``savefig`` writes.
+
+        Raises:
+            InputError: if the extra ``ventbench[view]`` is missing.
+        """
+        require("matplotlib")
+        from matplotlib.figure import Figure
+
+        columns = self.by_lung_index
+        figure = Figure(figsize=(3.0 + 2.2 * len(columns), 4.0), layout="constrained")
+        axes = figure.subplots(2, len(columns), sharex=True, sharey="row", squeeze=False)
+        names = ("airway pressure, cmH2O", "u_in, %")
+        for row, (name, values) in enumerate(zip(names, (self.pressure, self.u_in), strict=True)):
+            axes[row, 0].set_ylabel(name)
+            for axis, index in zip(axes[row], columns.values(), strict=True):
+                there = np.where(self.valid[index], values[index], np.nan)
+                axis.plot(self.time[index].T, there.T, color="#1f5aa6", lw=0.8, alpha=0.5)
+        for axis, (name, index) in zip(axes[0], columns.items(), strict=True):
+            axis.set_title(f"{name}, {len(index)} breaths", fontsize="small")
+        figure.supxlabel("time in the breath, s")
+        return figure
+
     @cached_property
     def lung_ids(self) -> np.ndarray:
         """The lung of each breath, such as `R5C10`, str, (n,)."""
@@ -114,6 +183,11 @@ class Breaths:
     def _arrays(self) -> dict[str, np.ndarray]:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+def _over(of: Callable[[np.ndarray], float], values: np.ndarray) -> float:
+    """Figure of what is not blank; NaN if all is."""
+    return float("nan") if np.isnan(values).all() else float(of(values))
 
 
 FILL = {"u_in": 0.0, "u_out": 1, "pressure": np.nan, "flow": np.nan, "volume": np.nan}

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,6 +24,9 @@ from ventbench.recordings.report import (
 from ventbench.recordings.scan import Block, Source, join_blocks, locate, open_source, scan
 from ventbench.recordings.times import IntervalTable
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 #: Environment variable that names the folder of public recordings.
 VARIABLE = "VENTBENCH_RECORDINGS"
 
@@ -34,12 +38,17 @@ Progress = Callable[[int, int], object]
 
 
 def load(
-    path: FilePath, *, clip: bool = False, pad: bool = False, progress: Progress | None = None
+    path: FilePath | pd.DataFrame | Breaths,
+    *,
+    clip: bool = False,
+    pad: bool = False,
+    progress: Progress | None = None,
 ) -> Breaths:
     """Read a recording (CSV, gzipped CSV or Parquet) into memory.
 
     Args:
-        path: the file.
+        path: the file; or a table in memory with the same columns, such as
+            :meth:`~ventbench.Breaths.to_frame` returns. Breaths are returned as they are.
         clip: clip u_in to 0..100 %.
         pad: accept breaths of unequal length and pad the short ones (see `Breaths`).
         progress: called with how much has been read and of how much, block by block.
@@ -49,6 +58,7 @@ def load(
 
     Raises:
         RecordingError: if the file cannot be used; the error carries its problems.
+        InputTypeError: if ``path`` is of another type.
 
     Examples:
         >>> import ventbench
@@ -56,6 +66,8 @@ def load(
         >>> breaths.pressure.shape, list(breaths.by_lung_index)
         ((24, 80), ['R20C50'])
     """
+    if isinstance(path, Breaths):
+        return path
     source = open_source(path)
     log = ProblemLog(source.file)
     tally = Tally()
@@ -74,7 +86,8 @@ def load(
     whole = join_blocks(blocks)
     blocks.clear()
     breaths = _assemble(whole, tally.table(), source.file)
-    return replace(breaths, sha256=source.sha256, notes=notes)
+    file = None if source.kind == "table" else source.file
+    return replace(breaths, source=file, sha256=source.sha256, notes=notes)
 
 
 def check(

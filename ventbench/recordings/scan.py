@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ventbench.base.errors import InputTypeError
 from ventbench.base.files import sha256
 from ventbench.recordings.checks import (
     check_ids,
@@ -29,8 +30,12 @@ from ventbench.recordings.schema import COLUMNS, Kind, check_header
 from ventbench.recordings.times import KnownTimes, known_times, leading_zeros
 
 if TYPE_CHECKING:
+    import pandas as pd
     import pyarrow as pa
 
+
+#: What messages call a table in memory.
+_TABLE = "the table"
 
 BATCH = 1 << 17
 """Rows read at a time."""
@@ -38,11 +43,12 @@ BATCH = 1 << 17
 
 @dataclass
 class ParquetSource:
-    """A Parquet file that is read once, in order.
+    """A Parquet file, or a table in memory, that is read once, in order.
 
     Attributes:
         file: the path as the caller wrote it.
-        kind: `parquet`.
+        kind: `parquet`, or `table` in memory.
+        table: the table in memory; None for a file.
         names: column names.
         warnings: about columns that are ignored.
         sha256: SHA-256 of the file; None until all chunks are read.
@@ -53,6 +59,7 @@ class ParquetSource:
 
     file: str
     kind: Kind = "parquet"
+    table: pa.Table | None = None
     names: tuple[str, ...] = ()
     warnings: tuple[RecordingProblem, ...] = ()
     sha256: str | None = None
@@ -71,7 +78,7 @@ class ParquetSource:
         from pyarrow import parquet
 
         try:
-            schema = parquet.read_schema(self.file)
+            schema = parquet.read_schema(self.file) if self.table is None else self.table.schema
         except (pa.ArrowException, OSError) as error:
             raise _damaged(self.file, error) from None
         self.names = tuple(schema.names)
@@ -92,23 +99,30 @@ class ParquetSource:
             RecordingError: the file is damaged.
         """
         import pyarrow as pa
-        from pyarrow import parquet
 
         row0, last_id = 0, None
         try:
-            with parquet.ParquetFile(self.file) as stream:
-                self.size = stream.metadata.num_rows
-                columns = [name for name in COLUMNS if name in self.names]
-                for batch in stream.iter_batches(self.batch, columns=columns):
-                    if batch.num_rows:
-                        chunk = chunk_of_batch(batch, row0, last_id)
-                        self.done = row0 + len(chunk)
-                        yield chunk
-                        row0 += len(chunk)
-                        last_id = int(chunk.columns["breath_id"][-1])
-            self.sha256 = sha256(Path(self.file))
+            for batch in self._batches([name for name in COLUMNS if name in self.names]):
+                if batch.num_rows:
+                    chunk = chunk_of_batch(batch, row0, last_id)
+                    self.done = row0 + len(chunk)
+                    yield chunk
+                    row0 += len(chunk)
+                    last_id = int(chunk.columns["breath_id"][-1])
+            self.sha256 = None if self.table is not None else sha256(Path(self.file))
         except (pa.ArrowException, OSError) as error:
             raise _damaged(self.file, error) from None
+
+    def _batches(self, columns: list[str]) -> Iterator[pa.RecordBatch]:
+        from pyarrow import parquet
+
+        if self.table is not None:
+            self.size = self.table.num_rows
+            yield from self.table.select(columns).to_batches(self.batch)
+            return
+        with parquet.ParquetFile(self.file) as stream:
+            self.size = stream.metadata.num_rows
+            yield from stream.iter_batches(self.batch, columns=columns)
 
 
 def _check_type(file: str, name: str, kind: pa.DataType) -> Iterator[RecordingProblem]:
@@ -132,14 +146,34 @@ def _damaged(file: str, error: Exception) -> RecordingError:
 Source = CsvSource | ParquetSource
 
 
-def open_source(path: str | os.PathLike[str]) -> Source:
-    """Open a file and check its header.
+def open_source(path: str | os.PathLike[str] | pd.DataFrame) -> Source:
+    """Open a file, or a table in memory, and check its header.
 
     Raises:
+        InputTypeError: it is neither.
         RecordingError: the file cannot be read or is no recording.
     """
+    if not isinstance(path, str | os.PathLike):
+        return _table_source(path)
     kind = kind_of(path)
     return ParquetSource(str(path)) if kind == "parquet" else CsvSource(str(path), kind)
+
+
+def _table_source(frame: object) -> ParquetSource:
+    import pandas as pd
+    import pyarrow as pa
+
+    if not isinstance(frame, pd.DataFrame):
+        raise InputTypeError(
+            "recording", frame, "a path, a pandas table in the public schema or Breaths"
+        )
+    named = frame.rename(columns=str)
+    try:
+        table = pa.Table.from_pandas(named, preserve_index=False)
+    except (pa.ArrowException, ValueError) as error:
+        what = f"the table cannot be read ({str(error).splitlines()[0]})"
+        raise fail(_TABLE, what, "Write numbers in every column.") from None
+    return ParquetSource(_TABLE, "table", table)
 
 
 def locate(source: Source, rows: Collection[int]) -> Mapping[int, Place]:

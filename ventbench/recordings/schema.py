@@ -14,8 +14,8 @@ from typing import Literal
 
 from ventbench.recordings.problems import RecordingError, RecordingProblem
 
-#: Formats of files.
-Kind = Literal["csv", "csv.gz", "parquet"]
+#: Formats of files, and a table in memory.
+Kind = Literal["csv", "csv.gz", "parquet", "table"]
 
 
 @dataclass(frozen=True)

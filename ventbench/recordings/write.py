@@ -68,7 +68,7 @@ def _write_csv(breaths: Breaths, stream: IO[bytes], blank: bool, *, packed: bool
         sink = pa.PythonFile(out, "w")
         with csv.CSVWriter(sink, schema, write_options=options) as writer:
             for first in range(0, len(breaths), BATCH):
-                writer.write_table(_table(breaths, first, schema, blank))
+                writer.write_table(_table(breaths, slice(first, first + BATCH), schema, blank))
 
 
 def _write_parquet(breaths: Breaths, stream: IO[bytes], blank: bool) -> None:
@@ -77,7 +77,7 @@ def _write_parquet(breaths: Breaths, stream: IO[bytes], blank: bool) -> None:
     schema = _schema(breaths)
     with parquet.ParquetWriter(stream, schema, compression="zstd") as writer:
         for first in range(0, len(breaths), BATCH):
-            writer.write_table(_table(breaths, first, schema, blank))
+            writer.write_table(_table(breaths, slice(first, first + BATCH), schema, blank))
 
 
 def _schema(breaths: Breaths) -> pa.Schema:
@@ -96,16 +96,20 @@ def _schema(breaths: Breaths) -> pa.Schema:
     )
 
 
-def _table(breaths: Breaths, first: int, schema: pa.Schema, blank: bool) -> pa.Table:
+def as_table(breaths: Breaths) -> pa.Table:
+    """One row a sample in the public schema; inferred times are blank, as they were read."""
+    return _table(breaths, slice(0, len(breaths)), _schema(breaths), True)
+
+
+def _table(breaths: Breaths, span: slice, schema: pa.Schema, blank: bool) -> pa.Table:
     import pyarrow as pa
 
-    span = slice(first, first + BATCH)
     valid = breaths.valid[span]
     lengths = valid.sum(axis=1)
     time = breaths.time[span]
     if blank:
         time = np.where(breaths.time_inferred[span, None], np.nan, time)
-    start = 1 + int(np.count_nonzero(breaths.valid[:first]))
+    start = 1 + int(np.count_nonzero(breaths.valid[: span.start]))
     columns = {
         "id": np.arange(start, start + int(lengths.sum())),
         "breath_id": np.repeat(breaths.breath_id[span], lengths),

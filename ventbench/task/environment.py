@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
+from ventbench.base.errors import InputError
 from ventbench.task import protocol, waveform
 from ventbench.task.interfaces import Observation, Plant, Signals
 
@@ -62,7 +63,7 @@ def nominal_scenario(pip: ArrayLike, peep: ArrayLike = protocol.PEEP) -> Scenari
     """
     pip, peep = np.broadcast_arrays(np.asarray(pip, float), np.asarray(peep, float))
     if not np.all(pip > peep):
-        raise ValueError(f"PIP {pip} cmH2O must exceed PEEP {peep} cmH2O")
+        raise InputError(f"PIP {pip} cmH2O must exceed PEEP {peep} cmH2O")
     ones, zeros = np.ones(pip.shape), np.zeros(pip.shape)
     noise = np.zeros((*pip.shape, protocol.BREATHS, protocol.INSPIRATION_STEPS))
     arrays = (pip, peep, peep, protocol.DT * ones, ones, ones, zeros, zeros, noise)

@@ -131,6 +131,10 @@ class TrainedControllers:
         networks = self.report["networks"]
         return pd.DataFrame.from_dict(networks, orient="index").rename_axis("network")
 
+    def __repr__(self) -> str:
+        """Names and folder."""
+        return f"<TrainedControllers {', '.join(self.controllers)} in {self.folder}>"
+
     def _repr_html_(self) -> str:
         return self.to_frame().to_html()
 
@@ -151,6 +155,7 @@ def check_names(
     known = trained_on.names
     if names is None:
         return known
+    names = [names] if isinstance(names, str) else names
     for name in names:
         if (all_lungs and name == ALL) or lung(name).id in known:
             continue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -139,6 +140,46 @@ def test_help_imports_nothing_heavy() -> None:
     assert not HEAVY & set(modules.split())
 
 
+#: What needs an extra: the extra, its packages as they are imported, and how it is asked for.
+NEEDS_EXTRA = {
+    "selftest": (
+        "hardware",
+        ("cobs", "serial"),
+        "ventbench-hardware selftest --port p --lung R5C20",
+    ),
+    "device": ("hardware", ("cobs", "serial"), "-m hardware_eval.device --help"),
+    "report": ("view", ("jinja2", "rerun"), "ventbench score pid_best --report --out o"),
+    "build": ("view", ("jinja2",), "ventbench board build --out o --folder {root}/leaderboard"),
+    "scheduler": ("dask", ("distributed",), "ventbench score pid_best --scheduler tcp://host:1"),
+    "gym": ("gym", ("gymnasium",), "-c 'import ventbench.gym_env'"),
+}
+
+
+def _one_line_names_the_extra(run: subprocess.CompletedProcess[str], extra: str) -> None:
+    line = run.stderr.splitlines()[-1]
+    assert f"pip install 'ventbench[{extra}]'" in line, run.stderr
+    if "InputError" not in line:  # from Python there are lines of the caller above it
+        assert (run.returncode, run.stderr.count("\n")) == (2, 1)
+
+
+@pytest.mark.parametrize("case", NEEDS_EXTRA)
+def test_without_an_extra_one_line_names_it(case: str, tmp_path: Path) -> None:
+    extra, missing, command = NEEDS_EXTRA[case]
+    name, *arguments = shlex.split(command.format(root=ROOT))
+    hidden = f"import runpy, sys; sys.modules.update(dict.fromkeys({missing})); sys.argv[1:] = "
+    if name == "-c":
+        code = f"{hidden}[]; {arguments[0]}"
+    elif name == "-m":
+        code = f"{hidden}{arguments[1:]}; runpy.run_module('{arguments[0]}', run_name='__main__')"
+    else:
+        module = {"ventbench": "ventbench.cli", "ventbench-hardware": "hardware_eval.cli"}[name]
+        code = f"{hidden}{arguments}; from {module} import main; main()"
+    ended = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
+    )
+    _one_line_names_the_extra(ended, extra)
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
@@ -168,8 +209,8 @@ def test_wheel_content(wheel: Path) -> None:
 
 @pytest.mark.slow
 def test_wheel_works_outside_the_repository(wheel: Path, tmp_path: Path) -> None:
-    # A venv of its own, with this one's packages behind it: path files inside those (such as that
-    # of an editable install) are not followed, so this checkout cannot be seen.
+    # A venv of its own, with links to this one's packages behind it: neither this checkout, which
+    # a path file in those names, nor the packages of any extra can be seen.
     home = tmp_path / "venv"
     venv.create(home, with_pip=False)
     python = home / "bin" / "python"
@@ -181,8 +222,13 @@ def test_wheel_works_outside_the_repository(wheel: Path, tmp_path: Path) -> None
             check=True,
         ).stdout.strip()
     )
-    behind = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
-    (site / "behind.pth").write_text("\n".join(sorted(behind)) + "\n")
+    behind = tmp_path / "behind"
+    behind.mkdir()
+    hidden = {name.partition("_")[0] for _, names, _ in NEEDS_EXTRA.values() for name in names}
+    for path in Path(sysconfig.get_path("purelib")).iterdir():
+        if path.suffix != ".pth" and path.name.partition("_")[0].partition("-")[0] not in hidden:
+            (behind / path.name).symlink_to(path)
+    (site / "behind.pth").write_text(f"{behind}\n")
     install = ["uv", "pip", "install", "--offline", "--no-cache", "--no-deps", "--python"]
     subprocess.run([sys.executable, "-m", *install, python, wheel], check=True)
 
@@ -203,10 +249,14 @@ def test_wheel_works_outside_the_repository(wheel: Path, tmp_path: Path) -> None
     assert ventbench.__version__ in ventbench_command("--version")
     assert "score" in ventbench_command("--help")
     assert "R20C50" in ventbench_command("lungs")
+    for extra, _, command in NEEDS_EXTRA.values():
+        program, *words = shlex.split(command.format(root=ROOT))
+        start = [python, program] if program.startswith("-") else [home / "bin" / program]
+        ended = subprocess.run([*start, *words], cwd=elsewhere, capture_output=True, text=True)
+        _one_line_names_the_extra(ended, extra)
     submission = site / "ventbench" / "_submissions" / "pid_best"
     ventbench_command("score", submission, "--json", "out.json")
     result = json.loads((elsewhere / "out.json").read_text())
-    assert result["protocol"] == 1
     assert set(result["lungs"]) == {f"R{r}C{c}" for r in (5, 20) for c in (10, 20, 50)}
 
 

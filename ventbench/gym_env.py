@@ -5,10 +5,16 @@ Importing this module registers it; so does Gymnasium itself, ``gymnasium.make``
 ``ventbench[gym]``.
 """
 
+# ruff: noqa: E402  # a missing package is named before its import fails
+
 from __future__ import annotations
 
 from functools import partial
 from typing import Any, ClassVar
+
+from ventbench.base.errors import InputError, require
+
+require("gymnasium", extra="gym", what="environments")
 
 import gymnasium
 import gymnasium.vector
@@ -21,7 +27,6 @@ from jax import Array
 from numpy.typing import NDArray
 
 from ventbench.base import precision
-from ventbench.base.errors import InputError
 from ventbench.plants import frozen
 from ventbench.task import environment as env
 from ventbench.task import protocol

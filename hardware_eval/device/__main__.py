@@ -14,11 +14,16 @@ from pathlib import Path
 from types import FrameType
 
 from hardware_eval import realtime
-from hardware_eval.device import deadman
-from hardware_eval.device.port import Guard, Port
-from hardware_eval.device.program import DeviceService, DeviceSettings
-from hardware_eval.wire.link import BAUD_RATE
 from ventbench.base.errors import InputError
+
+try:
+    from hardware_eval.device import deadman
+    from hardware_eval.device.port import Guard, Port
+    from hardware_eval.device.program import DeviceService, DeviceSettings
+    from hardware_eval.wire.link import BAUD_RATE
+except InputError as missing:  # an extra that brings the wire
+    print(f"python -m hardware_eval.device: {missing}", file=sys.stderr)
+    raise SystemExit(2) from None
 
 
 def serial_line(path: str, baud_rate: int = BAUD_RATE) -> Callable[[], int | None]:

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from ventbench.base.errors import InputError
-from ventbench.board import store
 from ventbench.board.verify import verify
 from ventbench.plants import frozen
 
@@ -21,7 +20,7 @@ FOLDER = Path(__file__).parents[2] / "leaderboard"
 NOT_MEANT = "left out"
 
 pytestmark = pytest.mark.skipif(
-    not store.record_paths(FOLDER), reason="this copy of the project has no leaderboard"
+    not FOLDER.is_dir(), reason="this copy of the project has no leaderboard"
 )
 
 

@@ -6,8 +6,6 @@ import json
 import os
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -89,21 +87,6 @@ def test_an_entry_of_which_every_run_failed_has_no_score(
     assert said in done.output
     assert "board add" not in done.output
     assert json.loads(result.read_text())["complete"] is False
-
-
-def test_without_the_extra_one_line_says_what_to_install() -> None:
-    program = (
-        "import importlib.util as u, sys; find = u.find_spec;"
-        "u.find_spec = lambda name, *_: None if name in ('cobs', 'serial') else find(name);"
-        "sys.argv[1:] = ['selftest', '--port', 'p', '--lung', 'R5C20'];"
-        "from hardware_eval.cli import main; main()"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 2
-    assert done.stderr.splitlines() == [
-        "ventbench-hardware: the wire needs cobs and pyserial, which this installation lacks: "
-        "pip install 'ventbench[hardware]'"
-    ]
 
 
 def test_the_port_and_not_the_device_decides_what_is_emulated(tmp_path: Path) -> None:

@@ -29,11 +29,13 @@ class InputTypeError(InputError, TypeError):
         super().__init__(f"{what} is of type {type(given).__name__}; give {wanted}")
 
 
-def require(*modules: str) -> None:
-    """Check that packages of ``ventbench[view]`` are here; call it when they are needed.
+def require(*modules: str, extra: str = "view", what: str = "pictures") -> None:
+    """Check that packages of an extra are here; call it when they are needed.
 
     Args:
         modules: names to import.
+        extra: of ventbench, that brings them.
+        what: needs them, in words.
 
     Raises:
         InputError: if one is missing, with the command that brings it.
@@ -43,6 +45,6 @@ def require(*modules: str) -> None:
             importlib.import_module(module)
         except ImportError as error:
             raise InputError(
-                f"pictures need {module}: install ventbench[view] "
-                f"(pip install 'ventbench[view]'); import failed with: {error}"
+                f"{what} need {module}: install ventbench[{extra}] "
+                f"(pip install 'ventbench[{extra}]'); import failed with: {error}"
             ) from error

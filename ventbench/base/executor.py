@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, TypeVar
 
-from ventbench.base.errors import InputError
+from ventbench.base.errors import InputError, require
 
 ArgumentT = TypeVar("ArgumentT")
 ResultT = TypeVar("ResultT")
@@ -105,13 +105,9 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _dask(scheduler: str) -> Iterator[futures.Executor]:
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise InputError(
-            "--scheduler needs Dask: install ventbench[dask] (pip install 'ventbench[dask]'); "
-            f"import failed with: {error}"
-        ) from error
+    require("distributed", extra="dask", what="--scheduler and its workers")
+    from distributed import Client
+
     try:
         client = Client(scheduler, timeout=PATIENCE)
     except (OSError, ValueError) as error:

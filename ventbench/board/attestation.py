@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 
 from ventbench.base import files
-from ventbench.base.errors import InputError
+from ventbench.base.errors import InputError, require
 from ventbench.board import canonical, schema
 from ventbench.board.canonical import ATTESTATIONS, RECORDS, SIGNATURE_SUFFIX
 
@@ -230,14 +230,10 @@ def _private(secret: str) -> Ed25519PrivateKey:
 
 def _library() -> tuple[Any, type[Exception]]:
     """The module of Ed25519 and its error of a wrong signature."""
-    try:
-        from cryptography.exceptions import InvalidSignature
-        from cryptography.hazmat.primitives.asymmetric import ed25519
-    except ImportError as error:
-        raise InputError(
-            "signatures of records need cryptography: install ventbench[attest] "
-            f"(pip install 'ventbench[attest]'); import failed with: {error}"
-        ) from error
+    require("cryptography", extra="attest", what="signatures of records")
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives.asymmetric import ed25519
+
     return ed25519, InvalidSignature
 
 

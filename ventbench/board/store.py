@@ -45,7 +45,17 @@ class Store:
 
 
 def record_paths(folder: Path) -> list[Path]:
-    """Paths of the records of a leaderboard."""
+    """Paths of the records of a leaderboard.
+
+    Raises:
+        InputError: if there is no such folder.
+    """
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder}: there is no such folder; the published leaderboard is a folder of the "
+            "source repository, which no installed package holds. Give the folder of a checkout, "
+            "or begin one with `ventbench board add RECORD`"
+        )
     paths = sorted((folder / RECORDS).glob(f"*{record.SUFFIX}"))
     return [path for path in paths if canonical.named(f"{RECORDS}/{path.name}")]
 
@@ -184,7 +194,8 @@ def add(
         InputError: if it is not a record, does not replay, or does not fit those that are there.
         OSError: if a file cannot be read or written.
     """
-    store, added = load(folder), record.load(path)
+    store = load(folder) if folder.is_dir() else Store(folder, (), frozenset())
+    added = record.load(path)
     if isinstance(added, Withdrawal):
         raise InputError(f"{path} is a withdrawal; use ventbench board withdraw")
     problems = conflicts([*store.records, added], start=len(store.records))

@@ -28,6 +28,8 @@ def _read(folders: list[Path]) -> tuple[list[Trajectories], list[dict[str, Any]]
     runs, scores = [], []
     for folder in folders:
         kept = folder / "trajectories.npz"
+        if not folder.is_dir():
+            raise InputError(f"{folder}: there is no such folder")
         if not kept.is_file():
             raise InputError(
                 f"{folder} contains no scored run; make one with "

@@ -6,12 +6,13 @@ import html
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ventbench.base.errors import InputError, require
+from ventbench.recordings.schema import OPTIONAL
 from ventbench.task.lungs import Lung
 
 if TYPE_CHECKING:
@@ -108,9 +109,31 @@ class Breaths:
 
     def to_frame(self) -> pd.DataFrame:
         """One row a sample in the public schema, which :func:`ventbench.load_recording` takes."""
-        from ventbench.recordings.write import as_table
+        import pandas as pd
 
-        return as_table(self).to_pandas()
+        return pd.DataFrame(self.columns(slice(0, len(self)), blank_inferred=True))
+
+    def columns(self, span: slice, *, blank_inferred: bool) -> dict[str, NDArray[Any]]:
+        """Columns of the public schema, one value a sample.
+
+        Args:
+            span: breaths.
+            blank_inferred: give NaN for times that were inferred and not read.
+        """
+        valid, time = self.valid[span], self.time[span]
+        lengths = valid.sum(axis=1)
+        if blank_inferred:
+            time = np.where(self.time_inferred[span, None], np.nan, time)
+        start = 1 + int(np.count_nonzero(self.valid[: span.start]))
+        columns = {
+            "id": np.arange(start, start + int(lengths.sum())),
+            "breath_id": np.repeat(self.breath_id[span], lengths),
+            "R": np.repeat(self.R[span], lengths),
+            "C": np.repeat(self.C[span], lengths),
+            "time_step": time[valid],
+        }
+        signals = {name: getattr(self, name) for name in ("u_in", "u_out", "pressure", *OPTIONAL)}
+        return columns | {k: x[span][valid] for k, x in signals.items() if x is not None}
 
     def plot(self) -> Figure:
         """Draw pressure and commands of all breaths, a column a lung.

@@ -96,30 +96,9 @@ def _schema(breaths: Breaths) -> pa.Schema:
     )
 
 
-def as_table(breaths: Breaths) -> pa.Table:
-    """One row a sample in the public schema; inferred times are blank, as they were read."""
-    return _table(breaths, slice(0, len(breaths)), _schema(breaths), True)
-
-
 def _table(breaths: Breaths, span: slice, schema: pa.Schema, blank: bool) -> pa.Table:
     import pyarrow as pa
 
-    valid = breaths.valid[span]
-    lengths = valid.sum(axis=1)
-    time = breaths.time[span]
-    if blank:
-        time = np.where(breaths.time_inferred[span, None], np.nan, time)
-    start = 1 + int(np.count_nonzero(breaths.valid[: span.start]))
-    columns = {
-        "id": np.arange(start, start + int(lengths.sum())),
-        "breath_id": np.repeat(breaths.breath_id[span], lengths),
-        "R": np.repeat(breaths.R[span], lengths),
-        "C": np.repeat(breaths.C[span], lengths),
-        "time_step": time[valid],
-    }
-    for name in ("u_in", "u_out", "pressure", *OPTIONAL):
-        values = getattr(breaths, name)
-        if values is not None:
-            columns[name] = values[span][valid]
+    columns = breaths.columns(span, blank_inferred=blank)
     arrays = [pa.array(columns[field.name], from_pandas=True).cast(field.type) for field in schema]
     return pa.Table.from_arrays(arrays, schema=schema)

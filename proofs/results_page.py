@@ -16,11 +16,9 @@ from ventbench.base import files
 from ventbench.base.errors import InputError
 
 if TYPE_CHECKING:
+    from proofs.challenge.figures import Figure
     from proofs.challenge.reveal import ChallengeResult
     from proofs.real.rig import Proof
-
-#: Answers of a row of the table of truths that are told one by one.
-_LONGEST = 6
 
 
 def write_section(path: Path, name: str, text: str) -> None:
@@ -85,27 +83,23 @@ def challenge_section(result: ChallengeResult, seeds: Sequence[str]) -> str:
             for seed, _, draw in draws
         ),
         "",
-        "| figure | measured | 95 % | cases | goal | met |",
-        "|---|---|---|---|---|---|",
+        "| figure | measured | cases | goal |",
+        "|---|---|---|---|",
+        *(_figure_row(figure) for figure in result.figures if figure.count),
     ]
-    for figure in result.figures:
-        value, span = "–", ""
-        if figure.value is not None and figure.ci95 is not None:
-            value = f"{figure.value:.0%}"
-            span = f"{figure.ci95[0]:.0%} to {figure.ci95[1]:.0%}"
-        elif figure.value is not None:
-            value = f"{figure.value:.3g}"
-        met = {True: "yes", False: "no", None: ""}[figure.met]
-        lines.append(
-            f"| {figure.what} | {value} | {span} | {figure.count} | {figure.goal} | {met} |"
-        )
-    lines += ["", "Truth and answers:", "", "| truth | answers |", "|---|---|"]
-    for truth, counts in result.confusion.items():
-        shown = [f"{answer} {count}" for answer, count in list(counts.items())[:_LONGEST]]
-        if (rest := sum(list(counts.values())[_LONGEST:])) > 0:
-            shown.append(f"others {rest}")
-        lines.append(f"| {truth} | {', '.join(shown)} |")
     return "\n".join([*lines, *_wrong_answers(result)])
+
+
+def _figure_row(figure: Figure) -> str:
+    """A figure, its 95 % interval, and whether its goal is met, as a row of a table."""
+    value = "–"
+    if figure.value is not None and figure.ci95 is not None:
+        low, high = (f"{100.0 * end:.0f}" for end in figure.ci95)
+        value = f"{figure.value:.0%} ({low}–{high})"
+    elif figure.value is not None:
+        value = f"{figure.value:.3g}"
+    goal = figure.goal + (", missed" if figure.met is False else "")
+    return f"| {figure.what} | {value} | {figure.count} | {goal} |"
 
 
 def _wrong_answers(result: ChallengeResult) -> list[str]:

@@ -33,7 +33,7 @@ def paper(
     ] = None,
     markdown: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write the tables below the first lines of this page."),
+        typer.Option(metavar="FILE", help="Write the page as Markdown."),
     ] = None,
     store: Annotated[
         Path | None,
@@ -81,23 +81,10 @@ def paper(
 
         written.append(write_reproduction(page, result))
     if markdown is not None:
-        files.write_text(markdown, _with_head(markdown, result.to_markdown()))
+        files.write_text(markdown, result.to_markdown())
         written.append(markdown)
     if store is not None:
         files.write_json(store, stored)
         written.append(store)
     for path in written:
         console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
-
-
-#: What separates the hand-written head of a Markdown page from the written tables.
-MARK = "<!-- written by `python -m proofs paper --markdown` -->"
-
-
-def _with_head(path: Path, tables: str) -> str:
-    """Put tables below the mark of an existing page; a page without one is replaced."""
-    head = "# The paper, reproduced\n\n"
-    if path.is_file():
-        before, mark, _ = path.read_text("utf-8").partition(MARK)
-        head = before if mark else head
-    return f"{head}{MARK}\n\n{tables}"

@@ -164,7 +164,8 @@ class Reproduction:
     def to_markdown(self) -> str:
         """The comparison as a page of documentation."""
         about = ", ".join(f"{name} {value}" for name, value in self.about.items())
-        parts = [f"Figures of: {about}.", "## Claims", _markdown(self.summary())]
+        parts = ["# The paper, reproduced", f"Figures of: {about}.", "## Claims"]
+        parts.append(_markdown(self.summary()))
         for section in self.sections:
             parts += [f"## {section.title}", f"*{section.place}; {section.source}*"]
             parts += [f"Paper: {section.claim}", f"Here (**{section.verdict}**): {section.finding}"]

@@ -68,7 +68,7 @@ def test_no_byte_of_the_simulators_may_change(tmp_path: Path) -> None:
             flip(copy / name, place)
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/protocol.md", "docs/stress.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/stress.md"])
 def test_tables_of_the_docs_are_those_of_the_records(page: str) -> None:
     root = FOLDER.parent
     if page == "docs/stress.md":
@@ -77,5 +77,5 @@ def test_tables_of_the_docs_are_those_of_the_records(page: str) -> None:
         table = tool["table"](scores)
     else:
         tool = runpy.run_path(str(root / "benchmarks" / "board_tables.py"))
-        table = tool["markdown"](short=page == "README.md")
+        table = tool["markdown"]()
     assert table in (root / page).read_text("utf-8"), "run the benchmark with --write"

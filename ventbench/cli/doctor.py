@@ -98,7 +98,7 @@ def _sandbox(problems: list[str]) -> str:
     if missing:
         problems.append(
             f"scores made here are not official: the sandbox lacks {', '.join(missing)} "
-            "(see docs/security.md)"
+            "(see docs/security_manual.md)"
         )
         return f"no: the sandbox lacks {', '.join(missing)}"
     return "yes: every layer of the sandbox is in force"

@@ -63,11 +63,10 @@ def challenge_section(result: ChallengeResult, seeds: Sequence[str]) -> str:
     ]
     lines = ["```sh"]
     for seed, where, draw in draws:
-        lines += [
+        lines.append(
             f"python -m proofs challenge make --generator {source} --seed={seed} "
-            f"--cases {draw.total} --out {where}",
-            f"python -m proofs challenge answer {where} --jobs 1",
-        ]
+            f"--cases {draw.total} --out {where}"
+        )
     folders = " ".join(where for _, where, _ in draws)
     given = " ".join(f"--seed={seed}" for seed, _, _ in draws)
     lines += [

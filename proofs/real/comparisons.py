@@ -311,18 +311,14 @@ def _stored(path: Path, pair: Pair) -> Answered | None:
 def report(answers: list[Answered]) -> str:
     """Markdown: rates of right answers by kind, and detection curves."""
     lines = [
-        "| kind | question | right | 95 % | pairs |",
-        "| --- | --- | --- | --- | --- |",
+        "| kind | question | right (95 %) |",
+        "|---|---|---|",
     ]
     counted = [a for a in answers if a.pair.kind not in ("leak", "lag")]
     for kind, question in KINDS.items():
         own = [a.right for a in counted if a.pair.kind == kind]
         if own:
-            low, high = wilson(sum(own), len(own))
-            lines.append(
-                f"| `{kind}` | {question} | {sum(own)} ({sum(own) / len(own):.0%}) | "
-                f"{low:.0%} to {high:.0%} | {len(own)} |"
-            )
+            lines.append(f"| `{kind}` | {question} | {_share(sum(own), len(own))} |")
     for kind, unit, scale in (("leak", "mL/s per cmH2O", 1.0), ("lag", "ms", 1e3)):
         own = [a for a in answers if a.pair.kind == kind]
         if own:
@@ -333,23 +329,27 @@ def report(answers: list[Answered]) -> str:
 def _curve(kind: str, unit: str, scale: float, answers: list[Answered]) -> list[str]:
     """Detection curve: share of the recordings in which what was added is named."""
     lines = [
-        f"| added {kind}, {unit} | named | 95 % | or a rival that acts alike | recordings | "
-        "estimate, median | a new wrong name |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
+        f"| added {kind}, {unit} | named (95 %) | or a rival that acts alike | estimate, median | "
+        "a new wrong name |",
+        "|---|---|---|---|---|",
     ]
     for strength in sorted({a.pair.strength for a in answers}):
         own = [a for a in answers if a.pair.strength == strength]
         named = [a.value for a in own if a.value is not None]
-        low, high = wilson(len(named), len(own))
         middle = f"{scale * float(np.median(named)):.3g}" if named else "-"
         alike = sum(a.in_class for a in own)
         wrong = sum(bool(a.wrong_names) for a in own)
         lines.append(
-            f"| {scale * strength:g} | {len(named)} ({len(named) / len(own):.0%}) | "
-            f"{low:.0%} to {high:.0%} | {alike} ({alike / len(own):.0%}) | {len(own)} | {middle} | "
+            f"| {scale * strength:g} | {_share(len(named), len(own))} | {alike} | {middle} | "
             f"{wrong} |"
         )
     return lines
+
+
+def _share(count: int, of: int) -> str:
+    """A count of several with its 95 % interval."""
+    low, high = wilson(count, of)
+    return f"{count} of {of} ({100 * low:.0f}–{100 * high:.0f})"
 
 
 def as_dict(answers: list[Answered]) -> dict[str, Any]:

@@ -134,9 +134,8 @@ def test_the_report_counts():
             made("lag", False, 0.02, wrong_names=("leak",)),
         ]
     )
-    assert "| `label` | which lung a run was recorded with (flow) | 1 (50%) |" in text
-    assert "| 20 | 1 (50%) |" in text
-    assert "| 2 | 21 | 1 |" in text
+    assert "| `label` | which lung a run was recorded with (flow) | 1 of 2 (9–91) |" in text
+    assert "| 20 | 1 of 2 (9–91) | 1 | 21 | 1 |" in text
 
 
 def test_a_rival_that_grows_counts_as_of_its_class(material):

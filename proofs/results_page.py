@@ -84,21 +84,28 @@ def challenge_section(result: ChallengeResult, seeds: Sequence[str]) -> str:
         "",
         "| figure | measured | cases | goal |",
         "|---|---|---|---|",
-        *(_figure_row(figure) for figure in result.figures if figure.count),
+        *(
+            f"| {figure.what} | {_measured(figure)} | {figure.count} | {figure.goal}"
+            + (", missed |" if figure.met is False else " |")
+            for figure in result.figures
+            if figure.count and figure.goal
+        ),
     ]
+    others = [figure for figure in result.figures if figure.count and not figure.goal]
+    if others:
+        told = "; ".join(f"{figure.what} {_measured(figure)}" for figure in others)
+        lines += ["", f"Without a goal: {told}."]
     return "\n".join([*lines, *_wrong_answers(result)])
 
 
-def _figure_row(figure: Figure) -> str:
-    """A figure, its 95 % interval, and whether its goal is met, as a row of a table."""
-    value = "–"
-    if figure.value is not None and figure.ci95 is not None:
-        low, high = (f"{100.0 * end:.0f}" for end in figure.ci95)
-        value = f"{figure.value:.0%} ({low}–{high})"
-    elif figure.value is not None:
-        value = f"{figure.value:.3g}"
-    goal = figure.goal + (", missed" if figure.met is False else "")
-    return f"| {figure.what} | {value} | {figure.count} | {goal} |"
+def _measured(figure: Figure) -> str:
+    """The value of a figure, with the ends of the 95 % interval of a share."""
+    if figure.value is None:
+        return "–"
+    if figure.ci95 is None:
+        return f"{figure.value:.3g}"
+    low, high = (f"{100.0 * end:.0f}" for end in figure.ci95)
+    return f"{figure.value:.0%} ({low}–{high})"
 
 
 def _wrong_answers(result: ChallengeResult) -> list[str]:

@@ -66,7 +66,7 @@ def test_a_challenge_tells_its_seed_its_commitment_and_its_code() -> None:
         "1.00, 0.60, 0.30 |"
     ) in text
     assert "| strong: right name | 90% (70–97) | 20 | >= 98%, missed |" in text
-    assert "| seconds a case, median | 5.25 | 20 |  |" in text
+    assert "\nWithout a goal: seconds a case, median 5.25.\n" in text
     assert "false names" not in text  # there was no case
 
 

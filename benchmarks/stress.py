@@ -35,29 +35,26 @@ def table(scores: list[dict[str, Any]]) -> str:
     def row(title: str, show: Callable[[dict[str, Any]], str]) -> str:
         return f"| {title} | " + " | ".join(map(show, scores)) + " |"
 
-    def interval(limits: list[float]) -> str:
-        return f"{limits[0]:.2f} to {limits[1]:.2f}"
+    def scored(entry: dict[str, Any]) -> str:
+        low, high = entry["ci95"]
+        return f"**{entry['score']:.2f}** [{low:.2f}, {high:.2f}]"
 
     lines = [
         row("", lambda e: e["name"]),
-        "| --- |" + " --- |" * len(scores),
-        row("**stress score, cmH2O**", lambda e: f"**{e['score']:.2f}**"),
-        row("95 % interval", lambda e: interval(e["ci95"])),
-        row("without stressors, cmH2O", lambda e: f"{e['unstressed']:.2f}"),
+        "|---|" + "---|" * len(scores),
+        row("stress score, cmH2O", scored),
         row("rise, cmH2O", lambda e: f"{e['rise']:+.2f}"),
-        row("survived, % of runs", lambda e: f"{100 * e['survived']:.1f}"),
-        row("survived without stressors, %", lambda e: f"{100 * e['survived_unstressed']:.0f}"),
-        row("unsafe runs", lambda e: f"{e['unsafe_runs']} of {e['stressed_runs']}"),
-        row("longest above PIP + 15 %, mean, s", lambda e: f"{e['above_alarm_s']:.2f}"),
+        row("survived", lambda e: f"{e['survived']:.1%}"),
+        row(f"unsafe of {scores[0]['stressed_runs']} runs", lambda e: f"{e['unsafe_runs']}"),
         row("worst condition, cmH2O", lambda e: f"{e['worst_error']:.1f}"),
     ]
     for category in (*CATEGORIES, "pairs"):
 
         def shown(entry: dict[str, Any], category: str = category) -> str:
             own = entry["categories"][category]
-            return f"{own['error_cmH2O']:.2f}, {100 * own['survived']:.0f} %"
+            return f"{own['error_cmH2O']:.2f}, {own['survived']:.0%}"
 
-        lines.append(row(f"{category}: cmH2O, survived", shown))
+        lines.append(row(f"{category}: error, survived", shown))
     return "\n".join(lines)
 
 

@@ -2,7 +2,7 @@
 
 README becomes the first page. Links are written for readers of the repository; here each is turned
 into one between pages of the site. A link to a file that is no page (the licence, code) becomes the
-path of that file. The table of stressors is written where ``stress.md`` has its mark.
+path of that file. Tables that the code gives are written where a page has their mark.
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ from typing import Any
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
+from ci.generated_tables import with_tables
+
 ROOT = Path(__file__).parents[1]
 
 #: A link or an image: its text, the path and the anchor; addresses and bare anchors are no match.
 _LINK = re.compile(r"(!?)\[([^\]]*)\]\((?![a-z]+:|#)([^)#\s]+)(#[^)\s]*)?\)")
-
-#: Where the table of stressors goes.
-_STRESSORS = "<!-- stressors -->"
 
 #: Page of the site for each page outside ``docs/``, by its path in the repository.
 _pages: dict[str, str] = {}
@@ -53,12 +52,9 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
-    """Rewrite the links of a page of ``docs/``, and write its table of stressors."""
+    """Rewrite the links of a page of ``docs/``, and write its tables."""
     path = f"docs/{page.file.src_uri}"
-    if _STRESSORS in markdown:
-        from ventbench.stress.stressors import table
-
-        markdown = markdown.replace(_STRESSORS, table())
+    markdown = with_tables(markdown)
     return _rewritten(markdown, path) if (ROOT / path).is_file() else markdown
 
 

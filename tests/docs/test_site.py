@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import ventbench
+from ventbench.physics import library
 from ventbench.stress.stressors import STRESSORS
 
 ROOT = Path(__file__).parents[2]
@@ -26,8 +27,15 @@ def test_the_site_builds_without_a_warning_and_needs_no_network(tmp_path):
     for page in tmp_path.glob("*.html"):
         loaded = re.findall(r'(?:src|<link[^>]*href)="(https?:[^"]*)"', page.read_text("utf-8"))
         assert not loaded, f"{page.name} loads {loaded}"
-    stress = (tmp_path / "stress.html").read_text("utf-8")
-    assert all(f"<code>{line.name}</code></td>" in stress for line in STRESSORS)
+    tables = {
+        "stress": [line.name for line in STRESSORS],
+        "physics": list(library()),
+        "commands": ["ventbench board withdraw", "ventbench-hardware emulate",
+                     "python -m proofs challenge reveal"],
+    }  # fmt: skip
+    for page, names in tables.items():
+        text = (tmp_path / f"{page}.html").read_text("utf-8")
+        assert all(f"<td><code>{name}</code></td>" in text for name in names), page
     reference = (tmp_path / "python.html").read_text("utf-8")
     for name in set(ventbench.__all__) - {"__version__", "LUNGS"}:
         heading = re.search(rf"<h3[^>]*>\s*ventbench\.{name}\s*<", reference)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ci.generated_tables import mechanisms
 from ventbench.base.errors import InputError
 from ventbench.base.precision import float64
 from ventbench.physics import library, mechanism, parameter, paths, physics, strength_path
@@ -59,13 +60,15 @@ def test_description_is_complete(name):
 
 
 @pytest.mark.parametrize("name", [*library(), *basis_terms(), *NONPARAMETRIC_COMPONENTS])
-def test_the_docs_have_a_row(name):
-    """The row of a mechanism gives its parameters too."""
-    rows = [row for row in DOCS.read_text("utf-8").splitlines() if row.startswith("| ")]
-    (row, *_) = [row for row in rows if f"`{name}`" in row]
-    if name in library():
-        assert row.startswith(f"| `{name}` |")
-        assert all(f"`{item.name}`" in row for item in mechanism(name).description.parameters)
+def test_the_docs_name_it(name):
+    assert f"`{name}`" in DOCS.read_text("utf-8")
+
+
+def test_the_sites_table_has_equation_and_parameters():
+    for line, (name, own) in zip(mechanisms().splitlines()[2:], library().items(), strict=True):
+        equation = own.description.equation.replace("|", r"\|")
+        assert line.startswith(f"| `{name}` | `{equation}` |")
+        assert all(f"`{item.name}`" in line for item in own.description.parameters)
 
 
 @pytest.mark.parametrize("name", library())

@@ -10,15 +10,14 @@ a valve that nobody has looked at. The steps are those that a laboratory would t
 5. train the same controllers on each (``ventbench tune pid``, ``ventbench train residual``), and
    run all of them on the rig, under noise and deviations that are the same for all.
 
-Usage: ``python benchmarks/own_rig.py [--out DIR] [--rig NAME] [--json FILE] [--page FILE]``.
-``--page docs/own_rig.md`` writes the tables into the page. Diagnosis, simulators and each training
-are kept in ``--out`` when they are finished, so that the same command continues.
+Usage: ``python benchmarks/own_rig.py [--out DIR] [--rig NAME] [--json FILE]``.
+Diagnosis, simulators and each training are kept in ``--out`` when they are finished, so that the
+same command continues.
 """
 
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -250,18 +249,6 @@ def table(name: str, result: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def write_page(page: Path, results: Mapping[str, Mapping[str, Any]]) -> None:
-    """Replace the part of a page between the two marks."""
-    text = "\n\n".join(table(name, result) for name, result in results.items())
-    marks = "<!-- begin: benchmarks/own_rig.py -->", "<!-- end: benchmarks/own_rig.py -->"
-    pattern = re.compile(f"{re.escape(marks[0])}.*{re.escape(marks[1])}", re.DOTALL)
-    before = page.read_text("utf-8")
-    if not pattern.search(before):
-        raise SystemExit(f"{page} has no part between {marks[0]} and {marks[1]}")
-    new = pattern.sub(lambda _: f"{marks[0]}\n{text}\n{marks[1]}", before)
-    files.write_atomically(page, lambda file: file.write(new.encode()))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, default=Path("runs/own_rig"))
@@ -271,7 +258,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3, help="of networks; 0: only a PID")
     parser.add_argument("--updates", type=int, default=600)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--page", type=Path, help="page to write the tables into")
     options = parser.parse_args()
     names = list(RIGS) if options.rig == "all" else [options.rig]
     seeds = range(options.seeds)
@@ -285,8 +271,6 @@ def main() -> None:
         print(table(name, result), end="\n\n")
     if options.json is not None:
         files.write_json(options.json, results)
-    if options.page is not None:
-        write_page(options.page, results)
 
 
 if __name__ == "__main__":

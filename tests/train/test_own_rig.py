@@ -1,4 +1,4 @@
-"""The benchmark of a rig of one's own: what is finished is kept, and the page holds its figures."""
+"""The benchmark of a rig of one's own: what is finished is kept, and shown in tables."""
 
 from __future__ import annotations
 
@@ -45,18 +45,9 @@ def test_finished_parts_are_read_and_shown(benchmark, tmp_path):
     assert cells[1][4] == cells[1][8] == "-1.500 [-1.500, -1.500]"
 
 
-def test_only_the_part_between_the_marks_is_written(benchmark, tmp_path):
-    page = tmp_path / "page.md"
-    marks = "<!-- begin: benchmarks/own_rig.py -->", "<!-- end: benchmarks/own_rig.py -->"
-    page.write_text(f"before\n{marks[0]}\nold\n{marks[1]}\nafter\n")
+def test_networks_that_were_not_trained_are_not_shown(benchmark):
     part = {"promised": 1.0, "rig": 1.0, "draws": [1.0] * 20}
     rows = {label: {"pid": part, "residual": []} for label in benchmark["SIMULATORS"][:2]}
-    benchmark["write_page"](page, {"leak": {"missing": [], "trained_on": rows}})
-    text = page.read_text()
-    assert text.startswith(f"before\n{marks[0]}\n**A leak of 15 mL/s")
-    assert text.endswith(f"|\n{marks[1]}\nafter\n")
-    assert "old" not in text
-    assert "network" not in text  # none was trained
-    page.write_text("no marks")
-    with pytest.raises(SystemExit, match="has no part between"):
-        benchmark["write_page"](page, {})
+    text = benchmark["table"]("leak", {"missing": [], "trained_on": rows})
+    assert text.startswith("**A leak of 15 mL/s")
+    assert "network" not in text

@@ -1,4 +1,4 @@
-"""How big the house is: lines and modules by room, and limits that it must stay within.
+"""How big the house is: lines and modules by room, words of the docs, and limits for all of them.
 
 ``make check`` runs it. A limit is lowered when a change leaves room below it; raising one needs a
 reason in the change that does.
@@ -20,6 +20,10 @@ MODULES = 330
 
 #: Most lines of one module, and most modules that lie loose in ``ventbench/``.
 LONGEST, LOOSE = 600, 8
+
+#: Most words of Markdown (as ``wc -w`` counts), and the folders that hold it beside the root.
+WORDS = 28_000
+PROSE = ("docs", "examples", "hardware_eval", "proofs", "submissions", "tests", "ventbench")
 
 #: A branch on a number of the protocol: there is one protocol.
 BRANCH = re.compile(r"\b(version|protocol) *(==|!=) *[0-9]")
@@ -65,6 +69,11 @@ def problems(root: Path) -> tuple[list[str], list[str]]:
         wrong.append(f"the product has {total} lines, more than the limit in ci/house.py")
     if len(product) > MODULES:
         wrong.append(f"the product has {len(product)} modules, more than {MODULES}")
+    pages = [*root.glob("*.md"), *(page for name in PROSE for page in (root / name).rglob("*.md"))]
+    words = sum(len(page.read_text("utf-8").split()) for page in pages)
+    table.append(f"{'words of Markdown':32} {len(pages):7} {words:7}")
+    if words > WORDS:
+        wrong.append(f"the docs have {words} words, more than {WORDS}")
     loose = [path.name for path in (root / "ventbench").glob("*.py")]
     if len(loose) > LOOSE:
         wrong.append(f"{len(loose)} modules lie loose in ventbench/, more than {LOOSE}: {loose}")

@@ -20,8 +20,16 @@ def test_what_is_beyond_a_limit_is_named(tmp_path: Path) -> None:
     (tmp_path / "hardware_eval" / "old.py").write_text("if protocol == 1:\n    pass\n")
     for k in range(house.LOOSE):
         (tmp_path / "ventbench" / f"m{k}.py").touch()
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "page.md").write_text("word " * house.WORDS)
+    (tmp_path / "README.md").write_text("one more")
     (tmp_path / "proofs" / "big.py").write_text("x = 1\n" * (house.LINES["proofs"] + 1))
     _, wrong = house.problems(tmp_path)
-    expected = ["ventbench/long.py has 601", "old.py branches on", "proofs has"]
+    expected = [
+        "ventbench/long.py has 601",
+        "old.py branches on",
+        "proofs has",
+        "the docs have 28002 words",
+    ]
     for words in (*expected, f"{house.LOOSE + 1} modules"):
         assert any(words in line for line in wrong), words

@@ -21,8 +21,7 @@ from ventbench.board.frames import load_tracks
 from ventbench.entries.runs import DRAWS, Runs
 from ventbench.entries.scoring import score
 from ventbench.pages.stress import write_stress_chart
-from ventbench.physics.catalogue import parameter
-from ventbench.task.stressors import CATEGORIES, STRESSORS
+from ventbench.task.stressors import CATEGORIES
 
 ENTRIES = ("pid_robust", "residual_mlp_all", "ppo", "dqn", "adaptive_pid")
 DOCS = Path(__file__).parents[1] / "docs"
@@ -58,27 +57,6 @@ def table(scores: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def stressor_table() -> str:
-    """The table of stressors as Markdown, as it stands in ``docs/stress.md``."""
-    lines = [
-        "| stressor | what happens | changes | mild | strong | why these strengths |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
-    for line in STRESSORS:
-        unit = "" if line.rule == "scale" else f" {parameter(line.strength).unit}"
-        unit = unit.replace(" 1/", " /").removesuffix(" 1")
-        sign = {"add": "+", "scale": "x ", "label": ""}[line.rule]
-        mild, strong = (
-            f"{sign if value > 0 else ''}{float(f'{value:.3g}'):g}{unit}"
-            for value in (line.mild, line.strong)
-        )
-        lines.append(
-            f"| `{line.name}` | {line.title} | `{line.strength}` | {mild} | {strong} "
-            f"| {line.reason} |"
-        )
-    return "\n".join(lines)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", action="store_true", help="put table and picture into docs/")
@@ -89,7 +67,6 @@ def main() -> None:
     scores = [{"name": name, **own.headline()} for name, own in tables.items()]
     text = table(scores)
     print(text)
-    print(stressor_table())
     best = min(tables, key=lambda name: tables[name].score)
     for name, own in tables.items():
         if name != best:

@@ -58,10 +58,28 @@ def mechanisms() -> str:
 
 
 def stressors() -> str:
-    """Every stressor with its strengths and their reason."""
-    from ventbench.stress.stressors import table
+    """Every stressor with its strengths and their reason, and the pairs."""
+    from ventbench.physics.catalogue import parameter
+    from ventbench.task.stressors import PAIRS, STRESSORS
 
-    return table()
+    lines = [
+        "| stressor | what happens | changes | mild | strong | why these strengths |",
+        "|---|---|---|---|---|---|",
+    ]
+    for line in STRESSORS:
+        unit = "" if line.rule == "scale" else f" {parameter(line.strength).unit}"
+        unit = unit.replace(" 1/", " /").removesuffix(" 1")
+        sign = {"add": "+", "scale": "x ", "label": ""}[line.rule]
+        mild, strong = (
+            f"{sign if value > 0 else ''}{float(f'{value:.3g}'):g}{unit}"
+            for value in (line.mild, line.strong)
+        )
+        lines.append(
+            f"| `{line.name}` | {line.title} | `{line.strength}` | {mild} | {strong} "
+            f"| {line.reason} |"
+        )
+    pairs = "; ".join(" + ".join(f"`{name}`" for name in pair) for pair in PAIRS)
+    return "\n".join([*lines, "", f"Pairs, both mild: {pairs}."])
 
 
 _TABLES: dict[str, Callable[[], str]] = {

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import ventbench
 from ventbench.physics import library
-from ventbench.stress.stressors import STRESSORS
+from ventbench.task.stressors import STRESSORS
 
 ROOT = Path(__file__).parents[2]
 

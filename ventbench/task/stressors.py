@@ -308,27 +308,3 @@ def conditions() -> tuple[Condition, ...]:
     """All conditions of the track: nothing first, then each stressor twice, then the pairs."""
     single = [Condition((s.name,), severity) for s in STRESSORS for severity in SEVERITIES]
     return (Condition(), *single, *(Condition(pair, "mild") for pair in PAIRS))
-
-
-def table() -> str:
-    """The stressors and the pairs as Markdown, for the site's page of the track."""
-    from ventbench.physics.catalogue import parameter  # brings JAX, which reading records needs not
-
-    lines = [
-        "| stressor | what happens | changes | mild | strong | why these strengths |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
-    for line in STRESSORS:
-        unit = "" if line.rule == "scale" else f" {parameter(line.strength).unit}"
-        unit = unit.replace(" 1/", " /").removesuffix(" 1")
-        sign = {"add": "+", "scale": "x ", "label": ""}[line.rule]
-        mild, strong = (
-            f"{sign if value > 0 else ''}{float(f'{value:.3g}'):g}{unit}"
-            for value in (line.mild, line.strong)
-        )
-        lines.append(
-            f"| `{line.name}` | {line.title} | `{line.strength}` | {mild} | {strong} "
-            f"| {line.reason} |"
-        )
-    pairs = "; ".join(" + ".join(f"`{name}`" for name in pair) for pair in PAIRS)
-    return "\n".join([*lines, "", f"Pairs, both mild: {pairs}."])

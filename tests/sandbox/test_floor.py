@@ -89,7 +89,7 @@ def test_below_the_floor_the_missing_layer_is_named_first(what, missing):
             for words in (
                 "score pid_best",
                 "score pid_best --plant physics",
-                "score pid_robust --track stress --draws 1",
+                "score pid_robust --stress 1",
                 "transfer pid_best",
             )
         ),

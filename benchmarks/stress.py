@@ -20,7 +20,7 @@ from ventbench.base import compilation
 from ventbench.board.frames import load_tracks
 from ventbench.entries.runs import DRAWS, Runs
 from ventbench.entries.scoring import score
-from ventbench.pages.stress import write_stress_chart
+from ventbench.pages.plots import write_stress_chart
 from ventbench.task.stressors import CATEGORIES
 
 ENTRIES = ("pid_robust", "residual_mlp_all", "ppo", "dqn", "adaptive_pid")

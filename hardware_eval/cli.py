@@ -427,7 +427,7 @@ def replay(
 
     Example: `ventbench-hardware replay runs/hardware`
     """
-    from hardware_eval.results.replay import replay as run_replay
+    from hardware_eval.results.compare import replay as run_replay
 
     report = run_replay(log, record=record, rerun=rerun)
     emit(report.as_dict(), json)

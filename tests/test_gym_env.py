@@ -13,11 +13,11 @@ gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
 
 from ventbench import gym_env  # noqa: E402
 from ventbench.base import precision  # noqa: E402
-from ventbench.controllers.script import Script  # noqa: E402
 from ventbench.plants import frozen  # noqa: E402
 from ventbench.task import environment, protocol, rollouts  # noqa: E402
 from ventbench.task.lungs import LUNG_IDS  # noqa: E402
 from ventbench.task.metrics.score import run_error  # noqa: E402
+from ventbench.task.rollouts import Script  # noqa: E402
 
 NAME = "ventbench.gym_env:ventbench/Ventilator-v1"
 

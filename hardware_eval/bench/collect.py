@@ -22,7 +22,7 @@ from hardware_eval.bench import safety
 from hardware_eval.bench.loop import Bench, BreathLog, EmergencyStop, answer_by
 from hardware_eval.bench.raw_log import RawLog, lines, recording
 from hardware_eval.bench.safety import SafetySample
-from hardware_eval.wire.errors import LinkError, NoAnswerError, RefusedError
+from hardware_eval.wire.parser import LinkError, NoAnswerError, RefusedError
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.write import write

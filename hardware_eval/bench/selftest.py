@@ -28,7 +28,7 @@ from hardware_eval.bench.loop import (
     no_collection,
 )
 from hardware_eval.bench.safety import VALVE_GAIN, SafetySample
-from hardware_eval.wire.errors import LinkError, NoAnswerError, RefusedError
+from hardware_eval.wire.parser import LinkError, NoAnswerError, RefusedError
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNGS
 from ventbench.task.lungs import lung as parse_lung

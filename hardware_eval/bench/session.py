@@ -24,7 +24,7 @@ from hardware_eval.bench.raw_log import RawLog, lines
 from hardware_eval.bench.safety import SafetySettings
 from hardware_eval.realtime import take_priority
 from hardware_eval.wire.client import Client
-from hardware_eval.wire.errors import LinkError
+from hardware_eval.wire.parser import LinkError
 
 #: Runs that the bench spoils in a row before the session gives up.
 MAX_ATTEMPTS = 3

@@ -12,8 +12,17 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from hardware_eval.emulation.cases import LIBRARY, Effect, draw_case, draw_effect, draw_grid
-from hardware_eval.emulation.seal import commitment, encrypt, random_generator, unseal
+from hardware_eval.emulation.cases import (
+    LIBRARY,
+    Effect,
+    commitment,
+    draw_case,
+    draw_effect,
+    draw_grid,
+    encrypt,
+    random_generator,
+    unseal,
+)
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.physics.model import physics

@@ -24,7 +24,7 @@ from hardware_eval.bench.loop import REST_S, Bench, Operator, View
 from hardware_eval.bench.plan import Plan, PlannedRun, make_plan, progress
 from hardware_eval.bench.raw_log import RawLog, lines, recording
 from hardware_eval.bench.safety import DEFAULT, SafetySettings
-from hardware_eval.clock import Clock, RealClock
+from hardware_eval.realtime import Clock, RealClock
 from hardware_eval.results import record as records
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.messages import Capability

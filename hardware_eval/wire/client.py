@@ -9,8 +9,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from hardware_eval.clock import Clock, RealClock
-from hardware_eval.wire.errors import DisconnectedError, NoAnswerError, RefusedError
+from hardware_eval.realtime import Clock, RealClock
 from hardware_eval.wire.messages import (
     PROTOCOL_VERSION,
     Arm,
@@ -29,7 +28,15 @@ from hardware_eval.wire.messages import (
     encode,
     milliseconds,
 )
-from hardware_eval.wire.parser import Event, Fault, ParserState, feed_bytes
+from hardware_eval.wire.parser import (
+    DisconnectedError,
+    Event,
+    Fault,
+    NoAnswerError,
+    ParserState,
+    RefusedError,
+    feed_bytes,
+)
 
 #: Time that an answer may take, s: most of a control step of 30 ms.
 ANSWER_TIMEOUT = 0.020

@@ -20,7 +20,7 @@ from typing import cast
 import serial
 
 from hardware_eval.realtime import take_priority
-from hardware_eval.wire.errors import (
+from hardware_eval.wire.parser import (
     DisconnectedError,
     LinkError,
     PortBusyError,

@@ -16,9 +16,49 @@ from hardware_eval.wire.messages import (
     LONGEST_PACKET,
     MalformedPacketError,
     Packet,
+    Refusal,
     checked,
     decode,
 )
+from ventbench.base.errors import InputError
+
+
+class LinkError(InputError):
+    """The base of all errors of the link."""
+
+
+class PortMissingError(LinkError):
+    """There is no such port."""
+
+
+class PortBusyError(LinkError):
+    """Another program has the port."""
+
+
+class PortForbiddenError(LinkError):
+    """The user may not open the port."""
+
+
+class DisconnectedError(LinkError):
+    """The port went away while it was open; the device vents by itself."""
+
+
+class NoAnswerError(LinkError):
+    """The device did not answer in time."""
+
+
+class RefusedError(LinkError):
+    """The device refused a message.
+
+    Attributes:
+        refusal: its answer.
+    """
+
+    def __init__(self, message: str, refusal: Refusal) -> None:
+        """Keep the device's answer."""
+        super().__init__(message)
+        self.refusal = refusal
+
 
 #: Longest frame without its zero bytes: COBS adds one byte to a packet of at most 254.
 LONGEST_FRAME = LONGEST_PACKET + 1

@@ -10,8 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from hardware_eval.emulation.cases import Base, Case, Effect
-from hardware_eval.emulation.seal import random_generator, unseal
+from hardware_eval.emulation.cases import Base, Case, Effect, random_generator, unseal
 from proofs.challenge.questions import DrawnCase
 from proofs.challenge.stranger.effects import StrangerCase
 from ventbench.base import files

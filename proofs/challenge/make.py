@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from hardware_eval.emulation.seal import commitment, encrypt, random_generator
+from hardware_eval.emulation.cases import commitment, encrypt, random_generator
 from proofs.challenge.detectability import log_likelihood_loss
 from proofs.challenge.folder import ChallengeFolder, encode_answers
 from proofs.challenge.generators import generator, generator_of

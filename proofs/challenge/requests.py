@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware_eval.emulation.seal import random_generator
+from hardware_eval.emulation.cases import random_generator
 from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.generators import generator_of
 from ventbench.base import files

@@ -15,16 +15,45 @@ import pytest
 from jax import Array
 
 from ventbench.base.precision import float64
-from ventbench.controllers.registry import CONTROLLERS
+from ventbench.controllers import residual, rl_policy
+from ventbench.controllers.pid import PID
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.task import protocol
 from ventbench.task.environment import nominal_scenario
 from ventbench.task.interfaces import Controller, Observation
 from ventbench.task.lungs import lung
-from ventbench.task.rollouts import Inspirations, closed_loop
+from ventbench.task.rollouts import Inspirations, Script, closed_loop
 
 PIPS = np.array([15.0, 20.0, 35.0])
 LUNG = lung("R20C20")
+
+
+def _residual() -> Controller:
+    like = residual.Residual(PID(2.0, 4.0, 0.3), ())
+    new = residual.untrained(jax.random.key(0), like, (8,))
+    *hidden, (weights, biases) = new.layers
+    # An untrained network corrects nothing: its last layer is zero.
+    return new.replace(layers=(*hidden, (weights + 0.1, biases + 0.05)))  # type: ignore[attr-defined]
+
+
+def _script() -> Controller:
+    steps = jnp.arange(protocol.BREATHS * protocol.INSPIRATION_STEPS) % protocol.INSPIRATION_STEPS
+    return Script(60.0 / (1.0 + steps))
+
+
+def _policy(kind: type, outputs: int) -> Controller:
+    network = rl_policy.TanhNetwork((8,), outputs, first=0.2)
+    return kind(rl_policy.init_parameters(network, jax.random.key(1)), network)
+
+
+#: Makes a controller of each family, in the precision that is in force.
+CONTROLLERS: dict[str, Callable[[], Controller]] = {
+    "pid": lambda: PID(2.0, 4.0, 0.3),
+    "residual": _residual,
+    "gaussian_policy": lambda: _policy(rl_policy.GaussianPolicy, 1),
+    "greedy_policy": lambda: _policy(rl_policy.GreedyPolicy, len(rl_policy.CHOICES)),
+    "script": _script,
+}
 
 
 def run(controller: Controller, pips: np.ndarray = PIPS) -> Inspirations:

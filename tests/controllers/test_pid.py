@@ -5,8 +5,8 @@ import pytest
 
 from ventbench.base import precision
 from ventbench.controllers.pid import PID
-from ventbench.controllers.script import Script
 from ventbench.task.interfaces import Controller, Observation
+from ventbench.task.rollouts import Script
 
 
 def plain(p, i, d, pressures, target, dt):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ventbench.diagnosis import report_text
-from ventbench.diagnosis.detection_limits import detection_limits
+from ventbench.diagnosis.adequacy import detection_limits
 from ventbench.diagnosis.hypothesis import Hypothesis, varies_by_breath
 from ventbench.diagnosis.selection.candidate_comparison import fit_with_noise
 from ventbench.physics import library, mechanism

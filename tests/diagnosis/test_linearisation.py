@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from ventbench.diagnosis.evaluator import Evaluator
-from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
-from ventbench.diagnosis.linearisation import Linearisation, linearise
+from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Linearisation, linearise
 from ventbench.system_id import START, Noise
 
 from . import small

@@ -8,7 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.diagnosis.plausibility import excludes_neutral, is_consistent, is_plausible
+from ventbench.diagnosis.selection.acceptance import (
+    excludes_neutral,
+    is_consistent,
+    is_plausible,
+)
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics import library

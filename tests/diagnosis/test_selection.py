@@ -10,7 +10,8 @@ import pytest
 from hardware_eval.emulation.cases import Base
 from ventbench.diagnosis.conclusion import _supported
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
-from ventbench.diagnosis.selection import forward, held_out_test
+from ventbench.diagnosis.selection import acceptance, forward
+from ventbench.diagnosis.selection.acceptance import passes_heldout_test
 from ventbench.diagnosis.selection.candidate_comparison import (
     Comparison,
     RankedModel,
@@ -26,7 +27,6 @@ from ventbench.diagnosis.selection.forward import (
     is_far_from_label,
     selection_at_label,
 )
-from ventbench.diagnosis.selection.held_out_test import passes_heldout_test
 from ventbench.diagnosis.selection.pair_exchange import replace_pair
 from ventbench.diagnosis.selection.screening import screen_mechanisms
 from ventbench.diagnosis.settings import HeldOutTestSettings
@@ -37,9 +37,9 @@ from . import small
 
 def test_a_mechanism_is_needed_if_and_only_if_it_acts(turbulent, both):
     named, without = both
-    assert held_out_test.is_needed(turbulent, named, without)
+    assert acceptance.is_needed(turbulent, named, without)
     idle = turbulent.fit(Hypothesis(("turbulent_resistance", "leak")), named.noise, named)
-    assert not held_out_test.is_needed(turbulent, idle, named)
+    assert not acceptance.is_needed(turbulent, idle, named)
 
 
 def test_cross_validation_runs_only_where_the_training_breaths_clearly_ask(
@@ -51,11 +51,11 @@ def test_cross_validation_runs_only_where_the_training_breaths_clearly_ask(
         asked.append(given)
         return np.full(small.BREATHS, 1.0)
 
-    monkeypatch.setattr(held_out_test, "cross_validated_gain", of_all)
-    monkeypatch.setattr(held_out_test, "passes_heldout_test", lambda gained, *_: len(gained) > 8)
-    assert held_out_test.is_needed(turbulent, *both)
+    monkeypatch.setattr(acceptance, "cross_validated_gain", of_all)
+    monkeypatch.setattr(acceptance, "passes_heldout_test", lambda gained, *_: len(gained) > 8)
+    assert acceptance.is_needed(turbulent, *both)
     assert len(asked) == 1
-    assert not held_out_test.is_needed(turbulent, *reversed(both))
+    assert not acceptance.is_needed(turbulent, *reversed(both))
     assert len(asked) == 1
 
 
@@ -63,9 +63,9 @@ def test_a_negligible_term_is_far_weaker_than_mild_and_explains_little(turbulent
     named, _ = both
     two = turbulent.fit(Hypothesis(("turbulent_resistance", "sensor_drift")), named.noise, named)
     assert abs(two.column("sensor_drift.drift")[0]) < 0.2 * 1.2
-    assert held_out_test.is_negligible(turbulent, two, named, "sensor_drift")
+    assert acceptance.is_negligible(turbulent, two, named, "sensor_drift")
     without = turbulent.fit(two.hypothesis.without("turbulent_resistance"), two.noise, two)
-    assert not held_out_test.is_negligible(turbulent, two, without, "turbulent_resistance")
+    assert not acceptance.is_negligible(turbulent, two, without, "turbulent_resistance")
 
 
 def test_a_weak_term_that_explains_nearly_all_is_not_negligible():
@@ -74,7 +74,7 @@ def test_a_weak_term_that_explains_nearly_all_is_not_negligible():
     assert weak.column("valve_dead_band.width")[0] < 0.2 * 1.5
     without = evaluator.fit(Hypothesis(), weak.noise, weak)
     assert evaluator.criterion(without) - evaluator.criterion(weak) > 100.0
-    assert not held_out_test.is_negligible(evaluator, weak, without, "valve_dead_band")
+    assert not acceptance.is_negligible(evaluator, weak, without, "valve_dead_band")
 
 
 THRESHOLD = HeldOutTestSettings().threshold

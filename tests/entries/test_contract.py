@@ -16,8 +16,8 @@ from ventbench.entries import contract
 from ventbench.entries.contract_runs import STEPS
 from ventbench.entries.errors import SubmissionError
 from ventbench.entries.file_checks import check_files
+from ventbench.entries.review import check_sources
 from ventbench.entries.runner import InProcessRunner
-from ventbench.entries.static_checks import check_sources
 from ventbench.sandbox.configuration import Allowance
 from ventbench.sandbox.runner import SandboxRunner
 

@@ -1,7 +1,6 @@
 from ventbench.entries.contract import check
-from ventbench.entries.review import review
+from ventbench.entries.review import check_sources, review
 from ventbench.entries.runner import InProcessRunner
-from ventbench.entries.static_checks import check_sources
 
 SOURCE = """\
 import gc, math

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ventbench.entries.static_checks import check_sources
+from ventbench.entries.review import check_sources
 
 RESET = "    def reset(self, task): pass\n"
 

@@ -18,7 +18,6 @@ from ventbench.base import precision
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
-from ventbench.controllers.script import Script
 from ventbench.entries.cells import Cells, protocol_of
 from ventbench.entries.errors import SubmissionError
 from ventbench.entries.folder import open_submission, submission_of
@@ -32,6 +31,7 @@ from ventbench.plants.rigs import load_rigs, rigs_of
 from ventbench.task import environment, protocol, rollouts
 from ventbench.task.interfaces import Task
 from ventbench.task.metrics.score import run_error
+from ventbench.task.rollouts import Script
 
 #: Stressors of the shared run.
 NAMES = ("leak", "sensor_low", "disconnection")
@@ -256,7 +256,7 @@ def test_json_and_tables_say_the_same(score: Score, runs: Runs, tmp_path: Path) 
 
 
 def test_the_chart_has_every_condition(score: Score, tmp_path: Path) -> None:
-    from ventbench.pages.stress import stress_chart_png, write_stress_chart
+    from ventbench.pages.plots import stress_chart_png, write_stress_chart
 
     values = score.to_json()["stress"]
     path = write_stress_chart(tmp_path / "stress.png", [values])

@@ -8,8 +8,7 @@ import pytest
 
 from ventbench.base.errors import InputError
 from ventbench.entries.folder import open_submission
-from ventbench.entries.scoring import run_protocol
-from ventbench.entries.transfer import GROUPS, by_group, transfer
+from ventbench.entries.scoring import GROUPS, by_group, run_protocol, transfer
 from ventbench.plants.rigs import load_rigs
 
 from ..textbook_rigs import TextbookRigs

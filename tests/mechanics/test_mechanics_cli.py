@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from tests.diagnosis import made
 from ventbench.base.errors import InputError
-from ventbench.cli import mechanics as command
+from ventbench.cli import diagnose as command
 from ventbench.mechanics import identify
 from ventbench.recordings import Breaths, join, load, write
 

@@ -13,7 +13,7 @@ import pytest
 from ventbench.base.errors import InputError
 from ventbench.base.text import number
 from ventbench.pages import graphics, report, scores, write_figure, write_report
-from ventbench.pages import runs as shared
+from ventbench.pages import scores as shared
 from ventbench.task import protocol
 from ventbench.trajectories import Trajectories
 

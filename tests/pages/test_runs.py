@@ -12,7 +12,7 @@ import pytest
 
 from ventbench import pages
 from ventbench.base.errors import InputError
-from ventbench.pages import runs as shared
+from ventbench.pages import scores as shared
 from ventbench.trajectories import Trajectories
 
 WRITERS = (pages.write_rerun, pages.write_report, pages.write_figure)
@@ -107,7 +107,7 @@ def test_import_loads_no_extra() -> None:
 def test_open_viewer_without_display(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("ventbench.pages.write.has_display", lambda: False)
+    monkeypatch.setattr("ventbench.pages.report.has_display", lambda: False)
     path = tmp_path / "run.rrd"
     with pytest.raises(FileNotFoundError):
         pages.open_viewer(path)
@@ -120,9 +120,9 @@ def test_open_viewer_without_display(
 
 def test_open_viewer_with_display(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[list[str]] = []
-    monkeypatch.setattr("ventbench.pages.write.has_display", lambda: True)
+    monkeypatch.setattr("ventbench.pages.report.has_display", lambda: True)
     monkeypatch.setattr(
-        "ventbench.pages.write.subprocess.Popen", lambda command, **_: started.append(command)
+        "ventbench.pages.report.subprocess.Popen", lambda command, **_: started.append(command)
     )
     path = tmp_path / "run.rrd"
     path.write_bytes(b"RRF2")

@@ -8,9 +8,9 @@ import pytest
 
 from ventbench.base.errors import InputError
 from ventbench.base.precision import float64
+from ventbench.diagnosis.estimates import component_curves
 from ventbench.physics import library, mechanism, parameter, paths, strength_path
 from ventbench.physics.catalogue import basis_terms, special_cases
-from ventbench.physics.component_curves import component_curves
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.plants.plant_files import load_plant, save_plant
 from ventbench.system_id import Predictor, fit, make_data, parameter_values

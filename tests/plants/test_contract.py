@@ -30,8 +30,7 @@ from ventbench.plants import frozen
 from ventbench.plants.catalog import load_simulators
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.learned import Architecture, learned
-from ventbench.plants.plant_files import save_plants
-from ventbench.plants.registry import FAMILIES, PlantFamily
+from ventbench.plants.plant_files import FAMILIES, PlantFamily, save_plants
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.task import protocol, waveform

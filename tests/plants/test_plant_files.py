@@ -16,7 +16,7 @@ from ventbench.base import precision
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.physics import physics
-from ventbench.plants import frozen, registry
+from ventbench.plants import frozen, plant_files
 from ventbench.plants.corrected import Corrected
 from ventbench.plants.learned import Architecture, learned
 from ventbench.plants.plant_files import load_plant, load_plants, save_plant, save_plants
@@ -54,10 +54,10 @@ def test_back_to_the_bit_with_dtype_shape_and_type(kind, tmp_path):
 
 
 def test_every_family_is_tried():
-    families = {family.plant.__name__ for family in registry.FAMILIES.values()}
+    families = {family.plant.__name__ for family in plant_files.FAMILIES.values()}
     assert families == set(PLANTS)
     for name in (*families, "Boundary", "MLP"):  # parts of a learned plant, and so in its file
-        assert registry.stored_type(name).__name__ == name
+        assert plant_files.stored_type(name).__name__ == name
 
 
 def test_a_file_with_the_old_name_of_a_class_is_still_read(tmp_path, monkeypatch):
@@ -66,7 +66,7 @@ def test_a_file_with_the_old_name_of_a_class_is_still_read(tmp_path, monkeypatch
     path.write_text(path.read_text().replace('"SingleCompartment"', '"TextbookLung"'))
     with pytest.raises(InputError, match="TextbookLung"):
         load_plants(path)
-    monkeypatch.setitem(registry.RENAMED, "TextbookLung", "SingleCompartment")
+    monkeypatch.setitem(plant_files.RENAMED, "TextbookLung", "SingleCompartment")
     assert float(load_plants(path)["R5C10"].C) == 10.0  # type: ignore[attr-defined]
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from ventbench.plants import frozen
+from ventbench.plants.corrected import reference_physics, stressed_plants
 from ventbench.plants.hybrid import VALVE_KNOTS
-from ventbench.plants.stressed import reference_physics, stressed_plants
 from ventbench.task.lungs import LUNGS
 from ventbench.task.stressors import conditions
 

@@ -7,13 +7,13 @@ import pytest
 
 from ventbench.base import precision
 from ventbench.controllers.pid import PID
-from ventbench.controllers.script import Script
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack, take
 from ventbench.task import draws, protocol, rollouts
 from ventbench.task import environment as env
 from ventbench.task.interfaces import Observation
 from ventbench.task.lungs import LUNGS
+from ventbench.task.rollouts import Script
 
 
 @pytest.fixture

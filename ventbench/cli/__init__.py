@@ -16,8 +16,6 @@ from ventbench.cli import (
     data,
     diagnose,
     doctor,
-    headroom,
-    mechanics,
     options,
     score,
     simulators,
@@ -54,14 +52,12 @@ def _root(
 
 
 score.register(app)
-headroom.register(app)
-simulators.register(app)
 tune.register(app)
+simulators.register(app)
 train.register(app)
 view.register(app)
 board.register(app)
 diagnose.register(app)
-mechanics.register(app)
 doctor.register(app)
 app.add_typer(data.app)
 

@@ -292,7 +292,7 @@ def _keep(out: Path, scores: list[Score], report: bool) -> list[Path]:
         result.save(written[-1])
     if report:
         from ventbench import pages
-        from ventbench.pages.stress import write_stress_chart
+        from ventbench.pages.plots import write_stress_chart
 
         values = [result.to_json() for result in scores]
         written.append(pages.write_report(out / "report.html", runs, values))
@@ -354,7 +354,7 @@ def transfer(
     from rich.console import Console
     from rich.table import Table
 
-    from ventbench.entries import transfer as transfers
+    from ventbench.entries import scoring as transfers
     from ventbench.entries.folder import open_submission
     from ventbench.entries.runner import CountingRunner, InProcessRunner, Runner
     from ventbench.plants.rigs import load_rigs

@@ -19,12 +19,16 @@ import numpy as np
 from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
-from ventbench.diagnosis.plausibility import is_consistent
 from ventbench.diagnosis.remaining_error import (
     UnnamedEffect,
     best_term,
     explain_remaining_error,
     gain_scatter,
+)
+from ventbench.diagnosis.selection.acceptance import (
+    is_consistent,
+    is_negligible,
+    passes_heldout_test,
 )
 from ventbench.diagnosis.selection.alternatives import (
     Alternatives,
@@ -40,7 +44,6 @@ from ventbench.diagnosis.selection.forward import (
     is_far_from_label,
     selection_at_label,
 )
-from ventbench.diagnosis.selection.held_out_test import is_negligible, passes_heldout_test
 from ventbench.diagnosis.selection.refinement import (
     SingleTermAlternative,
     backward_elimination,

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from ventbench.base.errors import InputError
 from ventbench.diagnosis import estimates, flow_drive
-from ventbench.diagnosis.adequacy import check_residuals
+from ventbench.diagnosis.adequacy import check_residuals, detection_limits
 from ventbench.diagnosis.conclusion import Conclusion
 from ventbench.diagnosis.corrected import Correction, correct
-from ventbench.diagnosis.detection_limits import detection_limits
 from ventbench.diagnosis.experiment_design import request_breaths
 from ventbench.diagnosis.findings import (
     BreathRequest,

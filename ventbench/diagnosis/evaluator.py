@@ -18,8 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ventbench.base.executor import parallel_map
-from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition, make_partition
-from ventbench.diagnosis.linearisation import linearise
+from ventbench.diagnosis.hypothesis import (
+    FittedModel,
+    Hypothesis,
+    Partition,
+    linearise,
+    make_partition,
+)
 from ventbench.diagnosis.patient_effort import BreathTerm, breath_term
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
 from ventbench.physics.catalogue import library

@@ -23,7 +23,7 @@ from ventbench.diagnosis.hypothesis import (
     make_partition,
     varies_by_breath,
 )
-from ventbench.diagnosis.plausibility import excludes_neutral, is_weak
+from ventbench.diagnosis.selection.acceptance import excludes_neutral, is_weak
 from ventbench.diagnosis.selection.screening import all_parameter_paths, library_paths
 from ventbench.diagnosis.settings import DEFAULT, DataSettings, SelectionConfig
 from ventbench.physics.catalogue import mechanism, special_cases

@@ -21,8 +21,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from ventbench.diagnosis.gaussian_process import LinearBreaths
-from ventbench.diagnosis.hypothesis import FittedModel
-from ventbench.diagnosis.linearisation import Linearisation, linearise
+from ventbench.diagnosis.hypothesis import FittedModel, Linearisation, linearise
 from ventbench.diagnosis.settings import PatientEffortSettings, SelectionConfig
 from ventbench.system_id.data import Floats
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise

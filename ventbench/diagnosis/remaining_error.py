@@ -24,7 +24,7 @@ from ventbench.diagnosis.latent_inputs import (
     log_likelihood_without_input,
     place_weights,
 )
-from ventbench.diagnosis.selection.held_out_test import passes_heldout_test
+from ventbench.diagnosis.selection.acceptance import passes_heldout_test
 from ventbench.diagnosis.selection.refinement import (
     NonparametricFit,
     compare_nonparametric_terms,
@@ -250,7 +250,7 @@ def _is_negligible_input(
     """Whether an input is far weaker than a mild effect and explains little beside the mechanisms.
 
     With many breaths, the least difference between the form of a mechanism and the library's passes
-    the held-out test; :func:`~ventbench.diagnosis.selection.held_out_test.is_negligible` asks the
+    the held-out test; :func:`~ventbench.diagnosis.selection.acceptance.is_negligible` asks the
     same of mechanisms.
     """
     latent, settings = unnamed.latent_input, evaluator.settings

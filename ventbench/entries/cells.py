@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from ventbench.base.errors import InputError
 from ventbench.entries.reference import Reference, reference_of
 from ventbench.entries.runs import pip_columns
+from ventbench.plants.corrected import Stressed, stressed_plants
 from ventbench.plants.rigs import Rigs
-from ventbench.plants.stressed import Stressed, stressed_plants
 from ventbench.task import draws as draw_tables
 from ventbench.task import protocol
 from ventbench.task.draws import Draws
@@ -60,7 +60,7 @@ class Cells:
         """One draw under every condition, as 64-bit arrays: call it within ``float64()``.
 
         Returns:
-            Plants as of :func:`~ventbench.plants.stressed.stressed_plants`, and cells of batch
+            Plants as of :func:`~ventbench.plants.corrected.stressed_plants`, and cells of batch
             shape ``(S * L,)``; there must be one PIP.
         """
         one = jax.tree.map(lambda leaf: np.asarray(leaf)[:, draw : draw + 1, 0], self.plants)

@@ -5,26 +5,255 @@ attack, and a reader of a pull request should see them all without searching.
 
 :func:`inspect_folder` finds all that reading a folder shows in a limited process, which runs none
 of it.
+
+Checks of the Python sources of a submission, by reading: none of them is run or imported.
+The class ``Controller`` must be there with methods that can be called, and what the controller
+imports must be there too.
 """
 
 from __future__ import annotations
 
 import ast
 import dataclasses
+import difflib
+import io
 import re
+import sys
+import tokenize
 import unicodedata
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from ventbench.entries.errors import Finding
 from ventbench.entries.file_checks import check_files
+from ventbench.entries.folder import CONTROLLER, MAX_BYTES
 from ventbench.entries.manifest import check_manifest
-from ventbench.entries.static_checks import check_sources
-from ventbench.sandbox.child.cell import source_text
-from ventbench.sandbox.child.sources import sources
+from ventbench.sandbox.child.cell import CLASS, source_text
+from ventbench.sandbox.child.sources import Import, imports, module_files, sources
+from ventbench.sandbox.configuration import OPTIONAL
 from ventbench.sandbox.reader import UnreadableError, read_apart
+
+
+def check_sources(folder: Path) -> list[Finding]:
+    """Look at ``controller.py`` and all of the folder's modules that it imports.
+
+    Other sources, such as the training's, need only be Python.
+
+    Args:
+        folder: the submission's folder.
+    """
+    findings, trees = [], {}
+    for path in sources(folder):
+        name = path.relative_to(folder).as_posix()
+        if path.stat().st_size > MAX_BYTES:
+            continue  # reported by check_files
+        tree = _parsed(path, name)
+        if isinstance(tree, Finding):
+            findings.append(tree)
+        else:
+            trees[name] = tree
+    if CONTROLLER in trees:
+        try:
+            findings += _check_class(trees[CONTROLLER])
+            findings += _check_imports(trees)
+        except RecursionError:
+            advice = "write a loop or a table in place of so many nested expressions"
+            findings.append(
+                Finding("source", CONTROLLER, "is nested too deeply to be read", advice)
+            )
+    return sorted(findings, key=lambda f: (f.file != CONTROLLER, f.file, f.line or 0))
+
+
+def _parsed(path: Path, name: str) -> ast.Module | Finding:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of doubtful escapes and the like
+            content = path.read_bytes()
+            encoding = _declared(content)
+            if encoding not in ("utf-8", "utf-8-sig"):
+                what = f"names the encoding {encoding}, and is read as UTF-8"
+                return Finding("source", name, what, "save it as UTF-8, and leave out the name", 1)
+            return ast.parse(source_text(content), name)
+    except SyntaxError as error:
+        what = f"is not Python: {error.msg}"
+        advice = "python -m py_compile shows the place"
+        return Finding("source", name, what, advice, error.lineno, error.offset or None)
+    except (ValueError, RecursionError, MemoryError, OSError) as error:
+        return Finding("source", name, f"is not Python: {error}", "save it as plain UTF-8 text")
+
+
+def _declared(content: bytes) -> str:
+    """Encoding that a source names in its first two lines."""
+    try:
+        return tokenize.detect_encoding(io.BytesIO(content).readline)[0]
+    except SyntaxError:
+        return "of no known name"
+
+
+_METHODS = {"reset": "task", "act": "observation"}
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def _check_class(tree: ast.Module) -> list[Finding]:
+    """Look for the class and its methods.
+
+    Args:
+        tree: the parsed ``controller.py``.
+    """
+    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    if CLASS in classes:
+        return list(_class(classes[CLASS]))
+    if _bound(tree):
+        return []  # imported or assigned: the run shows what it is
+    close = next(iter(difflib.get_close_matches(CLASS, classes, n=1, cutoff=0.3)), None)
+    line = classes[close].lineno if close else None
+    hint = f"; did you mean {close}?" if close else ""
+    advice = f"call the class {CLASS}" if close else f"write a class {CLASS}; see `ventbench new`"
+    return [_problem(f"defines no class {CLASS}{hint}", advice, line)]
+
+
+def _bound(tree: ast.Module) -> bool:
+    """Whether anything but a class statement at the top level may give the name a value."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id == CLASS:
+            return True
+        if isinstance(node, ast.alias) and (node.asname or node.name) in (CLASS, "*"):
+            return True
+        if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == CLASS:
+            return True
+    return False
+
+
+def _problem(what: str, advice: str, line: int | None, column: int | None = None) -> Finding:
+    return Finding("source", CONTROLLER, what, advice, line, column)
+
+
+def _class(node: ast.ClassDef) -> Iterator[Finding]:
+    methods = {part.name: part for part in node.body if isinstance(part, Function)}
+    given = {name.id for name in ast.walk(node) if isinstance(name, ast.Name)}
+    inherits = bool(node.bases or node.keywords or node.decorator_list)
+    for name, argument in _METHODS.items():
+        if name in methods:
+            yield from _method(methods[name], argument)
+        elif not inherits and name not in given:
+            advice = f"write def {name}(self, {argument})"
+            yield _problem(f"class {CLASS} has no method {name}", advice, node.lineno)
+    if "__init__" in methods:
+        yield from _constructor(methods["__init__"])
+
+
+def _method(node: Function, argument: str) -> Iterator[Finding]:
+    signature = f"def {node.name}(self, {argument})"
+    place = node.lineno, node.col_offset + 1
+    if isinstance(node, ast.AsyncFunctionDef):
+        yield _problem(f"{node.name} is async", f"write {signature}", *place)
+        return
+    decorators = [d.id if isinstance(d, ast.Name) else "" for d in node.decorator_list]
+    if set(decorators) - {"staticmethod", "classmethod"}:
+        return  # may change everything
+    required, most = _arguments(node)
+    wanted = 1 if "staticmethod" in decorators else 2
+    if not required <= wanted <= most or _required_keywords(node):
+        what = f"{node.name} cannot be called as {node.name}({argument})"
+        yield _problem(what, f"write {signature}", *place)
+    inside = list(_inside(node))
+    if any(isinstance(part, ast.Yield | ast.YieldFrom) for part in inside):
+        yield _problem(f"{node.name} is a generator", "return a value, do not yield it", *place)
+    elif node.name == "act" and not any(map(_ends, inside)):
+        yield _problem("act returns nothing", "return u_in, a number in %", *place)
+
+
+def _inside(node: ast.AST) -> Iterator[ast.AST]:
+    """What a function does itself, not in functions within it."""
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, Function | ast.Lambda | ast.ClassDef):
+            yield child
+            yield from _inside(child)
+
+
+def _ends(node: ast.AST) -> bool:
+    return isinstance(node, ast.Raise) or (isinstance(node, ast.Return) and node.value is not None)
+
+
+def _constructor(node: Function) -> Iterator[Finding]:
+    required, _ = _arguments(node)
+    if required > 1 or _required_keywords(node):
+        what = f"{CLASS}() needs arguments that it does not get"
+        advice = "give them defaults, or prepare in reset(self, task)"
+        yield _problem(what, advice, node.lineno, node.col_offset + 1)
+
+
+def _arguments(node: Function) -> tuple[int, float]:
+    """Fewest and most positional arguments, ``self`` among them."""
+    names = [*node.args.posonlyargs, *node.args.args]
+    return len(names) - len(node.args.defaults), float("inf") if node.args.vararg else len(names)
+
+
+def _required_keywords(node: Function) -> bool:
+    return any(default is None for default in node.args.kw_defaults)
+
+
+#: Packages beyond the standard library.
+ALLOWED = ("numpy", *OPTIONAL)
+
+#: Modules of the standard library that cannot do anything in the sandbox.
+_USELESS = {
+    **dict.fromkeys(("socket", "ssl", "urllib", "http", "ftplib", "smtplib"), "the network"),
+    **dict.fromkeys(("socketserver", "xmlrpc", "imaplib", "poplib", "webbrowser"), "the network"),
+    **dict.fromkeys(("subprocess", "multiprocessing", "pty"), "other processes"),
+    **dict.fromkeys(("shelve", "dbm", "sqlite3", "tempfile", "shutil"), "files to write"),
+    **dict.fromkeys(("ctypes", "_ctypes", "ptrace"), "memory beside its own"),
+}
+_SANDBOX = "leave it out: a submission has its folder to read, its observations, and nothing else"
+_LATE = "import it at the top of the file; later the folder is not searched any more"
+
+
+def _check_imports(trees: Mapping[str, ast.Module]) -> list[Finding]:
+    """Follow the imports from ``controller.py`` on.
+
+    Args:
+        trees: all parsed sources, by path below the folder; the controller's among them.
+    """
+    own = {name.partition("/")[0].removesuffix(".py") for name in trees}
+    waiting, seen, findings = [CONTROLLER], set(), []
+    while waiting:
+        name = waiting.pop()
+        if name in seen or name not in trees:
+            continue
+        seen.add(name)
+        for imported in imports(trees[name].body):
+            finding = _import_finding(imported, name, own)
+            if finding is not None:
+                findings.append(finding)
+            waiting += module_files(imported, name)
+    return list(dict.fromkeys(findings))  # `from a import b` may be two modules
+
+
+def _import_finding(imported: Import, name: str, own: set[str]) -> Finding | None:
+    top, what = imported.module.partition(".")[0], ""
+    if imported.level:
+        if "/" in name:
+            return None
+        what, advice = "uses a relative import, and is not in a package", "leave out the dot"
+    elif top in own:
+        if not imported.late or imported.optional:
+            return None
+        what, advice = f"imports {top} inside a function", _LATE
+    elif top in _USELESS:
+        what, advice = f"imports {top}, but the sandbox closes {_USELESS[top]}", _SANDBOX
+    elif top in ALLOWED or top in sys.stdlib_module_names:
+        return None
+    elif top == "ventbench":
+        what = "imports ventbench, which a submission does not have"
+        advice = "copy what it needs into the folder; task and observation come by themselves"
+    else:
+        what = f"imports {top}, which is neither in the folder nor among the packages it may use"
+        advice = f"use {', '.join(ALLOWED)} and the standard library"
+    place = imported.node.lineno, imported.node.col_offset + 1
+    return Finding("source", name, what, advice, *place, problem=not imported.optional)
+
 
 _MODULES = {
     **dict.fromkeys(("gc", "inspect", "traceback"), "looks into Python's own objects and frames"),

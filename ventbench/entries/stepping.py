@@ -14,7 +14,6 @@ from jax import Array
 from numpy.typing import NDArray
 
 from ventbench.base import precision
-from ventbench.controllers.script import Script
 from ventbench.entries.cells import Cells
 from ventbench.entries.errors import Failure
 from ventbench.entries.folder import Submission
@@ -23,6 +22,7 @@ from ventbench.task import environment as env
 from ventbench.task import protocol, rollouts
 from ventbench.task.environment import Scenario
 from ventbench.task.interfaces import Observation, Plant, PlantT, Task
+from ventbench.task.rollouts import Script
 
 Floats = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ventbench.pages.runs import Floats
+from ventbench.pages.scores import Floats
 from ventbench.task import protocol
 from ventbench.trajectories import Trajectories
 

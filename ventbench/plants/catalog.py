@@ -5,7 +5,7 @@ What is given                         What it stands for
 ====================================  ============================================================
 ``frozen`` (or ``hybrid``)            the official simulators
 ``physics``                           R-C lungs at their labels
-``two_balloon``, ...                  another family of :mod:`~ventbench.plants.registry` at labels
+``two_balloon``, ...                  another family of ``plant_files.FAMILIES`` at the labels
 ``FILE.json``, ``FILE.npz``           plants of some lungs, such as a ``corrected.json``
 ``FOLDER``                            what ``ventbench train simulator`` wrote
 ``FILE.csv``, ``FILE.parquet``        simulated pressures of recorded breaths, in the public schema
@@ -39,9 +39,8 @@ from ventbench.base import files, precision
 from ventbench.base.errors import InputError, InputTypeError
 from ventbench.physics import physics
 from ventbench.plants import frozen
-from ventbench.plants.plant_files import load_plants, origin
+from ventbench.plants.plant_files import FAMILIES, load_plants, origin
 from ventbench.plants.python_simulator import PythonSimulator, is_jax_plant, python_simulator
-from ventbench.plants.registry import FAMILIES
 from ventbench.plants.simulators import Simulators
 from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import (

@@ -1,13 +1,31 @@
-"""A simulator plus what another physics would add to it."""
+"""A simulator plus what another physics would add to it; and plants under stress.
+
+A stressed plant is the scored plant, plus what physics with a stressor does and without does not.
+The physics *without* is the reference physics of the scored plant: what the library can say of it.
+A plant says it by its ``parameters``, so that the difference is taken where a learned rig works;
+for a plant that says nothing they are those of the label.
+The physics *with* has the strength of the stressor in addition. Both are one model with the same
+parameters, so that all cells of all conditions run in one batch, without a branch.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import flax.struct
+import jax
+import numpy as np
 from jax import Array
+from numpy.typing import NDArray
 
-from ventbench.task.interfaces import Signals
+from ventbench.physics.catalogue import parameter, paths
+from ventbench.physics.model import Physics
+from ventbench.plants.hybrid import RELIEF, RELIEF_CONDUCTANCE
+from ventbench.task import protocol
+from ventbench.task.interfaces import Plant, Signals
+from ventbench.task.lungs import Lung
+from ventbench.task.stressors import Condition, Severity, Stressor, stressor
 
 
 @flax.struct.dataclass
@@ -71,3 +89,153 @@ def corrected_signals(simulator: Signals, more: Signals, less: Signals) -> Signa
         sum_of(simulator.flow, "flow"),
         sum_of(simulator.volume, "volume"),
     )
+
+
+Floats = NDArray[np.float64]
+
+
+@flax.struct.dataclass
+class Stressed:
+    """A plant under stress: :class:`~ventbench.plants.corrected.Corrected` that starts from truth.
+
+    Both physics are one model with an axis of two in front, so that they are compiled once.
+
+    Attributes:
+        simulator: the scored plant.
+        physics: with the stressor, then without, leaves ``(2,)``.
+    """
+
+    simulator: Any
+    physics: Physics
+
+    def init(self, pressure: Array, peep: Array | None = None) -> tuple[tuple[Any, Any], Signals]:
+        """Lung at rest at a true pressure; see :class:`~ventbench.task.interfaces.Plant`."""
+        behind = pressure if peep is None else peep
+        shown = self.physics.reading_of(pressure)
+        state, _ = self.physics.init(shown, behind)
+        simulator, seen = self.simulator.init(pressure, behind)
+        flow = None if seen.flow is None else 0.0 * seen.flow
+        signals = Signals(shown[0] + 0.0 * pressure, pressure, flow, 0.0 * pressure)
+        return (simulator, state), signals
+
+    def step(
+        self, state: tuple[Any, Any], u_in: Array, u_out: Array, dt: Array
+    ) -> tuple[tuple[Any, Any], Signals]:
+        """Hold one command; the volume is that of the physics with the stressor."""
+        simulator, seen = self.simulator.step(state[0], u_in, u_out, dt)
+        physics, both = self.physics.step(state[1], u_in, u_out, dt)
+        more, less = (jax.tree.map(lambda leaf, k=k: leaf[k], both) for k in (0, 1))
+        signals = corrected_signals(seen, more, less)._replace(volume=more.volume)
+        return (simulator, physics), signals
+
+    def vary(self, r_scale: Array, c_scale: Array) -> Stressed:
+        """Return the same lung with another resistance and compliance."""
+        return Stressed(self.simulator.vary(r_scale, c_scale), self.physics.vary(r_scale, c_scale))
+
+    def parameters(self) -> dict[str, Array]:
+        """Those with the stressor; see :class:`~ventbench.task.interfaces.Plant`."""
+        return {path: value[..., 0] for path, value in self.physics.parameters().items()}
+
+
+def reference_physics(plant: Plant, lungs: Sequence[Lung]) -> dict[str, Floats]:
+    """Parameters of the library's physics that say most of what a plant does.
+
+    Args:
+        plant: leaves ``(L, ...)``, one lung each on the leading axis.
+        lungs: labels, length L.
+
+    Returns:
+        Parameters by path: what the plant says, of its batch shape; for a plant that says nothing
+        those of the label, shape ``(L,)``.
+    """
+    wide: Any = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), plant)
+    known = wide.parameters()
+    if known is not None:
+        return {path: np.asarray(value) for path, value in known.items()}
+    return {
+        "R": np.array([lung.R for lung in lungs]),
+        "C": np.array([lung.C for lung in lungs]),
+        "relief_valve.conductance": np.full(len(lungs), RELIEF_CONDUCTANCE),
+        "relief_valve.opening": np.full(len(lungs), RELIEF),
+    }
+
+
+def stressed_plants(
+    plant: Plant, lungs: Sequence[Lung], conditions: Sequence[Condition]
+) -> Stressed:
+    """Put every lung under every condition.
+
+    Args:
+        plant: scored plants, leaves ``(L, n, ...)``: n cells of each lung.
+        lungs: labels, length L.
+        conditions: S of them.
+
+    Returns:
+        A plant for each cell and breath of a run: leaves ``(S * L * n, BREATHS, ...)``, of the
+        physics ``(S * L * n, BREATHS, 2)``.
+    """
+    leaves = jax.tree.leaves(plant)
+    cells = tuple(np.shape(leaves[0])[:2])
+    base = {
+        name: np.broadcast_to(_trailing(value, 2), cells)
+        for name, value in reference_physics(plant, lungs).items()
+    }
+    names = _parameters(base, conditions)
+    base = {name: base.get(name, np.full(cells, parameter(name).neutral)) for name in names}
+    size = (protocol.BREATHS, len(conditions), *cells)
+    before = {name: np.broadcast_to(value, size) for name, value in base.items()}
+    after = {name: value.copy() for name, value in before.items()}
+    labels = np.array([[lung.R, lung.C] for lung in lungs])[:, :, None]
+    for index, condition in enumerate(conditions):
+        for name in condition.stressors:
+            own = {path: value[:, index] for path, value in after.items()}
+            _apply(stressor(name), condition.severity or "mild", own, labels)
+
+    both: Any = tuple(
+        np.stack([x[name].reshape(protocol.BREATHS, -1).T for x in (after, before)], axis=-1)
+        for name in names
+    )
+
+    def repeated(leaf: Any) -> Any:
+        leaf = np.asarray(leaf)
+        every = np.broadcast_to(leaf[:, :, None], (size[1], *size[2:], size[0], *leaf.shape[2:]))
+        return every.reshape(-1, size[0], *leaf.shape[2:])
+
+    return Stressed(jax.tree.map(repeated, plant), Physics(both, names))
+
+
+def _apply(line: Stressor, severity: Severity, own: dict[str, Floats], labels: Floats) -> None:
+    """Change parameters of one condition in place.
+
+    Args:
+        line: the stressor.
+        severity: its severity.
+        own: parameters by path, ``(BREATHS, L, n)``.
+        labels: R and C that the labels say, ``(L, 2, 1)``.
+    """
+    strength, share = line.at(severity), np.reshape(line.breaths, (-1, 1, 1))
+    if line.rule == "add":
+        own[line.strength] += share * strength
+    else:
+        factor = np.array(strength)
+        if line.rule == "label":
+            factor = strength / labels[:, 0 if line.strength == "R" else 1]
+        for name, value in own.items():
+            if name == line.strength or parameter(name).follows == line.strength:
+                value *= factor**share
+    for name, value in line.settings(severity).items():
+        own[name][:] = np.reshape(value, (-1, 1, 1))
+
+
+def _parameters(base: dict[str, Floats], conditions: Sequence[Condition]) -> tuple[str, ...]:
+    """Paths of the base and of what a condition changes, in the order of the catalogue."""
+    used = set(base) | {"R", "C"}
+    for line in (stressor(name) for condition in conditions for name in condition.stressors):
+        used |= {line.strength, *line.settings("mild")}
+    owners = {path.rpartition(".")[0] for path in used}
+    return tuple(path for path in paths(tuple(sorted(owners - {""}))) if path in used)
+
+
+def _trailing(value: Floats, axes: int) -> Floats:
+    """Give an array of leading axes as many axes as wanted."""
+    return value.reshape(*value.shape, *(1,) * (axes - value.ndim))

@@ -1,8 +1,8 @@
-"""Plants in files: JSON that people can read, or one ``.npz`` with every array by its path.
+"""Families of plants, one line each, and their files: JSON, or one ``.npz`` of arrays by path.
 
-Never pickle: a file can only name the plant types of :mod:`ventbench.plants.registry`, by their
-class names. Numbers have full precision: what is read is to the bit what was written, and equal
-plants give equal bytes.
+A family is known to files, ``--plant`` and the contract tests. Never pickle: a file can only name
+the plant types of :data:`FAMILIES`, by their class names. Numbers have full precision: what is read
+is to the bit what was written, and equal plants give equal bytes.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,66 @@ import numpy as np
 
 from ventbench.base import files
 from ventbench.base.errors import InputError
-from ventbench.plants import registry
+from ventbench.physics.model import Physics
+from ventbench.plants.corrected import Corrected
+from ventbench.plants.hybrid import Hybrid
+from ventbench.plants.learned import MLP, Boundary, Learned
+from ventbench.plants.single_compartment import SingleCompartment, single_compartment
+from ventbench.plants.two_balloon import TwoBalloon, two_balloon
 from ventbench.task.interfaces import Plant
-from ventbench.task.lungs import lung
+from ventbench.task.lungs import Lung, lung
+
+
+@dataclass(frozen=True)
+class PlantFamily:
+    """One kind of plant.
+
+    Attributes:
+        plant: class of the plants; files name it by the class's name, so that a class that is
+            renamed needs a line in :data:`RENAMED`.
+        for_lung: makes the plant of a lung at its label, if labels are all it needs. The family
+            then has a name for ``--plant`` and goes through the contract tests of physics plants.
+        parts: further classes in its files.
+    """
+
+    plant: type
+    for_lung: Callable[[Lung], Plant] | None = None
+    parts: tuple[type, ...] = ()
+
+
+#: By the name that ``--plant`` takes. ``physics`` and the learned ones are more than one line, see
+#: :mod:`ventbench.plants.catalog`.
+FAMILIES: dict[str, PlantFamily] = {
+    "single_compartment": PlantFamily(SingleCompartment, single_compartment),
+    "two_balloon": PlantFamily(TwoBalloon, two_balloon),
+    "physics": PlantFamily(Physics),
+    "corrected": PlantFamily(Corrected),
+    "hybrid": PlantFamily(Hybrid),
+    "learned": PlantFamily(Learned, parts=(Boundary, MLP)),
+}
+
+#: Today's class name by the name that older files have.
+RENAMED: dict[str, str] = {}
+
+#: Names of fields in plant files, by class and field, where they differ from the attribute's.
+FIELDS_IN_FILES: dict[str, dict[str, str]] = {
+    "Corrected": {"with_mechanisms": "wanted", "without_mechanisms": "had"},
+}
+
+
+def stored_type(name: str) -> type:
+    """Return the class that a plant file names.
+
+    Raises:
+        KeyError: if there is no plant family with such a class.
+    """
+    types = {
+        kind.__name__: kind
+        for family in FAMILIES.values()
+        for kind in (family.plant, *family.parts)
+    }
+    return types[RENAMED.get(name, name)]
+
 
 FORMAT = "ventbench-plants-1"
 
@@ -151,7 +209,7 @@ def _write_npz(path: Path, structure: Any, arrays: dict[str, np.ndarray]) -> Non
 def _encode(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         kind = type(value).__name__
-        in_file = registry.FIELDS_IN_FILES.get(kind, {})
+        in_file = FIELDS_IN_FILES.get(kind, {})
         stored = {
             in_file.get(field.name, field.name): field.name for field in dataclasses.fields(value)
         }
@@ -173,8 +231,8 @@ def _encode(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
 
 def _decode(node: dict[str, Any], arrays: Any, as_array: Callable[[Any], Any]) -> Any:
     if "type" in node:
-        kind = registry.stored_type(node["type"])
-        in_file = registry.FIELDS_IN_FILES.get(kind.__name__, {})
+        kind = stored_type(node["type"])
+        in_file = FIELDS_IN_FILES.get(kind.__name__, {})
         attributes = {name: attribute for attribute, name in in_file.items()}
         fields: dict[str, Any] = {
             str(attributes.get(name, name)): _decode(child, arrays, as_array)

@@ -21,7 +21,7 @@ from hardware_eval.bench.session import run_plan
 from hardware_eval.emulation.faults import LineFault, LineFaultKind
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.emulation.simulated import FaultKind, LungFault
-from hardware_eval.wire.errors import LinkError
+from hardware_eval.wire.parser import LinkError
 from ventbench import rollout
 from ventbench.controllers.pid import PID
 from ventbench.task import protocol

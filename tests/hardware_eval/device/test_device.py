@@ -11,7 +11,6 @@ import pytest
 from hardware_eval.device.program import OLDEST_SEEN, PERIOD, SENSOR_TIMEOUT, DeviceSettings
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.wire.client import Client
-from hardware_eval.wire.errors import RefusedError
 from hardware_eval.wire.messages import (
     Command,
     Flag,
@@ -21,6 +20,7 @@ from hardware_eval.wire.messages import (
     Reason,
     encode,
 )
+from hardware_eval.wire.parser import RefusedError
 from tests.hardware_eval.stand_in import Bench
 
 #: From the last command to vented valves, s.

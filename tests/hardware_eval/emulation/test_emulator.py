@@ -18,7 +18,9 @@ from hardware_eval.emulation import emulator as emulator_module
 from hardware_eval.emulation.electronics import emulated_lung
 from hardware_eval.emulation.emulator import Emulator, tell
 from hardware_eval.wire.client import Client
-from hardware_eval.wire.errors import (
+from hardware_eval.wire.link import Link, ReconnectPolicy
+from hardware_eval.wire.messages import Flag, Mode, Packet, Vent, encode
+from hardware_eval.wire.parser import (
     DisconnectedError,
     LinkError,
     NoAnswerError,
@@ -27,8 +29,6 @@ from hardware_eval.wire.errors import (
     PortMissingError,
     RefusedError,
 )
-from hardware_eval.wire.link import Link, ReconnectPolicy
-from hardware_eval.wire.messages import Flag, Mode, Packet, Vent, encode
 from tests.hardware_eval.stand_in import Bench
 from ventbench.base.errors import InputError
 

@@ -14,9 +14,8 @@ from hardware_eval.bench.loop import SilentOperator
 from hardware_eval.bench.plan import make_plan
 from hardware_eval.results import evaluate as ev
 from hardware_eval.results import record as records
-from hardware_eval.results.compare import compare, recorded_breaths
+from hardware_eval.results.compare import compare, recorded_breaths, replay
 from hardware_eval.results.evaluate import Line
-from hardware_eval.results.replay import replay
 from ventbench.base.errors import InputError
 from ventbench.board import build, canonical, frames, record, store
 from ventbench.board.record import HardwareRecord

@@ -4,7 +4,7 @@ import hashlib
 
 import pytest
 
-from hardware_eval.emulation.seal import commitment, encrypt, random_generator, unseal
+from hardware_eval.emulation.cases import commitment, encrypt, random_generator, unseal
 from proofs.challenge.first.plan import draw
 from proofs.challenge.folder import decode_answers, encode_answers
 from ventbench.base.errors import InputError

@@ -6,8 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from hardware_eval.emulation.cases import Base, Case, Effect
-from hardware_eval.emulation.seal import random_generator
+from hardware_eval.emulation.cases import Base, Case, Effect, random_generator
 from proofs.challenge.first.rig import record as record_finely
 from proofs.challenge.make import PRESSURE, record_within_limits
 from proofs.challenge.questions import DrawnCase

@@ -10,7 +10,7 @@ import numpy as np
 from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis
-from ventbench.diagnosis.plausibility import is_plausible
+from ventbench.diagnosis.selection.acceptance import is_plausible, passes_heldout_test
 from ventbench.diagnosis.selection.candidate_comparison import (
     Comparison,
     RankedModel,
@@ -18,7 +18,6 @@ from ventbench.diagnosis.selection.candidate_comparison import (
     fit_with_noise,
     fit_with_white_noise,
 )
-from ventbench.diagnosis.selection.held_out_test import passes_heldout_test
 from ventbench.diagnosis.selection.screening import screen_mechanisms
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id.data import Floats

@@ -7,7 +7,7 @@ compared by BIC at one common noise: the noise that the best candidate leaves, s
 estimated with an effect still in the residual explains the effect away. The best candidate is
 fitted together with its noise and kept if held-out breaths ask for it: its log-likelihood ratio
 there must pass a test that chance passes in at most 1 % of recordings
-(:func:`~ventbench.diagnosis.selection.held_out_test.passes_heldout_test`), or, where the training
+(:func:`~ventbench.diagnosis.selection.acceptance.passes_heldout_test`), or, where the training
 breaths ask for it clearly, a cross-validated one; and it must not be a negligible strength that
 trims other terms. If it is, and nothing else explains as much, a term that explains much is part of
 the models that are compared from then on, and is not named in the end. Shape parameters of the new
@@ -28,6 +28,11 @@ import numpy as np
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, varies_by_breath
 from ventbench.diagnosis.latent_inputs import exceeds_sensor_noise
+from ventbench.diagnosis.selection.acceptance import (
+    is_needed,
+    is_negligible,
+    passes_heldout_test,
+)
 from ventbench.diagnosis.selection.candidate_comparison import (
     Comparison,
     RankedModel,
@@ -35,11 +40,6 @@ from ventbench.diagnosis.selection.candidate_comparison import (
     estimate_noise,
     fit_with_noise,
     fit_with_white_noise,
-)
-from ventbench.diagnosis.selection.held_out_test import (
-    is_needed,
-    is_negligible,
-    passes_heldout_test,
 )
 from ventbench.diagnosis.selection.pair_exchange import replace_pair
 from ventbench.diagnosis.selection.screening import screen_mechanisms

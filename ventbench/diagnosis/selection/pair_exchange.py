@@ -13,7 +13,7 @@ from typing import Any
 from ventbench.base.executor import parallel_map
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
-from ventbench.diagnosis.plausibility import is_plausible
+from ventbench.diagnosis.selection.acceptance import is_plausible, passes_heldout_test
 from ventbench.diagnosis.selection.candidate_comparison import (
     cost_at,
     cost_of,
@@ -21,7 +21,6 @@ from ventbench.diagnosis.selection.candidate_comparison import (
     fit_with_noise,
     hopeless_above,
 )
-from ventbench.diagnosis.selection.held_out_test import passes_heldout_test
 from ventbench.diagnosis.selection.shape_parameters import (
     fit_with_shape,
     shape_starts,

@@ -31,7 +31,7 @@ from ventbench.diagnosis.latent_inputs import (
     fit_latent_inputs,
     log_likelihood_without_input,
 )
-from ventbench.diagnosis.plausibility import is_plausible
+from ventbench.diagnosis.selection.acceptance import is_needed, is_plausible, passes_heldout_test
 from ventbench.diagnosis.selection.candidate_comparison import (
     Comparison,
     RankedModel,
@@ -40,7 +40,6 @@ from ventbench.diagnosis.selection.candidate_comparison import (
     fit_with_white_noise,
 )
 from ventbench.diagnosis.selection.forward import Progress
-from ventbench.diagnosis.selection.held_out_test import is_needed, passes_heldout_test
 from ventbench.diagnosis.selection.screening import (
     component_of,
     score_nonparametric_terms,

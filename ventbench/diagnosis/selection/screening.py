@@ -1,7 +1,7 @@
 """First-order ranking of what could be added to a hypothesis, without a fit.
 
 A mechanism is simulated at several strengths, and each change of the prediction is a template (see
-:mod:`ventbench.diagnosis.linearisation`). A nonparametric basis term is linear in its coefficients,
+:mod:`ventbench.diagnosis.hypothesis`). A nonparametric basis term is linear in its coefficients,
 so that its best gain follows from the derivatives.
 """
 
@@ -14,8 +14,13 @@ from itertools import product
 import numpy as np
 
 from ventbench.base.executor import parallel_map
-from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, varies_by_breath
-from ventbench.diagnosis.linearisation import Linearisation, linearise
+from ventbench.diagnosis.hypothesis import (
+    FittedModel,
+    Hypothesis,
+    Linearisation,
+    linearise,
+    varies_by_breath,
+)
 from ventbench.diagnosis.patient_effort import breath_term
 from ventbench.diagnosis.settings import ScreeningSettings, SelectionConfig
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter, paths

@@ -12,7 +12,7 @@ from ventbench.diagnosis.residual_analysis import Profile, profiles
 from ventbench.diagnosis.residual_axes import EDGE
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.pages import graphics
-from ventbench.pages.runs import Floats
+from ventbench.pages.scores import Floats
 from ventbench.physics.characteristics import Characteristic
 
 #: Room for the labels: left, right, top, bottom, picture units.

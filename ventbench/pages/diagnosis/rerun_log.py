@@ -16,7 +16,7 @@ from ventbench.base.text import escape_markdown
 from ventbench.diagnosis import number_text, report_text
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.pages.diagnosis.charts import STAGES, rmse
-from ventbench.pages.runs import Floats
+from ventbench.pages.scores import Floats
 
 APPLICATION = "ventbench"
 

@@ -18,8 +18,15 @@ from numpy.typing import NDArray
 
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
-from ventbench.recordings.foreign.breath_onsets import expiratory_valve, find_breaths
-from ventbench.recordings.foreign.layouts import LAYOUTS, ROLES, USUAL, Layout, recognise
+from ventbench.recordings.foreign.breath_onsets import (
+    LAYOUTS,
+    ROLES,
+    USUAL,
+    Layout,
+    expiratory_valve,
+    find_breaths,
+    recognise,
+)
 from ventbench.recordings.foreign.tables import Table, read_table
 from ventbench.recordings.foreign.units import Conversion, conversion, in_file_unit, stem
 from ventbench.recordings.roles import SLOW, check_roles, few_breaths, opposite_sign

@@ -19,6 +19,8 @@ from importlib import import_module
 from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
+from ventbench.base import VERSION
+
 if TYPE_CHECKING:
     from ventbench.base.errors import InputError as InputError
     from ventbench.base.files import example as example
@@ -50,7 +52,7 @@ if TYPE_CHECKING:
     from ventbench.trajectories import Trajectories as Trajectories
     from ventbench.trajectories import rollout as rollout
 
-__version__ = "0.1.0"
+__version__ = VERSION
 
 #: Module and attribute of each name.
 _SOURCES = {

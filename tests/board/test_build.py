@@ -119,6 +119,7 @@ def _texts(page: str) -> str:
 
 
 def test_a_new_leaderboard_has_a_page(tmp_path: Path) -> None:
+    (tmp_path / "none").mkdir()
     done = build.build(tmp_path / "none", tmp_path)
     assert done.records == 0
     assert set(done.changed) == {"index.html", "leaderboard.csv"}

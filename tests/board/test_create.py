@@ -12,7 +12,7 @@ import pytest
 
 from ventbench.base import files, precision
 from ventbench.base.errors import InputError
-from ventbench.board import actions, create, ranking, record, schema
+from ventbench.board import create, ranking, record, schema, store
 from ventbench.board.record import Record
 from ventbench.task import draws as draw_tables
 from ventbench.task import protocol
@@ -50,7 +50,7 @@ def test_a_record_is_small(drafts) -> None:
 def test_commands_come_back_bit_for_bit(drafts, scores, tmp_path: Path) -> None:
     item = record.load(drafts["pid_best"].save(tmp_path))
     assert isinstance(item, Record)
-    found = actions.load(item, tmp_path)
+    found = store.load_commands(item, tmp_path)
     assert found.tobytes() == scores["pid_best"].requested.tobytes()
 
 

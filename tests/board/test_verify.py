@@ -47,7 +47,7 @@ def _sound(folder: Path, only: str) -> list[str]:
         try:
             item = store.read_record(path) if path.stem == only else record.load(path, strict=False)
             if isinstance(item, record.Record) and item.header.actions.sha256 == only:
-                actions.load(item, folder / store.RECORDS)
+                store.load_commands(item, folder / store.RECORDS)
         except InputError as error:
             wrong.append(str(error))
     return wrong
@@ -121,7 +121,7 @@ def test_stray_files_and_links_are_refused(leaderboard: Path, check) -> None:
 
 def test_missing_commands_are_named(leaderboard: Path, check) -> None:
     score = store.load(leaderboard).scores[0]
-    actions.path_of(score, leaderboard / store.RECORDS).unlink()
+    store.commands_path(score, leaderboard / store.RECORDS).unlink()
     problems = "".join(check(leaderboard).problems)
     assert f"is missing: the commands of record {score.sha256[:12]}" in problems
 
@@ -168,7 +168,7 @@ def _forge(folder: Path, name: str, change: dict[str, Any]) -> Path:
         (fresh / store.RECORDS / f"{canonical.digest(content)}.json").write_bytes(content)
         new = record.from_bytes(content, "forged")
         assert isinstance(new, record.Record)
-        shutil.copy(actions.path_of(new, folder / store.RECORDS), fresh / store.RECORDS)
+        shutil.copy(store.commands_path(new, folder / store.RECORDS), fresh / store.RECORDS)
     accept(fresh)
     return fresh
 

@@ -27,7 +27,7 @@ pytest.importorskip("rerun", reason="needs the extra ventbench[view]")
 FILES = ["corrected.json", "diagnosis.json", "diagnosis.rrd", "record_next.csv", "report.html"]
 
 app = typer.Typer()
-command.register(app)
+app.command()(command.diagnose)
 
 
 def run(*arguments: object, code: int = 0) -> str:

@@ -87,7 +87,7 @@ def test_each_breath_has_one_use_where_there_are_enough(n):
     assert uses.testing.any()
     assert uses.judging.any()
     if n >= DEFAULT.data.judging_from:
-        assert not uses.reused.any()
+        assert not (uses.judging & uses.testing).any()
         assert uses.judging.sum() == n // DEFAULT.data.judging_every
         assert np.array_equal(uses.identifying, ~uses.judging)
     else:
@@ -101,7 +101,7 @@ def test_breaths_that_judged_an_earlier_correction_judge_again():
     earlier = (2, 7, 11)  # of another split
     uses = split(breaths, never_fitted=earlier)
     assert breaths.breath_id[uses.judging].tolist() == list(earlier)
-    assert not uses.reused.any()
+    assert not (uses.judging & uses.testing).any()
     everything = tuple(breaths.breath_id.tolist())
     assert np.array_equal(split(breaths, never_fitted=everything).judging, split(breaths).judging)
 

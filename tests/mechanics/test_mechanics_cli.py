@@ -19,7 +19,7 @@ from ventbench.mechanics import identify
 from ventbench.recordings import Breaths, join, load, write
 
 app = typer.Typer()
-command.register(app)
+app.command()(command.mechanics)
 
 
 def run(*arguments: object, code: int = 0) -> str:

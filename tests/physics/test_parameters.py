@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from ventbench.base.errors import InputError
 from ventbench.physics import Parameter, parameter, paths
 
 
@@ -10,10 +9,6 @@ def test_transforms_and_their_inverses(path):
     item = parameter(path)
     inner = item.low + (item.high - item.low) * np.linspace(0.01, 0.99, 9)
     np.testing.assert_allclose(item.physical(item.coordinate(inner)), inner, rtol=1e-12)
-    np.testing.assert_allclose(item.constrain(item.unconstrain(inner)), inner, rtol=1e-9)
-    real = item.unconstrain(inner)
-    assert np.all(np.diff(real) > 0)
-    assert item.low <= item.constrain(-1e3) < item.constrain(1e3) <= item.high + 1e-12
     step = 1e-6
     moved = (item.physical(item.coordinate(inner) + step) - inner) / step
     np.testing.assert_allclose(item.slope(inner), moved, rtol=1e-4)
@@ -29,8 +24,6 @@ def test_prior_covers_the_range(path):
 
 
 def test_bad_values():
-    with pytest.raises(InputError, match=r"delay = 0\.2 is outside 0\.0\.\.0\.15 s"):
-        parameter("valve_delay.delay").unconstrain(0.2)
     with pytest.raises(ValueError, match="must lie within"):
         Parameter("x", "1", "out of bounds", 0.0, 1.0, 2.0, 0.5, 0.5)
     with pytest.raises(ValueError, match="positive lower bound"):

@@ -12,7 +12,7 @@ import ventbench
 from ventbench.base.errors import InputError
 from ventbench.plants.catalog import load_simulated
 from ventbench.recordings import load
-from ventbench.recordings.simulated import read_simulated
+from ventbench.recordings.read import read_simulated
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +19,6 @@ from numpy.typing import NDArray
 from ventbench.base.errors import InputError
 from ventbench.board import canonical
 from ventbench.task import protocol
-
-if TYPE_CHECKING:
-    from ventbench.board.record import Record
 
 Floats = NDArray[np.float64]
 
@@ -84,35 +80,3 @@ def decode(content: bytes, shape: Sequence[int], label: str) -> Floats:
 def shape(lungs: int, draws: int, pips: int) -> tuple[int, int, int, int, int]:
     """Shape of the commands of a score: ``(L, 1 + K, P, BREATHS, INSPIRATION)``."""
     return lungs, 1 + draws, pips, protocol.BREATHS, protocol.INSPIRATION_STEPS
-
-
-def path_of(record: Record, folder: Path) -> Path:
-    """Where the commands of a record lie."""
-    return folder / f"{record.header.actions.sha256}{SUFFIX}"
-
-
-def load(record: Record, folder: Path) -> Floats:
-    """Read the commands of a record.
-
-    Args:
-        record: whose they are.
-        folder: that holds the file.
-
-    Returns:
-        %, shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``.
-
-    Raises:
-        InputError: if the file is missing, or not the one that the record names.
-    """
-    path, actions = path_of(record, folder), record.header.actions
-    if not path.is_file() or path.is_symlink():
-        raise InputError(f"{path} is missing: the commands of record {record.sha256[:12]}")
-    if path.stat().st_size > MAX_BYTES:
-        raise InputError(f"{path} is larger than {MAX_BYTES / 1e6:g} MB")
-    content = path.read_bytes()
-    sha256 = canonical.digest(content)
-    if sha256 != actions.sha256:
-        raise InputError(f"{path} has been changed: its SHA-256 is {sha256}")
-    if len(content) != actions.bytes:
-        raise InputError(f"record {record.sha256}, key actions.bytes: {path} has {len(content)}")
-    return decode(content, actions.shape, str(path))

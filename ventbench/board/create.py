@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import ventbench
-from ventbench.base import files
+from ventbench.base import VERSION, files
 from ventbench.base.errors import InputError
 from ventbench.board import actions, canonical, record, schema
 from ventbench.board.record import HardwareRecord
@@ -280,13 +279,13 @@ def amend(
 
 def versions() -> dict[str, str]:
     """Versions of Python and packages, and the hash of the lock file where there is one."""
-    known = {"ventbench": ventbench.__version__, "python": platform.python_version()}
+    known = {"ventbench": VERSION, "python": platform.python_version()}
     for name in _PACKAGES:
         try:
             known[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    lock = Path(ventbench.__file__).resolve().parent.parent / "requirements.lock"
+    lock = Path(files.__file__).parent.resolve().parent.parent / "requirements.lock"
     if lock.is_file():
         known["requirements.lock"] = files.sha256(lock)
     return known

@@ -222,17 +222,11 @@ class Recording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     breaths: schema.Count
 
 
-class HardwareContent(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="hardware"
-):
+class HardwareContent(schema.SubmittedContent, frozen=True, tag_field="kind", tag="hardware"):
     """The content of a hardware record; L lungs, P PIPs, K repetitions."""
 
-    format: schema.Version
-    protocol: schema.Version
-    created: schema.Time
     track: Literal["hardware"]
     simulated_track: schema.Track
-    submission: schema.RecordedSubmission
     device: Device
     operator: schema.Text
     notes: schema.Text
@@ -248,11 +242,6 @@ class HardwareContent(
     plan: schema.FreeForm
     control: schema.FreeForm
     safety: schema.FreeForm
-    timing: schema.FreeForm
-    sandbox: schema.FreeForm | None
-    provenance: schema.FreeForm
-    versions: schema.FreeForm
-    machine: schema.FreeForm
 
 
 @dataclass(frozen=True)
@@ -349,6 +338,7 @@ def from_bytes(content: bytes, label: str, *, strict: bool = True) -> AnyRecord:
         return Withdrawal(sha256, values.withdraws, values.reason, values.created)
     if isinstance(values, HardwareContent):
         return _checked(values, sha256, label)
+    assert isinstance(values, schema.ScoreContent)
     size = len(values.lungs), len(values.pips)
     return Record(
         sha256,
@@ -458,6 +448,7 @@ def _checked(content: HardwareContent, sha256: str, label: str) -> HardwareRecor
     Raises:
         InputError: naming the first key that is wrong.
     """
+    schema.check_free(content.device.about, f"{label}, key device.about")
     _check_tables(content, label)
     errors = np.array(content.errors, float)
     pressures = content.trace.pressure_milli_cmH2O

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from datetime import datetime
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
@@ -21,9 +21,6 @@ from ventbench.entries.folder import CONTROLLER, combined_hash
 from ventbench.entries.manifest import FAMILIES, MANIFEST, NAME, TRACKS
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
-
-if TYPE_CHECKING:
-    from ventbench.board.record import HardwareContent
 
 #: What every record says of its form: records of another one are not read.
 FORMAT, PROTOCOL = 1, 2
@@ -228,21 +225,27 @@ class Actions(_Table, frozen=True):
     shape: Annotated[list[Count], msgspec.Meta(min_length=5, max_length=5)]
 
 
-class ScoreHeader(_Table, frozen=True):
-    """A score's record without its large tables; L lungs, P PIPs, K draws."""
+class SubmittedContent(_Table, frozen=True):
+    """What all records of a submission say, simulated or on hardware."""
 
     format: Version
     protocol: Version
     created: Time
-    official: bool
-    supersedes: Sha256 | None
-    reason: Text
     provenance: FreeForm
-    track: Track
     submission: RecordedSubmission
     sandbox: FreeForm | None
     versions: FreeForm
     machine: FreeForm
+    timing: FreeForm
+
+
+class ScoreHeader(SubmittedContent, frozen=True):
+    """A score's record without its large tables; L lungs, P PIPs, K draws."""
+
+    official: bool
+    supersedes: Sha256 | None
+    reason: Text
+    track: Track
     simulators: FreeForm
     draws: Draws
     lungs: Annotated[list[LungName], msgspec.Meta(min_length=1)]
@@ -253,7 +256,6 @@ class ScoreHeader(_Table, frozen=True):
     failures: list[RecordedFailure]
     failed_cells: Count
     actions: Actions
-    timing: FreeForm
 
 
 class ScoreContent(ScoreHeader, frozen=True, tag_field="kind", tag="score"):
@@ -284,7 +286,7 @@ class WithdrawalContent(_Table, frozen=True, tag_field="kind", tag="withdrawal")
 
 def read(
     content: bytes, label: str, decoder: msgspec.json.Decoder[Any]
-) -> ScoreContent | WithdrawalContent | HardwareContent:
+) -> SubmittedContent | WithdrawalContent:
     """Read and check the content of a record.
 
     Args:
@@ -306,28 +308,19 @@ def read(
     _check_time(record.created, f"{label}, key created")
     if isinstance(record, WithdrawalContent):
         return record
+    for key in record.__struct_fields__:
+        if isinstance(free := getattr(record, key), dict):
+            check_free(free, f"{label}, key {key}")
+    check_free(record.submission.files, f"{label}, key submission.files")
+    check_free(record.submission.manifest.training, f"{label}, key submission.manifest")
     if isinstance(record, ScoreContent):
-        for key in ("provenance", "simulators", "sandbox", "versions", "machine", "timing"):
-            _check_free(getattr(record, key), f"{label}, key {key}")
         _check_claims(record, label)
-    else:
-        for key in ("plan", "control", "safety", "timing", "sandbox", "provenance", "versions"):
-            _check_free(getattr(record, key), f"{label}, key {key}")
-        _check_free(record.machine, f"{label}, key machine")
-        _check_free(record.device.about, f"{label}, key device.about")
-    _check_submitted(record, label)
+    _check_submission(record.submission, f"{label}, key submission")
+    _check_origin(record, label)
     if isinstance(record, ScoreContent):
         _check_shapes(record, label)
         _check_consistent(record, label)
     return record
-
-
-def _check_submitted(record: ScoreContent | HardwareContent, label: str) -> None:
-    """Check what records of scores and of hardware say alike: the submission and the origin."""
-    _check_free(record.submission.files, f"{label}, key submission.files")
-    _check_free(record.submission.manifest.training, f"{label}, key submission.manifest")
-    _check_submission(record.submission, f"{label}, key submission")
-    _check_origin(record, label)
 
 
 def decoded(decoder: msgspec.json.Decoder[T], content: bytes, label: str) -> T:
@@ -354,7 +347,7 @@ def _short(message: str) -> str:
     return message if len(message) <= _MAX_MESSAGE else f"{message[:_MAX_MESSAGE]}…"
 
 
-def _check_free(value: Any, where: str, depth: int = MAX_DEPTH) -> None:
+def check_free(value: Any, where: str, depth: int = MAX_DEPTH) -> None:
     """Bound the texts, the whole numbers and the nesting of JSON of any form."""
     if isinstance(value, str) and len(value) > MAX_TEXT:
         raise InputError(f"{where}: holds a text of more than {MAX_TEXT} characters")
@@ -366,9 +359,9 @@ def _check_free(value: Any, where: str, depth: int = MAX_DEPTH) -> None:
         raise InputError(f"{where}: is nested more than {MAX_DEPTH} deep")
     if isinstance(value, dict):
         for key in value:
-            _check_free(key, where, depth - 1)
+            check_free(key, where, depth - 1)
     for part in value.values() if isinstance(value, dict) else value:
-        _check_free(part, where, depth - 1)
+        check_free(part, where, depth - 1)
 
 
 def _check_shapes(record: ScoreContent, label: str) -> None:
@@ -478,7 +471,7 @@ def _check_submission(submission: RecordedSubmission, where: str) -> None:
         raise InputError(f"{where}.sha256: is not that of its files")
 
 
-def _check_origin(record: ScoreContent | HardwareContent, label: str) -> None:
+def _check_origin(record: SubmittedContent, label: str) -> None:
     """Refuse a record that does not say by which versions and on what machine it was made."""
     for table, keys in (("versions", REQUIRED_VERSIONS), ("machine", REQUIRED_MACHINE)):
         for key in keys:

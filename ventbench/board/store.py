@@ -13,6 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.board import actions, attestation, canonical, record, schema
@@ -202,11 +205,11 @@ def add(
     if problems:
         raise InputError(f"{path}: {'; '.join(problems)}")
     if isinstance(added, Record):  # a hardware record has measured pressures, and no commands
-        actions.load(added, path.parent)
-        content = actions.path_of(added, path.parent).read_bytes()
+        load_commands(added, path.parent)
+        content = commands_path(added, path.parent).read_bytes()
         if simulators is not None:
             require_replay(added, content, simulators, str(path))
-        kept = actions.path_of(added, folder / RECORDS)
+        kept = commands_path(added, folder / RECORDS)
         files.write_atomically(kept, lambda file: file.write(content))
     _write(folder, added, path.read_bytes())
     return added
@@ -339,3 +342,35 @@ def _conflicts(entry: AnyRecord, before: _Before) -> list[str]:
     elif old.official and not entry.official:
         sentences.append(f"{name} is not official and supersedes an official record")
     return sentences
+
+
+def commands_path(record: Record, folder: Path) -> Path:
+    """Where the commands of a record lie."""
+    return folder / f"{record.header.actions.sha256}{actions.SUFFIX}"
+
+
+def load_commands(record: Record, folder: Path) -> NDArray[np.float64]:
+    """Read the commands of a record.
+
+    Args:
+        record: whose they are.
+        folder: that holds the file.
+
+    Returns:
+        %, shape ``(L, 1 + K, P, BREATHS, INSPIRATION_STEPS)``.
+
+    Raises:
+        InputError: if the file is missing, or not the one that the record names.
+    """
+    path, named = commands_path(record, folder), record.header.actions
+    if not path.is_file() or path.is_symlink():
+        raise InputError(f"{path} is missing: the commands of record {record.sha256[:12]}")
+    if path.stat().st_size > actions.MAX_BYTES:
+        raise InputError(f"{path} is larger than {actions.MAX_BYTES / 1e6:g} MB")
+    content = path.read_bytes()
+    sha256 = canonical.digest(content)
+    if sha256 != named.sha256:
+        raise InputError(f"{path} has been changed: its SHA-256 is {sha256}")
+    if len(content) != named.bytes:
+        raise InputError(f"record {record.sha256}, key actions.bytes: {path} has {len(content)}")
+    return actions.decode(content, named.shape, str(path))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
-from ventbench.board import actions, attestation, canonical, create, ranking, store
+from ventbench.board import attestation, canonical, create, ranking, store
 from ventbench.board.canonical import ATTESTATIONS, RECORDS
 from ventbench.board.record import AnyRecord, Record, RecordStress
 from ventbench.board.replay import (
@@ -250,7 +250,7 @@ def _replay_batch(
     by_draw: dict[str, Floats] = {}
     for score in batch:
         try:
-            requested.append(actions.load(score, folder / RECORDS))
+            requested.append(store.load_commands(score, folder / RECORDS))
             sound.append(score)
         except (InputError, OSError) as error:
             report.problems.append(str(error))
@@ -417,7 +417,7 @@ def _run(
             drawn=draws_of(score.header, simulators),
         )  # fmt: skip
         _check_same(open_submission(str(code)), score)
-        recorded = actions.load(score, folder / RECORDS)
+        recorded = store.load_commands(score, folder / RECORDS)
         detail = difference(score, recorded, result.requested)
         closeness = _closeness(recorded, result.requested)
         failed = {(x.lung, x.pip, x.draw) for x in result.failures}

@@ -392,9 +392,6 @@ def transfer(
     Console(stderr=str(json) == "-").print(table)
 
 
-Family = Literal["pid", "residual", "ppo", "dqn", "other"]
-
-
 def new(
     name: Annotated[
         str,
@@ -402,7 +399,7 @@ def new(
             help="At most 40 lower-case letters, digits and underscores, starting with a letter."
         ),
     ],
-    family: Annotated[Family, typer.Option(help="Kind of controller to start from.")] = "pid",
+    family: Annotated[str, typer.Option(help="Kind: pid, residual, ppo, dqn or other.")] = "pid",
     folder: Annotated[
         Path, typer.Option("--dir", metavar="DIR", help="Folder in which NAME/ is written.")
     ] = Path("."),

@@ -68,8 +68,8 @@ def coverage(
     from rich.table import Table
 
     from ventbench.base.errors import InputError
-    from ventbench.board import actions
     from ventbench.board import record as records
+    from ventbench.board import store
     from ventbench.plants import frozen
     from ventbench.task.metrics import open_loop
 
@@ -77,7 +77,7 @@ def coverage(
     if not isinstance(entry, records.Record):
         raise InputError(f"{record} is no record of a score that lies open")
     lungs = frozen.load().lungs()
-    commands = actions.load(entry, record.parent).clip(0.0, 100.0)
+    commands = store.load_commands(entry, record.parent).clip(0.0, 100.0)
     by_lung = open_loop.by_lung(dict(zip(entry.lungs, commands, strict=True)), lungs)
     emit({name: asdict(share) for name, share in by_lung.items()}, json)
     table = Table(title="Commands beyond the recordings, % of all")

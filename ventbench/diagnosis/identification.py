@@ -63,11 +63,6 @@ class Split:
         """Breaths of the final fits: all but the judging ones."""
         return ~self.judging
 
-    @property
-    def reused(self) -> NDArray[np.bool_]:
-        """Breaths that both test terms and judge the corrected simulator."""
-        return self.judging & self.testing
-
 
 def held_out(breaths: Breaths, settings: DataSettings = DEFAULT.data) -> NDArray[np.bool_]:
     """Every third breath (by default) of each lung, from its second on, bool, ``(n,)``."""

@@ -8,8 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import ventbench
-from ventbench.base import errors, files
+from ventbench.base import VERSION, errors, files
 from ventbench.diagnosis import report_text
 from ventbench.diagnosis.findings import (
     BreathRequest,
@@ -151,7 +150,7 @@ class Diagnosis(Findings):
             "recording_sha256": breaths.sha256,
             "held_out_breaths": list(self.open_loop.held_out_breaths),
             "chosen": dict(self.chosen),
-            "ventbench": ventbench.__version__,
+            "ventbench": VERSION,
         }
         save_plants(corrected, self.plants, about)
         return [*written, corrected]
@@ -211,7 +210,7 @@ class Diagnosis(Findings):
             "seconds": self.seconds,
             "settings": self.settings.as_dict(),
             "format": FORMAT,
-            "ventbench": ventbench.__version__,
+            "ventbench": VERSION,
         }
         return files.json_values(plain)
 

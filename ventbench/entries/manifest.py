@@ -20,8 +20,15 @@ MANIFEST = "submission.toml"
 #: Stands for the author until the author fills in a name.
 AUTHOR = "Your Name"
 
-#: What kinds of controller the board distinguishes.
-FAMILIES = ("pid", "residual", "ppo", "dqn", "other")
+#: Kinds of controller that the board distinguishes, and what a new submission of one says.
+#: A file ``templates/FAMILY.py`` is what it starts from; without one it is that of ``pid``.
+FAMILIES = {
+    "pid": "One set of PID gains for all lungs.",
+    "residual": "A PI controller plus a small network that corrects it; untrained: it adds zero.",
+    "ppo": "A policy network for PPO; untrained: its weights are made to act as a PI controller.",
+    "dqn": "Values of 51 commands for DQN; untrained: its weights are made to choose as a PI does.",
+    "other": "One set of PID gains for all lungs.",
+}
 
 #: The two boards.
 TRACKS = ("performance", "robustness")
@@ -171,7 +178,7 @@ _REQUIRED: dict[str, ValueCheck] = {
     "authors": _many(_text, least=1),
     "licence": _text,
     "api_version": _version,
-    "family": _one_of(FAMILIES),
+    "family": _one_of(tuple(FAMILIES)),
     "tracks": _many(_one_of(TRACKS), least=1),
     "description": _text,
 }

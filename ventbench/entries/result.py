@@ -15,18 +15,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-import ventbench
-from ventbench.base import files
+from ventbench.base import VERSION, files
 from ventbench.entries.cells import Protocol
 from ventbench.entries.folder import Submission
 from ventbench.entries.runs import CellFailure, Runs, number
 from ventbench.plants import frozen
-from ventbench.task import protocol
+from ventbench.task import protocol, stressors
 from ventbench.task.draws import DEVELOPMENT_SEED, Draws, commitment
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.metrics import bootstrap
 from ventbench.task.metrics.score import lung_score
-from ventbench.task.stressors import VERSION
 from ventbench.trajectories import Trajectories
 
 if TYPE_CHECKING:
@@ -299,7 +297,7 @@ class Score:
             return None
         return {
             "name": self.submission.manifest.name,
-            "stressors_version": VERSION,
+            "stressors_version": stressors.VERSION,
             **self.stressed.headline(),
             "draws": self.stressed.pips.shape[1],
             "failures": [failure.to_json() for failure in self.stressed.failures],
@@ -385,7 +383,7 @@ class Score:
 def package_versions() -> dict[str, str]:
     """Versions of ventbench, Python and the packages that compute a score."""
     return {
-        "ventbench": ventbench.__version__,
+        "ventbench": VERSION,
         "python": platform.python_version(),
         **{name: version(name) for name in ("jax", "jaxlib", "numpy")},
     }

@@ -21,16 +21,11 @@ from ventbench.entries.folder import CONTROLLER, bundled
 from ventbench.entries.manifest import AUTHOR, FAMILIES, MANIFEST, NAME, NAME_RULE
 from ventbench.task.interfaces import API_VERSION
 
+_TEMPLATES = resources.files("ventbench.entries") / "templates"
+
 #: File of the weights that the network families start from.
 WEIGHTS = "weights.npz"
 
-_DESCRIPTIONS = {
-    "pid": "One set of PID gains for all lungs.",
-    "residual": "A PI controller plus a small network that corrects it; untrained: it adds zero.",
-    "ppo": "A policy network for PPO; untrained: its weights are made to act as a PI controller.",
-    "dqn": "Values of 51 commands for DQN; untrained: its weights are made to choose as a PI does.",
-    "other": "One set of PID gains for all lungs.",
-}
 _FILES = {
     CONTROLLER: "class `Controller` with `reset(task)` and `act(observation)`",
     "network.py": "inputs and layers of the network",
@@ -101,8 +96,10 @@ def contents(name: str, family: str) -> dict[str, bytes]:
         name: what the entry is called; allowed.
         family: the entry's family; known.
     """
-    network = family in ("residual", "ppo", "dqn")
-    files = {CONTROLLER: _template(f"{family if network else 'pid'}.py").encode()}
+    known = (_TEMPLATES / f"{family}.py").is_file()
+    controller = _template(f"{family if known else 'pid'}.py")
+    files = {CONTROLLER: controller.encode()}
+    network = "from network import" in controller
     if network:
         files["network.py"] = _template("network.py").encode()
         files[WEIGHTS] = _npz(initial_weights(family))
@@ -111,7 +108,7 @@ def contents(name: str, family: str) -> dict[str, bytes]:
         "author": AUTHOR,
         "family": family,
         "api_version": API_VERSION,
-        "description": _DESCRIPTIONS[family],
+        "description": FAMILIES[family],
         "weights": _EXPORT if network else "",
     }
     files[MANIFEST] = Template(_template(MANIFEST)).substitute(values).encode()
@@ -164,7 +161,7 @@ def _check_name(name: str) -> None:
 
 
 def _template(name: str) -> str:
-    return (resources.files("ventbench.entries") / "templates" / name).read_text()
+    return (_TEMPLATES / name).read_text()
 
 
 def _npz(arrays: dict[str, NDArray[np.float32]]) -> bytes:

@@ -8,8 +8,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench.base.errors import InputError
-
 #: Flow of the PVP's inspiratory valve, mL/s per % (137 L/min fully open).
 VALVE_GAIN = 22.8
 
@@ -109,31 +107,6 @@ class Parameter:
         """Derivative of the physical value with respect to the coordinate."""
         value = np.asarray(value, float)
         return value if self.scale == "log" else np.ones_like(value)
-
-    def unconstrain(self, value: ArrayLike) -> NDArray[np.float64]:
-        """Any real number for a value within the bounds: logit of where it lies between them.
-
-        For samplers and optimisers without bounds; on a log scale it is the logarithm that lies
-        between. The bounds themselves are at minus and plus infinity.
-
-        Raises:
-            InputError: if a value is outside.
-        """
-        value = np.asarray(value, float)
-        if np.any((value < self.low) | (value > self.high)):
-            raise InputError(
-                f"{self.name} = {value} is outside {self.low}..{self.high} {self.unit}"
-            )
-        low, high = self.coordinate(self.low), self.coordinate(self.high)
-        share = (self.coordinate(value) - low) / (high - low)
-        with np.errstate(divide="ignore"):
-            return np.log(share) - np.log1p(-share)
-
-    def constrain(self, real: ArrayLike) -> NDArray[np.float64]:
-        """Inverse of :meth:`unconstrain`."""
-        real = np.asarray(real, float)
-        low, high = self.coordinate(self.low), self.coordinate(self.high)
-        return self.physical(low + (high - low) * 0.5 * (1.0 + np.tanh(0.5 * real)))
 
     def prior(self) -> tuple[float, float]:
         """Mean and standard deviation, in coordinates, of what is plausible before any data.

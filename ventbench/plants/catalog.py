@@ -50,7 +50,7 @@ from ventbench.plants.stacking import (
     stack_heterogeneous,
 )
 from ventbench.recordings.breaths import Breaths
-from ventbench.recordings.simulated import read_simulated
+from ventbench.recordings.read import read_simulated
 from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import LUNGS, Lung, lung
 
@@ -156,7 +156,7 @@ def load_simulated(path: str | Path, breaths: Breaths) -> Simulators:
     """Load simulated pressures that stand in a table beside the recorded ones.
 
     Args:
-        path: CSV or Parquet; see :func:`~ventbench.recordings.simulated.read_simulated`.
+        path: CSV or Parquet; see :func:`~ventbench.recordings.read.read_simulated`.
         breaths: the recording that they answer to.
 
     Raises:

@@ -15,11 +15,11 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 #: Most lines of Python: of the product, of the proofs beside it; most modules of the product.
-LINES = {"ventbench + hardware_eval": 66_000, "proofs": 9_000}
-MODULES = 330
+LINES = {"ventbench + hardware_eval": 64_300, "proofs": 9_000}
+MODULES = 302
 
 #: Most lines of one module, and most modules that lie loose in ``ventbench/``.
-LONGEST, LOOSE = 600, 8
+LONGEST, LOOSE = 580, 8
 
 #: Most words of Markdown (as ``wc -w`` counts), and the folders that hold it beside the root.
 WORDS = 28_000

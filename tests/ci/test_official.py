@@ -166,8 +166,13 @@ class Unsteady(InProcessRunner):
         session = super().start(submission, tasks)
         if len(tasks) == 6 * 21 * 6:
             self.runs += 1
-            act, shift = session.act, 1e-12 * self.runs
-            session.act = lambda observations: act(observations) + shift  # type: ignore[method-assign]
+            answers, shift = session.answers, 1e-12 * self.runs
+
+            def shifted():
+                cells, commands = answers()
+                return cells, commands + shift
+
+            session.answers = shifted  # type: ignore[method-assign]
         return session
 
 

@@ -38,7 +38,7 @@ def reply(sequence):
 
 def collect(pipes, due, sequence):
     deadline = time.monotonic() + PATIENCE_S
-    return pipes.collect(due, sequence, wire.COMMAND, PATIENCE_S, deadline)
+    return pipes.collect(due, [sequence] * 2, wire.COMMAND, PATIENCE_S, deadline)
 
 
 def test_between_two_observations(pipes, cell):
@@ -76,14 +76,25 @@ def test_silence_is_waited_out(pipes, cell):
     cell(0)
     due = {0}
     before = time.monotonic()
-    assert pipes.collect(due, 1, wire.COMMAND, 0.05, float("inf")) == {}
+    assert pipes.collect(due, [1], wire.COMMAND, 0.05, float("inf")) == {}
     assert due == {0}
     assert time.monotonic() - before >= 0.05
 
 
+def test_some_are_taken_without_the_others(pipes, cell):
+    own, _ = cell(0), cell(1)
+    os.write(own, reply(3))
+    due = {0, 1}
+    found = pipes.collect(due, [3, 7], wire.COMMAND, PATIENCE_S, float("inf"), some=True)
+    assert found[0].value == 50.0
+    assert due == {1}, "it may take its time"
+    os.write(own, reply(3))
+    assert set(pipes.early({1})) == {0}
+
+
 def test_a_deadline_ends_patience(pipes, cell):
     cell(0)
-    assert pipes.collect({0}, 1, wire.COMMAND, 300.0, time.monotonic() + 0.05) == {}
+    assert pipes.collect({0}, [1], wire.COMMAND, 300.0, time.monotonic() + 0.05) == {}
 
 
 def test_an_ended_cell_is_none(pipes):

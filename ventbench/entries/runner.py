@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from ventbench.entries.errors import Failure
 from ventbench.entries.folder import Submission
 from ventbench.sandbox.child.cell import Cell, Failed, controller_class
+from ventbench.sandbox.pipes import Asked
 from ventbench.task import protocol
 from ventbench.task.interfaces import Observation, Task
 
-Floats = NDArray[np.float64]
+Floats, Integers = NDArray[np.float64], NDArray[np.int64]
 
 #: Called with rounds of commands that are done, and all of them.
 Progress = Callable[[int, int], None]
@@ -34,17 +35,27 @@ class ControllerSession(Protocol):
         """What went wrong up to now, by index of the cell; a failed cell stays failed."""
         ...
 
-    def act(self, observations: Floats) -> Floats:
-        """Ask every controller for its next command.
+    def ask(self, cells: Integers, observations: Floats) -> None:
+        """Give some controllers their next observation; each is asked by itself.
 
-        Called once for each step of each inspiration, in order.
+        Of each controller once for each step of each inspiration, in order, after its answer.
 
         Args:
-            observations: one row a cell, see :func:`pack`, shape ``(cells, ROW)``.
+            cells: their indices, shape ``(n,)``.
+            observations: one row each, see :func:`pack`, shape ``(n, ROW)``.
+        """
+        ...
+
+    def answers(self) -> tuple[Integers, Floats]:
+        """Take the commands that have come, and wait for one if there is none.
 
         Returns:
-            ``u_in``, %, shape ``(cells,)``: finite, 0 for a failed cell, not clipped.
+            Cells, shape ``(m,)``, and their ``u_in``, %: finite, 0 for a failed cell, not clipped.
         """
+        ...
+
+    def act(self, observations: Floats) -> Floats:
+        """Ask every controller and wait for all, see :class:`ventbench.sandbox.pipes.Asked`."""
         ...
 
     def processor_time(self) -> float:
@@ -104,7 +115,7 @@ def pack(observation: Observation) -> Floats:
     return rows.reshape(-1, rows.shape[-1])
 
 
-class InProcessSession:
+class InProcessSession(Asked):
     """Controllers of all cells in this process; :class:`InProcessRunner` starts them."""
 
     def __init__(self, submission: Submission, tasks: Sequence[Task]):
@@ -113,7 +124,7 @@ class InProcessSession:
         if controller is None:
             controller = controller_class(submission.folder, submission.label)
         self.failures: dict[int, Failure] = {}
-        self._count = len(tasks)
+        self._answers: dict[int, float] = {}
         self._cells: dict[int, Cell] = {}
         for index, task in enumerate(tasks):
             try:
@@ -121,17 +132,21 @@ class InProcessSession:
             except Failed as failed:
                 self.failures[index] = failed.failure
 
-    def act(self, observations: Floats) -> Floats:
-        """Ask every controller for its next command; see :class:`ControllerSession`."""
-        commands = np.zeros(self._count)
-        rows = observations.tolist()
-        for index, cell in list(self._cells.items()):
-            try:
-                commands[index] = cell.act(rows[index])
-            except Failed as failed:
-                self.failures[index] = failed.failure
-                del self._cells[index]
-        return commands
+    def ask(self, cells: Integers, observations: Floats) -> None:
+        """Ask some controllers for their next command; see :class:`ControllerSession`."""
+        for index, row in zip(cells.tolist(), observations.tolist(), strict=True):
+            self._answers[index] = 0.0
+            if index in self._cells:
+                try:
+                    self._answers[index] = self._cells[index].act(row)
+                except Failed as failed:
+                    self.failures[index] = failed.failure
+                    del self._cells[index]
+
+    def answers(self) -> tuple[Integers, Floats]:
+        """Take the commands; see :class:`ControllerSession`."""
+        given, self._answers = self._answers, {}
+        return np.array(list(given), np.int64), np.array(list(given.values()))
 
     def processor_time(self) -> float:
         """Processor time of this process, s; see :class:`ControllerSession`."""
@@ -194,23 +209,27 @@ class CountingRunner:
 
     def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
         """Make and reset one fresh controller for each cell; see :class:`Runner`."""
-        return _CountingSession(self._runner.start(submission, tasks), self._count)
+        return _CountingSession(self._runner.start(submission, tasks), self._count, len(tasks))
 
     def _count(self) -> None:
         self._done += 1
         self._progress(self._done, self._total)
 
 
-class _CountingSession:
-    def __init__(self, session: ControllerSession, count: Callable[[], None]):
-        self._session, self._count = session, count
+class _CountingSession(Asked):
+    def __init__(self, session: ControllerSession, count: Callable[[], None], cells: int):
+        self._session, self._count, self._cells, self._left = session, count, cells, cells
+        self.ask = session.ask
         self.close, self.processor_time = session.close, session.processor_time
 
     @property
     def failures(self) -> Mapping[int, Failure]:
         return self._session.failures
 
-    def act(self, observations: Floats) -> Floats:
-        commands = self._session.act(observations)
-        self._count()
-        return commands
+    def answers(self) -> tuple[Integers, Floats]:
+        cells, commands = self._session.answers()
+        self._left -= len(cells)
+        while self._left <= 0:
+            self._left += self._cells
+            self._count()
+        return cells, commands

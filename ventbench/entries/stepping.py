@@ -1,4 +1,4 @@
-"""The loop between plants and controllers: all cells together, only numbers between them."""
+"""The loop between plants and controllers: only numbers cross, and no cell waits for another."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ventbench.entries.runner import Runner, pack
 from ventbench.task import environment as env
 from ventbench.task import protocol, rollouts
 from ventbench.task.environment import Scenario
-from ventbench.task.interfaces import Observation, Plant, PlantT, Task
+from ventbench.task.interfaces import Plant, PlantT, Task
 from ventbench.task.rollouts import Script
 
 Floats = NDArray[np.float64]
@@ -39,8 +39,7 @@ class ProtocolRun:
         u_in: what was applied, %.
         volume: gas in the lung, mL; None where the plants have no such signal.
         failures: what failed, by index of the cell.
-        act_seconds: time that one ``act`` took on average, s, for each round of all cells, shape
-            ``(BREATHS * INSPIRATION_STEPS,)``.
+        act_seconds: time on the clock that an answer took on average, s, each time that some came.
     """
 
     pressure: Floats
@@ -87,16 +86,31 @@ def _begin(plants: Plant, scenario: Scenario) -> tuple[Plant, env.LoopState]:
     return _strong(jax.vmap(begin)(plants, scenario))
 
 
-@jax.jit
-def _observe(scenario: Scenario, loop: env.LoopState, breath: Array, step: Array) -> Observation:
-    return jax.vmap(env.observe, in_axes=(0, 0, None, None))(scenario, loop, breath, step)
+_observe = jax.jit(env.observe)
 
 
 @jax.jit
 def _inspire(
-    plants: Plant, scenario: Scenario, loop: env.LoopState, u_in: Array
+    plants: Plant, scenario: Scenario, loop: env.LoopState, u_in: Array, which: Array
 ) -> tuple[env.LoopState, Array]:
-    return _strong(jax.vmap(env.inspire)(plants, scenario, loop, u_in))
+    """Apply commands to some cells; the others wait."""
+    after, applied = _strong(jax.vmap(env.inspire)(plants, scenario, loop, u_in))
+    return _where(which, after, loop), applied
+
+
+@jax.jit
+def _where(which: Array, one: Any, other: Any) -> Any:
+    """Take one state in some cells and the other in the rest, ``which`` of the batch shape."""
+
+    def choose(x: Array, y: Array) -> Array:
+        shape = which.shape + (1,) * (x.ndim - which.ndim)
+        return jnp.where(which.reshape(shape), x, y)
+
+    return jax.tree.map(choose, one, other)
+
+
+def _of_cells(values: Array, batch: tuple[int, ...]) -> Floats:
+    return np.broadcast_to(np.asarray(values), batch).ravel()
 
 
 class PlantError(FloatingPointError):
@@ -136,33 +150,47 @@ def step_through(
         PlantError: if a plant answers with NaN or infinity.
     """
     batch = np.shape(scenario.pip)
-    cells = int(np.prod(batch))
-    shape = (*batch, protocol.BREATHS, protocol.INSPIRATION_STEPS)
-    pressure, requested, applied, volume = (np.zeros(shape) for _ in range(4))
-    seconds, has_volume = [], True
+    cells, steps = int(np.prod(batch)), protocol.INSPIRATION_STEPS
+    total = protocol.BREATHS * steps
+    pressure, requested, applied, volume = (np.zeros((cells, total)) for _ in range(4))
     each = [task for task in tasks for _ in range(cells // len(tasks))]
+    breaths = range(protocol.BREATHS if changing else 1)
+    parts = [jax.tree.map(lambda x, k=k: x[:, k], plants) if changing else plants for k in breaths]
+    begun = [_begin(part, scenario) for part in parts]
+    loop, seconds = begun[0][1], []
+    has_volume = loop.signals.volume is not None
+    # Cells go on by themselves: what one takes, no other one waits for.
+    given, ready = np.zeros(cells, np.int64), np.arange(cells)
     with precision.float32():  # a submission that uses JAX finds it as it is elsewhere
         session = runner.start(submission, each)
     try:
-        for breath in range(protocol.BREATHS):
-            if changing or breath == 0:
-                now = jax.tree.map(lambda x, k=breath: x[:, k], plants) if changing else plants
-                varied, rest = _begin(now, scenario)
-            loop = rest
-            for step in range(protocol.INSPIRATION_STEPS):
-                rows = pack(_observe(scenario, loop, breath, step))
-                live = max(1, cells - len(session.failures))
-                start = time.perf_counter()
-                with precision.float32():
-                    commands = session.act(rows)
-                seconds.append((time.perf_counter() - start) / live)
-                commands = commands.reshape(batch)
-                at = (..., breath, step)
-                pressure[at], requested[at] = loop.signals.scored, commands
-                has_volume = loop.signals.volume is not None
-                if has_volume:
-                    volume[at] = loop.signals.volume
-                loop, applied[at] = _inspire(varied, scenario, loop, commands)
+        while (given < total).any():
+            at = np.minimum(given, total - 1).reshape(batch)
+            rows = pack(_observe(scenario, loop, at // steps, at % steps))
+            pressure[ready, given[ready]] = _of_cells(loop.signals.scored, batch)[ready]
+            if has_volume:
+                volume[ready, given[ready]] = _of_cells(loop.signals.volume, batch)[ready]
+            start = time.perf_counter()
+            with precision.float32():
+                session.ask(ready, rows[ready])
+                ready, commands = session.answers()
+            seconds.append((time.perf_counter() - start) / max(1, len(ready)))
+            requested[ready, given[ready]] = commands
+            u_in, moved = np.zeros(cells), np.zeros(cells, bool)
+            u_in[ready], moved[ready] = commands, True
+            for k, (varied, _) in enumerate(begun):
+                own = moved & (given // steps == k) if changing else moved
+                if own.any():
+                    loop, now = _inspire(
+                        varied, scenario, loop, u_in.reshape(batch), own.reshape(batch)
+                    )
+                    applied[own, given[own]] = _of_cells(now, batch)[own]
+            given[ready] += 1
+            for k, (_, rest) in enumerate(begun):
+                fresh = moved & (given % steps == 0) & ((given // steps == k) | (not changing))
+                if fresh.any():
+                    loop = _where(fresh.reshape(batch), rest, loop)
+            ready = ready[given[ready] < total]
         failures = dict(session.failures)
     finally:
         session.close()
@@ -170,6 +198,10 @@ def step_through(
     if broken.size:
         raise PlantError(int(broken[0]))
     by_cell = {tuple(int(i) for i in np.unravel_index(k, batch)): v for k, v in failures.items()}
+    shape = (*batch, protocol.BREATHS, steps)
+    pressure, requested, applied, volume = (
+        x.reshape(shape) for x in (pressure, requested, applied, volume)
+    )
     kept = volume if has_volume else None
     return ProtocolRun(pressure, requested, applied, kept, by_cell, np.array(seconds))
 

@@ -7,7 +7,10 @@ import os
 import random
 import selectors
 import time
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Mapping, Sequence, Set
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ventbench.sandbox.child import wire
 from ventbench.sandbox.child.wire import Reply, WireError
@@ -15,8 +18,39 @@ from ventbench.sandbox.child.wire import Reply, WireError
 #: Of bytes that nothing had asked for, whether they are found with the reply or before the next.
 _UNASKED = "bytes came after the reply"
 
+Floats, Integers = NDArray[np.float64], NDArray[np.int64]
+
 #: What became of a cell: its reply, a breach of the wire's rules, or None: its pipe has ended.
 Outcome = Reply | WireError | None
+
+
+class Asked:
+    """Controllers that are asked each by itself; none waits for another."""
+
+    def ask(self, cells: Integers, observations: Floats) -> None:
+        """Give some controllers an observation each; see ``ControllerSession``."""
+        raise NotImplementedError
+
+    def answers(self) -> tuple[Integers, Floats]:
+        """Take what has been answered; see ``ControllerSession``."""
+        raise NotImplementedError
+
+    def act(self, observations: Floats) -> Floats:
+        """Ask every controller for its next command, and wait for all of them.
+
+        Args:
+            observations: one row a cell, shape ``(cells, ROW)``.
+
+        Returns:
+            ``u_in``, %, shape ``(cells,)``.
+        """
+        commands, waiting = np.zeros(len(observations)), len(observations)
+        self.ask(np.arange(waiting), observations)
+        while waiting:
+            cells, values = self.answers()
+            commands[cells] = values
+            waiting -= len(cells)
+        return commands
 
 
 class Clock:
@@ -56,6 +90,7 @@ class Pipes:
     def __init__(self, clock: Clock | None = None) -> None:
         self._clock = clock or Clock()
         self._ends: dict[int, tuple[int, int]] = {}  # cell -> observations, replies
+        self._partial: dict[int, bytes] = {}  # of replies, until the rest of them comes
         self._selector = selectors.DefaultSelector()
         self._random = random.Random()  # seeded by the system; nobody else's stream is touched
 
@@ -101,12 +136,13 @@ class Pipes:
             self.close(cell)
         self._selector.close()
 
-    def early(self) -> dict[int, Outcome]:
-        """Cells that have written although nothing was due, or have ended."""
+    def early(self, due: Set[int] = frozenset()) -> dict[int, Outcome]:
+        """Cells that have written although nothing was due, or have ended; not those in ``due``."""
         outcomes: dict[int, Outcome] = {}
         for key, _ in self._selector.select(0):
-            data = self._read(key.fd)
-            outcomes[key.data] = WireError(_UNASKED) if data else None
+            if key.data not in due:
+                data = self._read(key.fd)
+                outcomes[key.data] = WireError(_UNASKED) if data else None
         return outcomes
 
     def send(self, frames: Mapping[int, bytes]) -> None:
@@ -116,25 +152,28 @@ class Pipes:
                 os.write(self._ends[cell][0], frames[cell])
 
     def collect(
-        self, due: set[int], sequence: int, kind: int, patience_s: float, deadline: float
-    ) -> dict[int, Outcome]:
+        self, due: set[int], sequence: Mapping[int, int] | Sequence[int], kind: int,
+        patience_s: float, deadline: float, *, some: bool = False,
+    ) -> dict[int, Outcome]:  # fmt: skip
         """Wait for one reply of each cell.
 
         Args:
             due: the cells; those that have not answered in time are left in it.
-            sequence: number of the observation that they answer.
+            sequence: number of the observation that each cell answers.
             kind: what kind of reply is due, besides a failure.
             patience_s: how long to wait for the next cell to answer.
             deadline: when to stop waiting altogether, by the clock, s.
+            some: take what is there once there is any, and wait for nobody else.
 
         Returns:
             By cell, what came.
         """
         outcomes: dict[int, Outcome] = {}
-        partial: dict[int, bytes] = {}
         progress = self._clock.now()
         while due:
             wait = min(progress + patience_s, deadline) - self._clock.now()
+            if some and outcomes:
+                wait = 0.0
             events = self._clock.wait(self._selector, max(wait, 0.0), due, kind)
             if not events and wait <= 0:
                 break
@@ -143,12 +182,12 @@ class Pipes:
                 try:
                     if cell not in due and data:
                         raise WireError(_UNASKED)
-                    data = partial[cell] + data if data and cell in partial else data
-                    outcome = wire.unpack_reply(data, sequence, (kind,)) if data else None
+                    data = self._partial.pop(cell, b"") + data if data else data
+                    outcome = wire.unpack_reply(data, sequence[cell], (kind,)) if data else None
                 except WireError as error:
                     outcome = error
                 if data and outcome is None:
-                    partial[cell] = data
+                    self._partial[cell] = data
                     continue
                 # A cell that has answered and then ends, or writes more, is found here too.
                 outcomes[cell] = outcome

@@ -49,7 +49,7 @@ def layers() -> tuple[str, ...]:
         zygote = ZygoteClient({**told, "limits": limits})
         try:
             pipes.open(0, lambda far: zygote.start(0, None, far))
-            outcomes = pipes.collect({0}, 0, wire.LOCKED, _PROBE_S, float("inf"))
+            outcomes = pipes.collect({0}, [0], wire.LOCKED, _PROBE_S, float("inf"))
         finally:
             pipes.close_all()
             zygote.close()

@@ -17,18 +17,15 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ventbench.sandbox.child import libc, lockdown, wire
 from ventbench.sandbox.child.failures import Failure, SubmissionError, printable
 from ventbench.sandbox.child.wire import Reply
 from ventbench.sandbox.configuration import Allowance, SandboxError, configuration
-from ventbench.sandbox.pipes import Clock, Outcome, Pipes
+from ventbench.sandbox.pipes import Asked, Clock, Floats, Integers, Outcome, Pipes
 from ventbench.sandbox.zygote import ZygoteClient, signal_name
 from ventbench.task import protocol
 from ventbench.task.interfaces import Task
-
-Floats = NDArray[np.float64]
 
 #: A silent cell is waited for this many patiences: the machine may be busy with others. But not
 #: once it has had a patience of processor time; of a processor alone it gets nearly all.
@@ -52,7 +49,7 @@ class SubmittedFolder(Protocol):
         ...
 
 
-class SandboxSession:
+class SandboxSession(Asked):
     """Fresh, locked-down controllers, one process each.
 
     It is a :class:`ventbench.entries.runner.ControllerSession`.
@@ -79,7 +76,8 @@ class SandboxSession:
     ):
         self.failures: dict[int, Failure] = {}
         self._count, self._live = len(tasks), set(range(len(tasks)))
-        self._allowance, self._sequence = allowance, 0
+        self._allowance, self._sequence = allowance, [0] * len(tasks)
+        self._asked, self._void = set[int](), set[int]()
         self._clock = clock or Clock()
         self._deadline = self._clock.now() + allowance.total_s
         with contextlib.ExitStack() as stack:
@@ -106,7 +104,8 @@ class SandboxSession:
                 self._zygote.start(cell, tasks[cell], far)
 
             self._pipes.open(cell, start)
-        replies, late = self._round({}, wire.LOCKED, self._allowance.start_patience_s)
+        due = set(self._live)
+        replies, late = self._round(due, wire.LOCKED, self._allowance.start_patience_s)
         for reply in replies.values():
             if not isinstance(reply, Reply) or reply.kind != wire.LOCKED:
                 raise SandboxError(f"a cell could not be locked down: {said(reply)}")
@@ -117,30 +116,44 @@ class SandboxSession:
             raise SandboxError(f"{len(late)} cells did not start in time")
 
     def _reset(self) -> None:
-        frames = dict.fromkeys(self._live, wire.BEGIN)
-        replies, late = self._round(frames, wire.READY, self._allowance.start_patience_s)
+        self._pipes.send(dict.fromkeys(self._live, wire.BEGIN))
+        due = set(self._live)
+        replies, late = self._round(due, wire.READY, self._allowance.start_patience_s)
         for cell, reply in replies.items():
             failure = self._judge(cell, reply)
             if failure is not None and failure.kind == "import":
                 raise SubmissionError(failure.what)
         self._give_up(late)
 
-    def act(self, observations: Floats) -> Floats:
-        """Ask every controller for its next command, as of ``ControllerSession``."""
-        self._sequence += 1
-        for cell, outcome in self._pipes.early().items():
+    def ask(self, cells: Integers, observations: Floats) -> None:
+        """Ask some controllers for their next commands, as of ``ControllerSession``."""
+        for cell, outcome in self._pipes.early(self._asked).items():
             self._judge(cell, outcome)
-        rows = np.ascontiguousarray(observations, "<f8")
-        frames = {
-            cell: wire.pack_observation(self._sequence, rows[cell].tobytes()) for cell in self._live
-        }
-        replies, late = self._round(frames, wire.COMMAND, self._allowance.patience_s)
-        commands = np.zeros(self._count)
-        for cell, reply in replies.items():
-            if self._judge(cell, reply) is None:
-                commands[cell] = reply.value  # type: ignore[union-attr]
-        self._give_up(late)
-        return commands
+        rows, frames = np.ascontiguousarray(observations, "<f8"), {}
+        for cell, row in zip(cells.tolist(), rows, strict=True):
+            self._sequence[cell] += 1
+            if cell in self._live:
+                frames[cell] = wire.pack_observation(self._sequence[cell], row.tobytes())
+        self._asked |= frames.keys()
+        self._void |= set(cells.tolist()) - frames.keys()
+        self._pipes.send(frames)
+
+    def answers(self) -> tuple[Integers, Floats]:
+        """Take the commands that are there, as of ``ControllerSession``."""
+        commands = dict.fromkeys(self._void, 0.0)
+        if self._asked and not self._void:
+            patience = self._allowance.patience_s
+            replies, late = self._round(set(self._asked), wire.COMMAND, patience, some=True)
+            for cell, reply in replies.items():
+                failed = self._judge(cell, reply) is not None
+                if cell in self._asked:  # else it wrote what nobody had asked for
+                    commands[cell] = 0.0 if failed else reply.value  # type: ignore[union-attr]
+            self._asked -= replies.keys()
+            self._give_up(late)
+            self._asked -= late
+            commands |= dict.fromkeys(late, 0.0)
+        self._void.clear()
+        return np.array(list(commands), np.int64), np.array(list(commands.values()))
 
     def processor_time(self) -> float:
         """Processor time that all cells have had, s, as the kernel counts it."""
@@ -152,21 +165,28 @@ class SandboxSession:
         self._stack.close()
 
     def _round(
-        self, frames: dict[int, bytes], kind: int, patience_s: float
+        self, due: set[int], kind: int, patience_s: float, *, some: bool = False
     ) -> tuple[dict[int, Outcome], set[int]]:
-        """Send frames and wait for replies; cells that compute or are kept from it are waited for.
+        """Wait for replies; cells that compute or are kept from it are waited for.
+
+        Args:
+            due: cells that owe a reply.
+            kind: of the reply.
+            patience_s: processor time of it; on the clock :data:`_SILENCES` times as much.
+            some: take what is there once there is any.
 
         Returns:
-            What came, by cell, and the cells that are out of time: the session's, or patience_s of
-            processor time, or :data:`_SILENCES` times as long on the clock.
+            What came, by cell, and the cells that are out of time, their own or the session's.
         """
-        self._pipes.send(frames)
-        due, over = set(self._live), set[int]()
-        outcomes: dict[int, Outcome] = {}
+        over, outcomes = set[int](), dict[int, Outcome]()
         used: dict[int, float] = {}  # when a cell was first found silent
         for _ in range(_SILENCES):
-            outcomes |= self._pipes.collect(due, self._sequence, kind, patience_s, self._deadline)
-            if not due or self._clock.now() >= self._deadline:
+            outcomes |= self._pipes.collect(
+                due, self._sequence, kind, patience_s, self._deadline, some=some
+            )
+            if not due or (some and outcomes):
+                return outcomes, over
+            if self._clock.now() >= self._deadline:
                 break
             now = self._zygote.processor_time(due)
             over |= {c for c in due if now[c] - used.setdefault(c, now[c]) >= _BUSY * patience_s}
@@ -180,7 +200,7 @@ class SandboxSession:
                 return None
             return self._fail(cell, Verdict("value", f"act returned {outcome.value}"))
         if isinstance(outcome, Reply):
-            return self._fail(cell, failed(outcome.text, self._sequence))
+            return self._fail(cell, failed(outcome.text, self._sequence[cell]))
         if outcome is None:
             return self._fail(cell, ended(self._zygote.status(cell, self._clock.status_s)))
         return self._fail(
@@ -191,11 +211,14 @@ class SandboxSession:
         """Time out cells; first ask each where it is."""
         if not late:
             return
-        for cell in late:
-            self._zygote.interrupt(cell)
-        waiting = set(late)
-        deadline = self._clock.now() + _GRACE_S + 0.01 * len(late)
-        outcomes = self._pipes.collect(waiting, self._sequence, wire.FAILED, _GRACE_S, deadline)
+        outcomes: dict[int, Outcome] = {}
+        if not self._asked - late:  # nobody else may answer meanwhile
+            for cell in late:
+                self._zygote.interrupt(cell)
+            deadline = self._clock.now() + _GRACE_S + 0.01 * len(late)
+            outcomes = self._pipes.collect(
+                set(late), self._sequence, wire.FAILED, _GRACE_S, deadline
+            )
         limit = f"{self._allowance.total_s:g} s for the whole score"
         if self._clock.now() < self._deadline:
             patience = self._allowance.patience_s
@@ -207,8 +230,8 @@ class SandboxSession:
 
     def _fail(self, cell: int, verdict: Verdict) -> Failure:
         breath = step = None
-        if self._sequence:
-            breath, step = divmod(self._sequence - 1, protocol.INSPIRATION_STEPS)
+        if self._sequence[cell]:
+            breath, step = divmod(self._sequence[cell] - 1, protocol.INSPIRATION_STEPS)
             breath, step = breath + 1, step + 1
         self.failures[cell] = failure = Failure(*verdict, breath, step)
         self._live.discard(cell)

@@ -117,10 +117,16 @@ def observe(
     Args:
         scenario: the cells.
         loop: state of the loop.
-        breath: index of the breath.
-        step: index of the step in the breath, below ``INSPIRATION_STEPS``.
+        breath: index of the breath; of all cells, or of each, shape ``(...)``.
+        step: index of the step in the breath, below ``INSPIRATION_STEPS``; as ``breath``.
     """
-    measured = loop.signals.reading + scenario.noise[..., breath, step]
+    if jnp.ndim(step):
+        at = jnp.asarray(breath) * protocol.INSPIRATION_STEPS + step
+        flat = scenario.noise.reshape(*scenario.noise.shape[:-2], -1)
+        noise = jnp.take_along_axis(flat, at[..., None], axis=-1)[..., 0]
+    else:
+        noise = scenario.noise[..., breath, step]
+    measured = loop.signals.reading + noise
     quantum = jnp.where(scenario.quantum > 0, scenario.quantum, 1.0)
     measured = jnp.where(scenario.quantum > 0, jnp.round(measured / quantum) * quantum, measured)
     ahead = jnp.stack(

@@ -26,8 +26,11 @@ class Pretender:
         self.failures = {}
         return self
 
-    def act(self, observations):
-        return np.full(len(observations), 3.0)
+    def ask(self, cells, observations):
+        self.cells = cells
+
+    def answers(self):
+        return self.cells, np.full(len(self.cells), 3.0)
 
     def close(self):
         pass

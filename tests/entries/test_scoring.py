@@ -314,11 +314,14 @@ class Recorder:
         self.tasks, self.closed, self.failures, self.rows = tasks, 0, {}, []
         return self
 
-    def act(self, observations):
+    def ask(self, cells, observations):
+        self.cells = cells
         self.rows.append(observations)
         if len(self.rows) == 50:
             self.failures[len(self.tasks) - 1] = Failure("timeout", "took 1 s", "", 2, 16)
-        return np.full(len(observations), 2.0)
+
+    def answers(self):
+        return self.cells, np.full(len(self.cells), 2.0)
 
     def close(self):
         self.closed += 1
@@ -342,7 +345,7 @@ def test_another_runner(plants):
 
 def test_session_is_closed_when_the_loop_breaks(plants):
     class Breaks(Recorder):
-        def act(self, observations):
+        def answers(self):
             raise KeyboardInterrupt
 
     runner = Breaks()
@@ -487,8 +490,14 @@ def test_progress_counts_the_rounds_of_all_sessions():
         def __init__(self):
             self.failures = {0: "something"}
 
-        def act(self, observations):
-            return observations[:, 0]
+        def ask(self, cells, observations):
+            self.asked = cells, observations[:, 0]
+
+        def answers(self):
+            return self.asked
+
+        def processor_time(self):
+            return 0.0
 
         def close(self):
             Session.closed += 1

@@ -502,9 +502,6 @@ def test_progress_counts_the_rounds_of_all_sessions():
         def close(self):
             Session.closed += 1
 
-        def processor_time(self):
-            return 0.0
-
     class Plain:
         def __init__(self):
             self.sandbox = {"layer": "none"}

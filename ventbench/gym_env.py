@@ -1,16 +1,18 @@
-"""``ventbench/Ventilator-v1``: the benchmark as a Gymnasium environment, one breath an episode.
+"""``ventbench/Ventilator-v1``: the ranked task as a Gymnasium environment, alone or many at once.
 
 Importing this module registers it; so does Gymnasium itself, ``gymnasium.make`` and
-``gymnasium.make_vec`` by the name ``"ventbench.gym_env:ventbench/Ventilator-v1"``. Needs the extra
-``ventbench[gym]``.
+``gymnasium.make_vec`` by the name ``"ventbench.gym_env:ventbench/Ventilator-v1"``. The task is that
+of :mod:`ventbench.train.rl.environment`. Needs the extra ``ventbench[gym]``.
 """
 
 # ruff: noqa: E402  # a missing package is named before its import fails
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from ventbench.base.errors import InputError, require
 
@@ -27,167 +29,105 @@ from jax import Array
 from numpy.typing import NDArray
 
 from ventbench.base import precision
-from ventbench.plants import frozen
-from ventbench.task import environment as env
+from ventbench.plants.catalog import Given
 from ventbench.task import protocol
-from ventbench.task.draws import random_scenarios
-from ventbench.task.environment import Scenario
-from ventbench.task.interfaces import Plant
-from ventbench.task.lungs import LUNG_IDS, scored_lung
-from ventbench.train.rl import episodes
-
-#: What an observation holds, in order, each of the order of 1: pressure / 40, target / 40, the
-#: next ten targets / 40, command before / 50 - 1, time in s, control step / 0.03.
-OBSERVATION = 5 + protocol.TARGETS_AHEAD
+from ventbench.task.lungs import lung as parse_lung
+from ventbench.train.plants import plants_to_train_on
+from ventbench.train.rl import environment
+from ventbench.train.rl.environment import STEPS
+from ventbench.train.rl.episodes import Lungs
 
 Floats = NDArray[np.float32]
 
 
-@jax.jit
-def _start(plant: Plant, cell: Scenario) -> tuple[env.LoopState, Array]:
-    loop = env.start_breath(env.vary(plant, cell), cell)
-    return loop, _seen(cell, loop, 0)
+@dataclass(frozen=True)
+class _Layout:
+    """Where the leaves of a tree lie in one vector, so that a compiled step has few arguments."""
+
+    structure: Any
+    shapes: tuple[tuple[int, ...], ...]
+
+    @classmethod
+    def of(cls, tree: Any) -> _Layout:
+        """Layout of a tree of arrays or of their shapes."""
+        leaves, structure = jax.tree.flatten(tree)
+        return cls(structure, tuple(leaf.shape for leaf in leaves))
+
+    def unpack(self, vector: Array) -> Any:
+        """Tree of a vector that :func:`_pack` made."""
+        ends = np.cumsum([math.prod(shape) for shape in self.shapes])
+        parts = jnp.split(vector, ends[:-1])
+        leaves = [part.reshape(shape) for part, shape in zip(parts, self.shapes, strict=True)]
+        return jax.tree.unflatten(self.structure, leaves)
 
 
-@jax.jit
-def _step(
-    plant: Plant, cell: Scenario, loop: env.LoopState, u_in: Array, step: Array
-) -> tuple[env.LoopState, Array, Array]:
-    """State one step later, what is seen then, and the airway pressure, cmH2O."""
-    varied = env.vary(plant, cell)
-    loop, _ = env.inspire(varied, cell, loop, u_in)
-    # The target holds to the last step; the observation after it is of the same kind.
-    after = jnp.minimum(step + 1, protocol.INSPIRATION_STEPS - 1)
-    return loop, _seen(cell, loop, after), loop.signals.scored
+def _pack(tree: Any) -> Array:
+    return jnp.concatenate([leaf.reshape(-1) for leaf in jax.tree.leaves(tree)])
 
 
 @partial(jax.jit, static_argnames="vary")
-def _cell(key: Array, pip: Array, vary: bool) -> Scenario:
-    cells = episodes.sample(key, 1, first=pip, vary=vary, breaths=1)
-    return jax.tree.map(lambda leaf: leaf[0], cells)
+def _reset(
+    seed: Array, lungs: Lungs, lung: Array, pip: Array, *, vary: bool
+) -> tuple[Array, Array, Array, Array]:
+    """Begin E episodes.
 
-
-@partial(jax.jit, static_argnames="vary")
-def _cells(key: Array, pips: Array, vary: bool) -> Scenario:
-    return random_scenarios(key, pips, spread=None if vary else 0.0, breaths=1)
-
-
-def _seen(cell: Scenario, loop: env.LoopState, step: Array | int) -> Array:
-    seen = env.observe(cell, loop, 0, step)
-    values = [
-        seen.pressure / 40.0,
-        seen.target / 40.0,
-        *(seen.targets_ahead[..., k] / 40.0 for k in range(protocol.TARGETS_AHEAD)),
-        seen.previous_u_in / 50.0 - 1.0,
-        seen.time,
-        seen.dt / protocol.DT,
-    ]
-    return jnp.stack([jnp.asarray(value, jnp.float32) for value in values], axis=-1)
-
-
-class Ventilator(gymnasium.Env[Floats, Floats]):
-    """One inspiration from rest: 33 commands that move the pressure that is scored.
-
-    Action: ``u_in`` as ``50 + 50 a``, %, with ``a`` in -1..1. Reward: minus the absolute error
-    that follows, cmH2O, over 10. ``info`` holds ``lung``, ``pip``, ``pressure`` (true) and, at the
-    end, ``error``: the mean absolute error of the breath as the score counts it, cmH2O.
-
-    Args:
-        lung: id of the lung; a lung at random for each breath if not given.
-        pip: peak pressure, cmH2O; one of the six at random if not given.
-        noise: deviations and sensor noise drawn anew from the distributions of the scored draws;
-            else nominal breaths.
-        render_mode: must be None.
-
-    Raises:
-        InputError: if there is no such lung, or the PIP is outside 6..60 cmH2O.
+    Returns:
+        What stays the same in them and what changes, a row a number and a column an episode; PIPs,
+        cmH2O; observations.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+    def begin(key: Array, lung: Array, pip: Array) -> tuple[Array, Array, Array, Array]:
+        state, seen = environment.reset(key, lungs, lung, pip, vary=vary)
+        return _pack(state.episode), _pack(state.progress), state.episode.cell.pip, seen
 
-    def __init__(
-        self,
-        lung: str | None = None,
-        pip: float | None = None,
-        noise: bool = True,
-        render_mode: str | None = None,
-    ):
-        if render_mode is not None:
-            raise InputError("this environment draws nothing; leave render_mode out")
-        if pip is not None and not protocol.PEEP < pip <= protocol.SAFETY_PRESSURE:
-            raise InputError(f"PIP {pip:g} cmH2O is outside of 5..60 cmH2O")
-        self.render_mode = None
-        self._lungs = LUNG_IDS if lung is None else (scored_lung(lung).id,)
-        self._pip, self._noise = pip, noise
-        with precision.float32():
-            plants = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), frozen.load().plants)
-            self._plants = [jax.tree.map(lambda x, i=i: x[i], plants) for i in range(len(LUNG_IDS))]
-        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
-        low, high = np.full(OBSERVATION, -5.0, np.float32), np.full(OBSERVATION, 5.0, np.float32)
-        self.observation_space = spaces.Box(low, high, dtype=np.float32)
-        self._loop: env.LoopState | None = None
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Floats, dict[str, Any]]:
-        """Begin a breath; see :meth:`gymnasium.Env.reset`. No options are known."""
-        super().reset(seed=seed)
-        self._lung = self._lungs[int(self.np_random.integers(len(self._lungs)))]
-        which, number = self.np_random.integers([len(protocol.PIPS), 2**32])
-        with precision.float32():
-            key = jax.random.key(jnp.asarray(number, jnp.uint32))
-            cell = _cell(key, jnp.asarray(which), self._noise)
-            if self._pip is not None:
-                shift = cell.pip - jnp.asarray(protocol.PIPS, jnp.float32)[int(which)]
-                cell = cell.replace(pip=self._pip + shift)  # type: ignore[attr-defined]
-            self._cell: Scenario = cell
-            self._plant = self._plants[LUNG_IDS.index(self._lung)]
-            self._loop, seen = _start(self._plant, cell)
-        self._count = 0
-        self._pressure = float(cell.start)
-        self._total = abs(self._pressure - float(cell.pip))
-        return np.asarray(seen), self._info()
-
-    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        """Apply a command; see :meth:`gymnasium.Env.step`.
-
-        Raises:
-            InputError: if no breath is under way, or the action is not finite.
-        """
-        if self._loop is None or self._count >= episodes.STEPS:
-            raise InputError("no breath is under way: call reset() first")
-        value = float(np.asarray(action, np.float32).reshape(-1)[0])
-        if not np.isfinite(value):
-            raise InputError(f"the action is {value}; it must be a number from -1 to 1")
-        with precision.float32():
-            u_in, step = jnp.asarray(50.0 + 50.0 * value), jnp.asarray(self._count)
-            self._loop, seen, pressure = _step(self._plant, self._cell, self._loop, u_in, step)
-        self._pressure = float(pressure)
-        error = abs(self._pressure - float(self._cell.pip))
-        self._count += 1
-        self._total += error
-        ended = self._count == episodes.STEPS
-        info = self._info()
-        if ended:
-            info["error"] = self._total / protocol.INSPIRATION_STEPS
-        return np.asarray(seen), -error / episodes.REWARD_SCALE, ended, False, info
-
-    def _info(self) -> dict[str, Any]:
-        return {"lung": self._lung, "pip": float(self._cell.pip), "pressure": self._pressure}
+    keys = jax.random.split(jax.random.key(seed), lung.shape[0])
+    return jax.vmap(begin, out_axes=(-1, -1, 0, 0))(keys, lung, pip)
 
 
-class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, NDArray[np.float64]]):
-    """Many ventilators at once, each step compiled: what :class:`Ventilator` does, batched.
+@partial(jax.jit, static_argnames="layouts")
+def _step(
+    episodes: Array,
+    progress: Array,
+    count: Array,
+    actions: Array,
+    *,
+    layouts: tuple[_Layout, _Layout],
+) -> tuple[Array, ...]:
+    """Return the next progress and count, observations, rewards, pressures and sums of errors."""
 
-    Every breath has 33 commands, so that all end together. The call of ``step`` after the end
-    ignores its actions and begins new breaths, with reward 0 (``AutoresetMode.NEXT_STEP``).
+    def advance(episode: Array, progress: Array, action: Array) -> tuple[Array, ...]:
+        parts = (layout.unpack(x) for layout, x in zip(layouts, (episode, progress), strict=True))
+        state, seen, reward, _ = environment.step(environment.State(*parts, count), action)
+        after = state.progress
+        return _pack(after), seen, reward, after.loop.signals.scored, after.error
+
+    axes = {"in_axes": (-1, -1, 0), "out_axes": (-1, 0, 0, 0, 0)}
+    after, *told = jax.vmap(advance, **axes)(episodes, progress, actions.reshape(-1))
+    return after, count + 1, *told
+
+
+class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):
+    """Many ventilators at once, each step one compiled call.
+
+    An episode is a run as it is scored: three breaths of 34 commands, on any training rig of the
+    lung, with hidden deviations drawn anew. All episodes end together. The call of ``step`` after
+    the end ignores its actions and begins new ones, with reward 0 (``AutoresetMode.NEXT_STEP``).
+
+    Action: ``u_in`` as ``50 + 50 a``, %, with ``a`` in -1..1. Reward: minus the absolute error that
+    follows, cmH2O, over 10, with the weight of the lung and PIP in the ranked score. ``info`` holds
+    ``lung`` and ``pip`` at the start of episodes and ``error`` at their end: the mean absolute
+    error as the score counts it, cmH2O.
 
     Args:
         num_envs: number of ventilators E.
-        lung: id of the lung; the six in turn if not given.
+        lung: id of the lung; all in turn if not given.
         pip: peak pressure, cmH2O; the six of the protocol in turn if not given.
-        noise: as of :class:`Ventilator`.
-        render_mode: must be None.
+        rigs: ``"training"``, the population of the ranked draws; or ``"reference"``, the rig of the
+            nominal score.
+        noise: deviations and sensor noise drawn anew from the distributions of the scored draws;
+            else nominal breaths on the reference rig.
+        simulator: see :func:`ventbench.load_simulators`.
+        render_mode: must be None; one :class:`Ventilator` draws.
 
     Raises:
         InputError: if there is no such lung, the PIP is outside 5..60 cmH2O, or E is below 1.
@@ -203,89 +143,183 @@ class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, NDArray[np.flo
         num_envs: int = 1,
         lung: str | None = None,
         pip: float | None = None,
+        rigs: Literal["training", "reference"] = "training",
         noise: bool = True,
+        simulator: Given = "frozen",
         render_mode: str | None = None,
     ):
         if num_envs < 1:
             raise InputError(f"num_envs is {num_envs}; it must be at least 1")
-        single = Ventilator(lung, pip, noise, render_mode)
+        if render_mode is not None:
+            raise InputError("many at once draw nothing; leave render_mode out")
+        if pip is not None and not protocol.PEEP < pip <= protocol.SAFETY_PRESSURE:
+            raise InputError(f"PIP {pip:g} cmH2O is outside of 5..60 cmH2O")
         self.num_envs, self.render_mode = num_envs, None
-        self.single_action_space = single.action_space
-        self.single_observation_space = single.observation_space
-        self.action_space = batch_space(single.action_space, num_envs)
-        self.observation_space = batch_space(single.observation_space, num_envs)
-        lungs = [LUNG_IDS.index(name) for name in single._lungs]
-        self._lungs = [LUNG_IDS[i] for i in np.resize(lungs, num_envs)]
+        self.single_action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        limit = np.full(environment.OBSERVATION, 5.0, np.float32)
+        self.single_observation_space = spaces.Box(-limit, limit, dtype=np.float32)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        known = self.lungs = plants_to_train_on(simulator).names
+        if lung is not None and parse_lung(lung).id not in known:
+            raise InputError(f"{lung} is not a lung of the simulators: {', '.join(known)}")
+        chosen = range(len(known)) if lung is None else [known.index(parse_lung(lung).id)]
+        self._lung = np.resize(np.array(chosen), num_envs)
+        self._names = np.array(known, object)[self._lung]
         # Each lung gets each PIP before the first PIP comes again.
-        turn = np.arange(num_envs) // len(lungs) % len(protocol.PIPS)
-        self._pips = np.asarray(protocol.PIPS)[turn] if pip is None else np.full(num_envs, pip)
-        self._noise = noise
+        turn = np.arange(num_envs) // len(chosen) % len(protocol.PIPS)
+        pips = np.asarray(protocol.PIPS, np.float32)[turn]
+        self._pips = pips if pip is None else np.full(num_envs, pip, np.float32)
+        self._turn = len(chosen)
+        self._rigs, self._noise = environment.load_lungs(simulator, rigs=rigs), noise
         with precision.float32():
-            plants = jax.tree.map(
-                lambda *leaf: jnp.stack(leaf), *(single._plants[i] for i in lungs)
-            )
-            which = jnp.arange(num_envs) % len(lungs)
-            self._plants = jax.tree.map(lambda leaf: jnp.asarray(leaf)[which], plants)
-        self._loop: env.LoopState | None = None
+            state, _ = jax.eval_shape(environment.reset, jax.random.key(0), self._rigs)
+        self._layouts = _Layout.of(state.episode), _Layout.of(state.progress)
+        self._count = STEPS + 1
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Begin a breath in each; one seed for all, and no options are known."""
+        """Begin an episode in each; one seed for all, and no options are known."""
         super().reset(seed=seed)
-        # PIPs change lungs from breath to breath.
-        shift = int(self.np_random.integers(len(protocol.PIPS))) * len(set(self._lungs))
+        # PIPs change lungs from episode to episode.
+        shift = int(self.np_random.integers(len(protocol.PIPS))) * self._turn
+        number = np.uint32(self.np_random.integers(2**32))
         with precision.float32():
-            key = jax.random.key(jnp.asarray(self.np_random.integers(2**32), jnp.uint32))
-            pips = jnp.asarray(np.roll(self._pips, shift), jnp.float32)
-            self._cells = _cells(key, pips, self._noise)
-            loop, seen = _start(self._plants, self._cells)
-        self._loop, self._count = loop, 0
-        self._pressure = np.asarray(loop.signals.scored, float)
-        self._total = np.abs(self._pressure - np.asarray(self._cells.pip, float))
-        return np.asarray(seen), self._info()
+            self._episodes, self._progress, pip, seen = _reset(
+                number, self._rigs, self._lung, np.roll(self._pips, shift), vary=self._noise
+            )
+            self._steps = jnp.zeros((), jnp.int32)
+        self._count = 0
+        everywhere = np.ones(self.num_envs, bool)
+        info = {"lung": self._names, "pip": np.asarray(pip)}
+        return np.array(seen), info | {f"_{name}": everywhere for name in info}
 
     def step(
         self, actions: Floats
-    ) -> tuple[Floats, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+    ) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Apply a command to each; see :meth:`gymnasium.vector.VectorEnv.step`.
 
         Args:
             actions: shape ``(E, 1)``.
 
         Raises:
-            InputError: if no breath is under way, or an action is not finite.
+            InputError: if no episode is under way, or an action is not finite.
         """
-        if self._loop is None:
-            raise InputError("no breath is under way: call reset() first")
+        if self._count > STEPS:
+            raise InputError("no episode is under way: call reset() first")
         nothing = np.zeros(self.num_envs, bool)
-        if self._count == episodes.STEPS:
+        if self._count == STEPS:
             seen, info = self.reset()
-            return seen, np.zeros(self.num_envs), nothing, nothing.copy(), info
-        values = np.asarray(actions, np.float32).reshape(self.num_envs)
-        if not np.isfinite(values).all():
-            at = int(np.argmin(np.isfinite(values)))
-            raise InputError(f"action {at} is {values[at]}; it must be a number from -1 to 1")
+            return seen, np.zeros(self.num_envs, np.float32), nothing, nothing.copy(), info
+        values = np.asarray(actions, np.float32)
+        if not np.isfinite(values.sum()):
+            at = int(np.argmin(np.isfinite(values.reshape(self.num_envs))))
+            raise InputError(f"action {at} is {values[at, 0]}; it must be a number from -1 to 1")
         with precision.float32():
-            u_in, step = jnp.asarray(50.0 + 50.0 * values), jnp.asarray(self._count)
-            self._loop, seen, pressure = _step(self._plants, self._cells, self._loop, u_in, step)
+            self._progress, self._steps, seen, reward, self.pressure, error = _step(
+                self._episodes, self._progress, self._steps, values, layouts=self._layouts
+            )
         self._count += 1
-        self._pressure = np.asarray(pressure, float)
-        errors = np.abs(self._pressure - np.asarray(self._cells.pip, float))
-        self._total += errors
-        ended = np.full(self.num_envs, self._count == episodes.STEPS)
-        info = self._info()
-        if ended[0]:
-            info |= {"error": self._total / protocol.INSPIRATION_STEPS, "_error": ended.copy()}
-        return np.asarray(seen), -errors / episodes.REWARD_SCALE, ended, nothing, info
+        ended, info = ~nothing if self._count == STEPS else nothing.copy(), {}
+        if self._count == STEPS:
+            info = {"error": np.asarray(error) / environment.SCORED_STEPS, "_error": ended}
+        # Copies, which may be written to, as learners expect.
+        return np.array(seen), np.array(reward), ended, nothing, info
 
-    def _info(self) -> dict[str, Any]:
-        values = {
-            "lung": np.array(self._lungs, object),
-            "pip": np.asarray(self._cells.pip, float),
-            "pressure": self._pressure,
-        }
-        return values | {f"_{name}": np.ones(self.num_envs, bool) for name in values}
+
+class Ventilator(gymnasium.Env[Floats, Floats]):
+    """One ventilator of :class:`VentilatorVector`, which draws what it does.
+
+    ``info`` holds ``lung``, ``pip``, the true airway ``pressure``, cmH2O, and at the end ``error``.
+
+    Args:
+        lung: id of the lung; any for each episode if not given.
+        pip: peak pressure, cmH2O; one of the six at random if not given.
+        rigs: as of :class:`VentilatorVector`.
+        noise: as of :class:`VentilatorVector`.
+        simulator: see :func:`ventbench.load_simulators`.
+        render_mode: ``"rgb_array"`` for :meth:`render`, which needs the extra ``ventbench[view]``.
+
+    Raises:
+        InputError: if there is no such lung or render mode, or the PIP is outside 5..60 cmH2O.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 33}
+
+    def __init__(
+        self,
+        lung: str | None = None,
+        pip: float | None = None,
+        rigs: Literal["training", "reference"] = "training",
+        noise: bool = True,
+        simulator: Given = "frozen",
+        render_mode: str | None = None,
+    ):
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InputError(f"render_mode is {render_mode!r}; choose 'rgb_array' or None")
+        if render_mode is not None:
+            require("matplotlib")
+        self._one = VentilatorVector(1, lung, pip, rigs, noise, simulator)
+        self._any = () if lung is not None else self._one.lungs
+        self._fixed, self.render_mode = pip is not None, render_mode
+        self.action_space = self._one.single_action_space
+        self.observation_space = self._one.single_observation_space
+        self._info: dict[str, Any] = {}
+        self._seen: list[tuple[float, float, float]] = []
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Floats, dict[str, Any]]:
+        """Begin an episode; see :meth:`gymnasium.Env.reset`. No options are known."""
+        super().reset(seed=seed)
+        one, draw = self._one, self.np_random
+        if self._any:
+            at = int(draw.integers(len(self._any)))
+            one._lung, one._names = np.array([at]), np.array([self._any[at]], object)
+        if not self._fixed:
+            one._pips = draw.choice(np.asarray(protocol.PIPS, np.float32), 1)
+        seen, info = one.reset(seed=int(draw.integers(2**31)))
+        self._info = {"lung": str(info["lung"][0]), "pip": float(info["pip"][0])}
+        self._seen = []
+        return seen[0], {**self._info, "pressure": 40.0 * float(seen[0, 0])}
+
+    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        """Apply a command; see :meth:`gymnasium.Env.step`.
+
+        Raises:
+            InputError: if no episode is under way, or the action is not finite.
+        """
+        if self._one._count >= STEPS:
+            raise InputError("no episode is under way: call reset() first")
+        seen, reward, ended, _, last = self._one.step(np.asarray(action, np.float32).reshape(1, 1))
+        info = {**self._info, "pressure": float(self._one.pressure[0])}
+        u_in = 50.0 + 50.0 * float(np.ravel(action)[0])
+        self._seen.append((info["pressure"], 40.0 * float(seen[0, 1]), u_in))
+        if ended[0]:
+            info["error"] = float(last["error"][0])
+        return seen[0], float(reward[0]), bool(ended[0]), False, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """Draw pressure, target and command of the episode so far, RGB, shape ``(400, 640, 3)``."""
+        if self.render_mode is None:
+            return None
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(6.4, 4.0), dpi=100, layout="constrained")
+        upper, lower = figure.subplots(2, 1, sharex=True)
+        pressure, target, u_in = np.array(self._seen or [(np.nan,) * 3]).T
+        steps = np.arange(1, len(pressure) + 1)
+        upper.plot(steps, target, color="black", lw=1.0)
+        upper.plot(steps, pressure, color="#1f5aa6")
+        lower.step(steps, np.clip(u_in, 0.0, protocol.U_MAX), color="#1f5aa6", where="post")
+        upper.set(ylabel="pressure, cmH2O", ylim=(0.0, protocol.SAFETY_PRESSURE))
+        lower.set(ylabel="u_in, %", xlabel="command", xlim=(0, STEPS), ylim=(0.0, 100.0))
+        upper.set_title("{lung}, PIP {pip:.1f} cmH2O".format(**self._info), fontsize="medium")
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def register() -> None:

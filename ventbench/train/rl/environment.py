@@ -1,0 +1,184 @@
+"""The ranked task as an environment of two pure functions, :func:`reset` and :func:`step`.
+
+An episode is a run as it is scored: three breaths of 34 commands, each from rest, on any training
+rig of a lung, with deviations drawn anew. The loop is that of scoring,
+:func:`ventbench.task.rollouts.control_step`. Both functions treat one environment; ``jax.vmap``
+makes many, and all random numbers of an episode are drawn by :func:`reset`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, get_args
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ventbench.base import precision
+from ventbench.base.errors import InputError
+from ventbench.plants.catalog import Given
+from ventbench.task import environment as env
+from ventbench.task import protocol, rollouts
+from ventbench.task.draws import random_scenarios
+from ventbench.task.environment import Scenario
+from ventbench.train.plants import plants_to_train_on
+from ventbench.train.rl.episodes import REWARD_SCALE, Lungs
+
+#: Commands of a breath, and of an episode.
+BREATH = protocol.INSPIRATION_STEPS
+STEPS = protocol.BREATHS * BREATH
+
+#: Steps of an episode whose pressures are scored.
+SCORED_STEPS = len(protocol.SCORED_BREATHS) * BREATH
+
+#: What an observation holds, in order, each of the order of 1: pressure / 40, target / 40, the
+#: next ten targets / 40, command before / 50 - 1, time in s, control step / 0.03.
+OBSERVATION = 5 + protocol.TARGETS_AHEAD
+
+
+@flax.struct.dataclass
+class Episode:
+    """What stays the same in an episode.
+
+    Attributes:
+        plant: with the resistance and compliance of the cell.
+        cell: PIP, deviations and noise, hidden from the controller.
+        weight: of errors, see :class:`ventbench.train.plants.TrainingPlants`.
+    """
+
+    plant: Any
+    cell: Scenario
+    weight: Array
+
+
+@flax.struct.dataclass
+class Progress:
+    """What a command changes.
+
+    Attributes:
+        loop: state of the breath.
+        error: sum of ``|pressure - PIP|`` over the scored steps so far, cmH2O.
+    """
+
+    loop: env.LoopState
+    error: Array
+
+
+@flax.struct.dataclass
+class State:
+    """One environment in mid-episode.
+
+    Attributes:
+        episode: what stays the same.
+        progress: what changes.
+        count: commands so far.
+    """
+
+    episode: Episode
+    progress: Progress
+    count: Array
+
+
+def load_lungs(simulator: Given = "frozen", *, rigs: Literal["training", "reference"]) -> Lungs:
+    """Load lungs to learn on, in float32.
+
+    Args:
+        simulator: see :func:`ventbench.load_simulators`.
+        rigs: ``"training"`` for all members of all training rigs of each lung, the population that
+            ranked draws are from; ``"reference"`` for the rig of the nominal score.
+
+    Raises:
+        InputError: if there are no such simulators or rigs, or they have no plants.
+    """
+    if rigs not in get_args(Literal["training", "reference"]):
+        raise InputError(f"rigs is {rigs!r}; choose training or reference")
+    trained_on = plants_to_train_on(simulator)
+    kept = slice(None) if rigs == "training" else slice(1)
+    with precision.float32():
+        plants = jax.tree.map(
+            lambda leaf: jnp.asarray(np.asarray(leaf)[kept], jnp.float32), trained_on.plants
+        )
+        return Lungs(plants, jnp.asarray(trained_on.weights, jnp.float32))
+
+
+def reset(
+    key: Array,
+    lungs: Lungs,
+    lung: Array | int | None = None,
+    pip: Array | float | None = None,
+    *,
+    vary: bool = True,
+) -> tuple[State, Array]:
+    """Begin an episode.
+
+    Args:
+        key: of all random numbers of the episode.
+        lungs: to learn on, from :func:`load_lungs`.
+        lung: index of the lung; any if not given.
+        pip: nominal PIP, cmH2O; one of the protocol's if not given. The weight of the errors is
+            that of the nearest one.
+        vary: false for nominal cells on any of the plants.
+
+    Returns:
+        The state, and the first observation, shape ``(OBSERVATION,)``.
+    """
+    keys = jax.random.split(key, 4)
+    pips = jnp.asarray(protocol.PIPS, jnp.float32)
+    rigs = jax.tree.leaves(lungs.plants)[0].shape[0]
+    lung = jax.random.randint(keys[0], (), 0, lungs.count) if lung is None else lung
+    pip = jax.random.choice(keys[1], pips) if pip is None else jnp.asarray(pip)
+    rig = jax.random.randint(keys[2], (), 0, rigs) * vary
+    plant = jax.tree.map(lambda leaf: jnp.asarray(leaf)[rig, lung], lungs.plants)
+    cells = random_scenarios(keys[3], pip[None], spread=None if vary else 0.0)
+    cell = jax.tree.map(lambda leaf: leaf[0], cells)
+    varied = env.vary(plant, cell)
+    weight = lungs.weights[lung, jnp.argmin(jnp.abs(pips - pip))]
+    progress = Progress(env.start_breath(varied, cell), jnp.zeros_like(cell.pip))
+    state = State(Episode(varied, cell, weight), progress, jnp.zeros((), jnp.int32))
+    return state, observe(state)
+
+
+def observe(state: State) -> Array:
+    """What a submission sees, scaled, shape ``(OBSERVATION,)``; see :data:`OBSERVATION`."""
+    count = jnp.minimum(state.count, STEPS - 1)  # after the end, an observation of the same kind
+    seen = env.observe(state.episode.cell, state.progress.loop, count // BREATH, count % BREATH)
+    after = [seen.previous_u_in / 50.0 - 1.0, seen.time, seen.dt / protocol.DT]
+    pressures = jnp.stack([seen.pressure, seen.target]) / 40.0
+    return jnp.concatenate([pressures, seen.targets_ahead / 40.0, jnp.stack(after)])
+
+
+def step(state: State, action: Array) -> tuple[State, Array, Array, Array]:
+    """Apply a command.
+
+    The last command of a breath moves no pressure that is scored: its reward is 0, and what is
+    seen next is the lung at rest before the next breath.
+
+    Args:
+        state: from :func:`reset` or this function.
+        action: -1..1, shape ``()``: ``u_in`` is ``50 + 50 action``, %, clipped to 0..100.
+
+    Returns:
+        The next state; its observation; the reward, minus the weighted error that follows, cmH2O,
+        over 10; and whether the episode has ended, by which time ``state.progress.error`` over
+        :data:`SCORED_STEPS` is the error as it is scored.
+    """
+    episode, count = state.episode, state.count
+    breath, index = count // BREATH, count % BREATH
+
+    def pressures(before: env.LoopState, after: env.LoopState, *_: Array) -> tuple[Array, Array]:
+        return before.signals.scored, after.signals.scored
+
+    (loop, _), (before, after) = rollouts.control_step(
+        episode.plant, episode.cell, rollouts.commanded, pressures,
+        (state.progress.loop, None), (breath, index, 50.0 + 50.0 * action),
+    )  # fmt: skip
+    last = index == BREATH - 1
+    reward = -episode.weight * jnp.abs(after - episode.cell.pip) / REWARD_SCALE
+    scored = breath >= min(protocol.SCORED_BREATHS)
+    error = state.progress.error + scored * jnp.abs(before - episode.cell.pip)
+    rest = env.start_breath(episode.plant, episode.cell)
+    loop = jax.tree.map(lambda new, old: jnp.where(last, new, old), rest, loop)
+    state = State(episode, Progress(loop, error), count + 1)
+    return state, observe(state), jnp.where(last, 0.0, reward), state.count == STEPS

@@ -42,27 +42,31 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where the leaves of a tree lie in one vector, so that a compiled step has few arguments."""
+    """Where the leaves of E trees lie in one array, so that a compiled step has few arguments.
+
+    A row a number and a column a tree, so that every operation runs over contiguous vectors.
+    """
 
     structure: Any
     shapes: tuple[tuple[int, ...], ...]
 
     @classmethod
     def of(cls, tree: Any) -> _Layout:
-        """Layout of a tree of arrays or of their shapes."""
+        """Layout of trees like one of arrays, or of their shapes."""
         leaves, structure = jax.tree.flatten(tree)
         return cls(structure, tuple(leaf.shape for leaf in leaves))
 
-    def unpack(self, vector: Array) -> Any:
-        """Tree of a vector that :func:`_pack` made."""
+    def unpack(self, rows: Array) -> Any:
+        """Trees with leaves ``(..., E)`` of what :func:`_pack` made."""
         ends = np.cumsum([math.prod(shape) for shape in self.shapes])
-        parts = jnp.split(vector, ends[:-1])
-        leaves = [part.reshape(shape) for part, shape in zip(parts, self.shapes, strict=True)]
+        parts = zip(jnp.split(rows, ends[:-1]), self.shapes, strict=True)
+        leaves = [part.reshape(*shape, rows.shape[-1]) for part, shape in parts]
         return jax.tree.unflatten(self.structure, leaves)
 
 
-def _pack(tree: Any) -> Array:
-    return jnp.concatenate([leaf.reshape(-1) for leaf in jax.tree.leaves(tree)])
+def _pack(trees: Any) -> Array:
+    """Rows of trees with leaves ``(..., E)``."""
+    return jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in jax.tree.leaves(trees)])
 
 
 @partial(jax.jit, static_argnames="vary")
@@ -72,16 +76,14 @@ def _reset(
     """Begin E episodes.
 
     Returns:
-        What stays the same in them and what changes, a row a number and a column an episode; PIPs,
-        cmH2O; observations.
+        What stays the same in them and what changes, packed; PIPs, cmH2O; observations.
     """
-
-    def begin(key: Array, lung: Array, pip: Array) -> tuple[Array, Array, Array, Array]:
-        state, seen = environment.reset(key, lungs, lung, pip, vary=vary)
-        return _pack(state.episode), _pack(state.progress), state.episode.cell.pip, seen
-
     keys = jax.random.split(jax.random.key(seed), lung.shape[0])
-    return jax.vmap(begin, out_axes=(-1, -1, 0, 0))(keys, lung, pip)
+    reset = partial(environment.reset, lungs=lungs, vary=vary)
+    states, seen = jax.vmap(lambda key, lung, pip: reset(key, lung=lung, pip=pip), out_axes=-1)(
+        keys, lung, pip
+    )
+    return _pack(states.episode), _pack(states.progress), states.episode.cell.pip, seen.T
 
 
 @partial(jax.jit, static_argnames="layouts")
@@ -95,15 +97,18 @@ def _step(
 ) -> tuple[Array, ...]:
     """Return the next progress and count, observations, rewards, pressures and sums of errors."""
 
-    def advance(episode: Array, progress: Array, action: Array) -> tuple[Array, ...]:
-        parts = (layout.unpack(x) for layout, x in zip(layouts, (episode, progress), strict=True))
-        state, seen, reward, _ = environment.step(environment.State(*parts, count), action)
-        after = state.progress
-        return _pack(after), seen, reward, after.loop.signals.scored, after.error
+    def advance(
+        episode: environment.Episode, progress: environment.Progress, action: Array
+    ) -> tuple[environment.Progress, Array, Array]:
+        state = environment.State(episode, progress, count)
+        state, seen, reward, _ = environment.step(state, action)
+        return state.progress, seen, reward
 
-    axes = {"in_axes": (-1, -1, 0), "out_axes": (-1, 0, 0, 0, 0)}
-    after, *told = jax.vmap(advance, **axes)(episodes, progress, actions.reshape(-1))
-    return after, count + 1, *told
+    parts = (layout.unpack(x) for layout, x in zip(layouts, (episodes, progress), strict=True))
+    after, seen, reward = jax.vmap(advance, in_axes=-1, out_axes=(-1, 0, 0))(
+        *parts, actions.reshape(-1)
+    )
+    return _pack(after), count + 1, seen, reward, after.loop.signals.scored, after.error
 
 
 class VentilatorVector(gymnasium.vector.VectorEnv[Floats, Floats, Floats]):

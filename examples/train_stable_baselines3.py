@@ -18,7 +18,7 @@ import ventbench
 
 STEPS = 1000 * int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000
 OUT = Path("runs/stable_baselines3/sb3_ppo")
-COMMANDS = 33  # of one breath
+COMMANDS = 102  # of an episode: three breaths, as scored
 
 
 class CorrectedPID:
@@ -58,7 +58,7 @@ class CorrectedPID:
 
 
 class Ventilators(VecEnv):
-    """The vector environment as Stable-Baselines3 wants it: breaths begin anew by themselves."""
+    """The vector environment as Stable-Baselines3 wants it: episodes begin anew by themselves."""
 
     def __init__(self, count):
         self.made = gymnasium.make_vec("ventbench.gym_env:ventbench/Ventilator-v1", num_envs=count)
@@ -84,8 +84,8 @@ class Ventilators(VecEnv):
                     "terminal_observation": seen[k],
                     "episode": {"r": -errors[k], "l": COMMANDS, "t": 0.0},
                 }
-            seen = self.pid.see(self.made.step(self.actions)[0])  # begins new breaths
-        return seen, rewards.astype(np.float32), ended, infos
+            seen = self.pid.see(self.made.step(self.actions)[0])  # begins new episodes
+        return seen, rewards, ended, infos
 
     def close(self):
         self.made.close()
@@ -173,7 +173,7 @@ model = PPO(
     "MlpPolicy",
     Ventilators(144),
     n_steps=COMMANDS,
-    batch_size=1188,
+    batch_size=1224,
     n_epochs=6,
     gamma=0.95,
     gae_lambda=0.9,

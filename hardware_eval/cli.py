@@ -27,7 +27,6 @@ app = typer.Typer(
     name="ventbench-hardware",
     help="Entries on a physical lung: run, check and compare; or an emulator of the bench.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
@@ -41,7 +40,13 @@ Port = Annotated[
     ),
 ]
 Lungs = Annotated[
-    list[str], typer.Option("--lung", metavar="LUNG", help="Lung, such as R20C50; repeatable.")
+    list[str],
+    typer.Option(
+        "--lung",
+        metavar="LUNG",
+        help="Lung, such as R20C50; repeatable.",
+        autocompletion=options.known_lungs,
+    ),
 ]
 Yes = Annotated[
     bool, typer.Option("--yes", help="Confirm every question; for an emulator, not for a bench.")
@@ -85,7 +90,11 @@ def _root(
 @app.command()
 def run(
     submissions: Annotated[
-        list[str], typer.Argument(help="Folders of submissions, or names of bundled ones.")
+        list[str],
+        typer.Argument(
+            help="Folders of submissions, or names of bundled ones.",
+            autocompletion=options.known_entries,
+        ),
     ],
     port: Port,
     lung: Lungs,
@@ -239,7 +248,9 @@ def emulate(context: typer.Context) -> None:
 @app.command()
 def selftest(
     port: Port,
-    lung: Annotated[str, typer.Option(help="Label of the mounted lung.")],
+    lung: Annotated[
+        str, typer.Option(help="Label of the mounted lung.", autocompletion=options.known_lungs)
+    ],
     plant: Annotated[str, typer.Option(help="Simulators that know the lungs.")] = "frozen",
     json: JsonFile = None,
 ) -> None:
@@ -316,7 +327,9 @@ def compare(
 @app.command()
 def collect(
     port: Port,
-    lung: Annotated[str, typer.Option(help="Label of the mounted lung.")],
+    lung: Annotated[
+        str, typer.Option(help="Label of the mounted lung.", autocompletion=options.known_lungs)
+    ],
     breaths: Annotated[int, typer.Option(min=1, help="Breaths in all.")] = 60,
     seed: Annotated[int, typer.Option(help="Seed of the disturbances.")] = 0,
     out: Annotated[

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 SCRIPTS = sorted((ROOT / "examples").glob("*.py"))
 
 #: Arguments that make a script short, and what it needs besides ventbench.
-SHORT = {"beat_the_pid": ["3"], "train_stable_baselines3": ["5"]}
+SHORT = {"beat_the_pid": ["3"], "train_ppo_jax": ["2"], "train_stable_baselines3": ["5"]}
 NEEDS = {"train_stable_baselines3": "stable_baselines3"}
 
 

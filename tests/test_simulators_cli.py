@@ -19,10 +19,10 @@ from typer.testing import CliRunner
 import ventbench
 from ventbench.base import precision
 from ventbench.base.errors import InputError
-from ventbench.cli import app
+from ventbench.cli import app, options
 from ventbench.plants import frozen
 from ventbench.plants.stacking import take
-from ventbench.simulation import read_controls, simulate
+from ventbench.simulation import Controls, read_controls, simulate
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.rollouts import open_loop
@@ -74,6 +74,63 @@ def test_lungs_lists_the_six_with_their_errors():
         (line,) = [line for line in text.splitlines() if line.startswith(f"│ {name} ")]
         for kind in ("own_rig", "unseen_rig", "held_out"):
             assert f"{about[f'{kind}_mae']:.2f} / {about[f'{kind}_median_mae']:.2f}" in line
+
+
+def test_many_breaths_are_each_simulated_alone(tmp_path):
+    """Of two lungs and unequal lengths; what is written is a recording and a --plant."""
+    rng = np.random.default_rng(0)
+    rows, path, out = (
+        ["breath_id,R,C,time_step,u_in,u_out"],
+        tmp_path / "many.csv",
+        tmp_path / "o.csv",
+    )
+    lengths = {3: (5, 20, 40), 4: (20, 50, 30), 9: (5, 20, 40)}
+    commands = {}
+    for number, (R, C, length) in lengths.items():
+        commands[number] = np.round(rng.uniform(0.0, 30.0, length), 3)
+        rows += [
+            f"{number},{R},{C},{0.03 * k:.2f},{u},{int(k >= 30)}"
+            for k, u in enumerate(commands[number])
+        ]
+    path.write_text("\n".join(rows) + "\n")
+    run("simulate", "--controls", path, "--plant", "physics", "--out", out)
+    breaths = ventbench.load_recording(out, pad=True)
+    assert breaths.breath_id.tolist() == list(lengths)
+    for index, (number, (R, C, length)) in enumerate(lengths.items()):
+        u_out = (np.arange(length) >= 30).astype(float)
+        alone = Controls(0.03 * np.arange(length), commands[number], u_out)
+        wanted = simulate(alone, lung=f"R{R}C{C}", simulator="physics").pressure
+        np.testing.assert_allclose(breaths.pressure[index, :length], wanted, atol=2e-3)
+    printed = run("simulate", "--controls", path, "--plant", "physics")
+    assert printed.splitlines()[0] == out.read_text().splitlines()[0]
+    report = ventbench.open_loop(ventbench.load_recording(out, pad=True), str(out))
+    assert report.lungs["R5C20"]["mae"] == 0.0
+    (tmp_path / "bare.csv").write_text("breath_id,u_in\n1,5\n1,6\n2,7\n2,8\n")
+    assert "name the lung" in run("simulate", "--controls", tmp_path / "bare.csv", code=2)
+    text = run("simulate", "--controls", tmp_path / "bare.csv", "--lung", "R20C50")
+    assert columns(text)["R"].tolist() == [20.0] * 4
+    (tmp_path / "one.csv").write_text("u_in\n5\n6\n")
+    assert "--lung is needed" in run("simulate", "--controls", tmp_path / "one.csv", code=2)
+
+
+def test_the_shell_completes_entries_lungs_and_plants():
+    assert options.known_lungs("r20") == ["R20C10", "R20C20", "R20C50"]
+    assert {"pid_best", "pid_robust"} <= set(options.known_entries("pid"))
+    assert "physics" in options.known_plants("ph")
+    for command, words, wanted in (
+        ("ventbench", "ventbench simulate --lung R5", "R5C10"),
+        ("ventbench", "ventbench score pid_r", "pid_robust"),
+        ("ventbench-hardware", "ventbench-hardware selftest --lung R5", "R5C10"),
+    ):
+        module = {"ventbench": "ventbench.cli", "ventbench-hardware": "hardware_eval.cli"}[command]
+        code = f"import sys; sys.argv = ['{command}']; from {module} import main; main()"
+        variable = f"_{command.upper().replace('-', '_')}_COMPLETE"
+        environment = {**os.environ, variable: "complete_bash", "COMP_WORDS": words}
+        environment["COMP_CWORD"] = str(len(words.split()) - 1)
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+        )
+        assert wanted in done.stdout.split(), done.stderr
 
 
 def test_lungs_tells_which_sessions_are_not_scored():

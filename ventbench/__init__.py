@@ -3,7 +3,8 @@
 Everything that a notebook needs is an attribute of this package and is imported at first use:
 
 - recordings: ``load_recording``, ``import_recording``, ``example``, ``Breaths``;
-- simulators: ``load_simulators``, ``simulate``, ``open_loop``, the protocol ``Plant``;
+- simulators: ``load_simulators``, ``simulate``, ``simulate_breaths``, ``open_loop``, the protocol
+  ``Plant``;
 - controllers: ``score``, ``rollout``, ``tune_pid``, ``train_residual``, ``train_ppo``,
   ``train_dqn``, the protocol ``Controller``;
 - missing physics: ``diagnose``, ``Diagnosis``;
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from ventbench.recordings.foreign import import_recording as import_recording
     from ventbench.simulation import Simulation as Simulation
     from ventbench.simulation import simulate as simulate
+    from ventbench.simulation import simulate_breaths as simulate_breaths
     from ventbench.task.interfaces import Controller as Controller
     from ventbench.task.interfaces import Observation as Observation
     from ventbench.task.interfaces import Plant as Plant
@@ -80,6 +82,7 @@ _SOURCES = {
     "rollout": ("trajectories", "rollout"),
     "score": ("entries.scoring", "score"),
     "simulate": ("simulation", "simulate"),
+    "simulate_breaths": ("simulation", "simulate_breaths"),
     "train_dqn": ("train.rl.train", "train_dqn"),
     "train_ppo": ("train.rl.train", "train_ppo"),
     "train_residual": ("train.residual", "train_residual"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ventbench.base.errors import InputError
 from ventbench.plants.catalog import Given, load_simulators
+from ventbench.recordings import Breaths, load
 from ventbench.task import protocol
+from ventbench.task.lungs import lung as parse_lung
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -128,6 +130,63 @@ def simulate(
     commands = (controls.u_in, controls.u_out, controls.dt)
     pressure = simulators.respond(lung, *commands, initial_pressure=start)
     return Simulation(lung, simulators.name, controls.time, controls.u_in, controls.u_out, pressure)
+
+
+def simulate_breaths(
+    table: Path | str | pd.DataFrame,
+    *,
+    lung: str | None = None,
+    simulator: Given = "frozen",
+    start: float = protocol.PEEP,
+) -> Breaths:
+    """Answer the commands of many breaths with pressures.
+
+    Args:
+        table: a table, or its CSV file, with a row a sample: ``breath_id`` and ``u_in``, %;
+            optionally ``u_out`` (0 if missing), ``time_step``, s (steps of 30 ms if missing), and
+            ``R``, cmH2O/(L/s), and ``C``, mL/cmH2O. Breaths may differ in length. Other columns,
+            such as a pressure, are not used.
+        lung: id of the lung of all breaths; needed where there is no ``R`` or ``C``.
+        simulator: see :func:`ventbench.load_simulators`.
+        start: pressure at the first sample of each breath, cmH2O; the lung is at rest there.
+
+    Returns:
+        The breaths with the simulated pressures, which ``to_frame`` and
+        :func:`ventbench.recordings.write` give in the public schema.
+
+    Raises:
+        InputError: if a column is missing, a command is wrong, or there is no simulator of a lung.
+
+    Examples:
+        >>> import pandas as pd
+        >>> import ventbench
+        >>> table = pd.DataFrame({"breath_id": [1, 1, 1, 2, 2, 2], "u_in": [10.0] * 6})
+        >>> answer = ventbench.simulate_breaths(table, lung="R5C20", simulator="physics")
+        >>> answer.pressure.shape
+        (2, 3)
+    """
+    import pandas as pd
+
+    if not isinstance(table, pd.DataFrame):
+        try:
+            table = pd.read_csv(table, encoding="utf-8-sig")
+        except (ValueError, UnicodeDecodeError) as error:  # the parser's errors are ValueErrors
+            raise InputError(f"{table} is not a CSV file in UTF-8: {error}") from error
+    lacking = [name for name in ("breath_id", "u_in") if name not in table]
+    if lacking:
+        raise InputError(f"the table has no column {lacking[0]}; it has {', '.join(table)}")
+    if lung is None and not {"R", "C"} <= {*table}:
+        raise InputError("the table has no columns R and C: name the lung of all its breaths")
+    sample = table.groupby("breath_id").cumcount()
+    whole = table.assign(id=range(1, len(table) + 1), pressure=float(start))
+    if lung is not None:
+        label = parse_lung(lung)
+        whole = whole.assign(R=label.R, C=label.C)
+    for name, values in (("u_out", 0), ("time_step", protocol.DT * sample)):
+        whole = whole if name in whole else whole.assign(**{name: values})
+    needed = ["id", "breath_id", "R", "C", "time_step", "u_in", "u_out", "pressure"]
+    breaths = load(whole[needed], pad=True)
+    return replace(breaths, pressure=load_simulators(simulator).pressures(breaths))
 
 
 def _controls(u_in: ArrayLike) -> Controls:

@@ -7,6 +7,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
+from ventbench.base.files import example
 from ventbench.recordings import RecordingError, check, load, load_respiraworks, write
 
 
@@ -116,3 +117,22 @@ def test_respiraworks_schema_has_a_loader_of_its_own(tmp_path):
     parquet.write_table(pa.table(columns).drop_columns(["flow"]), path)
     with pytest.raises(RecordingError, match="missing columns flow"):
         load_respiraworks(path)
+
+
+def test_a_spreadsheet_is_a_recording_too(tmp_path):
+    pytest.importorskip("openpyxl", reason="needs the extra ventbench[excel]")
+    breaths = load(example("concealed"))[:2]
+    path = tmp_path / "breaths.xlsx"
+    table = breaths.to_frame()
+    table.to_excel(path, index=False)
+    again = load(path)
+    np.testing.assert_array_equal(again.pressure, breaths.pressure)
+    assert again.sha256 is not None
+    report = check(path)
+    assert (report.ok, report.kind, report.breaths) == (True, "xlsx", 2)
+    table.loc[4, "u_in"] = 130.0
+    table.to_excel(path, index=False)
+    (problem,) = check(path).problems
+    assert (problem.column, problem.line) == ("u_in", 6), "the row that a spreadsheet shows"
+    path.write_bytes(b"PK\x03\x04 and no more")
+    assert "cannot be read" in str(check(path).problems[0])

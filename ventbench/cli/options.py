@@ -55,6 +55,29 @@ def claim_json(path: Path | None) -> Path | None:
     return path
 
 
+def known_lungs(incomplete: str) -> list[str]:
+    """Ids of the six lungs, for completion by the shell."""
+    from ventbench.task.lungs import LUNG_IDS
+
+    return [name for name in LUNG_IDS if name.startswith(incomplete.upper())]
+
+
+def known_entries(incomplete: str) -> list[str]:
+    """Names of bundled submissions, and folders, for completion by the shell."""
+    from ventbench.entries.folder import bundled
+
+    folders = [f"{path}/" for path in Path().glob(f"{incomplete}*") if path.is_dir()]
+    return [name for name in bundled() if name.startswith(incomplete)] + sorted(folders)
+
+
+def known_plants(incomplete: str) -> list[str]:
+    """Names of simulators, and files, for completion by the shell."""
+    from ventbench.plants.catalog import names
+
+    files = sorted(str(path) for path in Path().glob(f"{incomplete}*"))
+    return [name for name in names() if name.startswith(incomplete)] + files
+
+
 JsonFile = Annotated[
     Path | None,
     typer.Option(
@@ -73,6 +96,7 @@ PlantName = Annotated[
     typer.Option(
         "--plant",
         metavar="PLANT",
+        autocompletion=known_plants,
         help="Simulators: frozen (the official ones), physics, two_balloon, a file of plants such "
         "as corrected.json, a CSV or Parquet file of simulated pressures, or module:function.",
     ),

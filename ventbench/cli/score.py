@@ -16,6 +16,7 @@ from ventbench.cli.options import (
     claim_out,
     counted,
     emit,
+    known_entries,
     notes,
     of_each_entry,
 )
@@ -34,7 +35,11 @@ Track = Literal["performance", "robustness", "all"]
 def score(
     names: Annotated[
         list[str],
-        typer.Argument(metavar="SUBMISSION...", help="Folders or names of bundled submissions."),
+        typer.Argument(
+            metavar="SUBMISSION...",
+            help="Folders or names of bundled submissions.",
+            autocompletion=known_entries,
+        ),
     ],
     track: Annotated[
         Track | None,
@@ -332,7 +337,11 @@ def stressors(json: JsonFile = None) -> None:
 def transfer(
     names: Annotated[
         list[str],
-        typer.Argument(metavar="SUBMISSION...", help="Folders or names of bundled submissions."),
+        typer.Argument(
+            metavar="SUBMISSION...",
+            help="Folders or names of bundled submissions.",
+            autocompletion=known_entries,
+        ),
     ],
     track: Annotated[
         Literal["performance", "robustness"] | None,
@@ -416,7 +425,12 @@ def new(
 
 
 def check(
-    submission: Annotated[str, typer.Argument(help="Folder or name of a bundled submission.")],
+    submission: Annotated[
+        str,
+        typer.Argument(
+            help="Folder or name of a bundled submission.", autocompletion=known_entries
+        ),
+    ],
     in_process: Annotated[
         bool,
         typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),

@@ -7,7 +7,17 @@ from typing import Annotated, Any
 
 import typer
 
-from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, bars, counted, emit, notes
+from ventbench.cli.options import (
+    Clip,
+    JsonFile,
+    Pad,
+    PlantName,
+    bars,
+    counted,
+    emit,
+    known_lungs,
+    notes,
+)
 from ventbench.task import protocol
 
 
@@ -90,30 +100,52 @@ def coverage(
 
 
 def simulate(
-    lung: Annotated[str, typer.Option(help="Lung, such as R20C50.")],
     controls: Annotated[
         Path,
         typer.Option(
-            metavar="FILE", help="CSV with u_in in %; optionally u_out (0 or 1) and time_step in s."
+            metavar="FILE",
+            help="CSV in UTF-8 with u_in in %; optionally u_out (0 or 1) and time_step in s; of "
+            "many breaths also breath_id, and R and C if --lung is not given.",
         ),
     ],
+    lung: Annotated[
+        str | None, typer.Option(help="Lung, such as R20C50.", autocompletion=known_lungs)
+    ] = None,
     start: Annotated[
         float, typer.Option(min=0.0, max=60.0, help="Pressure at the first sample, cmH2O.")
     ] = protocol.PEEP,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write the CSV to this file instead of stdout."),
+        typer.Option(
+            metavar="FILE",
+            help="Write to this file instead of stdout; of many breaths also .csv.gz or .parquet.",
+        ),
     ] = None,
     plant: PlantName = "frozen",
 ) -> None:
     """Simulate the pressures for a file of valve commands, as CSV.
 
+    A file with a column breath_id holds many breaths; what is written is then a recording in the
+    public schema.
+
     Example: `ventbench simulate --lung R20C50 --controls commands.csv`
     """
+    from ventbench import recordings, simulation
     from ventbench.base import files
-    from ventbench.simulation import simulate as work
+    from ventbench.base.errors import InputError
 
-    text = work(controls, lung=lung, simulator=plant, start=start).to_csv()
+    with open(controls, encoding="utf-8-sig", errors="replace") as file:
+        many = "breath_id" in file.readline().replace('"', "").strip().split(",")
+    if many:
+        done = simulation.simulate_breaths(controls, lung=lung, simulator=plant, start=start)
+        if out is None:
+            typer.echo(done.to_frame().to_csv(index=False), nl=False)
+        else:
+            recordings.write(done, out)
+        return
+    if lung is None:
+        raise InputError("--lung is needed: the file names no lung; give one such as R20C50")
+    text = simulation.simulate(controls, lung=lung, simulator=plant, start=start).to_csv()
     if out is None:
         typer.echo(text, nl=False)
     else:

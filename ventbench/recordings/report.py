@@ -23,7 +23,7 @@ class RecordingReport:
 
     Attributes:
         file: the path as the caller wrote it.
-        kind: `csv`, `csv.gz` or `parquet`, or None if the file cannot be read.
+        kind: `csv`, `csv.gz`, `parquet` or `xlsx`, or None if the file cannot be read.
         sha256: SHA-256 of the file, hex, or None if it cannot be read to its end.
         problems: the first problems, in file order.
         problem_count: number of all problems.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ventbench.base.errors import InputTypeError
+from ventbench.base.errors import InputTypeError, require
 from ventbench.base.files import sha256
 from ventbench.recordings.checks import (
     check_ids,
@@ -47,8 +47,8 @@ class ParquetSource:
 
     Attributes:
         file: the path as the caller wrote it.
-        kind: `parquet`, or `table` in memory.
-        table: the table in memory; None for a file.
+        kind: `parquet`, `xlsx`, or `table` in memory.
+        table: the table in memory; None for Parquet.
         names: column names.
         warnings: about columns that are ignored.
         sha256: SHA-256 of the file; None until all chunks are read.
@@ -109,7 +109,7 @@ class ParquetSource:
                     yield chunk
                     row0 += len(chunk)
                     last_id = int(chunk.columns["breath_id"][-1])
-            self.sha256 = None if self.table is not None else sha256(Path(self.file))
+            self.sha256 = None if self.kind == "table" else sha256(Path(self.file))
         except (pa.ArrowException, OSError) as error:
             raise _damaged(self.file, error) from None
 
@@ -156,10 +156,12 @@ def open_source(path: str | os.PathLike[str] | pd.DataFrame) -> Source:
     if not isinstance(path, str | os.PathLike):
         return _table_source(path)
     kind = kind_of(path)
+    if kind == "xlsx":
+        return _spreadsheet_source(str(path))
     return ParquetSource(str(path)) if kind == "parquet" else CsvSource(str(path), kind)
 
 
-def _table_source(frame: object) -> ParquetSource:
+def _table_source(frame: object, file: str = _TABLE, kind: Kind = "table") -> ParquetSource:
     import pandas as pd
     import pyarrow as pa
 
@@ -172,14 +174,29 @@ def _table_source(frame: object) -> ParquetSource:
         table = pa.Table.from_pandas(named, preserve_index=False)
     except (pa.ArrowException, ValueError) as error:
         what = f"the table cannot be read ({str(error).splitlines()[0]})"
-        raise fail(_TABLE, what, "Write numbers in every column.") from None
-    return ParquetSource(_TABLE, "table", table)
+        raise fail(file, what, "Write numbers in every column.") from None
+    return ParquetSource(file, kind, table)
+
+
+def _spreadsheet_source(file: str) -> ParquetSource:
+    """First sheet of a workbook; its rows count from the header."""
+    import zipfile
+
+    import pandas as pd
+
+    require("openpyxl", extra="excel", what="spreadsheets")
+    try:
+        frame = pd.read_excel(file)
+    except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
+        what = f"the spreadsheet cannot be read ({str(error).splitlines()[0]})"
+        raise fail(file, what, "Save it again, or as CSV.") from None
+    return _table_source(frame, file, "xlsx")
 
 
 def locate(source: Source, rows: Collection[int]) -> Mapping[int, Place]:
     """Find data rows (0 for the first) in a file: CSV lines and cells, or Parquet rows from 1."""
     if isinstance(source, ParquetSource):
-        return {row: (row + 1, {}) for row in rows}
+        return {row: (row + 1 + (source.kind == "xlsx"), {}) for row in rows}
     return locate_rows(source.file, source.kind, source.names, rows)
 
 
@@ -209,6 +226,8 @@ def kind_of(path: str | os.PathLike[str]) -> Kind:
         raise fail(name, "this is not a Parquet file", advice)
     if first.startswith(b"\x1f\x8b"):
         return "csv.gz"
+    if first.startswith(b"PK\x03\x04") and name.endswith(".xlsx"):
+        return "xlsx"
     if first.startswith(b"PK\x03\x04"):
         raise fail(name, "this is a zip archive", "Unpack it and name the CSV file in it.")
     if first.startswith((b"\xff\xfe", b"\xfe\xff")):

@@ -15,7 +15,7 @@ from typing import Literal
 from ventbench.recordings.problems import RecordingError, RecordingProblem
 
 #: Formats of files, and a table in memory.
-Kind = Literal["csv", "csv.gz", "parquet", "table"]
+Kind = Literal["csv", "csv.gz", "parquet", "xlsx", "table"]
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.base.errors import InputError
+from ventbench.base.errors import InputError, require
 from ventbench.recordings.foreign.units import is_unit, spelled, unit_of
 
 #: Lines that decide on separator, decimal mark and header, and of those, the ones that are split.
@@ -437,6 +437,7 @@ def _spreadsheet(file: str) -> Table:
 
     import pandas as pd
 
+    require("openpyxl", extra="excel", what="spreadsheets")
     try:
         with zipfile.ZipFile(file) as archive:
             if "xl/workbook.xml" not in archive.namelist():
@@ -444,10 +445,6 @@ def _spreadsheet(file: str) -> Table:
         frame = pd.read_excel(file, header=None, dtype=object)
     except zipfile.BadZipFile as error:
         raise InputError(f"{file} cannot be unpacked ({error}); copy it again") from None
-    except ImportError:
-        raise InputError(
-            f"{file} is a spreadsheet: `pip install openpyxl`, or save it as CSV"
-        ) from None
     cells = frame.astype(str).mask(frame.isna(), "").to_numpy(str)
     rows = [(k + 1, list(row)) for k, row in enumerate(cells.tolist()) if any(row)]
     return _table(file, rows, ".", "First sheet of a spreadsheet")

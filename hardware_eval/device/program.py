@@ -7,6 +7,9 @@ and the device stops running them when no acceptable command came for :data:`WAT
 a command is out of range, when the pressure exceeds the limit or stands at the end of the sensor's
 range, and when the sensor is lost, stuck or noisy. What the host says cannot change these limits,
 except to lower the pressure limit.
+
+Its clock counts whole microseconds, as the wire does, so that firmware without floating-point
+numbers decides alike.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ from hardware_eval.wire.messages import (
     Flag,
     Heartbeat,
     Hello,
+    HostMessage,
     Mode,
     Packet,
     Reading,
@@ -34,7 +38,7 @@ from hardware_eval.wire.messages import (
     Vent,
     Welcome,
     encode,
-    milliseconds,
+    microseconds,
 )
 from hardware_eval.wire.parser import Fault, ParserState, feed_bytes
 from ventbench.task import protocol
@@ -112,19 +116,19 @@ class DeviceState:
         pressure_limit: limit of the session, cmH2O.
         u_in: inspiratory valve, %.
         u_out: expiratory valve, 0 or 1.
-        fed: when the last acceptable command or arming came, s.
-        valid: when the last valid sample was taken, s.
-        changed: when the reading last changed, s.
+        fed: when the last acceptable command or arming came, us.
+        valid: when the last valid sample was taken, us.
+        changed: when the reading last changed, us.
         newest: the last valid pressures, oldest first, at most :data:`NOISE_WINDOW`, cmH2O.
-        stepped: time of the last step, s.
+        stepped: time of the last step, us.
         causes: why the device vented since it was last armed.
         counters: counts since the program started.
     """
 
     pressure_limit: float
-    valid: float
-    changed: float
-    stepped: float
+    valid: int
+    changed: int
+    stepped: int
     newest: tuple[float, ...] = ()
     parser: ParserState = field(default_factory=ParserState)
     mode: Mode = Mode.CLOSED
@@ -132,14 +136,15 @@ class DeviceState:
     sequence: int = 0
     u_in: float = 0.0
     u_out: int = 1
-    fed: float = 0.0
+    fed: int = 0
     causes: Flag = Flag.NONE
     counters: Counters = field(default_factory=Counters)
 
 
 def init(settings: DeviceSettings, now: float) -> DeviceState:
-    """Vented, no session."""
-    return DeviceState(settings.pressure_limit, valid=now, changed=now, stepped=now)
+    """Vented, no session, at ``now``, s."""
+    begun = microseconds(now)
+    return DeviceState(settings.pressure_limit, valid=begun, changed=begun, stepped=begun)
 
 
 def step(
@@ -167,13 +172,14 @@ def step(
         The next state, whose ``u_in`` and ``u_out`` the valves must take at once, and the bytes to
         send.
     """
-    held_up = now - state.stepped
-    state = replace(_sampled(state, sample), stepped=now)
+    instant, watchdog = microseconds(now), microseconds(settings.watchdog)
+    held_up = instant - state.stepped
+    state = replace(_sampled(state, sample), stepped=instant)
     if state.mode is Mode.RUNNING:
-        causes = _dangers(identity, state, now, sample)
-        if now - state.fed > settings.watchdog:
+        causes = _dangers(identity, state, sample)
+        if instant - state.fed > watchdog:
             causes |= Flag.COMMANDS_STOPPED
-            causes |= Flag.DEVICE_LATE if held_up > 0.5 * settings.watchdog else Flag.NONE
+            causes |= Flag.DEVICE_LATE if held_up > watchdog // 2 else Flag.NONE
         if causes:
             state = _vented(state, causes)
     answers: list[bytes] = []
@@ -184,11 +190,13 @@ def step(
             if isinstance(event, Fault):
                 state = _counted(state, event.value)
                 continue
+            if isinstance(event.message, DeviceMessage):  # an echo, or crossed wires
+                state = _counted(state, Fault.MALFORMED.value)
+                continue
             state, answer = _received(
-                settings, identity, _counted(state, "frames"), now, event, sample
+                settings, identity, _counted(state, "frames"), event, event.message, sample
             )
-            if answer is not None:
-                answers.append(encode(Packet(event.session, event.sequence, answer)))
+            answers.append(encode(Packet(event.session, event.sequence, answer)))
     return state, b"".join(answers)
 
 
@@ -196,12 +204,12 @@ def _received(
     settings: DeviceSettings,
     identity: Identity,
     state: DeviceState,
-    now: float,
     packet: Packet,
+    message: HostMessage,
     sample: Sample,
-) -> tuple[DeviceState, DeviceMessage | None]:
+) -> tuple[DeviceState, DeviceMessage]:
     """Do what one message asks."""
-    message, sequence = packet.message, packet.sequence
+    sequence = packet.sequence
 
     def refused(state: DeviceState, reason: Reason) -> tuple[DeviceState, DeviceMessage]:
         return state, Refusal(sequence, reason, state.mode, _flags(state, sample))
@@ -232,8 +240,6 @@ def _received(
             PROTOCOL_VERSION, FIRMWARE, identity.capabilities, settings.watchdog, limit,
             identity.device_id, identity.calibration, identity.name,
         )  # fmt: skip
-    if not isinstance(message, Arm | Command | Heartbeat | Statistics):
-        return _counted(state, "malformed"), None  # a message of devices: an echo, or crossed wires
     if packet.session != state.session:
         return refused(_counted(state, "session"), Reason.SESSION)
     if not fresh:
@@ -247,45 +253,47 @@ def _received(
         case Arm():
             if state.pressure_limit >= identity.highest:
                 return refused(state, Reason.SENSOR_RANGE)
-            if causes := _dangers(identity, state, now, sample):
+            if causes := _dangers(identity, state, sample):
                 return refused(_vented(state, causes), Reason.UNSAFE)
-            return reading(
-                replace(state, mode=Mode.RUNNING, fed=now, u_in=0.0, u_out=1, causes=Flag.NONE)
+            armed = replace(
+                state, mode=Mode.RUNNING, fed=state.stepped, u_in=0.0, u_out=1, causes=Flag.NONE
             )
+            return reading(armed)
         case Command(u_in, u_out, seen):
             if u_in > settings.u_in_limit or u_out not in (0, 1):
                 state = _counted(_vented(state, Flag.OUT_OF_RANGE), "out_of_range")
                 return refused(state, Reason.OUT_OF_RANGE)
             if state.mode is not Mode.RUNNING:
                 return refused(_counted(state, "not_armed"), Reason.NOT_ARMED)
-            age = (milliseconds(now) - seen) & 0xFFFFFFFF
+            age = (state.stepped // 1000 - seen) & 0xFFFFFFFF
             if age > OLDEST_SEEN * 1000.0:  # also a time ahead of the device's own
                 return refused(_counted(state, "stale"), Reason.STALE)
-            state = replace(_counted(state, "commands"), u_in=u_in, u_out=u_out, fed=now)
+            state = replace(_counted(state, "commands"), u_in=u_in, u_out=u_out, fed=state.stepped)
             return reading(state)
 
 
 def _sampled(state: DeviceState, sample: Sample) -> DeviceState:
     """Remember a sample, if it is valid and new."""
-    if sample.pressure != sample.pressure or sample.time <= state.valid:
+    taken = microseconds(sample.time)
+    if sample.pressure != sample.pressure or taken <= state.valid:
         return state
     same = bool(state.newest) and sample.pressure == state.newest[-1]
     return replace(
-        state, valid=sample.time, changed=state.changed if same else sample.time,
+        state, valid=taken, changed=state.changed if same else taken,
         newest=(*state.newest[1 - NOISE_WINDOW :], sample.pressure),
     )  # fmt: skip
 
 
-def _dangers(identity: Identity, state: DeviceState, now: float, sample: Sample) -> Flag:
+def _dangers(identity: Identity, state: DeviceState, sample: Sample) -> Flag:
     """Causes of venting that the sensor gives."""
     causes = Flag.NONE
     if sample.pressure > state.pressure_limit or sample.saturated:
         causes |= Flag.OVERPRESSURE
     if sample.lapsed:
         causes |= Flag.DEVICE_LATE
-    if now - state.valid > SENSOR_TIMEOUT:
+    if state.stepped - state.valid > microseconds(SENSOR_TIMEOUT):
         causes |= Flag.SENSOR_LOST
-    if identity.noisy and state.valid - state.changed > STUCK:
+    if identity.noisy and state.valid - state.changed > microseconds(STUCK):
         causes |= Flag.SENSOR_STUCK
     if len(state.newest) == NOISE_WINDOW and _noise(state.newest) > LARGEST_NOISE:
         causes |= Flag.SENSOR_NOISY

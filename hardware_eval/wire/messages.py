@@ -265,9 +265,9 @@ class Counters:
     Attributes:
         frames: intact packets.
         commands: commands that moved the valves.
-        framing: runs of bytes that are no frame: bad COBS, too long, too short.
-        checksum: packets with a wrong CRC.
-        malformed: intact packets of unknown kind or wrong length.
+        framing: runs of bytes that are no frame: bad COBS, too long.
+        checksum: packets with a wrong CRC, or too short to hold one.
+        malformed: intact packets of a kind that no host sends, or of wrong length.
         session: messages of another session.
         sequence: messages whose sequence number was not above the last.
         stale: commands that rest on a reading too old.
@@ -348,9 +348,13 @@ def to_frame(packet: bytes) -> bytes:
 
 def to_packet(packet: Packet) -> bytes:
     """Return header, body and CRC-32 of a packet; see :func:`encode`."""
-    content = _HEADER.pack(packet.message.kind, packet.session, packet.sequence) + _body(
-        packet.message
+    return with_crc(
+        _HEADER.pack(packet.message.kind, packet.session, packet.sequence) + _body(packet.message)
     )
+
+
+def with_crc(content: bytes) -> bytes:
+    """Return a packet's content with its CRC-32 behind it."""
     return content + _CRC.pack(crc32(content))
 
 
@@ -377,12 +381,17 @@ def decode(content: bytes) -> Packet:
         ) from error
 
 
+def microseconds(time: float) -> int:
+    """Device time, s, as :attr:`Reading.time` goes over the wire."""
+    return round(time * 1e6)
+
+
 def milliseconds(time: float) -> int:
     """Device time, s, as :attr:`Command.seen` holds it.
 
     By way of the microseconds of a reading, so that no rounding makes a reading newer than now.
     """
-    return round(time * 1e6) // 1000 & 0xFFFFFFFF
+    return microseconds(time) // 1000 & 0xFFFFFFFF
 
 
 def _body(message: Message) -> bytes:
@@ -403,8 +412,8 @@ def _body(message: Message) -> bytes:
             ) + name  # fmt: skip
         case Reading():
             return _READING.pack(
-                round(message.time * 1e6), _known(message.pressure, PRESSURE_STEPS),
-                _known(message.flow, FLOW_STEPS), _scaled(message.u_in, U_IN_STEPS, 0, 65535),
+                microseconds(message.time), fixed_point(message.pressure, PRESSURE_STEPS),
+                fixed_point(message.flow, FLOW_STEPS), _scaled(message.u_in, U_IN_STEPS, 0, 65535),
                 message.u_out, message.mode, message.flags,
             )  # fmt: skip
         case Refusal():
@@ -468,7 +477,8 @@ def _scaled(value: float, steps: int, low: int, high: int) -> int:
     return number
 
 
-def _known(value: float, steps: int) -> int:
+def fixed_point(value: float, steps: int) -> int:
+    """A pressure or flow as an i16 in units of the wire, steps to its unit; for NaN, not known."""
     if not math.isfinite(value):
         return _NO_VALUE
     return max(-32767, min(32767, round(value * steps)))

@@ -238,7 +238,7 @@ def test_a_device_that_was_held_up_vents_before_it_listens(
     assert state.session is not None
     seen = round((device.clock.now() + 0.15) * 1000)  # fresh, had the device run
     frame = encode(Packet(state.session, state.sequence + 1, Command(50.0, 0, seen)))
-    device.service.step(state.stepped + 0.2, frame)
+    device.service.step(1e-6 * state.stepped + 0.2, frame)
     after = device.service.state
     assert (after.mode, after.u_in, after.u_out) == (Mode.VENTED, 0.0, 1)
     assert Flag.DEVICE_LATE in after.causes

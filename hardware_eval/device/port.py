@@ -17,8 +17,9 @@ import time
 from collections import deque
 from collections.abc import Callable
 from queue import Empty, SimpleQueue
+from typing import Protocol
 
-from hardware_eval.device.program import PERIOD, DeviceService
+from hardware_eval.device.program import PERIOD
 from ventbench.base.errors import InputError
 
 _CHUNK = 4096
@@ -121,6 +122,18 @@ class Port:
         return bool(data)
 
 
+class Service(Protocol):
+    """A program of a device with its hardware."""
+
+    def step(self, now: float, data: bytes = b"") -> bytes:
+        """Guard the lung at ``now``, s, and do what arrived; returns bytes to send."""
+        ...
+
+    def vent(self, now: float) -> None:
+        """Vent whatever the program says."""
+        ...
+
+
 class Guard:
     """The loop of a device in real time: steps the program every period, and when bytes arrive.
 
@@ -131,7 +144,7 @@ class Guard:
     """
 
     def __init__(
-        self, service: DeviceService, port: Port, clock: Callable[[], float] = time.monotonic
+        self, service: Service, port: Port, clock: Callable[[], float] = time.monotonic
     ) -> None:
         """Guard with a clock, s, that is the device's own time."""
         self.service = service

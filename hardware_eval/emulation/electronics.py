@@ -34,7 +34,8 @@ from ventbench.base.errors import InputError
 if TYPE_CHECKING:
     from hardware_eval.emulation.simulated import SimulatedHal
 
-_LINES = struct.Struct("<fB")
+#: What the pins are told: inspiratory valve, %, and expiratory valve, 0 or 1.
+LINES = struct.Struct("<fB")
 
 #: Longest pause between two looks, s: shorter than what the lung may hold a command.
 _LOOK = 0.020
@@ -83,13 +84,46 @@ class Pins:
 
     def actuate(self, u_in: float, u_out: int) -> None:
         """Set the pins."""
-        self._wire.sendall(_LINES.pack(u_in, u_out))
+        self._wire.sendall(LINES.pack(u_in, u_out))
 
     def close(self) -> None:
         """Vent."""
         with contextlib.suppress(OSError):  # the electronics have gone
             self.actuate(0.0, 1)
         self._wire.close()
+
+
+def switch_on(given: dict[str, Any]) -> tuple[subprocess.Popen[bytes], Connection, socket.socket]:
+    """Start the electronics with arguments of :func:`serve` and :func:`emulated_lung`.
+
+    Returns:
+        The process, the sensor's bus, and the pins, see :func:`serve`.
+    """
+    here, there = Pipe()
+    pins, wire = socket.socketpair()
+    process = subprocess.Popen(
+        [sys.executable, "-m", __name__, str(there.fileno()), str(wire.fileno())],
+        pass_fds=(there.fileno(), wire.fileno()), start_new_session=True,
+    )  # fmt: skip
+    there.close()
+    wire.close()
+    here.send(given)
+    return process, here, pins
+
+
+def introduced(bus: Connection) -> tuple[Identity, str]:
+    """What the electronics say that they are, once the lung has been compiled.
+
+    Raises:
+        InputError: if they cannot be as asked.
+    """
+    try:
+        answer = bus.recv() if bus.poll(_STARTS) else "the emulated lung did not start"
+    except EOFError:
+        answer = "the emulated lung did not start"
+    if isinstance(answer, str):
+        raise InputError(answer)
+    return answer
 
 
 class EmulatedHal(deadman.SupervisedHal):
@@ -106,28 +140,17 @@ class EmulatedHal(deadman.SupervisedHal):
         Raises:
             InputError: if the electronics cannot be as asked.
         """
-        here, there = Pipe()
-        pins, wire = socket.socketpair()
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__, str(there.fileno()), str(wire.fileno())],
-            pass_fds=(there.fileno(), wire.fileno()), start_new_session=True,
-        )  # fmt: skip
-        there.close()
-        wire.close()
+        self._process, here, pins = switch_on({**given, "begun": begun})
         opens = f"{Pins.__module__}:{Pins.__name__}"
         self._deadman, orders = deadman.start(opens, str(pins.fileno()), [pins.fileno()])
         pins.close()
-        here.send({**given, "begun": begun})
         try:
-            answer = here.recv() if here.poll(_STARTS) else "the emulated lung did not start"
-        except EOFError:
-            answer = "the emulated lung did not start"
-        if isinstance(answer, str):
+            identity, self.told = introduced(here)
+        except InputError:
             orders.close()
             here.close()
             self._end()
-            raise InputError(answer)
-        identity, self.told = answer
+            raise
         self._faults: tuple[LungFault, ...] = tuple(given["faults"])
         self._bus = _Bus(here, identity)
         super().__init__(self._bus, orders, clock)
@@ -229,8 +252,8 @@ def serve(
                     if not data:
                         raise EOFError
                     rest += data
-                    whole = len(rest) - len(rest) % _LINES.size
-                    *_, lines = (state.lines, *_LINES.iter_unpack(rest[:whole]))
+                    whole = len(rest) - len(rest) % LINES.size
+                    *_, lines = (state.lines, *LINES.iter_unpack(rest[:whole]))
                     rest = rest[whole:]
                     state = Electronics(normally_open, monostable, lines, now)
                 elif (message := bus.recv()) == "sample":

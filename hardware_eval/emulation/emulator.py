@@ -24,10 +24,10 @@ from types import FrameType
 from typing import Any
 
 from hardware_eval import realtime
-from hardware_eval.device.hal import Hal
 from hardware_eval.device.port import Guard, Port
 from hardware_eval.device.program import DeviceService, DeviceSettings
 from hardware_eval.emulation.faults import AnyFault, Line, LineFault, LungFault, parse
+from hardware_eval.emulation.firmware import Firmware
 from hardware_eval.emulation.loopback import Actuation
 from hardware_eval.wire.messages import Flag
 from ventbench.base.errors import InputError
@@ -55,8 +55,7 @@ class Emulator(Guard):
 
     def __init__(
         self,
-        hal: Hal,
-        settings: DeviceSettings | None = None,
+        service: DeviceService | Firmware,
         *,
         link: Path | None = None,
         control: Path | None = None,
@@ -67,21 +66,19 @@ class Emulator(Guard):
         """Open the terminal.
 
         Args:
-            hal: simulated hardware; its clock counts from now.
-            settings: limits of the device.
+            service: program of the device, with simulated hardware.
             link: symbolic link to make to the terminal, so that its name stays.
             control: path of the control socket to make.
             line_faults: what goes wrong on the line.
             log: file to which each change of the valves is written as it happens: time of
                 ``time.monotonic``, s, u_in, %, u_out, flags.
-            begun: zero of the hardware's clock on ``time.monotonic``, s, if it is not now.
+            begun: zero of the program's clock on ``time.monotonic``, s, if it is not now.
 
         Raises:
             InputError: if the link or the socket cannot be made.
         """
         now = time.monotonic()
         begun = now if begun is None else begun
-        service = DeviceService(hal, settings or DeviceSettings(), now - begun)
         self.actuations: deque[Actuation] = deque(maxlen=_REMEMBERED)
         self.actuations.append(Actuation(now, 0.0, 1))
         self.line = Line(line_faults)
@@ -96,6 +93,7 @@ class Emulator(Guard):
         self._control = self._open_control() if control else None
         unopened = [first]
         port = Port(lambda: unopened.pop() if unopened else self._open(), self._close_terminal)
+        self._device = service
         super().__init__(service, port, lambda: time.monotonic() - begun)
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
@@ -123,7 +121,7 @@ class Emulator(Guard):
     def turn(self, now: float, data: bytes) -> None:
         """Step the program; answer as the line's faults allow, and do what the control says."""
         answers = self.service.step(now, self.line.to_device(now, data) if data else b"")
-        state, last = self.service.state, self.actuations[-1]
+        state, last = self._device.state, self.actuations[-1]
         if (state.u_in, state.u_out) != (last.u_in, last.u_out):
             done = Actuation(time.monotonic(), state.u_in, state.u_out)
             self.actuations.append(done)
@@ -141,7 +139,7 @@ class Emulator(Guard):
 
     def _obey(self, text: str) -> None:
         """Do what lines of the control socket say; a wrong one is named on stderr."""
-        hal: Any = self.service.hal
+        hal: Any = self._device.hal
         for line in text.splitlines():
             word, _, argument = line.strip().partition(" ")
             try:
@@ -158,7 +156,7 @@ class Emulator(Guard):
     def add_fault(self, fault: AnyFault) -> None:
         """Add a fault of the lung or of the line; times on the device's clock."""
         if isinstance(fault, LungFault):
-            hal: Any = self.service.hal
+            hal: Any = self._device.hal
             hal.faults = (*hal.faults, fault)
         else:
             self.line.faults = (*self.line.faults, fault)
@@ -267,6 +265,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         action="store_true",
         help="refuse to run without real-time scheduling, which is taken where it is granted",
     )
+    parser.add_argument(
+        "--firmware",
+        type=Path,
+        metavar="FILE",
+        help="a program of hardware_eval/firmware as the device: .elf runs under QEMU",
+    )
     parser.add_argument("--pressure-limit", type=float, help="device's own limit, cmH2O")
     given = parser.parse_args(arguments)
     try:
@@ -290,17 +294,25 @@ def _emulate(given: argparse.Namespace) -> int:
     about = {name: getattr(given, name) for name in ("lung", "plant", "conceal", "seal")}
     sensor = {name: getattr(given, name) for name in ("noise", "quantum", "highest")}
     begun = time.monotonic()
-    hal = EmulatedHal(
-        {
-            **about, **sensor, "faults": [x for x in faults if isinstance(x, LungFault)],
-            "log": given.electronics, "normally_open": not given.normally_closed,
-            "monostable": float("inf") if given.no_monostable else MONOSTABLE,
-        },
-        lambda: time.monotonic() - begun, begun,
-    )  # fmt: skip
+    asked = {
+        **about, **sensor, "faults": [x for x in faults if isinstance(x, LungFault)],
+        "log": given.electronics, "normally_open": not given.normally_closed,
+        "monostable": float("inf") if given.no_monostable else MONOSTABLE,
+    }  # fmt: skip
+    hal: EmulatedHal | Firmware
+    if given.firmware is None:
+        hal = EmulatedHal(asked, lambda: time.monotonic() - begun, begun)
+    elif limit is None:
+        hal = Firmware(given.firmware, asked, begun)
+    else:
+        raise InputError("--pressure-limit: with --firmware, the limit is the firmware's own")
     try:
+        if isinstance(hal, Firmware):
+            service = hal
+        else:
+            service = DeviceService(hal, settings, time.monotonic() - begun)
         emulator = Emulator(
-            hal, settings, link=given.link, control=given.control, line_faults=line_faults,
+            service, link=given.link, control=given.control, line_faults=line_faults,
             log=given.log, begun=begun,
         )  # fmt: skip
         reason = realtime.prefer()
@@ -315,6 +327,8 @@ def _emulate(given: argparse.Namespace) -> int:
 
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, end)
+        if isinstance(hal, Firmware):
+            hal.start(lambda: emulator.port.inbox.put(b""))
         print(emulator.terminal, flush=True)
         processes = ", ".join(f"{name} {number}" for name, number in hal.processes.items())
         print(f"{hal.told} ({processes}); Ctrl-C ends it", file=sys.stderr, flush=True)

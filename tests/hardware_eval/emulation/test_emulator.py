@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 import serial
 
+from hardware_eval.device.program import DeviceService, DeviceSettings
 from hardware_eval.emulation import emulator as emulator_module
 from hardware_eval.emulation.electronics import emulated_lung
 from hardware_eval.emulation.emulator import Emulator, tell
@@ -39,8 +40,9 @@ PATIENCE = 20.0
 @pytest.fixture
 def emulator(tmp_path: Path) -> Iterator[Emulator]:
     running = Emulator(
-        Bench(), link=tmp_path / "lung", control=tmp_path / "control", log=tmp_path / "valves.csv"
-    )
+        DeviceService(Bench(), DeviceSettings(), 0.0), link=tmp_path / "lung",
+        control=tmp_path / "control", log=tmp_path / "valves.csv",
+    )  # fmt: skip
     stop = threading.Event()
     thread = threading.Thread(target=running.run, args=(stop.is_set,))
     thread.start()
@@ -202,7 +204,7 @@ def test_wrong_arguments_say_what_to_do(tmp_path: Path, capsys: pytest.CaptureFi
     taken = tmp_path / "taken"
     taken.touch()
     with pytest.raises(InputError, match="remove it"):
-        Emulator(Bench(), link=taken)
+        Emulator(DeviceService(Bench(), DeviceSettings(), 0.0), link=taken)
 
 
 def test_pyserial_is_the_link() -> None:

@@ -1,0 +1,168 @@
+"""Images of the firmware, on this computer and on a Cortex-M3 under QEMU, with an emulated lung.
+
+They run in real time, on clocks of their own: bounds are those of the device's clock, which counts
+instructions under QEMU, so that a busy machine can be slow but not late.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from hardware_eval import cli
+from hardware_eval.emulation.emulator import Emulator
+from hardware_eval.emulation.firmware import Firmware, Order
+from hardware_eval.wire.client import Client
+from hardware_eval.wire.errors import RefusedError
+from hardware_eval.wire.link import Link
+from hardware_eval.wire.messages import Flag, Mode
+from tests.hardware_eval.firmware.core import FIRMWARE, tool
+from ventbench.base.errors import InputError
+
+IMAGES = {"linux": "ventilator-linux", "mps2": "ventilator-mps2.elf"}
+PATIENCE = 60.0
+LUNG = "R20C50"
+
+
+def _made(board: str, folder: Path) -> Path:
+    tool({"linux": "cc", "mps2": "arm-none-eabi-gcc"}[board])
+    subprocess.run(["make", "-s", "-C", str(FIRMWARE), f"OUT={folder}", board], check=True)
+    return folder / IMAGES[board]
+
+
+class Logged(Firmware):
+    """Remembers all orders."""
+
+    orders: list[Order]
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "state":
+            self.__dict__.setdefault("orders", []).append(value)
+        super().__setattr__(name, value)
+
+
+@pytest.fixture(params=list(IMAGES))
+def device(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Logged, Path]]:
+    image = _made(request.param, tmp_path)
+    if image.suffix == ".elf":
+        tool("qemu-system-arm")
+    log = tmp_path / "electronics.csv"
+    about = {"lung": LUNG, "plant": "single_compartment", "conceal": None, "seal": None}
+    given = {**about, "faults": [], "log": log, "normally_open": True, "monostable": 0.09}
+    firmware = Logged(image, given, time.monotonic())
+    emulator = Emulator(firmware, link=tmp_path / "lung")
+    firmware.start(lambda: emulator.port.inbox.put(b""))
+    stop = threading.Event()
+    thread = threading.Thread(target=emulator.run, args=(stop.is_set,))
+    thread.start()
+    yield firmware, tmp_path
+    stop.set()
+    thread.join()
+    firmware.close()
+
+
+def _until(done: Callable[[], object]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def _inspiring(firmware: Logged, client: Client) -> None:
+    client.arm()
+    client.heartbeat()
+    assert client.command(25.0, 0).mode is Mode.RUNNING
+    _until(lambda: (firmware.state.u_in, firmware.state.u_out) == (25.0, 0))
+
+
+def test_an_image_needs_neither_heap_nor_floating_point(tmp_path: Path) -> None:
+    image = _made("mps2", tmp_path)
+    names = subprocess.run(
+        [tool("arm-none-eabi-nm"), str(image)], check=True, capture_output=True, text=True
+    ).stdout
+    assert "device_step" in names
+    assert not re.search(r"malloc|sbrk|__aeabi_[fd]|__.*[sd]f[23]\b", names)
+
+
+def test_an_image_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no such file; make it with `make`"):
+        Firmware(tmp_path / "none.elf", {"faults": []}, 0.0)
+
+
+@pytest.mark.slow
+def test_the_watchdog_vents_when_the_host_falls_silent(device: tuple[Logged, Path]) -> None:
+    firmware, folder = device
+    client = Client(Link(str(folder / "lung")), timeout=PATIENCE)
+    _until(lambda: firmware.orders[-1].time > 0.0)
+    client.hello()
+    for _ in range(12):
+        firmware.orders.clear()
+        for _ in range(20):  # the link itself may be late, which vents too
+            try:
+                _inspiring(firmware, client)
+                break
+            except (AssertionError, RefusedError):
+                continue
+        _until(lambda: firmware.state.u_out == 1)
+        opened = next(order for order in firmware.orders if order.u_in == 25.0)
+        vented = next(x for x in firmware.orders if x.time > opened.time and x.u_out == 1)
+        assert vented.u_in == 0.0
+        assert vented.time - opened.time <= 0.1
+        assert client.heartbeat().flags == Flag.COMMANDS_STOPPED
+    client.close()
+
+
+@pytest.mark.slow
+def test_electronics_vent_when_the_image_stands_still(device: tuple[Logged, Path]) -> None:
+    firmware, folder = device
+    client = Client(Link(str(folder / "lung")), timeout=PATIENCE)
+    _until(lambda: firmware.orders[-1].time > 0.0)
+    client.hello()
+    _inspiring(firmware, client)
+    image = firmware.processes["device"]
+    os.kill(image, signal.SIGSTOP)
+    log = folder / "electronics.csv"
+    _until(lambda: log.read_text().splitlines()[-1].endswith("0,1,monostable"))
+    os.kill(image, signal.SIGCONT)
+    _until(lambda: client.heartbeat().mode is Mode.VENTED)
+    client.close()
+
+
+@pytest.mark.slow
+def test_self_test_and_a_run_of_twelve_on_an_emulated_microcontroller(tmp_path: Path) -> None:
+    image = _made("mps2", tmp_path)
+    tool("qemu-system-arm")
+    link, out = tmp_path / "lung", tmp_path / "out"
+    emulator = subprocess.Popen(
+        [sys.executable, "-m", "hardware_eval", "emulate", "--firmware", str(image), "--lung", LUNG,
+         "--link", str(link)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert emulator.stdout is not None
+        assert emulator.stdout.readline().strip(), emulator.communicate()[1]
+        sheet = CliRunner().invoke(cli.app, ["selftest", "--port", str(link), "--lung", LUNG])
+        assert sheet.exit_code == 0, sheet.output
+        assert f"self-test of {LUNG}: GO" in sheet.output
+        done = CliRunner().invoke(
+            cli.app,
+            ["run", "pid_best", "--port", str(link), "--lung", LUNG, "--repeats", "2", "--rest",
+             "0.5", "--control-every", "0", "--no-dry-run", "--no-selftest", "--no-sandbox",
+             "--yes", "--out", str(out)],
+        )  # fmt: skip
+        assert done.exit_code == 0, done.output
+    finally:
+        emulator.send_signal(signal.SIGINT)
+        emulator.communicate(timeout=PATIENCE)
+    assert emulator.returncode == 0

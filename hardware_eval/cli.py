@@ -7,6 +7,7 @@ without a score, a no-go); 2 bad input or no device.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -278,6 +279,44 @@ def selftest(
     emit(sheet.as_dict(), json)
     print(sheet, file=sys.stderr if str(json) == "-" else sys.stdout)
     if not sheet.go:
+        raise typer.Exit(1)
+
+
+@app.command()
+def conformance(
+    port: Annotated[str | None, typer.Option(help="Serial port of the device; see `run`.")] = None,
+    vectors: Annotated[
+        bool, typer.Option("--vectors", help="Print frames for whoever writes firmware.")
+    ] = False,
+    json: JsonFile = None,
+) -> None:
+    """Does a device follow PROTOCOL.md? Exit code 1 if a line of it does not hold.
+
+    The valves move, up to 100 % for a moment: supply off, or an open tube.
+
+    Example: `ventbench-hardware conformance --port /dev/ttyACM0`
+    """
+    from hardware_eval.results import evaluate as ev
+    from hardware_eval.wire import conformance as judge
+
+    if vectors:
+        print(judge.vectors())
+        return
+    if port is None:
+        raise InputError("--port: give the device's serial port, such as /dev/ttyACM0")
+    shown = sys.stderr if str(json) == "-" else sys.stdout
+    transport, clock = ev.carrier(port)
+    try:
+        clauses = judge.conformance(
+            transport, clock, lambda clause: print(clause, file=shown, flush=True)
+        )
+    finally:
+        transport.close()
+    failed = sum(clause.holds is False for clause in clauses)
+    held = sum(clause.holds is True for clause in clauses)
+    emit({"holds": not failed, "clauses": [dataclasses.asdict(clause) for clause in clauses]}, json)
+    print(f"{held} hold, {failed} fail, {len(clauses) - held - failed} not tried", file=shown)
+    if failed:
         raise typer.Exit(1)
 
 

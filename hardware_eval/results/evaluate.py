@@ -39,6 +39,7 @@ from ventbench.task.interfaces import Task
 
 if TYPE_CHECKING:
     from hardware_eval.emulation.loopback import LoopbackDevice
+    from hardware_eval.wire.link import Link
 
 #: Files of an evaluation in its folder.
 LOG, RECORDING = "raw.jsonl", "recording.csv.gz"
@@ -118,8 +119,25 @@ def port_kind(port: str) -> str:
 VIRTUAL = "virtual:"
 
 
+def carrier(port: str) -> tuple[Link | LoopbackDevice, Clock]:
+    """Open a port and say nothing; see :func:`connect`.
+
+    Returns:
+        What carries the bytes, and the clock that it lives by.
+    """
+    from hardware_eval.wire.link import Link
+
+    if not port.startswith(VIRTUAL):
+        return Link(port), RealClock()
+    from hardware_eval.emulation.loopback import loopback
+    from hardware_eval.emulation.simulated import simulated_lung
+
+    device = loopback(simulated_lung(port.removeprefix(VIRTUAL)))
+    return device, device.clock
+
+
 def connect(port: str) -> Line:
-    """Open a port.
+    """Open a port, and a session.
 
     Args:
         port: a serial port or socket, in real time; or ``virtual:R20C50``, an emulated lung in this
@@ -131,22 +149,15 @@ def connect(port: str) -> Line:
     """
     from hardware_eval.wire.link import Link
 
-    if port.startswith(VIRTUAL):
-        from hardware_eval.emulation.loopback import loopback
-        from hardware_eval.emulation.simulated import simulated_lung
-
-        device = loopback(simulated_lung(port.removeprefix(VIRTUAL)))
-        virtual = Client(device, device.clock)
-        virtual.hello()
-        return Line(virtual, device.clock, device)
-    kind = port_kind(port)
-    client = Client(Link(port))
+    transport, clock = carrier(port)
+    client = Client(transport, clock)
     try:
         client.hello()
     except InputError:
         client.close()
         raise
-    return Line(client, RealClock(), port=kind)
+    device = None if isinstance(transport, Link) else transport
+    return Line(client, clock, device, port_kind(port))
 
 
 def device_about(line: Line) -> dict[str, Any]:

@@ -21,9 +21,11 @@ import pytest
 from typer.testing import CliRunner
 
 from hardware_eval import cli
+from hardware_eval.clock import RealClock
 from hardware_eval.emulation.emulator import Emulator
 from hardware_eval.emulation.firmware import Firmware, Order
 from hardware_eval.wire.client import Client
+from hardware_eval.wire.conformance import conformance
 from hardware_eval.wire.errors import RefusedError
 from hardware_eval.wire.link import Link
 from hardware_eval.wire.messages import Flag, Mode
@@ -121,6 +123,16 @@ def test_the_watchdog_vents_when_the_host_falls_silent(device: tuple[Logged, Pat
         assert vented.time - opened.time <= 0.1
         assert client.heartbeat().flags == Flag.COMMANDS_STOPPED
     client.close()
+
+
+@pytest.mark.slow
+def test_an_image_conforms(device: tuple[Logged, Path]) -> None:
+    firmware, folder = device
+    _until(lambda: firmware.orders[-1].time > 0.0)
+    link = Link(str(folder / "lung"))
+    clauses = conformance(link, RealClock())
+    link.close()
+    assert not [str(clause) for clause in clauses if clause.holds is False]
 
 
 @pytest.mark.slow

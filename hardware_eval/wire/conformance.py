@@ -1,0 +1,209 @@
+"""Does a device follow PROTOCOL.md? The specification as a list of checks over the wire.
+
+Written from the specification, with nothing of a device but the codec of the wire. Every check
+begins a session of its own. What a slow host could spoil is judged by bounds that lateness cannot
+move, and is otherwise tried again: an answer that came before the watchdog's time shows that the
+device had no reason to vent, and a question that was asked after its bound that it must have. So is
+a check in which sensor or pressure made the device vent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from hardware_eval.clock import Clock
+from hardware_eval.wire.clauses import CLAUSES
+from hardware_eval.wire.client import Transport
+from hardware_eval.wire.errors import NoAnswerError
+from hardware_eval.wire.messages import (
+    Arm,
+    Capability,
+    Command,
+    Counters,
+    DeviceMessage,
+    Flag,
+    Heartbeat,
+    Hello,
+    HostMessage,
+    Mode,
+    Packet,
+    Reading,
+    Reason,
+    Refusal,
+    Statistics,
+    Vent,
+    Welcome,
+    encode,
+)
+from hardware_eval.wire.probe import (
+    DiffersError,
+    LateError,
+    Probe,
+    UntriedError,
+)
+
+#: Attempts at a check that a slow host spoils.
+_ATTEMPTS = 20
+
+#: What no host can provoke over the wire.
+NOT_TRIED = (
+    "no valid pressure for 50 ms vents (duty 2)",
+    "a reading that stands for 250 ms vents, if the sensor has noise (duty 2)",
+    "noise above 1 cmH2O vents (duty 2)",
+    "the end of the sensor's range vents, and a limit beyond it bars arming (duty 2)",
+    "a device that was held up vents before it listens (duty 3)",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Clause:
+    """One line of the verdict.
+
+    Attributes:
+        text: what the specification asks, and where.
+        holds: whether it does; None if it was not tried.
+        detail: what was seen instead, or why it was not tried.
+    """
+
+    text: str
+    holds: bool | None
+    detail: str = ""
+
+    def __str__(self) -> str:
+        """A line for people."""
+        mark = {True: "holds", False: "FAILS", None: "not tried"}[self.holds]
+        return f"{mark:9}  {self.text}{f': {self.detail}' if self.detail else ''}"
+
+
+def conformance(
+    transport: Transport,
+    clock: Clock,
+    tell: Callable[[Clause], None] = lambda clause: None,
+    seed: int = 0,
+) -> list[Clause]:
+    """Try a device by the specification.
+
+    Args:
+        transport: carries bytes to it and back.
+        clock: of the transport.
+        tell: called with each line as it is known.
+        seed: of the session numbers.
+
+    Returns:
+        All lines, in the order of :data:`CLAUSES`, then those of :data:`NOT_TRIED`.
+
+    Raises:
+        NoAnswerError: if there is no device.
+        DisconnectedError: if the port goes away.
+    """
+    host, done = Probe(transport, clock, seed), []
+    for attempt in range(_ATTEMPTS):
+        try:
+            host.hello()
+            break
+        except DiffersError as error:
+            if attempt == _ATTEMPTS - 1:
+                raise NoAnswerError(f"the device does not answer a hello: {error}") from None
+    for text, check in CLAUSES:
+        done.append(_judged(host, text, check))
+        tell(done[-1])
+    for text in NOT_TRIED:
+        done.append(Clause(text, None, "no host can provoke it"))
+        tell(done[-1])
+    host.transport.write(host.frame(Vent()))
+    return done
+
+
+def _judged(host: Probe, text: str, check: Callable[[Probe], None]) -> Clause:
+    reason = ""
+    for _ in range(_ATTEMPTS):
+        try:
+            host.hear(0.01)
+            host.heard.clear()
+            host.hello()
+            before = host.counters()
+            host.hello()
+            check(host)
+        except LateError:
+            reason = "the host was too slow; close other programs"
+            host.hear(0.25)
+            continue
+        except DiffersError as error:
+            reason = str(error)
+            if _by_itself(host, before):
+                continue
+            return Clause(text, False, reason)
+        except UntriedError as error:
+            return Clause(text, None, str(error))
+        return Clause(text, True)
+    return Clause(text, False, f"{reason}, {_ATTEMPTS} times in a row")
+
+
+def _by_itself(host: Probe, before: Counters) -> bool:
+    """Whether sensor, pressure or lateness have made the device vent since."""
+    try:
+        host.hear(0.01)
+        host.heard.clear()
+        host.hello()
+        after = host.counters()
+    except DiffersError:
+        return False
+    names = ("sensor", "overpressure", "device_late")
+    return any(getattr(after, name) != getattr(before, name) for name in names)
+
+
+def exchange() -> list[tuple[str, HostMessage | DeviceMessage, str]]:
+    """Frames for whoever writes firmware: a device at 1.234567 s, its sensor at 5 cmH2O.
+
+    Returns:
+        Who sends, the message, and its frame in hexadecimal digits, in the order of the exchange.
+    """
+    reading: dict[str, Any] = {"time": 1.234567, "pressure": 5.0, "flow": math.nan}
+    ready = {"u_in": 0.0, "u_out": 1, "mode": Mode.READY, "flags": Flag.NONE}
+    running = {**ready, "mode": Mode.RUNNING}
+    welcome = Welcome(
+        1, (1, 0, 0), Capability.NONE, 0.08, 40.0, b"12345678", bytes(range(32)), "bench"
+    )
+    counts = Counters(frames=6, commands=1, stale=1)
+    steps: list[tuple[HostMessage, Callable[[int], DeviceMessage]]] = [
+        (Hello(pressure_limit=40.0), lambda number: welcome),
+        (Heartbeat(), lambda number: Reading(number, **reading, **ready)),
+        (Arm(), lambda number: Reading(number, **reading, **running)),
+        (
+            Command(12.34, 0, 1234),
+            lambda number: Reading(number, **reading, **{**running, "u_in": 12.34, "u_out": 0}),
+        ),
+        (
+            Command(50.0, 0, 1133),
+            lambda number: Refusal(number, Reason.STALE, Mode.RUNNING, Flag.NONE),
+        ),
+        (Statistics(), lambda number: counts),
+        (
+            Command(100.01, 0, 1234),
+            lambda number: Refusal(number, Reason.OUT_OF_RANGE, Mode.VENTED, Flag.OUT_OF_RANGE),
+        ),
+        (
+            Vent(),
+            lambda number: Reading(
+                number, **reading, u_in=0.0, u_out=1, mode=Mode.VENTED,
+                flags=Flag.OUT_OF_RANGE | Flag.HOST_VENTED,
+            ),
+        ),
+    ]  # fmt: skip
+    rows: list[tuple[str, HostMessage | DeviceMessage, str]] = []
+    for number, (asked, answer) in enumerate(steps, 1):
+        for who, message in (("host", asked), ("device", answer(number))):
+            frame = encode(Packet(0x01020304, number, message)).hex()
+            rows.append((who, message, frame))
+    return rows
+
+
+def vectors() -> str:
+    """The exchange as the table of PROTOCOL.md."""
+    lines = ["| from | message | frame |", "|---|---|---|"]
+    for who, message, frame in exchange():
+        lines.append(f"| {who} | {message.kind.name.lower()} | `{frame}` |")
+    return "\n".join(lines)

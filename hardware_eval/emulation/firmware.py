@@ -98,11 +98,9 @@ class Firmware:
             self.close()
             raise
         endless = identity.highest > 327.0
-        self._send(
-            _IDENTITY.pack(
-                b"I", identity.device_id, identity.calibration, identity.capabilities,
-                _ENDLESS if endless else round(PRESSURE_STEPS * identity.highest), identity.noisy,
-            )
+        self._identity = _IDENTITY.pack(
+            b"I", identity.device_id, identity.calibration, identity.capabilities,
+            _ENDLESS if endless else round(PRESSURE_STEPS * identity.highest), identity.noisy,
         )  # fmt: skip
 
     def start(self, wake: Callable[[], None]) -> None:
@@ -189,7 +187,9 @@ class Firmware:
                 for frame in frames:
                     order = _content(frame)
                     if order is not None and len(order) == _ORDER.size:
-                        _, time, u_in, u_out = _ORDER.unpack(order)
+                        kind, time, u_in, u_out = _ORDER.unpack(order)
+                        if kind == b"?":
+                            self._send(self._identity)
                         self.state = Order(time / 1e6, u_in / U_IN_STEPS, u_out)
                         self._pins.sendall(electronics.LINES.pack(self.state.u_in, u_out))
                         with self._asking:

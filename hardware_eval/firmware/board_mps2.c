@@ -7,6 +7,7 @@
 
 enum {
     CLOCK = 25,  /* MHz */
+    BYTE_PATIENCE = 500, /* us: a byte takes 87 at the host's speed */
     RING = 1024, /* bytes that a line holds, a power of two */
     TX_FULL = 1,
     RX_FULL = 2,
@@ -174,8 +175,10 @@ size_t board_read(enum board_line line, uint8_t *data, size_t room)
 void board_write(enum board_line line, const uint8_t *data, size_t length)
 {
     while (length--) {
+        uint64_t until = board_now() + BYTE_PATIENCE;
         while (UART(line)->state & TX_FULL)
-            ;
+            if (board_now() > until)
+                return; /* nobody takes it: lost, as on a wire; the guard must go on */
         UART(line)->data = *data++;
     }
 }

@@ -1,8 +1,8 @@
 /* The loop of a device: sample, step, set the valves, answer.
  *
- * Sensors and valves are on a bus, in frames as on the wire without its header. The electronics
- * first send what they are ('I'); then every order ('O') is answered with a sample ('S'). A board
- * with a converter and PWM of its own replaces `take` and `order`. */
+ * Sensors and valves are on a bus, in frames as on the wire without its header. An order of a board
+ * that has just started ('?') is answered with what the electronics are ('I'), later ones ('O')
+ * with a sample ('S'). A board with a converter and PWM of its own replaces `take` and `order`. */
 #include <string.h>
 
 #include "board.h"
@@ -18,7 +18,8 @@ static struct sample newest = {.pressure = DEVICE_UNKNOWN, .flow = DEVICE_UNKNOW
 /* Orders the valves: time, inspiratory valve, expiratory valve. */
 static void order(uint16_t u_in, uint8_t u_out)
 {
-    uint8_t packet[1 + 8 + 2 + 1 + WIRE_CRC] = {'O'}, frame[sizeof packet + 3];
+    uint8_t packet[1 + 8 + 2 + 1 + WIRE_CRC] = {identity.name_length ? 'O' : '?'};
+    uint8_t frame[sizeof packet + 3];
     wire_put(wire_put(wire_put(packet + 1, board_now(), 8), u_in, 2), u_out, 1);
     board_write(BOARD_BUS, frame, wire_frame(packet, sizeof packet - WIRE_CRC, frame));
 }

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
+from hardware_eval.wire.errors import NoAnswerError
 from typer.testing import CliRunner
 
 from hardware_eval import cli
@@ -15,7 +16,6 @@ from hardware_eval.device.program import DeviceService, DeviceSettings
 from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.results import evaluate
 from hardware_eval.wire.conformance import CLAUSES, NOT_TRIED, Clause, conformance, vectors
-from hardware_eval.wire.errors import NoAnswerError
 from hardware_eval.wire.messages import Capability
 from tests.hardware_eval.firmware.core import CoreService, loopback
 from tests.hardware_eval.stand_in import Bench

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hardware_eval.wire.errors import RefusedError
 from typer.testing import CliRunner
 
 from hardware_eval import cli
@@ -25,7 +26,6 @@ from hardware_eval.emulation.emulator import Emulator
 from hardware_eval.emulation.firmware import Firmware, Order
 from hardware_eval.wire.client import Client
 from hardware_eval.wire.conformance import conformance
-from hardware_eval.wire.errors import RefusedError
 from hardware_eval.wire.link import Link
 from hardware_eval.wire.messages import Flag, Mode
 from tests.hardware_eval.firmware.core import FIRMWARE, tool

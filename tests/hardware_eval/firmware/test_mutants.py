@@ -1,4 +1,4 @@
-"""The core explored over all its states, and wrong cores that exploration or conformance catches."""
+"""The core explored over all its states, and wrong cores that it or conformance catches."""
 
 from __future__ import annotations
 

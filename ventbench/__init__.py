@@ -7,7 +7,7 @@ Everything that a notebook needs is an attribute of this package and is imported
   ``Plant``;
 - controllers: ``score``, ``rollout``, ``tune_pid``, ``train_residual``, ``train_ppo``,
   ``train_dqn``, the protocol ``Controller``;
-- missing physics: ``diagnose``, ``Diagnosis``;
+- missing physics: ``diagnose``, ``Diagnosis``, ``isolability``;
 - learned simulators: ``train_rigs``; the leaderboard: ``load_board``.
 
 ``help(ventbench.score)`` and so on say types, shapes and units and give an example.
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ventbench.base.files import example as example
     from ventbench.board.frames import load_board as load_board
     from ventbench.diagnosis.diagnose import diagnose as diagnose
+    from ventbench.diagnosis.isolability import isolability as isolability
     from ventbench.diagnosis.result import Diagnosis as Diagnosis
     from ventbench.entries.result import Score as Score
     from ventbench.entries.scoring import score as score
@@ -74,6 +75,7 @@ _SOURCES = {
     "Trajectories": ("trajectories", "Trajectories"),
     "diagnose": ("diagnosis.diagnose", "diagnose"),
     "example": ("base.files", "example"),
+    "isolability": ("diagnosis.isolability", "isolability"),
     "import_recording": ("recordings.foreign", "import_recording"),
     "load_board": ("board.frames", "load_board"),
     "load_recording": ("recordings", "load"),

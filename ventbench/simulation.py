@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -199,13 +200,14 @@ def _controls(u_in: ArrayLike) -> Controls:
     return Controls(_steps(values.size), values, np.zeros_like(values))
 
 
-def read_controls(path: Path) -> Controls:
+def read_controls(path: Path, *, by_breath: bool = False) -> Controls:
     """Read a CSV file of commands.
 
     Args:
         path: header line and one row a sample; column ``u_in``, optionally ``u_out`` (0 if missing)
             and ``time_step`` in s (steps of 30 ms if missing); others are ignored, so that a
             recording of one breath is such a file too.
+        by_breath: times may start anew with another ``breath_id``.
 
     Raises:
         InputError: if a column is missing or a value is wrong; it says which.
@@ -231,6 +233,8 @@ def read_controls(path: Path) -> Controls:
     _first(path, "u_in", out, u_in, "is outside 0..100 %. Fix the row.")
     _first(path, "u_out", (u_out != 0) & (u_out != 1), u_out, "is neither 0 nor 1. Fix the row.")
     back = np.append(False, np.diff(time) <= 0)
+    if by_breath:
+        back[1:] &= [a["breath_id"] == b["breath_id"] for a, b in pairwise(rows)]
     _first(path, "time_step", back, time, "s is not later than the row before. Give one breath.")
     return Controls(time, u_in, u_out)
 

@@ -319,7 +319,60 @@ def remaining(elapsed: float, share: float) -> str:
     return f"about {left / 60.0:.0f} min left"
 
 
+def isolability(
+    controls: Annotated[
+        Path,
+        typer.Option(
+            metavar="FILE", help="CSV file of planned breaths: u_in, u_out, time_step, breath_id."
+        ),
+    ],
+    lung: Annotated[str, typer.Option(metavar="R20C50", help="Label of the lung.")] = "R20C50",
+    sensors: Annotated[
+        str, typer.Option(metavar="pressure,flow", help="What is measured.")
+    ] = "pressure",
+    noise: Annotated[float, typer.Option(help="Of pressure, standard deviation, cmH2O.")] = 0.25,
+    names: Annotated[
+        str, typer.Option(metavar="A,B", help="Only these mechanisms; the library if empty.")
+    ] = "",
+    json: JsonFile = None,
+) -> None:
+    """Tell which mechanisms planned breaths could tell apart, before anything is recorded.
+
+    Strengths are mild. Pairs that cannot be told apart are listed with the breath or the sensor
+    that would separate them. The exit code is 1 if there are such pairs.
+
+    Example: `ventbench isolability --lung R20C50 --controls plan.csv --sensors pressure,flow`
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from ventbench.base import compilation
+    from ventbench.diagnosis.isolability import isolability as compute
+
+    compilation.keep()
+    found = compute(
+        controls, lung=lung, sensors=[each.strip() for each in sensors.split(",")],
+        noise={"pressure": noise}, names=[each for each in names.split(",") if each] or None,
+    )  # fmt: skip
+    emit(found.as_dict(), json)
+    console = Console(stderr=str(json) == "-")
+    for group in found.groups:
+        told = "told from all others" if len(group) == 1 else "not told apart"
+        console.print(f"{', '.join(group)}: {told}", highlight=False)
+    table = Table(title="What the plan does not tell apart, or not show at a mild strength")
+    for name in ("mechanisms", "nats", "what would", "nats then"):
+        table.add_column(name, justify="right" if "nats" in name else "left")
+    for pair in (*found.confused, *found.unseen):
+        remedy = pair.remedy or "nothing that is known"
+        table.add_row(" / ".join(pair.names), f"{pair.nats:.1f}", remedy, f"{pair.gained:.1f}")
+    if table.row_count:
+        console.print(table)
+    if found.confused:
+        raise typer.Exit(1)
+
+
 def register(app: typer.Typer) -> None:
     """Add the command."""
     app.command()(diagnose)
     app.command()(mechanics)
+    app.command()(isolability)

@@ -1,0 +1,285 @@
+"""Which mechanisms planned breaths could tell apart, before anything is recorded.
+
+The response to planned commands is simulated without any mechanism and with each at its mild
+strength. What a refit of R, C, R_ex, PEEP and each breath's start absorbs is projected out, in the
+metric of the noise. Half of what is left, squared, is the log-likelihood, nats, that the mechanism
+is worth. Of a pair, what is left of one after the other is refitted too, with all of its
+parameters and the sign that it can have, is what tells them apart; the smaller of both directions
+counts. (Fault isolability by sensitivities: the angle between residual subspaces.)
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ventbench.base.errors import InputError
+from ventbench.diagnosis.candidate_breaths import Rig, families
+from ventbench.diagnosis.settings import DEFAULT
+from ventbench.physics.catalogue import library, mechanism, parameter, paths, strength_path
+from ventbench.physics.parameters import REFITTED
+from ventbench.simulation import Controls, read_controls
+from ventbench.system_id import START, Data, Noise, Predictor, parameter_values
+from ventbench.system_id.data import Floats
+from ventbench.task import protocol
+from ventbench.task.lungs import lung as parse_lung
+
+#: What may be measured, and the channel of each.
+SENSORS = ("pressure", "flow")
+
+#: Share of the other parameters of a mechanism by which they are moved for their derivatives.
+_STEP = 0.1
+
+#: Share of a diagonal below which a direction is taken to be absorbed.
+_RIDGE = 1e-9
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two mechanisms that the plan cannot tell apart, or one that it cannot show.
+
+    Attributes:
+        names: both, or the one.
+        nats: log-likelihood by which the plan tells them apart, or shows it.
+        remedy: the least that would, a sensor or one further breath in words; None if none does.
+        gained: nats with it; with the best there is if it is not enough.
+    """
+
+    names: tuple[str, ...]
+    nats: float
+    remedy: str | None
+    gained: float
+
+
+@dataclass(frozen=True)
+class Isolability:
+    """What a plan can tell.
+
+    Attributes:
+        lung: label.
+        sensors: what is measured.
+        threshold: nats from which something is told.
+        detectable: nats that each mechanism is worth at its mild strength, by name.
+        nats: nats by which each pair of detectable mechanisms is told apart.
+        confused: the pairs below the threshold, the closest first.
+        unseen: mechanisms that the plan would not show at a mild strength.
+        groups: detectable mechanisms, those in one group that pairs below the threshold join.
+    """
+
+    lung: str
+    sensors: tuple[str, ...]
+    threshold: float
+    detectable: dict[str, float]
+    nats: dict[tuple[str, str], float]
+    confused: tuple[Pair, ...]
+    unseen: tuple[Pair, ...]
+    groups: tuple[tuple[str, ...], ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values."""
+        pairs = [{"names": list(names), "nats": value} for names, value in self.nats.items()]
+        return asdict(self) | {"nats": pairs}
+
+
+def isolability(
+    controls: Controls | Sequence[Controls] | Path | str,
+    *,
+    lung: str = "R20C50",
+    sensors: Sequence[str] = ("pressure",),
+    noise: Mapping[str, float] | None = None,
+    names: Iterable[str] | None = None,
+    threshold: float = DEFAULT.held_out_test.threshold,
+) -> Isolability:
+    """Tell which mechanisms planned breaths can tell apart.
+
+    Args:
+        controls: planned breaths: one, several, or a CSV file of them (``u_in``, and perhaps
+            ``u_out``, ``time_step`` and ``breath_id``).
+        lung: label of the lung.
+        sensors: ``"pressure"``, ``"flow"`` or both.
+        noise: standard deviations, cmH2O and mL/s, by sensor; 0.25 and 20 if not given.
+        names: mechanisms to compare; the library without patient effort if None.
+        threshold: nats from which something is told: odds of a hundred to one.
+
+    Raises:
+        InputError: if a command, a sensor or a name is wrong.
+
+    Examples:
+        >>> from ventbench.diagnosis.isolability import isolability
+        >>> told = isolability("plan.csv", lung="R20C20")  # doctest: +SKIP
+        >>> told.groups  # doctest: +SKIP
+    """
+    if not sensors or not set(sensors) <= set(SENSORS):
+        raise InputError(f"sensors {', '.join(sensors)}: choose among {', '.join(SENSORS)}")
+    chosen = tuple(names or (name for name in library() if name != "patient_effort"))
+    for name in chosen:
+        mechanism(name)  # says what there is if the name is wrong
+    planned = read_plan(controls) if isinstance(controls, str | Path) else controls
+    planned = [planned] if isinstance(planned, Controls) else list(planned)
+    label = parse_lung(lung)
+    dt = float(np.median(np.concatenate([breath.dt for breath in planned])))
+    rig = Rig(label.R, label.C, float(parameter("gain").neutral), protocol.PEEP)
+    samples = max(len(breath.time) for breath in planned)
+    kinds = families(rig, samples, dt)
+    further = [
+        (kind.title, Controls(np.arange(samples, dtype=np.float64) * dt, u_in, u_out))
+        for kind in kinds
+        for u_in, u_out in zip(kind.u_in, kind.u_out, strict=True)
+    ]
+    every = [*planned, *(breath for _, breath in further)]
+    data = _data(every, len(planned), label.R, label.C, samples)
+    sigma = {"pressure": Noise().sigma[0], "flow": Noise().sigma[1]} | dict(noise or {})
+    now = _Space(data, chosen, sensors, sigma)
+    both = now if "flow" in sensors else _Space(data, chosen, (*sensors, "flow"), sigma)
+    plan = list(range(len(planned)))
+    detectable = {name: now.worth(name, plan) for name in chosen}
+    seen = [name for name in chosen if detectable[name] >= threshold]
+    nats = {pair: now.apart(*pair, plan) for pair in combinations(seen, 2)}
+
+    def remedy(measure: Callable[[_Space, list[int]], float]) -> tuple[str | None, float]:
+        options = [
+            (f"one breath: {title}", measure(now, [*plan, len(planned) + k]))
+            for k, (title, _) in enumerate(further)
+        ]
+        best = max(options, key=lambda option: option[1])
+        if best[1] < threshold and "flow" not in sensors:
+            best = max(best, ("also measure flow", measure(both, plan)), key=lambda o: o[1])
+        return (best[0] if best[1] >= threshold else None), best[1]
+
+    confused = [
+        Pair(pair, value, *remedy(lambda space, which, pair=pair: space.apart(*pair, which)))
+        for pair, value in sorted(nats.items(), key=lambda item: item[1])
+        if value < threshold
+    ]
+    unseen = [
+        Pair((name,), value, *remedy(lambda space, which, name=name: space.worth(name, which)))
+        for name, value in detectable.items()
+        if value < threshold
+    ]
+    return Isolability(
+        label.id, tuple(sensors), threshold, detectable, nats, tuple(confused), tuple(unseen),
+        _groups(seen, confused),
+    )  # fmt: skip
+
+
+def read_plan(path: Path | str) -> list[Controls]:
+    """Read planned breaths, those of a recording or of ``record_next.csv`` too.
+
+    Raises:
+        InputError: if a column is missing or a value is wrong.
+        OSError: if the file cannot be read.
+    """
+    with open(path, newline="", encoding="utf-8-sig") as file:
+        rows = [row.get("breath_id") for row in csv.DictReader(file)]
+    if None in rows or len(set(rows)) < 2:
+        return [read_controls(Path(path))]
+    whole = read_controls(Path(path), by_breath=True)
+    edges = [k for k in range(1, len(rows)) if rows[k] != rows[k - 1]]
+    parts = zip(*(np.split(c, edges) for c in (whole.time, whole.u_in, whole.u_out)), strict=True)
+    return [Controls(time - time[0], u_in, u_out) for time, u_in, u_out in parts]
+
+
+def _data(breaths: Sequence[Controls], planned: int, R: float, C: float, samples: int) -> Data:
+    """Breaths without readings; short ones end with an open expiratory valve that nobody reads."""
+    n = len(breaths)
+    u_in, u_out, weight = np.zeros((n, samples)), np.ones((n, samples)), np.zeros((n, 2, samples))
+    dt = np.full((n, samples), float(np.median(breaths[0].dt)))
+    for k, breath in enumerate(breaths):
+        count = len(breath.time)
+        u_in[k, :count], u_out[k, :count], dt[k, :count] = breath.u_in, breath.u_out, breath.dt
+        weight[k, :, :count] = 1.0
+    weight[:, 1, 0] = 0.0
+    ones: Floats = np.ones(n)
+    position = np.minimum(np.arange(n) / max(planned - 1, 1), 1.0)  # further breaths come last
+    return Data(u_in, u_out, dt, np.zeros((n, 2, samples)), weight, R * ones, C * ones, position)
+
+
+class _Space:
+    """Inner products, breath by breath, of all changes of the response that are compared."""
+
+    def __init__(
+        self, data: Data, names: Sequence[str], sensors: Sequence[str], sigma: Mapping[str, float]
+    ) -> None:
+        simulator = Predictor(data, paths(tuple(names)))
+        start = np.full(len(data), protocol.PEEP)
+        values = parameter_values(data, simulator.names, {START: start})
+        first, slopes = simulator.derivatives(
+            values, tuple((*simulator.names, START).index(path) for path in (*REFITTED, START))
+        )
+        scale = np.array([float(sensor in sensors) / sigma[sensor] for sensor in SENSORS])
+        metric = data.weight * scale[:, None]
+        columns = [slopes[:, k] for k in range(len(REFITTED))]
+        self._of: dict[str, list[int]] = {}
+        for name in names:
+            mild = _mild(name)
+            moved = [simulator.predict(_with(values, simulator.names, mild))]
+            for path in mild:
+                if path != strength_path(name):
+                    other = mild | {path: mild[path] * (1.0 + _STEP)}
+                    moved.append(simulator.predict(_with(values, simulator.names, other)))
+            changes = [moved[0] - first, *(each - moved[0] for each in moved[1:])]
+            self._of[name] = list(range(len(columns), len(columns) + len(changes)))
+            columns += changes
+        white = np.stack([column * metric for column in columns], axis=1)
+        white = white.reshape(*white.shape[:2], -1)
+        own = (slopes[:, -1] * metric).reshape(len(data), 1, -1)
+        own = own / np.maximum(np.linalg.norm(own, axis=2, keepdims=True), 1e-12)
+        white = white - np.matmul(white, own.swapaxes(1, 2)) * own
+        self._gram = np.matmul(white, white.swapaxes(1, 2))
+
+    def worth(self, name: str, breaths: Sequence[int]) -> float:
+        """Nats that a mechanism is worth after a refit."""
+        return 0.5 * self._left(self._of[name][0], [], breaths)[0]
+
+    def apart(self, one: str, other: str, breaths: Sequence[int]) -> float:
+        """Nats by which two mechanisms are told apart, in the worse of both directions."""
+        return min(self._against(one, other, breaths), self._against(other, one, breaths))
+
+    def _against(self, true: str, rival: str, breaths: Sequence[int]) -> float:
+        target = self._of[true][0]
+        left, weights = self._left(target, self._of[rival], breaths)
+        strength = mechanism(rival).description.strength
+        one_sided = not strength.low < strength.neutral < strength.high
+        return self.worth(true, breaths) if one_sided and weights[0] < 0.0 else 0.5 * left
+
+    def _left(
+        self, target: int, rivals: Sequence[int], breaths: Sequence[int]
+    ) -> tuple[float, Floats]:
+        """Squared length of a change after others are refitted, and the weights of the rivals."""
+        gram = self._gram[list(breaths)].sum(axis=0)
+        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        gram = gram / np.outer(size, size)
+        others = [*rivals, *range(len(REFITTED))]
+        inner = gram[np.ix_(others, others)] + _RIDGE * np.eye(len(others))
+        weights = np.linalg.solve(inner, gram[others, target])
+        left = float(gram[target, target] - gram[others, target] @ weights)
+        return max(left, 0.0) * float(size[target]) ** 2, weights
+
+
+def _mild(name: str) -> dict[str, float]:
+    about = mechanism(name).description.parameters
+    return {f"{name}.{each.name}": float(each.mild) for each in about if not each.shape}
+
+
+def _with(values: Floats, names: tuple[str, ...], given: Mapping[str, float]) -> Floats:
+    changed = values.copy()
+    for path, value in given.items():
+        changed[:, names.index(path)] = value
+    return changed
+
+
+def _groups(names: Sequence[str], confused: Sequence[Pair]) -> tuple[tuple[str, ...], ...]:
+    """Sets of names that confused pairs join, the largest first."""
+    group = {name: {name} for name in names}
+    for pair in confused:
+        joined = group[pair.names[0]] | group[pair.names[1]]
+        for name in joined:
+            group[name] = joined
+    found = {tuple(sorted(each)) for each in group.values()}
+    return tuple(sorted(found, key=lambda each: (-len(each), each)))

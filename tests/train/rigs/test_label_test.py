@@ -8,6 +8,7 @@ integrated by Euler's rule here and fitted as recordings are. No plant of ours i
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -186,7 +187,7 @@ def judged(*parts: Breaths) -> list[LabelTest]:
 
 @pytest.mark.slow
 def test_recorded_lungs_pass_if_they_are_what_they_say_and_not_otherwise():
-    for rig, true in (
+    cases: tuple[tuple[dict[str, Any], bool], ...] = (
         ({"C": 50.0}, True),
         ({"C": 50.0, "gain": 1.3}, True),
         ({"C": 50.0, "gain": 0.8}, True),
@@ -195,7 +196,8 @@ def test_recorded_lungs_pass_if_they_are_what_they_say_and_not_otherwise():
         ({"C": 37.5, "gain": 0.75}, False),
         ({"C": 62.5, "gain": 1.25}, False),
         ({"C": 37.5, "gain": 0.75, "share": 0.4}, False),
-    ):
+    )
+    for rig, true in cases:
         (test,) = judged(recorded("R20C50", **rig))
         assert test.label_true == true, (rig, test.as_dict())
         # The compliance by the resistor is that of the lung, whatever was fitted.

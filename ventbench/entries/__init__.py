@@ -5,10 +5,12 @@
 - :mod:`~ventbench.entries.runner`: who runs the controllers (in this process, or a sandbox);
   one controller in one run is a :class:`ventbench.sandbox.child.cell.Cell` in both;
 - :mod:`~ventbench.entries.stepping`: the loop between plants and runner;
-- :mod:`~ventbench.entries.scoring`: the score, and :mod:`~ventbench.entries.result` its
-  form;
+- :mod:`~ventbench.entries.cells`: what is scored, against the bounds of
+  :mod:`~ventbench.entries.reference`;
+- :mod:`~ventbench.entries.scoring`: the score, :mod:`~ventbench.entries.runs` the figures of its
+  runs, and :mod:`~ventbench.entries.result` its form;
 - :mod:`~ventbench.entries.scaffold`: a new submission that scores at once;
 - :mod:`~ventbench.entries.contract`: everything that must hold before it is submitted, by
-  reading (``file_checks``, ``manifest``, ``static_checks``) and by running (``contract_runs``);
+  reading (``file_checks``, ``manifest``, ``review``) and by running (``contract_runs``);
 - :mod:`~ventbench.entries.errors`: what is wrong with a submission, in words for its author.
 """

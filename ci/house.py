@@ -15,8 +15,8 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 #: Most lines of Python: of the product, of the proofs beside it; most modules of the product.
-LINES = {"ventbench + hardware_eval": 64_300, "proofs": 9_000}
-MODULES = 302
+LINES = {"ventbench + hardware_eval": 65_900, "proofs": 9_000}
+MODULES = 306
 
 #: Most lines of one module, and most modules that lie loose in ``ventbench/``.
 LONGEST, LOOSE = 580, 8

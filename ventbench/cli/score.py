@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -104,7 +105,8 @@ def score(
     on the reference rig of each lung; lower is better. With `--draws 20` the ranked score stands
     beside it: normalised, on all rigs of each lung, and the score under missing physics. Each
     controller runs in sandboxed processes that have no access to the simulators. With another
-    `--plant` the lungs are those of that plant, and the score is not official. Several controllers
+    `--plant` the lungs are those of that plant, and the score is not official; beside a score on a
+    `corrected.json` stands that on the simulator that was corrected. Several controllers
     are scored in turn, or at the same time with `--workers` or `--scheduler`.
 
     Example: `ventbench score submissions/pid_best --json score.json`
@@ -120,6 +122,7 @@ def score(
     from ventbench.entries.folder import open_submission
     from ventbench.entries.runs import DRAWS
     from ventbench.plants.catalog import load_simulators
+    from ventbench.plants.catalog import names as simulator_names
 
     if record is not None and (draws < 20 or stress not in (None, 0, DRAWS)):
         raise InputError(f"--record needs all published draws: add --draws 20 --stress {DRAWS}")
@@ -133,7 +136,7 @@ def score(
         raise InputError(f"two submissions have the same name: {', '.join(sorted(entries))}")
     if record is not None and plant != "frozen":
         raise InputError("--record needs the official simulators: leave out --plant")
-    load_simulators(plant)  # whatever is wrong with it is told before anything runs
+    tested = load_simulators(plant)  # whatever is wrong with it is told before anything runs
     if stress and track is None:
         track = "robustness"
     if stress is None:
@@ -148,9 +151,21 @@ def score(
     work = partial(_run, simulator=plant, draws=draws, sandbox=not in_process)
     scores = of_each_entry("scoring", work, jobs, workers, scheduler)
     results = [result.to_json() for result in scores]
+    given = str(tested.origin.get("corrected", ""))
+    if given in simulator_names():
+        before = partial(_run, simulator=given, draws=0, sandbox=not in_process)
+        what = f"scoring on {given}, which was corrected,"
+        unstressed = [(entry, each, 0) for entry, each, _ in jobs]
+        for values, other in zip(
+            results, of_each_entry(what, before, unstressed, workers, scheduler), strict=True
+        ):
+            values["given"] = _given(given, other.to_json(), values)
     emit(results[0] if len(results) == 1 else {"submissions": results}, json)
     console = Console(stderr=str(json) == "-")
     console.print(_table(results))
+    if given in simulator_names():
+        console.print(_corrected_table(results))
+        _why_corrected(console, tested.origin, given, plant)
     if all(entry["normalised"] is not None for entry in results):
         console.print(_normalised_table(results))
     if any(values["stress"] for values in results):
@@ -211,6 +226,57 @@ def _table(scores: list[dict[str, Any]]) -> Table:
         table.add_row("mean of the draws", *(show(draws["score"]) for draws in drawn))
         table.add_row("95 % interval", *("..".join(map(show, draws["ci95"])) for draws in drawn))
     return table
+
+
+def _given(name: str, before: dict[str, Any], after: dict[str, Any]) -> dict[str, Any]:
+    """Score on the simulators that were corrected, on the lungs of the corrected ones."""
+    lungs = {lung: before["lungs"].get(lung, {"score": None})["score"] for lung in after["lungs"]}
+    known = None not in lungs.values()
+    score = sum(filter(None, lungs.values())) / len(lungs) if known else None
+    return {"simulators": name, "score": score, "lungs": lungs}
+
+
+def _corrected_table(results: list[dict[str, Any]]) -> Table:
+    """Return each entry's score before and after the correction: a row for each lung."""
+    from rich.table import Table
+
+    def cells(given: float | None, corrected: float | None) -> str:
+        if given is None or corrected is None:
+            return "failed"
+        return f"{given:.3f} -> {corrected:.3f} ({corrected - given:+.3f})"
+
+    name = results[0]["given"]["simulators"]
+    table = Table(title=f"From {name}, the given simulator, to the corrected one, cmH2O")
+    table.add_column("lung")
+    for entry in results:
+        table.add_column(f"{entry['name']}\n{entry['track']}", justify="right")
+    for lung in results[0]["lungs"]:
+        pairs = ((e["given"]["lungs"][lung], e["lungs"][lung]["score"]) for e in results)
+        table.add_row(lung, *(cells(*pair) for pair in pairs))
+    table.add_section()
+    means = ((entry["given"]["score"], entry["score"]) for entry in results)
+    table.add_row("mean", *(cells(*pair) for pair in means), style="bold")
+    return table
+
+
+def _why_corrected(console: Console, origin: Mapping[str, Any], given: str, plant: str) -> None:
+    """Say why the scores differ, and what to do."""
+    from ventbench.physics.catalogue import everything
+
+    known = everything()
+    titles = [
+        known[name].description.title if name in known else name
+        for name in origin.get("mechanisms", ())
+    ]
+    lacks = ", ".join(titles) or "what its refitted parameters and unnamed term stand for"
+    console.print(
+        f"They differ because {given} lacks what the recording has: {lacks}. A controller that was "
+        f"tuned on {given} does not know it: tune on the corrected simulator, "
+        f"`ventbench tune pid --plant {plant}`.",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,  # the command can be copied
+    )
 
 
 def _normalised_table(scores: list[dict[str, Any]]) -> Table:

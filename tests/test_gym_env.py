@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -100,7 +102,7 @@ def test_hidden_deviations_are_those_of_the_scored_draws():
     assert bool(ended)
     assert cell.noise.std() > 0.1
     assert float(cell.delay) > 0.0
-    as_varied = cell.replace(r_scale=jnp.ones(()), c_scale=jnp.ones(()))
+    as_varied = replace(cell, r_scale=jnp.ones(()), c_scale=jnp.ones(()))
     assert error == pytest.approx(scripted(actions, plant, as_varied), rel=1e-4)
 
 
@@ -116,12 +118,13 @@ def test_seeds_repeat_and_lungs_and_pips_vary():
 
 
 def test_what_cannot_be_done_is_said():
-    for options, said in (
+    wrong: list[tuple[dict[str, Any], str]] = [
         ({"lung": "R7C7"}, "R7C7 is not a lung of the simulators: R5C10"),
         ({"pip": 80.0}, "PIP 80 cmH2O"),
         ({"rigs": "all"}, "choose training or reference"),
         ({"render_mode": "human"}, "choose 'rgb_array'"),
-    ):
+    ]
+    for options, said in wrong:
         with pytest.raises(InputError, match=said):
             gym_env.Ventilator(**options)
     made = gym_env.Ventilator(lung="R5C10")

@@ -98,7 +98,7 @@ def test_many_breaths_are_each_simulated_alone(tmp_path):
     assert breaths.breath_id.tolist() == list(lengths)
     for index, (number, (R, C, length)) in enumerate(lengths.items()):
         u_out = (np.arange(length) >= 30).astype(float)
-        alone = Controls(0.03 * np.arange(length), commands[number], u_out)
+        alone = Controls(np.linspace(0.0, 0.03 * (length - 1), length), commands[number], u_out)
         wanted = simulate(alone, lung=f"R{R}C{C}", simulator="physics").pressure
         np.testing.assert_allclose(breaths.pressure[index, :length], wanted, atol=2e-3)
     printed = run("simulate", "--controls", path, "--plant", "physics")

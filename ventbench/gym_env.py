@@ -104,9 +104,9 @@ def _step(
         state, seen, reward, _ = environment.step(state, action)
         return state.progress, seen, reward
 
-    parts = (layout.unpack(x) for layout, x in zip(layouts, (episodes, progress), strict=True))
+    fixed, changing = layouts[0].unpack(episodes), layouts[1].unpack(progress)
     after, seen, reward = jax.vmap(advance, in_axes=-1, out_axes=(-1, 0, 0))(
-        *parts, actions.reshape(-1)
+        fixed, changing, actions.reshape(-1)
     )
     return _pack(after), count + 1, seen, reward, after.loop.signals.scored, after.error
 

@@ -186,7 +186,7 @@ def simulate_breaths(
     for name, values in (("u_out", 0), ("time_step", protocol.DT * sample)):
         whole = whole if name in whole else whole.assign(**{name: values})
     needed = ["id", "breath_id", "R", "C", "time_step", "u_in", "u_out", "pressure"]
-    breaths = load(whole[needed], pad=True)
+    breaths = load(pd.DataFrame(whole[needed]), pad=True)
     return replace(breaths, pressure=load_simulators(simulator).pressures(breaths))
 
 

@@ -235,7 +235,8 @@ def emulate(context: typer.Context) -> None:
 
     Options: --lung, --plant, --conceal WORDS, --seal FILE, --link PATH, --control SOCKET, --fault
     KIND@START[-END][:STRENGTH], --noise, --quantum, --highest, --log FILE,
-    --electronics FILE, --normally-closed, --no-monostable; `emulate --help` explains them.
+    --electronics FILE, --normally-closed, --no-monostable, --firmware FILE; `emulate --help`
+    explains them.
 
     Example: `ventbench-hardware emulate --lung R20C50 --link ./lung`
     """

@@ -6,8 +6,10 @@ instructions under QEMU, so that a busy machine can be slow but not late.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hardware_eval.wire.errors import RefusedError
 from typer.testing import CliRunner
 
 from hardware_eval import cli
@@ -28,6 +29,7 @@ from hardware_eval.wire.client import Client
 from hardware_eval.wire.conformance import conformance
 from hardware_eval.wire.link import Link
 from hardware_eval.wire.messages import Flag, Mode
+from hardware_eval.wire.parser import NoAnswerError, RefusedError
 from tests.hardware_eval.firmware.core import FIRMWARE, tool
 from ventbench.base.errors import InputError
 
@@ -36,9 +38,9 @@ PATIENCE = 60.0
 LUNG = "R20C50"
 
 
-def _made(board: str, folder: Path) -> Path:
+def _made(board: str, folder: Path, firmware: Path = FIRMWARE) -> Path:
     tool({"linux": "cc", "mps2": "arm-none-eabi-gcc"}[board])
-    subprocess.run(["make", "-s", "-C", str(FIRMWARE), f"OUT={folder}", board], check=True)
+    subprocess.run(["make", "-s", "-C", str(firmware), f"OUT={folder}", board], check=True)
     return folder / IMAGES[board]
 
 
@@ -55,7 +57,12 @@ class Logged(Firmware):
 
 @pytest.fixture(params=list(IMAGES))
 def device(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Logged, Path]]:
-    image = _made(request.param, tmp_path)
+    with _running(_made(request.param, tmp_path), tmp_path) as firmware:
+        yield firmware, tmp_path
+
+
+@contextlib.contextmanager
+def _running(image: Path, tmp_path: Path) -> Iterator[Logged]:
     if image.suffix == ".elf":
         tool("qemu-system-arm")
     log = tmp_path / "electronics.csv"
@@ -67,7 +74,7 @@ def device(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Log
     stop = threading.Event()
     thread = threading.Thread(target=emulator.run, args=(stop.is_set,))
     thread.start()
-    yield firmware, tmp_path
+    yield firmware
     stop.set()
     thread.join()
     firmware.close()
@@ -168,6 +175,34 @@ def test_electronics_vent_when_the_image_stands_still(device: tuple[Logged, Path
     os.kill(image, signal.SIGCONT)
     _until(lambda: client.heartbeat().mode is Mode.VENTED)
     client.close()
+
+
+@pytest.mark.slow
+def test_the_boards_watchdog_vents_and_resets_a_program_that_stands_still(tmp_path: Path) -> None:
+    source = tmp_path / "firmware"
+    shutil.copytree(FIRMWARE, source)
+    loop, order = source / "main.c", "            order(device.u_in, device.u_out);\n"
+    hang = f"{order}        while (device.u_in == 2500)\n            ;\n"
+    assert loop.read_text().count(order) == 1
+    loop.write_text(loop.read_text().replace(order, hang))
+    tool("qemu-system-arm")
+    with _running(_made("mps2", tmp_path, source), tmp_path) as firmware:
+        client = Client(Link(str(tmp_path / "lung")), timeout=PATIENCE)
+        _until(lambda: firmware.orders[-1].time > 0.0)
+        client.hello()
+        client.arm()
+        firmware.orders.clear()
+        with pytest.raises(NoAnswerError):
+            client.command(25.0, 0, timeout=1.0)
+        at = next(k for k, order in enumerate(firmware.orders) if order.u_in == 25.0)
+        _until(lambda: len(firmware.orders) > at + 20)
+        opened, vented = firmware.orders[at : at + 2]
+        assert (opened.u_out, vented.u_in, vented.u_out) == (0, 0.0, 1)
+        assert vented.time - opened.time <= 0.06  # the watchdog is told every 5 ms, and waits 50
+        assert min(order.time for order in firmware.orders) < opened.time  # it has started anew
+        with pytest.raises(RefusedError, match="SESSION"):
+            client.heartbeat()
+        client.close()
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The core explored over all its states, and wrong cores that it or conformance catches."""
+"""Every state of the core is explored; exploration or conformance catches wrong cores."""
 
 from __future__ import annotations
 

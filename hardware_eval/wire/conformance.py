@@ -14,10 +14,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from hardware_eval.clock import Clock
+from hardware_eval.realtime import Clock
 from hardware_eval.wire.clauses import CLAUSES
 from hardware_eval.wire.client import Transport
-from hardware_eval.wire.errors import NoAnswerError
 from hardware_eval.wire.messages import (
     Arm,
     Capability,
@@ -38,6 +37,7 @@ from hardware_eval.wire.messages import (
     Welcome,
     encode,
 )
+from hardware_eval.wire.parser import NoAnswerError
 from hardware_eval.wire.probe import (
     DiffersError,
     LateError,

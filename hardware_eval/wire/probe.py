@@ -5,7 +5,7 @@ from __future__ import annotations
 from random import Random
 from typing import TypeVar
 
-from hardware_eval.clock import Clock
+from hardware_eval.realtime import Clock
 from hardware_eval.wire.client import Transport
 from hardware_eval.wire.messages import (
     Arm,

@@ -7,7 +7,6 @@ import re
 from pathlib import Path
 
 import pytest
-from hardware_eval.wire.errors import NoAnswerError
 from typer.testing import CliRunner
 
 from hardware_eval import cli
@@ -17,6 +16,7 @@ from hardware_eval.emulation.loopback import LoopbackDevice
 from hardware_eval.results import evaluate
 from hardware_eval.wire.conformance import CLAUSES, NOT_TRIED, Clause, conformance, vectors
 from hardware_eval.wire.messages import Capability
+from hardware_eval.wire.parser import NoAnswerError
 from tests.hardware_eval.firmware.core import CoreService, loopback
 from tests.hardware_eval.stand_in import Bench
 

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from proofs import code_version
-from proofs.challenge.figures import full_answer
+from proofs.challenge.figures import Figure, full_answer, in_words, scores
 from ventbench.base import files
 from ventbench.base.errors import InputError
 
 if TYPE_CHECKING:
-    from proofs.challenge.figures import Figure
-    from proofs.challenge.reveal import ChallengeResult
+    from proofs.challenge.reveal import Board, Judged
     from proofs.real.rig import Proof
 
 
@@ -47,7 +46,7 @@ def write_section(path: Path, name: str, text: str) -> None:
     files.write_text(path, before[:start] + section + before[end + len(last) :])
 
 
-def challenge_section(result: ChallengeResult, seeds: Sequence[str]) -> str:
+def challenge_section(result: Judged, seeds: Sequence[str]) -> str:
     """Figures of a challenge as Markdown, with the commands and what was committed.
 
     Args:
@@ -55,7 +54,7 @@ def challenge_section(result: ChallengeResult, seeds: Sequence[str]) -> str:
         seeds: seed of each draw.
     """
     source = result.generator
-    folder = "runs/strangers" if source == "stranger" else "runs/challenge"
+    folder, who = f"runs/{source}", result.diagnoser
     versions = ", ".join(result.versions) or "unknown"
     draws = [
         (seed, f"{folder}{k}" if k > 1 else folder, draw)
@@ -67,13 +66,14 @@ def challenge_section(result: ChallengeResult, seeds: Sequence[str]) -> str:
             f"python -m proofs challenge make --generator {source} --seed={seed} "
             f"--cases {draw.total} --out {where}"
         )
+        lines.append(f"python -m proofs challenge answer {where} --diagnoser {who}")
     folders = " ".join(where for _, where, _ in draws)
     given = " ".join(f"--seed={seed}" for seed, _, _ in draws)
     lines += [
-        f"python -m proofs challenge reveal {folders} {given}",
+        f"python -m proofs challenge reveal {folders} --diagnoser {who} {given}",
         "```",
         "",
-        f"Generator `{source}`, code {versions}:",
+        f"Generator `{source}`, diagnoser `{who}`, code {versions}:",
         "",
         "| seed | commitment | answered |",
         "|---|---|---|",
@@ -85,7 +85,7 @@ def challenge_section(result: ChallengeResult, seeds: Sequence[str]) -> str:
         "| figure | measured | cases | goal |",
         "|---|---|---|---|",
         *(
-            f"| {figure.what} | {_measured(figure)} | {figure.count} | {figure.goal}"
+            f"| {figure.what} | {_cell(figure)} | {figure.count} | {figure.goal}"
             + (", missed |" if figure.met is False else " |")
             for figure in result.figures
             if figure.count and figure.goal
@@ -93,25 +93,15 @@ def challenge_section(result: ChallengeResult, seeds: Sequence[str]) -> str:
     ]
     others = [figure for figure in result.figures if figure.count and not figure.goal]
     if others:
-        told = "; ".join(f"{figure.what} {_measured(figure)}" for figure in others)
+        told = "; ".join(f"{figure.what} {_cell(figure)}" for figure in others)
         lines += ["", f"Without a goal: {told}."]
     return "\n".join([*lines, *_wrong_answers(result)])
 
 
-def _measured(figure: Figure) -> str:
-    """The value of a figure, with the ends of the 95 % interval of a share."""
-    if figure.value is None:
-        return "–"
-    if figure.ci95 is None:
-        return f"{figure.value:.3g}"
-    low, high = (f"{100.0 * end:.0f}" for end in figure.ci95)
-    return f"{figure.value:.0%} ({low}–{high})"
-
-
-def _wrong_answers(result: ChallengeResult) -> list[str]:
+def _wrong_answers(result: Judged) -> list[str]:
     """Every answer that is not right, by kind of the question."""
     wrong = sorted(
-        (case for case in result.cases if not case.right),
+        (case for case in result.cases.values() if not case.right),
         key=lambda case: (case.kind, case.effects, case.name),
     )
     if not wrong:
@@ -120,19 +110,46 @@ def _wrong_answers(result: ChallengeResult) -> list[str]:
         "",
         f"Answers that are not right ({len(wrong)} of {len(result.cases)}):",
         "",
-        "| kind | lung | truth | answer | error given, refitted, corrected |",
-        "|---|---|---|---|---|",
+        "| kind | lung | truth | answer | believed | error, inspiration, expiration |",
+        "|---|---|---|---|---|---|",
     ]
     for case in wrong:
         truth = " + ".join(
-            f"{name} ({strength}{'' if name in case.seen else ', below the detection limit'})"
-            for name, strength in zip(case.effects, case.strengths, strict=True)
+            f"{effect.name} ({strength}{'' if effect.seen else ', below the detection limit'})"
+            for effect, strength in zip(case.truth, case.strengths, strict=True)
         )
-        errors = ", ".join(f"{x:.2f}" for x in (case.before, case.refit, case.after))
         lines.append(
-            f"| {case.kind} | {case.lung} | {truth or 'nothing'} | {full_answer(case)} | {errors} |"
+            f"| {case.kind} | {case.lung} | {truth or 'nothing'} | {full_answer(case)} | "
+            f"{case.confidence:.0%} | {case.inspiration:.2f}, {case.expiration:.2f} |"
         )
     return lines
+
+
+def board_section(result: Board) -> str:
+    """Figures of all diagnosers side by side, and paired differences with their 95 % intervals."""
+    lines = []
+    for generator, rows in result.tables.items():
+        names = " | ".join(f"{row.diagnoser} ({len(row.cases)})" for row in rows)
+        lines += [f"Generator `{generator}`:", "", f"| figure | {names} |"]
+        lines.append("|---" * (len(rows) + 1) + "|")
+        for figures in zip(*(scores(list(row.cases.values())) for row in rows), strict=True):
+            lines.append(f"| {figures[0].what} | {' | '.join(map(_cell, figures))} |")
+        compared = {row.diagnoser: d for row in rows if (d := result.differences(row))}
+        if compared:
+            what = next(iter(compared.values()))
+            words = f"`{result.against}` minus the other, case by case; below zero: it is better:"
+            lines += ["", words, "", f"| other | {' | '.join(what)} |"]
+            lines.append("|---" * (len(what) + 1) + "|")
+        for name, differences in compared.items():
+            lines.append(f"| {name} | {' | '.join(map(_cell, differences.values()))} |")
+        drawn = dict.fromkeys(draw.commitment for row in rows for draw in row.draws)
+        lines += ["", f"Commitments: {', '.join(drawn)}.", ""]
+    return "\n".join(lines)
+
+
+def _cell(figure: Figure) -> str:
+    value, span = in_words(figure)
+    return f"{value} ({span})" if span else value
 
 
 def proof_section(proof: Proof) -> str:

@@ -14,9 +14,6 @@ from ventbench.recordings.breaths import Breaths
 
 Floats = NDArray[np.float64]
 
-#: Breaths that are compared, spread over the recording.
-_BREATHS = 8
-
 #: Detection limit, nats over all breaths of a recording. The fifth of the breaths that a diagnosis
 #: holds out would hardly raise the likelihood of a weaker effect by log 100.
 LIMIT = 25.0
@@ -56,7 +53,7 @@ def log_likelihood_loss(case: Case, breaths: Breaths, index: int) -> float:
         index: index of the effect in ``case.effects``.
     """
     assert case.base is not None
-    count = min(_BREATHS, len(breaths))
+    count = min(generator_of(case).compared, len(breaths))
     chosen = breaths.select(np.linspace(0, len(breaths) - 1, count).astype(int))
     start = np.full(count, case.base.peep)
     response = generator_of(case).replay(case, chosen, start, seed=index)

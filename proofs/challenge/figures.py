@@ -1,16 +1,24 @@
-"""Figures of a challenge: shares with intervals, medians, goals, and tables of the answers."""
+"""Figures of a challenge: shares and means with intervals, goals, tables, paired differences."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from proofs.challenge.judge import EstimateAgainstTruth, JudgedCase
+from proofs.challenge.judge import CONFIDENT, JudgedCase
 from proofs.challenge.questions import CLASSES
+
+#: Resamples of the cases for an interval, and bins of equally many cases of a calibration error.
+_RESAMPLES, _BINS = 2000, 10
+
+#: Largest relative error of a strength whose size is right.
+_SIZE = 0.25
 
 
 @dataclass(frozen=True)
@@ -22,8 +30,9 @@ class Figure:
         value: None if there was nothing to measure.
         goal: goal in words, ``""`` if there is none.
         count: number of cases, parameters or breaths behind the value.
-        ci95: Wilson's interval of a share, else None.
+        ci95: Wilson's interval of a share; of a mean, by resampling cases; or None.
         met: whether the goal is met; None without a goal or a value.
+        is_share: whether the value is a share of the count.
     """
 
     what: str
@@ -32,6 +41,16 @@ class Figure:
     count: int
     ci95: tuple[float, float] | None
     met: bool | None
+    is_share: bool = False
+
+
+def in_words(figure: Figure, between: str = " to ") -> tuple[str, str]:
+    """Value and interval of a figure in words; empty where there is none."""
+    if figure.value is None:
+        return "–", ""
+    form = "{:.0%}" if figure.is_share else "{:.3g}"
+    span = "" if figure.ci95 is None else between.join(form.format(end) for end in figure.ci95)
+    return form.format(figure.value), span
 
 
 def wilson(hits: int, count: int) -> tuple[float, float]:
@@ -51,10 +70,10 @@ def share(
     n, k = len(each), sum(each)
     goal = _goal(least, most)
     if n == 0:
-        return Figure(what, None, goal, 0, None, None)
+        return Figure(what, None, goal, 0, None, None, True)
     value = k / n
     met = (least is None or value >= least) and (most is None or value <= most)
-    return Figure(what, value, goal, n, wilson(k, n), met if goal else None)
+    return Figure(what, value, goal, n, wilson(k, n), met if goal else None, True)
 
 
 def _goal(least: float | None, most: float | None) -> str:
@@ -72,8 +91,92 @@ def statistic(what: str, values: Sequence[float], of: Callable, most: float | No
     return Figure(what, value, goal, len(values), None, None if most is None else value <= most)
 
 
-def figures(cases: Sequence[JudgedCase]) -> list[Figure]:
-    """All figures that need no oracle."""
+def mean(
+    what: str, values: Sequence[float], *, most: float | None = None,
+    of: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
+) -> Figure:  # fmt: skip
+    """Mean, or another statistic, with the interval that resampled cases give.
+
+    Args:
+        what: the quantity.
+        values: one or more numbers of each case, ``(n,)`` or ``(n, k)``.
+        most: goal.
+        of: statistic of resampled values ``(m, n, ...)``, returns ``(m,)``.
+    """
+    goal = "" if most is None else f"<= {most:g}"
+    given = np.asarray(values, float)
+    if len(given) == 0:
+        return Figure(what, None, goal, 0, None, None)
+    statistic = of or (lambda x: x.mean(axis=1))
+    value = float(statistic(given[None])[0])
+    span = interval(given, statistic) if len(given) > 2 else None
+    met = None if most is None else value <= most
+    return Figure(what, value, goal, len(given), span, met)
+
+
+def interval(
+    values: NDArray[np.float64], statistic: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+) -> tuple[float, float]:
+    """95 % interval of a statistic by resampling cases, always with the same random numbers."""
+    rng = np.random.default_rng(0)
+    drawn = statistic(values[rng.integers(0, len(values), (_RESAMPLES, len(values)))])
+    low, high = np.quantile(drawn, (0.025, 0.975))
+    return float(low), float(high)
+
+
+def calibration_error(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Expected calibration error of resamples: confidence and correctness, ``(m, n, 2)``.
+
+    Cases are sorted by confidence into bins of equally many. It is above zero by chance, the more
+    so the fewer cases there are.
+    """
+    order = np.argsort(values[..., 0], axis=1, kind="stable")
+    ordered = np.take_along_axis(values, order[..., None], axis=1)
+    count = values.shape[1]
+    edges = np.linspace(0, count, min(_BINS, count) + 1).astype(int)
+    parts = [ordered[:, a:b] for a, b in pairwise(edges)]
+    gaps = [np.abs((part[..., 0] - part[..., 1]).sum(axis=1)) for part in parts]
+    return np.sum(gaps, axis=0) / count
+
+
+def scores(cases: Sequence[JudgedCase]) -> list[Figure]:
+    """What every diagnoser is measured by, over all cases."""
+    present = [c for c in cases if c.something]
+    none = [c for c in cases if not c.effects]
+    seen = [c for c in present if c.visible]
+    parts = [c.overlap for c in cases if c.overlap is not None]
+    believed = [(c.confidence, float(c.isolation > 0.0)) for c in cases]
+    return [
+        share("lost cases", (bool(c.problem) for c in cases), most=0.0),
+        mean("log score, nats", [c.log_score for c in cases]),
+        mean("Brier score", [c.brier for c in cases]),
+        mean("isolation accuracy", [c.isolation for c in cases]),
+        mean("calibration error (ECE)", believed, most=0.05, of=calibration_error),  # type: ignore[arg-type]
+        share("detected, where something is missing", (c.missing > 0.5 for c in present)),
+        share("false alarms, where nothing is missing",
+              (c.missing > 0.5 or bool(c.problem) for c in none), most=0.0),
+        share("right part of the rig", (c.right_place for c in seen), least=0.90),
+        share("right name and size", (c.right and _size_is_right(c) for c in seen), least=0.80),
+        mean("harm of wrong names", [c.harm for c in cases]),
+        share("a confident wrong name",
+              (any(p > CONFIDENT for p in c.wrong.values()) for c in cases), most=0.03),
+        mean("localisation F1, where an effect acts in part", parts),  # type: ignore[arg-type]
+        mean("withheld inspirations, error, cmH2O", [c.inspiration for c in cases]),
+        mean("withheld expirations, error, cmH2O", [c.expiration for c in cases]),
+        *_parameters(cases),
+        mean("processor seconds, mean", [c.seconds for c in cases]),
+        statistic("processor seconds, longest", [c.seconds for c in cases], np.max, None),
+        statistic("memory, MiB, most", [c.peak for c in cases], np.max, None),
+    ]  # fmt: skip
+
+
+def _size_is_right(case: JudgedCase) -> bool:
+    """Whether every strength that can be compared is within a quarter of the truth."""
+    return all(estimate.error <= _SIZE for estimate in case.estimates)
+
+
+def by_kind(cases: Sequence[JudgedCase]) -> list[Figure]:
+    """Shares of the likeliest answers, by the kind of the question."""
     single = [c for c in cases if c.kind == "single"]
     seen = [c for c in single if c.visible]
     strong = [c for c in seen if c.strengths == ("strong",)]
@@ -88,96 +191,80 @@ def figures(cases: Sequence[JudgedCase]) -> list[Figure]:
     return [
         share("strong: right name and nothing else", (c.right for c in strong), least=0.98),
         share("mild: right name and nothing else", (c.right for c in mild), least=0.94),
-        share("mild: a wrong name", (bool(c.wrong) for c in mild), most=0.02),
-        share("single: true name given or among two alternatives",
-              (c.listed == c.library for c in seen), least=0.98),
-        share("single: right, with a nonparametric term for its form",
-              (c.right and c.form is not None for c in seen)),
+        share("mild: a wrong name", (bool(c.false) for c in mild), most=0.02),
         share("below the detection limit: silence or the right answer",
-              (c.silent or (c.named == c.library and bool(c.named)) or c.right for c in under),
-              least=0.99),
+              (c.right for c in under), least=0.99),
         share("nothing missing: false names", (bool(c.named) for c in null), most=0.0),
         share("nothing missing: said so", (c.silent for c in null)),
-        share("outside the library: said so", (c.said_outside for c in outside), least=0.90),
-        share("outside the library: right place",
-              (c.said_outside and c.right_slot for c in outside), least=0.90),
+        share("outside the library: right place or equivalent name",
+              (c.right for c in outside), least=0.90),
         share("library effect called unknown",
-              (c.verdict == "unnamed" for c in seen + form), most=0.05),
-        share("other form: right name and no other",
-              (c.named == c.library for c in form), least=0.90),
-        share("pair: both and only both", (c.named == c.library for c in pair), least=0.90),
+              (bool(c.answered) and not c.named for c in seen + form), most=0.05),
+        share("other form: right name and no other", (c.right for c in form), least=0.90),
+        share("pair: both and only both", (c.right for c in pair), least=0.90),
         share("four: terms found",
-              (name in c.named for c in four for name in sorted(c.seen)), least=0.90),
-        statistic("four: spurious names a case", [len(c.wrong) for c in four], np.mean, 0.25),
+              (bool(c.answered & effect.terms) for c in four for effect in c.truth if effect.seen),
+              least=0.90),
+        statistic("four: spurious names a case", [len(c.false) for c in four], np.mean, 0.25),
         share("masked: right name and nothing else", (c.right for c in masked)),
-        share("masked: a wrong name", (bool(c.wrong) for c in masked)),
-        *_parameters(cases),
-        *_distances(cases),
-        share("held-out RMSE not above before",
-              (c.after <= c.before * 1.001 for c in cases), least=1.0),
-        share("held-out RMSE not above refitted",
-              (c.after <= c.refit * 1.001 for c in cases), least=1.0),
-        *_costs(cases),
+        share("masked: a wrong name", (bool(c.false) for c in masked)),
     ]  # fmt: skip
 
 
-def _distances(cases: Sequence[JudgedCase]) -> list[Figure]:
-    acting = [c for c in cases if c.effects]
-    return [
-        statistic(f"held-out RMSE with an effect, {stage}, median", values, np.median, None)
-        for stage, values in (
-            ("before", [c.before for c in acting]),
-            ("refitted", [c.refit for c in acting]),
-            ("after", [c.after for c in acting]),
-        )
-    ]
-
-
 def _parameters(cases: Sequence[JudgedCase]) -> list[Figure]:
-    estimates = [estimate for c in cases for estimate in c.estimates]
-    errors = [estimate.error for estimate in estimates]
+    every = [estimate for c in cases for estimate in c.estimates]
+    named = [estimate for estimate in every if "." in estimate.path]
+    lungs = [estimate for estimate in every if "." not in estimate.path]
     return [
-        statistic("parameters: median relative error", errors, np.median, 0.10),
-        share(
-            "parameters: 95 % intervals that hold the truth",
-            (estimate.covered for estimate in estimates),
-            least=0.92,
-            most=0.98,
-        ),
-    ]
+        statistic("parameters: median relative error", [e.error for e in named], np.median, 0.10),
+        share("parameters: 95 % intervals that hold the truth", (e.covered for e in named),
+              least=0.92, most=0.98),
+        share("R and C, nothing missing: intervals that hold the truth",
+              (e.covered for e in lungs)),
+    ]  # fmt: skip
 
 
-def _costs(cases: Sequence[JudgedCase]) -> list[Figure]:
-    started = [c for c in cases if not c.first]
-    few = [c.seconds for c in started if c.kind != "four"]
-    many = [c.seconds for c in started if c.kind == "four"]
-    return [
-        statistic("seconds a case, longest", few, np.max, 60.0),
-        statistic("seconds a case, median", few, np.median, None),
-        statistic("seconds a case with four effects, longest", many, np.max, 180.0),
-        statistic("memory, MiB, most", [c.peak for c in cases], np.max, 1024.0),
-    ]
-
-
-def _within_class(case: JudgedCase) -> bool:
-    return any(case.wrong & group and case.library & group for group in CLASSES)
+def _is_confusable(case: JudgedCase) -> bool:
+    right = frozenset().union(*(effect.terms for effect in case.truth))
+    within = any(case.false & group and right & group for group in CLASSES)
+    return within or case.confidence < 0.9
 
 
 def second_round(before: dict[str, JudgedCase], after: dict[str, JudgedCase]) -> Figure:
     """Share of the confusable cases that the requested breaths resolve.
 
-    A case is confusable if its first answer lists alternatives, or gives another name of the same
-    class for the true one.
+    A case is confusable if its first answer is believed at less than 90 %, or has another name of
+    the same class for the true one. It is resolved if the second is right and believed.
     """
     cases = [
-        after[name].resolved
+        after[name].right and after[name].confidence >= 0.9
         for name, first in before.items()
-        if name in after and (first.open or _within_class(first))
+        if name in after and _is_confusable(first)
     ]
-    return share("confusable cases resolved by five more breaths", cases, least=0.80)
+    return share("confusable cases resolved by more breaths", cases, least=0.80)
 
 
-_NOTHING, _SEVERAL = "nothing missing", "several names"
+#: What diagnosers are compared by, case by case; less is better.
+PAIRED: Mapping[str, Callable[[JudgedCase], float]] = {
+    "log score": lambda case: case.log_score,
+    "Brier": lambda case: case.brier,
+    "isolation error": lambda case: 1.0 - case.isolation,
+    "harm": lambda case: case.harm,
+    "inspiration, cmH2O": lambda case: case.inspiration,
+    "expiration, cmH2O": lambda case: case.expiration,
+}
+
+
+def paired(ours: Mapping[Any, JudgedCase], other: Mapping[Any, JudgedCase]) -> dict[str, Figure]:
+    """Mean of the differences ``ours - other`` over common cases; negative: ours is better."""
+    common = sorted(ours.keys() & other.keys())
+    return {
+        what: mean(what, [of(ours[name]) - of(other[name]) for name in common])
+        for what, of in PAIRED.items()
+    }
+
+
+_NOTHING, _SEVERAL, _LOST = "nothing missing", "several names", "no answer"
 
 
 def confusion(cases: Sequence[JudgedCase]) -> dict[str, dict[str, int]]:
@@ -186,39 +273,13 @@ def confusion(cases: Sequence[JudgedCase]) -> dict[str, dict[str, int]]:
     for case in sorted(cases, key=lambda c: c.effects):
         if len(case.effects) <= 1:
             truth = case.effects[0] if case.effects else _NOTHING
-            table.setdefault(truth, Counter())[_answer_in_words(case)] += 1
+            answer = full_answer(case) if len(case.named) <= 1 else _SEVERAL
+            table.setdefault(truth, Counter())[answer] += 1
     return {truth: dict(counts.most_common()) for truth, counts in table.items()}
 
 
-def _answer_in_words(case: JudgedCase) -> str:
-    if case.verdict == "nothing_missing":
-        return _NOTHING
-    if case.verdict == "unnamed":
-        return f"unnamed: {case.slot}"
-    name = next(iter(case.named)) if len(case.named) == 1 else _SEVERAL
-    name = name if case.form is None else f"{name} (form: {case.form})"
-    return name if case.slot is None else f"{name} + {case.slot}"
-
-
 def full_answer(case: JudgedCase) -> str:
-    """Every name of an answer and its place without a name, in words."""
-    said = [*sorted(case.named), *([case.slot] if case.slot else [])]
-    if said:
-        return " + ".join(said)
-    return _NOTHING if case.verdict == "nothing_missing" else "unnamed, no place"
-
-
-def by_parameter(cases: Sequence[JudgedCase]) -> dict[str, dict[str, Any]]:
-    """Coverage and median error of the estimates of each parameter, by its path."""
-    grouped: dict[str, list[EstimateAgainstTruth]] = {}
-    for case in cases:
-        for estimate in case.estimates:
-            grouped.setdefault(estimate.path, []).append(estimate)
-    return {
-        path: {
-            "count": len(estimates),
-            "covered": sum(estimate.covered for estimate in estimates),
-            "median_error": sorted(e.error for e in estimates)[len(estimates) // 2],
-        }
-        for path, estimates in sorted(grouped.items())
-    }
+    """The likeliest hypotheses in words."""
+    if case.problem:
+        return _LOST
+    return " or ".join(" + ".join(sorted(terms)) or _NOTHING for terms in case.leading)

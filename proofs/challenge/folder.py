@@ -10,13 +10,42 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from hardware_eval.emulation.cases import Base, Case, Effect, random_generator, unseal
+import msgspec
+
+from hardware_eval.emulation.cases import (
+    Base,
+    Case,
+    Effect,
+    encrypt,
+    random_generator,
+    unseal,
+)
+from proofs.challenge.faults.effects import FaultsCase
 from proofs.challenge.questions import DrawnCase
 from proofs.challenge.stranger.effects import StrangerCase
 from ventbench.base import files
 from ventbench.base.errors import InputError
 
 _FORMAT = "ventbench-challenge-1"
+
+#: Class of the cases of each generator.
+_CASES: dict[str, type[Case]] = {
+    "first": Case, "stranger": StrangerCase, "faults": FaultsCase,
+}  # fmt: skip
+
+
+class Withheld(msgspec.Struct, frozen=True):
+    """What a diagnoser does not see of a recording.
+
+    Attributes:
+        pressures: readings of the withheld breaths, cmH2O, None where blank, by id.
+        active: where an effect acts that acts in part of the recording only: intervals of time, s,
+            by id of the breath; None if there is no such effect.
+    """
+
+    pressures: dict[int, tuple[float | None, ...]]
+    active: dict[int, tuple[tuple[float, float], ...]] | None = None
+
 
 #: Cases, each with the nats of its effects.
 Truth = list[tuple[DrawnCase, list[float]]]
@@ -51,7 +80,7 @@ def decode_answers(text: bytes) -> Truth:
 def _case(value: dict[str, Any]) -> Case:
     effects = tuple(Effect(**effect) for effect in value["effects"])
     base = None if value["base"] is None else Base(**value["base"])
-    kind = StrangerCase if value.get("generator") == "stranger" else Case
+    kind = _CASES[value.get("generator", "first")]
     return kind(**(value | {"effects": effects, "base": base}))
 
 
@@ -82,23 +111,22 @@ class ChallengeFolder:
         """Hash of the plain answers."""
         return self.path / "commitment.txt"
 
-    @property
-    def _suffix(self) -> str:
-        return "" if self.round == 1 else f"_{self.round}"
+    def recording(self, name: str, diagnoser: str = "") -> Path:
+        """Recording of a case; in the second round, with the breaths that a diagnoser requested."""
+        if self.round == 1:
+            return self.path / "recordings" / f"{name}.csv"
+        return self.path / "recordings_2" / diagnoser / f"{name}.csv"
 
-    def recording(self, name: str) -> Path:
-        """Recording of a case."""
-        return self.path / f"recordings{self._suffix}" / f"{name}.csv"
+    def withheld(self, name: str) -> Path:
+        """What is withheld of a recording, encrypted."""
+        return self.path / "withheld" / f"{name}.sealed"
 
-    def answer(self, name: str) -> Path:
-        """Answer to a case."""
-        return self.path / f"answers{self._suffix}" / f"{name}.json"
+    def answer(self, name: str, diagnoser: str) -> Path:
+        """A diagnoser's answer to a case."""
+        rounds = "answers" if self.round == 1 else "answers_2"
+        return self.path / rounds / diagnoser / f"{name}.json"
 
-    def request(self, name: str) -> Path:
-        """Breaths that the answer to a case requests."""
-        return self.path / f"requests{self._suffix}" / f"{name}.csv"
-
-    def cases(self) -> dict[str, dict[str, str]]:
+    def cases(self) -> dict[str, dict[str, Any]]:
         """Return the public entries by name.
 
         Raises:
@@ -127,12 +155,37 @@ class ChallengeFolder:
                     "differs"
                 )
 
-    def answers(self) -> dict[str, dict[str, Any]]:
-        """Return the answers by name; cases without an answer are left out."""
-        paths = {name: self.answer(name) for name in self.cases()}
+    def diagnosers(self) -> tuple[str, ...]:
+        """Names of those who have answered."""
+        folders = self.answer("case", "name").parents[1]
+        return tuple(sorted(path.name for path in folders.glob("*") if path.is_dir()))
+
+    def answers(self, diagnoser: str) -> dict[str, dict[str, Any]]:
+        """Return a diagnoser's answers by name; cases without an answer are left out."""
+        paths = {name: self.answer(name, diagnoser) for name in self.cases()}
         return {
             name: json.loads(path.read_text()) for name, path in paths.items() if path.is_file()
         }
+
+    def keep(self, name: str, secret: str, withheld: Withheld) -> None:
+        """Seal what is withheld of a recording."""
+        sealed = encrypt(msgspec.json.encode(withheld), secret, name.encode())
+        files.write_atomically(self.withheld(name), lambda file: file.write(sealed))
+
+    def open(self, name: str, secret: str) -> Withheld:
+        """Open what is withheld of a recording.
+
+        Raises:
+            InputError: if the file is missing or damaged, or the secret is another one.
+        """
+        path = self.withheld(name)
+        if not path.is_file():
+            raise InputError(f"{path} is missing; make the challenge again in another folder")
+        try:
+            plain = encrypt(path.read_bytes(), secret, name.encode())
+            return msgspec.json.decode(plain, type=Withheld)
+        except (msgspec.DecodeError, UnicodeDecodeError):
+            raise InputError(f"{path} is damaged, or sealed with another seed") from None
 
     def truth(self, secret: str) -> Truth:
         """Open the seal; returns the cases with the nats of their effects.

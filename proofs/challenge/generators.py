@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hardware_eval.emulation.cases import EFFECTS, Case
+from proofs.challenge.faults import effects as faults
+from proofs.challenge.faults import laboratory as bedside
 from proofs.challenge.first import plan, rig
 from proofs.challenge.questions import DrawnCase
 from proofs.challenge.stranger import effects as stranger
@@ -25,6 +30,8 @@ class Generator:
         record_commands: records requested breaths; see
             :func:`~proofs.challenge.first.rig.record_commands`.
         replay: responds without noise; see :func:`~proofs.challenge.first.rig.replay`.
+        active: where in a recording the effects of a case act, ``(n, T)``, or None if everywhere.
+        compared: most breaths by which it is measured how far an effect can be detected.
     """
 
     name: str
@@ -32,13 +39,19 @@ class Generator:
     record: Callable[..., Breaths]
     record_commands: Callable[..., Breaths]
     replay: Callable[..., rig.Floats]
+    active: Callable[[Case, Breaths], NDArray[np.bool_] | None] = lambda case, breaths: None
+    compared: int = 8
 
 
 FIRST = Generator("first", plan.draw, rig.record, rig.record_commands, rig.replay)
 STRANGER = Generator(
     "stranger", stranger.draw, laboratory.record, laboratory.record_commands, laboratory.replay
 )
-GENERATORS: dict[str, Generator] = {entry.name: entry for entry in (FIRST, STRANGER)}
+FAULTS = Generator(
+    "faults", faults.draw, bedside.record, bedside.record_commands, bedside.replay, bedside.active,
+    compared=1000,
+)  # fmt: skip
+GENERATORS: dict[str, Generator] = {entry.name: entry for entry in (FIRST, STRANGER, FAULTS)}
 
 
 def generator(name: str) -> Generator:
@@ -48,12 +61,14 @@ def generator(name: str) -> Generator:
         InputError: if there is none of that name.
     """
     if name not in GENERATORS:
-        raise InputError(f"there is no generator {name!r}; choose {' or '.join(GENERATORS)}")
+        raise InputError(f"there is no generator {name!r}; choose {', '.join(GENERATORS)}")
     return GENERATORS[name]
 
 
 def generator_of(case: Case) -> Generator:
     """Return the generator of a case."""
+    if isinstance(case, faults.FaultsCase):
+        return FAULTS
     return STRANGER if isinstance(case, stranger.StrangerCase) else FIRST
 
 

@@ -1,166 +1,49 @@
-"""One answer against the truth: names, places and values.
+"""One answer against the truth: everything is measured here, nothing is taken from the answer.
 
-A fit assumes the nominal gain of the valve; true values are converted to what it should find.
+The judge holds the withheld pressures and knows the concealed effects. It shares no code with any
+diagnoser. A lost case has no probability of the truth and predicts a constant pressure.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-from hardware_eval.emulation.cases import EFFECTS, NOMINAL_GAIN, Case, Effect
-from proofs.challenge.detectability import LIMIT
-from proofs.challenge.generators import in_library
+from proofs.challenge.contract import Answer
+from proofs.challenge.folder import Withheld
 from proofs.challenge.questions import DrawnCase, Kind
-from proofs.challenge.stranger import effects as stranger
+from proofs.challenge.truth import Concealed, concealed, is_right, true_values
+from proofs.challenge.vocabulary import UNKNOWN, place_of
+from ventbench.recordings.breaths import Breaths
 
-#: Places that are right for an effect outside the library.
-PLACES: dict[str, frozenset[str]] = {
-    "volume_resistance": frozenset({"R(V)"}),
-    "cardiogenic": frozenset({"f(t) at the alveolus"}),
-    "pulsating_supply": frozenset({"f(t) at the supply"}),
-    "direction_resistance": frozenset({"R(direction)", "f(Q)"}),
-    "second_compartment": frozenset({"memory of p", "memory of V"}),
-    "sensor_nonlinearity": frozenset({"measurement"}),
-    "expiratory_valve_orifice": frozenset({"exhalation path"}),
-}
+#: Least probability of the truth that the log score counts, so that no single case decides.
+FLOOR = 1e-3
 
-#: Mechanisms whose equations equal those of an effect outside this generator's library, or do so
-#: when only pressure is seen.
-EQUIVALENTS: dict[str, str] = {
-    "second_compartment": "viscoelasticity",
-    "sensor_nonlinearity": "sensor_curve",
-}
+#: Hypotheses whose probabilities differ by less are one set.
+_EQUAL = 1e-6
 
-#: Power of (true gain / nominal gain) by which a parameter's value changes when a fit assumes the
-#: nominal gain: flows are scaled, pressures are not.
-_POWERS = {
-    "leak.conductance": -1,
-    "circuit_compliance.compliance": -1,
-    "inertance.inertance": 1,
-    "turbulent_resistance.quadratic": 2,
-}
+#: Probability from which a name that is not in the rig is a confident wrong name.
+CONFIDENT = 0.5
 
-#: Number of alternatives of an answer that count.
-_ALTERNATIVES = 2
-
-
-def library_names(case: Case) -> frozenset[str]:
-    """Mechanisms of the library that are in the case."""
-    return frozenset(effect.name for effect in case.effects if in_library(case, effect.name))
-
-
-def acceptable_names(
-    case: Case, named: frozenset[str] = frozenset(), *, inertance_is_seen: bool = True
-) -> frozenset[str]:
-    """Mechanisms of the library that are in the case, or are equivalent to an effect in it.
-
-    Args:
-        case: the case.
-        named: names of the answer. A stranger's effect outside the library has names that are right
-            if the library has come to have one of them; and its inertance comes with a circuit's
-            compliance, which may be named or not.
-        inertance_is_seen: False if a stranger's inertance is below the detection limit, so that the
-            circuit alone is a right answer.
-    """
-    if isinstance(case, stranger.StrangerCase):
-        other = {n for e in case.effects if not in_library(case, e.name)
-                 for n in stranger.EFFECTS[e.name].names}  # fmt: skip
-        inside = library_names(case)
-        if "inertance" in inside:
-            other.add("circuit_compliance")
-        if not inertance_is_seen and "inertance" not in named:
-            inside -= {"inertance"}
-        return inside | (named & other)
-    equivalents = {EQUIVALENTS[e.name] for e in case.effects if e.name in EQUIVALENTS}
-    return library_names(case) | equivalents
-
-
-def right_places(case: Case) -> frozenset[str]:
-    """Places that are right for the case's effects outside the library."""
-    if isinstance(case, stranger.StrangerCase):
-        own = [e.name for e in case.effects if not in_library(case, e.name)]
-        return frozenset(place for name in own for place in stranger.EFFECTS[name].places)
-    return frozenset().union(*(PLACES.get(effect.name, frozenset()) for effect in case.effects))
-
-
-def detectable_names(case: Case, nats: list[float]) -> frozenset[str]:
-    """Effects above the detection limit, by their nats."""
-    pairs = zip(case.effects, nats, strict=True)
-    return frozenset(effect.name for effect, loss in pairs if loss >= LIMIT)
-
-
-def has_library_form(effect: Effect) -> bool:
-    """Tell whether the library has the effect in exactly this form."""
-    family = EFFECTS[effect.name]
-    return family.inside and effect.form == family.forms[0]
-
-
-def true_values(case: Case) -> dict[str, float]:
-    """Parameters by path, of effects that the library has in exactly this form.
-
-    Parameters that the library fits only on request (shapes), parameters that differ from breath to
-    breath, and rounding, which has no size, are left out.
-    """
-    assert case.base is not None
-    ratio = case.base.gain / NOMINAL_GAIN
-    values = {}
-    for effect in case.effects:
-        if isinstance(case, stranger.StrangerCase):
-            same = effect.form == stranger.SAME
-        else:
-            same = has_library_form(effect)
-        if same and effect.name == "circuit_compliance" and isinstance(case, stranger.StrangerCase):
-            # The circuit that every rig of this generator has adds to the drawn one.
-            whole = effect.parameters["compliance"] + case.dead_space
-            effect = replace(effect, parameters={"compliance": whole})
-        if same:
-            values |= _values_of(effect, ratio)
-    if isinstance(case, stranger.StrangerCase):
-        _refer_to_zero_pressure(values, case)
-    return values
-
-
-def _refer_to_zero_pressure(values: dict[str, float], case: stranger.StrangerCase) -> None:
-    """Convert a ratio to the elastance of a stiffening lung, which the generator states at PEEP.
-
-    The library states it at zero pressure. An exponential curve is the same from any pressure, with
-    another compliance; half a sigmoid is not, and has no such ratio.
-    """
-    path = "viscoelasticity.ratio"
-    for effect in case.effects:
-        if effect.name == "nonlinear_compliance" and path in values:
-            assert case.base is not None
-            ratio = values.pop(path)
-            if effect.form == "Salazar-Knowles":
-                values[path] = ratio * np.exp(case.base.peep / effect.parameters["capacity"])
-
-
-def _values_of(effect: Effect, ratio: float) -> dict[str, float]:
-    given = effect.parameters
-    if effect.name == "command_rounding":
-        return {}
-    if effect.name == "patient_effort":
-        return {"patient_effort.duration": given["duration"]}
-    if effect.name == "supply_droop":  # per flow, which is scaled
-        k = given["drop"] / (1.0 - given["drop"]) * ratio
-        return {"supply_droop.drop": k / (1.0 + k)}
-    paths = {f"{effect.name}.{key}": value for key, value in given.items()}
-    return {path: value * ratio ** _POWERS.get(path, 0) for path, value in paths.items()}
+#: Harm of a wrong name in the right part of the rig, where a search would begin there anyway; in
+#: another part it is 1.
+_SAME_PLACE = 0.5
 
 
 @dataclass(frozen=True)
 class EstimateAgainstTruth:
-    """An estimated parameter beside its true value.
+    """An estimated parameter beside its true value, as a fit with the nominal valve gain sees it.
 
     Attributes:
         path: path of the parameter.
         value: estimate.
         low: lower end of the estimate's 95 % interval.
         high: upper end of the interval.
-        true: true value, as a fit with the nominal valve gain sees it.
+        true: true value.
     """
 
     path: str
@@ -182,139 +65,220 @@ class EstimateAgainstTruth:
 
 @dataclass(frozen=True)
 class JudgedCase:
-    """One case with its answer.
+    """One case with what was measured of its answer.
 
     Attributes:
         name: name of the case.
         kind: kind of the question.
         lung: label.
         strengths: strengths of the effects.
-        effects: names of the effects in the rig.
-        library: names of the library that are acceptable for these effects.
-        seen: effects above the detection limit.
-        verdict: verdict of the answer.
-        named: mechanisms that the answer names.
-        listed: true mechanisms that are named or among the first two alternatives to a name.
-        open: whether the answer lists alternatives.
-        slot: place without a name that the answer gives, or None.
-        form: place of the nonparametric term that shows the form of a named mechanism, or None.
-        right_slot: whether that place is one of the effect's.
-        estimates: parameters of rightly named effects in the library's form.
-        before: held-out open-loop RMSE of the given simulator, cmH2O.
-        refit: held-out open-loop RMSE of the refitted simulator, cmH2O.
-        after: held-out open-loop RMSE of the corrected simulator, cmH2O.
-        seconds: time of the answer.
+        truth: the effects.
+        leading: terms of the likeliest hypotheses, which are several if they are equally likely.
+        confidence: probability of the leading hypotheses together.
+        isolation: 1 over the number of leading hypotheses if one of them is right, else 0.
+        belief: probability of all right hypotheses.
+        brier: squared error of the probabilities of the truth and of each wrong hypothesis.
+        missing: probability that something is missing.
+        wrong: probability of each name that is not in the rig.
+        harm: sum of these, less where the name is in the right part of the rig.
+        estimates: parameters of rightly named effects in the vocabulary's form; R and C where
+            nothing is missing.
+        overlap: F1 of the samples in which the answer says that an effect acts; None if the effect
+            acts everywhere.
+        inspiration: mean absolute error on withheld breaths, cmH2O.
+        expiration: the same with an open expiratory valve.
+        seconds: processor time.
         peak: memory, MiB.
-        first: whether the case was the first of its process, which includes compilation.
+        problem: why the case is lost, or empty.
     """
 
     name: str
     kind: Kind
     lung: str
     strengths: tuple[str, ...]
-    effects: tuple[str, ...]
-    library: frozenset[str]
-    seen: frozenset[str]
-    verdict: str
-    named: frozenset[str]
-    listed: frozenset[str]
-    open: bool
-    slot: str | None
-    form: str | None
-    right_slot: bool
+    truth: tuple[Concealed, ...]
+    leading: tuple[frozenset[str], ...]
+    confidence: float
+    isolation: float
+    belief: float
+    brier: float
+    missing: float
+    wrong: dict[str, float]
+    harm: float
     estimates: tuple[EstimateAgainstTruth, ...]
-    before: float
-    refit: float
-    after: float
+    overlap: float | None
+    inspiration: float
+    expiration: float
     seconds: float
     peak: float
-    first: bool
+    problem: str
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of the effects in the rig."""
+        return tuple(effect.name for effect in self.truth)
 
     @property
     def visible(self) -> bool:
         """Whether every effect is above the detection limit."""
-        return self.seen == frozenset(self.effects)
+        return all(effect.seen for effect in self.truth)
+
+    @property
+    def something(self) -> bool:
+        """Whether an effect is above the detection limit."""
+        return any(effect.seen for effect in self.truth)
+
+    @property
+    def answered(self) -> frozenset[str]:
+        """Terms of the first of the leading hypotheses."""
+        return self.leading[0] if self.leading else frozenset()
+
+    @property
+    def named(self) -> frozenset[str]:
+        """Names among the answered terms."""
+        return frozenset(term for term in self.answered if not term.startswith(UNKNOWN))
+
+    @property
+    def false(self) -> frozenset[str]:
+        """Answered names that are not in the rig."""
+        return frozenset(term for term in self.named if term in self.wrong)
 
     @property
     def silent(self) -> bool:
         """Whether the answer is that nothing is missing."""
-        return self.verdict == "nothing_missing"
+        return not self.problem and not self.answered
 
     @property
     def right(self) -> bool:
-        """Whether the answer has all true names, no other name and no place without a name."""
-        if self.kind == "outside":
-            return self.said_outside and self.right_slot
-        if not self.effects:
-            return self.silent
-        return self.verdict == "named" and self.named == self.library and self.slot is None
+        """Whether the likeliest hypothesis alone is right."""
+        return self.isolation == 1.0
 
     @property
-    def wrong(self) -> frozenset[str]:
-        """Names that are not in the rig."""
-        return self.named - self.library
+    def log_score(self) -> float:
+        """Minus the logarithm of the probability of the truth; 0 is best."""
+        return -float(np.log(max(self.belief, FLOOR)))
 
     @property
-    def said_outside(self) -> bool:
-        """Whether the answer calls the effect unknown to the library, or names an equivalent."""
-        equivalent = bool(self.library) and self.named == self.library
-        return self.verdict == "unnamed" or equivalent
-
-    @property
-    def resolved(self) -> bool:
-        """Whether the answer is right and lists no alternatives."""
-        return self.right and not self.open
+    def right_place(self) -> bool:
+        """Whether the answered terms act where the effects do, and nowhere else."""
+        places = frozenset(place_of(term) for term in self.answered)
+        allowed = frozenset().union(*(effect.places for effect in self.truth))
+        everywhere = all(places & effect.places for effect in self.truth if effect.seen)
+        return not self.problem and everywhere and places <= allowed
 
 
-def judge(drawn: DrawnCase, nats: list[float], answer: dict[str, Any]) -> JudgedCase:
-    """Compare an answer with the truth.
+def judge(
+    drawn: DrawnCase, nats: list[float], breaths: Breaths, withheld: Withheld,
+    given: dict[str, Any],
+) -> JudgedCase:  # fmt: skip
+    """Measure an answer.
 
     Args:
         drawn: the case.
         nats: log-likelihood that is lost without each of its effects, nats.
-        answer: content of the answer's file.
+        breaths: its recording, without the withheld pressures.
+        withheld: these pressures, and where an effect acts.
+        given: content of the answer's file: the answer itself, and what it took.
     """
-    case, diagnosis = drawn.case, answer["diagnosis"]
-    mechanisms = diagnosis["mechanisms"]
-    named = frozenset(mechanism["name"] for mechanism in mechanisms)
-    seen = detectable_names(case, nats)
-    library = acceptable_names(case, named, inertance_is_seen="inertance" in seen)
-    alternatives = {name for m in mechanisms for name in m["alternatives"][:_ALTERNATIVES]}
-    place = diagnosis["slot"]["name"] if diagnosis["slot"] else None
-    equivalent = drawn.kind == "outside" and bool(library) and named == library
+    case, problem = drawn.case, given["problem"]
+    answer = None if problem else msgspec.convert(given["answer"], Answer, strict=False)
+    truth = concealed(drawn, nats)
+    hypotheses = {} if answer is None else {
+        frozenset(each.terms): each.probability for each in answer.hypotheses
+    }  # fmt: skip
+    most = max(hypotheses.values(), default=0.0)
+    leading = tuple(sorted((h for h, p in hypotheses.items() if p >= most - _EQUAL), key=sorted))
+    right = {terms for terms in hypotheses if is_right(terms, truth)}
+    belief = sum(hypotheses[terms] for terms in right)
+    others = [p for terms, p in hypotheses.items() if terms not in right]
+    allowed = frozenset().union(*(effect.terms | effect.beside for effect in truth))
+    by_term = _marginals(hypotheses)
+    wrong = {
+        term: p for term, p in by_term.items()
+        if term not in allowed and not term.startswith(UNKNOWN)
+    }  # fmt: skip
+    places = frozenset().union(*(effect.places for effect in truth))
+    errors = _errors(breaths, withheld, answer)
     return JudgedCase(
         name=case.name,
         kind=drawn.kind,
         lung=case.lung,
         strengths=tuple(effect.strength for effect in case.effects),
-        effects=tuple(effect.name for effect in case.effects),
-        library=library,
-        seen=seen,
-        verdict=diagnosis["verdict"],
-        named=named,
-        listed=library & (named | alternatives),
-        open=any(mechanism["alternatives"] for mechanism in mechanisms),
-        slot=place,
-        form=(diagnosis.get("form") or {}).get("name"),
-        right_slot=place in right_places(case) or equivalent,
-        estimates=_estimates(true_values(case), mechanisms),
-        before=diagnosis["open_loop"]["before"]["rmse"],
-        refit=diagnosis["open_loop"]["refit"]["rmse"],
-        after=diagnosis["open_loop"]["after"]["rmse"],
-        seconds=answer["seconds"],
-        peak=answer["peak_mib"],
-        first=answer["first_in_process"],
+        truth=truth,
+        leading=leading,
+        confidence=most * len(leading),
+        isolation=any(terms in right for terms in leading) / max(len(leading), 1),
+        belief=belief,
+        brier=(1.0 - belief) ** 2 + float(np.sum(np.square(others))),
+        missing=0.0 if answer is None else 1.0 - hypotheses.get(frozenset(), 0.0),
+        wrong=wrong,
+        harm=sum(p * (_SAME_PLACE if place_of(t) in places else 1.0) for t, p in wrong.items()),
+        estimates=_estimates(true_values(case), answer, leading),
+        overlap=_overlap(breaths, withheld, answer),
+        inspiration=errors[0],
+        expiration=errors[1],
+        seconds=given["seconds"],
+        peak=given["peak_mib"],
+        problem=problem,
     )
 
 
+def _marginals(hypotheses: dict[frozenset[str], float]) -> dict[str, float]:
+    """Probability of each term: that of all hypotheses that have it."""
+    found: dict[str, float] = {}
+    for terms, probability in hypotheses.items():
+        for term in terms:
+            found[term] = found.get(term, 0.0) + probability
+    return found
+
+
 def _estimates(
-    true: dict[str, float], mechanisms: list[dict[str, Any]]
+    true: dict[str, float], answer: Answer | None, leading: tuple[frozenset[str], ...]
 ) -> tuple[EstimateAgainstTruth, ...]:
-    estimates = []
-    for mechanism in mechanisms:
-        for key, estimate in mechanism["parameters"].items():
-            path, value = f"{mechanism['name']}.{key}", estimate["value"]
-            low, high = estimate["ci95"]
-            if path in true and None not in (low, high, value):
-                estimates.append(EstimateAgainstTruth(path, value, low, high, true[path]))
-    return tuple(estimates)
+    if answer is None or not leading:
+        return ()
+    return tuple(
+        EstimateAgainstTruth(path, given.value, given.low, given.high, true[path])
+        for path, given in sorted(answer.parameters.items())
+        if path in true and ("." not in path or path.partition(".")[0] in leading[0])
+    )
+
+
+def _errors(breaths: Breaths, withheld: Withheld, answer: Answer | None) -> tuple[float, float]:
+    """Mean absolute error of inspirations and of expirations, cmH2O.
+
+    The first sample is left out: it is the start of the breath, which commands do not tell.
+    """
+    constant, parts = float(np.nanmedian(breaths.pressure)), ([], [])
+    for breath, readings in withheld.pressures.items():
+        (k,) = np.flatnonzero(breaths.breath_id == breath)
+        measured = np.array(readings, float)
+        count = int(breaths.valid[k].sum())
+        told = np.full(len(measured), constant)
+        if answer is not None:
+            told[:count] = answer.pressures[breath]
+        error = np.abs(told - measured)[1:count]
+        open_ = breaths.u_out[k, 1:count] == 1
+        parts[0].append(error[~open_])
+        parts[1].append(error[open_])
+    inspiration, expiration = (float(np.nanmean(np.concatenate(part))) for part in parts)
+    return inspiration, expiration
+
+
+def _overlap(breaths: Breaths, withheld: Withheld, answer: Answer | None) -> float | None:
+    """F1 of the samples of all breaths in which an effect is said to act."""
+    if withheld.active is None:
+        return None
+    true, told = _flags(breaths, withheld.active), _flags(breaths, answer.active if answer else {})
+    both = int((true & told).sum())
+    return 2.0 * both / max(int(true.sum()) + int(told.sum()), 1)
+
+
+def _flags(
+    breaths: Breaths, spans: dict[int, tuple[tuple[float, float], ...]]
+) -> NDArray[np.bool_]:
+    flags = np.zeros(breaths.time.shape, bool)
+    for k, breath in enumerate(breaths.breath_id.tolist()):
+        for low, high in spans.get(breath, ()):
+            flags[k] |= (breaths.time[k] >= low - 1e-9) & (breaths.time[k] <= high + 1e-9)
+    return flags & breaths.valid

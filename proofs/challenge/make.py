@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hardware_eval.emulation.cases import commitment, encrypt, random_generator
+from hardware_eval.emulation.cases import Case, commitment, encrypt, random_generator
 from proofs.challenge.detectability import log_likelihood_loss
-from proofs.challenge.folder import ChallengeFolder, encode_answers
+from proofs.challenge.folder import ChallengeFolder, Withheld, encode_answers
 from proofs.challenge.generators import generator, generator_of
 from proofs.challenge.questions import DrawnCase, Kind
 from ventbench.base import files
@@ -27,6 +29,11 @@ PRESSURE = COLUMNS["pressure"]
 #: Attempts to stay within the limits: with other commands of the usual size first, then with
 #: gentler ones, each this share of the attempt before.
 _USUAL_ATTEMPTS, _GENTLE_ATTEMPTS, _GENTLER = 10, 10, 0.85
+
+#: One breath in so many is withheld.
+_WITHHELD = 6
+
+Flags = NDArray[np.bool_]
 
 #: Records a case; has the arguments of :func:`~proofs.challenge.first.rig.record`. That of
 #: the case's generator if None.
@@ -50,7 +57,7 @@ def make(
         jobs: number of processes.
         scheduler: address of a Dask scheduler instead, whose workers see the same files; they are
             told the secret.
-        source: name of the generator, ``"first"`` or ``"stranger"``.
+        source: name of the generator, one of :data:`~proofs.challenge.generators.GENERATORS`.
         record: see :data:`Record`; a function of a module if there are processes.
         progress: called with the number of finished recordings.
 
@@ -83,6 +90,7 @@ def make(
             "file": f"recordings/{question.case.name}.csv",
             "lung": question.case.lung,
             "sha256": files.sha256(folder.recording(question.case.name)),
+            "withheld": withheld_breaths(secret, question.case),
         }
         for question in drawn
     ]
@@ -98,8 +106,39 @@ def _make_case(
     """Record one case; returns the nats of each of its effects."""
     case = drawn.case
     breaths = record_within_limits(secret, drawn, record=record)
-    write(breaths, folder.recording(case.name))
+    apart = np.isin(breaths.breath_id, withheld_breaths(secret, case))
+    active = generator_of(case).active(case, breaths)
+    folder.keep(case.name, secret, Withheld(
+        {int(breaths.breath_id[k]): _readings(breaths, k) for k in np.flatnonzero(apart)},
+        None if active is None else _intervals(breaths, active),
+    ))  # fmt: skip
+    blank = np.where(apart[:, None], np.nan, breaths.pressure)
+    write(replace(breaths, pressure=blank), folder.recording(case.name))
     return [round(log_likelihood_loss(case, breaths, k), 1) for k in range(len(case.effects))]
+
+
+def withheld_breaths(secret: str, case: Case) -> list[int]:
+    """Ids of the breaths whose pressures no diagnoser sees: every sixth, two at least."""
+    count = max(2, case.breaths // _WITHHELD)
+    rng = random_generator(secret, "withheld", case.name)
+    # One of each stretch of the session, and neither its first nor its last breath.
+    edges = np.linspace(1, case.breaths - 1, count + 1).astype(int)
+    return [int(rng.integers(low, high)) + 1 for low, high in pairwise(edges)]
+
+
+def _readings(breaths: Breaths, k: int) -> tuple[float | None, ...]:
+    return tuple(None if np.isnan(p) else float(p) for p in breaths.pressure[k])
+
+
+def _intervals(breaths: Breaths, active: Flags) -> dict[int, tuple[tuple[float, float], ...]]:
+    """Where an effect acts, as intervals of time of the breaths."""
+    found = {}
+    for number, time, flags in zip(breaths.breath_id, breaths.time, active, strict=True):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+        spans = [(float(time[a]), float(time[b - 1])) for a, b in edges.reshape(-1, 2)]
+        if spans:
+            found[int(number)] = tuple(spans)
+    return found
 
 
 def record_within_limits(

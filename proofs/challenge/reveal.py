@@ -1,35 +1,21 @@
-"""Opening the seal and scoring the answers, also against a fit that knows the true structure."""
+"""Opening the seal and judging the answers of a diagnoser; comparing those of all."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from functools import cached_property
 from typing import Any
 
-import numpy as np
+import msgspec
 
-from proofs.challenge.figures import (
-    Figure,
-    by_parameter,
-    confusion,
-    figures,
-    second_round,
-    statistic,
-)
-from proofs.challenge.folder import ChallengeFolder, Truth
-from proofs.challenge.judge import JudgedCase, judge, library_names
-from proofs.challenge.stranger.effects import StrangerCase
+from proofs.challenge import contract
+from proofs.challenge.figures import Figure, by_kind, confusion, paired, scores, second_round
+from proofs.challenge.folder import ChallengeFolder
+from proofs.challenge.generators import generator_of
+from proofs.challenge.judge import JudgedCase, judge
 from ventbench.base.errors import InputError
-from ventbench.base.executor import executor, results
-from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.read import load
-
-#: Goals for the corrected simulator's held-out RMSE over the oracle's: median, 95th percentile.
-_MEDIAN_RATIO, _LARGE_RATIO = 1.02, 1.10
-
-#: Parameters of each breath's own effort.
-_EFFORT = ("patient_effort.amplitude", "patient_effort.onset")
 
 
 @dataclass(frozen=True)
@@ -48,218 +34,175 @@ class Draw:
 
 
 @dataclass(frozen=True)
-class ChallengeResult:
-    """Scores of a challenge, or of several draws from one generator together.
+class Judged:
+    """A diagnoser on draws from one generator.
 
     Attributes:
-        draws: where the cases are from.
-        unanswered: cases without an answer; in the second round only those with a request.
-        cases: the answered cases.
-        figures: measured values with their goals.
-        confusion: see :func:`~.figures.confusion`.
-        parameters: see :func:`~.figures.by_parameter`.
-        versions: code that gave the answers, as the answers say.
+        diagnoser: who answered.
         generator: name of the generator.
+        draws: where the cases are from.
+        cases: judged answers, by number of the draw and name of the case.
+        unanswered: cases without an answer; in the second round only those with a request.
+        versions: code that ran the diagnoser, as the answers say.
+        more: further figures.
     """
 
+    diagnoser: str
+    generator: str
     draws: tuple[Draw, ...]
-    unanswered: tuple[str, ...]
-    cases: tuple[JudgedCase, ...]
-    figures: tuple[Figure, ...]
-    confusion: dict[str, dict[str, int]]
-    parameters: dict[str, dict[str, Any]]
+    cases: dict[tuple[int, str], JudgedCase]
+    unanswered: tuple[str, ...] = ()
     versions: tuple[str, ...] = ()
-    generator: str = "first"
+    more: tuple[Figure, ...] = ()
+
+    @cached_property
+    def figures(self) -> tuple[Figure, ...]:
+        """Everything that is measured."""
+        cases = list(self.cases.values())
+        return (*scores(cases), *by_kind(cases), *self.more)
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON values; names of cases are those within a draw, which is given by its place."""
-        of_draw = [k for k, draw in enumerate(self.draws) for _ in range(draw.answered)]
+        """JSON values."""
+        cases = [
+            asdict(case)
+            | {"draw": draw, "right": case.right, "log_score": case.log_score}
+            | {"leading": [sorted(terms) for terms in case.leading]}
+            | {"truth": [{"name": e.name, "seen": e.seen} for e in case.truth]}
+            for (draw, _), case in self.cases.items()
+        ]
         return {
-            "draws": [asdict(draw) for draw in self.draws],
-            "unanswered": list(self.unanswered),
+            "diagnoser": self.diagnoser, "generator": self.generator,
+            "draws": [asdict(draw) for draw in self.draws], "unanswered": list(self.unanswered),
             "figures": [asdict(figure) for figure in self.figures],
-            "confusion": self.confusion,
-            "parameters": self.parameters,
-            "versions": list(self.versions),
-            "cases": [
-                _as_dict(case) | {"draw": draw}
-                for case, draw in zip(self.cases, of_draw, strict=True)
-            ],
-        }
+            "confusion": confusion(list(self.cases.values())), "versions": list(self.versions),
+            "cases": cases,
+        }  # fmt: skip
 
 
-def reveal(
-    folder: ChallengeFolder, secret: str, *, with_oracle: bool = False, jobs: int = 0,
-    scheduler: str | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> ChallengeResult:  # fmt: skip
-    """Check all hashes and score the answers.
+def reveal(folders: Sequence[ChallengeFolder], seeds: Sequence[str], diagnoser: str) -> Judged:
+    """Check all hashes and judge the answers of a diagnoser to draws from one generator.
 
     Args:
-        folder: folder of the challenge; for the second round, the first is read too.
-        secret: secret that the challenge was made with.
-        with_oracle: compare with fits that know the true structure, which takes seconds a case.
-        jobs: number of processes that fit; 0 to work in this process.
-        scheduler: address of a Dask scheduler instead, whose workers see the same files.
-        progress: called with the number of finished fits and the number of all fits.
+        folders: draws; of the second round one alone, whose first is read too.
+        seeds: secret that each was made with.
+        diagnoser: name of the diagnoser.
 
     Raises:
-        InputError: if the secret or a file is not that of the challenge, or there is no answer.
+        InputError: if a secret or a file is not that of its challenge, a draw is given twice,
+            generators differ, or there is no answer.
     """
-    truth = folder.truth(secret)
-    folder.check_recordings()
-    cases = _judged(folder, truth)
-    if not cases:
-        raise InputError(f"{folder.answer('case_0001').parent} has no answers; run `answer` first")
-    measured = figures(list(cases.values()))
-    if folder.round == 2:
-        measured.append(second_round(_judged(ChallengeFolder(folder.path), truth), cases))
-    if with_oracle:
-        measured += _against_oracle(folder, truth, cases, (jobs, scheduler), progress)
-    published = folder.commitment.read_text().split()[0]
-    return ChallengeResult(
-        (Draw(published, len(folder.cases()), len(cases)),),
-        tuple(name for name in _expected(folder) if name not in cases),
-        tuple(cases.values()),
-        tuple(measured),
-        confusion(list(cases.values())),
-        by_parameter(list(cases.values())),
-        tuple(sorted({given["code"] for given in folder.answers().values() if "code" in given})),
-        "stranger" if any(isinstance(d.case, StrangerCase) for d, _ in truth) else "first",
-    )
-
-
-def pool(results: Sequence[ChallengeResult]) -> ChallengeResult:
-    """Figures of several draws from one generator together, without those of an oracle.
-
-    Args:
-        results: one or more opened challenges, first rounds.
-
-    Raises:
-        InputError: if the generators differ, or a draw is given twice.
-    """
-    commitments = [draw.commitment for result in results for draw in result.draws]
-    twice = next((each for each in commitments if commitments.count(each) > 1), None)
-    if twice is not None:
-        raise InputError(f"the draw with commitment {twice} is given twice; give each draw once")
-    generators = sorted({result.generator for result in results})
+    draws, cases, unanswered, versions, generators = [], {}, [], set(), set()
+    more: tuple[Figure, ...] = ()
+    for number, (folder, secret) in enumerate(zip(folders, seeds, strict=True)):
+        found = _judge_all(folder, secret, diagnoser)
+        expected = list(folder.cases())
+        if folder.round == 2:
+            expected = [n for n in expected if folder.recording(n, diagnoser).is_file()]
+            first = _judge_all(ChallengeFolder(folder.path), secret, diagnoser)
+            more = (second_round(first, found),)
+        published = folder.commitment.read_text().split()[0]
+        if published in {draw.commitment for draw in draws}:
+            raise InputError(f"the draw with commitment {published} is given twice")
+        draws.append(Draw(published, len(folder.cases()), len(found)))
+        cases |= {(number, name): case for name, case in found.items()}
+        unanswered += [name for name in expected if name not in found]
+        versions |= {given["code"] for given in folder.answers(diagnoser).values()}
+        generators.add(generator_name(folder, secret))
     if len(generators) > 1:
         raise InputError(
-            f"draws from the generators {' and '.join(generators)} have figures of their own; "
-            "reveal them one at a time"
+            f"draws from the generators {' and '.join(sorted(generators))} have figures of their "
+            "own; reveal them one at a time"
         )
-    if len(results) == 1:
-        return results[0]
-    cases = [case for result in results for case in result.cases]
-    return ChallengeResult(
-        tuple(draw for result in results for draw in result.draws),
-        tuple(name for result in results for name in result.unanswered),
-        tuple(cases),
-        tuple(figures(cases)),
-        confusion(cases),
-        by_parameter(cases),
-        tuple(sorted({version for result in results for version in result.versions})),
-        generators[0],
-    )
+    if not cases:
+        place = folders[0].answer("case", diagnoser).parent
+        raise InputError(f"{place} has no answers; run `answer --diagnoser {diagnoser}` first")
+    return Judged(
+        diagnoser, generators.pop(), tuple(draws), cases, tuple(unanswered),
+        tuple(sorted(versions)), more,
+    )  # fmt: skip
 
 
-def _expected(folder: ChallengeFolder) -> list[str]:
-    """Cases that should have an answer: in the second round those with a request."""
-    first = ChallengeFolder(folder.path)
-    return [n for n in folder.cases() if folder.round == 1 or first.request(n).is_file()]
+def generator_name(folder: ChallengeFolder, secret: str) -> str:
+    """Name of the generator of a draw; opens its seal."""
+    return generator_of(folder.truth(secret)[0][0].case).name
 
 
-def _judged(folder: ChallengeFolder, truth: Truth) -> dict[str, JudgedCase]:
-    answers = folder.answers()
-    if folder.round == 1:
-        public = folder.cases()
-        for name, given in answers.items():
-            if given["recording_sha256"] != public[name]["sha256"]:
-                raise InputError(f"{folder.answer(name)} answers another recording; remove it")
-    return {
-        drawn.case.name: judge(drawn, nats, answers[drawn.case.name])
-        for drawn, nats in truth
-        if drawn.case.name in answers
-    }
+def _judge_all(folder: ChallengeFolder, secret: str, diagnoser: str) -> dict[str, JudgedCase]:
+    """Judge every answer of a diagnoser, by name of the case."""
+    truth = folder.truth(secret)
+    folder.check_recordings()
+    answers, public, found = folder.answers(diagnoser), folder.cases(), {}
+    for drawn, nats in truth:
+        name = drawn.case.name
+        if name not in answers:
+            continue
+        given = answers[name]
+        if folder.round == 1 and given["recording_sha256"] != public[name]["sha256"]:
+            raise InputError(
+                f"{folder.answer(name, diagnoser)} answers another recording; remove it"
+            )
+        breaths = load(ChallengeFolder(folder.path).recording(name))
+        withheld = folder.open(name, secret)
+        if not given["problem"]:
+            samples = {breath: len(readings) for breath, readings in withheld.pressures.items()}
+            try:  # the file may have changed since it was written
+                contract.decode(msgspec.json.encode(given["answer"]), samples)
+            except contract.AnswerError as error:
+                given = given | {"problem": str(error)}
+        found[name] = judge(drawn, nats, breaths, withheld, given)
+    return found
 
 
-def _against_oracle(
-    folder: ChallengeFolder, truth: Truth, cases: dict[str, JudgedCase],
-    parallel: tuple[int, str | None], progress: Callable[[int, int], None],
-) -> list[Figure]:  # fmt: skip
-    """Ratios of the held-out RMSE to that of a fit with the true structure.
+@dataclass(frozen=True)
+class Board:
+    """All diagnosers that have answered.
 
-    ``parallel`` holds the number of processes and the scheduler of :func:`reveal`.
+    Attributes:
+        against: diagnoser with whom the others are compared.
+        tables: rows by name of the generator, the best log score first.
     """
-    answers, ratios = folder.answers(), []
-    fits = {
-        d.case.name: (
-            folder.recording(d.case.name),
-            answers[d.case.name]["diagnosis"]["open_loop"]["held_out_breaths"],
-            library_names(d.case),
-        )
-        for d, _ in truth
-        if d.case.name in cases and d.kind != "outside"
-    }
-    with executor(*parallel) as pool:
-        for name, best in results(pool, oracle_rmse_of_file, fits):
-            ratios.append(cases[name].after / best)
-            progress(len(ratios), len(fits))
-    return [
-        statistic("held-out RMSE over the oracle's, median", ratios, np.median, _MEDIAN_RATIO),
-        statistic("held-out RMSE over the oracle's, 95th percentile", ratios,
-               lambda values: np.percentile(values, 95), _LARGE_RATIO),
-    ]  # fmt: skip
+
+    against: str
+    tables: dict[str, tuple[Judged, ...]]
+
+    def differences(self, row: Judged) -> dict[str, Figure]:
+        """The compared one minus another, over common cases; negative: the compared one is better.
+
+        Empty for the compared one itself, and where it has not answered the same cases.
+        """
+        ours = [r for r in self.tables[row.generator] if r.diagnoser == self.against]
+        if not ours or row is ours[0] or not ours[0].cases.keys() & row.cases.keys():
+            return {}
+        return paired(ours[0].cases, row.cases)
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values."""
+        rows = {
+            generator: [
+                row.as_dict()
+                | {"differences": {k: asdict(f) for k, f in self.differences(row).items()}}
+                for row in table
+            ]
+            for generator, table in self.tables.items()
+        }
+        return {"against": self.against, "tables": rows}
 
 
-def _as_dict(case: JudgedCase) -> dict[str, Any]:
-    value = asdict(case) | {"right": case.right, "wrong": sorted(case.wrong)}
-    for key in ("library", "seen", "named", "listed"):
-        value[key] = sorted(value[key])
-    return value
-
-
-def oracle_rmse_of_file(path: Path, held_out: list[int], names: frozenset[str]) -> float:
-    """Apply :func:`oracle_rmse` to a recording in a file."""
-    return oracle_rmse(load(path), held_out, names)
-
-
-def oracle_rmse(breaths: Breaths, held_out: list[int], names: frozenset[str]) -> float:
-    """Held-out open-loop RMSE over inspiratory samples of a fit with the true names, cmH2O.
-
-    Each simulated breath starts from its first reading. The effort of a future breath is unknown;
-    the prediction is the mean over the efforts of the fitted breaths.
-
-    Args:
-        breaths: the recording.
-        held_out: ids of the breaths on which the answer was scored.
-        names: mechanisms of the library that are in the rig.
+def board(folders: Sequence[ChallengeFolder], seeds: Sequence[str], against: str) -> Board:
+    """Judge all diagnosers that have answered draws, from any generators.
 
     Raises:
-        InputError: if no breath or every breath is held out.
+        InputError: as :func:`reveal`, or if nobody has answered.
     """
-    from ventbench.physics.catalogue import parameter
-    from ventbench.system_id import START, Predictor, fit, make_data, parameter_values
-
-    apart = np.isin(breaths.breath_id, held_out)
-    if not apart.any() or apart.all():
-        raise InputError(f"{apart.sum()} of {len(apart)} breaths are held out; both are needed")
-    data = make_data(breaths)
-    fitted = fit(data.select(~apart), sorted(names))
-    test = data.select(apart)
-    simulator = Predictor(test, fitted.problem.predictor.names)
-    values = parameter_values(test, simulator.names, {})
-    for column, name in enumerate(simulator.names):
-        per_breath = "." in name and parameter(name).scope == "breath"
-        if name != "position" and name != START and not per_breath:
-            values[:, column] = fitted.column(name)[0]
-    predicted = [simulator.predict(values)]
-    if set(_EFFORT) <= set(simulator.names):
-        columns, predicted = [simulator.names.index(path) for path in _EFFORT], []
-        for effort in zip(*(fitted.column(path) for path in _EFFORT), strict=True):
-            values[:, columns] = effort
-            predicted.append(simulator.predict(values))
-    error = np.mean(predicted, axis=0)[:, 0] - test.measured[:, 0]
-    counted = (test.u_out < 0.5) & (test.weight[:, 0] > 0)
-    counted[:, 0] = False  # every simulation starts there, and no answer is scored there either
-    return float(np.sqrt(np.mean(error[counted] ** 2)))
+    by_generator: dict[str, list[tuple[ChallengeFolder, str]]] = {}
+    for folder, secret in zip(folders, seeds, strict=True):
+        by_generator.setdefault(generator_name(folder, secret), []).append((folder, secret))
+    tables = {}
+    for generator, given in by_generator.items():
+        places, secrets = zip(*given, strict=True)
+        names = sorted({name for folder in places for name in folder.diagnosers()})
+        if not names:
+            raise InputError(f"nobody has answered {places[0].path}; run `answer` first")
+        rows = [reveal(places, secrets, name) for name in names]
+        tables[generator] = tuple(sorted(rows, key=lambda row: row.figures[1].value or 0.0))
+    return Board(against, tables)

@@ -12,7 +12,7 @@ from ventbench.cli.options import JsonFile, Scheduler, bars, claim_out, emit
 
 app = typer.Typer(
     name="challenge",
-    help="Test the diagnosis on recordings with concealed effects.",
+    help="Test diagnosers on recordings with concealed effects.",
     no_args_is_help=True,
 )
 
@@ -48,18 +48,19 @@ def make(
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
     scheduler: Scheduler = None,
     generator: Annotated[
-        Literal["first", "stranger"],
+        Literal["first", "stranger", "faults"],
         typer.Option(
-            help="Who records: the first generator, or the stranger, with other equations, another "
-            "integrator and the nuisances of real laboratories."
+            help="Who records: the first generator; the stranger, with other equations, another "
+            "integrator and the nuisances of real laboratories; or faults of the recording, the "
+            "session and the circuit."
         ),
     ] = "first",
 ) -> None:
     """Write recordings with concealed effects, and the sealed answers.
 
-    Anyone may read DIR/recordings and DIR/cases.json. commitment.txt holds the SHA-256 of the
-    answers: publish it before the first diagnosis. The same seed, kind, number of recordings and
-    generator give the same files.
+    Anyone may read DIR/recordings, without the withheld pressures, and DIR/cases.json.
+    commitment.txt holds the SHA-256 of the answers: publish it before the first diagnosis. The same
+    seed, kind, number of recordings and generator give the same files.
 
     Example: `python -m proofs challenge make --generator stranger --seed "$SECRET" --out runs/s`
     """
@@ -75,44 +76,61 @@ def make(
     typer.echo(f"wrote {cases} recordings to {out}; commitment {hashed}")
 
 
+Diagnoser = Annotated[
+    str,
+    typer.Option(
+        help="Who answers: module:function, a folder with diagnoser.toml, or one of the project's, "
+        "such as ventbench or refit. `reveal` and `record` take the name alone."
+    ),
+]
+
+
 @app.command()
 def answer(
     folder: Folder,
-    jobs: Annotated[
-        int, typer.Option(min=1, help="Number of processes, each with one thread.")
-    ] = 2,
+    diagnoser: Diagnoser = "ventbench",
+    seconds: Annotated[float, typer.Option(min=1, help="Processor seconds a case.")] = 300.0,
+    memory: Annotated[float, typer.Option(min=0.5, help="Address space a case, GiB.")] = 16.0,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of cases at once.")] = 1,
+    case: Annotated[list[str], typer.Option(help="Only this case; may be repeated.")] = [],  # noqa: B006
     scheduler: Scheduler = None,
     round_: Round = 1,
 ) -> None:
-    """Diagnose every recording without reading the sealed answers.
+    """Let a diagnoser answer every case, each in a process of its own.
 
-    Ctrl-C keeps the finished diagnoses; the same command continues.
+    Ctrl-C keeps the finished answers; the same command continues.
 
-    Example: `python -m proofs challenge answer runs/challenge --jobs 2`
+    Example: `python -m proofs challenge answer runs/challenge --diagnoser refit`
     """
     from proofs.challenge.answer import answer as work
     from proofs.challenge.folder import ChallengeFolder
+    from proofs.challenge.run import Limits, find
 
+    who = find(diagnoser)
     with bars() as shown:
-        task = shown.add_task("diagnosing", total=None)
+        task = shown.add_task("answering", total=None)
 
         def progress(done: int, total: int) -> None:
             shown.update(task, completed=done, total=total)
 
         place = folder if scheduler is None else folder.resolve()
-        failed = work(
-            ChallengeFolder(place, round_), jobs=jobs, scheduler=scheduler, progress=progress
-        )
-    for name, problem in sorted(failed.items()):
-        typer.echo(f"{name}: no answer: {problem}", err=True)
-    if failed:
+        lost = work(
+            ChallengeFolder(place, round_), who, limits=Limits(seconds, memory), jobs=jobs,
+            only=tuple(case), scheduler=scheduler, progress=progress,
+        )  # fmt: skip
+    for name, problem in sorted(lost.items()):
+        typer.echo(f"{name}: lost: {problem}", err=True)
+    typer.echo(
+        f"answered; now `python -m proofs challenge reveal {folder} --diagnoser {who.name} "
+        "--seed ...`"
+    )
+    if lost:
         raise typer.Exit(1)
-    typer.echo(f"answered; now `python -m proofs challenge reveal {folder} --seed ...`")
 
 
 @app.command()
-def record(folder: Folder, seed: Seed) -> None:
-    """Record the breaths that the answers asked for, each on its own concealed rig.
+def record(folder: Folder, seed: Seed, diagnoser: Diagnoser = "ventbench") -> None:
+    """Record the breaths that a diagnoser's answers ask for, each on its own concealed rig.
 
     Afterwards, `answer` and `reveal` with `--round 2` use all breaths.
 
@@ -121,112 +139,86 @@ def record(folder: Folder, seed: Seed) -> None:
     from proofs.challenge import requests
     from proofs.challenge.folder import ChallengeFolder
 
-    names = requests.record(ChallengeFolder(folder), seed)
+    names = requests.record(ChallengeFolder(folder), seed, diagnoser)
     typer.echo(f"recorded the requested breaths of {len(names)} cases")
+
+
+Folders = Annotated[
+    list[Path], typer.Argument(metavar="DIR...", help="Folders of challenges from one generator.")
+]
+Seeds = Annotated[
+    list[str], typer.Option("--seed", help="Secret seed of each folder, in the folders' order.")
+]
 
 
 @app.command()
 def reveal(
-    folders: Annotated[
-        list[Path],
-        typer.Argument(metavar="DIR...", help="Folders of challenges from one generator."),
-    ],
-    seed: Annotated[
-        list[str], typer.Option(help="Secret seed of each folder, in the folders' order.")
-    ],
+    folders: Folders,
+    seed: Seeds,
+    diagnoser: Diagnoser = "ventbench",
     round_: Round = 1,
-    oracle: Annotated[
-        bool, typer.Option("--oracle", help="Compare with fits that know the true effects; slow.")
-    ] = False,
-    jobs: Annotated[
-        int, typer.Option(min=0, help="Processes for --oracle; 0 for this process alone.")
-    ] = 0,
-    scheduler: Scheduler = None,
     json: JsonFile = None,
     page: ResultsPage = None,
 ) -> None:
-    """Open the sealed answers, check all hashes, and score the diagnoses.
+    """Open the seal, check all hashes, and judge a diagnoser by the withheld pressures and effects.
 
-    Several draws are scored together. The exit code is 1 if a goal is missed.
+    Several draws are judged together. The exit code is 1 if a goal is missed.
 
     Example: `python -m proofs challenge reveal runs/challenge --seed "$SECRET" --json scores.json`
     """
+    _one_seed_each(folders, seed)
+    if len(folders) > 1 and round_ == 2:
+        raise typer.BadParameter("--round 2 takes one folder", param_hint="DIR")
+
+    from proofs.challenge.folder import ChallengeFolder
+    from proofs.challenge.reveal import reveal as work
+    from proofs.results_page import challenge_section
+
+    result = work([ChallengeFolder(folder, round_) for folder in folders], seed, diagnoser)
+    _told(result, json, page, f"challenge {result.generator}", challenge_section(result, seed))
+    if any(figure.met is False for figure in result.figures):
+        raise typer.Exit(1)
+
+
+@app.command()
+def board(
+    folders: Folders,
+    seed: Seeds,
+    against: Annotated[
+        str, typer.Option(help="Diagnoser with whom all others are compared case by case.")
+    ] = "ventbench",
+    json: JsonFile = None,
+    page: ResultsPage = None,
+) -> None:
+    """Compare all diagnosers that have answered, with intervals of paired differences.
+
+    Folders may be from different generators; each generator has a table of its own.
+
+    Example: `python -m proofs challenge board runs/challenge --seed "$SECRET"`
+    """
+    _one_seed_each(folders, seed)
+
+    from proofs.challenge.folder import ChallengeFolder
+    from proofs.challenge.reveal import board as work
+    from proofs.results_page import board_section
+
+    result = work([ChallengeFolder(folder) for folder in folders], seed, against)
+    _told(result, json, page, "board of diagnosers", board_section(result))
+
+
+def _told(result: Any, json: Path | None, page: Path | None, name: str, text: str) -> None:
+    from proofs.results_page import write_section
+
+    emit(result.as_dict(), json)
+    if page is not None:
+        write_section(page, name, text)
+    if str(json) != "-":
+        typer.echo(text)
+
+
+def _one_seed_each(folders: list[Path], seed: list[str]) -> None:
     if len(seed) != len(folders):
         raise typer.BadParameter(
             f"{len(folders)} folders and {len(seed)} seeds were given; give --seed once a folder",
             param_hint="--seed",
         )
-    if len(folders) > 1 and (oracle or round_ == 2):
-        raise typer.BadParameter("--oracle and --round 2 take one folder", param_hint="DIR")
-
-    from rich.console import Console
-
-    from proofs.challenge.folder import ChallengeFolder
-    from proofs.challenge.reveal import pool
-    from proofs.challenge.reveal import reveal as work
-    from proofs.results_page import challenge_section, write_section
-
-    with bars() as shown:
-        task = shown.add_task("oracle" if oracle else "scoring", total=None)
-
-        def progress(done: int, total: int) -> None:
-            shown.update(task, completed=done, total=total)
-
-        results = []
-        for folder, secret in zip(folders, seed, strict=True):
-            place = folder if scheduler is None else folder.resolve()
-            opened = work(
-                ChallengeFolder(place, round_), secret, with_oracle=oracle, jobs=jobs,
-                scheduler=scheduler, progress=progress,
-            )  # fmt: skip
-            results.append(opened)
-        result = pool(results)
-    emit(result.as_dict(), json)
-    if page is not None:
-        write_section(page, f"challenge {result.generator}", challenge_section(result, seed))
-    console = Console(stderr=str(json) == "-")
-    _show(result, console)
-    if any(figure.met is False for figure in result.figures):
-        raise typer.Exit(1)
-
-
-def _show(result: Any, console: Any) -> None:
-    for draw in result.draws:
-        console.print(f"commitment {draw.commitment}: kept", highlight=False)
-    console.print(_confusion(result))
-    console.print(_figures(result))
-    if result.unanswered:
-        console.print(f"{len(result.unanswered)} cases have no answer and are not counted")
-
-
-def _confusion(result: Any) -> Any:
-    from rich.table import Table
-
-    table = Table(title="Truth and answers")
-    table.add_column("truth", no_wrap=True)
-    table.add_column("n", justify="right")
-    table.add_column("answers")
-    for truth, counts in result.confusion.items():
-        answers = ", ".join(f"{answer} {count}" for answer, count in counts.items())
-        table.add_row(truth, str(sum(counts.values())), answers)
-    return table
-
-
-def _figures(result: Any) -> Any:
-    from rich.table import Table
-
-    table = Table(title="Figures and goals")
-    table.add_column("figure")
-    for name in ("value", "95 %", "goal", "n", ""):
-        table.add_column(name, justify="right", no_wrap=True)
-    words = {True: "met", False: "missed", None: ""}
-    for figure in result.figures:
-        if figure.value is None:
-            value, span = "-", ""
-        elif figure.ci95 is None:
-            value, span = f"{figure.value:.3g}", ""
-        else:
-            value = f"{figure.value:.1%}"
-            span = f"{figure.ci95[0]:.1%}..{figure.ci95[1]:.1%}"
-        table.add_row(figure.what, value, span, figure.goal, str(figure.count), words[figure.met])
-    return table

@@ -9,15 +9,15 @@ import pytest
 from hardware_eval.emulation.cases import Effect
 from proofs import code_version
 from proofs.challenge.figures import Figure
-from proofs.challenge.judge import judge
-from proofs.challenge.reveal import ChallengeResult, Draw
+from proofs.challenge.reveal import Board, Draw, Judged
 from proofs.real.rig import Claim, Proof
 from proofs.results_page import (
+    board_section,
     challenge_section,
     proof_section,
     write_section,
 )
-from tests.proofs.challenge.truths import answer, drawn, mechanism
+from tests.proofs.challenge.truths import answer, judged
 from ventbench.base.errors import InputError
 
 
@@ -38,36 +38,51 @@ def test_a_section_is_replaced_and_the_rest_stays(tmp_path: Path) -> None:
 
 def test_a_challenge_tells_its_seed_its_commitment_and_its_code() -> None:
     leak = Effect("leak", "strong", "library", {"conductance": 20.0})
-    right = judge(drawn("single", leak), [100.0], answer("named", mechanism("leak")))
-    wrong = judge(
-        drawn("single", leak), [0.1], answer("named", mechanism("valve_lag"), slot="f(V)")
-    )
-    result = ChallengeResult(
-        (Draw("abc123", 40, 1), Draw("def456", 8, 1)), ("case_0003",), (right, wrong), (
-            Figure("strong: right name", 0.9, ">= 98%", 20, (0.7, 0.97), False),
+    right = judged("single", [leak], answer((1.0, "leak")))
+    wrong = judged("single", [leak], answer((0.9, "unknown:lung valve_lag"), (0.1, "")), worth=0.1)
+    result = Judged(
+        "refit", "stranger", (Draw("abc123", 40, 1), Draw("def456", 8, 1)),
+        {(0, "case_0001"): right, (1, "case_0001"): wrong}, ("case_0003",), ("1a2b3c",), (
+            Figure("strong: more", 0.9, ">= 98%", 20, (0.7, 0.97), False, True),
             Figure("seconds a case, median", 5.25, "", 20, None, None),
-            Figure("nothing missing: false names", None, "<= 0%", 0, None, None),
+            Figure("another score", 0.51, "", 20, (0.4, 0.625), None),
+            Figure("nothing missing: false", None, "<= 0%", 0, None, None, True),
         ),
-        {"leak": {"leak": 5, **{f"name {k}": 1 for k in range(8)}}}, {}, ("1a2b3c",), "stranger",
     )  # fmt: skip
     text = challenge_section(result, ["words", "-more"])
     make = "python -m proofs challenge make --generator stranger"
-    assert f"{make} --seed=words --cases 40 --out runs/strangers\n" in text
-    assert f"{make} --seed=-more --cases 8 --out runs/strangers2\n" in text
-    both = "runs/strangers runs/strangers2 --seed=words --seed=-more"
-    assert f"python -m proofs challenge reveal {both}\n" in text
-    assert "Generator `stranger`, code 1a2b3c:\n" in text
+    assert f"{make} --seed=words --cases 40 --out runs/stranger\n" in text
+    assert f"{make} --seed=-more --cases 8 --out runs/stranger2\n" in text
+    both = "runs/stranger runs/stranger2 --seed=words --seed=-more"
+    folders, seeds = both.split(" --seed", 1)
+    told = f"python -m proofs challenge reveal {folders} --diagnoser refit --seed{seeds}"
+    assert told + "\n" in text
+    assert "Generator `stranger`, diagnoser `refit`, code 1a2b3c:\n" in text
     assert "| `words` | `abc123` | 1 of 40 |\n| `-more` | `def456` | 1 of 8 |" in text
     same = challenge_section(result, ["words", "words"])  # with other numbers of cases
     assert "| `words` | `abc123` | 1 of 40 |\n| `words` | `def456` | 1 of 8 |" in same
     assert "Answers that are not right (1 of 2):" in text
     assert (
-        "| single | R10C20 | leak (strong, below the detection limit) | valve_lag + f(V) | "
-        "1.00, 0.60, 0.30 |"
+        "| single | R10C20 | leak (strong, below the detection limit) | unknown:lung + valve_lag | "
+        "90% | 0.00, 0.00 |"
     ) in text
-    assert "| strong: right name | 90% (70–97) | 20 | >= 98%, missed |" in text
-    assert "\nWithout a goal: seconds a case, median 5.25.\n" in text
-    assert "false names" not in text  # there was no case
+    assert "| strong: more | 90% (70% to 97%) | 20 | >= 98%, missed |" in text
+    assert "seconds a case, median 5.25; another score 0.51 (0.4 to 0.625)." in text
+    assert "false |" not in text  # there was no case
+
+
+def test_the_board_has_a_column_and_a_difference_for_each() -> None:
+    leak = Effect("leak", "strong", "library", {"conductance": 20.0})
+    ours = {(0, str(k)): judged("single", [leak], answer((1.0, "leak"))) for k in range(5)}
+    other = {(0, str(k)): judged("single", [leak], answer((1.0, ""))) for k in range(3)}
+    draws = (Draw("abc123", 5, 5),)
+    rows = (Judged("ours", "faults", draws, ours), Judged("flat", "faults", draws, other))
+    text = board_section(Board("ours", {"faults": rows}))
+    assert "| figure | ours (5) | flat (3) |\n|---|---|---|" in text
+    assert "| isolation accuracy | 1 (1 to 1) | 0 (0 to 0) |" in text
+    assert "\n| flat | -6.91 (-6.91 to -6.91) |" in text
+    assert "\n| ours | " not in text
+    assert text.strip().endswith("Commitments: abc123.")
 
 
 def test_the_proof_is_told_part_by_part_and_lung_by_lung() -> None:

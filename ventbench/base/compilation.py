@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import gc
 import hashlib
 import os
 import platform
@@ -43,18 +42,6 @@ def keep() -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(place))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
-
-
-def forget() -> None:
-    """Free what this process has compiled and hand the memory back; what is kept stays kept."""
-    import jax
-
-    jax.clear_caches()
-    gc.collect()  # compiled functions refer to each other
-    try:
-        ctypes.CDLL(None).malloc_trim(0)
-    except (AttributeError, OSError, TypeError):  # not the C library of GNU
-        return
 
 
 def is_warm() -> bool:

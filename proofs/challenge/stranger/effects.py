@@ -64,8 +64,8 @@ class Family(EffectFamily):
     """An effect of the second generator.
 
     Attributes:
-        names: names that are right for it, where the library has one of them.
-        places: places that are right for it without a name.
+        names: names of the vocabulary that are right for it, though it is outside the library.
+        places: places of the vocabulary that are right for it without a name.
     """
 
     names: tuple[str, ...] = ()
@@ -97,45 +97,44 @@ EFFECTS: dict[str, Family] = {
         "amplitude", 2.0, 5.0, ("half sine", "exponential"), (("duration", (0.5, 1.1)),)
     ),
     "volume_resistance": Family(
-        "capacity", 18.0, 8.0, ("conductance grows with volume",), inside=False, places=("R(V)",),
-        names=("volume_resistance",),
+        "capacity", 18.0, 8.0, ("conductance grows with volume",), inside=False, places=("airway",),
     ),
     "direction_resistance": Family(
         "ratio", 1.6, 2.1, ("expiratory resistance",), inside=False,
-        places=("R(direction)", "f(Q)"), names=("direction_resistance",),
+        places=("airway",),
     ),
     "cardiogenic": Family(
         "amplitude", 0.6, 1.2, ("two harmonics",), (("frequency", (0.9, 1.8)),), inside=False,
-        places=("f(t) at the alveolus",),
+        places=("muscles",),
     ),
     "pulsating_supply": Family(
         "amplitude", 0.12, 0.18, ("piston",), (("frequency", (2.5, 7.0)),), inside=False,
-        places=("f(t) at the supply",),
+        places=("supply",), names=("supply_ripple",),
     ),
     "second_compartment": Family(
         "share", 0.25, 0.45, ("Otis",), (("time", (0.4, 1.6)),), inside=False,
-        places=("memory of p", "memory of V"), names=("viscoelasticity", "second_compartment"),
+        places=("lung",), names=("viscoelasticity",),
     ),
     "sensor_nonlinearity": Family(
-        "bend", 0.9, 1.4, ("bow",), signs=(1.0, -1.0), inside=False, places=("measurement",),
-        names=("sensor_curve", "sensor_nonlinearity"),
+        "bend", 0.9, 1.4, ("bow",), signs=(1.0, -1.0), inside=False, places=("pressure_sensor",),
+        names=("sensor_curve",),
     ),
     "expiratory_valve_orifice": Family(
-        "amount", 1.0, 1.0, ("orifice",), inside=False, places=("exhalation path",),
+        "amount", 1.0, 1.0, ("orifice",), inside=False, places=("expiratory_valve",),
     ),
     "supply_back_pressure": Family(
         "supply", 120.0, 70.0, ("incompressible valve",), inside=False,
-        places=("f(p)", "f(u)", "memory of u"),
-        names=("supply_back_pressure", "valve_back_pressure", "back_pressure", "supply_pressure"),
+        places=("supply", "inspiratory_valve", "circuit"),
+        names=("supply_pressure",),
     ),
     "compliance_change": Family(
         "change", 0.2, 0.4, ("recruitment",), signs=(1.0, -1.0), inside=False,
-        places=("f(V)", "measurement"),
-        names=("compliance_drift", "compliance_change", "lung_drift", "elastance_drift"),
+        places=("lung",),
+        names=("compliance_drift",),
     ),
     "resistance_change": Family(
-        "change", 0.3, 0.6, ("secretions",), signs=(1.0, -1.0), inside=False, places=("f(Q)",),
-        names=("resistance_drift", "resistance_change", "lung_drift"),
+        "change", 0.3, 0.6, ("secretions",), signs=(1.0, -1.0), inside=False, places=("airway",),
+        names=("resistance_drift",),
     ),
 }  # fmt: skip
 

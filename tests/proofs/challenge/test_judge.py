@@ -1,35 +1,39 @@
 from __future__ import annotations
 
-from dataclasses import replace
+import subprocess
+import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hardware_eval.emulation.cases import Base, Effect
 from proofs.challenge.figures import (
-    by_parameter,
+    by_kind,
+    calibration_error,
     confusion,
-    figures,
+    paired,
+    scores,
     second_round,
     share,
     wilson,
 )
-from proofs.challenge.judge import judge, true_values
+from proofs.challenge.judge import FLOOR, judge
+from proofs.challenge.truth import true_values
 
-from .truths import answer, case, drawn, mechanism
+from .truths import answer, answered, case, drawn, judged, recording, withheld
 
 LEAK = Effect("leak", "strong", "library", {"conductance": 20.0})
 LAG = Effect("valve_lag", "mild", "library", {"tau": 0.04})
 LINEAR = Effect("leak", "strong", "linear", {"conductance": 20.0})
 HEART = Effect("cardiogenic", "strong", "oscillation", {"amplitude": 1.0, "frequency": 1.2})
 SECOND = Effect("second_compartment", "strong", "two compartments", {"share": 0.4, "time": 1.0})
+SURE = answer((1.0, "leak"))
+NOTHING = answer((1.0, ""))
 
 
-def judged(kind, effects, given, worth=100.0):
-    return judge(drawn(kind, *effects), [worth] * len(effects), given)
-
-
-def value(cases, what):
-    return next(f for f in figures(cases) if f.what.startswith(what))
+def value(figures, what):
+    return next(f for f in figures if f.what.startswith(what))
 
 
 def test_wilson_is_the_published_interval():
@@ -40,128 +44,185 @@ def test_wilson_is_the_published_interval():
 
 
 def test_right_is_the_name_and_nothing_else():
-    assert judged("single", [LEAK], answer("named", mechanism("leak"))).right
-    assert not judged("single", [LEAK], answer("named", mechanism("leak"), slot="f(V)")).right
-    bent = judged("single", [LEAK], answer("named", mechanism("leak"), form="leak"))
-    assert bent.right
-    assert (bent.slot, bent.form) == (None, "leak")
-    both = answer("named", mechanism("leak"), mechanism("valve_lag"))
+    assert judged("single", [LEAK], SURE).right
+    assert not judged("single", [LEAK], answer((1.0, "leak unknown:lung"))).right
+    both = answer((1.0, "leak valve_lag"))
     assert not judged("single", [LEAK], both).right
-    assert judged("single", [LEAK], both).wrong == {"valve_lag"}
+    assert judged("single", [LEAK], both).false == {"valve_lag"}
     assert judged("pair", [LEAK, LAG], both).right
-    assert judged("null", [], answer("nothing_missing")).right
-    assert not judged("null", [], answer("unnamed", slot="f(V)")).right
+    assert judged("null", [], NOTHING).right
+    assert not judged("null", [], answer((1.0, "unknown:lung"))).right
 
 
-def test_only_two_alternatives_count():
-    listed = answer("named", mechanism("valve_lag", "sensor_lag", "leak"))
-    assert judged("single", [LEAK], listed).listed == {"leak"}
-    longer = answer("named", mechanism("valve_lag", "sensor_lag", "inertance", "leak"))
-    assert judged("single", [LEAK], longer).listed == frozenset()
+def test_probabilities_are_scored():
+    case = judged("single", [LEAK], answer((0.7, "leak"), (0.2, "valve_lag"), (0.1, "")))
+    assert case.log_score == pytest.approx(-np.log(0.7))
+    assert case.brier == pytest.approx(0.3**2 + 0.2**2 + 0.1**2)
+    assert (case.confidence, case.isolation, case.missing) == (0.7, 1.0, pytest.approx(0.9))
+    assert judged("single", [LEAK], NOTHING).log_score == pytest.approx(-np.log(FLOOR))
 
 
-def test_outside_wants_the_place():
-    there = judged("outside", [HEART], answer("unnamed", slot="f(t) at the alveolus"))
-    assert there.right
-    elsewhere = judged("outside", [HEART], answer("unnamed", slot="f(V)"))
-    assert elsewhere.said_outside
-    assert not elsewhere.right
-    assert not judged("outside", [HEART], answer("named", mechanism("leak"))).said_outside
+def test_a_set_counts_by_its_size():
+    halves = judged("single", [LEAK], answer((0.5, "leak"), (0.5, "valve_lag")))
+    assert halves.isolation == 0.5
+    assert halves.confidence == 1.0
+    assert not halves.right
+    others = judged("single", [LEAK], answer((0.4, "cough"), (0.4, "valve_lag"), (0.2, "leak")))
+    assert others.isolation == 0.0
 
 
-def test_a_second_compartment_may_be_called_viscoelasticity():
-    for given in (answer("named", mechanism("viscoelasticity")),
-                  answer("unnamed", slot="memory of p")):  # fmt: skip
-        found = judged("outside", [SECOND], given)
-        assert found.said_outside
-        assert found.right
+def test_harm_is_less_in_the_right_part_of_the_rig():
+    near = judged("single", [LEAK], answer((1.0, "circuit_compliance")))
+    far = judged("single", [LEAK], answer((0.8, "cough"), (0.2, "leak")))
+    assert near.harm == 0.5
+    assert far.harm == 0.8
+    assert near.right_place
+    assert not far.right_place
+    assert judged("single", [LEAK], answer((1.0, "unknown:lung"))).harm == 0.0
+
+
+def test_outside_wants_the_place_or_an_equivalent():
+    assert judged("outside", [HEART], answer((1.0, "unknown:muscles"))).right
+    assert not judged("outside", [HEART], answer((1.0, "unknown:lung"))).right
+    assert judged("outside", [SECOND], answer((1.0, "viscoelasticity"))).right
+
+
+def test_what_is_below_the_detection_limit_may_be_left_out():
+    for given in (SURE, NOTHING):
+        assert judged("single", [LEAK], given, worth=3.0).right
+    assert not judged("single", [LEAK], answer((1.0, "cough")), worth=3.0).right
+    assert judged("single", [LEAK], answer((0.5, "leak"), (0.5, "")), worth=3.0).belief == 1.0
+
+
+def test_errors_are_measured_on_the_withheld_pressures():
+    off = SURE | {"pressures": {"2": [0, 21, 9, 6], "5": [0, 20, 6, 6]}}
+    found = judged("single", [LEAK], off)
+    assert found.inspiration == pytest.approx(0.5)  # the first sample is not counted
+    assert found.expiration == pytest.approx(3.0 / 4.0)
+
+
+def test_an_answer_that_lies_about_itself_changes_nothing():
+    forged = SURE | {"notes": {"open_loop": {"after": {"rmse": 0.0}}, "verdict": "named",
+                               "seconds": 0.0, "right": True}}  # fmt: skip
+    assert judged("single", [LEAK], forged) == judged("single", [LEAK], SURE)
+    first, second = (
+        [f for f in [*scores([c]), *by_kind([c])] if f.value is not None]
+        for c in (judged("null", [], forged), judged("null", [], SURE))
+    )
+    assert first == second
+
+
+def test_a_lost_case_is_not_right_and_predicts_a_constant():
+    lost = judged("null", [], None)
+    assert not lost.right
+    assert not lost.silent
+    assert lost.log_score == pytest.approx(-np.log(FLOOR))
+    assert lost.brier == 1.0
+    assert lost.inspiration == 7.0  # the median of the recording is 13
+    assert value(scores([lost]), "lost cases").met is False
+    assert value(scores([lost]), "false alarms").value == 1.0
+    assert confusion([lost]) == {"nothing missing": {"no answer": 1}}
+
+
+def test_localisation_is_the_f1_of_samples():
+    kept = withheld(active={1: ((0.5, 1.0),), 3: ((0.0, 0.5),)})
+    half = judged(
+        "single", [LEAK], SURE | {"active": {"1": [[0.5, 1.0]], "4": [[0, 0.5]]}}, kept=kept
+    )
+    assert half.overlap == pytest.approx(0.5)
+    assert judged("single", [LEAK], SURE, kept=kept).overlap == 0.0
+    assert judged("single", [LEAK], SURE).overlap is None
 
 
 def test_values_are_those_a_fit_with_the_nominal_gain_sees():
     tube = Effect("circuit_compliance", "mild", "library", {"compliance": 1.2})
     rough = Effect("turbulent_resistance", "mild", "library", {"quadratic": 4.0})
     weak = case(LEAK, tube, rough, LAG, base=Base(10.0, 20.0, gain=22.8 * 1.1))
-    found = true_values(weak)
-    assert found == pytest.approx({
+    assert true_values(weak) == pytest.approx({
         "leak.conductance": 20 / 1.1, "circuit_compliance.compliance": 1.2 / 1.1,
         "turbulent_resistance.quadratic": 4 * 1.21, "valve_lag.tau": 0.04,
     })  # fmt: skip
     assert true_values(case(LINEAR)) == {}
+    assert true_values(case(base=Base(10.0, 20.0, gain=22.8 * 1.1))) == pytest.approx(
+        {"R": 11.0, "C": 20 / 1.1}
+    )
+
+
+def conductance(value, low, high):
+    return SURE | {"parameters": {"leak.conductance": {"value": value, "low": low, "high": high}}}
 
 
 def test_estimates_know_error_and_coverage():
-    given = answer("named", mechanism("leak", conductance=(22.0, 19.0, 25.0)))
-    (item,) = judged("single", [LEAK], given).estimates
+    (item,) = judged("single", [LEAK], conductance(22.0, 19.0, 25.0)).estimates
     assert item.error == pytest.approx(0.1)
     assert item.covered
-    narrow = answer("named", mechanism("leak", conductance=(22.0, 21.0, 23.0)))
-    assert not judged("single", [LEAK], narrow).estimates[0].covered
-    assert judged("form", [LINEAR], given).estimates == ()
+    (narrow,) = judged("single", [LEAK], conductance(22.0, 21.0, 23.0)).estimates
+    assert not narrow.covered
+    assert judged("form", [LINEAR], conductance(22.0, 19.0, 25.0)).estimates == ()
+    unnamed = conductance(20.0, 19.0, 21.0) | {"hypotheses": NOTHING["hypotheses"]}
+    assert judged("single", [LEAK], unnamed).estimates == ()
 
 
 def test_figures_count_what_they_say():
-    right = judged("single", [LEAK], answer("named", mechanism("leak")))
-    silent = judged("single", [LEAK], answer("nothing_missing"))
-    assert value([right, right, right, silent], "strong: right").value == 0.75
-    assert value([right, silent], "strong: right").met is False
-    mild = judged("single", [LAG], answer("named", mechanism("leak")))
-    assert value([mild], "mild: a wrong").value == 1.0
-    assert value([right], "mild: a wrong").count == 0
-    hidden = judged("single", [LEAK], answer("nothing_missing"), worth=3.0)
-    assert value([hidden], "strong: right").count == 0
-    assert value([hidden], "below the detection").value == 1.0
-    null = judged("null", [], answer("named", mechanism("leak")))
-    assert value([null], "nothing missing: false").met is False
-    unknown = judged("form", [LINEAR], answer("unnamed", slot="f(V)"))
-    assert value([unknown, right], "library effect called").value == 0.5
+    right, silent = judged("single", [LEAK], SURE), judged("single", [LEAK], NOTHING)
+    figures = by_kind([right, right, right, silent])
+    assert value(figures, "strong: right").value == 0.75
+    assert value(figures, "strong: right").met is False
+    assert value(scores([right, silent]), "detected").value == 0.5
+    mild = judged("single", [LAG], SURE)
+    assert value(by_kind([mild]), "mild: a wrong").value == 1.0
+    assert value(scores([mild]), "a confident wrong").value == 1.0
+    assert value(by_kind([right]), "mild: a wrong").count == 0
+    hidden = judged("single", [LEAK], NOTHING, worth=3.0)
+    assert value(by_kind([hidden]), "strong: right").count == 0
+    assert value(by_kind([hidden]), "below the detection").value == 1.0
+    null = judged("null", [], SURE)
+    assert value(by_kind([null]), "nothing missing: false").met is False
+    unknown = judged("form", [LINEAR], answer((1.0, "unknown:lung")))
+    assert value(by_kind([unknown, right]), "library effect called").value == 0.5
+    four = judged("four", [LEAK, LAG], answer((1.0, "leak inertance")))
+    assert value(by_kind([four]), "four: terms").value == 0.5
+    assert value(by_kind([four]), "four: spurious").value == 1.0
 
 
-def test_four_counts_terms():
-    given = answer("named", mechanism("leak"), mechanism("inertance"))
-    found = judged("four", [LEAK, LAG], given)
-    assert value([found], "four: terms").value == 0.5
-    assert value([found], "four: spurious").value == 1.0
+def test_size_is_right_within_a_quarter():
+    near = judged("single", [LEAK], conductance(24.0, 19.0, 25.0))
+    far = judged("single", [LEAK], conductance(30.0, 19.0, 35.0))
+    assert value(scores([near, far]), "right name and size").value == 0.5
 
 
-def test_costs_leave_out_the_first_of_a_process():
-    quick = judged("single", [LEAK], answer("nothing_missing", seconds=20.0))
-    first = judged("single", [LEAK], answer("nothing_missing", seconds=90.0, first_in_process=True))
-    assert value([quick, first], "seconds a case, longest").value == 20.0
-    assert value([quick, first], "memory").met
+def test_calibration_compares_confidence_with_what_was_right():
+    sure_and_half_right = np.array([[[1.0, 1.0], [1.0, 0.0]] * 50])
+    assert calibration_error(sure_and_half_right) == pytest.approx(0.5)
+    rng = np.random.default_rng(0)
+    believed = rng.uniform(size=20_000)
+    happened = rng.uniform(size=20_000) < believed
+    honest = calibration_error(np.stack([believed, happened], axis=-1)[None].astype(float))
+    assert honest < 0.02
 
 
-def test_distances_must_not_grow():
-    good = judged("single", [LEAK], answer("nothing_missing"))
-    assert value([good], "held-out RMSE not above").met
-    assert value([good, replace(good, after=1.1)], "held-out RMSE not above").value == 0.5
+def test_differences_are_paired():
+    rng = np.random.default_rng(1)
+    ours, other = {}, {}
+    for k in range(30):  # both have the same hard and easy cases; ours is always a bit better
+        p = float(rng.uniform(0.3, 0.9))
+        ours[str(k)] = judged("single", [LEAK], answer((p + 0.05, "leak"), (0.95 - p, "")))
+        other[str(k)] = judged("single", [LEAK], answer((p, "leak"), (1.0 - p, "")))
+    other["more"] = judged("single", [LEAK], NOTHING)
+    found = paired(ours, other)["log score"]
+    assert found.count == 30
+    assert found.ci95 is not None
+    assert found.value is not None
+    assert found.ci95[0] < found.value < found.ci95[1] < 0.0
 
 
 def test_second_round_counts_what_was_open():
-    sure = judged("single", [LEAK], answer("named", mechanism("leak")))
-    unsure = judged("single", [LEAK], answer("named", mechanism("leak", "valve_dead_band")))
-    mistaken = judged("single", [LEAK], answer("named", mechanism("valve_dead_band")))
+    sure = judged("single", [LEAK], SURE)
+    unsure = judged("single", [LEAK], answer((0.6, "leak"), (0.4, "valve_dead_band")))
+    mistaken = judged("single", [LEAK], answer((1.0, "valve_dead_band")))
     before = {"a": sure, "b": unsure, "c": mistaken, "d": unsure}
-    after = {"a": sure, "b": sure, "c": mistaken, "d": sure}
-    found = second_round(before, after)
+    found = second_round(before, {"a": sure, "b": sure, "c": mistaken, "d": sure})
     assert (found.value, found.count) == (pytest.approx(2 / 3), 3)
-
-
-def test_confusion_has_truths_and_answers():
-    cases = [
-        judged("single", [LEAK], answer("named", mechanism("leak"))),
-        judged("single", [LEAK], answer("nothing_missing")),
-        judged("null", [], answer("unnamed", slot="f(V)")),
-        judged("pair", [LEAK, LAG], answer("nothing_missing")),
-    ]
-    assert confusion(cases) == {
-        "nothing missing": {"unnamed: f(V)": 1},
-        "leak": {"leak": 1, "nothing missing": 1},
-    }
-    found = judged(
-        "single", [LEAK], answer("named", mechanism("leak", conductance=(20.0, 19.0, 21.0)))
-    )
-    table = by_parameter([found])
-    assert table == {"leak.conductance": {"count": 1, "covered": 1, "median_error": 0.0}}
 
 
 def test_a_share_of_nothing_has_no_value():
@@ -170,3 +231,27 @@ def test_a_share_of_nothing_has_no_value():
     band = share("x", [True] * 95 + [False] * 5, least=0.92, most=0.98)
     assert band.met
     assert share("x", [True] * 10, least=0.92, most=0.98).met is False
+
+
+def test_the_judge_knows_no_diagnoser():
+    code = (
+        "import sys; import proofs.challenge.reveal, proofs.challenge.answer; "
+        "bad = ('ventbench.diagnosis', 'ventbench.system_id', 'ventbench.physics', "
+        "'proofs.diagnosers', 'jax'); "
+        "print([m for m in sys.modules if m.startswith(bad)])"
+    )
+    root = Path(__file__).parents[3]
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def test_another_order_of_hypotheses_is_the_same_answer():
+    there = answer((0.5, "leak"), (0.5, "cough"))
+    back = answer((0.5, "cough"), (0.5, "leak"))
+    first, second = (
+        judge(drawn("single", LEAK), [99.0], recording(), withheld(), answered(a))
+        for a in (there, back)
+    )
+    assert first == second

@@ -8,8 +8,8 @@ import pytest
 
 from hardware_eval.emulation.cases import LIBRARY
 from proofs.challenge.first.plan import CLASSES, OUTSIDE, draw
-from proofs.challenge.judge import has_library_form
 from proofs.challenge.questions import KINDS
+from proofs.challenge.truth import has_library_form
 from ventbench.base.errors import InputError
 from ventbench.physics import library
 

@@ -15,7 +15,7 @@ from proofs.challenge.first.rig import (
     sampling_times,
     step_grid,
 )
-from proofs.challenge.judge import has_library_form
+from proofs.challenge.truth import has_library_form
 
 from .truths import case
 

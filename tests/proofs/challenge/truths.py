@@ -1,14 +1,22 @@
-"""Answers made up for a known truth."""
+"""Answers made up for a known truth, and diagnosers that run in processes of their own."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hardware_eval.emulation.cases import Base, Case, Effect
+from proofs.challenge.folder import Withheld
+from proofs.challenge.judge import JudgedCase, judge
 from proofs.challenge.questions import DrawnCase
+from ventbench.recordings.breaths import Breaths, make_breaths
+
+#: Withheld breaths and samples of the made-up recording.
+WITHHELD, SAMPLES = (2, 5), 4
 
 
 def case(*effects: Effect, **changed: Any) -> Case:
@@ -21,67 +29,92 @@ def drawn(kind: Any, *effects: Effect) -> DrawnCase:
     return DrawnCase(kind, case(*effects))
 
 
-def mechanism(name: str, *alternatives: str, **parameters: tuple[float, float, float]) -> Any:
-    """A named mechanism; parameters as value, low, high."""
-    return {
-        "name": name,
-        "parameters": {
-            key: {"value": value, "unit": "", "ci95": [low, high]}
-            for key, (value, low, high) in parameters.items()
-        },
-        "alternatives": list(alternatives),
-    }
+def recording() -> Breaths:
+    """Six breaths of four samples; half of each is an inspiration at 20 cmH2O, the rest at 6."""
+    time = np.tile(np.arange(SAMPLES) * 0.5, (6, 1))
+    u_out = (time >= 1.0).astype(np.int8)
+    pressure = np.where(u_out == 0, 20.0, 6.0)
+    pressure[np.isin(np.arange(1, 7), WITHHELD)] = np.nan
+    ones = np.ones(6)
+    return make_breaths(
+        np.arange(1, 7), 10 * ones, 20 * ones, time, 10.0 * (1 - u_out), u_out, pressure
+    )
 
 
-def answer(
-    verdict: str, *mechanisms: Any, slot: str | None = None, form: str | None = None, **changed: Any
-) -> Any:
-    """The file of an answer."""
-    rmse = {stage: {"mae": 0.0, "rmse": x} for stage, x in
-            (("before", 1.0), ("refit", 0.6), ("after", 0.3))}  # fmt: skip
+def withheld(**changed: Any) -> Withheld:
+    return Withheld({breath: (20.0, 20.0, 6.0, 6.0) for breath in WITHHELD}, **changed)
+
+
+def answer(*hypotheses: tuple[float, str], **changed: Any) -> dict[str, Any]:
+    """An answer; hypotheses as probability and terms with blanks between, ``""`` for nothing."""
     return {
-        "recording_sha256": "",
-        "seconds": 10.0,
-        "peak_mib": 500.0,
-        "first_in_process": False,
-        "diagnosis": {
-            "verdict": verdict,
-            "mechanisms": list(mechanisms),
-            "slot": None if slot is None else {"name": slot},
-            "form": None if form is None else {"name": form},
-            "open_loop": rmse | {"held_out_breaths": [1, 2]},
-        },
+        "hypotheses": [{"terms": terms.split(), "probability": p} for p, terms in hypotheses],
+        "pressures": {str(breath): [20.0, 20.0, 6.0, 6.0] for breath in WITHHELD},
     } | changed
 
 
-@dataclass(frozen=True, eq=False)
-class Commands:
-    """A request of two breaths."""
-
-    u_in: Any
-    u_out: Any
-    dt: Any
-
-
-@dataclass(frozen=True, eq=False)
-class GivenDiagnosis:
-    """A diagnosis."""
-
-    value: Any
-    request: Commands | None = None
-
-    def as_dict(self) -> Any:
-        return self.value
+def answered(given: dict[str, Any] | None, **changed: Any) -> dict[str, Any]:
+    """The file of an answer; None for a lost case."""
+    return {
+        "recording_sha256": "", "seconds": 10.0, "peak_mib": 500.0, "code": "", "layers": [],
+        "problem": "" if given else "failed", "answer": given,
+    } | changed  # fmt: skip
 
 
-def request(samples: int = 80) -> Commands:
-    u_in = np.zeros((2, samples))
-    u_in[:, :20] = [[5.0], [8.0]]
-    u_out = np.zeros((2, samples))
-    u_out[:, 50:] = 1.0
-    return Commands(u_in, u_out, np.full((2, samples), 0.033))
+def judged(
+    kind: Any, effects: list[Effect], given: dict[str, Any] | None, worth: float = 100.0,
+    kept: Withheld | None = None, **changed: Any,
+) -> JudgedCase:  # fmt: skip
+    nats = [worth] * len(effects)
+    file = answered(given, **changed)
+    return judge(drawn(kind, *effects), nats, recording(), kept or withheld(), file)
 
 
-def sees_nothing(breaths: Any, lung: str) -> GivenDiagnosis:
-    """A diagnosis that another process can be asked for."""
-    return GivenDiagnosis(answer("nothing_missing")["diagnosis"])
+def _flat(folder: Path, terms: list[str]) -> dict[str, Any]:
+    """Answer with certainty, and with a constant pressure."""
+    question = json.loads((folder / "case.json").read_text())
+    header, *rows = (line.split(",") for line in (folder / "recording.csv").read_text().split())
+    numbers = [int(row[header.index("breath_id")]) for row in rows]
+    return {
+        "hypotheses": [{"terms": terms, "probability": 1.0}],
+        "pressures": {str(b): [10.0] * numbers.count(b) for b in question["withheld"]},
+    }
+
+
+def sees_nothing(folder: Path) -> dict[str, Any]:
+    return _flat(folder, [])
+
+
+def asks(folder: Path) -> dict[str, Any]:
+    """Is not sure, and asks for two breaths."""
+    time = np.arange(80) * 0.033
+    u_in = [np.where(time < 0.6, level, 0.0) for level in (5.0, 8.0)]
+    return _flat(folder, ["leak"]) | {
+        "hypotheses": [
+            {"terms": ["leak"], "probability": 0.6}, {"terms": [], "probability": 0.4},
+        ],
+        "record_next": [
+            {"time": time, "u_in": u, "u_out": (time > 1.6).astype(int)} for u in u_in
+        ],
+    }  # fmt: skip
+
+
+def fails(folder: Path) -> None:
+    raise ValueError("no idea")
+
+
+def answers_text(folder: Path) -> str:
+    return "nothing is missing"
+
+
+def never_ends(folder: Path) -> None:
+    while True:
+        pass
+
+
+def eats_memory(folder: Path) -> Any:
+    return np.ones(1 << 38)
+
+
+def kills_itself(folder: Path) -> None:
+    os.kill(os.getpid(), 6)

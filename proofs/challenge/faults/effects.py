@@ -1,0 +1,205 @@
+"""Faults of the third generator: strengths, sources; and the draw of its cases.
+
+Sources: J. Fraden, *Handbook of Modern Sensors* (Springer 2016) (span, zero and warm-up of pressure
+sensors, saturation); IEEE 1057 (clipping, delay of converters); D. L. Mills, *Computer Network Time
+Synchronization* (CRC 2011) (offset and skew of clocks); J. Nilsson, *Real-Time Control Systems with
+Delays* (Lund 1998) (lost and late commands); M. Basseville, I. V. Nikiforov, *Detection of Abrupt
+Changes* (Prentice Hall 1993) (steps and drifts); ISO 80601-2-12 (leaks, disconnection, pressure
+relief, ripple of the supply); P. E. Pepe, J. J. Marini, Am. Rev. Respir. Dis. 126 (1982) 166
+(trapped gas); A. Jubran, M. J. Tobin, Am. J. Respir. Crit. Care Med. 150 (1994) 766 (secretions saw
+the flow; water in a tube swings alike, but slower); J. G. Widdicombe, Eur. Respir. J. 8 (1995) 1193
+(course of a cough); data sheets of stepper valves (whole steps).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hardware_eval.emulation.cases import NOMINAL_GAIN, Base, Case, Effect, Strength
+from proofs.challenge.questions import DrawnCase, Kind
+from ventbench.base.errors import InputError
+from ventbench.task.lungs import Lung
+
+
+@dataclass(frozen=True)
+class FaultsCase(Case):
+    """A recording of the third generator.
+
+    Attributes:
+        generator: always ``"faults"``; the sealed answers tell the generators apart by it.
+        interval: sampling interval, s.
+        inspiration: duration of inspiration, s.
+        tubing: compliance of the circuit that every rig has, mL/cmH2O.
+        choice: seed of which breaths and commands are affected.
+    """
+
+    generator: str = "faults"
+    interval: float = 0.03
+    inspiration: float = 1.0
+    tubing: float = 0.05
+    choice: int = 0
+
+
+@dataclass(frozen=True)
+class Family:
+    """A fault.
+
+    Attributes:
+        parameter: parameter that carries the strength, as in the vocabulary.
+        mild: its mean in a mild fault.
+        strong: its mean in a strong fault.
+        ranges: further parameters with the ends of a uniform distribution.
+        forms: forms of its course.
+        both: whether the strength may be negative.
+        share: ends of the share of the breaths that it affects; None for all.
+    """
+
+    parameter: str
+    mild: float
+    strong: float
+    ranges: tuple[tuple[str, tuple[float, float]], ...] = ()
+    forms: tuple[str, ...] = ("plain",)
+    both: bool = False
+    share: tuple[float, float] | None = None
+
+
+_COURSES = ("linear", "warm-up")
+
+FAULTS: dict[str, Family] = {
+    "saturation": Family("level", 31.0, 24.0),
+    "clock_offset": Family("offset", 0.03, 0.07),
+    "clock_skew": Family("skew", 0.012, 0.03),
+    "lost_commands": Family("share", 0.06, 0.15),
+    "late_commands": Family("share", 0.12, 0.3, (("delay", (0.06, 0.12)),)),
+    "gain_step": Family("change", 0.08, 0.25, both=True),
+    "gain_drift": Family("change", 0.1, 0.3, forms=_COURSES, both=True),
+    "zero_step": Family("change", 0.8, 2.0, both=True),
+    "sensor_drift": Family("drift", 1.2, 3.0, forms=_COURSES, both=True),
+    "resistance_step": Family("change", 0.25, 0.6, both=True),
+    "resistance_drift": Family("change", 0.3, 0.6, forms=_COURSES, both=True),
+    "compliance_step": Family("change", 0.15, 0.35, both=True),
+    "compliance_drift": Family("change", 0.2, 0.4, forms=_COURSES, both=True),
+    "intermittent_leak": Family("conductance", 9.0, 22.0, share=(0.2, 0.5)),
+    "disconnection": Family("share", 0.08, 0.25),
+    "relief_leak": Family("opening", 26.0, 19.0, (("conductance", (20.0, 40.0)),)),
+    "trapped_gas": Family("pressure", 2.0, 5.0),
+    "command_rounding": Family("step", 1.0, 2.0, forms=("nearest", "truncation")),
+    "supply_ripple": Family("amplitude", 0.08, 0.18, (("frequency", (2.0, 8.0)),)),
+    "circuit_water": Family("amplitude", 0.7, 1.6, (("frequency", (3.0, 7.0)),)),
+    "secretions": Family("increase", 0.5, 1.2, share=(0.3, 0.6)),
+    "cough": Family("pressure", 5.0, 14.0, share=(0.1, 0.3)),
+}
+
+#: Faults that act in part of the recording: in some breaths or above a pressure.
+PARTIAL = ("intermittent_leak", "disconnection", "relief_leak", "secretions", "cough")
+
+SHARES: dict[Kind, float] = {"single": 0.62, "null": 0.18, "pair": 0.14, "masked": 0.06}
+
+#: Share of the single faults that are below detection, and their size as a share of a mild one.
+_FAINT, _FAINT_SIZE = 0.1, 0.08
+
+#: Share of breaths below which a fault never happens.
+_NEVER = 0.02
+
+#: Largest relative deviation of a strength from its mean.
+_VARIATION = 0.15
+
+_LUNGS = tuple(Lung(R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.0))
+
+#: Sampling intervals, s, with the number of samples of a breath.
+_SAMPLING = ((0.03, 84), (0.025, 100), (0.0333, 76))
+
+
+def draw(kind: Kind | Literal["all"], count: int, rng: np.random.Generator) -> list[DrawnCase]:
+    """Draw cases of one kind or of all kinds, in random order.
+
+    Raises:
+        InputError: if the generator has no such kind, or there are fewer cases than kinds.
+    """
+    if kind != "all" and kind not in SHARES:
+        raise InputError(f"the generator faults has no kind {kind}; choose {', '.join(SHARES)}")
+    if count < (len(SHARES) if kind == "all" else 1):
+        raise InputError(f"{count} cases are too few; ask for at least {len(SHARES)}")
+    sizes: dict[Kind, int] = {}
+    if kind == "all":
+        sizes = {each: max(1, int(share * count)) for each, share in SHARES.items()}
+        sizes["single"] += count - sum(sizes.values())
+    else:
+        sizes[kind] = count
+    cases = [DrawnCase(each, case) for each, n in sizes.items() for case in _of_kind(each, n, rng)]
+    return [cases[i] for i in rng.permutation(len(cases))]
+
+
+def _of_kind(kind: Kind, count: int, rng: np.random.Generator) -> Iterator[FaultsCase]:
+    every = tuple(FAULTS)
+    rounds = count // len(every) + 1
+    names = [every[i] for _ in range(rounds) for i in rng.permutation(len(every))]
+    flip = int(rng.integers(2))
+    for k in range(count):
+        strength: Strength = ("mild", "strong")[(k + flip) % 2]
+        most = 24 if kind == "masked" else 200
+        breaths = int(np.round(np.exp(rng.uniform(np.log(12), np.log(most)))))
+        effects: tuple[Effect, ...] = ()
+        if kind == "pair":
+            first, second = rng.choice(len(every), 2, replace=False)
+            chosen = sorted((every[first], every[second]))
+            effects = tuple(_effect(name, "strong", breaths, rng) for name in chosen)
+        elif kind != "null":
+            faint = kind == "single" and rng.uniform() < _FAINT
+            effects = (_effect(names[k], strength, breaths, rng, faint=faint),)
+        yield _case(effects, breaths, rng)
+
+
+def _effect(
+    name: str, strength: Strength, breaths: int, rng: np.random.Generator, *, faint: bool = False
+) -> Effect:
+    family = FAULTS[name]
+    size = getattr(family, strength) * rng.uniform(1.0 - _VARIATION, 1.0 + _VARIATION)
+    if faint:  # a level or an opening is faint where nothing reaches it
+        size = 90.0 if family.parameter in ("level", "opening") else _FAINT_SIZE * family.mild
+    if family.both and rng.uniform() < 0.5:
+        size = -size
+    values = {family.parameter: float(size)}
+    values |= {key: float(rng.uniform(*span)) for key, span in family.ranges}
+    if name.endswith("_step"):
+        values["breath"] = float(1 + int(breaths * rng.uniform(0.3, 0.7)))
+    if family.share is not None:
+        values["affected"] = float(rng.uniform(*family.share))
+    return Effect(name, strength, family.forms[int(rng.integers(len(family.forms)))], values)
+
+
+def _case(effects: tuple[Effect, ...], breaths: int, rng: np.random.Generator) -> FaultsCase:
+    label = _LUNGS[int(rng.integers(len(_LUNGS)))]
+    interval, samples = _SAMPLING[int(rng.integers(len(_SAMPLING)))]
+    base = Base(
+        R=float(label.R * np.exp(0.1 * rng.standard_normal())),
+        C=float(label.C * np.exp(0.05 * rng.standard_normal())),
+        R_ex=float(rng.uniform(3.0, 8.0)),
+        peep=float(rng.uniform(4.0, 6.0)),
+        gain=float(NOMINAL_GAIN * np.exp(0.06 * rng.standard_normal())),
+    )
+    return FaultsCase(
+        name="", lung_R=label.R, lung_C=label.C, effects=effects, base=base,
+        noise=float(rng.uniform(0.1, 0.25)),
+        coloured=float(rng.uniform(0.0, 0.4)) if rng.uniform() < 0.4 else 0.0,
+        step=float(rng.choice(np.array([0.05, 0.07]))),
+        jitter=float(rng.choice(np.array([1e-4, 6e-4]))),
+        breaths=breaths, samples=samples, log_step=0.01, interval=interval,
+        inspiration=float(rng.uniform(0.8, 1.1)), tubing=float(rng.uniform(0.02, 0.08)),
+        choice=int(rng.integers(2**31)),
+    )  # fmt: skip
+
+
+def affected(case: FaultsCase, effect: Effect, number: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which breaths a fault affects, by their numbers from 0, ``(n,)``."""
+    share = effect.parameters["share" if effect.name == "disconnection" else "affected"]
+    size = max(case.breaths, int(number.max()) + 1)
+    seed = (case.choice, 3, list(FAULTS).index(effect.name))
+    rank = np.random.default_rng(seed).permutation(size)
+    count = 0 if share < _NEVER else int(np.ceil(share * size))
+    return rank[number] < count

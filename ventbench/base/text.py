@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,34 @@ def plain(text: str) -> str:
     return "".join(
         c if c.isprintable() else " " if c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in text
     )
+
+
+# Characters that are printable by their category and yet show nothing (default-ignorable).
+_IGNORABLE = re.compile(
+    "[\u00ad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180b-\u180f\u200b-\u200f\u202a-\u202e\u2060-\u206f"
+    "\u3164\ufe00-\ufe0f\ufeff\uffa0\ufff0-\ufff8\U0001bca0-\U0001bca3\U0001d173-\U0001d17a"
+    "\U000e0000-\U000e0fff]"
+)
+
+
+# Scripts that are written together.
+_ASIAN = {"CJK", "HIRAGANA", "KATAKANA", "KATAKANA-HIRAGANA"}
+
+
+def deceptive(text: str) -> str:
+    """Say why a name may look like another one; empty if it cannot.
+
+    Characters that show nothing, and words whose letters come from several scripts.
+    """
+    if not text.isprintable() or _IGNORABLE.search(text) or not text.strip():
+        return f"{plain(text)!r} holds a character that cannot be seen"
+    for word in re.findall(r"[^\W\d_]+", text):
+        scripts = {
+            unicodedata.name(c, "?").split()[0] for c in word if unicodedata.category(c) != "Lm"
+        }
+        if len(scripts - {"CJK", "HIRAGANA", "KATAKANA", "FULLWIDTH", "HALFWIDTH"}) > 1:
+            return f"{word!r} mixes the letters of {' and '.join(sorted(scripts)).lower()}"
+    return ""
 
 
 def escape_markdown(text: str) -> str:

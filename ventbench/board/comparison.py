@@ -1,0 +1,269 @@
+r"""Which entries are better beyond doubt, over all pairs at once, and how stable their order is.
+
+**Paired test.** Entries ran on the same draws. The difference of two of them on a lung is a mean
+over rigs; draws on one rig share it, so that the rig is what varies independently (the draw, where
+a lung has one rig only). With the sums :math:`e_{lg}` of the centred differences of rig g of lung l
+over the number of draws, the variance of the mean over L lungs is
+
+.. math:: V = \sum_l V_l / L^2, \qquad V_l = \frac{G_l}{G_l - 1} \sum_g e_{lg}^2,
+
+with Satterthwaite's degrees of freedom :math:`(\sum V_l)^2 / \sum V_l^2 / (G_l - 1)`.
+
+**Beyond doubt.** Entry i is better than j if ``mean_j - mean_i`` exceeds the least difference that
+matters by more than chance: one-sided t tests of all ordered pairs, with Holm's correction. So the
+probability that any pair is called wrongly is at most :data:`ERROR`, whatever the truth is.
+
+**Rank.** 1 + the number of entries that are better beyond doubt than it or than one with a lower
+mean: no entry stands above one that has a lower mean. Beside it stand the ranks that it may have;
+they hold for all entries together. An entry that follows another's commands counts as one with it,
+and never against it; see :func:`sources`.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+#: Probability that any pair of entries is called wrongly.
+ERROR = 0.05
+
+#: Least difference that matters: points of the normalised score, and cmH2O of the stress score.
+POINTS, CMH2O = 1.0, 0.01
+
+#: Runs of two entries follow each other if their commands, scaled to fit best, differ by this share
+#: (root mean square), and one entry follows another if this share of its runs does. Independent
+#: bundled entries differ by 8 to 45 % in the middle run.
+DISTANCE, FOLLOWING = 0.05, 0.75
+
+#: Thresholds of performance profiles, points of the normalised score.
+THRESHOLDS = np.arange(0.0, 201.0, 5.0)
+
+# Runs by which entries are first compared.
+_FEW = 48
+
+#: Resamples and seed of the interval of the interquartile mean.
+_RESAMPLES, _SEED = 400, 20210215
+
+# Below this standard error, replays on other machines round differently.
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Ranks:
+    """Ranks of N entries, in the order in which they were given.
+
+    Attributes:
+        better: whether row i is better than column j beyond doubt, shape ``(N, N)``.
+        rank: from 1, shape ``(N,)``; equal where entries cannot be told apart.
+        best: best rank that each may have, shape ``(N,)``.
+        worst: worst rank, shape ``(N,)``.
+    """
+
+    better: NDArray[np.bool_]
+    rank: Ints
+    best: Ints
+    worst: Ints
+
+
+def ranks(
+    values: Floats, rig: Ints, source: Sequence[int | None] | None = None, *, matters: float
+) -> Ranks:
+    """Rank entries; less is better.
+
+    Args:
+        values: of each lung and draw, shape ``(N, L, K)``.
+        rig: of each lung and draw, shape ``(L, K)``.
+        source: index of the entry that each follows; see :func:`sources`.
+        matters: least difference that matters, in the unit of the values.
+    """
+    count, means = len(values), values.mean(axis=(1, 2))
+    better = holm(p_values(values, rig, matters))
+    source = [None] * count if source is None else source
+    lines = [_line_of(k, source) for k in range(count)]
+    root = np.array([line[-1] for line in lines], int)
+    # Whoever follows an entry, directly or not, never counts against it.
+    against = np.array([[j != i and i not in lines[j] for j in range(count)] for i in range(count)])
+    against = against.reshape(count, count)
+    best = np.array([1 + len({*root[better[:, i] & against[i]]}) for i in range(count)], int)
+    worst = np.array([1 + len({*root[~better[i] & against[i]]}) for i in range(count)], int)
+    order = np.argsort(means, kind="stable")
+    rank = np.empty(count, int)
+    rank[order] = np.maximum.accumulate(best[order]) if count else best
+    return Ranks(better, np.minimum(rank, worst), best, worst)
+
+
+def _line_of(k: int, source: Sequence[int | None]) -> list[int]:
+    """An entry, the one that it follows, and so on."""
+    line = [k]
+    while (earlier := source[line[-1]]) is not None:
+        line.append(earlier)
+    return line
+
+
+def p_values(values: Floats, rig: Ints, matters: float) -> Floats:
+    """Probability of such a lead of row i over column j, did it not exceed what matters.
+
+    Args:
+        values: of each lung and draw, shape ``(N, L, K)``.
+        rig: of each lung and draw, shape ``(L, K)``.
+        matters: least difference that matters.
+
+    Returns:
+        Shape ``(N, N)``; 1 on the diagonal.
+    """
+    count, lungs, _ = values.shape
+    means = values.mean(axis=(1, 2))
+    p = np.ones((count, count))
+    parts = [_clusters(values[:, lung], rig[lung]) for lung in range(lungs)]
+    for i in range(count):
+        lead = means - means[i] - matters
+        variances = np.stack(
+            [
+                part.shape[1] / max(part.shape[1] - 1, 1) * ((part - part[i]) ** 2).sum(axis=1)
+                for part in parts
+            ]
+        )
+        spare = np.array([max(part.shape[1] - 1, 1) for part in parts])[:, None]
+        total = variances.sum(axis=0)
+        freedom = total**2 / np.maximum((variances**2 / spare).sum(axis=0), 1e-300)
+        error = np.maximum(np.sqrt(total) / lungs, _ROUNDING)
+        p[i] = np.where(lead > 0.0, stats.t.sf(lead / error, np.maximum(freedom, 1.0)), 1.0)
+    return p
+
+
+def _clusters(values: Floats, rig: Ints) -> Floats:
+    """Sums over the rigs of a lung of centred values over the number of draws, ``(N, G)``."""
+    names, index = np.unique(rig, return_inverse=True)
+    if len(names) < 2:  # nothing is known of other rigs: draws are all that varies
+        index = np.arange(len(rig))
+    member = index[:, None] == np.arange(index.max() + 1)
+    centred = values - values.mean(axis=1, keepdims=True)
+    return centred @ member / values.shape[1]
+
+
+def holm(p: Floats) -> NDArray[np.bool_]:
+    """Which hypotheses of all ordered pairs are rejected, shape ``(N, N)``."""
+    rejected = np.zeros(p.shape, bool)
+    pairs = np.flatnonzero(~np.eye(len(p), dtype=bool))
+    order = pairs[np.argsort(p.ravel()[pairs], kind="stable")]
+    passed = p.ravel()[order] <= ERROR / np.arange(len(order), 0, -1)
+    rejected.ravel()[order[: int(np.logical_and.accumulate(passed).sum())]] = True
+    return rejected
+
+
+def sources(commands: Sequence[Floats]) -> list[int | None]:
+    """Find entries whose commands follow those of an earlier one nearly everywhere.
+
+    A factor does not matter: commands times 1.01 follow as copies do. Controllers that were made
+    independently answer differently to the noise of the draws.
+
+    Args:
+        commands: as applied, %, of each entry, the earliest first, shapes ``(runs, steps)``.
+
+    Returns:
+        For each entry the index of the earliest one that it follows, or None.
+    """
+    if not commands:
+        return []
+    # A few runs tell most pairs apart; the others are looked at in full.
+    few = np.stack([own[:: max(1, len(own) // _FEW)] for own in commands])
+    found: list[int | None] = []
+    for k, own in enumerate(commands):
+        likely = np.mean(_apart(few[k], few[:k]) <= 2.0 * DISTANCE, axis=-1) >= 0.5 * FOLLOWING
+        follows = (
+            int(j)
+            for j in np.flatnonzero(likely)
+            if np.mean(_apart(own, commands[j]) <= DISTANCE) >= FOLLOWING
+        )
+        found.append(next(follows, None))
+    return found
+
+
+def _apart(own: Floats, other: Floats) -> Floats:
+    """What is left of each run when another, times the factor that fits best, is taken off.
+
+    Args:
+        own: shape ``(runs, steps)``.
+        other: shape ``(..., runs, steps)``.
+
+    Returns:
+        Root mean square over that of the run, shape ``(..., runs)``.
+    """
+    squares = [np.maximum((x**2).sum(axis=-1), _ROUNDING) for x in (own, other)]
+    product = np.einsum("rs,...rs->...r", own, other)
+    return np.sqrt(np.maximum(1.0 - product**2 / (squares[0] * squares[1]), 0.0))
+
+
+def agreement(cells: Floats, rig: Ints, lungs: Sequence[str], pips: Sequence[float]) -> Mapping[
+    str, Mapping[str, float]
+]:  # fmt: skip
+    """Kendall's tau between the order by all runs and that by one rig, one lung or one PIP.
+
+    Args:
+        cells: normalised scores, shape ``(N, K, L, P)``, N at least 2.
+        rig: of each lung and draw, shape ``(L, K)``.
+        lungs: ids, length L.
+        pips: cmH2O, length P.
+
+    Returns:
+        For ``"rig"``, ``"lung"`` and ``"PIP"``, tau by name; NaN where all are equal.
+    """
+    means = cells.mean(axis=(1, 2, 3))
+
+    def tau(part: Floats) -> float:
+        result: Any = stats.kendalltau(means, part.reshape(len(means), -1).mean(axis=1))
+        return float(result.statistic)
+
+    return {
+        "rig": {
+            f"{lung}, rig {name}": tau(cells[:, rig[i] == name, i])
+            for i, lung in enumerate(lungs)
+            for name in np.unique(rig[i]).tolist()
+        },
+        "lung": {lung: tau(cells[:, :, i]) for i, lung in enumerate(lungs)},
+        "PIP": {f"{pip:g}": tau(cells[..., j]) for j, pip in enumerate(pips)},
+    }
+
+
+def profile(cells: Floats) -> Floats:
+    """Share of runs whose normalised score is at most each of :data:`THRESHOLDS`."""
+    return np.searchsorted(np.sort(cells.ravel()), THRESHOLDS, side="right") / cells.size
+
+
+def interquartile_mean(cells: Floats, rig: Ints) -> tuple[float, float, float]:
+    """Mean of the middle half of all runs (Agarwal et al. 2021), with its 95 % interval over rigs.
+
+    Args:
+        cells: normalised scores of one entry, shape ``(K, L, P)``.
+        rig: of each lung and draw, shape ``(L, K)``.
+    """
+    flat = cells.ravel()
+    order = np.argsort(flat, kind="stable")
+    weights = _taken(tuple(map(tuple, rig.tolist())))
+    spread = np.repeat(weights.reshape(_RESAMPLES, -1), cells.shape[2], axis=1)[:, order]
+    upto = np.cumsum(spread, axis=1) / spread.sum(axis=1, keepdims=True)
+    inside = np.diff(np.clip(upto, 0.25, 0.75), axis=1, prepend=0.25)
+    low, high = np.quantile(2.0 * inside @ flat[order], (0.025, 0.975))
+    return float(stats.trim_mean(flat, 0.25)), float(low), float(high)
+
+
+@functools.lru_cache(maxsize=4)
+def _taken(rig: tuple[tuple[int, ...], ...]) -> Floats:
+    """How often resamples of the rigs of each lung take each draw, ``(_RESAMPLES, K, L)``."""
+    rng = np.random.default_rng(_SEED)
+    taken = []
+    for own in rig:
+        names, index = np.unique(own, return_inverse=True)
+        index = np.arange(len(own)) if len(names) < 2 else index
+        size = int(index.max()) + 1
+        taken.append(rng.multinomial(size, np.full(size, 1 / size), _RESAMPLES)[:, index])
+    return np.stack(taken, axis=-1).astype(float)

@@ -23,9 +23,12 @@ def markdown() -> str:
     titles = ["track", "rank", "entry", "normalised", "error", "stress", "runs survived"]
     lines = [titles, ["---"] * len(titles)]
     board = load_board(ROOT / "leaderboard")
-    for row in board.query("status == 'ranked'").to_dict(orient="records"):
-        ranks = f"{row['rank']}"
-        if row["rank_low"] != row["rank_high"]:
+    shown = board[board["status"].isin(["ranked", "practice"])]
+    newest = shown[shown["draws"] == shown["draws"].iloc[0]]
+    for row in newest.to_dict(orient="records"):
+        ranked = row["status"] == "ranked"
+        ranks = f"{row['rank']}" if ranked else "practice"
+        if ranked and row["rank_low"] != row["rank_high"]:
             ranks += f" ({row['rank_low']} to {row['rank_high']})"
         limits = f"[{row['normalised_low']:.1f}, {row['normalised_high']:.1f}]"
         stress = row["stress_cmH2O"]

@@ -10,8 +10,8 @@ is not a plain small file in ``submissions/NAME/`` is refused.
 - :mod:`ci.take`: a submission out of an exact commit;
 - :mod:`ci.workflow`: variables, summaries and exit codes of a job;
 - :mod:`ci.advisory`: what a pull request's author is told;
-- :mod:`ci.official`: the score that a maintainer starts, as a record;
-- :mod:`ci.seed`: the seed of a season of hidden draws, to the scorer and to nobody else;
-- :mod:`ci.propose`: the record into the leaderboard, on a branch;
+- :mod:`ci.requests`: whose account asked for which entry of a round;
+- :mod:`ci.propose`: a step of a round, and its records, onto a branch;
+- :mod:`ci.apart`: that no change adds records together with what vouches for them;
 - :mod:`ci.publish`: the leaderboard as a branch of pages.
 """

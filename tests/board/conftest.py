@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.board import build, canonical, create, record, store, verify
+from ventbench.board import build, canonical, create, record, rounds, store
 from ventbench.board.record import Record
 from ventbench.board.replay import Replayed, ReplayPlants, replay
 from ventbench.entries import reference as references
@@ -28,9 +28,22 @@ from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
 
 from ..textbook_rigs import TextbookRigs
+from . import referee
 
 SANDBOX = {"layers": ["landlock", "seccomp"], "official": True}
 NOW = datetime(2026, 11, 20, 12, tzinfo=UTC)
+
+#: When the round of the tests closed and was frozen, and its referee's secret.
+FROZEN, SECRET = datetime(2026, 11, 20, 10, tzinfo=UTC), 20261120
+
+#: Name of the round, and all entries that any test sends to it, with what they are copies of.
+ROUND = "r1"
+ENTERED = {
+    **dict.fromkeys(("softer", "harder", "broken", "open", "home", "twin", "told", "new", "weak",
+                     "honest"), "pid_best"),
+    **dict.fromkeys(("robust", "leaky", "later", "fails", "absent", "uneven", "zero", "soft"),
+                    "pid_robust"),
+}  # fmt: skip
 
 #: Text that must never be anything but text.
 HOSTILE = (
@@ -44,32 +57,62 @@ def simulators() -> TextbookRigs:
 
 
 @pytest.fixture(scope="session")
-def reference(simulators: TextbookRigs) -> references.Reference:
-    """The PID's true errors, and a tenth of them as what is attainable."""
+def entered(simulators: TextbookRigs, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A leaderboard with a round that has draws, and nothing else."""
+    folder = tmp_path_factory.mktemp("entered")
+    for name in ("pid_best", "pid_robust"):
+        entry_folder(folder / "submissions" / name, name, name)
+    for name, base in ENTERED.items():
+        entry_folder(folder / "submissions" / name, base, name)
+    board, names = folder / "leaderboard", ["pid_best", "pid_robust", *ENTERED]
+    rounds.open_round(
+        board, ROUND, FROZEN, names, delay_s=60, chain=referee.chain(SECRET), now=FROZEN
+    )
+    own = rounds.freeze(board, ROUND, folder / "submissions", [], simulators.about(), now=FROZEN)
+    rounds.draw(board, ROUND, referee.value(SECRET, own.number))
+    return board
+
+
+@pytest.fixture(scope="session")
+def drawn(entered: Path, simulators: TextbookRigs) -> draw_tables.Draws:
+    """Draws of the round."""
+    return rounds.load(entered, ROUND).draws(simulators.scored())
+
+
+@pytest.fixture(scope="session")
+def reference(
+    entered: Path, simulators: TextbookRigs, drawn: draw_tables.Draws
+) -> references.Reference:
+    """The PID's true errors, and a tenth of them as what is attainable; the round is scored."""
     own = simulators.scored()
-    drawn = own.draws(draw_tables.COUNT)
     controller = runpy.run_path(str(resolve("pid_robust") / "controller.py"))
     gains = np.tile(controller["GAINS"], (6, 1))
     plants, cells = own.cells(drawn, protocol.PIPS)
     pid = references.pid_errors(plants, cells, gains)
     about = references.settings(own.about, drawn.about())
     zero = np.zeros((*pid.shape, 33))
-    return references.Reference(about, gains, 0.1 * pid, 0.1 * pid, 0.0 * pid, pid, zero)
+    made = references.Reference(about, gains, 0.1 * pid, 0.1 * pid, 0.0 * pid, pid, zero)
+    sha256 = made.save(entered / "rounds" / ROUND / rounds.BOUNDS)
+    content = canonical.canonical({"bounds": sha256, "records": {}, "failed": {}})
+    (entered / "rounds" / ROUND / rounds.RESULT).write_bytes(content)
+    return made
 
 
 @pytest.fixture(autouse=True)
-def _published(reference: references.Reference, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The reference errors of the textbook rigs in the place of the published ones."""
-    monkeypatch.setattr(verify, "published", lambda: reference)
+def _witnesses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No commands attain a tenth of the PID's errors: nobody asks for them here."""
+    monkeypatch.setattr(references, "witness_errors", lambda made, *_: made.attainable)
 
 
 @pytest.fixture(scope="session")
-def scores(simulators: TextbookRigs, reference: references.Reference) -> dict[str, Score]:
+def scores(
+    simulators: TextbookRigs, reference: references.Reference, drawn: draw_tables.Draws
+) -> dict[str, Score]:
     """The two PIDs, scored."""
     found = {}
     for name in ("pid_best", "pid_robust"):
         result = run_protocol(
-            open_submission(name), simulators.scored(), draws=draw_tables.COUNT, reference=reference
+            open_submission(name), simulators.scored(), drawn=drawn, reference=reference
         )
         rigs = dataclasses.replace(result.protocol.rigs, sha256=frozen.load().manifest_sha256)
         protocol = dataclasses.replace(result.protocol, rigs=rigs)
@@ -104,7 +147,10 @@ def draft(
         manifest = dataclasses.replace(score.submission.manifest, name=name)
         if texts is not None:
             manifest = dataclasses.replace(
-                manifest, authors=(texts,), licence=texts, description=texts
+                manifest,
+                authors=(texts.replace("\u202e", ""),),
+                licence=texts,
+                description=texts,
             )
         opened = dataclasses.replace(
             score.submission, label=str(folder), folder=folder, manifest=manifest,
@@ -181,10 +227,11 @@ def drafts(draft: Draft) -> dict[str, create.Draft]:
 def full(
     drafts: dict[str, create.Draft],
     simulators: TextbookRigs,
+    entered: Path,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Path:
     """A leaderboard that nobody may change; see :func:`leaderboard`."""
-    folder = tmp_path_factory.mktemp("full") / "leaderboard"
+    folder = shutil.copytree(entered, tmp_path_factory.mktemp("full") / "leaderboard")
     for made in drafts.values():
         put(folder, made, simulators)
     return folder

@@ -54,12 +54,12 @@ def test_a_build_in_another_process_gives_the_same_bytes(
 
 
 def test_stale_pages_go_and_other_files_stay(leaderboard: Path, out: Path) -> None:
-    stale = out / "entries/performance/nobody.html"
+    stale = out / "entries/r1/performance/nobody.html"
     stale.write_text("old")
     (out / "README.md").write_text("mine")
     (out / "index.html").write_text("changed")
     done = build.build(leaderboard, out)
-    assert set(done.changed) == {"index.html", "entries/performance/nobody.html"}
+    assert set(done.changed) == {"index.html", "entries/r1/performance/nobody.html"}
     assert not stale.exists()
     assert (out / "README.md").read_text() == "mine"
 
@@ -123,7 +123,7 @@ def test_a_new_leaderboard_has_a_page(tmp_path: Path) -> None:
     done = build.build(tmp_path / "none", tmp_path)
     assert done.records == 0
     assert set(done.changed) == {"index.html", "leaderboard.csv"}
-    assert "No ranked entry yet" in (tmp_path / "index.html").read_text()
+    assert "No round has been scored yet" in (tmp_path / "index.html").read_text()
 
 
 def test_a_correction_takes_the_place_of_its_record(leaderboard, out, draft, simulators) -> None:
@@ -131,8 +131,8 @@ def test_a_correction_takes_the_place_of_its_record(leaderboard, out, draft, sim
     corrected = draft("softer", factor=0.95, supersedes=old.sha256, reason="a better number")
     new = put(leaderboard, corrected, simulators)
     done = build.build(leaderboard, out)
-    page = (out / "entries/performance/softer.html").read_text()
-    assert "entries/performance/softer.html" in done.changed
+    page = (out / "entries/r1/performance/softer.html").read_text()
+    assert "entries/r1/performance/softer.html" in done.changed
     assert page.index(new.sha256[:12]) < page.index("superseded")
     assert f"<b>counts</b>: {'a better number'}" in page
     assert f"records/{old.sha256}.json" in page

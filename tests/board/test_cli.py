@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -36,8 +37,8 @@ def run(*arguments: object, code: int = 0) -> str:
     return found.output
 
 
-def test_from_records_to_a_verified_board(drafts, tmp_path: Path) -> None:
-    folder = tmp_path / "board"
+def test_from_records_to_a_verified_board(drafts, entered: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(entered, tmp_path / "board")
     names = ("pid_best", "softer", "broken")
     paths = [drafts[name].save(tmp_path / "records") for name in names]
     refused = run("add", *paths, "--supersedes", "f00", "--folder", folder, code=2)
@@ -47,8 +48,8 @@ def test_from_records_to_a_verified_board(drafts, tmp_path: Path) -> None:
         assert f"added {name} (performance)" in added
     accept(folder)
     build = ("build", "--folder", folder, "--out", tmp_path / "site")
-    assert "3 records, 5 pages, 12 files changed" in run(*build)
-    assert "3 records, 5 pages, 0 files changed" in run(*build)
+    assert "3 records, 6 pages, 19 files changed" in run(*build)
+    assert "3 records, 6 pages, 0 files changed" in run(*build)
     output = run("verify", "--folder", folder)
     assert "no problems: 3 records, 3 replayed" in output
     report = tmp_path / "show.json"
@@ -93,7 +94,7 @@ def test_a_correction_says_why_and_whence(leaderboard: Path, draft) -> None:
     new = next(x for x in store.load(leaderboard).scores if x.header.supersedes)
     assert new.header.supersedes == old.sha256
     assert new.header.provenance == {"commit": "9c1e5d0"}
-    page = (leaderboard.parent / "site/entries/performance/softer.html").read_text()
+    page = (leaderboard.parent / "site/entries/r1/performance/softer.html").read_text()
     assert "<b>counts</b>: a bug" in page
     assert '<th scope="row">commit</th><td>9c1e5d0</td>' in page
     message = run("add", path, "--source", "commit", "--folder", leaderboard, code=2)
@@ -156,7 +157,10 @@ def test_tables_fit_80_columns(full: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert "broken: not ranked" in text or "broken: not official" in text
 
 
-def test_an_entry_that_nobody_vouches_for_says_so_once(drafts, tmp_path: Path) -> None:
+def test_an_entry_that_nobody_vouches_for_says_so_once(
+    drafts, entered: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(entered, tmp_path / "board")
     run("add", drafts["softer"].save(tmp_path), "--folder", tmp_path / "board")
     said = " ".join(run("show", "--folder", tmp_path / "board").split())
     assert "softer: not official: no key of this leaderboard has signed the record" in said

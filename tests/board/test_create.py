@@ -12,23 +12,22 @@ import pytest
 
 from ventbench.base import files, precision
 from ventbench.base.errors import InputError
-from ventbench.board import create, ranking, record, schema, store
+from ventbench.board import create, gate, record, schema, store
 from ventbench.board.record import Record
 from ventbench.task import draws as draw_tables
 from ventbench.task import protocol
 
 from ..textbook_rigs import TextbookRigs
-from .conftest import SANDBOX, opened
+from .conftest import ROUND, SANDBOX, opened
 
 
-def test_a_record_says_where_it_comes_from(drafts, scores) -> None:
+def test_a_record_says_where_it_comes_from(drafts, scores, drawn) -> None:
     content = json.loads(drafts["pid_best"].content)
     assert (content["format"], content["protocol"]) == (schema.FORMAT, schema.PROTOCOL)
     assert content["official"] is True
     assert content["sandbox"] == SANDBOX
-    seed = draw_tables.commitment(draw_tables.DEVELOPMENT_SEED)
     assert content["draws"] == {
-        "version": 2, "sha256": seed, "count": 20, "season": "development",
+        "version": 2, "sha256": drawn.commitment, "count": 20, "season": ROUND,
     }  # fmt: skip
     assert content["simulators"]["manifest_sha256"] == "2" * 64
     root = Path(draw_tables.__file__).parents[2]
@@ -94,7 +93,7 @@ def test_every_failure_is_there(draft) -> None:
     assert item.header.failed_cells == len(item.header.failures) == 30
     assert np.isnan(item.nominal).sum() == 30
     assert np.isnan(item.exploitation)
-    (first, *_) = ranking.reasons(ranking.Event(item, None, True))
+    (first, *_) = gate.unfit(item, gate.Evidence())
     assert first.startswith("30 of 756 cells failed, the first: weak: xxx")
     assert len(first) < 400
 

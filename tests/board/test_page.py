@@ -85,13 +85,13 @@ def test_an_entry_opens_and_leads_back(quiet: Page, site: Path) -> None:
 
 
 def test_foreign_text_is_text(quiet: Page, site: Path) -> None:
-    quiet.open(site / "entries/performance/harder.html", 1280)
+    quiet.open(site / "entries/r1/performance/harder.html", 1280)
     assert quiet.run("document.title") == "harder, performance – ventbench"
     lead = quiet.run("document.querySelector('.lead').innerText")
     assert lead == HOSTILE.replace("\u202e", "\ufffd")
     assert quiet.run("document.images.length") == 0
     assert quiet.run("document.scripts.length") == 1
-    quiet.open(site / "entries/performance/broken.html", 1280)
+    quiet.open(site / "entries/r1/performance/broken.html", 1280)
     assert quiet.run("document.title").startswith("broken")
     assert HOSTILE[:40] in quiet.run("document.querySelector('.notice').innerText")
 
@@ -108,7 +108,7 @@ def test_the_policy_stops_a_script_that_got_in(page: Page, site: Path, tmp_path:
 
 @pytest.mark.parametrize("dark", [False, True])
 @pytest.mark.parametrize("width", [390, 1280])
-@pytest.mark.parametrize("name", ["index", "entries/performance/harder"])
+@pytest.mark.parametrize("name", ["index", "entries/r1/performance/harder"])
 def test_pages_fit(quiet: Page, site: Path, name: str, width: int, dark: bool) -> None:
     quiet.open(site / f"{name}.html", width, dark=dark)
     root = "document.documentElement"

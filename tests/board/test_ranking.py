@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ventbench.board import ranking
-from ventbench.board.ranking import Entry, Event
+from ventbench.board.ranking import Entry
 from ventbench.board.record import Record
 
 from .conftest import opened
@@ -33,7 +33,7 @@ def _entry(base: Record, name: str, by_draw: np.ndarray) -> Entry:
     fields = {f.name: getattr(base, f.name) for f in dataclasses.fields(base)}
     headroom = type(own)(own.session, own.member, error, own.attainable, own.pid)
     record = Record(**{**fields, "header": header, "headroom": headroom})
-    return Entry(record, (Event(record, None, True),), ())
+    return Entry(record, (record,), ())
 
 
 def test_score_is_the_mean_over_draws_lungs_and_pips(base: Record) -> None:
@@ -86,7 +86,7 @@ def test_ties_share_a_rank_and_are_sorted_by_name(base: Record) -> None:
 
 def test_order_of_arrival_does_not_matter(base: Record) -> None:
     random = np.random.default_rng(11)
-    entries = [_entry(base, f"e{n}", random.normal(100, 10, 20)) for n in range(8)]
+    entries = [_entry(base, f"e{n}", random.normal(10 * n, 10, 20)) for n in range(8)]
     first = ranking.rank(entries, "performance")
     assert ranking.rank(entries[::-1], "performance") == first
 

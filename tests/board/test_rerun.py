@@ -47,9 +47,9 @@ def board(three: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def three(draft, drafts, simulators, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def three(draft, drafts, simulators, entered, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An honest PID, one with commands that its code does not give, one without code."""
-    folder = tmp_path_factory.mktemp("three") / "leaderboard"
+    folder = shutil.copytree(entered, tmp_path_factory.mktemp("three") / "leaderboard")
     for made in (draft("honest"), drafts["softer"], draft("absent", "pid_robust")):
         put(folder, made, simulators)
     return folder

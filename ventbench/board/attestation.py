@@ -4,17 +4,19 @@ Replay proves that a record's errors follow from its commands, and nothing about
 commands. No record is ranked, simulated, stressed or measured, unless
 
 - ``records/HASH.sig`` holds an Ed25519 signature over its hash by a key of the leaderboard, or
-- the maintainers name it among the official second runs, with what they saw and a date.
+- the maintainers name it among the official second runs, with what they saw and a date; or, for
+  a hardware record, among the bench logs, with the hash of the raw recording.
 
-Keys and second runs stand in ``attestations.toml``, which reviewed commits alone change. The
-signature is made in a job that has run no code of a submission; see ``ci/propose.py``.
+Keys, second runs and bench logs stand in ``attestations.toml``, which reviewed commits alone
+change, and never together with records. The signature is made in a job that has run no code of a
+submission; see ``ci/propose.py``.
 """
 
 from __future__ import annotations
 
 import hashlib
 import tomllib
-from collections.abc import Collection
+from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -63,11 +65,21 @@ class SecondRun(_Table, frozen=True):
     date: date
 
 
+class BenchLog(_Table, frozen=True):
+    """A hardware record that the maintainers saw made, or whose raw recording they have read."""
+
+    record: schema.Sha256
+    recording: schema.Sha256
+    witness: Annotated[str, msgspec.Meta(max_length=schema.MAX_TEXT, pattern=r"\S")]
+    date: date
+
+
 class Attestations(_Table, frozen=True):
     """Content of ``attestations.toml``."""
 
     keys: list[Key] = []
     second_runs: list[SecondRun] = []
+    bench_logs: list[BenchLog] = []
 
 
 class _Signature(_Table, frozen=True):
@@ -78,16 +90,16 @@ class _Signature(_Table, frozen=True):
     signature: Annotated[str, schema.matching("[0-9a-f]{128}")]
 
 
-def attested(folder: Path, records: Collection[str]) -> tuple[frozenset[str], list[str]]:
+def attested(folder: Path, records: Mapping[str, str | None]) -> tuple[frozenset[str], list[str]]:
     """Find the records that somebody who may do so vouches for.
 
     Args:
         folder: of the leaderboard.
-        records: SHA-256 of all of its records.
+        records: SHA-256 of all of its records, and for hardware ones that of the raw recording.
 
     Returns:
-        Hashes of the records that are signed or were run again, and a sentence for each signature
-        or line of the list that is wrong.
+        Hashes of the records that are signed or were run again, and of hardware records with a
+        bench log; and a sentence for each signature or line of the list that is wrong.
 
     Raises:
         InputError: if there are signatures and no library to check them with.
@@ -107,17 +119,25 @@ def attested(folder: Path, records: Collection[str]) -> tuple[frozenset[str], li
         if key.id != key_id(bytes.fromhex(key.public))
     ]
     for entry in listed.second_runs:
-        if entry.record in records:
-            vouched.add(entry.record)
-        else:
+        if entry.record not in records:
             problems.append(f"{path}: record {entry.record} is not there")
+        elif records[entry.record] is not None:
+            problems.append(f"{path}: record {entry.record} was measured: it needs a bench log")
+        else:
+            vouched.add(entry.record)
+    for log in listed.bench_logs:
+        if records.get(log.record) != log.recording:
+            problems.append(f"{path}: record {log.record} is not of recording {log.recording[:12]}")
+        else:
+            vouched.add(log.record)
     for sha256 in records:
         path = signature_path(folder, sha256)
         if not path.is_file() or path.is_symlink():
             continue
         try:
             check(path, sha256, keys)
-            vouched.add(sha256)
+            if records[sha256] is None:  # no key has seen a bench
+                vouched.add(sha256)
         except InputError as error:
             problems.append(str(error))
     return frozenset(vouched), problems
@@ -201,7 +221,7 @@ def new_key() -> tuple[str, str]:
     public = private.public_key().public_bytes_raw()
     lines = (
         f'[[keys]]\nid = "{key_id(public)}"\npublic = "{public.hex()}"\n'
-        f'added = {date.today().isoformat()}\nholder = "the workflow score-official"\n'
+        f'added = {date.today().isoformat()}\nholder = "the workflow round"\n'
     )
     return private.private_bytes_raw().hex(), lines
 

@@ -28,13 +28,23 @@ RECORD_SUFFIX, ACTIONS_SUFFIX, SIGNATURE_SUFFIX = ".json", ".actions", ".sig"
 #: Keys that sign records, and records that an official second run vouches for.
 ATTESTATIONS = "attestations.toml"
 
-#: What a build writes: the page of the board, its CSV, and the pages of entries.
+#: Folder of rounds, the name of one, and its files in the order in which they come to be.
+ROUNDS, ROUND_NAME = "rounds", "[a-z0-9][a-z0-9-]{0,39}"
+ROUND_FILES = (
+    "round.toml", "protocol.json", "frozen.toml", "beacon.json", "bounds.npz", "result.json",
+)  # fmt: skip
+
+#: What a build writes: the page of the board, its CSV, pages of rounds, and pages of entries.
 INDEX, CSV = "index.html", "leaderboard.csv"
 BUILT = re.compile(
-    r"index\.html|leaderboard\.csv|entries/(performance|robustness)/[a-z][a-z0-9_]{0,39}\.html"
+    rf"index\.html|leaderboard\.csv|rounds/{ROUND_NAME}\.html|"
+    rf"entries/{ROUND_NAME}/(performance|robustness)/[a-z][a-z0-9_]{{0,39}}\.html"
 )
 
-_RECORD_FILE = re.compile(rf"{RECORDS}/[0-9a-f]{{64}}\.(json|actions|sig)")
+_PART = re.compile(
+    rf"{RECORDS}/[0-9a-f]{{64}}\.(json|actions|sig)|"
+    rf"{ROUNDS}/{ROUND_NAME}/({'|'.join(map(re.escape, ROUND_FILES))})"
+)
 
 
 def canonical(value: Any) -> bytes:
@@ -103,8 +113,8 @@ def _only_text_keys(value: Any) -> None:
 
 
 def named(name: str) -> bool:
-    """Whether a relative path may be one of a leaderboard: attestations, or named by a hash."""
-    return name == ATTESTATIONS or _RECORD_FILE.fullmatch(name) is not None
+    """Whether a relative path may be one of a leaderboard: of a record, a round, attestations."""
+    return name == ATTESTATIONS or _PART.fullmatch(name) is not None
 
 
 def walk(folder: Path) -> tuple[set[str], list[str]]:

@@ -90,6 +90,11 @@ def _ranks(line: Line) -> str:
     return "" if line.row.ranks is None else f"{line.row.ranks[0]} to {line.row.ranks[1]}"
 
 
+def _family(line: Line) -> str:
+    source = line.row.entry.source
+    return f"{line.row.record.manifest.family}{f', derived from {source}' if source else ''}"
+
+
 def _compared(name: str) -> Callable[[Line], Interval | None]:
     """A field of the comparison of normalised scores."""
     return lambda line: None if line.row.normalised is None else getattr(line.row.normalised, name)
@@ -115,13 +120,13 @@ def _of_stress(figure: Callable[[Any], Any], missing: Any = math.nan) -> Callabl
 #: Every figure of an entry, in the order of pages and CSV.
 COLUMNS = (
     Column(("track",), lambda x: x.track.name, "performance or robustness"),
-    Column(("status",), lambda x: x.status, "ranked, not ranked or not official"),
+    Column(("status",), lambda x: x.status, "ranked, practice, not ranked or not official"),
     Column(("rank",), lambda x: x.row.rank, "Rank, and the ranks that it may have",
            title="Rank", small=_ranks, terminal=("rank", "ranks")),
     Column(("rank_low",), lambda x: x.row.ranks and x.row.ranks[0], "best rank that it may have"),
     Column(("rank_high",), lambda x: x.row.ranks and x.row.ranks[1], "worst rank"),
     Column(("name",), lambda x: x.row.record.name, "Name and family of the controller",
-           title="Entry", small=lambda x: x.row.record.manifest.family, terminal=("entry",)),
+           title="Entry", small=_family, terminal=("entry",)),
     Column(("family",), lambda x: x.row.record.manifest.family, "family of the controller"),
     Column(_of_three("normalised"), _compared("score"),
            "0 = best attainable, 100 = best PID of the lung; mean over the draws",
@@ -145,6 +150,11 @@ COLUMNS = (
     Column(("exploitation_cmH2O",), lambda x: x.row.record.exploitation,
            "How far the ensemble of simulators disagrees on this entry's pressures, cmH₂O",
            title="Exploitation"),
+    Column(_of_three("middle"), _compared("middle"),
+           "Mean of the normalised score over the middle half of all runs (IQM)",
+           title="Middle half", digits=1),
+    Column(("derived_from",), lambda x: x.row.entry.source,
+           "earlier entry whose commands it follows nearly everywhere"),
     Column(("clipped_share",), lambda x: x.row.record.clipped_share,
            "Share of commands outside 0 to 100 %, 0 to 1", title="Clipped"),
     Column(("act_median_us",), lambda x: pages.step_time(x.row.record.header.timing),
@@ -174,10 +184,11 @@ _NULLABLE_INTEGERS = ("rank", "rank_low", "rank_high", "stress_unsafe_runs")
 
 
 def load_board(folder: Path | str | None = None, *, track: str | None = None) -> pd.DataFrame:
-    """Read a leaderboard into a frame: one row an entry, in the order of the pages.
+    """Read a leaderboard into a frame: one row an entry and draws, in the order of the pages.
 
     Its columns are those of :data:`COLUMNS`, which say what each is: among them ``track``,
-    ``status`` (``"ranked"``, ``"not ranked"``, ``"not official"``), ``name``, ``rank`` with
+    ``draws`` (a round, or ``"development"``), ``status`` (``"ranked"``, ``"practice"``,
+    ``"not ranked"``, ``"not official"``), ``name``, ``rank`` with
     ``rank_low`` and ``rank_high``, ``normalised`` (the score that ranks, points) and
     ``score_cmH2O`` (the error of the same runs) with their 95 % intervals, ``nominal_cmH2O`` (the
     paper's score) and ``stress_cmH2O``. Three more a lung follow: ``normalised_R5C10``,
@@ -210,8 +221,8 @@ def load_board(folder: Path | str | None = None, *, track: str | None = None) ->
 def load_cells(folder: Path | str | None = None, *, track: str | None = None) -> pd.DataFrame:
     """Read every cell of every entry: one row a lung, PIP and draw.
 
-    Columns: ``track``, ``name``, ``lung``, ``pip`` (cmH2O), ``draw`` (0 is the nominal run, the
-    published draws count from 1), ``error_cmH2O`` (mean absolute error over the scored
+    Columns: ``track``, ``draws``, ``name``, ``lung``, ``pip`` (cmH2O), ``draw`` (0 is the nominal
+    run, draws count from 1), ``error_cmH2O`` (mean absolute error over the scored
     inspirations; NaN if the cell failed), ``peak_cmH2O`` (highest pressure, to 0.01) and
     ``steps_above`` (longest time above the safety limit, control steps).
 
@@ -236,6 +247,7 @@ def load_cells(folder: Path | str | None = None, *, track: str | None = None) ->
                 pd.DataFrame(
                     {
                         "track": tracks.name,
+                        "draws": record.header.draws.season,
                         "name": record.name,
                         "lung": np.array(record.lungs)[lung],
                         "pip": np.array(record.pips)[pip],
@@ -280,8 +292,8 @@ def record_index(folder: Path | str | None = None) -> list[dict[str, Any]]:
         For each record ``record`` and ``commands`` (SHA-256, or None: they name the files in
         ``records/``), ``kind`` (``"score"``, ``"hardware"``, ``"withdrawal"``), ``track`` and
         ``name`` (of what is withdrawn, for a withdrawal), ``created`` (UTC) and ``state``:
-        ``"ranked"``, ``"not ranked"``, ``"not official"``, ``"superseded"``, ``"withdrawn"``, or
-        empty for what has none.
+        ``"ranked"``, ``"practice"``, ``"not ranked"``, ``"not official"``, ``"superseded"``,
+        ``"withdrawn"``, or empty for what has none.
 
     Raises:
         InputError: if there is no leaderboard, or a record was changed.

@@ -25,6 +25,8 @@ from ventbench.task.stressors import CATEGORIES, SEVERITIES, Condition, conditio
 if TYPE_CHECKING:
     import jinja2
 
+    from ventbench.board.record import Record
+
 #: Shown where there is nothing to show.
 NONE = "–"
 
@@ -65,9 +67,14 @@ def environment() -> jinja2.Environment:
     return made
 
 
-def entry_path(track: str, name: str) -> str:
+def entry_path(draws: str, track: str, name: str) -> str:
     """Address of an entry; names are checked when records are read."""
-    return f"entries/{track}/{name}.html"
+    return f"entries/{draws}/{track}/{name}.html"
+
+
+def address(record: Record) -> str:
+    """Address of the entry of a record."""
+    return entry_path(record.header.draws.season, record.track, record.name)
 
 
 @functools.cache
@@ -160,7 +167,7 @@ def _short(value: Any) -> str:
 def hardware_of(made: Sequence[HardwareRow], name: str) -> HardwareRow | None:
     """The row that stands for an entry: attested ones first, a physical lung before an emulator."""
     counting = [row for row in made if row.newest and row.record.name == name]
-    return min(counting, key=lambda row: (not row.attested, row.record.emulated), default=None)
+    return min(counting, key=lambda row: (bool(row.reasons), row.record.emulated), default=None)
 
 
 def hardware_shown(row: HardwareRow) -> dict[str, Any]:
@@ -171,7 +178,7 @@ def hardware_shown(row: HardwareRow) -> dict[str, Any]:
     return {
         "name": record.name,
         "sha256": record.sha256,
-        "path": entry_path(record.track, record.name),
+        "path": row.simulated and address(row.simulated.record),
         "listed": row.simulated is not None,
         "value": f"{record.score:.9f}" if math.isfinite(record.score) else "",
         "score": figure(record.score) if math.isfinite(record.score) else "stopped",
@@ -204,9 +211,8 @@ def hardware_shown(row: HardwareRow) -> dict[str, Any]:
             f"{stop.lung}, PIP {stop.pip:g}, repetition {stop.repeat}: {stop.reason}"
             for stop in header.stops
         ],
-        "withdrawn": row.withdrawn,
         "newest": row.newest,
-        "attested": row.attested,
+        "reasons": list(row.reasons),
         "recording": header.recording.sha256,
     }
 
@@ -218,7 +224,7 @@ def stress_shown(row: StressRow) -> dict[str, Any]:
         "name": row.name,
         "rank": row.rank,
         "ranks": row.ranks,
-        "path": entry_path(row.row.record.track, row.name),
+        "path": address(row.row.record),
         "family": row.row.record.manifest.family,
         "score": None if row.score is None else interval(row.score, 2),
         "unstressed": figure(row.tables.unstressed, 2),

@@ -1,27 +1,34 @@
 """From records to a board: which record of an entry counts, its rank, intervals and differences.
 
-The ranked score of an entry is the mean of its normalised score over draws, lungs and PIPs. Draws,
-their rigs and members of the ensemble are common to all entries and resampled alike, so that every
-interval of a difference is a paired one. Stress ranks compare entries of the robustness track under
-missing physics, hardware ranks those that ran on the same lungs and PIPs of a bench. No rank of any
-kind without somebody who vouches for the record; see :mod:`ventbench.board.attestation`.
+The ranked score of an entry is the mean of its normalised score over draws, lungs and PIPs of a
+round. Intervals resample draws, rigs and members of the ensemble alike for all entries, so that
+those of differences are paired; ranks follow from :mod:`ventbench.board.comparison`, and who may
+have one from :mod:`ventbench.board.gate`. Stress ranks compare entries of the robustness track
+under missing physics, hardware ranks those that ran on the same lungs and PIPs of a bench.
 """
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Container, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.board.record import AnyRecord, HardwareRecord, Record, Withdrawal
-from ventbench.board.store import Store
+from ventbench.board import comparison, gate
+from ventbench.board.canonical import RECORDS
+from ventbench.board.comparison import CMH2O, POINTS, Ranks
+from ventbench.board.gate import Evidence
+from ventbench.board.record import HardwareRecord, Record
+from ventbench.board.rounds import Round
+from ventbench.board.store import Store, load_commands
 from ventbench.entries.manifest import TRACKS
 from ventbench.entries.runs import Runs
+from ventbench.task import protocol
+from ventbench.task.draws import DEVELOPMENT
 from ventbench.task.metrics import bootstrap
 
 Floats = NDArray[np.float64]
@@ -35,61 +42,22 @@ DECIMALS = 9
 #: Decimals, of cmH2O, that decide a hardware rank: measured scores repeat no better.
 _MEASURED_DECIMALS = 3
 
-#: Most characters of a failure's message that a reason quotes; a submission chose them.
-MAX_QUOTED = 300
-
-#: Why a record has no rank although its sandbox was official.
-UNATTESTED = "not official: no key of this leaderboard has signed the record"
-
-
-@dataclass(frozen=True)
-class Event:
-    """One record of an entry's history.
-
-    Attributes:
-        record: the record.
-        withdrawn: why it was taken back; None if it was not.
-        attested: whether somebody vouches for it; see :mod:`ventbench.board.attestation`.
-    """
-
-    record: Record
-    withdrawn: str | None
-    attested: bool
-
-    @property
-    def official(self) -> bool:
-        """Whether its sandbox deserves the word, and somebody vouches for that."""
-        return self.record.official and self.attested
-
 
 @dataclass(frozen=True)
 class Entry:
-    """A submission on one track, by the record that counts.
+    """A submission on one track and on the same draws, by the record that counts.
 
     Attributes:
         record: the newest one: of the official ones if there are any.
         history: all of its records, newest first.
         reasons: why it is not ranked; empty if it is.
+        source: name of the earlier entry whose commands it follows; empty if there is none.
     """
 
     record: Record
-    history: tuple[Event, ...]
+    history: tuple[Record, ...]
     reasons: tuple[str, ...]
-
-
-@dataclass
-class Standing:
-    """One track of the board.
-
-    Attributes:
-        ranked: official, complete and safe entries, in no order yet.
-        unranked: official entries that are not ranked, with reasons.
-        unofficial: newest unofficial record of each submission without a newer official one.
-    """
-
-    ranked: list[Entry] = field(default_factory=list)
-    unranked: list[Entry] = field(default_factory=list)
-    unofficial: list[Entry] = field(default_factory=list)
+    source: str = ""
 
 
 @dataclass(frozen=True)
@@ -115,11 +83,13 @@ class Comparison:
         score: mean over draws.
         to_baseline: difference to the track's PID; None for the PID itself, or without one.
         to_above: difference to the entry above; None for the first.
+        middle: mean of the middle half of all runs.
     """
 
     score: Interval
     to_baseline: Interval | None
     to_above: Interval | None
+    middle: Interval
 
 
 @dataclass(frozen=True)
@@ -128,7 +98,7 @@ class Row:
 
     Attributes:
         entry: whose row it is.
-        rank: from 1; None if it is not ranked. See :func:`rank_ranges`.
+        rank: from 1; None if it is not ranked. See :mod:`ventbench.board.comparison`.
         ranks: ranks that it may have; None if it is not ranked.
         normalised: the normalised score, which ranks; None if a cell failed.
         error: the error of the same runs, cmH2O; None if a cell failed.
@@ -158,7 +128,7 @@ class StressRow:
         row: of the entry on the robustness track.
         tables: its stressed runs.
         score: stress score with its interval, cmH2O; None if a run failed.
-        rank: 1 + the number of entries that are better beyond doubt; None if a run failed.
+        rank: as of :class:`Row`; None if a run failed, or it has no rank.
         ranks: ranks that it may have.
     """
 
@@ -180,19 +150,16 @@ class HardwareRow:
 
     Attributes:
         record: the hardware record.
-        withdrawn: why it was taken back; None if it was not.
-        attested: whether somebody vouches for it.
+        reasons: why it has no rank; empty if it has one.
         newest: whether no later one of the same entry and kind of device counts instead.
         simulated: row of the entry in the simulated ranking; None if there is none.
         nominal: nominal simulated score over the same lungs and PIPs, cmH2O; NaN without one.
-        rank: among the newest attested records over the same lungs and PIPs, from 1; None if a run
-            was stopped or it does not count.
+        rank: among the newest records over the same lungs and PIPs, from 1; None if it has none.
         count: how many were ranked.
     """
 
     record: HardwareRecord
-    withdrawn: str | None
-    attested: bool
+    reasons: tuple[str, ...]
     newest: bool
     simulated: Row | None
     nominal: float
@@ -215,19 +182,20 @@ class HardwareRow:
     @property
     def comparable(self) -> tuple[Any, ...] | None:
         """What it must share with another one to be ranked against it; None if it has no rank."""
-        if not (self.attested and self.newest and math.isfinite(self.record.score)):
+        if self.reasons or not self.newest:
             return None
-        header = self.record.header
-        return self.record.emulated, frozenset(header.lungs), frozenset(header.pips)
+        return frozenset(self.record.header.lungs), frozenset(self.record.header.pips)
 
 
 @dataclass(frozen=True)
 class Track:
-    """One track of the board.
+    """One track of a round, or of practice on the development draws.
 
     Attributes:
         name: ``"performance"`` or ``"robustness"``.
-        ranked: best first.
+        draws: name of the draws: of the round, or ``"development"``.
+        round: that ranks; None for practice, where nothing is.
+        ranked: best first; in practice whatever could be ranked on other draws.
         unranked: official entries that are not ranked, with reasons, by name.
         unofficial: entries that nobody vouches for, or without a full sandbox, by name.
         baseline: record of the track's PID, that the others are compared with; None if there is no
@@ -237,101 +205,120 @@ class Track:
     """
 
     name: str
+    draws: str
+    round: Round | None
     ranked: tuple[Row, ...]
     unranked: tuple[Row, ...]
     unofficial: tuple[Row, ...]
     baseline: Record | None
     stress: tuple[StressRow, ...]
-    hardware: tuple[HardwareRow, ...]
+    hardware: tuple[HardwareRow, ...] = ()
 
     @property
     def rows(self) -> list[tuple[str, Row]]:
         """All rows with their status, in the order in which they are shown."""
-        kinds = ("ranked", "not ranked", "not official")
+        kinds = ("ranked" if self.round else "practice", "not ranked", "not official")
         groups = (self.ranked, self.unranked, self.unofficial)
         return [(kind, row) for kind, rows in zip(kinds, groups, strict=True) for row in rows]
 
+    @property
+    def title(self) -> str:
+        """What the draws are, in words."""
+        if self.round is None:
+            return "practice on the development draws, not ranked"
+        kind = "rehearsal" if self.round.opened.rehearsal else "round"
+        return f"{kind} {self.draws}"
+
 
 def board(leaderboard: Store) -> tuple[Track, ...]:
-    """Rank all records of a leaderboard: both tracks."""
-    return tuple(
-        _track(leaderboard, name, standing) for name, standing in standings(leaderboard).items()
-    )
-
-
-def _track(leaderboard: Store, name: str, standing: Standing) -> Track:
-    ranked = rank(standing.ranked, name)
-    records = [row.record for row in ranked]
-    base = baseline(records, name)
-    track = Track(
-        name=name,
-        ranked=tuple(ranked),
-        unranked=tuple(unranked_rows(standing.unranked)),
-        unofficial=tuple(unranked_rows(standing.unofficial)),
-        baseline=None if base is None else records[base],
-        stress=tuple(stress_rows(ranked)),
-        hardware=(),
-    )
-    measured = hardware_rows(leaderboard.records, leaderboard.attested, track)
-    return replace(track, hardware=tuple(measured))
-
-
-def standings(leaderboard: Store) -> dict[str, Standing]:
-    """Sort the records of a leaderboard into tracks, by their names."""
-    withdrawn = _withdrawn(leaderboard.records)
-    grouped: dict[tuple[str, str], list[Event]] = defaultdict(list)
+    """Rank all records: both tracks of every round, the newest first, and practice last."""
+    evidence = leaderboard.evidence
+    grouped: dict[tuple[str, str], dict[str, list[Record]]] = defaultdict(dict)
     for record in leaderboard.scores:
-        sha256 = record.sha256
-        event = Event(record, withdrawn.get(sha256), sha256 in leaderboard.attested)
-        grouped[record.key].insert(0, event)
-    tracks = {name: Standing() for name in TRACKS}
-    for (track, _), history in sorted(grouped.items()):
-        _place(tracks[track], tuple(history))
-    return tracks
+        drawn = record.header.draws.season
+        own = grouped[drawn if drawn in evidence.rounds else DEVELOPMENT, record.track]
+        own.setdefault(record.name, []).insert(0, record)
+    tracks = [
+        _track(leaderboard, draws, name, grouped[draws, name], evidence)
+        for draws in (*evidence.rounds, DEVELOPMENT)
+        for name in TRACKS
+    ]
+    # Hardware stands beside the newest simulated ranking.
+    newest = len(TRACKS)
+    return (*(replace(x, hardware=_hardware_rows(leaderboard, x)) for x in tracks[:newest]),
+            *tracks[newest:])  # fmt: skip
 
 
-def _withdrawn(records: Sequence[AnyRecord]) -> dict[str, str]:
-    """Why records were taken back, by their hashes."""
-    return {entry.withdraws: entry.reason for entry in records if isinstance(entry, Withdrawal)}
+def newest(tracks: Sequence[Track]) -> list[Track]:
+    """Tracks that the board shows first: those of the newest scored round, and practice."""
+    draws = next((x.draws for x in tracks if x.round and x.round.result), None)
+    return [x for x in tracks if x.draws == draws or x.round is None]
 
 
-def _place(standing: Standing, history: tuple[Event, ...]) -> None:
-    counts = next((event for event in history if event.official), None)
-    if counts is not None:
-        why = reasons(counts)
-        entry = Entry(counts.record, history, why)
-        (standing.unranked if why else standing.ranked).append(entry)
-    newest = history[0]
-    if not newest.official:
-        why = "not official: its sandbox lacked a layer, or there was none"
-        first = UNATTESTED if newest.record.official else why
-        standing.unofficial.append(Entry(newest.record, history, (first, *reasons(newest))))
+def _track(
+    leaderboard: Store, draws: str, name: str, histories: dict[str, list[Record]],
+    evidence: Evidence,
+) -> Track:  # fmt: skip
+    """Sort the entries of a track: ranked, not ranked, not official."""
+    own = evidence.rounds.get(draws)
+    placed: dict[str, list[Entry]] = defaultdict(list)
+    for _, history in sorted(histories.items()):
+        counts = [record for record in history if evidence.official(record)][:1]
+        newest = [] if evidence.official(history[0]) else history[:1]
+        for record in counts + newest:
+            why = gate.simulated(record, evidence)
+            if own is None:
+                why = tuple(reason for reason in why if reason != gate.PRACTICE)
+            kind = "unranked" if why else "ranked"
+            kind = kind if evidence.official(record) else "unofficial"
+            placed[kind].append(Entry(record, tuple(history), why))
+    ranked = rank(derived(leaderboard, placed["ranked"]), name, ranks=own is not None)
+    records = [row.record for row in ranked]
+    base = _baseline(records, name)
+    return Track(
+        name=name,
+        draws=draws,
+        round=own,
+        ranked=tuple(ranked),
+        unranked=tuple(_unranked_rows(placed["unranked"])),
+        unofficial=tuple(_unranked_rows(placed["unofficial"])),
+        baseline=None if base is None else records[base],
+        stress=tuple(_stress_rows(ranked, evidence)),
+    )
 
 
-def reasons(event: Event) -> tuple[str, ...]:
-    """Why a record is not ranked; empty if it is."""
-    record, why = event.record, []
-    if event.withdrawn is not None:
-        why.append(f"withdrawn: {event.withdrawn}")
-    failed = record.header.failed_cells
-    if failed:
-        cells = record.nominal.size + record.drawn.size
-        first = record.header.failures[0].message.removesuffix("; the entry is not ranked.")
-        cut = first if len(first) <= MAX_QUOTED else f"{first[:MAX_QUOTED]}…"
-        why.append(f"{failed} of {cells} cells failed, the first: {cut}")
-    safe = zip(record.lungs, record.header.safe, strict=True)
-    unsafe = [lung for lung, passed in safe if not passed]
-    if unsafe:
-        why.append(f"did not pass the safety gate on {', '.join(unsafe)}")
-    return tuple(why)
+def derived(leaderboard: Store, entries: Sequence[Entry]) -> list[Entry]:
+    """Name the source of each entry whose commands follow those of an earlier one.
+
+    The earlier one is that whose name came first onto the leaderboard, baselines before all.
+    """
+    first: dict[str, int] = {}
+    for at, record in enumerate(leaderboard.scores):
+        first.setdefault(record.name, at)
+    order = sorted(
+        entries, key=lambda x: (x.record.name not in BASELINES.values(), first[x.record.name])
+    )
+    found = comparison.sources([_commands(leaderboard, x.record) for x in order])
+    return [
+        entry if at is None else replace(entry, source=order[at].record.name)
+        for entry, at in zip(order, found, strict=True)
+    ]
 
 
-def rank(entries: Sequence[Entry], track: str) -> list[Row]:
+def _commands(leaderboard: Store, record: Record) -> Floats:
+    """Drawn commands of the last scored breath as applied, %, shape ``(runs, steps)``."""
+    requested = load_commands(record, leaderboard.folder / RECORDS)
+    last = requested[:, 1:, :, max(protocol.SCORED_BREATHS)]
+    return np.clip(last, 0.0, protocol.U_MAX).reshape(-1, last.shape[-1])
+
+
+def rank(entries: Sequence[Entry], track: str, *, ranks: bool = True) -> list[Row]:
     """Rank complete entries.
 
     Args:
         entries: to be ranked, in any order; all over the same draws.
         track: that they are on.
+        ranks: whether their order is a ranking, not only practice.
 
     Returns:
         Best first; entries of equal score by name.
@@ -340,9 +327,22 @@ def rank(entries: Sequence[Entry], track: str) -> list[Row]:
     if not ordered:
         return []
     records = [entry.record for entry in ordered]
-    ranges = ranges_of(records, [record.ranked_values for record in records])
-    compared = _comparisons(records, baseline(records, track))
-    return [_row(entry, ranges[i][0], ranges[i], compared[i]) for i, entry in enumerate(ordered)]
+    made = ranks_of(ordered, [record.ranked_values for record in records])
+    compared = _comparisons(records, _baseline(records, track))
+    rows = []
+    for i, entry in enumerate(ordered):
+        may = (int(made.best[i]), int(made.worst[i]))
+        own = (int(made.rank[i]), may) if ranks else (None, None)
+        rows.append(_row(entry, *own, compared[i]))
+    return rows
+
+
+def ranks_of(entries: Sequence[Entry], values: Sequence[Floats], matters: float = POINTS) -> Ranks:
+    """Ranks of entries by values of shape ``(L, k)`` on their first k draws, less is better."""
+    names = [entry.record.name for entry in entries]
+    source = [names.index(x.source) if x.source in names else None for x in entries]
+    rig = entries[0].record.headroom.session[:, : values[0].shape[1]]
+    return comparison.ranks(np.stack(values), rig, source, matters=matters)
 
 
 def _row(
@@ -367,36 +367,13 @@ def _comparisons(records: Sequence[Record], base: int | None) -> list[Comparison
             to_baseline = _interval(own - values[base], means[i] - means[base])
         if i:
             to_above = _interval(own - values[i - 1], means[i] - means[i - 1])
-        compared.append(Comparison(_interval(own, means[i]), to_baseline, to_above))
+        headroom = records[i].headroom
+        middle = Interval(*comparison.interquartile_mean(headroom.normalised[1:], headroom.session))
+        compared.append(Comparison(_interval(own, means[i]), to_baseline, to_above, middle))
     return compared
 
 
-def ranges_of(records: Sequence[Record], values: Sequence[Floats]) -> list[tuple[int, int]]:
-    """Ranks that records may have by values of shape ``(L, K)``; see :func:`rank_ranges`."""
-    if not records:
-        return []
-    return rank_ranges(np.stack([_resampled(*x) for x in zip(records, values, strict=True)]))
-
-
-def rank_ranges(means: Floats) -> list[tuple[int, int]]:
-    """Ranks that entries may have, by paired comparison of each with each; lower is better.
-
-    The best is 1 + the number of entries that are better beyond doubt, the worst the number of
-    entries less those that are worse beyond doubt. Beyond doubt: the paired 95 % interval of the
-    difference does not hold zero; no allowance is made for the number of pairs.
-
-    Args:
-        means: resampled alike for all entries, shape ``(N, resamples)``.
-    """
-    count, least = len(means), 10.0**-DECIMALS
-    ranges = []
-    for own in means:
-        low, high = np.quantile(own - means, (0.025, 0.975), axis=1)
-        ranges.append((1 + int(np.sum(low > least)), count - int(np.sum(high < -least))))
-    return ranges
-
-
-def unranked_rows(entries: Sequence[Entry]) -> list[Row]:
+def _unranked_rows(entries: Sequence[Entry]) -> list[Row]:
     """Rows of entries that are not ranked, by name; scores where they exist."""
     rows = []
     for entry in sorted(entries, key=lambda e: e.record.name):
@@ -407,7 +384,7 @@ def unranked_rows(entries: Sequence[Entry]) -> list[Row]:
     return rows
 
 
-def baseline(records: Sequence[Record], track: str) -> int | None:
+def _baseline(records: Sequence[Record], track: str) -> int | None:
     """Index of the track's PID among records."""
     names = [record.name for record in records]
     return names.index(BASELINES[track]) if BASELINES[track] in names else None
@@ -436,55 +413,55 @@ def _interval(values: Floats, means: Floats) -> Interval:
     return Interval(float(np.mean(values)), float(low), float(high))
 
 
-def stress_rows(ranked: Sequence[Row]) -> list[StressRow]:
+def _stress_rows(rows: Sequence[Row], evidence: Evidence) -> list[StressRow]:
     """Entries that were run under the newest table of stressors, best first.
 
     Args:
-        ranked: entries of a track; those of other tables of stressors are left out.
+        rows: entries of a track; those of other tables of stressors are left out.
+        evidence: what stands behind the records.
     """
-    stressed = [(row, own) for row in ranked if (own := row.record.stress) is not None]
-    newest = max((own.stressors for _, own in stressed), default=0)
-    current = [(row, own.tables) for row, own in stressed if own.stressors == newest]
+    ran = [(row, own) for row in rows if (own := row.record.stress) is not None]
+    newest = max((own.stressors for _, own in ran), default=0)
+    current = [(row, own.tables) for row, own in ran if own.stressors == newest]
     alike = [StressRow(row, own) for row, own in current if own.comparable(current[0][1])]
     whole = [row for row in alike if math.isfinite(row.tables.score)]
-    means = [row.tables.resampled(row.tables.by_lung_and_draw) for row in whole]
-    ranges = rank_ranges(np.stack(means)) if means else []
-    made = []
-    for row, mean, ranks in zip(whole, means, ranges, strict=True):
-        low, high = np.quantile(mean, (0.025, 0.975))
-        score = Interval(row.tables.score, float(low), float(high))
-        made.append(replace(row, score=score, rank=ranks[0], ranks=ranks))
-    made.sort(key=lambda row: (row.tables.score, row.name))
-    return made + [row for row in alike if not math.isfinite(row.tables.score)]
+    if not whole:
+        return alike
+    fit = [row for row in whole if not gate.stressed(row.row.record, evidence)]
+    ranks = {}
+    if fit:
+        values = [row.tables.by_lung_and_draw for row in fit]
+        made = ranks_of([row.row.entry for row in fit], values, CMH2O)
+        for i, row in enumerate(fit):
+            ranks[row.name] = int(made.rank[i]), (int(made.best[i]), int(made.worst[i]))
+    shown = []
+    for row in whole:
+        low, high = row.tables.interval(row.tables.by_lung_and_draw)
+        score = Interval(row.tables.score, low, high)
+        own, may = ranks.get(row.name, (None, None))
+        shown.append(replace(row, score=score, rank=own, ranks=may))
+    shown.sort(key=lambda row: (row.tables.score, row.name))
+    return shown + [row for row in alike if not math.isfinite(row.tables.score)]
 
 
-def hardware_rows(
-    records: Sequence[AnyRecord], attested: Container[str], track: Track
-) -> list[HardwareRow]:
-    """Rows of a track's hardware records, newest first.
-
-    Args:
-        records: all records, each after those that it names.
-        attested: hashes of the records that somebody vouches for.
-        track: the simulated ranking.
-    """
-    withdrawn = _withdrawn(records)
+def _hardware_rows(leaderboard: Store, track: Track) -> tuple[HardwareRow, ...]:
+    """Rows of a track's hardware records, newest first."""
+    evidence = leaderboard.evidence
     simulated = {row.record.name: row for _, row in reversed(track.rows)}
     made: list[HardwareRow] = []
     seen: set[tuple[str, bool]] = set()
-    for record in reversed(records):
+    for record in reversed(leaderboard.records):
         if not isinstance(record, HardwareRecord) or record.track != track.name:
             continue
-        vouched, why = record.sha256 in attested, withdrawn.get(record.sha256)
         # Nobody takes a vouched-for record's place by one that nobody vouches for.
         key = (record.name, record.emulated)
-        newest = why is None and key not in seen
-        if newest and vouched:
+        newest = record.sha256 not in evidence.withdrawn and key not in seen
+        if newest and record.sha256 in evidence.vouched:
             seen.add(key)
         row = simulated.get(record.name)
-        nominal = _nominal(record, row)
-        made.append(HardwareRow(record, why, vouched, newest, row, nominal))
-    return [_hardware_rank(row, made) for row in made]
+        why = gate.measured(record, evidence)
+        made.append(HardwareRow(record, why, newest, row, _nominal(record, row)))
+    return tuple(_hardware_rank(row, made) for row in made)
 
 
 def _nominal(record: HardwareRecord, row: Row | None) -> float:

@@ -22,7 +22,7 @@ from ventbench.base.errors import InputError
 from ventbench.board import canonical, schema
 from ventbench.entries.runs import Runs
 from ventbench.task import protocol
-from ventbench.task.metrics.score import normalised
+from ventbench.task.metrics.score import normalised, passes_safety_gate
 from ventbench.task.stressors import VERSION as STRESSORS_VERSION
 from ventbench.task.stressors import condition_of
 
@@ -33,6 +33,12 @@ TRACK = "hardware"
 
 #: Recorded errors may differ from those of the pressures, which are rounded to 0.001, cmH2O.
 _TOLERANCE = 0.001
+
+#: Most of the way from PEEP to PIP that a lung may be before the first command acts.
+_HALF_WAY = 0.5
+
+# Recorded pressures are rounded to 0.001 cmH2O.
+_ROUNDED = 0.001
 
 #: Most repetitions of one cell.
 MAX_REPEATS = 100
@@ -129,9 +135,9 @@ class Record(schema.Submitted):
         return self.header.official
 
     @property
-    def key(self) -> tuple[str, str]:
-        """Track and name: what one entry of the board is known by."""
-        return self.track, self.name
+    def key(self) -> tuple[str, str, str]:
+        """Draws, track and name: what one entry of the board is known by."""
+        return self.header.draws.season, self.track, self.name
 
     @property
     def lungs(self) -> list[str]:
@@ -473,6 +479,8 @@ def _checked(content: HardwareContent, sha256: str, label: str) -> HardwareRecor
     }
     if stopped != missing or len(stopped) != len(content.stops):
         raise InputError(f"{label}, key stops: do not fit the errors")
+    for problem in _measured_problems(content):
+        raise InputError(f"{label}, {problem}")
     return HardwareRecord(sha256, content, errors)
 
 
@@ -504,3 +512,44 @@ def _check_tables(content: HardwareContent, label: str) -> None:
             raise InputError(f"{label}, key {key}: does not have one value a lung")
     if content.simulated_track not in content.submission.manifest.tracks:
         raise InputError(f"{label}, key simulated_track: the submission does not enter it")
+
+
+def _measured_problems(content: HardwareContent) -> list[str]:
+    """What a hardware record says of its pressures and they do not, by key.
+
+    Highest pressure, safety, the pressure before the first command acts, and that no two breaths of
+    a lung are equal to the last digit.
+
+    Args:
+        content: types, ranges and shapes are right.
+    """
+    problems: list[str] = []
+    seen: set[bytes] = set()
+    for at, lung in enumerate(content.lungs):
+        highest, safe = -np.inf, True
+        for pip, cell in zip(content.pips, content.trace.pressure_milli_cmH2O[at], strict=True):
+            for repeat, run in enumerate(cell, 1):
+                if run is None:
+                    continue
+                pressure = np.array(run) / 1000.0
+                where = f"{lung}, PIP {pip:g}, repetition {repeat}"
+                highest = max(highest, float(pressure.max()))
+                safe &= bool(np.all(passes_safety_gate(pressure, pip, protocol.DT)))
+                first = float(np.abs(pressure[:, 0] - protocol.PEEP).max())
+                if first > _HALF_WAY * (pip - protocol.PEEP):
+                    problems.append(
+                        f"key trace: {where} begins {first:.1f} cmH2O from PEEP, before any "
+                        "command acts"
+                    )
+                for breath in pressure:
+                    if breath.tobytes() in seen and not content.device.emulated:
+                        problems.append(f"key trace: {where} repeats a breath to the last digit")
+                    seen.add(breath.tobytes())
+        if content.peak_pressure_cmH2O[at] < highest - _ROUNDED:
+            problems.append(
+                f"key peak_pressure_cmH2O: {lung} says {content.peak_pressure_cmH2O[at]:.3f}, its "
+                f"pressures reach {highest:.3f}"
+            )
+        if content.safe[at] and not safe:
+            problems.append(f"key safe: {lung} says true, its pressures are above the limit")
+    return problems

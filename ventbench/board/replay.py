@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from ventbench.base import precision
 from ventbench.base.errors import InputError
 from ventbench.board.record import Record
+from ventbench.board.rounds import Round
 from ventbench.board.schema import ScoreHeader
 from ventbench.entries.stepping import as_float64
 from ventbench.plants.rigs import rigs_of
@@ -201,21 +202,22 @@ def spread(simulators: ReplayPlants, pips: Sequence[float], requested: Floats) -
     return np.mean(deviation[..., protocol.SCORED_BREATHS, :], axis=(-2, -1))
 
 
-def draws_of(header: ScoreHeader, simulators: ReplayPlants) -> Draws:
+def draws_of(header: ScoreHeader, simulators: ReplayPlants, rounds: Mapping[str, Round]) -> Draws:
     """Make the draws that a record names again.
 
     Args:
         header: of the record.
         simulators: that it names.
+        rounds: that have draws, by name.
 
     Raises:
-        InputError: if the draws are not those of the published seed.
+        InputError: if the draws are neither the development draws nor those of a round.
     """
-    recorded = header.draws.about()
-    rigs = rigs_of(simulators)
-    drawn = draw_tables.build(rigs.sessions or (), rigs.members, n=recorded["count"])
+    recorded, rigs = header.draws.about(), rigs_of(simulators)
+    own = rounds.get(header.draws.season)
+    drawn = rigs.draws(draw_tables.COUNT) if own is None else own.draws(rigs)
     if drawn.about() != recorded:
-        raise InputError("key draws: not the development draws, the only ones that are published")
+        raise InputError("key draws: neither the development draws nor those of a round")
     return drawn
 
 

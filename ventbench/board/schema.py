@@ -15,7 +15,7 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 
 from ventbench.base.errors import InputError
-from ventbench.base.text import plain
+from ventbench.base.text import deceptive, plain
 from ventbench.board import actions
 from ventbench.entries.folder import CONTROLLER, combined_hash
 from ventbench.entries.manifest import FAMILIES, MANIFEST, NAME, TRACKS
@@ -316,6 +316,8 @@ def read(
     if isinstance(record, ScoreContent):
         _check_claims(record, label)
     _check_submission(record.submission, f"{label}, key submission")
+    for why in filter(None, map(deceptive, record.submission.manifest.authors)):
+        raise InputError(f"{label}, key submission.manifest.authors: {why}")
     _check_origin(record, label)
     if isinstance(record, ScoreContent):
         _check_shapes(record, label)

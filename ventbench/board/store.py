@@ -8,7 +8,7 @@ publishes refuses to drop one; see ``ci/publish.py``.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 
 from ventbench.base import files
 from ventbench.base.errors import InputError
-from ventbench.board import actions, attestation, canonical, record, schema
+from ventbench.board import actions, attestation, canonical, record, rounds, schema
 from ventbench.board.canonical import RECORDS
+from ventbench.board.gate import Evidence
 from ventbench.board.record import AnyRecord, HardwareRecord, Record, Withdrawal
+from ventbench.board.rounds import Round
 
 if TYPE_CHECKING:
     from ventbench.board.replay import ReplayPlants
@@ -35,11 +37,20 @@ class Store:
         records: all of them.
         attested: hashes of the records that somebody who may do so vouches for; see
             :mod:`ventbench.board.attestation`.
+        rounds: all of them, the newest first.
     """
 
     folder: Path
     records: tuple[AnyRecord, ...]
     attested: frozenset[str]
+    rounds: tuple[Round, ...] = ()
+
+    @property
+    def evidence(self) -> Evidence:
+        """What stands behind the records."""
+        taken = {x.withdraws: x.reason for x in self.records if isinstance(x, Withdrawal)}
+        drawn = {x.name: x for x in self.rounds if x.value is not None}
+        return Evidence(self.attested, taken, drawn)
 
     @property
     def scores(self) -> list[Record]:
@@ -71,10 +82,18 @@ def load(folder: Path) -> Store:
         OSError: if one cannot be read.
     """
     records = in_order(read_record(path) for path in record_paths(folder))
-    attested, problems = attestation.attested(folder, [entry.sha256 for entry in records])
+    attested, problems = attestation.attested(folder, measured(records))
     if problems:
         raise InputError(problems[0])
-    return Store(folder, records, attested)
+    return Store(folder, records, attested, rounds.load_all(folder))
+
+
+def measured(records: Iterable[AnyRecord]) -> dict[str, str | None]:
+    """By the hash of each record that of its raw recording; None for what was not measured."""
+    return {
+        x.sha256: x.header.recording.sha256 if isinstance(x, HardwareRecord) else None
+        for x in records
+    }
 
 
 def in_order(records: Iterable[AnyRecord]) -> tuple[AnyRecord, ...]:
@@ -156,7 +175,13 @@ def find_record(
     return matches[0]
 
 
-def require_replay(score: Record, commands: bytes, simulators: ReplayPlants, label: str) -> None:
+def require_replay(
+    score: Record,
+    commands: bytes,
+    simulators: ReplayPlants,
+    label: str,
+    known: Mapping[str, Round],
+) -> None:
     """Replay a record.
 
     Args:
@@ -164,6 +189,7 @@ def require_replay(score: Record, commands: bytes, simulators: ReplayPlants, lab
         commands: content of its action file.
         simulators: the frozen ones.
         label: names it in messages.
+        known: rounds that have draws, by name.
 
     Raises:
         InputError: if it was scored on other simulators, or does not replay.
@@ -173,7 +199,7 @@ def require_replay(score: Record, commands: bytes, simulators: ReplayPlants, lab
     if score.header.simulators != canonical.through_json(simulators.about()):
         raise InputError(f"{label} was scored on other simulators than those of this ventbench")
     requested = actions.decode(commands, score.header.actions.shape, label)
-    drawn = draws_of(score.header, simulators)
+    drawn = draws_of(score.header, simulators, known)
     (replayed,) = replay(simulators, score.pips, [requested], drawn)
     problems = differences(score, replayed)
     if problems:
@@ -208,7 +234,8 @@ def add(
         load_commands(added, path.parent)
         content = commands_path(added, path.parent).read_bytes()
         if simulators is not None:
-            require_replay(added, content, simulators, str(path))
+            known = store.evidence.rounds
+            require_replay(added, content, simulators, str(path), known)
         kept = commands_path(added, folder / RECORDS)
         files.write_atomically(kept, lambda file: file.write(content))
     _write(folder, added, path.read_bytes())
@@ -266,17 +293,15 @@ class _Before:
     """What the records before one say.
 
     Attributes:
-        first: record of a score.
-        first_of_name: first record of each entry's name, on any track.
-        newest: of each entry, by track and name.
+        first: record of a score on each draws, by their name.
+        newest: of each entry, by draws, track and name.
         known: all scores, by their hash.
         hardware: hashes of all hardware records.
         withdrawn: hashes of those that were taken back.
     """
 
-    first: Record | None = None
-    first_of_name: dict[str, Record] = field(default_factory=dict)
-    newest: dict[tuple[str, str], Record] = field(default_factory=dict)
+    first: dict[str, Record] = field(default_factory=dict)
+    newest: dict[tuple[str, str, str], Record] = field(default_factory=dict)
     known: dict[str, Record] = field(default_factory=dict)
     hardware: set[str] = field(default_factory=set)
     withdrawn: set[str] = field(default_factory=set)
@@ -287,8 +312,7 @@ class _Before:
         elif isinstance(entry, HardwareRecord):
             self.hardware.add(entry.sha256)
         else:
-            self.first = self.first or entry
-            self.first_of_name.setdefault(entry.name, entry)
+            self.first.setdefault(entry.header.draws.season, entry)
             self.newest[entry.key] = entry
             self.known[entry.sha256] = entry
 
@@ -303,9 +327,11 @@ def _conflicts(entry: AnyRecord, before: _Before) -> list[str]:
         return []
     if entry.sha256 in before.known or entry.sha256 in before.hardware:
         return [f"{name} is on the leaderboard already"]
-    sentences = []
-    first = before.first
-    if first is not None and isinstance(entry, Record):
+    sentences: list[str] = []
+    if isinstance(entry, HardwareRecord):
+        return sentences
+    first = before.first.get(entry.header.draws.season)
+    if first is not None:
         # Records can only be compared over the same simulators, draws and reference errors.
         keys = ("simulators", "draws", "headroom")
         sentences = [
@@ -314,14 +340,6 @@ def _conflicts(entry: AnyRecord, before: _Before) -> list[str]:
             for key, own, common in zip(keys, entry.basis, first.basis, strict=True)
             if own != common
         ]
-    owner = before.first_of_name.get(entry.name)
-    if owner is not None and set(owner.manifest.authors) != set(entry.manifest.authors):
-        sentences.append(
-            f"{name} ({entry.name}), key submission.manifest.authors: the name belongs to the "
-            f"authors of record {owner.sha256[:12]}; choose another name"
-        )
-    if isinstance(entry, HardwareRecord):
-        return sentences
     superseded, newest = entry.header.supersedes, before.newest.get(entry.key)
     if superseded is None:
         if newest is not None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
-from ventbench.board import attestation, canonical, create, ranking, store
+from ventbench.board import attestation, canonical, create, ranking, rounds, store
 from ventbench.board.canonical import ATTESTATIONS, RECORDS
 from ventbench.board.record import AnyRecord, Record, RecordStress
 from ventbench.board.replay import (
@@ -31,14 +31,16 @@ from ventbench.board.replay import (
     draws_of,
     replay,
 )
+from ventbench.board.rounds import Round
 from ventbench.board.store import Store
-from ventbench.entries.folder import Submission, file_hashes, open_submission
+from ventbench.entries import reference as references
+from ventbench.entries.folder import Submission, combined_hash, file_hashes, open_submission
 from ventbench.entries.reference import published, reference_of
 from ventbench.entries.runner import Runner
 from ventbench.entries.runs import Runs
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import rigs_of
-from ventbench.task import stressors
+from ventbench.task import protocol, stressors
 from ventbench.task.draws import Draws
 from ventbench.task.metrics.score import normalised
 
@@ -55,6 +57,9 @@ COMMAND_TOLERANCE = 1e-3
 
 #: Most that the error of a stress run may differ, cmH2O, where commands are not equal to the bit.
 STRESS_TOLERANCE = 1e-3
+
+#: Most that errors of bounds may differ from what their commands give, cmH2O.
+BOUNDS_TOLERANCE = 1e-9
 
 #: Most folders of submissions that are looked through in one place.
 MAX_FOLDERS = 5000
@@ -116,9 +121,9 @@ def verify(folder: Path, load: Load, *, progress: Progress | None = None) -> Rep
     report.records = len(entries)
     report.problems += _strange_files(folder, entries, whole=len(entries) == len(paths))
     report.problems += store.conflicts(entries)
-    vouched, problems = attestation.attested(folder, [path.stem for path in paths])
-    report.problems += problems
-    leaderboard = Store(folder, entries, vouched)
+    vouched, problems = attestation.attested(folder, store.measured(entries))
+    report.problems += problems if len(entries) == len(paths) else []
+    leaderboard = Store(folder, entries, vouched, tuple(_rounds(folder, load, report)))
     by_draw = _check_replay(leaderboard, load, report, progress)
     if not report.problems:  # else whatever is wrong has been said, and moves the ranks
         report.problems += _check_ranks(leaderboard, by_draw)
@@ -141,7 +146,7 @@ def _strange_files(folder: Path, entries: Sequence[AnyRecord], *, whole: bool) -
         path = Path(name)
         if not canonical.named(name):
             problems.append(f"{folder / name} is no part of a leaderboard; remove it")
-        elif whole and path.suffix != canonical.RECORD_SUFFIX:
+        elif whole and path.parts[0] == RECORDS and path.suffix != canonical.RECORD_SUFFIX:
             of = commands if path.suffix == canonical.ACTIONS_SUFFIX else named
             if path.stem not in of:
                 problems.append(f"{folder / name} belongs to no record; remove it")
@@ -167,11 +172,12 @@ def _check_replay(
         if simulators is None:
             continue
         try:
-            drawn = draws_of(header, simulators)
+            drawn = draws_of(header, simulators, leaderboard.evidence.rounds)
         except InputError as error:
             report.problems += [f"record {score.sha256}, {error}" for score in group]
             continue
-        report.problems += _wrong_reference(group)
+        own = leaderboard.evidence.rounds.get(header.draws.season)
+        report.problems += _wrong_reference(group, own)
         for first in range(0, len(group), BATCH):
             batch = group[first : first + BATCH]
             by_draw |= _replay_batch(leaderboard.folder, batch, simulators, drawn, report)
@@ -188,31 +194,77 @@ def _check_ranks(leaderboard: Store, by_draw: Mapping[str, Floats]) -> list[str]
         by_draw: replayed values that rank; a record without them keeps its own.
     """
     problems = []
-    for name, standing in ranking.standings(leaderboard).items():
-        records = [entry.record for entry in standing.ranked]
-        recorded = ranking.ranges_of(records, [score.ranked_values for score in records])
-        again = [by_draw.get(x.sha256, x.ranked_values) for x in records]
-        replayed = ranking.ranges_of(records, again)
+    for track in ranking.board(leaderboard):
+        if track.round is None or not track.ranked:
+            continue
+        entries = [row.entry for row in track.ranked]
+        again = [by_draw.get(x.record.sha256, x.record.ranked_values) for x in entries]
         problems += [
-            f"record {score.sha256} ({score.name}): ranks {said[0]} on the {name} track by its "
-            f"recorded errors, {given[0]} by those that all commands give"
-            for score, said, given in zip(records, recorded, replayed, strict=True)
-            if said[0] != given[0]
+            f"record {row.record.sha256} ({row.record.name}): ranks {row.rank} on the "
+            f"{track.name} track by its recorded errors, {given} by those that all commands give"
+            for row, given in zip(track.ranked, ranking.ranks_of(entries, again).rank, strict=True)
+            if row.rank != given
         ]
     return problems
 
 
-def _wrong_reference(group: Sequence[Record]) -> list[str]:
-    """Records whose reference errors are not the published ones of their draws."""
+def _rounds(folder: Path, load: Load, report: Report) -> Iterator[Round]:
+    """Read the rounds, newest first, and note what is wrong with them."""
+    newest = True
+    for name in rounds.names(folder):
+        try:
+            yield (own := rounds.load(folder, name))
+        except (InputError, OSError) as error:
+            report.problems.append(str(error))
+            continue
+        if own.frozen is None:
+            continue
+        simulators = _loaded(load, report)
+        if simulators is None:
+            return
+        for key in rounds.protocol_differences(own, simulators.about()):
+            report.problems.append(f"{own.folder}: this ventbench has another protocol: {key}")
+        available = list(folders([folder.parent / "submissions"]))
+        for entry in own.frozen.entries:
+            if not newest:
+                break
+            named = [x for x in available if x.name == entry.name]
+            if named and all(combined_hash(file_hashes(x)) != entry.sha256 for x in named):
+                report.problems.append(
+                    f"{named[0]} is not what was frozen in round {name}, {entry.sha256[:12]}"
+                )
+        if own.result is not None:
+            report.problems += _wrong_bounds(own, simulators)
+
+
+def _wrong_bounds(own: Round, simulators: ReplayPlants) -> list[str]:
+    """Say whether the bounds of a round are what their commands and its PIDs give."""
+    rigs = rigs_of(simulators)
+    try:
+        drawn, bounds = own.draws(rigs), own.bounds()
+        references.reference_of(rigs.about, drawn.about(), bounds)
+    except (InputError, OSError) as error:
+        return [str(error)]
+    plants, cells = rigs.cells(drawn, protocol.PIPS)
+    attained = references.witness_errors(bounds, plants, cells) - bounds.attainable
+    pid = references.pid_errors(plants, cells, bounds.gains) - bounds.pid
+    if max(np.abs(attained).max(), np.abs(pid).max()) > BOUNDS_TOLERANCE:
+        return [f"{own.folder / rounds.BOUNDS}: its commands or PIDs do not attain its errors"]
+    return []
+
+
+def _wrong_reference(group: Sequence[Record], own: Round | None) -> list[str]:
+    """Records whose reference errors are not those of their round, or the published ones."""
     header = group[0].header
     try:
-        reference = reference_of(header.simulators, header.draws.about(), published())
-    except InputError as error:
+        given = published() if own is None else own.bounds()
+        reference = reference_of(header.simulators, header.draws.about(), given)
+    except (InputError, OSError) as error:
         return [f"record {group[0].sha256}, key headroom: {error}"]
     assert reference is not None
     tables = {"attainable": reference.attainable, "pid": reference.pid}
     return [
-        f"record {score.sha256}, key headroom.{key}: not the published reference errors"
+        f"record {score.sha256}, key headroom.{key}: not the reference errors of its draws"
         for score in group
         for key, table in tables.items()
         if not np.array_equal(getattr(score.headroom, key), np.moveaxis(table, 1, 0))
@@ -221,14 +273,10 @@ def _wrong_reference(group: Sequence[Record]) -> list[str]:
 
 def _simulators(recorded: Mapping[str, Any], load: Load, report: Report) -> ReplayPlants | None:
     """Load the simulators; None, and a problem, where they are not those that records name."""
-    try:
-        simulators = load()
-        here = canonical.through_json(simulators.about())
-    # A damaged manifest can lack anything; InputError is a ValueError.
-    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-        text = str(error) if isinstance(error, InputError) else repr(error)
-        report.problems.append(f"simulators: {text}")
+    simulators = _loaded(load, report)
+    if simulators is None:
         return None
+    here = canonical.through_json(simulators.about())
     if here == recorded:
         return simulators
     keys = sorted(key for key in {*here, *recorded} if here.get(key) != recorded.get(key))
@@ -237,6 +285,19 @@ def _simulators(recorded: Mapping[str, Any], load: Load, report: Report) -> Repl
         "differ"
     )
     return None
+
+
+def _loaded(load: Load, report: Report) -> ReplayPlants | None:
+    """Load the simulators; None, and a problem, where they are damaged."""
+    try:
+        simulators = load()
+        canonical.through_json(simulators.about())
+        return simulators
+    # A damaged manifest can lack anything; InputError is a ValueError.
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        text = f"simulators: {error if isinstance(error, InputError) else repr(error)}"
+        report.problems += [text] if text not in report.problems else []
+        return None
 
 
 def _replay_batch(
@@ -359,7 +420,7 @@ def rerun(
         if progress is not None:
             progress(outcome)
 
-    available = list(_folders([folder.parent / "submissions", *sources]))
+    available = list(folders([folder.parent / "submissions", *sources]))
     for score in scores:
         code, why = _code_of(score, available, about)
         if code is None:
@@ -372,7 +433,7 @@ def rerun(
     return [outcomes[score.sha256] for score in scores]
 
 
-def _folders(places: Sequence[Path]) -> Iterator[Path]:
+def folders(places: Sequence[Path]) -> Iterator[Path]:
     """Folders that may hold a submission: the places themselves and those in them."""
     for place in (*places, files.submissions_folder()):
         if not place.is_dir():
@@ -412,9 +473,10 @@ def _run(
         submission = open_submission(str(code))
         _check_same(submission, score)
         stress = 0 if score.stress is None else score.stress.tables.pips.shape[1]
+        known = store.load(folder).evidence.rounds
         result = run_protocol(
             submission, rigs_of(simulators), track=score.track, stress=stress, runner=apart,
-            drawn=draws_of(score.header, simulators),
+            drawn=draws_of(score.header, simulators, known),
         )  # fmt: skip
         _check_same(open_submission(str(code)), score)
         recorded = store.load_commands(score, folder / RECORDS)

@@ -17,6 +17,7 @@ from ventbench.cli import (
     diagnose,
     doctor,
     options,
+    round,
     score,
     simulators,
     train,
@@ -57,6 +58,7 @@ simulators.register(app)
 train.register(app)
 view.register(app)
 board.register(app)
+round.register(app)
 diagnose.register(app)
 doctor.register(app)
 app.add_typer(data.app)

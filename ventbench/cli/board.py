@@ -268,7 +268,7 @@ def show(
     ] = None,
     json: JsonFile = None,
 ) -> None:
-    """Show the ranking of both tracks, and that under missing physics.
+    """Show the newest round's ranking of both tracks and under missing physics, and practice.
 
     With --lung the table has a column for each PIP of that lung, or for each lung with `all`: the
     normalised score over the draws.
@@ -277,10 +277,9 @@ def show(
     """
     from rich.console import Console
 
-    from ventbench.base.text import plain
-    from ventbench.board import frames
+    from ventbench.board import frames, ranking
 
-    tracks = frames.load_tracks(folder)
+    tracks = ranking.newest(frames.load_tracks(folder))
     rows = [
         frames.csv_row(line)
         | ({} if lung is None else {"cells": frames.cell_means(line.row.record, lung)})
@@ -292,15 +291,35 @@ def show(
         if lung is not None:
             console.print(_lung_table(track, lung))
             continue
-        console.print(_table(track))
-        for status, row in track.rows:
-            if status != "ranked":
-                reasons = row.entry.reasons
-                said = any(reason.startswith(status) for reason in reasons)
-                why = plain("; ".join(reasons if said else (status, *reasons))[:300])
-                console.print(f"{row.record.name}: {why}", markup=False, highlight=False)
-        if track.stress:
-            console.print(_stress_table(track))
+        _print_track(console, track)
+
+
+def tables_of(folder: Path, name: str, *, err: bool = False) -> None:
+    """Print the tables of a round."""
+    from rich.console import Console
+
+    from ventbench.board import frames
+
+    for track in frames.load_tracks(folder):
+        if track.draws == name:
+            _print_track(Console(stderr=err), track)
+
+
+def _print_track(console: Console, track: Track) -> None:
+    """Print the ranking of a track, why others are not ranked, and the ranking under stress."""
+    from ventbench.base.text import plain
+
+    if not track.rows:
+        return
+    console.print(_table(track))
+    for status, row in track.rows:
+        if status not in ("ranked", "practice"):
+            reasons = row.entry.reasons
+            said = any(reason.startswith(status) for reason in reasons)
+            why = plain("; ".join(reasons if said else (status, *reasons))[:300])
+            console.print(f"{row.record.name}: {why}", markup=False, highlight=False)
+    if track.stress:
+        console.print(_stress_table(track))
 
 
 @app.command(name="records")
@@ -376,8 +395,7 @@ def _table(track: Track) -> Table:
 
     shown = [column for column in frames.COLUMNS if column.terminal]
     table = _plain_table(f"{track.name}: 0 = best attainable, 100 = best PID")
-    draws = sorted({row.record.header.draws.season for _, row in track.rows})
-    table.caption = f"{', '.join(draws)} draws, for practice; error in cmH2O"
+    table.caption = f"{track.title}; error in cmH2O"
     for name in (*(name for column in shown for name in column.terminal), "record"):
         table.add_column(name, justify="left" if name in ("entry", "record") else "right")
     for line in frames.lines([track]):

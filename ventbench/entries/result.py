@@ -21,7 +21,7 @@ from ventbench.entries.folder import Submission
 from ventbench.entries.runs import CellFailure, Runs, number
 from ventbench.plants import frozen
 from ventbench.task import protocol, stressors
-from ventbench.task.draws import DEVELOPMENT_SEED, Draws, commitment
+from ventbench.task.draws import Draws
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.metrics import bootstrap
 from ventbench.task.metrics.score import lung_score
@@ -31,9 +31,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Floats = NDArray[np.float64]
-
-#: Commitment of the published draws.
-PUBLISHED = commitment(DEVELOPMENT_SEED)
 
 #: Failures and stressed conditions that a printed score names; the JSON has all.
 _FAILURES_SHOWN, _CONDITIONS_SHOWN = 3, 10
@@ -159,8 +156,6 @@ class Score:
             "no full sandbox": (self.sandbox or {}).get("official") is not True,
             "not on the frozen simulators": self.protocol.rigs.sha256 != frozen.MANIFEST_SHA256,
             "not all lungs and PIPs": not self.complete,
-            "other draws than the published ones": self.rig_draws is not None
-            and self.rig_draws.commitment != PUBLISHED,
         }
         return tuple(reason for reason, holds in reasons.items() if holds)
 

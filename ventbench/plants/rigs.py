@@ -44,14 +44,27 @@ class Rigs:
         """Number of members of the ensemble."""
         return 1 if self.sessions is None else jax.tree.leaves(self.plants)[0].shape[0]
 
-    def draws(self, n: int, pips: Sequence[float] = protocol.PIPS) -> Draws:
-        """Return the first n development draws of these rigs at some of the protocol's PIPs.
+    def draws(
+        self,
+        n: int,
+        pips: Sequence[float] = protocol.PIPS,
+        *,
+        seed: bytes = draw_tables.DEVELOPMENT_SEED,
+        name: str = draw_tables.DEVELOPMENT,
+    ) -> Draws:
+        """Return the first n draws of these rigs at some of the protocol's PIPs.
+
+        Args:
+            n: how many.
+            pips: cmH2O.
+            seed: of the draws; that of the development draws by default.
+            name: of the draws.
 
         Raises:
             InputError: if there are not so many, or a PIP is not one of the protocol's.
         """
         sessions = self.sessions or tuple((0,) for _ in self.lungs)
-        return draw_tables.build(sessions, self.members, pips=pips).first(n)
+        return draw_tables.build(sessions, self.members, seed=seed, name=name, pips=pips).first(n)
 
     def cells(self, drawn: Draws | None, pips: Sequence[float]) -> tuple[Plant, Scenario]:
         """Nominal cells in front of draws, and their plants.

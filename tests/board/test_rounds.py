@@ -1,0 +1,320 @@
+"""Rounds: who is in is fixed before anybody can know the draws, and no byte changes unseen."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import tomli_w
+
+from ci import propose
+from ci.git import Git
+from ventbench.base.errors import InputError
+from ventbench.base.executor import executor
+from ventbench.board import canonical, gate, round_scoring, rounds, store
+from ventbench.board.gate import PRACTICE
+from ventbench.board.rounds import Request
+from ventbench.board.verify import verify
+from ventbench.entries import reference as references
+from ventbench.entries.folder import as_submission
+from ventbench.entries.runner import InProcessRunner
+from ventbench.entries.scoring import run_protocol
+from ventbench.plants.rigs import load_rigs
+from ventbench.task import draws as draw_tables
+from ventbench.task import protocol
+
+from . import referee
+from .conftest import FROZEN, ROUND, SECRET, entry_folder, opened, put
+from .test_verify import flip
+
+#: What names the rigs of rounds that are never scored.
+ABOUT = {"version": 2}
+
+
+def ask(name: str, account: str, minute: int = 0) -> Request:
+    return Request(name, account, FROZEN + timedelta(minutes=minute - 60))
+
+
+@pytest.fixture
+def fresh(tmp_path: Path) -> Path:
+    """A leaderboard with an open round, and four submissions."""
+    for name in ("pid_robust", "one", "two", "three"):
+        entry_folder(tmp_path / "submissions" / name, "pid_robust", name)
+    board = tmp_path / "leaderboard"
+    rounds.open_round(
+        board, "r2", FROZEN, ["pid_robust"], delay_s=60, limit=2,
+        chain=referee.chain(SECRET), now=FROZEN - timedelta(days=1),
+    )  # fmt: skip
+    return board
+
+
+def freeze(board: Path, *requests: Request, now: datetime = FROZEN) -> rounds.Round:
+    return rounds.freeze(board, "r2", board.parent / "submissions", requests, ABOUT, now=now)
+
+
+def test_the_public_beacon_is_the_default_and_anything_else_a_rehearsal(tmp_path: Path) -> None:
+    later = datetime.now(UTC) + timedelta(days=1)
+    assert not rounds.open_round(tmp_path, "a", later, ["pid_best"]).opened.rehearsal
+    chain = referee.chain(SECRET)
+    assert rounds.open_round(tmp_path, "b", later, ["pid_best"], chain=chain).opened.rehearsal
+    for name in ("development", "a", "A/b", ".."):
+        with pytest.raises(InputError):
+            rounds.open_round(tmp_path, name, later, ["pid_best"])
+
+
+def test_entries_are_limited_by_account_and_not_by_name(fresh: Path) -> None:
+    own = freeze(fresh, ask("three", "Eve", 2), ask("one", "eve", 0), ask("two", "EVE", 1))
+    assert own.frozen is not None
+    assert [(x.name, x.account) for x in own.frozen.entries] == [
+        ("pid_robust", ""), ("one", "eve"), ("two", "eve")
+    ]  # fmt: skip
+    assert own.frozen.left_out == {"three": "account eve has 2 entries already"}
+    assert own.state == "frozen"
+
+
+def test_a_name_stays_with_its_account(fresh: Path) -> None:
+    freeze(fresh, ask("one", "eve"))
+    rounds.open_round(fresh, "r3", FROZEN, ["pid_robust"], chain=referee.chain(SECRET))
+    asked = [ask("one", "mallory"), ask("two", "mallory"), ask("pid_robust", "mallory")]
+    own = rounds.freeze(fresh, "r3", fresh.parent / "submissions", asked, ABOUT, now=FROZEN)
+    assert own.frozen is not None
+    assert {x.name: x.account for x in own.frozen.entries} == {"pid_robust": "", "two": "mallory"}
+    assert "another account" in own.frozen.left_out["one"]
+
+
+@pytest.mark.parametrize("author", ["Ada\\u200b", "\\u3164", "Аda", "A\\u0344\\ufe0fda"])
+def test_authors_who_look_like_others_are_left_out(fresh: Path, author: str) -> None:
+    path = fresh.parent / "submissions/one/submission.toml"
+    text = path.read_text()
+    start = text.index("authors = ")
+    end = text.index("\n", start)
+    path.write_text(f'{text[:start]}authors = ["{author}"]{text[end:]}')
+    own = freeze(fresh, ask("one", "eve"), ask("two", "eve"))
+    assert own.frozen is not None
+    assert [x.name for x in own.frozen.entries] == ["pid_robust", "two"]
+
+
+def test_nothing_is_frozen_early_or_twice_and_nothing_drawn_early(fresh: Path) -> None:
+    with pytest.raises(InputError, match="closes at"):
+        freeze(fresh, now=FROZEN - timedelta(seconds=1))
+    with pytest.raises(InputError, match="it must be frozen"):
+        rounds.draw(fresh, "r2", referee.value(SECRET, 1))
+    own = freeze(fresh)
+    with pytest.raises(InputError, match="frozen already"):
+        freeze(fresh)
+    with pytest.raises(InputError, match="has no draws yet"):
+        _ = own.seed
+    due = FROZEN + timedelta(seconds=60)
+    assert own.opened.chain.time_of(own.number) == due
+    value = referee.value(SECRET, own.number)
+    with pytest.raises(InputError, match="is published at"):
+        rounds.draw(fresh, "r2", value, now=due - timedelta(seconds=1))
+    # No other value can be chosen: neither the next one, nor one of another key.
+    for wrong in (referee.value(SECRET, own.number + 1), referee.value(SECRET + 1, own.number)):
+        with pytest.raises(InputError, match=r"key (round|signature)"):
+            rounds.draw(fresh, "r2", wrong, now=due)
+    assert rounds.draw(fresh, "r2", value, now=due).state == "drawn"
+
+
+def test_the_seed_is_of_the_entries_and_of_the_beacon(fresh: Path) -> None:
+    other = shutil.copytree(fresh.parent, fresh.parent.parent / "other") / "leaderboard"
+    (other.parent / "submissions/pid_robust/README.md").write_text("another entry")
+    seeds = set()
+    for board in (fresh, other):
+        own = freeze(board)
+        rounds.draw(board, "r2", referee.value(SECRET, own.number))
+        seeds.add(rounds.load(board, "r2").seed)
+    assert len(seeds) == 2
+    assert draw_tables.DEVELOPMENT_SEED not in seeds
+
+
+@pytest.mark.parametrize("name", ["round.toml", "protocol.json", "frozen.toml", "beacon.json"])
+def test_a_changed_byte_of_a_round_is_found(leaderboard: Path, simulators, name: str) -> None:
+    path = leaderboard / "rounds" / ROUND / name
+    assert verify(leaderboard, lambda: simulators).problems == [], "control"
+    flip(path, path.stat().st_size // 2)
+    assert verify(leaderboard, lambda: simulators).problems
+    flip(path, path.stat().st_size // 2)
+    # A byte that changes no value: in a date, a digit; else a space at the end.
+    path.write_bytes(path.read_bytes() + b" ")
+    assert verify(leaderboard, lambda: simulators).problems
+
+
+def test_a_changed_entry_or_protocol_is_found(
+    full: Path, entered: Path, simulators, tmp_path: Path
+) -> None:
+    folder = tmp_path / "clone"
+    board = shutil.copytree(full, folder / "leaderboard")
+    shutil.copytree(entered.parent / "submissions", folder / "submissions")
+    assert verify(board, lambda: simulators).problems == []
+    flip(folder / "submissions/harder/README.md", 10)
+    (problem,) = verify(board, lambda: simulators).problems
+    assert "harder is not what was frozen in round r1" in problem
+    flip(folder / "submissions/harder/README.md", 10)
+
+    class Other(type(simulators)):
+        def about(self):
+            return {**super().about(), "kind": "other"}
+
+    problems = verify(board, Other).problems
+    assert any("this ventbench has another protocol: simulators" in text for text in problems)
+
+
+def test_what_was_not_frozen_has_no_rank(leaderboard: Path, drafts, simulators) -> None:
+    own = leaderboard / "rounds" / ROUND / rounds.FROZEN
+    changed = json.loads(drafts["softer"].content)
+    changed["submission"]["manifest"]["name"] = "unknown"
+    made = type(drafts["softer"])(canonical.canonical(changed), drafts["softer"].commands)
+    put(leaderboard, made, simulators)
+    board = store.load(leaderboard)
+    record = next(x for x in board.scores if x.name == "unknown")
+    assert gate.simulated(record, board.evidence) == ("its code was not frozen in round r1",)
+    assert own.exists()
+
+
+def test_practice_is_never_ranked(drafts) -> None:
+    record = opened(drafts["softer"])
+    vouched = gate.Evidence(frozenset([record.sha256]))
+    assert gate.simulated(record, vouched) == (PRACTICE,)
+
+
+def _pid_bounds(own, simulators, pool, folder, **options):
+    """Bounds in no time: a tenth of the PID's errors."""
+    rigs = simulators.scored()
+    plants, cells = rigs.cells(own.draws(rigs), protocol.PIPS)
+    gains = np.tile([1.0, 5.0, 0.0], (6, 1))
+    pid = references.pid_errors(plants, cells, gains)
+    about = references.settings(rigs.about, own.draws(rigs).about())
+    zero = np.zeros((*pid.shape, 33))
+    return references.Reference(about, gains, 0.1 * pid, 0.1 * pid, 0.0 * pid, pid, zero)
+
+
+def test_a_round_is_scored_and_continues(fresh: Path, simulators, monkeypatch) -> None:
+    """Two entries, one of which cannot be run; the second time nothing runs again."""
+    monkeypatch.setattr(round_scoring, "bounds_of", _pid_bounds)
+    one = fresh.parent / "submissions/one/controller.py"
+    one.write_text("raise ValueError('no')\n" + one.read_text())
+    submissions = fresh.parent / "submissions"
+    own = rounds.freeze(
+        fresh, "r2", submissions, [ask("one", "eve")], simulators.about(), now=FROZEN
+    )
+    rounds.draw(fresh, "r2", referee.value(SECRET, own.number))
+    checkout = shutil.copytree(fresh, fresh.parent / "checkout" / "leaderboard")
+    monkeypatch.setattr(round_scoring, "DRAWS", 0)  # stress has tests of its own
+    ran: list[str] = []
+    run = round_scoring.run_protocol
+    monkeypatch.setattr(
+        round_scoring, "run_protocol",
+        lambda entry, *a, **b: ran.append(entry.manifest.name) or run(entry, *a, **b),
+    )  # fmt: skip
+
+    def score():
+        with executor() as pool:
+            return round_scoring.score(
+                fresh, "r2", pool, fresh.parent / "work", places=[submissions],
+                load=lambda: simulators, runner=InProcessRunner,
+            )  # fmt: skip
+
+    with monkeypatch.context() as broken:
+        broken.setattr(store, "add", lambda *_: 1 / 0)  # as if the machine had gone off
+        with pytest.raises(ZeroDivisionError):
+            score()
+    first, done = list(ran), score()
+    assert ran == first, "what was run was kept"
+    assert done.state == "scored"
+    assert done.result is not None
+    assert list(done.result.records) == ["pid_robust (performance)", "pid_robust (robustness)"]
+    assert any(key.startswith("one") and "no" in why for key, why in done.result.failed.items())
+    with pytest.raises(InputError, match="scored; it is scored once"):
+        score()
+    report = verify(fresh, lambda: simulators)
+    assert report.problems == []
+    assert report.replayed == len(done.result.records)
+    _proposed(fresh, checkout, simulators)
+
+
+def _proposed(scored: Path, leaderboard: Path, simulators) -> None:
+    """The job that may write takes from the other one what replays, and commits it."""
+    forged = shutil.copytree(leaderboard, scored.parent / "forged")
+    other = shutil.copytree(scored, scored.parent / "other")
+    path, _ = sorted((other / "records").glob("*.json"))
+    values = json.loads(path.read_bytes())
+    values["errors"]["drawn"][0][0][0] *= 0.5
+    content = canonical.canonical(values)
+    (path.parent / f"{canonical.digest(content)}.json").write_bytes(content)
+    result = json.loads((other / "rounds/r2/result.json").read_bytes())
+    result["records"] = dict.fromkeys(result["records"], canonical.digest(content))
+    (other / "rounds/r2/result.json").write_bytes(canonical.canonical(result))
+    with pytest.raises(InputError, match="does not replay"):
+        propose.add(other, forged, "r2", simulators)
+    assert not store.load(forged).scores
+    added = propose.add(scored, leaderboard, "r2", simulators)
+    assert {(x.name, x.track) for x in added} == {
+        ("pid_robust", "performance"), ("pid_robust", "robustness")
+    }  # fmt: skip
+    git = Git(leaderboard.parent)
+    git.output("init", "--quiet", "--template=")
+    assert propose.commit(leaderboard.parent, "r2", "scored") == "round/r2-scored"
+    assert git.text("log", "-1", "--format=%s") == "Round r2 is scored"
+    with pytest.raises(InputError, match="no name of a round"):
+        propose.commit(leaderboard.parent, "../r2", "scored")
+
+
+def test_code_that_changed_after_the_freeze_is_not_scored(fresh: Path, simulators) -> None:
+    own = freeze(fresh, ask("one", "eve"))
+    rounds.draw(fresh, "r2", referee.value(SECRET, own.number))
+    flip(fresh.parent / "submissions/one/controller.py", 5)
+    with pytest.raises(InputError, match="the code of one, as it was frozen"):
+        round_scoring.code_of(rounds.load(fresh, "r2"), [fresh.parent / "submissions"])
+
+
+def test_a_thousand_entries_are_planned(fresh: Path) -> None:
+    own = freeze(fresh)
+    table = msgspec.to_builtins(own.frozen, builtin_types=(datetime,))
+    entry = {**table["entries"][0], "account": "eve", "tracks": ["performance", "robustness"]}
+    table["entries"] = [{**entry, "name": f"entry_{k}"} for k in range(1000)]
+    (own.folder / rounds.FROZEN).write_text(tomli_w.dumps(table))
+    own = rounds.load(fresh, "r2")
+    rounds.draw(fresh, "r2", referee.value(SECRET, own.number))
+    runs = round_scoring.plan(rounds.load(fresh, "r2"))
+    assert len(runs) == len(set(runs)) == 2000
+
+
+class LookUp:
+    """Plays the published optimum of the development cell that looks most like this one."""
+
+    def reset(self, task) -> None:
+        rigs = load_rigs()
+        lung = [x.id for x in rigs.lungs].index(task.lung)
+        _, cells = rigs.cells(rigs.draws(draw_tables.COUNT), protocol.PIPS)
+        self.dt, self.target = (np.asarray(x)[lung].ravel() for x in (cells.dt, cells.pip))
+        self.commands = references.published().commands[lung].reshape(self.dt.size, -1)
+
+    def act(self, observation) -> float:
+        step = round(observation.time / observation.dt)
+        if step == 0:
+            off = np.abs(self.dt - observation.dt) / 1e-3 + np.abs(self.target - observation.target)
+            self.chosen = self.commands[np.argmin(off)]
+        return float(self.chosen[min(step, len(self.chosen) - 1)])
+
+
+def test_a_table_of_public_files_is_worse_than_the_pid_in_a_round(entered: Path) -> None:
+    """And far better than it on the draws that the files are of."""
+    rigs, pips = load_rigs(), (15.0, 30.0)
+    seed = rounds.load(entered, ROUND).seed
+    means = {}
+    for name, drawn in (
+        ("development", rigs.draws(2, pips)),
+        ("round", rigs.draws(2, pips, seed=seed, name=ROUND)),
+    ):
+        for entry in (as_submission(LookUp), as_submission("pid_best")):
+            result = run_protocol(entry, rigs, track="performance", drawn=drawn, pips=pips)
+            assert result.failures == ()
+            means[name, entry.manifest.name] = result.drawn.mean()
+    assert means["development", "lookup"] < means["development", "pid_best"], "control"
+    assert means["round", "lookup"] > means["round", "pid_best"]

@@ -1,0 +1,461 @@
+r"""Rounds: entries are frozen first, and a public beacon then says on what draws they are scored.
+
+A round is a folder ``rounds/NAME/`` of the leaderboard; each file is bound by the next one:
+
+- ``round.toml``: when it closes, the delay, the beacon's chain, how many entries an account has;
+- ``protocol.json``: every number that the score depends on besides entries and draws;
+- ``frozen.toml``: hashes of the two, the time, and of each entry account and hash of its files;
+- ``beacon.json``: the beacon's first value after freeze and delay;
+- ``bounds.npz``: best attainable and best PID of the draws, once the entries were scored;
+- ``result.json``: its hash, and what became of each entry.
+
+The seed of the draws is HMAC-SHA256 of the hash of ``frozen.toml`` with the beacon's randomness as
+the key. Nobody can know it before the freeze, and nobody can choose it: the number of the value is
+fixed by the time of the freeze. A round whose chain is not the pinned public one is a *rehearsal*.
+"""
+
+from __future__ import annotations
+
+import hmac
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+import tomli_w
+
+from ventbench.base import files
+from ventbench.base.errors import InputError
+from ventbench.base.text import deceptive
+from ventbench.board import beacon, canonical, schema
+from ventbench.board.beacon import QUICKNET, Chain, Value
+from ventbench.board.canonical import ROUNDS
+from ventbench.entries import reference as references
+from ventbench.entries.folder import Submission, open_submission
+from ventbench.entries.reference import Reference
+from ventbench.plants.rigs import Rigs
+from ventbench.task import draws as draw_tables
+from ventbench.task import protocol, stressors
+from ventbench.task.draws import DEVELOPMENT, Draws
+
+#: Files of a round, in the order in which they come to be.
+OPENED, PROTOCOL, FROZEN, BEACON, BOUNDS, RESULT = canonical.ROUND_FILES
+
+#: Time between freeze and beacon, s, and entries of an account, unless a round says otherwise.
+DELAY_S, LIMIT = 600, 3
+
+_PURPOSE = b"ventbench round 1\n"
+_MAX_BYTES = 5_000_000
+
+_Name = Annotated[str, schema.matching(canonical.ROUND_NAME)]
+_Account = Annotated[str, schema.matching(r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,62}[A-Za-z0-9])?")]
+TableT = TypeVar("TableT", bound="_Table")
+
+
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A table with exactly these keys."""
+
+
+class Opened(_Table, frozen=True):
+    """Content of ``round.toml``.
+
+    Attributes:
+        name: of the round.
+        opened: when, UTC.
+        closes: when entries are frozen at the earliest, UTC.
+        delay_s: least time from the freeze to the beacon's value, s.
+        limit: most entries of an account.
+        project: entries of the project, which no account asks for, baselines among them.
+        chain: of the beacon.
+    """
+
+    name: _Name
+    opened: datetime
+    closes: datetime
+    delay_s: Annotated[int, msgspec.Meta(ge=1, le=10**7)]
+    limit: Annotated[int, msgspec.Meta(ge=1, le=1000)]
+    project: list[schema.EntryName]
+    chain: Chain
+
+    @property
+    def rehearsal(self) -> bool:
+        """Whether a referee stands in for the public beacon: never official."""
+        return self.chain != QUICKNET
+
+
+class Request(_Table, frozen=True):
+    """Who asked for an entry, as the platform says, never the entry itself, and when."""
+
+    name: schema.EntryName
+    account: _Account
+    asked: datetime
+
+
+class Entered(_Table, frozen=True):
+    """A frozen entry; entries of the project have no account."""
+
+    name: schema.EntryName
+    account: str
+    sha256: schema.Sha256
+    tracks: list[schema.Track]
+
+
+class Frozen(_Table, frozen=True):
+    """Content of ``frozen.toml``; ``left_out`` says why an entry that was asked for is not in."""
+
+    round: schema.Sha256
+    protocol: schema.Sha256
+    frozen: datetime
+    entries: Annotated[list[Entered], msgspec.Meta(min_length=1)]
+    left_out: dict[str, str] = {}
+
+
+class Result(_Table, frozen=True):
+    """Content of ``result.json``: by entry and track a record, or why there is none."""
+
+    bounds: schema.Sha256
+    records: dict[str, schema.Sha256]
+    failed: dict[str, str] = {}
+
+
+@dataclass(frozen=True)
+class Round:
+    """A round as far as it has come; make one with :func:`load`.
+
+    Attributes:
+        folder: of the round.
+        opened: how it was opened.
+        frozen: its entries; None before.
+        value: of the beacon, checked; None before.
+        result: None before it is scored.
+        frozen_sha256: of ``frozen.toml``; empty before.
+    """
+
+    folder: Path
+    opened: Opened
+    frozen: Frozen | None = None
+    value: Value | None = None
+    result: Result | None = None
+    frozen_sha256: str = ""
+
+    @property
+    def name(self) -> str:
+        """Name of the round."""
+        return self.opened.name
+
+    @property
+    def state(self) -> str:
+        """``"open"``, ``"frozen"``, ``"drawn"`` or ``"scored"``."""
+        steps = (self.frozen, self.value, self.result)
+        return ("open", "frozen", "drawn", "scored")[sum(step is not None for step in steps)]
+
+    @property
+    def seed(self) -> bytes:
+        """Seed of the draws.
+
+        Raises:
+            InputError: if the beacon's value is not there yet.
+        """
+        if self.value is None:
+            raise InputError(f"round {self.name} is {self.state}: it has no draws yet")
+        key = bytes.fromhex(self.value.randomness)
+        return hmac.digest(key, _PURPOSE + bytes.fromhex(self.frozen_sha256), "sha256")
+
+    @property
+    def number(self) -> int:
+        """Round of the beacon whose value it must take."""
+        assert self.frozen is not None
+        delay = timedelta(seconds=self.opened.delay_s)
+        return self.opened.chain.first_at(self.frozen.frozen + delay)
+
+    @property
+    def commitment(self) -> str:
+        """Hash of the seed, as records state it."""
+        return draw_tables.commitment(self.seed)
+
+    def entered(self, name: str, track: str, sha256: str) -> bool:
+        """Whether this very code was frozen for a track."""
+        entries = self.frozen.entries if self.frozen else []
+        return any(x.name == name and x.sha256 == sha256 and track in x.tracks for x in entries)
+
+    def draws(self, rigs: Rigs) -> Draws:
+        """Draws of the round."""
+        return rigs.draws(draw_tables.COUNT, seed=self.seed, name=self.name)
+
+    def bounds(self) -> Reference:
+        """Best attainable and best PID of the draws.
+
+        Raises:
+            InputError: if the file is missing, or not that of the result.
+        """
+        path = self.folder / BOUNDS
+        reference = references.load(path)
+        if self.result is not None and files.sha256(path) != self.result.bounds:
+            raise InputError(f"{path} has been changed: it is not the file that {RESULT} names")
+        return reference
+
+
+def load(leaderboard: Path, name: str) -> Round:
+    """Read a round; what one file says of another must be so.
+
+    Raises:
+        InputError: naming the file that was changed.
+        OSError: if one cannot be read.
+    """
+    folder = leaderboard / ROUNDS / name
+    opened = _toml(folder / OPENED, Opened)
+    if opened.name != name or name == DEVELOPMENT:
+        raise InputError(f"{folder / OPENED}, key name: {opened.name} is not the folder's name")
+    made = Round(folder, opened)
+    if not (folder / FROZEN).exists():
+        return made
+    frozen = _toml(folder / FROZEN, Frozen)
+    for key, file in (("round", OPENED), ("protocol", PROTOCOL)):
+        if getattr(frozen, key) != files.sha256(folder / file):
+            raise InputError(f"{folder / file} has been changed since the round was frozen")
+    if frozen.frozen < opened.closes:
+        raise InputError(f"{folder / FROZEN}, key frozen: is before the round closed")
+    names = [entry.name for entry in frozen.entries]
+    if len(set(names)) < len(names):
+        raise InputError(f"{folder / FROZEN}, key entries: names one twice")
+    made = Round(folder, opened, frozen, frozen_sha256=files.sha256(folder / FROZEN))
+    if not (folder / BEACON).exists():
+        return made
+    path = folder / BEACON
+    canonical.parse(path.read_bytes(), str(path))
+    value = beacon.read(path.read_bytes(), str(path))
+    beacon.check(value, opened.chain, made.number, str(path))
+    result = None
+    if (folder / RESULT).exists():
+        path = folder / RESULT
+        canonical.parse(path.read_bytes(), str(path))
+        result = schema.decoded(_RESULT, path.read_bytes(), str(path))
+    return Round(folder, opened, frozen, value, result, made.frozen_sha256)
+
+
+def names(leaderboard: Path) -> list[str]:
+    """Names of the rounds of a leaderboard."""
+    return sorted(path.parent.name for path in (leaderboard / ROUNDS).glob(f"*/{OPENED}"))
+
+
+def load_all(leaderboard: Path) -> tuple[Round, ...]:
+    """All rounds, the newest first; arguments and errors as of :func:`load`."""
+    made = [load(leaderboard, name) for name in names(leaderboard)]
+    return tuple(sorted(made, key=lambda x: (x.opened.closes, x.name), reverse=True))
+
+
+def open_round(
+    leaderboard: Path,
+    name: str,
+    closes: datetime,
+    project: Sequence[str],
+    *,
+    delay_s: int = DELAY_S,
+    limit: int = LIMIT,
+    chain: Chain = QUICKNET,
+    now: datetime | None = None,
+) -> Round:
+    """Open a round; arguments as of :class:`Opened`.
+
+    Raises:
+        InputError: if there is such a round, or a value is out of range.
+    """
+    values = {
+        "name": name,
+        "opened": _seconds(now),
+        "closes": _seconds(closes),
+        "delay_s": delay_s,
+        "limit": limit,
+        "project": sorted(project),
+        "chain": msgspec.structs.asdict(chain),
+    }
+    try:
+        msgspec.convert(values, Opened)
+    except msgspec.ValidationError as error:
+        raise InputError(f"round {name!r}: {error}") from None
+    folder = leaderboard / ROUNDS / name
+    if name == DEVELOPMENT or folder.exists():
+        raise InputError(f"{folder} is there already, or its name is taken")
+    _write(folder / OPENED, tomli_w.dumps(values).encode())
+    return load(leaderboard, name)
+
+
+def freeze(
+    leaderboard: Path,
+    name: str,
+    submissions: Path,
+    requests: Sequence[Request],
+    simulators: Mapping[str, Any],
+    *,
+    now: datetime | None = None,
+) -> Round:
+    """Take the hashes of all entries; later changes do not count.
+
+    Args:
+        leaderboard: its folder.
+        name: of the round.
+        submissions: folder of the submissions, one each.
+        requests: who asked for each; entries of the project need none.
+        simulators: version and hashes.
+        now: time of the freeze; the clock's if not given.
+
+    Raises:
+        InputError: if the round is not open or has not closed yet, or nothing can be frozen.
+    """
+    own, at = load(leaderboard, name), _seconds(now)
+    if own.state != "open":
+        raise InputError(f"round {name} is {own.state} already")
+    if at < own.opened.closes:
+        raise InputError(f"round {name} closes at {own.opened.closes:%Y-%m-%d %H:%M:%S} UTC")
+    owners = _owners(leaderboard)
+    asked: dict[str, Request] = {}
+    for request in sorted(requests, key=lambda x: (x.asked, x.name)):
+        asked.setdefault(request.name, request)
+    order = [*own.opened.project, *(x for x in asked if x not in own.opened.project)]
+    entries: list[dict[str, Any]] = []
+    left_out: dict[str, str] = {}
+    count: dict[str, int] = {}
+    for entry in order:
+        account = "" if entry in own.opened.project else asked[entry].account.lower()
+        try:
+            submission = _named(submissions / entry, entry)
+            if owners.get(entry, account) != account:
+                raise InputError("the name belongs to another account since an earlier round")
+            if account and count.get(account, 0) >= own.opened.limit:
+                raise InputError(f"account {account} has {own.opened.limit} entries already")
+        except InputError as error:
+            left_out[entry] = str(error)[: schema.MAX_TEXT]
+            continue
+        count[account] = count.get(account, 0) + 1
+        tracks = list(submission.manifest.tracks)
+        entries.append(
+            {"name": entry, "account": account, "sha256": submission.sha256, "tracks": tracks}
+        )
+    if not entries:
+        raise InputError(f"round {name}: no entry can be frozen; {left_out}")
+    written = canonical.canonical(protocol_of(simulators))
+    _write(own.folder / PROTOCOL, written)
+    frozen = {
+        "round": files.sha256(own.folder / OPENED),
+        "protocol": canonical.digest(written),
+        "frozen": at,
+        "entries": entries,
+        "left_out": left_out,
+    }
+    _write(own.folder / FROZEN, tomli_w.dumps(frozen).encode())
+    return load(leaderboard, name)
+
+
+def _named(folder: Path, name: str) -> Submission:
+    """Open a submission that must have the name of its folder, and authors who can be read."""
+    if not folder.is_dir():
+        raise InputError(f"there is no folder {folder.name}")
+    submission = open_submission(str(folder))
+    if submission.manifest.name != name:
+        raise InputError(f"submission.toml calls it {submission.manifest.name}")
+    for author in submission.manifest.authors:
+        if why := deceptive(author):
+            raise InputError(f"submission.toml, key authors: {why}")
+    return submission
+
+
+def _owners(leaderboard: Path) -> dict[str, str]:
+    """Account of each name in the earliest round that has it."""
+    entries = (x for r in load_all(leaderboard) if r.frozen for x in r.frozen.entries)
+    return {entry.name: entry.account for entry in entries}
+
+
+def draw(leaderboard: Path, name: str, content: bytes, *, now: datetime | None = None) -> Round:
+    """Take the beacon's value.
+
+    Args:
+        leaderboard: its folder.
+        name: of the round.
+        content: value as relays publish it.
+        now: the clock's if not given.
+
+    Raises:
+        InputError: if the round is not frozen, the time has not come, or the value is not the one
+            that it must take.
+    """
+    own = load(leaderboard, name)
+    if own.state != "frozen":
+        raise InputError(f"round {name} is {own.state}; it must be frozen")
+    due = own.opened.chain.time_of(own.number)
+    if _seconds(now) < due:
+        raise InputError(f"round {own.number} of the beacon is published at {due:%F %T} UTC")
+    value = beacon.read(content, "the value of the beacon")
+    beacon.check(value, own.opened.chain, own.number, "the value of the beacon")
+    _write(own.folder / BEACON, canonical.canonical(msgspec.structs.asdict(value)))
+    return load(leaderboard, name)
+
+
+def protocol_of(simulators: Mapping[str, Any]) -> dict[str, Any]:
+    """Every number that a score depends on besides entry and draws, as JSON values."""
+    values = {
+        "simulators": dict(simulators),
+        "protocol": _constants(protocol),
+        "draws": _constants(draw_tables),
+        "pid": references.published().gains.tolist(),
+        "stress": [condition.id for condition in stressors.conditions()],
+        "stressors": stressors.VERSION,
+        "version": schema.PROTOCOL,
+    }
+    return canonical.through_json(values)
+
+
+def _constants(module: Any) -> dict[str, Any]:
+    """Public constants of a module that JSON can hold."""
+    kept = {}
+    for key, value in vars(module).items():
+        plain = isinstance(value, int | float | str | tuple | list | dict)
+        if key.isupper() and not key.startswith("_") and plain:
+            kept[key] = value
+    return kept
+
+
+def protocol_differences(own: Round, simulators: Mapping[str, Any]) -> list[str]:
+    """Parts of the protocol of a round that this ventbench does not have."""
+    path = own.folder / PROTOCOL
+    recorded, here = canonical.parse(path.read_bytes(), str(path)), protocol_of(simulators)
+    return [key for key in sorted({*recorded, *here}) if recorded.get(key) != here.get(key)]
+
+
+def read_requests(path: Path) -> list[Request]:
+    """Read who asked for which entry: a JSON list of objects with the keys of :class:`Request`.
+
+    Raises:
+        InputError: if it is no such file.
+    """
+    return schema.decoded(_REQUESTS, path.read_bytes(), str(path))
+
+
+def _seconds(when: datetime | None) -> datetime:
+    return (when or datetime.now(UTC)).astimezone(UTC).replace(microsecond=0)
+
+
+def _toml(path: Path, kind: type[TableT]) -> TableT:
+    try:
+        if path.is_symlink() or path.stat().st_size > _MAX_BYTES:
+            raise InputError(f"{path} is a link, or larger than {_MAX_BYTES} bytes")
+        table = msgspec.convert(tomllib.loads(path.read_text("utf-8")), kind)
+    except FileNotFoundError:
+        raise InputError(f"{path} is not there: there is no such round") from None
+    except (ValueError, RecursionError) as error:  # not UTF-8, not TOML, or not of this form
+        raise InputError(f"{path}: {error}") from None
+    for key in ("opened", "closes", "frozen"):
+        when = getattr(table, key, None)
+        if isinstance(when, datetime) and when.tzinfo is None:
+            raise InputError(f"{path}, key {key}: has no time zone; times are UTC")
+    return table
+
+
+def _write(path: Path, content: bytes) -> None:
+    files.write_atomically(path, lambda file: file.write(content))
+
+
+_RESULT = msgspec.json.Decoder(Result)
+_REQUESTS = msgspec.json.Decoder(list[Request])

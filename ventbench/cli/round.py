@@ -1,0 +1,260 @@
+"""``ventbench round``: open a round, freeze its entries, draw, score, show."""
+
+from __future__ import annotations
+
+import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ventbench.cli.board import FOLDER, Folder, tables_of
+from ventbench.cli.options import JsonFile, Scheduler, Workers, bars, emit
+
+if TYPE_CHECKING:
+    from ventbench.board.rounds import Round
+
+app = typer.Typer(
+    name="round",
+    help="Rounds of the leaderboard: freeze entries, draw by a public beacon, score.",
+    no_args_is_help=True,
+)
+
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the round.")]
+
+
+@app.command(name="open")
+def open_(
+    name: Name,
+    closes: Annotated[
+        datetime.datetime,
+        typer.Option(
+            formats=["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"],
+            help="When entries are frozen at the earliest, UTC.",
+        ),
+    ],
+    delay: Annotated[
+        int, typer.Option(min=1, help="Least time from the freeze to the beacon's value, s.")
+    ] = 600,
+    limit: Annotated[int, typer.Option(min=1, help="Most entries of an account.")] = 3,
+    project: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ENTRY",
+            help="Entry of the project, which no account asks for; may be repeated. Default: the "
+            "bundled submissions.",
+        ),
+    ] = None,
+    rehearsal: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Rehearse, with a referee in the place of the public beacon: JSON with "
+            "public_key, genesis, period and hash of the referee's chain. Never official.",
+        ),
+    ] = None,
+    folder: Folder = FOLDER,
+    json: JsonFile = None,
+) -> None:
+    """Open a round.
+
+    Example: `ventbench round open 2027-1 --closes 2027-03-01T12:00`
+    """
+    from ventbench.board import beacon, rounds
+    from ventbench.entries.folder import bundled
+
+    made = rounds.open_round(
+        folder,
+        name,
+        closes.replace(tzinfo=datetime.UTC),
+        project or bundled(),
+        delay_s=delay,
+        limit=limit,
+        chain=beacon.QUICKNET if rehearsal is None else beacon.chain_of(rehearsal),
+    )
+    _told(made, json)
+
+
+@app.command()
+def freeze(
+    name: Name,
+    submissions: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder with the submissions, one each.")
+    ] = Path("submissions"),
+    requests: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="JSON list of who asked for what: name, account and asked (time) of each entry.",
+        ),
+    ] = None,
+    folder: Folder = FOLDER,
+    json: JsonFile = None,
+) -> None:
+    """Take the hashes of all entries; from then on nobody can change one.
+
+    Example: `ventbench round freeze 2027-1 --requests requests.json`
+    """
+    from ventbench.board import rounds
+    from ventbench.plants import frozen
+
+    asked = [] if requests is None else rounds.read_requests(requests)
+    _told(rounds.freeze(folder, name, submissions, asked, frozen.load().about()), json)
+
+
+@app.command()
+def draw(
+    name: Name,
+    beacon: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Value of the beacon, as its relays and referees publish it; default: ask a "
+            "public relay. Its signature is checked either way.",
+        ),
+    ] = None,
+    folder: Folder = FOLDER,
+    json: JsonFile = None,
+) -> None:
+    """Take the beacon's first value after the freeze and the delay; the draws follow from it.
+
+    Example: `ventbench round draw 2027-1`
+    """
+    from ventbench.base.errors import InputError
+    from ventbench.board import beacon as beacons
+    from ventbench.board import rounds
+
+    own = rounds.load(folder, name)
+    if own.frozen is None:
+        raise InputError(f"round {name} is {own.state}; freeze its entries first")
+    content = beacon.read_bytes() if beacon else beacons.fetch(own.opened.chain, own.number)
+    _told(rounds.draw(folder, name, content), json)
+
+
+@app.command()
+def score(
+    name: Name,
+    source: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="DIR",
+            help="Code of the entries: a submission or a folder of them; may be repeated. "
+            "submissions/ beside the leaderboard is looked through anyway.",
+        ),
+    ] = None,
+    plan: Annotated[
+        bool, typer.Option("--plan", help="Only list what there is to run, and what is done.")
+    ] = False,
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="What is finished; the same command continues.")
+    ] = Path("runs/round"),
+    folder: Folder = FOLDER,
+    json: JsonFile = None,
+) -> None:
+    """Score every frozen entry in the full sandbox, and write the records.
+
+    Bounds of the draws come first. With a key in VENTBENCH_SIGNING_KEY the records are signed.
+
+    Example: `ventbench round score 2027-1 --workers 2`
+    """
+    import os
+
+    from ventbench.base.executor import executor
+    from ventbench.board import attestation, round_scoring, rounds
+
+    own = rounds.load(folder, name)
+    if plan:
+        runs = round_scoring.plan(own)
+        emit({"runs": runs}, json)
+        typer.echo(f"{len(runs)} runs of {len({x for x, _ in runs})} entries", err=str(json) == "-")
+        return
+    tasks = {}
+    with bars() as shown, executor(workers, scheduler) as pool:
+
+        def tell(what: str, done: int, count: int) -> None:
+            if what not in tasks:
+                tasks[what] = shown.add_task(what, total=count)
+            shown.update(tasks[what], completed=done, total=count)
+
+        made = round_scoring.score(
+            folder,
+            name,
+            pool,
+            out / name,
+            places=[folder.parent / "submissions", *(source or [])],
+            secret=os.environ.get(attestation.SECRET) or None,
+            progress=tell,
+        )
+    _told(made, json)
+
+
+@app.command()
+def show(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="Name of the round; default: list all.")
+    ] = None,
+    folder: Folder = FOLDER,
+    json: JsonFile = None,
+) -> None:
+    """Show how far a round is, who is in it, and its ranking.
+
+    Example: `ventbench round show 2027-1`
+    """
+    from ventbench.board import rounds
+
+    if name is None:
+        made = rounds.load_all(folder)
+        emit({"rounds": [_about(own) for own in made]}, json)
+        for own in made:
+            typer.echo(f"{own.name}: {own.state}", err=str(json) == "-")
+        return
+    own = rounds.load(folder, name)
+    _told(own, json)
+    if own.result is not None:
+        tables_of(folder, name, err=str(json) == "-")
+
+
+def _about(own: Round) -> dict[str, object]:
+    """What is known of a round, as JSON values."""
+    frozen = own.frozen
+    return {
+        "name": own.name,
+        "state": own.state,
+        "rehearsal": own.opened.rehearsal,
+        "closes": own.opened.closes.isoformat(),
+        "beacon_round": own.number if frozen else None,
+        "beacon_time": own.opened.chain.time_of(own.number).isoformat() if frozen else None,
+        "entries": [entry.name for entry in frozen.entries] if frozen else [],
+        "left_out": frozen.left_out if frozen else {},
+        "failed": own.result.failed if own.result else {},
+        "draws": own.commitment if own.value else None,
+    }
+
+
+def _told(own: Round, json: Path | None) -> None:
+    """Say how far a round is, and what comes next."""
+    from ventbench.base.text import plain
+
+    about, err = _about(own), str(json) == "-"
+    emit(about, json)
+    kind = "rehearsal" if own.opened.rehearsal else "round"
+    typer.echo(f"{kind} {own.name} is {own.state}", err=err)
+    if own.frozen is not None:
+        typer.echo(
+            f"{len(own.frozen.entries)} entries, {own.frozen_sha256}; value {own.number} of the "
+            f"beacon, at {about['beacon_time']}",
+            err=err,
+        )
+        reasons = {**own.frozen.left_out, **(own.result.failed if own.result else {})}
+        for entry, why in reasons.items():
+            typer.echo(f"{entry}: {plain(why)}", err=err)
+    following = {"open": "freeze", "frozen": "draw", "drawn": "score"}.get(own.state)
+    next_ = f"ventbench round {following} {own.name}" if following else "ventbench board build"
+    typer.echo(f"next: {next_}", err=err)
+
+
+def register(root: typer.Typer) -> None:
+    """Add the commands."""
+    root.add_typer(app)

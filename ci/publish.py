@@ -88,10 +88,13 @@ def _files(git: Git, tree: str) -> dict[str, tuple[str, str]]:
 def _require_published(
     listed: dict[str, tuple[str, str]], before: dict[str, tuple[str, str]]
 ) -> None:
-    """Refuse what lacks a published record or its commands; signatures go with a leaked key."""
-    lasting = (canonical.RECORD_SUFFIX, canonical.ACTIONS_SUFFIX)
+    """Refuse what lacks a published record, its commands, or a file of a round.
+
+    Signatures go with a leaked key.
+    """
+    lasting = (canonical.RECORD_SUFFIX, canonical.ACTIONS_SUFFIX, *canonical.ROUND_FILES)
     for name, content in before.items():
-        if name.startswith(f"{canonical.RECORDS}/") and name.endswith(lasting):
+        if canonical.named(name) and name.endswith(lasting):
             if name not in listed:
                 raise InputError(f"{LEADERBOARD}/{name} was published and is missing")
             if listed[name] != content:

@@ -8,12 +8,9 @@ import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from ventbench.entries.reference import Reference, settings
 from ventbench.entries.scaffold import contents
-from ventbench.task import draws as draw_tables
 
 from ..textbook_rigs import TextbookRigs
 
@@ -106,14 +103,3 @@ def demo() -> dict[str, bytes]:
 @pytest.fixture(scope="session")
 def simulators() -> TextbookRigs:
     return TextbookRigs()
-
-
-@pytest.fixture(scope="session")
-def reference(simulators: TextbookRigs) -> Reference:
-    """Reference errors of the textbook rigs: 0 and 1 cmH2O everywhere."""
-    own = simulators.scored()
-    drawn = own.draws(draw_tables.COUNT)
-    about = settings(own.about, drawn.about())
-    none = np.zeros((6, 1 + draw_tables.COUNT, 6))
-    gains, commands = np.zeros((6, 3)), np.zeros((*none.shape, 33))
-    return Reference(about, gains, none, none, none, none + 1.0, commands)

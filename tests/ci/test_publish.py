@@ -25,7 +25,7 @@ def files(*records, **others):
 @pytest.fixture
 def site(tmp_path):
     """Pages, and a copy of a record that nobody looks at."""
-    for name in ("index.html", "leaderboard.csv", "entries/robustness/a_1.html"):
+    for name in ("index.html", "leaderboard.csv", "entries/r1/robustness/a_1.html"):
         (tmp_path / "site" / name).parent.mkdir(exist_ok=True, parents=True)
         (tmp_path / "site" / name).write_text(name)
     (tmp_path / "site/records").mkdir()
@@ -52,7 +52,7 @@ def test_a_leaderboard_holds_plain_files_only(repository, site):
         "_config.yml",
         "records/index.html",
         f"records/{OTHER}.html",
-        "entries/performance/a.html",
+        "entries/r1/performance/a.html",
         "sw.js",
         ".well-known/security.txt",
     ],
@@ -65,7 +65,8 @@ def test_a_stray_file_is_not_published(repository, site, name):
 
 
 @pytest.mark.parametrize(
-    "name", ["404.html", "entries/x/a.html", "entries/performance/a.js", "entries/a.html", "CNAME"]
+    "name",
+    ["404.html", "entries/x/a.html", "entries/r1/performance/a.js", "a/a.html", "CNAME"],
 )
 def test_a_stray_page_is_not_published(repository, site, name):
     (site / name).parent.mkdir(exist_ok=True, parents=True)
@@ -78,7 +79,7 @@ def test_a_stray_page_is_not_published(repository, site, name):
 
 def test_links_and_empty_sites_are_not_published(repository, site, tmp_path):
     git, commit = Git(repository.folder), repository.commit(files(RECORD), repository.base)
-    (site / "entries/performance").symlink_to("/etc")
+    (site / "entries/r1/performance").symlink_to("/etc")
     with pytest.raises(InputError, match="is no page of a leaderboard"):
         publish.pages(git, commit, site)
     with pytest.raises(InputError, match=r"index\.html is missing"):
@@ -90,7 +91,7 @@ def test_what_was_built_is_published_beside_the_records_of_the_commit(repository
     made = publish.pages(Git(repository.folder), repository.commit(signed, repository.base), site)
     assert made is not None
     listed = repository.git("ls-tree", "-r", "--name-only", made).splitlines()
-    pages = ["index.html", "leaderboard.csv", "entries/robustness/a_1.html", ".nojekyll"]
+    pages = ["index.html", "leaderboard.csv", "entries/r1/robustness/a_1.html", ".nojekyll"]
     assert sorted(listed) == sorted(
         [*(name.removeprefix("leaderboard/") for name in signed), *pages]
     )

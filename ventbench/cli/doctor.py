@@ -22,6 +22,7 @@ _EXTRAS = {
     "dask": ("distributed",),
     "gym": ("gymnasium", "safetensors"),
     "attest": ("cryptography",),
+    "rounds": ("py-ecc",),
 }
 
 #: Free space that compiled functions, results and reports of a day of work may take, GiB.

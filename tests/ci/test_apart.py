@@ -1,0 +1,58 @@
+"""Records come alone, and requests are the platform's word."""
+
+from __future__ import annotations
+
+import pytest
+
+from ci import apart
+from ci.requests import requests
+from ventbench.base.errors import InputError
+
+RECORD = f"leaderboard/records/{'1' * 64}.json"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "leaderboard/attestations.toml",
+        "leaderboard/rounds/2027-1/round.toml",
+        "leaderboard/rounds/2027-1/frozen.toml",
+        "leaderboard/rounds/2027-1/protocol.json",
+        "leaderboard/rounds/2027-1/beacon.json",
+    ],
+)
+def test_records_do_not_come_with_what_vouches_for_them(path: str) -> None:
+    (problem,) = apart.problems([RECORD, "README.md", path])
+    assert path in problem
+    assert apart.problems([path, "README.md"]) == []
+
+
+def test_bounds_and_result_come_with_the_records_of_their_round() -> None:
+    own = ["leaderboard/rounds/2027-1/bounds.npz", "leaderboard/rounds/2027-1/result.json"]
+    assert apart.problems([RECORD, *own]) == []
+
+
+def test_the_job_reads_what_a_branch_changes(repository, monkeypatch, capsys) -> None:
+    alone = repository.commit({RECORD: b"{}"}, repository.base)
+    both = repository.commit({RECORD: b"{}", "leaderboard/attestations.toml": b""}, repository.base)
+    monkeypatch.chdir(repository.folder)
+    monkeypatch.setenv("BASE", repository.base)
+    for commit, code in ((alone, 0), (both, 1)):
+        monkeypatch.setenv("COMMIT", commit)
+        assert apart.main() == code
+    assert "propose it by itself first" in capsys.readouterr().out
+
+
+def test_requests_are_of_accounts() -> None:
+    merged = [
+        {"author": {"login": "eve"}, "mergedAt": "2027-01-02T00:00:00Z",
+         "files": [{"path": "submissions/one/controller.py"}, {"path": "submissions/one/a/b.py"}]},
+        {"author": {"login": "ada"}, "mergedAt": "2027-01-01T00:00:00Z",
+         "files": [{"path": "submissions/README.md"}, {"path": "submissions/two/x.py"}]},
+    ]  # fmt: skip
+    assert requests(merged) == [
+        {"name": "two", "account": "ada", "asked": "2027-01-01T00:00:00Z"},
+        {"name": "one", "account": "eve", "asked": "2027-01-02T00:00:00Z"},
+    ]
+    with pytest.raises(InputError):
+        requests([{"author": None}])

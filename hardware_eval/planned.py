@@ -163,8 +163,8 @@ class _Breathing:
         state, signals = self.plant.step(state, u_in, u_out, dt)
         return state, Signals(signals.reading)
 
-    def vary(self, r_scale: Array, c_scale: Array) -> _Breathing:
-        return _Breathing(self.plant.vary(r_scale, c_scale), self.state)
+    def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> _Breathing:
+        return _Breathing(self.plant.vary(r_scale, c_scale, gain), self.state)
 
     def parameters(self) -> Any:
         return self.plant.parameters()
@@ -238,7 +238,7 @@ def _errors(
     share = protocol.DT / (protocol.DT + TIME_CONSTANT)
 
     def error(gain: Array, cell: Scenario, state: Any, commands: Array, pressures: Array) -> Array:
-        varied = env.vary(_Breathing(plant, state), cell)
+        varied = env.vary(_Breathing(plant, state), cell, 0)
 
         def feedback(integral: Array, seen: Observation, planned: Any) -> tuple[Array, Array]:
             command, pressure = planned

@@ -27,8 +27,8 @@ class Balloon:
         after = state + u_in * dt / self.C
         return after, Signals(after)
 
-    def vary(self, r_scale, c_scale):
-        return Balloon(self.C * c_scale)
+    def vary(self, r_scale, c_scale, gain=1.0):
+        return Balloon(self.C * c_scale / gain)
 
     def parameters(self):
         return {"C": self.C}

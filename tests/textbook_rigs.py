@@ -45,8 +45,8 @@ class OffsetLung:
         after, signals = self.lung.step(state, u_in, u_out, dt)
         return after, signals._replace(reading=signals.reading + OFFSET)
 
-    def vary(self, r_scale: Array, c_scale: Array) -> OffsetLung:
-        return OffsetLung(self.lung.vary(r_scale, c_scale))
+    def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> OffsetLung:
+        return OffsetLung(self.lung.vary(r_scale, c_scale, gain))
 
     def parameters(self) -> dict[str, Array]:
         return self.lung.parameters()
@@ -57,7 +57,8 @@ class TextbookRigs:
 
     manifest_sha256 = "2" * 64
     rigs = tuple((2 * k, 2 * k + 1) for k in range(len(LUNGS)))
-    held_out_rigs = tuple(2 * k + 1 for k in range(len(LUNGS)))
+    held_out_rigs = tuple((2 * k + 1,) for k in range(len(LUNGS)))
+    population = None
 
     def __init__(self) -> None:
         with precision.float64():

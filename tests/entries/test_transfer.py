@@ -18,7 +18,7 @@ from ..textbook_rigs import TextbookRigs
 def rigs():
     # The first lung has no rig set aside: its other rig is one like all others.
     made = TextbookRigs()
-    return dataclasses.replace(made.scored(), held_out=(None, *made.held_out_rigs[1:]))
+    return dataclasses.replace(made.scored(), held_out=((), *made.held_out_rigs[1:]))
 
 
 @pytest.fixture(scope="module")

@@ -263,6 +263,14 @@ def test_nominal_variation_changes_nothing(name):
 
 
 @every_plant
+def test_a_larger_gain_gives_more_pressure(name):
+    plant, one = PLANTS[name](), jnp.asarray(1.0)
+    u_in = np.full((1, T), 12.0)
+    more = pressures(plant.vary(one, one, jnp.asarray(1.2)), u_in)
+    assert np.all(more[..., 10] > pressures(plant, u_in)[..., 10] + 0.3)
+
+
+@every_plant
 def test_its_parameters_are_physics_that_answer_alike(name):
     plant = PLANTS[name]()
     known = plant.parameters()
@@ -303,8 +311,8 @@ class FirstOrder:
         pressure = goal + (pressure - goal) * jnp.exp(-dt / self.tau)
         return (pressure, peep), Signals(pressure)
 
-    def vary(self, r_scale, c_scale):
-        return FirstOrder(self.gain * r_scale, self.tau * r_scale * c_scale)
+    def vary(self, r_scale, c_scale, gain=1.0):
+        return FirstOrder(self.gain * r_scale * gain, self.tau * r_scale * c_scale)
 
     def parameters(self):
         return None

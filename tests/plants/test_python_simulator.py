@@ -175,7 +175,7 @@ class Untraceable:
     def step(self, state, u_in, u_out, dt):
         return state, Signals(float(u_in) * self.R)
 
-    def vary(self, r_scale, c_scale):
+    def vary(self, r_scale, c_scale, gain=1.0):
         return self
 
     def parameters(self):

@@ -30,10 +30,11 @@ def nominal():
 
 def looped(plant, controller, cells):
     """The same run, step by step in Python, nothing compiled."""
-    plant = env.vary(plant, cells)
+    nominal = plant
     state = controller.init(cells.pip.shape)
     out = []
     for breath in range(3):
+        plant = env.vary(nominal, cells, breath)
         bench, rows = env.start_breath(plant, cells), []
         for step in range(100):
             pressure = bench.signals.reading

@@ -404,8 +404,9 @@ def _rounded(values: Floats) -> float:
 
 
 def _resampled(record: Record, values: Floats) -> Floats:
-    """Resampled means of values of shape ``(L, K)``: the same draws for every record."""
-    return bootstrap.resampled_scores(values, record.headroom.session, record.headroom.member)
+    """Resampled means of values of shape ``(L, k)``: the same ranked draws for every record."""
+    rigs, some = record.headroom, record.headroom.ranked
+    return bootstrap.resampled_scores(values, rigs.session[:, some], rigs.member[:, some])
 
 
 def _interval(values: Floats, means: Floats) -> Interval:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ventbench.base.errors import InputError
 from ventbench.board import canonical, schema
 from ventbench.entries.runs import Runs
-from ventbench.task import protocol
+from ventbench.task import draws, protocol
 from ventbench.task.metrics.score import normalised, passes_safety_gate
 from ventbench.task.stressors import VERSION as STRESSORS_VERSION
 from ventbench.task.stressors import condition_of
@@ -67,6 +67,11 @@ class RecordHeadroom:
     error: Floats
     attainable: Floats
     pid: Floats
+
+    @property
+    def ranked(self) -> NDArray[np.bool_]:
+        """Whether each draw is on rigs that nobody trained on, shape ``(K,)``."""
+        return draws.ranked(self.session)
 
     @cached_property
     def normalised(self) -> Floats:
@@ -178,7 +183,16 @@ class Record(schema.Submitted):
 
     @cached_property
     def ranked_values(self) -> Floats:
-        """What ranks: mean normalised score of each lung and draw, shape ``(L, K)``."""
+        """What ranks: mean normalised score of each lung and ranked draw, shape ``(L, k)``."""
+        return self._by_draw[:, self.headroom.ranked]
+
+    @cached_property
+    def training_values(self) -> Floats:
+        """The same of the draws on rigs of the training, to compare."""
+        return self._by_draw[:, ~self.headroom.ranked]
+
+    @property
+    def _by_draw(self) -> Floats:
         return self.headroom.normalised[1:].mean(axis=2).T
 
 
@@ -381,13 +395,13 @@ def _stress(values: schema.ScoreContent, label: str) -> RecordStress | None:
         raise InputError(
             f"{label}, key stress.conditions: must begin with none and name each condition once"
         )
-    draws = len(own.pips[0])
+    ranked = np.flatnonzero(draws.ranked(np.array(values.rigs.session)))[: len(own.pips[0])]
     tables = Runs(
         conditions=chosen,
         lungs=tuple(values.lungs),
         pips=np.array(own.pips, float),
-        rig=np.array(values.rigs.session)[:, :draws],
-        member=np.array(values.rigs.member)[:, :draws],
+        rig=np.array(values.rigs.session)[:, ranked],
+        member=np.array(values.rigs.member)[:, ranked],
         error=np.array(own.errors, float),
         safe=np.array(own.safe, bool),
         survived=np.array(own.survived, bool),

@@ -116,19 +116,21 @@ class Replayed:
 
 @jax.jit
 def _pressures(plants: Plant, cells: Scenario, requested: Array) -> Array:
-    """Airway pressures for commands of the same shape, ``(L, n, ..., S)``; cells ``(L, ...)``."""
+    """Airway pressures for commands of the same shape, ``(L, n, ..., S)``; cells ``(L, ...)``.
+
+    The n inspirations are all breaths of some runs, breath by breath.
+    """
 
     def lung(plant: Plant, cells: Scenario, commands: Array) -> Array:
-        varied = env.vary(plant, cells)
-
-        def inspiration(commands: Array) -> Array:
+        def inspiration(commands: Array, breath: Array) -> Array:
+            varied = env.vary(plant, cells, breath)
             _, _, pressure = rollouts.inspiration(
                 varied, cells, rollouts.commanded, inputs=jnp.moveaxis(commands, -1, 0),
                 record=lambda before, *_: before.signals.scored,
             )  # fmt: skip
             return jnp.moveaxis(pressure, 0, -1)
 
-        return jax.vmap(inspiration)(commands)
+        return jax.vmap(inspiration)(commands, jnp.arange(len(commands)) % protocol.BREATHS)
 
     return jax.vmap(lung)(plants, cells, requested)
 

@@ -159,7 +159,7 @@ def _check_replay(
     """Replay records and note in the report what differs.
 
     Returns:
-        What ranks as replayed, shape ``(L, K)``, by the record's hash; see
+        What ranks as replayed, shape ``(L, k)``, by the record's hash; see
         :attr:`ventbench.board.record.Record.ranked_values`.
     """
     by_draw: dict[str, Floats] = {}
@@ -325,7 +325,7 @@ def _replay_batch(
         report.problems += [f"{path}, {text}" for text in differences(score, replayed)]
         own, failed = score.headroom, np.isnan(score.drawn)
         values = normalised(replayed.controllable, own.attainable, own.pid)[1:]
-        by_draw[score.sha256] = np.where(failed, np.nan, values).mean(axis=2).T
+        by_draw[score.sha256] = np.where(failed, np.nan, values).mean(axis=2).T[:, own.ranked]
     return by_draw
 
 

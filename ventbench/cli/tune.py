@@ -41,8 +41,9 @@ def headroom(
 ) -> None:
     """Compute the best attainable error and the best PID of every cell of the development draws.
 
-    Commands are optimised for each cell with everything known; the best PID of a lung comes from
-    the paper's grid on all rigs of the lung. Takes minutes; the same command continues.
+    Commands are optimised for each cell with everything known; the best PID of a lung is searched
+    for without a grid's edge, on the rigs of the training. Takes minutes; the same command
+    continues.
 
     Example: `ventbench headroom --check data/bounds-v2.npz`
     """
@@ -53,7 +54,7 @@ def headroom(
     from ventbench.entries import reference as references
     from ventbench.plants.rigs import load_rigs
     from ventbench.task import draws, protocol
-    from ventbench.train import pid_grid
+    from ventbench.train.best_pid import best_pids
 
     console = Console(stderr=str(json) == "-")
     rigs = load_rigs()
@@ -73,7 +74,7 @@ def headroom(
     parts = out.with_suffix(".parts")
     with bars() as progress:
         task = progress.add_task("best PID of each lung", total=None)
-        gains, _ = pid_grid.best_pids(
+        pids = best_pids(
             rigs, progress=lambda done, all_: progress.update(task, completed=done, total=all_)
         )
         task = progress.add_task("best attainable", total=None)
@@ -81,7 +82,7 @@ def headroom(
             computed = references.compute(
                 plants,
                 cells,
-                gains,
+                pids.gains,
                 about,
                 folder=parts,
                 pool=pool,
@@ -93,6 +94,10 @@ def headroom(
         "file": str(out),
         "sha256": sha256,
         "gains": computed.gains.tolist(),
+        "searches": pids.search_gains.tolist(),
+        "search_errors": pids.search_errors.tolist(),
+        "searches_agree": pids.agree.tolist(),
+        "distance": np.round(computed.attainable - computed.lower, 6).tolist(),
         "attainable": float(computed.attainable.mean()),
         "lower": float(computed.lower.mean()),
         "pid": float(computed.pid.mean()),

@@ -116,7 +116,7 @@ def protocol_of(
         draws: how many of the development draws to run besides the nominal cells.
         drawn: other draws instead.
         pips: cmH2O.
-        stress: how many draws to run under missing physics.
+        stress: how many ranked draws to run under missing physics.
         stressors: names of the stressors; all conditions if empty.
         reference: best attainable and best PID of these simulators and draws; the published one if
             not given and it is of these.
@@ -127,11 +127,12 @@ def protocol_of(
     pips = tuple(float(pip) for pip in pips)
     if draws < 0 or stress < 0:
         raise InputError(f"{min(draws, stress)} draws: there cannot be fewer than none")
-    under_stress = drawn
+    every = drawn
     if drawn is None and draws:
         drawn = rigs.draws(draws, pips)
     if stress:
-        whole = rigs.draws(stress) if under_stress is None else under_stress.first(stress)
+        every = rigs.draws(draw_tables.COUNT) if every is None else every
+        whole = every.only(np.flatnonzero(every.ranked)).first(stress)
     if pips == protocol.PIPS:
         about = None if drawn is None else drawn.about()
         reference = reference_of(rigs.about, about, reference)
@@ -169,7 +170,7 @@ def _under_stress(rigs: Rigs, drawn: Draws, chosen: tuple[Condition, ...]) -> Ce
             lambda leaf: np.repeat(np.asarray(leaf)[:, None, None], n, axis=1), rigs.plants
         )
     else:
-        plants = draw_tables.plants_of(rigs.plants, drawn.rig, drawn.member)
+        plants = rigs.plants_of(drawn)
     nominal = np.asarray(protocol.PIPS)[columns][:, :, None]
     every = np.arange(1, n + 1)
     return Cells(rigs.lungs, chosen, plants, scenario, nominal, every, drawn.rig, drawn.member)

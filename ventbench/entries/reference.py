@@ -28,7 +28,7 @@ from ventbench.base.errors import InputError
 from ventbench.base.executor import InProcess, results
 from ventbench.base.resume import ARRAY, WorkFolder, fingerprint
 from ventbench.controllers.pid import PID
-from ventbench.task import attainable, rollouts
+from ventbench.task import attainable, protocol, rollouts
 from ventbench.task.attainable import second_optimum
 from ventbench.task.environment import Scenario
 from ventbench.task.interfaces import Plant
@@ -38,7 +38,7 @@ from ventbench.task.metrics import score as metric
 FILE = "bounds-v2.npz"
 
 #: Its SHA-256, as `ventbench headroom` prints it: a change of the bounds is a change of this line.
-SHA256 = "558d7c57af148feabb78e2df260d7aa3598cf8956e90af8655939398c6062eef"
+SHA256 = "ed3ec2e6265f81036aa01be49f27a8c715fd449bee5cb04c2737816a962e4db4"
 
 #: By how much a second optimiser may do better, cmH2O: a tenth of the least headroom.
 TOLERANCE = 0.1 * metric.LEAST_HEADROOM
@@ -48,6 +48,9 @@ MAX_BYTES = 20_000_000
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
+
+# Steps that the second start of a further breath opens the valve fully for.
+_FEW_STEPS = 4
 
 # Columns of a stored part before the commands.
 _COLUMNS = ("attainable", "lower", "stationarity", "pid")
@@ -68,7 +71,7 @@ class Reference:
         stationarity: first-order decrease that is left, cmH2O, shape ``(L, 1 + K, P)``; see
             :class:`ventbench.task.attainable.Attainable`.
         pid: error of the best PID with the noise of the draw, cmH2O, shape ``(L, 1 + K, P)``.
-        commands: of one inspiration, %, shape ``(L, 1 + K, P, COMMANDS)``.
+        commands: of each scored inspiration, %, shape ``(L, 1 + K, P, B, COMMANDS)``.
     """
 
     about: Mapping[str, Any]
@@ -260,22 +263,42 @@ def compute(
         report(len(parts) * lungs * pips, lungs * draws * pips)
     stacked = np.stack([parts[name] for name in names], axis=1)
     columns = {name: stacked[..., k] for k, name in enumerate(_COLUMNS)}
-    return Reference(
-        dict(about), np.asarray(gains), **columns, commands=stacked[..., len(_COLUMNS) :]
-    )
+    commands = stacked[..., len(_COLUMNS) :]
+    commands = commands.reshape(*commands.shape[:3], len(protocol.SCORED_BREATHS), -1)
+    return Reference(dict(about), np.asarray(gains), **columns, commands=commands)
 
 
 def _part(own: Plant, cell: Scenario, gains: Floats, starts: tuple[int, ...]) -> Floats:
     """Reference of one draw, shape ``(L, P, columns)``; cells have batch shape ``(L, 1, P)``."""
     lungs, _, pips = np.shape(cell.pip)
     pid = pid_errors(own, cell, gains)[:, 0]
-    flat = jax.tree.map(lambda x: x.reshape(lungs * pips, *x.shape[3:]), cell)
+    bounds: list[attainable.Attainable] = []
+    for breath in range(len(protocol.SCORED_BREATHS)):
+        # Another gain moves the best commands but little: the next breath begins there.
+        near = [bounds[0].commands, _FEW_STEPS] if bounds else starts
+        bounds.append(attainable.attainable(*_inspirations(own, cell, breath), starts=near))
+    columns = [np.mean([getattr(b, k) for b in bounds], axis=0) for k in ("error", "lower")]
+    columns += [np.max([b.stationarity for b in bounds], axis=0), pid.ravel()]
+    commands = np.concatenate([b.commands for b in bounds], axis=-1)
+    return np.column_stack([*columns, commands]).reshape(lungs, pips, -1)
+
+
+def _inspirations(plants: Plant, cells: Scenario, breath: int) -> tuple[Plant, Scenario]:
+    """One scored inspiration of each cell, on one axis, with its plant.
+
+    Args:
+        plants: leaves ``(L, n, 1, ...)``.
+        cells: batch shape ``(L, n, P)``.
+        breath: which of the scored ones.
+    """
+    shape = np.shape(cells.pip)
+    size, at = int(np.prod(shape)), protocol.SCORED_BREATHS[breath]
     each = jax.tree.map(
-        lambda x: np.broadcast_to(x, (lungs, 1, pips, *x.shape[3:])).reshape(-1, *x.shape[3:]), own
+        lambda x: np.broadcast_to(x, (*shape, *np.shape(x)[3:])).reshape(size, *np.shape(x)[3:]),
+        plants,
     )
-    bound = attainable.attainable(each, flat, starts=starts)
-    errors = np.stack([bound.error, bound.lower, bound.stationarity, pid.ravel()], axis=-1)
-    return np.concatenate([errors, bound.commands], axis=-1).reshape(lungs, pips, -1)
+    flat = jax.tree.map(lambda x: np.asarray(x).reshape(size, *np.shape(x)[3:]), cells)
+    return each, flat.replace(gain=flat.gain[:, [at]], noise=np.zeros((size, 1, 1)))
 
 
 def witness_errors(reference: Reference, plants: Plant, cells: Scenario) -> Floats:
@@ -286,17 +309,14 @@ def witness_errors(reference: Reference, plants: Plant, cells: Scenario) -> Floa
         plants: leaves ``(L, 1 + K, 1, ...)``.
         cells: batch shape ``(L, 1 + K, P)``.
     """
-    shape = np.shape(cells.pip)
-    size = int(np.prod(shape))
-    each = jax.tree.map(
-        lambda x: np.broadcast_to(x, (*shape, *np.shape(x)[3:])).reshape(size, *np.shape(x)[3:]),
-        plants,
-    )
-    flat = jax.tree.map(lambda x: np.asarray(x).reshape(size, *np.shape(x)[3:]), cells)
-    commands = reference.commands.reshape(size, -1)
-    with precision.float64():
-        pressure = attainable.pressures(each, flat, commands)
-    return np.mean(np.abs(pressure - flat.pip[:, None]), axis=1).reshape(shape)
+    errors = []
+    for breath in range(len(protocol.SCORED_BREATHS)):
+        each, flat = _inspirations(plants, cells, breath)
+        commands = reference.commands[..., breath, :].reshape(len(flat.pip), -1)
+        with precision.float64():
+            pressure = attainable.pressures(each, flat, commands)
+        errors.append(np.mean(np.abs(pressure - flat.pip[:, None]), axis=1))
+    return np.mean(errors, axis=0).reshape(np.shape(cells.pip))
 
 
 def checked(
@@ -321,10 +341,13 @@ def checked(
     off = np.abs(witness_errors(reference, plants, cells) - reference.attainable)
     pid = np.abs(pid_errors(plants, cells, reference.gains) - reference.pid)
     shape = np.shape(cells.pip)
-    at = np.unravel_index(np.arange(0, int(np.prod(shape)), every), shape)
-    own = jax.tree.map(lambda x: np.asarray(x)[at[0], at[1], 0], plants)
-    second = second_optimum(own, jax.tree.map(lambda x: np.asarray(x)[at], cells))
-    lead = reference.attainable[at] - second
+    some = np.arange(0, int(np.prod(shape)), every)
+    at = np.unravel_index(some, shape)
+    second = []
+    for breath in range(len(protocol.SCORED_BREATHS)):
+        picked = jax.tree.map(lambda x: x[some], _inspirations(plants, cells, breath))
+        second.append(second_optimum(*picked))
+    lead = reference.attainable[at] - np.mean(second, axis=0)
     gap = reference.attainable - reference.lower
     result: dict[str, Any] = {
         "cells": int(np.prod(shape)),

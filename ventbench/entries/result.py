@@ -145,6 +145,11 @@ class Score:
         return None if reference is None else reference.normalised(self.controllable)
 
     @property
+    def ranked(self) -> NDArray[np.bool_]:
+        """Whether each draw is on rigs that nobody trained on, shape ``(K,)``."""
+        return np.zeros(0, bool) if self.rig_draws is None else self.rig_draws.ranked
+
+    @property
     def official(self) -> bool:
         """Whether nothing stands in the way of calling it so, see :attr:`not_official_because`."""
         return not self.not_official_because
@@ -220,8 +225,9 @@ class Score:
 
         Returns:
             Columns ``score_cmH2O`` (nominal), ``draws_cmH2O`` (mean over the draws; only with
-            draws), ``normalised`` (over the draws, or nominal without; only with a reference),
-            ``safe`` and ``peak_cmH2O`` (highest pressure of any run).
+            draws), ``normalised`` (over the ranked draws, or nominal without; only with a
+            reference), ``held_out_gap`` (that less the same on rigs of the training), ``safe`` and
+            ``peak_cmH2O`` (highest pressure of any run).
         """
         import pandas as pd
 
@@ -229,9 +235,13 @@ class Score:
         if len(self.drawn):
             columns["draws_cmH2O"] = lung_score(self.drawn).mean(axis=0)
         if (values := self.normalised) is not None:
+            ranked = self.ranked
             columns["normalised"] = (
-                values[:, 1:].mean((1, 2)) if len(self.drawn) else values[:, 0].mean(1)
+                values[:, 1:][:, ranked].mean((1, 2)) if len(ranked) else values[:, 0].mean(1)
             )
+            if len(ranked) > ranked.sum():
+                training = values[:, 1:][:, ~ranked].mean((1, 2))
+                columns["held_out_gap"] = columns["normalised"] - training
         columns |= {"safe": self.safe, "peak_cmH2O": self.peak}
         return pd.DataFrame(columns, index=pd.Index(self.lungs, name="lung"))
 
@@ -312,16 +322,23 @@ class Score:
         }
 
     def _draws(
-        self, values: Floats, *, first: int = 0, published: bool = False
+        self,
+        values: Floats,
+        *,
+        first: int = 0,
+        published: bool = False,
+        some: NDArray[np.bool_] | slice = slice(None),
     ) -> dict[str, Any] | None:
-        """Mean over draws, shape ``(K, lungs)``, of all lungs or of those from ``first`` on."""
+        """Mean over some draws, ``(k, lungs)``, of all lungs or of those from ``first`` on."""
         if not len(values):
             return None
         assert self.rig_draws is not None
         means = values.mean(axis=1)
         # A draw that failed must not be left out of a mean.
         finite = bool(np.isfinite(means).all())
-        score, ci95 = self._over_rigs(values, first) if finite else (math.nan, (math.nan,) * 2)
+        score, ci95 = (
+            self._over_rigs(values, first, some) if finite else (math.nan, (math.nan,) * 2)
+        )
         about = self.rig_draws.about()
         return {
             "score": number(score),
@@ -331,26 +348,35 @@ class Score:
         }
 
     def _normalised(self, lung: int | None = None) -> dict[str, Any]:
-        """Normalised score of a lung or of all; null without a reference."""
+        """Normalised score of a lung or of all; null without a reference.
+
+        ``draws`` are those on rigs that nobody trained on, which rank; ``training`` is the score on
+        rigs of the training, and ``held_out_gap`` the difference.
+        """
         values, reference = self.normalised, self.protocol.reference
         if values is None or reference is None:
             return {"normalised": None}
         lungs = slice(None) if lung is None else slice(lung, lung + 1)
-        drawn = lung_score(values[lungs, 1:]).T
+        drawn, ranked = lung_score(values[lungs, 1:]).T, self.ranked
+        training = drawn[~ranked].mean() if len(ranked) > ranked.sum() else math.nan
         return {
             "normalised": {
                 "nominal": number(np.mean(values[lungs, 0])),
-                "draws": self._draws(drawn, first=lung or 0),
+                "draws": self._draws(drawn[ranked], first=lung or 0, some=ranked),
+                "training": number(training),
+                "held_out_gap": number(drawn[ranked].mean() - training) if ranked.any() else None,
                 "attainable_cmH2O": float(reference.attainable[lungs].mean()),
                 "pid_cmH2O": float(reference.pid[lungs].mean()),
             }
         }
 
-    def _over_rigs(self, values: Floats, first: int) -> tuple[float, tuple[float, float]]:
+    def _over_rigs(
+        self, values: Floats, first: int, some: NDArray[np.bool_] | slice
+    ) -> tuple[float, tuple[float, float]]:
         """Mean over draws with its interval, which resamples draws, rigs and members."""
         assert self.rig_draws is not None
         lungs = slice(first, first + values.shape[1])
-        rig, member = self.rig_draws.rig[lungs], self.rig_draws.member[lungs]
+        rig, member = self.rig_draws.rig[lungs, some], self.rig_draws.member[lungs, some]
         resampled = bootstrap.resampled_scores(values.T, rig, member)
         low, high = np.quantile(resampled, (0.025, 0.975))
         return float(values.mean()), (float(low), float(high))

@@ -304,7 +304,7 @@ def runs_of(run: ProtocolRun, cells: Cells, submission: Submission, tasks: Seque
 
 
 #: Where an entry is tried, in the order of the table.
-GROUPS = ("reference rig", "other members", "other rigs", "held-out rig")
+GROUPS = ("reference rig", "other members", "other rigs", "held-out rigs")
 
 
 def transfer(
@@ -361,9 +361,9 @@ def by_group(runs: Runs, rigs: Rigs) -> dict[str, Any]:
     table = runs.to_frame().drop_duplicates(["lung", "pip_cmH2O", "rig", "member"])
     assert rigs.sessions is not None
     reference = {lung: own[0] for lung, own in zip(runs.lungs, rigs.sessions, strict=True)}
-    apart = dict(zip(runs.lungs, rigs.held_out, strict=False))
+    apart = {rig for rigs_of_lung in rigs.held_out for rig in rigs_of_lung}
     at_home = table.rig == table.lung.map(reference)
-    kinds = [at_home & (table.member == 0), at_home, table.rig != table.lung.map(apart)]
+    kinds = [at_home & (table.member == 0), at_home, ~table.rig.isin(apart)]
     table["group"] = np.select(kinds, GROUPS[:3], GROUPS[3])
     groups = {}
     for group in GROUPS:

@@ -78,9 +78,9 @@ def _strong(tree: Any) -> Any:
 
 
 @jax.jit
-def _begin(plants: Plant, scenario: Scenario) -> tuple[Plant, env.LoopState]:
+def _begin(plants: Plant, scenario: Scenario, breath: Array) -> tuple[Plant, env.LoopState]:
     def begin(plant: Plant, scenario: Scenario) -> tuple[Plant, env.LoopState]:
-        varied = env.vary(plant, scenario)
+        varied = env.vary(plant, scenario, breath)
         return varied, env.start_breath(varied, scenario)
 
     return _strong(jax.vmap(begin)(plants, scenario))
@@ -154,9 +154,9 @@ def step_through(
     total = protocol.BREATHS * steps
     pressure, requested, applied, volume = (np.zeros((cells, total)) for _ in range(4))
     each = [task for task in tasks for _ in range(cells // len(tasks))]
-    breaths = range(protocol.BREATHS if changing else 1)
+    breaths = range(protocol.BREATHS)
     parts = [jax.tree.map(lambda x, k=k: x[:, k], plants) if changing else plants for k in breaths]
-    begun = [_begin(part, scenario) for part in parts]
+    begun = [_begin(part, scenario, k) for k, part in enumerate(parts)]
     loop, seconds = begun[0][1], []
     has_volume = loop.signals.volume is not None
     # Cells go on by themselves: what one takes, no other one waits for.
@@ -179,7 +179,7 @@ def step_through(
             u_in, moved = np.zeros(cells), np.zeros(cells, bool)
             u_in[ready], moved[ready] = commands, True
             for k, (varied, _) in enumerate(begun):
-                own = moved & (given // steps == k) if changing else moved
+                own = moved & (given // steps == k)
                 if own.any():
                     loop, now = _inspire(
                         varied, scenario, loop, u_in.reshape(batch), own.reshape(batch)
@@ -187,7 +187,7 @@ def step_through(
                     applied[own, given[own]] = _of_cells(now, batch)[own]
             given[ready] += 1
             for k, (_, rest) in enumerate(begun):
-                fresh = moved & (given % steps == 0) & ((given // steps == k) | (not changing))
+                fresh = moved & (given % steps == 0) & (given // steps == k)
                 if fresh.any():
                     loop = _where(fresh.reshape(batch), rest, loop)
             ready = ready[given[ready] < total]

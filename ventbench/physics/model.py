@@ -163,11 +163,11 @@ class Physics:
         """What the sensor shows of a pressure that does not change, cmH2O."""
         return solver.sensor_output(self._assembly(), jnp.asarray(pressure))
 
-    def vary(self, r_scale: Array, c_scale: Array) -> Physics:
-        """Return the model with scaled resistance and compliance."""
-        scales = {"R": r_scale, "C": c_scale}
+    def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> Physics:
+        """Return the model with scaled resistance, compliance and gain of the valve."""
+        scales = {"R": r_scale, "C": c_scale, "gain": gain}
         varied = [
-            value * scales.get(parameter(name).follows or "", 1.0)
+            value * scales.get(parameter(name).follows or name, 1.0)
             for name, value in zip(self.names, self.values, strict=True)
         ]
         return self.replace(values=tuple(varied))  # type: ignore[attr-defined]

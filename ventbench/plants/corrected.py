@@ -63,10 +63,10 @@ class Corrected:
         own, less = self.without_mechanisms.step(state[2], u_in, u_out, dt)
         return (simulator, wanted, own), corrected_signals(shown, more, less)
 
-    def vary(self, r_scale: Array, c_scale: Array) -> Corrected:
-        """Return the same lung with another resistance and compliance."""
+    def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> Corrected:
+        """Return the same lung with another resistance, compliance and gain."""
         parts = (self.simulator, self.with_mechanisms, self.without_mechanisms)
-        return Corrected(*(part.vary(r_scale, c_scale) for part in parts))
+        return Corrected(*(part.vary(r_scale, c_scale, gain) for part in parts))
 
     def parameters(self) -> dict[str, Array] | None:
         """Those with the mechanisms; see :class:`~ventbench.task.interfaces.Plant`."""
@@ -128,9 +128,10 @@ class Stressed:
         signals = corrected_signals(seen, more, less)._replace(volume=more.volume)
         return (simulator, physics), signals
 
-    def vary(self, r_scale: Array, c_scale: Array) -> Stressed:
+    def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> Stressed:
         """Return the same lung with another resistance and compliance."""
-        return Stressed(self.simulator.vary(r_scale, c_scale), self.physics.vary(r_scale, c_scale))
+        parts = (self.simulator, self.physics)
+        return Stressed(*(part.vary(r_scale, c_scale, gain) for part in parts))
 
     def parameters(self) -> dict[str, Array]:
         """Those with the stressor; see :class:`~ventbench.task.interfaces.Plant`."""

@@ -23,13 +23,24 @@ from ventbench.base.errors import InputError
 from ventbench.base.files import data_path
 from ventbench.plants.hybrid import Hybrid
 from ventbench.plants.plant_files import load_plant
+from ventbench.plants.population import RigPopulation
+from ventbench.plants.population import load as load_population
 from ventbench.plants.sessions import Sessions
 from ventbench.recordings.breaths import Breaths
 from ventbench.recordings.identity import Fingerprints, fingerprints, match, repetitions
 
 #: Format of the manifest.
 FORMAT = "ventbench-simulators-2"
+ROLES_FORMAT = "ventbench-population-1"
 MANIFEST, MEMBERS, SEEN = "manifest.toml", "hybrid.npz", "seen.npz"
+POPULATION = "population.npz"
+
+#: What rounds draw rigs from, and the rigs that are held out: beside the manifest, whose hash every
+#: score names.
+ROLES = "population.toml"
+
+#: SHA-256 of the official one, which holds that of the population.
+ROLES_SHA256 = "6ba57c9d353db6769c4424301448654bff65701c65e11e7a05797fbce7410c50"
 
 #: SHA-256 of the official manifest, which holds those of all its files.
 MANIFEST_SHA256 = "e4b214dd47b9233918260c0576bf76ce15eb1629309be0ae05cf04394fe368e9"
@@ -76,6 +87,7 @@ class Frozen:
         sessions: what a breath's clock is compared with.
         members: float64 leaves ``(members, sessions, ...)``.
         seen: the breaths of the training.
+        population: that rigs of each lung are drawn from; None where none was fitted.
     """
 
     folder: Path
@@ -84,6 +96,7 @@ class Frozen:
     sessions: Sessions
     members: Hybrid
     seen: Seen
+    population: RigPopulation | None = None
 
     @property
     def lung_ids(self) -> tuple[str, ...]:
@@ -104,18 +117,34 @@ class Frozen:
         return tuple(tuple(about["rigs"]) for about in self.manifest["lungs"].values())
 
     @property
-    def held_out_rigs(self) -> tuple[int | None, ...]:
-        """For each lung the scored session on which no entry of ours may be trained.
+    def held_out_rigs(self) -> tuple[tuple[int, ...], ...]:
+        """For each lung the scored sessions on which no entry may be trained.
 
-        None where too few sessions passed to spare one.
+        At least a third of those that passed, by the rule of
+        :func:`ventbench.train.rigs.train.choose_rigs`; none where only one passed.
         """
-        return tuple(about.get("held_out_rig") for about in self.manifest["lungs"].values())
+        return self._of_lungs("held_out_rigs")
+
+    @property
+    def seen_rigs(self) -> tuple[tuple[int, ...], ...]:
+        """Those of :attr:`held_out_rigs` that entries were trained on before they were held out."""
+        return self._of_lungs("seen_rigs")
+
+    @property
+    def roles(self) -> dict[str, dict[str, list[int]]]:
+        """Rigs that are held out and seen, by lung, as :data:`ROLES` holds them."""
+        keys = ("held_out_rigs", "seen_rigs")
+        lungs = self.manifest["lungs"].items()
+        return {lung: {key: about[key] for key in keys if key in about} for lung, about in lungs}
+
+    def _of_lungs(self, key: str) -> tuple[tuple[int, ...], ...]:
+        return tuple(tuple(about.get(key, ())) for about in self.manifest["lungs"].values())
 
     @property
     def training_rigs(self) -> tuple[tuple[int, ...], ...]:
-        """For each lung :attr:`rigs` without the one of :attr:`held_out_rigs`."""
+        """For each lung :attr:`rigs` without those of :attr:`held_out_rigs`."""
         pairs = zip(self.rigs, self.held_out_rigs, strict=True)
-        return tuple(tuple(rig for rig in rigs if rig != apart) for rigs, apart in pairs)
+        return tuple(tuple(rig for rig in rigs if rig not in apart) for rigs, apart in pairs)
 
     @property
     def rejected(self) -> dict[int, str]:
@@ -223,20 +252,34 @@ def load(path: Path | None = None) -> Frozen:
         names = [field.name for field in fields(Fingerprints)]
         known = Seen(Fingerprints(*(arrays[name] for name in names)), arrays["fold"])
     table = Sessions.from_list(manifest["sessions"])
-    return Frozen(path, manifest, files.sha256(path / MANIFEST), table, members, known)
+    drawn = None
+    if POPULATION in manifest["files"]:
+        drawn = load_population(_checked(path, POPULATION, manifest))
+    return Frozen(path, manifest, files.sha256(path / MANIFEST), table, members, known, drawn)
 
 
 def _manifest(path: Path) -> dict[str, Any]:
-    try:
-        manifest = tomllib.loads((path / MANIFEST).read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path / MANIFEST} cannot be read: {error}") from error
-    if manifest.get("format") != FORMAT:
-        raise InputError(
-            f"{path / MANIFEST}, key format: {manifest.get('format')!r} is not {FORMAT!r}; this "
-            "ventbench reads no other"
-        )
+    manifest = _toml(path / MANIFEST, FORMAT)
+    if (path / ROLES).is_file():
+        roles = _toml(path / ROLES, ROLES_FORMAT)
+        for lung, own in roles.get("lungs", {}).items():
+            manifest["lungs"][lung] |= own
+        manifest["files"] |= roles["files"]
+        manifest["population"] = roles["population"]
     return manifest
+
+
+def _toml(path: Path, form: str) -> dict[str, Any]:
+    try:
+        values = tomllib.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read: {error}") from error
+    if values.get("format") != form:
+        raise InputError(
+            f"{path}, key format: {values.get('format')!r} is not {form!r}; this ventbench reads "
+            "no other"
+        )
+    return values
 
 
 def _checked(path: Path, name: str, manifest: dict[str, Any]) -> Path:

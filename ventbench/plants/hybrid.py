@@ -249,10 +249,13 @@ class Hybrid:
         pressure = pressure - excess + RELIEF_ROOM * (1.0 - jnp.exp(-excess / RELIEF_ROOM))
         return elastic, pressure - recoil, pressure
 
-    def vary(self, r_scale: Array, c_scale: Array) -> Hybrid:
-        """Return the same rig with another resistance and compliance of the lung."""
+    def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> Hybrid:
+        """Return the same rig with another resistance and compliance, and gain of the valve."""
         return self.replace(  # type: ignore[attr-defined]
-            R=self.R * r_scale, K2=self.K2 * r_scale, E=self.E / c_scale
+            R=self.R * r_scale,
+            K2=self.K2 * r_scale,
+            E=self.E / c_scale,
+            slopes=self.slopes * jnp.asarray(gain)[..., None],
         )
 
     def parameters(self) -> dict[str, Array]:

@@ -306,19 +306,19 @@ class Learned:
             going,
         ), Signals(pressure)
 
-    def vary(self, r_scale: Array, c_scale: Array) -> Learned:
-        """Return the plant of a lung with other R and C, through two exact symmetries.
+    def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> Learned:
+        """Return the plant of a lung with other R, C and gain, by two exact symmetries.
 
         A network has no R and C, but an R-C lung obeys ``p = R q + integral(q dt) / C``: R and
         1 / C together ``r`` times larger answer like ``r`` times the flow; both time constants
         ``s`` times longer answer like steps of ``dt / s``. So commands are multiplied by
-        ``r_scale`` and intervals divided by ``r_scale c_scale``. Exact for a linear lung and
+        ``r_scale gain`` and intervals divided by ``r_scale c_scale``. Exact for a linear lung and
         valve; the valve's own lag is scaled along, which is small for the few percent that the
         published draws vary.
         """
         return replace(
             self,
-            valve_scale=self.valve_scale * r_scale,
+            valve_scale=self.valve_scale * r_scale * gain,
             time_scale=self.time_scale * r_scale * c_scale,
         )
 

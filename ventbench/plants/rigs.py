@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
+import numpy as np
 
 from ventbench.plants import frozen
 from ventbench.plants.catalog import Given, load_simulators
+from ventbench.plants.population import RigPopulation
 from ventbench.task import draws as draw_tables
 from ventbench.task import protocol
 from ventbench.task.draws import Draws
@@ -29,7 +31,8 @@ class Rigs:
         sessions: scored sessions of each lung, the reference rig first; None for one rig each.
         about: version and hashes, for the result.
         sha256: of the manifest of the frozen simulators; None for others.
-        held_out: for each lung the scored session that no entry of ours was trained on, or None.
+        held_out: for each lung the scored sessions that no entry may be trained on.
+        population: that further rigs are drawn from; None for none.
     """
 
     lungs: tuple[Lung, ...]
@@ -37,7 +40,8 @@ class Rigs:
     sessions: tuple[tuple[int, ...], ...] | None = None
     about: Mapping[str, Any] = field(default_factory=dict)
     sha256: str | None = None
-    held_out: tuple[int | None, ...] = ()
+    held_out: tuple[tuple[int, ...], ...] = ()
+    population: RigPopulation | None = None
 
     @property
     def members(self) -> int:
@@ -52,19 +56,46 @@ class Rigs:
         seed: bytes = draw_tables.DEVELOPMENT_SEED,
         name: str = draw_tables.DEVELOPMENT,
     ) -> Draws:
-        """Return the first n draws of these rigs at some of the protocol's PIPs.
+        """Return the first n draws of a seed on these rigs at some of the protocol's PIPs.
 
         Args:
-            n: how many.
+            n: number of draws, of :data:`ventbench.task.draws.COUNT` at most.
             pips: cmH2O.
-            seed: of the draws; that of the development draws by default.
+            seed: 32 bytes; that of the development draws if not given.
             name: of the draws.
 
         Raises:
-            InputError: if there are not so many, or a PIP is not one of the protocol's.
+            InputError: if there are not so many, a PIP is not one of the protocol's, or the seed
+                does not have 32 bytes.
         """
         sessions = self.sessions or tuple((0,) for _ in self.lungs)
-        return draw_tables.build(sessions, self.members, seed=seed, name=name, pips=pips).first(n)
+        if seed == draw_tables.DEVELOPMENT_SEED or self.population is None:
+            return draw_tables.build(sessions, self.members, seed=seed, name=name, pips=pips).first(
+                n
+            )
+        each = [
+            self.population.rigs(seed, lung, draw_tables.COUNT) for lung in range(len(sessions))
+        ]
+        drawn = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
+        return draw_tables.build(
+            sessions, self.members, held_out=self.held_out, drawn=drawn, seed=seed, name=name,
+            pips=pips,
+        ).first(n)  # fmt: skip
+
+    @property
+    def of_training(self) -> Rigs:
+        """The same without what is held out: what a controller may be tuned on."""
+        if self.sessions is None or not self.held_out:
+            return self
+        pairs = zip(self.sessions, self.held_out, strict=True)
+        sessions = tuple(tuple(rig for rig in own if rig not in apart) for own, apart in pairs)
+        return replace(self, sessions=sessions, held_out=(), population=None)
+
+    def plants_of(self, drawn: Draws) -> Plant:
+        """Plants of draws, leaves ``(L, n, 1, ...)``, or ``(L, ...)`` with one rig a lung."""
+        if self.sessions is None:
+            return self.plants
+        return draw_tables.plants_of(self.plants, drawn.rig, drawn.member, drawn.drawn)
 
     def cells(self, drawn: Draws | None, pips: Sequence[float]) -> tuple[Plant, Scenario]:
         """Nominal cells in front of draws, and their plants.
@@ -81,7 +112,8 @@ class Rigs:
         cells, rig, member = draw_tables.with_nominal(drawn, reference, pips)
         if self.sessions is None:
             return self.plants, cells
-        return draw_tables.plants_of(self.plants, rig, member), cells
+        anew = None if drawn is None else drawn.drawn
+        return draw_tables.plants_of(self.plants, rig, member, anew), cells
 
 
 def load_rigs(simulator: Given = "frozen") -> Rigs:
@@ -109,4 +141,5 @@ def rigs_of(official: Any) -> Rigs:
         official.about(),
         official.manifest_sha256,
         official.held_out_rigs,
+        official.population,
     )

@@ -68,9 +68,11 @@ class SingleCompartment:
         signals = Signals(pressure, pressure, entering, self.C * alveolar)
         return SingleCompartmentState(alveolar, state.peep), signals
 
-    def vary(self, r_scale: Array, c_scale: Array) -> SingleCompartment:
-        """Return the same lung with other R and C."""
-        return self.replace(R=self.R * r_scale, C=self.C * c_scale)  # type: ignore[attr-defined]
+    def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> SingleCompartment:
+        """Return the same lung with other R, C and gain."""
+        return self.replace(  # type: ignore[attr-defined]
+            R=self.R * r_scale, C=self.C * c_scale, gain=self.gain * gain
+        )
 
     def parameters(self) -> dict[str, Array]:
         """Its own by path; see :class:`~ventbench.task.interfaces.Plant`."""

@@ -152,11 +152,10 @@ class VmappedPlant:
 
         return jax.vmap(step)(self.plants, state, u_in, u_out, dt)
 
-    def vary(self, r_scale: Array, c_scale: Array) -> VmappedPlant:
-        """Return the same lungs with other resistances and compliances."""
-        return VmappedPlant(
-            jax.vmap(lambda plant, *x: plant.vary(*x))(self.plants, r_scale, c_scale)
-        )
+    def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> VmappedPlant:
+        """Return the same lungs with other resistances, compliances and gains."""
+        scales = (r_scale, c_scale, jnp.broadcast_to(gain, jnp.shape(r_scale)))
+        return VmappedPlant(jax.vmap(lambda plant, *x: plant.vary(*x))(self.plants, *scales))
 
     def parameters(self) -> None:
         """Nothing is known of its physics; see :class:`~ventbench.task.interfaces.Plant`."""

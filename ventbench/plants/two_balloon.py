@@ -113,9 +113,9 @@ class TwoBalloon:
         volume = 1000.0 * rest_volume * x
         return TwoBalloonState(x, state.peep), Signals(pressure, pressure, 1e3 * entering, volume)
 
-    def vary(self, r_scale: Array, c_scale: Array) -> TwoBalloon:
-        """Return the same lung with other R and C."""
-        return replace(self, R=self.R * r_scale, C=self.C * c_scale)
+    def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> TwoBalloon:
+        """Return the same lung with other R, C and gain."""
+        return replace(self, R=self.R * r_scale, C=self.C * c_scale, gain=self.gain * gain)
 
     def parameters(self) -> None:
         """Nothing is known of its physics; see :class:`~ventbench.task.interfaces.Plant`."""

@@ -2,7 +2,8 @@
 
 The error of an inspiration is ``f(u) = mean over steps 2 to 34 of |p_t(u) - PIP|`` for commands
 ``u`` in 0 to 100 %, with plant, deviations and target known and no noise: more than any controller
-knows. Every breath begins at the same rest, so one inspiration stands for all.
+knows. Every breath begins at the same rest, and its gain is the only thing of its own: a cell is
+one inspiration, whose gain is the first of its :attr:`Scenario.gain`.
 
 **Upper bound.** At ``u`` the pressures are linearised by automatic differentiation, and a linear
 program finds the best change of the commands within the valve's range and a trust region (Fletcher
@@ -22,7 +23,7 @@ own, half of them random.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -94,7 +95,7 @@ def _pressures(plant: Plant, cell: Scenario, u_in: Array) -> Array:
         return after.signals.scored
 
     return rollouts.inspiration(
-        env.vary(plant, cell), cell, rollouts.commanded,
+        env.vary(plant, cell, 0), cell, rollouts.commanded,
         steps=len(u_in), inputs=u_in, record=record,
     )[2]  # fmt: skip
 
@@ -130,7 +131,7 @@ def attainable(
     plants: Plant,
     cells: Scenario,
     *,
-    starts: tuple[int, ...] = STARTS,
+    starts: Sequence[int | Floats] = STARTS,
     iterations: int = ITERATIONS,
     progress: Progress | None = None,
 ) -> Attainable:
@@ -139,7 +140,7 @@ def attainable(
     Args:
         plants: leaves ``(n, ...)``.
         cells: batch shape ``(n,)``; their noise is not used.
-        starts: see :data:`STARTS`.
+        starts: see :data:`STARTS`; or commands to start at, %, shape ``(n, COMMANDS)``.
         iterations: most linear programs of a cell and start.
         progress: called with the number of programs solved, and of all at most.
     """
@@ -149,9 +150,10 @@ def attainable(
     best, witness = np.full(n, np.inf), np.zeros((n, COMMANDS))
     total = len(starts) * iterations
     with precision.float64():
-        for turn, opened in enumerate(starts):
-            u_in = np.where(np.arange(COMMANDS) < opened, protocol.U_MAX, HOLD)
-            u_in = np.broadcast_to(u_in, (n, COMMANDS)).copy()
+        for turn, start in enumerate(starts):
+            if isinstance(start, int):
+                start = np.where(np.arange(COMMANDS) < start, protocol.U_MAX, HOLD)
+            u_in = np.broadcast_to(start, (n, COMMANDS)).astype(float)
             error = _descend(
                 plants, cells, pip, u_in, iterations,
                 lambda k, turn=turn: progress and progress(turn * iterations + k, total),

@@ -1,18 +1,25 @@
-"""Deviations of the ventilator and the lung from nominal: every draw is on some rig.
+"""Draws of a score: rigs, and how the ventilator, the sensor and each breath deviate from nominal.
 
-One draw gives each lung one of its rigs and one member of the ensemble, and each PIP of it sensor
-noise and converter, pressure at the start of the inspiration, R, C, dead time, control step, PIP
-and PEEP. All numbers follow from a seed of 32 bytes by :func:`uniforms`. The development draws,
-common to all entries, come from a published seed; training draws anew with JAX keys.
+One draw puts each lung on a rig, and gives each PIP of it sensor noise and converter, pressure at
+the start of the inspiration, control step, PIP and PEEP. All numbers follow from a seed of 32 bytes
+by :func:`uniforms`. Training draws anew with JAX keys.
+
+**Practice.** The development draws, from a published seed, are on all rigs of a lung. R, C and dead
+time deviate.
+
+**Rounds.** Of four draws two are on rigs that are drawn anew from the population of a lung's rigs,
+one is on a rig that was held out of every training, and one on a rig of the training, to compare.
+The first three are ranked: they are on rigs that nobody trained on. The gain of the valve scatters
+from breath to breath.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import hmac
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from statistics import NormalDist
 from typing import Any, TypeVar
 
@@ -26,6 +33,7 @@ from ventbench.base import precision
 from ventbench.base.errors import InputError
 from ventbench.task import protocol
 from ventbench.task.environment import Scenario, nominal_scenario
+from ventbench.task.interfaces import Plant
 
 #: How many draws a ranked score has.
 COUNT = 20
@@ -61,6 +69,45 @@ RANGES = {
     "delay": (0.0, 0.53),
 }
 
+#: Which of them rigs differ by. Rigs that are drawn from a population have no further ones.
+OF_RIGS = ("r_scale", "c_scale", "delay")
+
+#: Logarithm of the gain of the valve in a breath around its rig's, at every twentieth of the
+#: probability from 0 to 1: quantiles of the measured breaths of the scored rigs, which the manifest
+#: of the simulators holds too. Between neighbouring breaths no correlation was found.
+GAIN_QUANTILES = (
+    -0.428,
+    -0.296,
+    -0.155,
+    -0.093,
+    -0.077,
+    -0.05,
+    -0.034,
+    -0.02,
+    -0.01,
+    -0.001,
+    0.0,
+    0.001,
+    0.011,
+    0.021,
+    0.033,
+    0.038,
+    0.045,
+    0.081,
+    0.092,
+    0.119,
+    0.247,
+)
+
+#: What kind of rig a draw is on.
+TRAINING, HELD_OUT, DRAWN = 0, 1, 2
+
+#: Kinds of rigs of draws, in turn.
+PATTERN = (DRAWN, HELD_OUT, DRAWN, TRAINING)
+
+#: Number of the first rig that is drawn anew; sessions have lower ones.
+FIRST_DRAWN = 1000
+
 # They stand before what is hashed, so that no hash of one use is also one of another use.
 _STREAM = b"ventbench uniforms 1\n"
 _COMMITMENT = b"ventbench season 1\n"
@@ -81,8 +128,11 @@ class Draws:
         name: ``"development"`` for the published draws.
         commitment: of the seed, 64 hexadecimal digits.
         cells: batch shape ``(L, n, P)``, float64 numpy leaves.
-        rig: session of each lung in each draw, shape ``(L, n)``.
-        member: member of the ensemble, shape ``(L, n)``.
+        rig: session of each lung in each draw, or :data:`FIRST_DRAWN` and more for a rig that is
+            drawn anew, shape ``(L, n)``.
+        member: member of the ensemble, 0 for a drawn rig, shape ``(L, n)``.
+        ranked: whether a draw is meant for rigs that nobody trained on, shape ``(n,)``.
+        drawn: rigs that are drawn anew, leaves ``(L, n, ...)``; None where there are none.
     """
 
     name: str
@@ -90,6 +140,8 @@ class Draws:
     cells: Scenario
     rig: Ints
     member: Ints
+    ranked: NDArray[np.bool_]
+    drawn: Plant | None = None
 
     @property
     def count(self) -> int:
@@ -106,10 +158,13 @@ class Draws:
             raise InputError(
                 f"there are {self.count} {self.name} draws; {n} is outside 1..{self.count}"
             )
-        cells = jax.tree.map(lambda x: x[:, :n], self.cells)
-        return dataclasses.replace(
-            self, cells=cells, rig=self.rig[:, :n], member=self.member[:, :n]
-        )
+        return self.only(np.arange(n))
+
+    def only(self, at: Ints) -> Draws:
+        """Return some draws."""
+        parts = (self.cells, self.rig, self.member, self.drawn)
+        cells, rig, member, drawn = jax.tree.map(lambda x: x[:, at], parts)
+        return Draws(self.name, self.commitment, cells, rig, member, self.ranked[at], drawn)
 
     def about(self) -> dict[str, Any]:
         """Commitment, number and name of the draws, with the keys that records have."""
@@ -125,6 +180,8 @@ def build(
     rigs: Sequence[Sequence[int]],
     members: int,
     *,
+    held_out: Sequence[Sequence[int]] = (),
+    drawn: Plant | None = None,
     seed: bytes = DEVELOPMENT_SEED,
     name: str = DEVELOPMENT,
     n: int = COUNT,
@@ -132,12 +189,15 @@ def build(
 ) -> Draws:
     """Make the draws of a seed; the result is the same everywhere.
 
-    The rigs of a lung are drawn equally often, up to one, and so are the members. The rounding to 4
-    decimals removes what differs between mathematical libraries.
+    The rigs of a lung of one kind are drawn equally often, up to one, and so are the members. The
+    rounding to 4 decimals removes what differs between mathematical libraries.
 
     Args:
         rigs: sessions of each lung that may be drawn; L of them.
         members: number of members of the ensemble.
+        held_out: those of them on which nothing was trained; L of them, or nothing.
+        drawn: a rig of each lung and draw from the population, leaves ``(L, n, ...)``. If there are
+            none, the rigs themselves deviate (:data:`OF_RIGS`), and no gain does.
         seed: 32 bytes.
         name: of the draws.
         n: number of draws.
@@ -162,28 +222,81 @@ def build(
     def uniform(label: str, shape: tuple[int, ...]) -> Floats:
         return uniforms(seed, f"draws {_FORMAT}, {label}", shape)
 
-    drawn = {
+    values = {
         name: low + (high - low) * uniform(name, cells) for name, (low, high) in RANGES.items()
     }
+    gain = np.ones((*cells, protocol.BREATHS))
+    if drawn is not None:
+        values |= {name: np.full(cells, _nominal(name)) for name in OF_RIGS}
+        gain = np.exp(_log_gain(uniform("gain", gain.shape), np))
     low, high = NOISE_SD
     sd = low + (high - low) * uniform("noise_sd", cells)
     normal = np.vectorize(NormalDist().inv_cdf, otypes=[float])
     steps = (protocol.BREATHS, protocol.INSPIRATION_STEPS)
-    drawn["noise"] = sd[..., None, None] * normal(uniform("noise", (*cells, *steps)))
+    values["noise"] = sd[..., None, None] * normal(uniform("noise", (*cells, *steps)))
+    values["gain"] = gain
     columns = [protocol.PIPS.index(pip) for pip in pips]
-    drawn = {name: np.round(values[:, :, columns], 4) for name, values in drawn.items()}
-    pip = np.broadcast_to(np.asarray(pips, float), drawn["pip_shift"].shape)
-    noise = drawn.pop("noise")
+    values = {name: np.round(array[:, :, columns], 4) for name, array in values.items()}
+    pip = np.broadcast_to(np.asarray(pips, float), values["pip_shift"].shape)
+    noise = values.pop("noise")
     quantum = np.full(pip.shape, QUANTUM)
-    places = [_balanced(uniform(f"rig {k}", (n + 1,)), len(own)) for k, own in enumerate(rigs)]
+    apart = held_out or [()] * len(rigs)
+    places = [
+        _places(own, out, drawn is not None, partial(uniform, f"rig {k}"), n)
+        for k, (own, out) in enumerate(zip(rigs, apart, strict=True))
+    ]
+    rig = np.array(places)
     turns = [_balanced(uniform(f"member {k}", (n + 1,)), members) for k in range(len(rigs))]
     return Draws(
         name=name,
         commitment=commitment(seed),
-        cells=deviate(pip, drawn, quantum, noise),
-        rig=np.array([np.array(own)[at] for own, at in zip(rigs, places, strict=True)]),
-        member=np.array(turns),
+        cells=deviate(pip, values, quantum, noise),
+        rig=rig,
+        member=np.where(rig >= FIRST_DRAWN, 0, turns),
+        ranked=ranked(rig),
+        drawn=drawn,
     )
+
+
+def ranked(rig: Ints) -> NDArray[np.bool_]:
+    """Whether each draw is ranked, shape ``(n,)``.
+
+    In a round those are ranked that are on rigs that nobody trained on; in practice all are shown.
+
+    Args:
+        rig: of each lung and draw, shape ``(L, n)``; see :class:`Draws`.
+    """
+    count = rig.shape[1]
+    if not np.any(rig >= FIRST_DRAWN):
+        return np.ones(count, bool)
+    return np.resize(np.array(PATTERN), count) != TRAINING
+
+
+def _places(
+    rigs: Sequence[int],
+    held_out: Sequence[int],
+    anew: bool,
+    uniform: Callable[[tuple[int, ...]], Floats],
+    n: int,
+) -> Ints:
+    """Rig of each draw of one lung."""
+    kind = np.resize(np.array(PATTERN), n)
+    kind[(kind == DRAWN) & (not anew)] = HELD_OUT
+    kind[(kind == HELD_OUT) & (not held_out)] = DRAWN if anew else TRAINING
+    numbers = uniform((n + 1,))
+    rig = FIRST_DRAWN + np.arange(n)
+    training = [own for own in rigs if own not in held_out]
+    for value, choices in ((TRAINING, training), (HELD_OUT, held_out)):
+        at = np.flatnonzero(kind == value)
+        if len(at):
+            some = _balanced(numbers[np.append(0, 1 + at)], len(choices))
+            rig[at] = np.array(choices)[some]
+    return rig
+
+
+def _log_gain(numbers: Any, xp: Any) -> Any:
+    """Logarithms of gains for uniform numbers."""
+    return xp.interp(numbers, np.linspace(0.0, 1.0, len(GAIN_QUANTILES)), np.array(GAIN_QUANTILES))
 
 
 def _balanced(numbers: Floats, choices: int) -> Ints:
@@ -225,20 +338,31 @@ def with_nominal(
     return cells, np.hstack([rig, drawn.rig]), np.hstack([member, drawn.member])
 
 
-def plants_of(plants: PlantT, rig: Ints, member: Ints) -> PlantT:
+def plants_of(plants: PlantT, rig: Ints, member: Ints, drawn: PlantT | None = None) -> PlantT:
     """Plants of cells.
 
     Args:
         plants: of every member and session, leaves ``(members, sessions, ...)``.
-        rig: sessions, shape ``(L, n)``.
+        rig: sessions, or :data:`FIRST_DRAWN` and more, shape ``(L, n)``.
         member: members, shape ``(L, n)``.
+        drawn: of the last draws, leaves ``(L, k, ...)`` with k <= n.
 
     Returns:
         Leaves ``(L, n, 1, ...)``, float64: the axis of length 1 stands for the PIPs.
     """
-    return jax.tree.map(
-        lambda leaf: np.asarray(leaf)[member, rig][:, :, None].astype(np.float64), plants
-    )
+    anew = rig >= FIRST_DRAWN
+    session = np.where(anew, 0, rig)
+    chosen = jax.tree.map(lambda leaf: np.asarray(leaf, float)[member, session], plants)
+    if drawn is not None:
+        places = np.nonzero(anew)
+        before = rig.shape[1] - jax.tree.leaves(drawn)[0].shape[1]
+
+        def replaced(leaf: Floats, new: Floats) -> Floats:
+            leaf[places] = new[places[0], places[1] - before]
+            return leaf
+
+        chosen = jax.tree.map(replaced, chosen, drawn)
+    return jax.tree.map(lambda leaf: leaf[:, :, None], chosen)
 
 
 def uniforms(seed: bytes, label: str, shape: int | tuple[int, ...]) -> NDArray[np.float64]:
@@ -328,11 +452,14 @@ def random_scenarios(
     if smooth:
         noise += QUANTUM * jax.random.uniform(keys[-1], shape, minval=-0.5, maxval=0.5)
     quantum = jnp.full(n, 0.0 if smooth else QUANTUM)
+    gain = _log_gain(jax.random.uniform(jax.random.fold_in(key, 1), (n, breaths)), jnp)
     if spread is not None:
         scale = jnp.broadcast_to(spread, (n,))
         noise = scale[:, None, None] * noise
         quantum = jnp.where(scale > 0, quantum, 0.0)
         drawn["delay"] = jnp.minimum(drawn["delay"], 0.99)
+        gain = scale[:, None] * gain
+    drawn["gain"] = jnp.exp(gain)
     return deviate(pip, drawn, quantum, noise)
 
 
@@ -346,7 +473,8 @@ def deviate(pip: Any, deviations: Mapping[str, Any], quantum: Any, noise: Any) -
 
     Args:
         pip: nominal, cmH2O, shape ``(...)``.
-        deviations: by the keys of :data:`RANGES`, shapes ``(...)``.
+        deviations: by the keys of :data:`RANGES`, shapes ``(...)``; and
+            ``gain``, shape ``(..., BREATHS)``.
         quantum: step of the converter, cmH2O, shape ``(...)``.
         noise: cmH2O, shape ``(..., BREATHS, INSPIRATION_STEPS)``.
     """
@@ -359,6 +487,7 @@ def deviate(pip: Any, deviations: Mapping[str, Any], quantum: Any, noise: Any) -
         r_scale=deviations["r_scale"],
         c_scale=deviations["c_scale"],
         delay=deviations["delay"],
+        gain=deviations["gain"],
         quantum=quantum,
         noise=noise,
     )

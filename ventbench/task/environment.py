@@ -25,7 +25,7 @@ _EXPIRATORY = waveform.expiratory_command(np.arange(protocol.BREATH_STEPS))
 
 @flax.struct.dataclass
 class Scenario:
-    """A batch of cells; every field has the batch shape ``(...)``, ``noise`` two axes more.
+    """A batch of cells; every field has the batch shape ``(...)`` unless it says otherwise.
 
     Attributes:
         pip: peak inspiratory pressure, cmH2O.
@@ -35,6 +35,7 @@ class Scenario:
         r_scale: true over nominal resistance.
         c_scale: true over nominal compliance.
         delay: additional dead time of the command, as a share of one step, 0..1.
+        gain: flow of the inspiratory valve in each breath over that of its rig, ``(..., BREATHS)``.
         quantum: step of the pressure sensor's converter, cmH2O; 0 for none.
         noise: noise that is added to the measured pressure before the converter, cmH2O, shape
             ``(..., BREATHS, INSPIRATION_STEPS)``.
@@ -47,6 +48,7 @@ class Scenario:
     r_scale: Array
     c_scale: Array
     delay: Array
+    gain: Array
     quantum: Array
     noise: Array
 
@@ -66,7 +68,8 @@ def nominal_scenario(pip: ArrayLike, peep: ArrayLike = protocol.PEEP) -> Scenari
         raise InputError(f"PIP {pip} cmH2O must exceed PEEP {peep} cmH2O")
     ones, zeros = np.ones(pip.shape), np.zeros(pip.shape)
     noise = np.zeros((*pip.shape, protocol.BREATHS, protocol.INSPIRATION_STEPS))
-    arrays = (pip, peep, peep, protocol.DT * ones, ones, ones, zeros, zeros, noise)
+    gain = np.ones((*pip.shape, protocol.BREATHS))
+    arrays = (pip, peep, peep, protocol.DT * ones, ones, ones, zeros, gain, zeros, noise)
     return Scenario(*(jnp.asarray(array) for array in arrays))
 
 
@@ -91,9 +94,10 @@ class LoopState:
     previous: Array
 
 
-def vary(plant: Plant, scenario: Scenario) -> Plant:
-    """Return plants with the resistance and compliance of each cell of a scenario."""
-    return plant.vary(scenario.r_scale, scenario.c_scale)
+def vary(plant: Plant, scenario: Scenario, breath: Array | int) -> Plant:
+    """Return plants with the resistance, the compliance and the valve's gain of a breath."""
+    gain = scenario.gain[..., breath]
+    return plant.vary(scenario.r_scale, scenario.c_scale, gain)
 
 
 def start_breath(plant: Plant, scenario: Scenario) -> LoopState:

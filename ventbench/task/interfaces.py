@@ -81,8 +81,8 @@ class Plant(Protocol):
         """
         ...
 
-    def vary(self, r_scale: Array, c_scale: Array) -> Plant:
-        """Return the same lung with resistance and compliance times these factors."""
+    def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> Plant:
+        """Return the same lung with resistance, compliance and the valve's flow times factors."""
         ...
 
     def parameters(self) -> Mapping[str, Any] | None:

@@ -225,7 +225,7 @@ def closed_loop(
 
     def run(state: Any, at: tuple[Array, Any]) -> tuple[Any, Any]:
         breath, own = at
-        varied = env.vary(own if changing else plant, scenario)
+        varied = env.vary(own if changing else plant, scenario, breath)
         loop, state, inspired = inspiration(varied, scenario, policy, state, breath=breath)
 
         expired = expiration(varied, scenario, loop)[1] if whole else None

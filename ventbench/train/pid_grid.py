@@ -4,10 +4,8 @@ Without noise each breath of a run is the same, as each begins at rest and the P
 one inspiration stands for all. The search is dealt out in parts, which run in this process, in
 others or on a cluster; a finished part is never computed twice.
 
-The best of a grid then run on draws, whose noise a high gain amplifies, and the least mean error
-wins. On all scored rigs and the development draws this gives the 100 of normalised scores
-(:func:`best_pids`); on the rigs and draws that are for tuning, the gains of the entries
-``pid_best`` and ``pid_robust`` (:func:`tune_pid`).
+The best of the grid then run on draws for tuning, whose noise a high gain amplifies, and the least
+mean error wins: the gains of the entries ``pid_best`` and ``pid_robust``.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ import itertools
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +85,9 @@ def _errors(plant: Plant, gains: Array, cells: Scenario) -> Array:
         return jnp.abs(before.signals.scored - cells.pip)
 
     policy, state = rollouts.controlled_by(controller), controller.init(cells.pip.shape)
-    _, _, error = rollouts.inspiration(env.vary(plant, cells), cells, policy, state, record=record)
+    _, _, error = rollouts.inspiration(
+        env.vary(plant, cells, 0), cells, policy, state, record=record
+    )
     return error.mean(axis=0)
 
 
@@ -265,7 +265,9 @@ def _mean_errors(plants: Plant, gains: Floats) -> NDArray[np.float32]:
     return errors(plants, gains).mean(axis=0, dtype=np.float64).astype(np.float32)
 
 
-def drawn_errors(rigs: Rigs, drawn: Draws, lung: int, gains: Floats) -> Floats:
+def drawn_errors(
+    rigs: Rigs, drawn: Draws, lung: int, gains: Floats, *, together: int = TOGETHER
+) -> Floats:
     """Error of PIDs on draws of one lung, without the first step.
 
     Args:
@@ -273,6 +275,7 @@ def drawn_errors(rigs: Rigs, drawn: Draws, lung: int, gains: Floats) -> Floats:
         drawn: K draws.
         lung: index of the lung.
         gains: P, I, D, %/cmH2O, shape ``(G, 3)``.
+        together: gains that are run together.
 
     Returns:
         Mean over the draws, cmH2O, shape ``(G, P)``.
@@ -283,9 +286,9 @@ def drawn_errors(rigs: Rigs, drawn: Draws, lung: int, gains: Floats) -> Floats:
         own = jax.tree.map(lambda x: x[1:], own)
     cell = jax.tree.map(lambda x: np.asarray(x)[lung, 1:], cells)
     errors = []
-    for first in range(0, len(gains), TOGETHER):
+    for first in range(0, len(gains), together):
         # The last batch is padded, so that all compile once.
-        index = np.minimum(np.arange(first, first + TOGETHER), len(gains) - 1)
+        index = np.minimum(np.arange(first, first + together), len(gains) - 1)
         with precision.float64():
             arrays = jax.tree.map(jnp.asarray, (own, gains[index], cell))
             pressure = np.asarray(_pressures(*arrays))
@@ -349,7 +352,7 @@ def tune_pid(
     names = check_names(lungs, trained_on, all_lungs=False)
     where = [trained_on.names.index(name) for name in names]
     weights, single = trained_on.weights[where], len(names) > 1 if single is None else single
-    rigs = _training_rigs(load_rigs(simulator))
+    rigs = load_rigs(simulator).of_training
     parts = None if out is None else Path(out) / PARTS
     count = FINALISTS if draws else 1
     with executor(workers, scheduler) as pool:
@@ -366,10 +369,7 @@ def tune_pid(
         own = np.argsort(weighted, axis=1, kind="stable")[:, : count if each else 0]
         lists = [np.concatenate([row, common]) for row in own]
         if draws:
-            sessions = rigs.sessions or tuple((0,) for _ in rigs.lungs)
-            drawn = draw_tables.build(
-                sessions, rigs.members, seed=TUNING_SEED, name=TUNING, n=draws
-            )
+            drawn = rigs.draws(draws, seed=TUNING_SEED, name=TUNING)
             jobs = [
                 (rigs, drawn, lung, grid.gains[some])
                 for lung, some in zip(where, lists, strict=True)
@@ -405,43 +405,3 @@ def tune_pid(
         files.write_json(Path(out) / RESULT, result)
         shutil.rmtree(Path(out) / PARTS)
     return grid, result
-
-
-def _training_rigs(scored: Rigs) -> Rigs:
-    """The same without the rigs that are held out."""
-    if scored.sessions is None:
-        return scored
-    pairs = zip(scored.sessions, scored.held_out, strict=True)
-    sessions = tuple(tuple(rig for rig in own if rig != apart) for own, apart in pairs)
-    return replace(scored, sessions=sessions)
-
-
-def best_pids(
-    rigs: Rigs,
-    *,
-    gains: Floats | None = None,
-    draws: int = 20,
-    progress: Progress | None = None,
-) -> tuple[Floats, Floats]:
-    """Find the best PID of each lung.
-
-    Args:
-        rigs: L lungs, all of whose scored rigs count alike.
-        gains: P, I, D, %/cmH2O, shape ``(G, 3)``; the paper's 8,000 if not given.
-        draws: number of development draws that decide among the best.
-        progress: see :data:`Progress`.
-
-    Returns:
-        Gains, shape ``(L, 3)``, and their mean errors over the draws without the first step, cmH2O,
-        shape ``(L,)``.
-    """
-    grid = paper_gains() if gains is None else np.asarray(gains, float)
-    drawn = rigs.draws(draws)
-    nominal = _nominal_grid(rigs, range(len(rigs.lungs)), grid, progress=progress)
-    chosen, least = [], []
-    for lung, error in enumerate(nominal.error.mean(axis=-1, dtype=np.float64)):
-        finalists = grid[np.argsort(error, kind="stable")[:FINALISTS]]
-        on_draws = drawn_errors(rigs, drawn, lung, finalists).mean(axis=-1)
-        chosen.append(finalists[np.argmin(on_draws)])
-        least.append(on_draws.min())
-    return np.array(chosen), np.array(least)

@@ -142,8 +142,6 @@ def run(controller: Residual, plant: Plant, cell: Scenario) -> DifferentiableRun
         plant: plant of one lung.
         cell: one cell, batch shape ``()``.
     """
-    varied = env.vary(plant, cell)
-    rest = env.start_breath(varied, cell)
 
     def policy(state: Any, seen: Any, _: Any) -> tuple[Any, Array]:
         inner, base, correction = controller.parts(state[0], seen)
@@ -151,6 +149,8 @@ def run(controller: Residual, plant: Plant, cell: Scenario) -> DifferentiableRun
 
     def step(carry: tuple[env.LoopState, Any], at: tuple[Array, Array]) -> tuple[Any, Any]:
         # In one scan over all breaths: half the compilation of a scan of scans.
+        varied = env.vary(plant, cell, at[0])
+        rest = env.start_breath(varied, cell)
         start = jax.tree.map(lambda new, old: jnp.where(at[1] == 0, new, old), rest, carry[0])
         (after, state), (pressure, applied) = rollouts.control_step(
             varied, cell, policy, lambda before, _, __, u: (before.signals.scored, u),
@@ -160,6 +160,7 @@ def run(controller: Residual, plant: Plant, cell: Scenario) -> DifferentiableRun
 
     count = jnp.arange(protocol.BREATHS * protocol.INSPIRATION_STEPS)
     at = (count // protocol.INSPIRATION_STEPS, count % protocol.INSPIRATION_STEPS)
+    rest = env.start_breath(env.vary(plant, cell, 0), cell)
     begin = (rest, (controller.init(()), jnp.zeros_like(cell.pip)))
     _, steps = jax.lax.scan(step, begin, at)
     shape = (protocol.BREATHS, protocol.INSPIRATION_STEPS)

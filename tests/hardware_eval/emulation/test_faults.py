@@ -105,8 +105,8 @@ class _Rigid:
         after = state + self.gain * u_in * dt
         return after, Signals(after)
 
-    def vary(self, r_scale: Any, c_scale: Any) -> Any:
-        return _Rigid(self.gain * r_scale)
+    def vary(self, r_scale: Any, c_scale: Any, gain: Any = 1.0) -> Any:
+        return _Rigid(self.gain * r_scale * gain)
 
     def parameters(self) -> None:
         return None

@@ -43,7 +43,7 @@ class Episode:
     """What stays the same in an episode.
 
     Attributes:
-        plant: with the resistance and compliance of the cell.
+        plant: of the rig, without the deviations of the cell.
         cell: PIP, deviations and noise, hidden from the controller.
         weight: of errors, see :class:`ventbench.train.plants.TrainingPlants`.
     """
@@ -133,10 +133,10 @@ def reset(
     plant = jax.tree.map(lambda leaf: jnp.asarray(leaf)[rig, lung], lungs.plants)
     cells = random_scenarios(keys[3], pip[None], spread=None if vary else 0.0)
     cell = jax.tree.map(lambda leaf: leaf[0], cells)
-    varied = env.vary(plant, cell)
+    varied = env.vary(plant, cell, 0)
     weight = lungs.weights[lung, jnp.argmin(jnp.abs(pips - pip))]
     progress = Progress(env.start_breath(varied, cell), jnp.zeros_like(cell.pip))
-    state = State(Episode(varied, cell, weight), progress, jnp.zeros((), jnp.int32))
+    state = State(Episode(plant, cell, weight), progress, jnp.zeros((), jnp.int32))
     return state, observe(state)
 
 
@@ -170,15 +170,17 @@ def step(state: State, action: Array) -> tuple[State, Array, Array, Array]:
     def pressures(before: env.LoopState, after: env.LoopState, *_: Array) -> tuple[Array, Array]:
         return before.signals.scored, after.signals.scored
 
+    varied = env.vary(episode.plant, episode.cell, breath)
     (loop, _), (before, after) = rollouts.control_step(
-        episode.plant, episode.cell, rollouts.commanded, pressures,
+        varied, episode.cell, rollouts.commanded, pressures,
         (state.progress.loop, None), (breath, index, 50.0 + 50.0 * action),
     )  # fmt: skip
     last = index == BREATH - 1
     reward = -episode.weight * jnp.abs(after - episode.cell.pip) / REWARD_SCALE
     scored = breath >= min(protocol.SCORED_BREATHS)
     error = state.progress.error + scored * jnp.abs(before - episode.cell.pip)
-    rest = env.start_breath(episode.plant, episode.cell)
+    following = jnp.minimum((count + 1) // BREATH, protocol.BREATHS - 1)
+    rest = env.start_breath(env.vary(episode.plant, episode.cell, following), episode.cell)
     loop = jax.tree.map(lambda new, old: jnp.where(last, new, old), rest, loop)
     state = State(episode, Progress(loop, error), count + 1)
     return state, observe(state), jnp.where(last, 0.0, reward), state.count == STEPS

@@ -137,7 +137,6 @@ def roll(episodes: Episodes, act: Act, key: Array) -> tuple[Array, Any, Array]:
         command over ``REWARD_SCALE``, shape ``(STEPS, B)``.
     """
     cells, weight = episodes.cells, episodes.weight
-    varied = env.vary(episodes.plants, cells)
     memory = rl_policy.init_features(cells.pip.shape)
 
     def policy(state: Any, seen: Any, key: Array) -> tuple[Any, Array]:
@@ -147,6 +146,7 @@ def roll(episodes: Episodes, act: Act, key: Array) -> tuple[Array, Any, Array]:
 
     def run(memory: Any, now: tuple[Array, Array]) -> tuple[Any, Any]:
         breath, keys = now
+        varied = env.vary(episodes.plants, cells, breath)
 
         def step(carry: Any, now: tuple[Array, Array]) -> tuple[Any, tuple[Array, Any, Array]]:
             loop, memory = carry

@@ -1,0 +1,425 @@
+"""Fit of the population of rigs to recordings, and the check that holds it to account.
+
+Around its fitted plant each session's inspirations are linearised in all numbers of a rig
+(:data:`ventbench.plants.population.NAMES`) and in each breath's own gain and start, which are then
+integrated out. What is left says what the session knows of its rig, with its error; the mixed model
+of :mod:`ventbench.train.rigs.random_effects` makes a population of it. The linearisation is renewed
+a few times around the rigs that result.
+
+What the ventilator decides has one mean over all rigs, what the lung decides one for each lung.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tomli_w
+from jax import Array
+from numpy.typing import NDArray
+
+from ventbench.base import files, precision
+from ventbench.plants import frozen, population
+from ventbench.plants.hybrid import Hybrid
+from ventbench.plants.population import LUNG, NAMES, RigPopulation, from_vector, to_vector
+from ventbench.task.draws import GAIN_QUANTILES
+from ventbench.train.rigs import random_effects
+from ventbench.train.rigs.data import InspirationData, inspirations, load_rig_recordings
+from ventbench.train.rigs.fit import Noise, simulate
+from ventbench.train.rigs.random_effects import Population, Prior, Units
+
+Floats = NDArray[np.float64]
+
+#: Standard deviation of the logarithm of the valve's last slope that is added, as between members
+#: of the ensemble: hardly anything is recorded there.
+UNRECORDED_SLOPE = 0.4
+
+#: Standard deviations between rigs that the data start from, of logarithms unless said, by the
+#: beginning of a name; and of everything else.
+SCALES = {
+    "resistance": 0.1,
+    "elastance": 0.08,
+    "offset": 0.3,
+    "stiffening": 0.1,
+    "valve_size": 0.08,
+    "valve_bend": 0.1,
+    "direction": 0.3,
+}
+OTHER_SCALE = 0.15
+
+#: How many sessions these scales count for, and how many count for no correlation. With fewer of
+#: either the renewals of the linearisation do not settle: some curves run away. The manifest says
+#: how sessions that were left out lie in what results (:meth:`FittedPopulation.left_out`).
+PRIOR_SESSIONS, UNCORRELATED_SESSIONS = 5.0, 30.0
+
+#: What the data cannot bound, as a play's weight changes nothing any more when it nears its bound:
+#: its scale is given.
+GIVEN = ("direction",)
+
+#: Standard deviation of means around the fitted plants', wide.
+CENTRE_SCALE = 0.5
+
+#: Renewals of the linearisation, steps of each breath's gain and start in each, and of the mixed
+#: model in each; at most so much changes in one, as the linearisation holds nearby only.
+RENEWALS, BREATH_STEPS, MIXED_STEPS, LARGEST = 12, 6, 10, 0.3
+
+#: Degrees of freedom of the errors of samples and of the gains of breaths.
+TAIL = 4.0
+
+#: Scale of a breath's gain while its rig is fitted; and while the gains are measured, wide.
+GAIN, WIDE_GAIN = 0.1, 1.0
+
+
+@dataclass(frozen=True)
+class _Breaths:
+    """What the breaths of the chosen sessions are, and their gains and starts so far."""
+
+    data: InspirationData
+    at: NDArray[np.int64]
+    weight: Floats
+    noise: Noise
+    gain: Floats
+    start: Floats
+
+    @property
+    def counted(self) -> NDArray[np.bool_]:
+        return np.asarray(self.data.share) > 0
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        return np.asarray(self.data.start_known) > 0
+
+    def at_start(self) -> Floats:
+        first = np.where(self.known, np.asarray(self.data.start), self.noise.unknown_start)
+        return first + self.start
+
+
+def _pressures(vector: Array, gain: Array, start: Array, data: InspirationData) -> Array:
+    plant = from_vector(vector)
+    plant = plant.replace(slopes=plant.slopes * jnp.exp(gain))  # type: ignore[attr-defined]
+    return simulate(plant, start, data)
+
+
+def _derivatives(*names: int) -> Callable[..., tuple[Array, ...]]:
+    def both(*arguments: Any) -> tuple[Array, ...]:
+        return _pressures(*arguments), *jax.jacfwd(_pressures, argnums=names)(*arguments)
+
+    return jax.jit(jax.vmap(both))
+
+
+_by_all, _by_breath = _derivatives(0, 1, 2), _derivatives(1, 2)
+
+
+def _linearised(
+    breaths: _Breaths, rigs: Floats, function: Callable[..., tuple[Array, ...]]
+) -> tuple[Floats, Floats, list[Floats]]:
+    """Residuals, their weights, and derivatives of the pressures of all breaths."""
+    with precision.float64():
+        arguments = (rigs[breaths.at], breaths.gain, breaths.at_start())
+        pressure, *slopes = map(np.asarray, function(*map(jnp.asarray, arguments), breaths.data))
+    counted, noise = breaths.counted, breaths.noise
+    residual = np.where(counted, np.asarray(breaths.data.pressure) - pressure, 0.0)
+    robust = (TAIL + 1.0) / (TAIL + (residual / noise.pressure) ** 2)
+    share = np.asarray(breaths.data.share)
+    weight = breaths.weight[:, None] * robust * share * noise.independent / noise.pressure**2
+    return residual, weight, slopes
+
+
+def _own(breaths: _Breaths, scale: float) -> tuple[Floats, Floats]:
+    """Prior precisions of each breath's gain and start, ``(n, 2)``, and their values."""
+    noise = breaths.noise
+    unknown = np.hypot(noise.unknown_start_scale, noise.rig_start)
+    start = np.where(breaths.known, noise.start, unknown)
+    gain = scale**2 * (TAIL + (breaths.gain / scale) ** 2) / (TAIL + 1.0)
+    return np.stack([1.0 / gain, start**-2.0], -1), np.stack([breaths.gain, breaths.start], -1)
+
+
+def _with_own(breaths: _Breaths, rigs: Floats, scale: float, steps: int) -> _Breaths:
+    """Fit each breath's gain and start for given rigs."""
+    for _ in range(steps):
+        residual, weight, slopes = _linearised(breaths, rigs, _by_breath)
+        by = np.stack(slopes, -1)
+        prior, own = _own(breaths, scale)
+        normal = np.einsum("bt,bti,btj->bij", weight, by, by)
+        normal[:, [0, 1], [0, 1]] += prior
+        right = np.einsum("bt,bti->bi", weight * residual, by) - prior * own
+        change = np.linalg.solve(normal, right[..., None])[..., 0]
+        gain, start = np.clip(change, -LARGEST, LARGEST).T
+        breaths = _Breaths(
+            breaths.data, breaths.at, breaths.weight, breaths.noise,
+            breaths.gain + gain, breaths.start + start,
+        )  # fmt: skip
+    return breaths
+
+
+def _units(breaths: _Breaths, rigs: Floats, design: Floats) -> Units:
+    """Information of the sessions, the breaths' gains and starts integrated out."""
+    residual, weight, (by_rig, *slopes) = _linearised(breaths, rigs, _by_all)
+    by = np.stack(slopes, -1)
+    prior, own = _own(breaths, GAIN)
+    weighted = weight[..., None] * by_rig
+    inner = np.einsum("bt,bti,btj->bij", weight, by, by)
+    inner[:, [0, 1], [0, 1]] += prior
+    mixed = weighted.transpose(0, 2, 1) @ by
+    solved = mixed @ np.linalg.inv(inner)
+    inner_right = np.einsum("bt,bti->bi", weight * residual, by) - prior * own
+    right = np.einsum("btp,bt->bp", weighted, residual)
+    right -= (solved @ inner_right[..., None])[..., 0]
+    information = weighted.transpose(0, 2, 1) @ by_rig - solved @ mixed.transpose(0, 2, 1)
+    count, size = rigs.shape
+    A, b = np.zeros((count, size, size)), np.zeros((count, size))
+    np.add.at(A, breaths.at, information)
+    np.add.at(b, breaths.at, right)
+    A = 0.5 * (A + A.transpose(0, 2, 1))
+    return Units(A, b + (A @ rigs[..., None])[..., 0], design)
+
+
+def design_of(lungs: Sequence[str]) -> Floats:
+    """Design of rigs: own means of a lung's numbers, common means of a ventilator's.
+
+    Args:
+        lungs: id of each rig's lung, J of them.
+
+    Returns:
+        Shape ``(J, p, q)``; the lungs are in the order in which they come.
+    """
+    names, mine = list(dict.fromkeys(lungs)), len(LUNG)
+    shared = len(NAMES) - mine
+    out = np.zeros((len(lungs), len(NAMES), mine * len(names) + shared))
+    for j, lung in enumerate(lungs):
+        first = mine * names.index(lung)
+        out[j, :mine, first : first + mine] = np.eye(mine)
+        out[j, mine:, mine * len(names) :] = np.eye(shared)
+    return out
+
+
+def scales() -> Floats:
+    """:data:`SCALES` of all numbers of a rig, shape ``(len(NAMES),)``."""
+
+    def scale(name: str) -> float:
+        return next((s for start, s in SCALES.items() if name.startswith(start)), OTHER_SCALE)
+
+    return np.array([scale(name) for name in NAMES])
+
+
+@dataclass(frozen=True)
+class FittedPopulation:
+    """A fitted population and what it was fitted to.
+
+    Attributes:
+        sessions: indices of the J sessions.
+        lungs: id of the lung of each.
+        units: what each session says of its rig.
+        prior: of the fit.
+        population: the fit.
+        gain: logarithm of each measured breath's gain around its session's median, ``(m,)``.
+        gain_sd: standard deviation of it within sessions.
+        gain_lag: correlation of it between neighbours in the files' order.
+    """
+
+    sessions: tuple[int, ...]
+    lungs: tuple[str, ...]
+    units: Units
+    prior: Prior
+    population: Population
+    gain: Floats
+    gain_sd: float
+    gain_lag: float
+
+    def left_out(self) -> list[tuple[float, float]]:
+        """:func:`~ventbench.train.rigs.random_effects.surprise` of each session by the others."""
+        out = []
+        for j in range(len(self.sessions)):
+            others = random_effects.fit(
+                self.units.without(j), self.prior, iterations=30, start=self.population.covariance
+            )
+            out.append(random_effects.surprise(self.units, j, others))
+        return out
+
+    def nearest_of(
+        self, j: int, data: InspirationData, weight: Floats, count: int, seed: bytes
+    ) -> tuple[float, float]:
+        """How near rigs that are drawn without a session come to its measured breaths.
+
+        Args:
+            j: the session, by its place among the J.
+            data: inspirations.
+            weight: of each breath: 1 for a measured one.
+            count: number of drawn rigs.
+            seed: 32 bytes.
+
+        Returns:
+            Mean error of the breaths under the nearest of the drawn rigs, and the median over the
+            drawn rigs, cmH2O; NaN where no breath was measured.
+        """
+        others = random_effects.fit(
+            self.units.without(j), self.prior, iterations=30, start=self.population.covariance
+        )
+        mean, covariance = others.predictive(self.units.design[[j]])
+        rigs = RigPopulation(mean, np.linalg.cholesky(covariance))
+        drawn = to_vector(rigs.rigs(seed, 0, count))
+        at = np.flatnonzero(
+            (np.asarray(data.groups.session) == self.sessions[j])
+            & (weight == 1.0) & (np.asarray(data.start_known) > 0)
+        )  # fmt: skip
+        if not len(at):
+            return float("nan"), float("nan")
+        own = jax.tree.map(lambda x: np.asarray(x)[at], data)
+        with precision.float64():
+            each = jax.vmap(jax.vmap(_pressures, (None, None, 0, 0)), (0, None, None, None))
+            pressure = np.asarray(jax.jit(each)(jnp.asarray(drawn), 0.0, own.start, own))
+        error = np.sum(np.asarray(own.share) * np.abs(pressure - np.asarray(own.pressure)), -1)
+        return float(error.mean(axis=1).min()), float(np.median(error.mean(axis=1)))
+
+    def of_lungs(self, lungs: Sequence[str], unrecorded: float) -> RigPopulation:
+        """The population that rigs are drawn from.
+
+        Args:
+            lungs: ids, L of them.
+            unrecorded: what is added to the standard deviation of the valve's last bend, above
+                which hardly anything is recorded.
+        """
+        first = [self.lungs.index(lung) for lung in lungs]
+        mean, covariance = self.population.predictive(self.units.design[first])
+        last = NAMES.index("valve_bend_12")
+        covariance[:, last, last] += unrecorded**2
+        return RigPopulation(mean, np.linalg.cholesky(covariance))
+
+
+def fit_population(
+    plants: Hybrid,
+    data: InspirationData,
+    sessions: Sequence[int],
+    lungs: Sequence[str],
+    weight: Floats,
+    *,
+    noise: Noise | None = None,
+    renewals: int = RENEWALS,
+    progress: Callable[[float], None] | None = None,
+) -> FittedPopulation:
+    """Fit the population of rigs.
+
+    Args:
+        plants: fitted plants of all sessions, leaves ``(S, ...)``.
+        data: inspirations.
+        sessions: J of the S, which are what their label says.
+        lungs: id of the lung of each of the J.
+        weight: of each breath: 1 for a measured one.
+        noise: of breaths and samples.
+        renewals: see :data:`RENEWALS`.
+        progress: called with the share that is done, 0..1.
+    """
+    session = np.asarray(data.groups.session)
+    kept = np.flatnonzero(np.isin(session, sessions))
+    order = {index: j for j, index in enumerate(sessions)}
+    at = np.array([order[index] for index in session[kept].tolist()])
+    zero = np.zeros(len(kept))
+    chosen = jax.tree.map(lambda x: np.asarray(x)[kept], data)
+    breaths = _Breaths(chosen, at, weight[kept], noise or Noise(), zero, zero)
+    rigs = to_vector(plants)[list(sessions)]
+    design = design_of(lungs)
+    centre = np.linalg.lstsq(design.reshape(-1, design.shape[2]), rigs.ravel(), rcond=None)[0]
+    counts = [np.inf if name.startswith(GIVEN) else PRIOR_SESSIONS for name in NAMES]
+    prior = Prior(scales(), np.array(counts), UNCORRELATED_SESSIONS, centre, CENTRE_SCALE)
+    start = None
+    for turn in range(renewals):
+        breaths = _with_own(breaths, rigs, GAIN, BREATH_STEPS)
+        units = _units(breaths, rigs, design)
+        last = turn == renewals - 1
+        fitted = random_effects.fit(
+            units, prior, iterations=200 if last else MIXED_STEPS, start=start
+        )
+        start = fitted.covariance
+        if not last:
+            rigs = rigs + np.clip(fitted.units - rigs, -LARGEST, LARGEST)
+        if progress is not None:
+            progress((turn + 1) / renewals)
+    breaths = _with_own(breaths, rigs, WIDE_GAIN, 4 * BREATH_STEPS)
+    measured = breaths.weight == 1.0
+    gain, sd, lag = _scatter(breaths.gain[measured], at[measured])
+    return FittedPopulation(tuple(sessions), tuple(lungs), units, prior, fitted, gain, sd, lag)
+
+
+def train_population(
+    recordings: Path | str,
+    simulators: Path | str,
+    *,
+    progress: Callable[[float], None] | None = None,
+) -> FittedPopulation:
+    """Fit the population of the scored rigs of simulators and add it to their folder.
+
+    The manifest then names the file, and says how the sessions lie in a population that was fitted
+    without them.
+
+    Args:
+        recordings: folder of the recordings that the simulators were learned from.
+        simulators: folder that :func:`ventbench.train_rigs` wrote.
+        progress: called with the share that is done, 0..1.
+
+    Raises:
+        InputError: if a folder is not what it should be.
+        OSError: if a file cannot be written.
+    """
+    folder = Path(simulators)
+    known = frozen.load(folder)
+    settings = known.manifest["recipe"]["rigs"]
+    data = load_rig_recordings(Path(recordings), folds=settings["folds"], seed=settings["seed"])
+    weight = np.where(np.arange(len(data.breaths)) < data.measured, 1.0, settings["reconstructed"])
+    with precision.float64():
+        arranged = inspirations(data.breaths, known.sessions, data.labels)
+    rigs = [(session, lung) for lung, own in zip(known.lung_ids, known.rigs, strict=True)
+            for session in sorted(own)]  # fmt: skip
+    scored = jax.tree.map(lambda leaf: np.asarray(leaf)[0], known.members)
+    fitted = fit_population(
+        scored, arranged, *map(list, zip(*rigs, strict=True)), weight, progress=progress
+    )
+    _write(fitted, known)
+    return fitted
+
+
+def _write(fitted: FittedPopulation, known: frozen.Frozen) -> None:
+    """Write the population, its check and its hash into the folder of simulators."""
+    folder = known.folder
+    population.save(fitted.of_lungs(known.lung_ids, UNRECORDED_SLOPE), folder / frozen.POPULATION)
+    sd = np.sqrt(fitted.population.covariance.diagonal())
+    levels = np.linspace(0.0, 1.0, len(GAIN_QUANTILES))
+    about = {
+        "sessions": list(fitted.sessions),
+        "left_out": [round(share, 4) for _, share in fitted.left_out()],
+        "deviations": {name: round(float(x), 4) for name, x in zip(NAMES, sd, strict=True)},
+        "gain_breaths": len(fitted.gain),
+        "gain_deviation": round(fitted.gain_sd, 4),
+        "gain_quantiles": np.round(np.quantile(fitted.gain, levels), 3).tolist(),
+        "gain_correlation": round(fitted.gain_lag, 4),
+    }
+    digest = files.sha256(folder / frozen.POPULATION)
+    written = {
+        "format": frozen.ROLES_FORMAT,
+        "lungs": known.roles,
+        "population": about,
+        "files": {frozen.POPULATION: {"sha256": digest}},
+    }
+    files.write_text(folder / frozen.ROLES, tomli_w.dumps(written))
+
+
+def _scatter(gain: Floats, group: NDArray[np.int64]) -> tuple[Floats, float, float]:
+    """Deviations from the median of each group, scaled to the standard deviation within groups.
+
+    Returns:
+        The deviations; the standard deviation; and the correlation between neighbours.
+    """
+    off, squares, freedom, products = np.zeros(len(gain)), 0.0, 0, []
+    for name in np.unique(group):
+        own = gain[group == name]
+        off[group == name] = own - np.median(own)
+        away = own - own.mean()
+        squares, freedom = squares + float(away @ away), freedom + len(own) - 1
+        products += (away[1:] * away[:-1]).tolist()
+    sd = float(np.sqrt(squares / max(freedom, 1)))
+    lag = float(np.mean(products) / sd**2) if products and sd > 0 else 0.0
+    return off * (sd / max(float(np.std(off)), 1e-12)), sd, lag

@@ -134,7 +134,9 @@ def test_only_the_tests_fill_a_cache():
 def test_slow_tests_run_on_schedule_and_branches_may_be_main_or_master():
     started = read(FOLDER / "test.yml")[True]
     assert started["schedule"][0]["cron"]
-    assert started["push"]["branches"] == ["main", "master"]
+    pushed = [read(path)[True].get("push", {}) for path in FILES]
+    branches = [on["branches"] for on in pushed if "branches" in on]
+    assert branches == [["main", "master"]] * 2, "tests and pages"
     slow = read(FOLDER / "test.yml")["jobs"]["slow"]
     assert any("make test-slow" in step.get("run", "") for step in slow["steps"])
 

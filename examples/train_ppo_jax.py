@@ -113,5 +113,6 @@ for k in range(ITERATIONS):
     parameters, opt, error = iterate(parameters, opt, jax.random.key(k))
     errors.append(float(error))
     if k % 50 == 0 or k == ITERATIONS - 1:
-        print(f"iteration {k}: mean |pressure - PIP| {error:.3f} cmH2O while exploring", flush=True)
+        mean = sum(errors[-50:]) / len(errors[-50:])  # each iteration has other lungs and cells
+        print(f"iteration {k}: mean |pressure - PIP| {mean:.2f} cmH2O while exploring", flush=True)
 write_json(Path("runs/train_ppo_jax/errors.json"), errors)

@@ -7,9 +7,8 @@ on pairs of real recordings, the paper's tables and figures beside ours, studies
 from __future__ import annotations
 
 import subprocess
+from importlib.metadata import version
 from pathlib import Path
-
-import ventbench
 
 
 def code_version() -> str:
@@ -19,5 +18,5 @@ def code_version() -> str:
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
-        return ventbench.__version__
-    return done.stdout.strip() or ventbench.__version__
+        return version("ventbench")
+    return done.stdout.strip() or version("ventbench")

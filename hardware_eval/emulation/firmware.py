@@ -2,8 +2,7 @@
 
 An ``.elf`` runs under QEMU on an emulated MPS2 board with a Cortex-M3; any other file is a program
 of this computer. Both are made by ``make`` in ``hardware_eval/firmware``; its ``main.c`` specifies
-the bus. The clock of the emulated board counts instructions, so that a busy computer slows the
-board down and does not make it late by its own clock.
+the bus. Where the computer is too busy for it, the emulated board's watchdog resets it.
 """
 
 from __future__ import annotations

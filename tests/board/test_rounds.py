@@ -293,7 +293,8 @@ class LookUp:
         lung = [x.id for x in rigs.lungs].index(task.lung)
         _, cells = rigs.cells(rigs.draws(draw_tables.COUNT), protocol.PIPS)
         self.dt, self.target = (np.asarray(x)[lung].ravel() for x in (cells.dt, cells.pip))
-        self.commands = references.published().commands[lung].reshape(self.dt.size, -1)
+        commands = references.published().commands[lung][..., 0, :]
+        self.commands = commands.reshape(self.dt.size, -1)
 
     def act(self, observation) -> float:
         step = round(observation.time / observation.dt)

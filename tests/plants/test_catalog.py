@@ -211,7 +211,8 @@ def test_simulated_pressures_from_a_table_or_an_array(breaths, tmp_path):
 
 @pytest.mark.parametrize("given", ["magic", "no/such/file.json", "a b:c", 3 + 0j, object()])
 def test_what_stands_for_nothing_is_refused(given):
-    with pytest.raises(InputError, match=r"choose frozen|stands for no simulators|give a name, a file"):
+    refused = r"choose frozen|stands for no simulators|give a name, a file"
+    with pytest.raises(InputError, match=refused):
         load_simulators(given)
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -97,7 +98,7 @@ def bounds_of(
     plants, cells = rigs.cells(drawn, protocol.PIPS)
     about = references.settings(rigs.about, drawn.about())
     return references.compute(
-        plants, cells, references.published().gains, about,
+        plants, cells, np.array(references.PID_GAINS), about,
         folder=folder, starts=starts, pool=pool, progress=progress,
     )  # fmt: skip
 

@@ -399,7 +399,7 @@ def protocol_of(simulators: Mapping[str, Any]) -> dict[str, Any]:
         "simulators": dict(simulators),
         "protocol": _constants(protocol),
         "draws": _constants(draw_tables),
-        "pid": references.published().gains.tolist(),
+        "pid": references.PID_GAINS,
         "stress": [condition.id for condition in stressors.conditions()],
         "stressors": stressors.VERSION,
         "version": schema.PROTOCOL,

@@ -46,6 +46,17 @@ TOLERANCE = 0.1 * metric.LEAST_HEADROOM
 #: Largest file that is read, bytes.
 MAX_BYTES = 20_000_000
 
+#: P, I and D of the best PID of each lung, %/cmH2O: the 100 of rounds. What
+#: :func:`ventbench.train.best_pid.best_pids` finds on the rigs of the training.
+PID_GAINS = (
+    (10.6, 0.065, 26.2),
+    (29.1, 0.332, 0.119),
+    (28.2, 9.27, 9.86),
+    (0.974, 4.89, 68.9),
+    (1.87, 21.4, 15.8),
+    (1.96, 23.0, 0.14),
+)
+
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 

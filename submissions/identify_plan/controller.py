@@ -20,7 +20,7 @@ from rig import NAMES, simulate
 
 RIG = dict(np.load(Path(__file__).parent / "rig.npz"))
 SMOOTH = RIG | {"direction": np.zeros(3)}  # play has no derivative
-LUNGS = [str(lung) for lung in RIG["lungs"]]
+LUNGS = ["R5C10", "R5C20", "R5C50", "R20C10", "R20C20", "R20C50"]  # in the order of RIG
 STEPS = 34
 START = NAMES.index("start")
 GAIN = NAMES.index("gain")
@@ -170,7 +170,7 @@ class Controller:
     def reset(self, task):
         self.told = LUNGS.index(task.lung) if task.lung in LUNGS else None
         self.lungs = np.arange(len(LUNGS)) if self.told is None else np.array([self.told])
-        self.breaths = []
+        self.breaths, self.readings, self.applied = [], [], []
         self.commands = None
 
     def act(self, observation):
@@ -191,8 +191,7 @@ class Controller:
         return float(min(max(self._correct(step), 0.0), 100.0))
 
     def _begin(self, observation):
-        if self.commands is not None or self.breaths or hasattr(self, "readings"):
-            self._end()
+        self._end()
         self.dt, self.sum = observation.dt, 0.0
         self.readings, self.applied = [observation.pressure], []
         self.slope = None

@@ -7,7 +7,6 @@ from rig import KNOTS, TOP
 
 from ventbench.plants import frozen
 from ventbench.plants.hybrid import ELASTIC_KNOTS
-from ventbench.task.lungs import LUNGS
 
 
 def main():
@@ -38,7 +37,6 @@ def main():
         curve=curve,
         recoil=np.array(recoils),
         means=np.array(means),
-        lungs=np.array([lung.id for lung in LUNGS]),
         direction=np.median(leaf["direction"][:, used], axis=(0, 1)),
         lag=pooled("valve_lag"),
         circuit=pooled("circuit_compliance"),

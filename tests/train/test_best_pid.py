@@ -1,0 +1,39 @@
+"""The 100 of rounds: the best PID of each lung, without a grid's edge."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ventbench.entries.reference import PID_GAINS
+from ventbench.plants.rigs import load_rigs
+from ventbench.task.draws import COUNT
+from ventbench.train import best_pid
+from ventbench.train.pid_grid import drawn_errors
+
+
+@pytest.mark.slow
+def test_no_neighbour_of_the_published_gains_and_no_pid_of_the_paper_is_better():
+    rigs = load_rigs().of_training
+    drawn = rigs.draws(COUNT)
+    corners = np.array([[1.5**k if at == axis else 1.0 for at in range(3)]
+                        for axis in range(3) for k in (-1, 1)])  # fmt: skip
+    paper = np.stack(np.meshgrid([2.0, 5.0, 10.0], [1.0, 4.0, 10.0], [0.0, 5.0]), -1).reshape(-1, 3)
+    for lung, gains in enumerate(np.array(PID_GAINS)):
+        tried = np.concatenate([gains[None], gains * corners, paper])
+        errors = drawn_errors(rigs, drawn, lung, tried).mean(axis=-1)
+        assert errors[0] <= errors.min() + best_pid.AGREEMENT, lung
+
+
+def test_a_search_finds_what_it_is_told_of(monkeypatch):
+    """On a made-up error whose optimum is beyond the grid of the paper."""
+    optimum = np.log([40.0, 3.0, 0.5])
+
+    def errors(rigs, drawn, lung, gains, together=None):
+        away = np.log(np.maximum(np.asarray(gains, float), 1e-9)) - optimum
+        return np.sum(away**2, axis=-1)[..., None]
+
+    monkeypatch.setattr(best_pid, "drawn_errors", errors)
+    found = best_pid.best_pids(load_rigs(), draws=1)
+    assert found.agree.all()
+    np.testing.assert_allclose(np.log(found.gains), np.tile(optimum, (6, 1)), atol=0.03)

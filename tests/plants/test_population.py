@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from ventbench.base import precision
 from ventbench.base.errors import InputError
@@ -13,6 +14,7 @@ from ventbench.plants import frozen, population
 from ventbench.plants.population import FLOW, NAMES, from_vector, to_vector
 from ventbench.plants.rigs import load_rigs
 from ventbench.task import draws, protocol
+from ventbench.task.lungs import LUNGS
 from ventbench.task.rollouts import open_loop
 
 SEED = bytes(range(32))
@@ -69,9 +71,12 @@ def test_drawn_rigs_are_lungs_of_their_label_and_rise_with_the_command(official)
     for lung, settings in enumerate(official.lungs().values()):
         rigs = official.population.rigs(SEED, lung, 60)
         assert np.median(1000.0 / rigs.E) == pytest.approx(settings["C"], rel=0.25)
+        # Fitted rigs of one labelled resistor differ by 20 %.
+        same = [own for own, other in zip(official.rigs, LUNGS, strict=True)
+                if settings["R"] == other.R]  # fmt: skip
+        fitted = (official.members.R[0] + FLOW * official.members.K2[0])[np.concatenate(same)]
         resistance = np.median(rigs.R + FLOW * rigs.K2)
-        own = official.members.R[0] + FLOW * official.members.K2[0]
-        assert resistance == pytest.approx(np.median(own[list(official.rigs[lung])]), rel=0.15)
+        assert resistance == pytest.approx(np.median(fitted), rel=0.25)
         three = jax.tree.map(lambda x: np.tile(x[:3], (5,) + (1,) * (x.ndim - 1)), rigs)
         with precision.float64():
             zeros, dt = np.zeros((15, steps)), np.full((15, steps), protocol.DT)
@@ -84,8 +89,9 @@ def test_drawn_rigs_are_lungs_of_their_label_and_rise_with_the_command(official)
 def test_left_out_sessions_lie_where_the_population_says(official):
     about = official.manifest["population"]
     assert sorted(about["sessions"]) == sorted(rig for rigs in official.rigs for rig in rigs)
-    inside = np.mean(np.array(about["left_out"]) < 0.9)
-    assert 0.8 <= inside <= 1.0
+    # 90 % regions: as many are inside as a binomial number of that mean is in 99 % of cases.
+    inside = np.array(about["left_out"]) < 0.9
+    assert np.count_nonzero(inside) >= binom.ppf(0.01, len(inside), 0.9)
     assert 0.10 <= about["gain_deviation"] <= 0.14
     assert about["gain_quantiles"] == list(draws.GAIN_QUANTILES)
 

@@ -40,7 +40,7 @@ POPULATION = "population.npz"
 ROLES = "population.toml"
 
 #: SHA-256 of the official one, which holds that of the population.
-ROLES_SHA256 = "6ba57c9d353db6769c4424301448654bff65701c65e11e7a05797fbce7410c50"
+ROLES_SHA256 = "f593a610bc4db77f83119e1b3797fb848300c3412cd04ee7674f2b5086d1c293"
 
 #: SHA-256 of the official manifest, which holds those of all its files.
 MANIFEST_SHA256 = "e4b214dd47b9233918260c0576bf76ce15eb1629309be0ae05cf04394fe368e9"

@@ -9,7 +9,7 @@ from ventbench.train.rigs.random_effects import Prior, Units, fit, surprise
 
 
 def prior(p: int, q: int, *, units: float = 0.0, uncorrelated: float = 0.0) -> Prior:
-    return Prior(np.ones(p), np.full(p, units), uncorrelated, np.zeros(q), 1e3)
+    return Prior(np.ones(p), np.full(p, units), uncorrelated, np.zeros(q), np.full(q, 1e3))
 
 
 def units_of(estimates: np.ndarray, errors: np.ndarray, groups: int = 1) -> Units:
@@ -81,7 +81,7 @@ def test_a_direction_without_information_keeps_its_given_scale():
     blind = units.information.copy()
     blind[:, 1], blind[:, :, 1] = 0.0, 0.0
     weighted = units.weighted * [1.0, 0.0]
-    given = Prior(np.array([1.0, 0.2]), np.array([2.0, np.inf]), 3.0, np.zeros(2), 1.0)
+    given = Prior(np.array([1.0, 0.2]), np.array([2.0, np.inf]), 3.0, np.zeros(2), np.ones(2))
     found = fit(Units(blind, weighted, units.design), given)
     assert np.sqrt(found.covariance[1, 1]) == pytest.approx(0.2)
     assert abs(found.covariance[0, 1]) < 1e-6

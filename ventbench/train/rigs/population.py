@@ -61,8 +61,9 @@ PRIOR_SESSIONS, UNCORRELATED_SESSIONS = 5.0, 30.0
 #: its scale is given.
 GIVEN = ("direction",)
 
-#: Standard deviation of means around the fitted plants', wide.
-CENTRE_SCALE = 0.5
+#: Standard deviations of means around those of the fitted plants; the second is of what a label
+#: says: that fit ties lungs of one labelled resistor or spring together, which this one does not.
+LABELLED, CENTRE_SCALE, LABELLED_SCALE = ("resistance", "elastance"), 0.5, 0.05
 
 #: Renewals of the linearisation, steps of each breath's gain and start in each, and of the mixed
 #: model in each; at most so much changes in one, as the linearisation holds nearby only.
@@ -241,41 +242,6 @@ class FittedPopulation:
             out.append(random_effects.surprise(self.units, j, others))
         return out
 
-    def nearest_of(
-        self, j: int, data: InspirationData, weight: Floats, count: int, seed: bytes
-    ) -> tuple[float, float]:
-        """How near rigs that are drawn without a session come to its measured breaths.
-
-        Args:
-            j: the session, by its place among the J.
-            data: inspirations.
-            weight: of each breath: 1 for a measured one.
-            count: number of drawn rigs.
-            seed: 32 bytes.
-
-        Returns:
-            Mean error of the breaths under the nearest of the drawn rigs, and the median over the
-            drawn rigs, cmH2O; NaN where no breath was measured.
-        """
-        others = random_effects.fit(
-            self.units.without(j), self.prior, iterations=30, start=self.population.covariance
-        )
-        mean, covariance = others.predictive(self.units.design[[j]])
-        rigs = RigPopulation(mean, np.linalg.cholesky(covariance))
-        drawn = to_vector(rigs.rigs(seed, 0, count))
-        at = np.flatnonzero(
-            (np.asarray(data.groups.session) == self.sessions[j])
-            & (weight == 1.0) & (np.asarray(data.start_known) > 0)
-        )  # fmt: skip
-        if not len(at):
-            return float("nan"), float("nan")
-        own = jax.tree.map(lambda x: np.asarray(x)[at], data)
-        with precision.float64():
-            each = jax.vmap(jax.vmap(_pressures, (None, None, 0, 0)), (0, None, None, None))
-            pressure = np.asarray(jax.jit(each)(jnp.asarray(drawn), 0.0, own.start, own))
-        error = np.sum(np.asarray(own.share) * np.abs(pressure - np.asarray(own.pressure)), -1)
-        return float(error.mean(axis=1).min()), float(np.median(error.mean(axis=1)))
-
     def of_lungs(self, lungs: Sequence[str], unrecorded: float) -> RigPopulation:
         """The population that rigs are drawn from.
 
@@ -325,7 +291,9 @@ def fit_population(
     design = design_of(lungs)
     centre = np.linalg.lstsq(design.reshape(-1, design.shape[2]), rigs.ravel(), rcond=None)[0]
     counts = [np.inf if name.startswith(GIVEN) else PRIOR_SESSIONS for name in NAMES]
-    prior = Prior(scales(), np.array(counts), UNCORRELATED_SESSIONS, centre, CENTRE_SCALE)
+    labelled = design[:, [NAMES.index(name) for name in LABELLED]].any(axis=(0, 1))
+    wide = np.where(labelled, LABELLED_SCALE, CENTRE_SCALE)
+    prior = Prior(scales(), np.array(counts), UNCORRELATED_SESSIONS, centre, wide)
     start = None
     for turn in range(renewals):
         breaths = _with_own(breaths, rigs, GAIN, BREATH_STEPS)

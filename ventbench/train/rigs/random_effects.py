@@ -50,14 +50,14 @@ class Prior:
         units: how many units each scale counts for, shape ``(p,)``; infinity for one that is given.
         uncorrelated: how many units count for no correlation between parameters.
         centre: of ``beta``, shape ``(q,)``.
-        centre_scale: standard deviation of ``beta`` around it, wide.
+        centre_scale: standard deviations of ``beta`` around it, shape ``(q,)``.
     """
 
     scale: Floats
     units: Floats
     uncorrelated: float
     centre: Floats
-    centre_scale: float
+    centre_scale: Floats
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def _expect(
     turned = X.transpose(0, 2, 1)
     precision = prior.centre_scale**-2.0
     normal = (turned @ (A - A @ posterior @ A) @ X).sum(axis=0)
-    normal += precision * np.eye(X.shape[2])
+    normal += np.diag(precision)
     right = (turned @ (b - A @ (posterior @ b)))[..., 0].sum(axis=0) + precision * prior.centre
     error = np.linalg.inv(normal)
     beta = error @ right

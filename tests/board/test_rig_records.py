@@ -159,7 +159,7 @@ def test_stress_is_ranked_and_shown(board, built):
     # Two differ by one number in all runs, the third only in noise.
     assert [row.ranks for row in rows] == [(1, 2), (1, 2), (2, 2)]
     assert rows[0].score is not None
-    assert rows[0].score.value == pytest.approx(rows[0].tables.error[1:].mean())
+    assert rows[0].score.value == pytest.approx(rows[0].tables.by_lung_and_draw.mean())
     groups = pages.stress_chart(rows)
     fields = [field for group in groups for row in group["rows"] for field in row["fields"]]
     assert sum(field is not None for field in fields) == 3 * (len(conditions()) - 1)

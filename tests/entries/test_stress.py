@@ -32,6 +32,7 @@ from ventbench.task import environment, protocol, rollouts
 from ventbench.task.interfaces import Task
 from ventbench.task.metrics.score import run_error
 from ventbench.task.rollouts import Script
+from ventbench.task.stressors import STRESSORS, WEIGHTS, held_out
 
 #: Stressors of the shared run.
 NAMES = ("leak", "sensor_low", "disconnection")
@@ -242,8 +243,10 @@ def test_json_and_tables_say_the_same(score: Score, runs: Runs, tmp_path: Path) 
     assert not values["complete"]
     rows = values["conditions"]
     assert [row["condition"] for row in rows] == [c.id for c in runs.conditions]
-    assert np.mean([row["error_cmH2O"] for row in rows[1:]]) == pytest.approx(runs.score)
-    assert np.mean([row["rise_cmH2O"] for row in rows[1:]]) == pytest.approx(values["rise"])
+    weights = [WEIGHTS.get(row["condition"], 1.0) for row in rows[1:]]
+    for key, mean in (("error_cmH2O", runs.score), ("rise_cmH2O", values["rise"])):
+        by_row = [row[key] for row in rows[1:]]
+        assert np.average(by_row, weights=weights) == pytest.approx(mean)
     assert len(runs.to_frame()) == runs.error.size
     assert len(score.to_frame()) == runs.error.size + 6
     worst = max(rows[1:], key=lambda row: row["error_cmH2O"])
@@ -356,3 +359,41 @@ def test_stressors_act_as_a_person_expects(runs: Runs) -> None:
     off = _of(runs, "disconnection:strong")
     assert error[off] > 1.5 * error[0]
     assert np.median(runs.volume_ratio[off]) < 0.7
+
+
+def _recorded_errors() -> dict[str, tuple[list[str], np.ndarray]]:
+    found = {}
+    for path in sorted((Path(__file__).parents[2] / "leaderboard" / "records").glob("*.json")):
+        stress = json.loads(path.read_text()).get("stress")
+        if stress:
+            found[path.stem] = stress["conditions"], np.array(stress["errors"], float)
+    return found
+
+
+def test_no_condition_is_more_than_a_tenth_of_level_or_rise() -> None:
+    found = _recorded_errors()
+    assert len(found) >= 5
+    for names, errors in found.values():
+        mean = errors.mean(axis=(1, 2))
+        weight = np.array([WEIGHTS.get(name, 1.0) for name in names[1:]])
+        for value in (mean[1:], mean[1:] - mean[0]):
+            assert np.max(weight * value) < 0.1 * np.sum(weight * value)
+
+
+def test_the_score_weighs_conditions(runs: Runs) -> None:
+    names = [condition.id for condition in runs.conditions[1:]]
+    weight = np.array([WEIGHTS.get(name, 1.0) for name in names])
+    by_hand = weight @ runs.error[1:].mean(axis=(1, 2)) / weight.sum()
+    assert runs.score == pytest.approx(by_hand, rel=1e-12)
+    assert weight.min() < 1.0
+    apart = [
+        k for k, c in enumerate(runs.conditions) if c.stressors and set(c.stressors) <= held_out()
+    ]
+    expected = runs.error[apart].mean() if apart else np.nan
+    np.testing.assert_allclose(runs.held_out_score, expected, rtol=1e-12)
+
+
+def test_a_third_of_the_stressors_is_held_out_of_every_tuning() -> None:
+    names = {line.name for line in STRESSORS}
+    assert held_out() < names
+    assert 3 * len(held_out()) >= len(names) > 2 * len(held_out())

@@ -22,7 +22,14 @@ from ventbench.entries.errors import Failure
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.metrics.bootstrap import resampled_scores
-from ventbench.task.stressors import CATEGORIES, Condition, conditions, stressor
+from ventbench.task.stressors import (
+    CATEGORIES,
+    WEIGHTS,
+    Condition,
+    conditions,
+    held_out,
+    stressor,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -112,8 +119,20 @@ class Runs:
 
     @property
     def score(self) -> float:
-        """Mean error over all stressed conditions, cmH2O; NaN if any cell failed."""
-        return float(np.mean(self.error[1:]))
+        """Weighted mean error of the stressed conditions, cmH2O; NaN if any cell failed."""
+        return float(np.mean(self.by_lung_and_draw))
+
+    def over_conditions(self, values: Floats) -> Floats:
+        """Weighted mean over the stressed conditions of values ``(S, L, n)``, ``(L, n)``."""
+        weights = [WEIGHTS.get(condition.id, 1.0) for condition in self.conditions[1:]]
+        return np.average(values[1:], axis=0, weights=weights)
+
+    @property
+    def held_out_score(self) -> float:
+        """Mean error under stressors that nothing may be tuned under, cmH2O; NaN without any."""
+        apart = held_out()
+        at = [k for k, c in enumerate(self.conditions) if c.stressors and set(c.stressors) <= apart]
+        return float(np.mean(self.error[at])) if at else float("nan")
 
     @property
     def unstressed(self) -> float:
@@ -147,8 +166,8 @@ class Runs:
 
     @property
     def by_lung_and_draw(self) -> Floats:
-        """Mean error over the stressed conditions, cmH2O, ``(L, n)``; NaN if one failed."""
-        return self.error[1:].mean(axis=0)
+        """Weighted mean error of the stressed conditions, cmH2O, ``(L, n)``; NaN if one failed."""
+        return self.over_conditions(self.error)
 
     def resampled(self, values: Floats) -> Floats:
         """Means over cells with draws, rigs and ensemble members resampled, alike for all entries.
@@ -243,13 +262,14 @@ class Runs:
     def headline(self) -> dict[str, Any]:
         """What a table shows of an entry, as JSON values: score, rise, survival, safety, worst."""
         worst_one = max(self.by_condition[1:], key=lambda row: _order(row["error_cmH2O"]))
-        stressed = self.by_lung_and_draw
+        stressed, rise = self.by_lung_and_draw, self.over_conditions(self.rise)
         return {
             "score": number(self.score),
             "ci95": [number(limit) for limit in self.interval(stressed)],
             "unstressed": number(self.unstressed),
-            "rise": number(np.mean(self.rise[1:])),
-            "rise_ci95": [number(limit) for limit in self.interval(self.rise[1:].mean(axis=0))],
+            "rise": number(np.mean(rise)),
+            "rise_ci95": [number(limit) for limit in self.interval(rise)],
+            "held_out_score": number(self.held_out_score),
             "survived": self.survived_share,
             "survived_ci95": [
                 number(limit) for limit in self.interval(self.survived[1:].mean(axis=0))

@@ -408,7 +408,7 @@ def _stress(values: schema.ScoreContent, label: str) -> RecordStress | None:
         alarm_s=np.array(own.above_alarm_ms) / 1e3,
         peak=np.array(own.peak_centi_cmH2O) / 100.0,
         volume=np.array(own.volume_mL, float),
-        draw=np.arange(1, draws + 1),
+        draw=np.arange(1, len(ranked) + 1),
     )
     if own.stressors == STRESSORS_VERSION and not tables.complete:
         raise InputError(

@@ -1,5 +1,6 @@
 """Airway pressure on rigs, step by step and in a compiled scan alike."""
 
+import dataclasses
 import json
 
 import jax
@@ -70,10 +71,8 @@ def test_draws_run_on_the_rigs_that_they_name(rigs, result):
     drawn = result.rig_draws
     assert sorted(set(drawn.rig[0])) == [0, 1]
     # The second rig of a lung is another plant: the same deviations on the first give other errors.
-    forced = drawn.__class__(
-        drawn.name, drawn.commitment, drawn.cells, np.zeros_like(drawn.rig)
-        + np.array([own[0] for own in rigs.sessions])[:, None], np.zeros_like(drawn.member),
-    )  # fmt: skip
+    first = np.zeros_like(drawn.rig) + np.array([own[0] for own in rigs.sessions])[:, None]
+    forced = dataclasses.replace(drawn, rig=first, member=np.zeros_like(drawn.member))
     again = run_protocol(open_submission("pid_robust"), rigs, drawn=forced, pips=PIPS)
     changed = np.any(again.drawn != result.drawn, axis=2).T
     elsewhere = (drawn.rig != forced.rig) | (drawn.member > 0)

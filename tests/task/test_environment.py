@@ -93,7 +93,7 @@ def test_expiration_uses_the_hard_coded_controller(plant):
 
 def test_vary(plant):
     gain = np.array([[1.0, 1.2, 0.8], [1.0, 0.9, 1.1]])
-    varied = env.vary(plant, cell(r_scale=1.1, c_scale=0.9, gain=gain), 1)
+    varied = env.vary(plant, replace(cell(r_scale=1.1, c_scale=0.9), gain=jnp.asarray(gain)), 1)
     assert isinstance(varied, SingleCompartment)
     np.testing.assert_allclose(varied.R, 5.5)
     np.testing.assert_allclose(varied.gain, [1.2 * 22.8, 0.9 * 22.8])

@@ -166,11 +166,13 @@ class Physics:
     def vary(self, r_scale: Array, c_scale: Array, gain: Array | float = 1.0) -> Physics:
         """Return the model with scaled resistance, compliance and gain of the valve."""
         scales = {"R": r_scale, "C": c_scale, "gain": gain}
+        unscaled = isinstance(gain, float) and gain == 1.0
+        own = self if unscaled else self.having(gain=self.get("gain"))
         varied = [
             value * scales.get(parameter(name).follows or name, 1.0)
-            for name, value in zip(self.names, self.values, strict=True)
+            for name, value in zip(own.names, own.values, strict=True)
         ]
-        return self.replace(values=tuple(varied))  # type: ignore[attr-defined]
+        return own.replace(values=tuple(varied))  # type: ignore[attr-defined]
 
     def parameters(self) -> dict[str, Array]:
         """Its own by path; see :class:`~ventbench.task.interfaces.Plant`."""

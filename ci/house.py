@@ -23,7 +23,7 @@ MODULES = 317
 LONGEST, LOOSE = 580, 8
 
 #: Most words of Markdown (as ``wc -w`` counts), and the folders that hold it beside the root.
-WORDS = 31_000
+WORDS = 31_200
 PROSE = ("docs", "examples", "hardware_eval", "proofs", "submissions", "tests", "ventbench")
 
 #: A branch on a number of the protocol: there is one protocol.

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.entries import contract
 from ventbench.entries.contract_runs import STEPS
@@ -352,7 +353,9 @@ def test_command_new(tmp_path):
     made = command("new", "demo", "--family", "dqn", "--dir", tmp_path)
     assert made.exit_code == 0, made.output
     assert "network.py, submission.toml, weights.npz" in made.output
-    assert command("new", "demo", "--family", "nothing").exit_code == 2
+    refused = command("new", "demo", "--family", "nothing")
+    assert isinstance(refused.exception, InputError)
+    assert "is not one of pid" in str(refused.exception)
 
 
 def test_everything_at_once(demo):

@@ -38,14 +38,14 @@ def test_reference_rig_is_the_nominal_score(rigs, result):
 
 def test_plants_fall_into_groups(result):
     assert [result[group]["plants"] for group in GROUPS] == [6, 6, 1, 5]
-    assert result["held-out rig"]["lungs"]["R5C10"] is None
+    assert result["held-out rigs"]["lungs"]["R5C10"] is None
     assert result["other rigs"]["error_cmH2O"] == result["other rigs"]["lungs"]["R5C10"]
     assert list(result["other rigs"]["lungs"].values())[1:] == [None] * 5
 
 
 def test_other_rigs_give_other_errors(result):
     assert np.all(errors(result, "other members") != errors(result, "reference rig"))
-    assert np.all(errors(result, "held-out rig")[1:] != errors(result, "reference rig")[1:])
+    assert np.all(errors(result, "held-out rigs")[1:] != errors(result, "reference rig")[1:])
 
 
 def test_json_has_null_where_there_is_no_plant(result):

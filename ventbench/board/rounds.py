@@ -36,6 +36,7 @@ from ventbench.board.canonical import ROUNDS
 from ventbench.entries import reference as references
 from ventbench.entries.folder import Submission, open_submission
 from ventbench.entries.reference import Reference
+from ventbench.plants import frozen
 from ventbench.plants.rigs import Rigs
 from ventbench.task import draws as draw_tables
 from ventbench.task import protocol, stressors
@@ -400,6 +401,7 @@ def protocol_of(simulators: Mapping[str, Any]) -> dict[str, Any]:
         "protocol": _constants(protocol),
         "draws": _constants(draw_tables),
         "pid": references.PID_GAINS,
+        "population": frozen.ROLES_SHA256,
         "stress": [condition.id for condition in stressors.conditions()],
         "stressors": stressors.VERSION,
         "version": schema.PROTOCOL,

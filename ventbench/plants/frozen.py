@@ -207,7 +207,7 @@ class Frozen:
 
     def about(self) -> dict[str, Any]:
         """Version and hashes that a score states of its simulators."""
-        hashes = {name: entry["sha256"] for name, entry in self.manifest["files"].items()}
+        hashes = {name: self.manifest["files"][name]["sha256"] for name in (MEMBERS, SEEN)}
         return {
             "version": self.manifest["version"],
             "kind": self.manifest["kind"],
@@ -240,6 +240,8 @@ def load(path: Path | None = None) -> Frozen:
     Raises:
         InputError: if a file is missing or is not what the manifest says.
     """
+    if path is None and files.sha256(folder() / ROLES) != ROLES_SHA256:
+        raise InputError(f"{folder() / ROLES} is damaged or changed: restore it")
     path = path or folder()
     manifest = _manifest(path)
     members = load_plant(_checked(path, MEMBERS, manifest), as_array=np.asarray)

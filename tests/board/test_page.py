@@ -11,7 +11,10 @@ import pytest
 from .browser import Page, browser, find
 from .conftest import HOSTILE
 
-NAMES = "[...document.querySelectorAll('#performance ~ .scroll tbody tr th')].map(x => x.innerText)"
+NAMES = (
+    "[...document.querySelector('#performance ~ .scroll').querySelectorAll('tbody tr th')]"
+    ".map(x => x.innerText)"
+)
 SORT = "document.querySelector('#performance ~ .scroll thead th:nth-child({}) button')"
 
 

@@ -11,6 +11,7 @@ import argparse
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 from ventbench.board.frames import load_board
 
@@ -23,7 +24,7 @@ def markdown() -> str:
     titles = ["track", "rank", "entry", "normalised", "error", "stress", "runs survived"]
     lines = [titles, ["---"] * len(titles)]
     board = load_board(ROOT / "leaderboard")
-    shown = board[board["status"].isin(["ranked", "practice"])]
+    shown: Any = board[board["status"].isin(["ranked", "practice"])]
     newest = shown[shown["draws"] == shown["draws"].iloc[0]]
     for row in newest.to_dict(orient="records"):
         ranked = row["status"] == "ranked"

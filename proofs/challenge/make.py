@@ -109,7 +109,7 @@ def _make_case(
     apart = np.isin(breaths.breath_id, withheld_breaths(secret, case))
     active = generator_of(case).active(case, breaths)
     folder.keep(case.name, secret, Withheld(
-        {int(breaths.breath_id[k]): _readings(breaths, k) for k in np.flatnonzero(apart)},
+        {int(breaths.breath_id[k]): _readings(breaths, k) for k in np.flatnonzero(apart).tolist()},
         None if active is None else _intervals(breaths, active),
     ))  # fmt: skip
     blank = np.where(apart[:, None], np.nan, breaths.pressure)

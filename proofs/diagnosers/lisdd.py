@@ -58,7 +58,7 @@ def diagnose(folder: Path) -> dict[str, Any]:
     def solve(chosen: tuple[str, ...], rows: NDArray[np.bool_]) -> Floats:
         columns = [*base, *(model.effects[name] for name in chosen)]
         x = np.stack([column[rows] for column in columns], axis=1)
-        return np.linalg.lstsq(x, model.residual[rows], rcond=None)[0]
+        return np.asarray(np.linalg.lstsq(x, model.residual[rows], rcond=None)[0], float)
 
     def corrected(chosen: tuple[str, ...], weights: Floats) -> Floats:
         columns = [*base, *(model.effects[name] for name in chosen)]

@@ -76,7 +76,7 @@ def estimate(lungs, breaths):
     cost = np.full(many, np.inf)
     best, curvature = theta.copy(), np.repeat(precision[None], many, 0)
     damping = np.full(many, 1e-2)
-    slope = residual = None
+    slope = residual = np.zeros(0)
     for _ in range(FITS):
         shifted = np.repeat(theta[:, None], size + 1, 1)
         shifted[:, np.arange(size) + 1, np.arange(size)] += SHIFT
@@ -93,7 +93,7 @@ def estimate(lungs, breaths):
         robust = np.where(np.abs(scaled) < 3.0, 0.5 * scaled**2, 3.0 * np.abs(scaled) - 4.5)
         new_cost = robust.sum(-1) + 0.5 * (((theta - mean) / SPREAD) ** 2).sum(-1)
         better = new_cost < cost
-        if slope is None:
+        if slope.size == 0:
             residual, slope = new_residual, new_slope
         cost = np.where(better, new_cost, cost)
         best[better] = theta[better]
@@ -146,7 +146,8 @@ def plan(theta, lung, dt, target, commands):
     starts = np.concatenate([commands[None], starts])
     _, airway = simulate(RIG, thetas[: len(starts)], dt, starts, rows[: len(starts)])
     commands = starts[np.abs(target[1:] - airway[:, 1:]).sum(1).argmin()]
-    best, error, slope, least, radius = commands, None, None, np.inf, RADIUS
+    best, least, radius = commands, np.inf, RADIUS
+    error, slope = np.zeros(0), np.zeros((0, 0))
     for _ in range(PLANS):
         away = target[1:] - simulate(RIG, theta[None], dt, commands[None], rows[:1])[1][0, 1:]
         total = np.abs(away).sum()
@@ -171,7 +172,8 @@ class Controller:
         self.told = LUNGS.index(task.lung) if task.lung in LUNGS else None
         self.lungs = np.arange(len(LUNGS)) if self.told is None else np.array([self.told])
         self.breaths, self.readings, self.applied = [], [], []
-        self.commands = None
+        self.commands = np.zeros(0)
+        self.slope = np.zeros((0, 0))
 
     def act(self, observation):
         if observation.time == 0:
@@ -182,7 +184,7 @@ class Controller:
         step = len(self.readings) - 1
         if step >= STEPS - 1:
             return self.applied[-1]
-        if self.slope is None:
+        if self.slope.size == 0:
             error = observation.target - observation.pressure
             self.sum += error
             rise = observation.pressure - self.readings[-2] if step else 0.0
@@ -194,7 +196,7 @@ class Controller:
         self._end()
         self.dt, self.sum = observation.dt, 0.0
         self.readings, self.applied = [observation.pressure], []
-        self.slope = None
+        self.slope = np.zeros((0, 0))
         if self.breaths:
             theta, covariance, lung = estimate(self.lungs, self.breaths)
             theta = theta.copy()
@@ -206,7 +208,7 @@ class Controller:
         covariance = covariance.copy()
         covariance[GAIN, GAIN] += BETWEEN**2
         self.target = np.array([observation.target] * STEPS)
-        first = self.commands if self.commands is not None else np.full(STEPS - 1, 10.0)
+        first = self.commands if self.commands.size else np.full(STEPS - 1, 10.0)
         self.commands, self.slope = plan(theta, lung, self.dt, self.target, first)
         shifted = np.repeat(theta[None], len(NAMES) + 1, 0)
         shifted[np.arange(len(NAMES)) + 1, np.arange(len(NAMES))] += SHIFT

@@ -12,8 +12,8 @@ from ventbench.board.beacon import Chain
 
 _LIMIT = sys.getrecursionlimit()
 
-from py_ecc import optimized_bls12_381 as curve  # noqa: E402
 from py_ecc.bls import hash_to_curve, point_compression  # noqa: E402
+from py_ecc.optimized_bls12_381 import optimized_curve as curve  # noqa: E402
 
 sys.setrecursionlimit(_LIMIT)  # py_ecc raises it beyond what the stack holds
 
@@ -28,7 +28,7 @@ def chain(secret: int, *, genesis: int = 0, period: int = 1) -> Chain:
 def value(secret: int, number: int) -> bytes:
     """What the beacon publishes in a round, as relays do."""
     message = hashlib.sha256(number.to_bytes(8, "big")).digest()
-    hashed = hash_to_curve.hash_to_G1(message, beacon.DOMAIN, hashlib.sha256)
+    hashed = hash_to_curve.hash_to_G1(message, beacon.DOMAIN, hashlib.sha256)  # type: ignore[arg-type]
     point = point_compression.compress_G1(curve.multiply(hashed, secret))
     signature = point.to_bytes(48, "big")
     return json.dumps(

@@ -21,7 +21,7 @@ NAMES = ("valve_lag", "sensor_lag", "leak", "viscoelasticity")
 
 
 def plan(*levels: float) -> list[Controls]:
-    time = 0.03 * np.arange(60)
+    time = np.arange(60) * np.float64(0.03)
     falling = np.where(time < 1.0, np.exp(-time / 0.6), 0.0)
     return [Controls(time, level * falling, (time >= 1.0).astype(float)) for level in levels]
 

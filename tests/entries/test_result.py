@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ class Pretender:
         pass
 
 
-def scored(plants, runner=None, **options):
+def scored(plants, runner: Any = None, **options):
     rigs = plants if isinstance(plants, Rigs) else Rigs(LUNGS, plants, about=frozen.load().about())
     runner = runner or Pretender()
     return run_protocol(open_submission("pid_robust"), rigs, runner=runner, **options)

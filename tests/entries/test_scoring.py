@@ -330,7 +330,7 @@ class Recorder:
 
 
 def test_another_runner(plants):
-    runner = Recorder()
+    runner: Any = Recorder()
     found = run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), draws=1, runner=runner)
     assert len(runner.rows) == 102
     assert all(rows.shape == (72, 15) and rows.dtype == np.float64 for rows in runner.rows)
@@ -350,7 +350,7 @@ def test_session_is_closed_when_the_loop_breaks(plants):
         def answers(self):
             raise KeyboardInterrupt
 
-    runner = Breaks()
+    runner: Any = Breaks()
     with pytest.raises(KeyboardInterrupt):
         run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), runner=runner)
     assert runner.closed == 1

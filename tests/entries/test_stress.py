@@ -122,9 +122,9 @@ def test_the_scan_and_the_steps_give_the_same_score(runs: Runs, cells: Cells) ->
     pip = np.asarray(scenario.pip)[:, None, None]
     error = run_error(np.asarray(pressure), pip).reshape(runs.error.shape)
     np.testing.assert_allclose(error, runs.error, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(
-        np.asarray(requested).reshape(np.shape(runs.requested)), runs.requested, rtol=0, atol=1e-7
-    )
+    given = np.asarray(runs.requested)
+    again = np.asarray(requested).reshape(given.shape)
+    np.testing.assert_allclose(again, given, rtol=0, atol=1e-7)
 
 
 @pytest.mark.slow

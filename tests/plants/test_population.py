@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -97,7 +99,7 @@ def test_left_out_sessions_lie_where_the_population_says(official):
 
 
 def test_ranked_draws_are_on_rigs_that_nobody_trained_on():
-    rigs = load_rigs()
+    rigs: Any = load_rigs()
     drawn = rigs.draws(draws.COUNT, seed=SEED, name="practice")
     for lung in range(6):
         ranked, others = drawn.rig[lung, drawn.ranked], drawn.rig[lung, ~drawn.ranked]

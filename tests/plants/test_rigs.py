@@ -71,7 +71,8 @@ def test_what_the_absolute_test_of_labels_says_of_the_scored_rigs(official):
         others = {row["lung"]: row["error_own_label"]}
         others[row["best_other_label"]] = row["error_best_other_label"]
         errors[row["session"]] = [others.get(lung.id, np.inf) for lung in RECORDED_LUNGS]
-    counts = tuple(np.array([row[key] for row in rows]) for key in ("measured", "breaths"))
+    measured, breaths = (np.array([row[key] for row in rows]) for key in ("measured", "breaths"))
+    counts = (measured, breaths)
     tests = label_tests(
         members[0], members[1:], errors, official.sessions, RECORDED_LUNGS, counts, LAMINAR_SHARE
     )

@@ -180,8 +180,8 @@ def sources(commands: Sequence[Floats]) -> list[int | None]:
     for k, own in enumerate(commands):
         likely = np.mean(_apart(few[k], few[:k]) <= 2.0 * DISTANCE, axis=-1) >= 0.5 * FOLLOWING
         follows = (
-            int(j)
-            for j in np.flatnonzero(likely)
+            j
+            for j in np.flatnonzero(likely).tolist()
             if np.mean(_apart(own, commands[j]) <= DISTANCE) >= FOLLOWING
         )
         found.append(next(follows, None))

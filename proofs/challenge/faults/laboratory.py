@@ -75,9 +75,8 @@ class _Faults:
         if name not in self.chosen:
             return np.zeros(time.shape, bool)
         extra = (slice(None),) + (None,) * (time.ndim - 1)
-        chosen, late, length = (
-            part[extra] for part in (self.chosen[name], self.random[:, 0], self.random[:, 1])
-        )
+        chosen = self.chosen[name][extra]
+        late, length = self.random[:, 0][extra], self.random[:, 1][extra]
         if name == "disconnection":
             begins = 0.2 + 0.5 * late * self.case.inspiration
             return chosen & (time >= begins) & (time <= begins + 0.25 + 0.3 * length)

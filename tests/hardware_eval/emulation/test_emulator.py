@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import serial
@@ -81,7 +82,8 @@ def test_a_session_on_a_pseudo_terminal(emulator: Emulator, tmp_path: Path) -> N
     _run(client)
     # The host dies: nothing is said any more.
     _wait_for(lambda: _vented(emulator))
-    assert Flag.COMMANDS_STOPPED in emulator.service.state.causes
+    service: Any = emulator.service
+    assert Flag.COMMANDS_STOPPED in service.state.causes
     with pytest.raises(RefusedError, match="NOT_ARMED"):
         client.command(10.0, 0)
     client.close()

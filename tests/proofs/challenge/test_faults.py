@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -95,8 +96,8 @@ def test_a_fault_does_what_it_is_called(rig, what):
 )
 def test_a_fault_of_some_breaths_leaves_the_others_alone(rig, sign):
     recorded = record(rig, np.random.default_rng(0))
-    flags = active(rig, recorded)
-    hit = flags.any(axis=1)
+    flags: Any = active(rig, recorded)
+    hit: Any = flags.any(axis=1)
     assert 0 < hit.sum() < len(hit)
     change = answered(rig) - PLAIN
     np.testing.assert_allclose(change[~hit], 0.0, atol=1e-9)
@@ -136,7 +137,7 @@ def test_a_faint_fault_is_below_detection_and_a_strong_one_above():
 
 def test_requested_breaths_go_on_after_the_session():
     rig = case("zero_step", change=2.0, breath=5.0)
-    time = np.tile(0.03 * np.arange(60), (2, 1))
+    time: Any = np.tile(0.03 * np.arange(60), (2, 1))
     out = (time > 1.0).astype(np.int8)
     more = record_commands(rig, time, np.where(out == 0, 15.0, 0.0), out, np.random.default_rng(1))
     assert more.breath_id.tolist() == [9, 10]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,13 +57,14 @@ def test_rigs_of_known_size_are_told_apart_through_the_gains_of_their_breaths():
         -np.arange(samples) / rng.uniform(3, 9, (n, 1))
     )
     groups = Groups(*(jnp.asarray(at) for _ in range(3)))
-    zeros = np.zeros((n, samples))
-    data = InspirationData(
+    zeros: Any = np.zeros((n, samples))
+    make: Any = InspirationData
+    data = make(
         groups, np.full(n, 5.0), np.ones(n), u_in, np.full((n, samples), 0.032), zeros,
         np.full((n, samples), 1.0 / samples),
     )  # fmt: skip
     with precision.float64():
-        rigs = from_vector(true[at], np)
+        rigs: Any = from_vector(true[at], np)
         rigs = rigs.replace(slopes=rigs.slopes * np.exp(gain)[:, None])
         pressure = simulate(
             jax.tree.map(jnp.asarray, rigs), data.start, jax.tree.map(jnp.asarray, data)

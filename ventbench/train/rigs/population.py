@@ -254,7 +254,7 @@ class FittedPopulation:
         mean, covariance = self.population.predictive(self.units.design[first])
         last = NAMES.index("valve_bend_12")
         covariance[:, last, last] += unrecorded**2
-        return RigPopulation(mean, np.linalg.cholesky(covariance))
+        return RigPopulation(mean, np.asarray(np.linalg.cholesky(covariance), float))
 
 
 def fit_population(
@@ -289,7 +289,8 @@ def fit_population(
     breaths = _Breaths(chosen, at, weight[kept], noise or Noise(), zero, zero)
     rigs = to_vector(plants)[list(sessions)]
     design = design_of(lungs)
-    centre = np.linalg.lstsq(design.reshape(-1, design.shape[2]), rigs.ravel(), rcond=None)[0]
+    fit = np.linalg.lstsq(design.reshape(-1, design.shape[2]), rigs.ravel(), rcond=None)
+    centre = np.asarray(fit[0], float)
     counts = [np.inf if name.startswith(GIVEN) else PRIOR_SESSIONS for name in NAMES]
     labelled = design[:, [NAMES.index(name) for name in LABELLED]].any(axis=(0, 1))
     wide = np.where(labelled, LABELLED_SCALE, CENTRE_SCALE)
@@ -343,9 +344,8 @@ def train_population(
     rigs = [(session, lung) for lung, own in zip(known.lung_ids, known.rigs, strict=True)
             for session in sorted(own)]  # fmt: skip
     scored = jax.tree.map(lambda leaf: np.asarray(leaf)[0], known.members)
-    fitted = fit_population(
-        scored, arranged, *map(list, zip(*rigs, strict=True)), weight, progress=progress
-    )
+    sessions, lungs = [session for session, _ in rigs], [lung for _, lung in rigs]
+    fitted = fit_population(scored, arranged, sessions, lungs, weight, progress=progress)
     _write(fitted, known)
     return fitted
 

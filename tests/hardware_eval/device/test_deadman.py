@@ -121,7 +121,8 @@ def test_a_blocked_bus_does_not_block_the_guard() -> None:
     hal = SupervisedHal(sensor, orders)
     service = DeviceService(hal, DeviceSettings(), time.monotonic())
     running = replace(service.state, mode=Mode.RUNNING, u_in=50.0, u_out=0)
-    service.state = replace(running, fed=time.monotonic() + 10.0)  # by commands, all the time
+    # Fed by commands, all the time; a device counts whole microseconds.
+    service.state = replace(running, fed=round(1e6 * (time.monotonic() + 10.0)))
     port = Port(lambda: None, lambda descriptor: None)
     turns = 0
 

@@ -17,14 +17,8 @@ class CircuitCompliance(Mechanism):
         equation="C_circuit dp/dt = q_in - q_lung - q_out",
         parameters=(
             Parameter(
-                "compliance",
-                "mL/cmH2O",
-                "of tubing, humidifier and dead space",
-                0.0,
-                10.0,
-                0.0,
-                1.2,
-                3.0,
+                "compliance", "mL/cmH2O", "of tubing, humidifier and dead space",
+                0.0, 10.0, 0.0, 1.2, 3.0,
             ),
         ),
         source=(
@@ -39,7 +33,7 @@ class CircuitCompliance(Mechanism):
         least=0.3,
         least_reason="a syringe's worth of tubing; less moves no edge of 30 samples a second",
         ubiquitous=True,
-    )
+    )  # fmt: skip
 
     # Behind 5 cmH2O/(L/s) it fills within 15 ms: at 7 ms a step, a fit finds 3 % too much of it.
     divisions = 2

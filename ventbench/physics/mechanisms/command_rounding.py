@@ -19,27 +19,13 @@ class CommandRounding(Mechanism):
         equation="u_effective = u + amount (floor(u + bias) - u)",
         parameters=(
             Parameter(
-                "amount",
-                "1",
+                "amount", "1",
                 "share of the rounding that is seen: 1 if the valve gets whole percents",
-                0.0,
-                1.0,
-                0.0,
-                1.0,
-                1.0,
+                0.0, 1.0, 0.0, 1.0, 1.0,
             ),
             Parameter(
-                "bias",
-                "%",
-                "0 cuts off, 0.5 rounds to the nearest; no derivative: try both",
-                0.0,
-                0.5,
-                0.0,
-                0.0,
-                0.0,
-                shape=True,
-                grid=(0.0, 0.5),
-                discrete=True,
+                "bias", "%", "0 cuts off, 0.5 rounds to the nearest; no derivative: try both",
+                0.0, 0.5, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 0.5), discrete=True,
             ),
         ),
         source=(
@@ -53,7 +39,7 @@ class CommandRounding(Mechanism):
         least=0.5,
         least_reason="a driver rounds or does not; half a rounding is another effect",
         special_case_of=("valve_shape",),
-    )
+    )  # fmt: skip
 
     def driven(self, values: Values, u_in: Array) -> Array:
         """The command, moved towards a whole number."""

@@ -17,15 +17,8 @@ class ComplianceDrift(Mechanism):
         equation="C(x) = C (1 + change x), x = position of the breath in the recording, 0..1",
         parameters=(
             Parameter(
-                "change",
-                "1",
-                "change from the first breath to the last, as a share of C",
-                -0.7,
-                2.0,
-                0.0,
-                0.2,
-                0.4,
-                share=True,
+                "change", "1", "change from the first breath to the last, as a share of C",
+                -0.7, 2.0, 0.0, 0.2, 0.4, share=True,
             ),
         ),
         source=(
@@ -38,7 +31,7 @@ class ComplianceDrift(Mechanism):
         detectable=None,
         least=0.03,
         least_reason="test lungs repeat their compliance to a few percent",
-    )
+    )  # fmt: skip
 
     uses_position = True
 

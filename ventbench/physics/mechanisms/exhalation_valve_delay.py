@@ -24,42 +24,18 @@ class ExhalationValveDelay(Mechanism):
         equation="opening slow do/dt = u_out(t - opening (1 - slow)) - o",
         parameters=(
             Parameter(
-                "opening",
-                "s",
-                "mean delay of opening",
-                0.0,
-                0.15,
-                0.0,
-                0.05,
-                0.1,
-                scan=tuple(0.01 * k for k in range(16)),
-                kinked=True,
+                "opening", "s", "mean delay of opening",
+                0.0, 0.15, 0.0, 0.05, 0.1, scan=tuple(0.01 * k for k in range(16)), kinked=True,
             ),
             Parameter(
-                "closing",
-                "s",
-                "dead time of closing",
-                0.0,
-                0.15,
-                0.0,
-                0.0,
-                0.0,
-                shape=True,
-                kinked=True,
+                "closing", "s", "dead time of closing",
+                0.0, 0.15, 0.0, 0.0, 0.0, shape=True, kinked=True,
             ),
             Parameter(
-                "slow",
-                "1",
+                "slow", "1",
                 "share of the opening's delay that is a lag: 0 for a dead time, 1 for a valve that "
                 "opens slowly",
-                0.0,
-                1.0,
-                0.0,
-                0.0,
-                0.0,
-                shape=True,
-                grid=(0.0, 1.0),
-                share=True,
+                0.0, 1.0, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 1.0), share=True,
             ),
         ),
         source=(
@@ -75,7 +51,7 @@ class ExhalationValveDelay(Mechanism):
         least=0.008,
         least_reason="a quarter of a sample: less is the clock's, not the valve's",
         special_case_of=("outlet_memory",),
-    )
+    )  # fmt: skip
     stateful = True
 
     def outlet_dead_time(self, values: Values, u_out: Array) -> Array:

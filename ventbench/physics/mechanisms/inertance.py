@@ -31,15 +31,8 @@ class Inertance(Mechanism):
                 "inertance", "cmH2O s2/L", "of gas in airway and tubing", 0.0, 0.4, 0.0, 0.04, 0.1
             ),
             Parameter(
-                "tubing",
-                "mL/cmH2O",
-                "compliance of the circuit before it",
-                0.0,
-                1.2,
-                0.0,
-                0.3,
-                0.5,
-                grid=(0.0, 0.15, 0.4, 0.8),
+                "tubing", "mL/cmH2O", "compliance of the circuit before it",
+                0.0, 1.2, 0.0, 0.3, 0.5, grid=(0.0, 0.15, 0.4, 0.8),
             ),
         ),
         source=(
@@ -54,7 +47,7 @@ class Inertance(Mechanism):
         detectable=0.16,
         least=0.008,
         least_reason="less than the gas in a tracheal tube alone",
-    )
+    )  # fmt: skip
 
     # With tubing it rings at 20 Hz: at 7 ms a step, a fit finds 15 to 50 % too little of it.
     divisions = 4

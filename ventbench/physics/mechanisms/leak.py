@@ -23,16 +23,8 @@ class Leak(Mechanism):
         parameters=(
             Parameter("conductance", "mL/s", "leak at 1 cmH2O", 0.0, 50.0, 0.0, 8.0, 20.0),
             Parameter(
-                "exponent",
-                "1",
-                "0.5 for an orifice, 1 for a narrow channel",
-                0.5,
-                1.0,
-                0.5,
-                0.5,
-                0.5,
-                shape=True,
-                grid=(0.5, 1.0),
+                "exponent", "1", "0.5 for an orifice, 1 for a narrow channel",
+                0.5, 1.0, 0.5, 0.5, 0.5, shape=True, grid=(0.5, 1.0),
             ),
         ),
         source=(
@@ -48,7 +40,7 @@ class Leak(Mechanism):
         least=1.0,
         least_reason="less than connectors are allowed to leak",
         special_case_of=("leak_shape",),
-    )
+    )  # fmt: skip
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Tangent of the leak at the last pressure."""

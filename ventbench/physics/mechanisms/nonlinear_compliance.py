@@ -29,27 +29,14 @@ class NonlinearCompliance(Mechanism):
         ),
         parameters=(
             Parameter(
-                "stiffening",
-                "1/cmH2O",
-                "1 over (capacity / C); negative: the lung softens",
-                -0.05,
-                0.08,
-                0.0,
-                1 / 40,
-                1 / 24,
+                "stiffening", "1/cmH2O", "1 over (capacity / C); negative: the lung softens",
+                -0.05, 0.08, 0.0, 1 / 40, 1 / 24,
             ),
             Parameter(
-                "sigmoid",
-                "1",
+                "sigmoid", "1",
                 "0 for an exponential curve, 1 for the upper half of a sigmoid, more for one whose "
                 "middle lies above zero pressure",
-                0.0,
-                4.0,
-                0.0,
-                0.0,
-                0.0,
-                shape=True,
-                grid=(0.0, 1.0),
+                0.0, 4.0, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 1.0),
             ),
         ),
         source=(
@@ -67,7 +54,7 @@ class NonlinearCompliance(Mechanism):
         least=0.003,
         least_reason="stiffening by 5 % at 15 cmH2O; less is within the spread of springs",
         special_case_of=("recoil_shape",),
-    )
+    )  # fmt: skip
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Tangent of the curve at the last volume, less the linear lung's.

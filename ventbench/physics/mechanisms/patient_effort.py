@@ -26,41 +26,18 @@ class PatientEffort(Mechanism):
         ),
         parameters=(
             Parameter(
-                "amplitude",
-                "cmH2O",
-                "highest pressure of the muscles, positive if inspiratory",
-                -20.0,
-                20.0,
-                0.0,
-                2.0,
-                5.0,
-                scope="breath",
-                scan=(2.0, -2.0),
+                "amplitude", "cmH2O", "highest pressure of the muscles, positive if inspiratory",
+                -20.0, 20.0, 0.0, 2.0, 5.0, scope="breath", scan=(2.0, -2.0),
             ),
             Parameter(
-                "onset",
-                "s",
-                "after the first sample",
-                0.0,
-                2.5,
-                0.3,
-                0.3,
-                0.3,
-                scope="breath",
-                scan=(0.05, 0.3, 0.6, 0.9, 1.2, 1.6),
+                "onset", "s", "after the first sample",
+                0.0, 2.5, 0.3, 0.3, 0.3, scope="breath", scan=(0.05, 0.3, 0.6, 0.9, 1.2, 1.6),
             ),
             Parameter("duration", "s", "of the effort", 0.2, 2.0, 0.8, 0.8, 0.8),
             Parameter(
-                "relaxing",
-                "1",
+                "relaxing", "1",
                 "0 for half a sine, 1 for a muscle that relaxes exponentially after its peak",
-                0.0,
-                1.0,
-                0.0,
-                0.0,
-                0.0,
-                shape=True,
-                grid=(0.0, 1.0),
+                0.0, 1.0, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 1.0),
             ),
         ),
         source=(
@@ -76,7 +53,7 @@ class PatientEffort(Mechanism):
         detectable=0.3,
         least=0.5,
         least_reason="a muscle pressure that a trigger would hardly see",
-    )
+    )  # fmt: skip
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Subtract the pressure of the muscles from the recoil."""

@@ -17,15 +17,8 @@ class ResistanceDrift(Mechanism):
         equation="R(x) = R (1 + change x), x = position of the breath in the recording, 0..1",
         parameters=(
             Parameter(
-                "change",
-                "1",
-                "change from the first breath to the last, as a share of R",
-                -0.8,
-                3.0,
-                0.0,
-                0.3,
-                0.6,
-                share=True,
+                "change", "1", "change from the first breath to the last, as a share of R",
+                -0.8, 3.0, 0.0, 0.3, 0.6, share=True,
             ),
         ),
         source=(
@@ -37,7 +30,7 @@ class ResistanceDrift(Mechanism):
         detectable=None,
         least=0.05,
         least_reason="resistors repeat to a few percent",
-    )
+    )  # fmt: skip
 
     uses_position = True
 

@@ -28,14 +28,8 @@ class SensorCurve(Mechanism):
         equation="y = p + 4 bend p / 40 (1 - p / 40)",
         parameters=(
             Parameter(
-                "bend",
-                "cmH2O",
-                "error at 20 cmH2O of a sensor that is right at 0 and at 40 cmH2O",
-                -6.0,
-                6.0,
-                0.0,
-                0.9,
-                1.4,
+                "bend", "cmH2O", "error at 20 cmH2O of a sensor that is right at 0 and at 40 cmH2O",
+                -6.0, 6.0, 0.0, 0.9, 1.4,
             ),
         ),
         source=(
@@ -51,7 +45,7 @@ class SensorCurve(Mechanism):
         least=0.25,
         least_reason="half a percent of a usual sensor's full scale",
         special_case_of=("sensor_shape",),
-    )
+    )  # fmt: skip
 
     def sensor_output(self, values: Values, pressure: Array, position: Array) -> Array:
         """Bent pressure."""

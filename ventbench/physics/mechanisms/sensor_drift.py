@@ -25,37 +25,16 @@ class SensorDrift(Mechanism):
         ),
         parameters=(
             Parameter(
-                "drift",
-                "cmH2O",
-                "change of the offset from the first breath to the last",
-                -8.0,
-                8.0,
-                0.0,
-                1.2,
-                3.0,
+                "drift", "cmH2O", "change of the offset from the first breath to the last",
+                -8.0, 8.0, 0.0, 1.2, 3.0,
             ),
             Parameter(
-                "gain",
-                "1",
-                "change of the gain over the recording",
-                -0.3,
-                0.3,
-                0.0,
-                0.0,
-                0.0,
-                shape=True,
-                share=True,
+                "gain", "1", "change of the gain over the recording",
+                -0.3, 0.3, 0.0, 0.0, 0.0, shape=True, share=True,
             ),
             Parameter(
-                "warming",
-                "1",
-                "times that the drift fades by e in the recording; 0: it is steady",
-                0.0,
-                10.0,
-                0.0,
-                0.0,
-                0.0,
-                shape=True,
+                "warming", "1", "times that the drift fades by e in the recording; 0: it is steady",
+                0.0, 10.0, 0.0, 0.0, 0.0, shape=True,
             ),
         ),
         source=(
@@ -70,7 +49,7 @@ class SensorDrift(Mechanism):
         least=0.15,
         least_reason="two steps of a usual converter",
         special_case_of=("drift_shape",),
-    )
+    )  # fmt: skip
 
     rank = 1
     uses_position = True

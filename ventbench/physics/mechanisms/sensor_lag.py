@@ -20,15 +20,9 @@ class SensorLag(Mechanism):
         parameters=(
             Parameter("tau", "s", "time constant", 0.0, 0.25, 0.0, 0.05, 0.12),
             Parameter(
-                "second",
-                "s",
+                "second", "s",
                 "time constant of a lag behind the first, as of a filter behind a sampling line",
-                0.0,
-                0.25,
-                0.0,
-                0.0,
-                0.0,
-                shape=True,
+                0.0, 0.25, 0.0, 0.0, 0.0, shape=True,
             ),
         ),
         source="Low-pass filter of sensor, sampling line and electronics: 5 to 120 ms.",
@@ -42,7 +36,7 @@ class SensorLag(Mechanism):
         least_reason="a third of a sample: less is an offset between two clocks",
         special_case_of=("sensor_memory",),
         interchangeable=(("tau", "second"),),
-    )
+    )  # fmt: skip
     stateful = True
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:

@@ -28,41 +28,18 @@ class SupplyDroop(Mechanism):
         ),
         parameters=(
             Parameter(
-                "drop",
-                "1",
-                "share of the flow that is lost at a lasting 0.5 L/s",
-                0.0,
-                0.7,
-                0.0,
-                0.1,
-                0.3,
-                share=True,
+                "drop", "1", "share of the flow that is lost at a lasting 0.5 L/s",
+                0.0, 0.7, 0.0, 0.1, 0.3, share=True,
             ),
             Parameter(
-                "recovery",
-                "s",
-                "time constant",
-                0.1,
-                5.0,
-                1.0,
-                1.0,
-                1.0,
-                "log",
-                shape=True,
-                uncertain=True,
+                "recovery", "s", "time constant",
+                0.1, 5.0, 1.0, 1.0, 1.0, "log", shape=True, uncertain=True,
             ),
             Parameter(
-                "linear",
-                "1",
+                "linear", "1",
                 "1 where the loss grows with recent flow as a regulator's does, 0 where it levels "
                 "off",
-                0.0,
-                1.0,
-                0.0,
-                0.0,
-                0.0,
-                shape=True,
-                grid=(0.0, 1.0),
+                0.0, 1.0, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 1.0),
             ),
         ),
         source=(
@@ -77,7 +54,7 @@ class SupplyDroop(Mechanism):
         least=0.03,
         least_reason="regulators hold their pressure to a few percent",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
-    )
+    )  # fmt: skip
 
     rank = 1
     stateful = True

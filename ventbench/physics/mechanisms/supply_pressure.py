@@ -28,15 +28,8 @@ class SupplyPressure(Mechanism):
         ),
         parameters=(
             Parameter(
-                "loss",
-                "1",
-                "share of the flow that is lost against 30 cmH2O",
-                0.0,
-                0.7,
-                0.0,
-                0.13,
-                0.24,
-                share=True,
+                "loss", "1", "share of the flow that is lost against 30 cmH2O",
+                0.0, 0.7, 0.0, 0.13, 0.24, share=True,
             ),
         ),
         source=(
@@ -52,7 +45,7 @@ class SupplyPressure(Mechanism):
         detectable=None,
         least=0.04,
         least_reason="a supply of 380 cmH2O; valves hold their flow to a few percent",
-    )
+    )  # fmt: skip
 
     #: After everything that changes the flow itself.
     rank = 4

@@ -22,26 +22,12 @@ class TurbulentResistance(Mechanism):
         equation="p = ... + R Q + quadratic Q |Q| (Q^2 + e^2)^(exponent / 2 - 1), e = 0.02 L/s",
         parameters=(
             Parameter(
-                "quadratic",
-                "cmH2O s2/L2",
-                "second coefficient of Rohrer; drop at 1 L/s",
-                0.0,
-                80.0,
-                0.0,
-                4.0,
-                10.0,
-                follows="R",
+                "quadratic", "cmH2O s2/L2", "second coefficient of Rohrer; drop at 1 L/s",
+                0.0, 80.0, 0.0, 4.0, 10.0, follows="R",
             ),
             Parameter(
-                "exponent",
-                "1",
-                "2 for an orifice, 1.75 for a smooth tube",
-                1.5,
-                2.0,
-                2.0,
-                2.0,
-                2.0,
-                shape=True,
+                "exponent", "1", "2 for an orifice, 1.75 for a smooth tube",
+                1.5, 2.0, 2.0, 2.0, 2.0, shape=True,
             ),
         ),
         source=(
@@ -59,7 +45,7 @@ class TurbulentResistance(Mechanism):
         least=1.0,
         least_reason="the curvature of a straight tracheal tube; less is within R",
         special_case_of=("flow_shape",),
-    )
+    )  # fmt: skip
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Add the resistance; the part that differs from a square is taken at the last flow."""

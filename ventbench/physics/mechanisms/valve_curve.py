@@ -19,27 +19,12 @@ class ValveCurve(Mechanism):
         equation="q = gain u (1 + a x^m)^(-1/m), x = u / 100, a = (1 - loss)^-m - 1",
         parameters=(
             Parameter(
-                "loss",
-                "1",
-                "share of the flow that is missing fully open; negative: flow gained",
-                -1.0,
-                0.95,
-                0.0,
-                0.2,
-                0.5,
-                share=True,
+                "loss", "1", "share of the flow that is missing fully open; negative: flow gained",
+                -1.0, 0.95, 0.0, 0.2, 0.5, share=True,
             ),
             Parameter(
-                "power",
-                "1",
-                "m: 1 bends from the start, higher later",
-                0.5,
-                4.0,
-                1.0,
-                1.0,
-                1.0,
-                shape=True,
-                grid=(1.0, 3.0),
+                "power", "1", "m: 1 bends from the start, higher later",
+                0.5, 4.0, 1.0, 1.0, 1.0, shape=True, grid=(1.0, 3.0),
             ),
         ),
         source=(
@@ -57,7 +42,7 @@ class ValveCurve(Mechanism):
         least=0.04,
         least_reason="linearised valves hold their curve to a few percent",
         special_case_of=("valve_shape",),
-    )
+    )  # fmt: skip
 
     rank = 3
 

@@ -27,29 +27,15 @@ class ValveDeadBand(Mechanism):
         parameters=(
             Parameter("width", "%", "command at which flow begins", 0.0, 10.0, 0.0, 1.5, 3.5),
             Parameter(
-                "crack",
-                "1",
+                "crack", "1",
                 "0 for overlap, which every command loses; 1 for a stuck seat that cracks open",
-                0.0,
-                1.0,
-                0.0,
-                0.0,
-                0.0,
-                shape=True,
-                grid=(0.0, 1.0),
+                0.0, 1.0, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 1.0),
             ),
             Parameter(
-                "driver",
-                "1",
+                "driver", "1",
                 "share of the width that is lost before the valve's play, not behind it: 0 for "
                 "overlap of the seat, 1 for a driver with a least command",
-                0.0,
-                1.0,
-                0.0,
-                0.0,
-                0.0,
-                shape=True,
-                grid=(0.0, 1.0),
+                0.0, 1.0, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 1.0),
             ),
         ),
         source=(
@@ -66,7 +52,7 @@ class ValveDeadBand(Mechanism):
         least=0.25,
         least_reason="a quarter of a percent of stroke, the resolution of drivers",
         special_case_of=("valve_shape",),
-    )
+    )  # fmt: skip
 
     rank = 2
 

@@ -18,16 +18,8 @@ class ValveDelay(Mechanism):
         equation="q(t) = q_commanded(t - delay)",
         parameters=(
             Parameter(
-                "delay",
-                "s",
-                "dead time",
-                0.0,
-                0.15,
-                0.0,
-                0.04,
-                0.08,
-                scan=tuple(0.01 * k for k in range(16)),
-                kinked=True,
+                "delay", "s", "dead time",
+                0.0, 0.15, 0.0, 0.04, 0.08, scan=tuple(0.01 * k for k in range(16)), kinked=True,
             ),
         ),
         source=(
@@ -44,7 +36,7 @@ class ValveDelay(Mechanism):
         least=0.008,
         least_reason="a quarter of a sample: less is the clock's, not the valve's",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
-    )
+    )  # fmt: skip
 
     def dead_time(self, values: Values) -> Array:
         """The delay, s."""

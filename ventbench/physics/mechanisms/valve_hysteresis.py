@@ -27,27 +27,12 @@ class ValveHysteresis(Mechanism):
         parameters=(
             Parameter("width", "%", "command lost at every reversal", 0.0, 15.0, 0.0, 2.0, 5.0),
             Parameter(
-                "give",
-                "1",
-                "0 for slack, 1 for a drive that gives before it moves the seat",
-                0.0,
-                1.0,
-                0.0,
-                0.0,
-                0.0,
-                shape=True,
+                "give", "1", "0 for slack, 1 for a drive that gives before it moves the seat",
+                0.0, 1.0, 0.0, 0.0, 0.0, shape=True,
             ),
             Parameter(
-                "smooth",
-                "1",
-                "1 for a lag that nears its width exponentially with the travel",
-                0.0,
-                1.0,
-                0.0,
-                0.0,
-                0.0,
-                shape=True,
-                grid=(0.0, 1.0),
+                "smooth", "1", "1 for a lag that nears its width exponentially with the travel",
+                0.0, 1.0, 0.0, 0.0, 0.0, shape=True, grid=(0.0, 1.0),
             ),
         ),
         source=(
@@ -65,7 +50,7 @@ class ValveHysteresis(Mechanism):
         least=0.3,
         least_reason="a little more than the resolution of drivers",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
-    )
+    )  # fmt: skip
 
     rank = 1
     has_memory = True

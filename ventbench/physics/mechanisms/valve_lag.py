@@ -20,15 +20,8 @@ class ValveLag(Mechanism):
         parameters=(
             Parameter("tau", "s", "time constant", 0.0, 0.2, 0.0, 0.04, 0.1),
             Parameter(
-                "second",
-                "s",
-                "time constant of a lag behind the first, as of a pilot stage",
-                0.0,
-                0.2,
-                0.0,
-                0.0,
-                0.0,
-                shape=True,
+                "second", "s", "time constant of a lag behind the first, as of a pilot stage",
+                0.0, 0.2, 0.0, 0.0, 0.0, shape=True,
             ),
         ),
         source=(
@@ -45,7 +38,7 @@ class ValveLag(Mechanism):
         least_reason="a quarter of a sample: less rounds no edge that a recording shows",
         special_case_of=("command_memory", "command_plays", "supply_memory"),
         interchangeable=(("tau", "second"),),
-    )
+    )  # fmt: skip
     stateful = True
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:

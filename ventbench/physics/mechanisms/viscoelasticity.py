@@ -19,26 +19,12 @@ class Viscoelasticity(Mechanism):
         equation="dS/dt = ratio / C Q - S / time, P = V / C + S",
         parameters=(
             Parameter(
-                "ratio",
-                "1",
-                "elastance of the Maxwell element over that of the lung",
-                0.0,
-                1.5,
-                0.0,
-                0.25,
-                0.7,
+                "ratio", "1", "elastance of the Maxwell element over that of the lung",
+                0.0, 1.5, 0.0, 0.25, 0.7,
             ),
             Parameter(
-                "time",
-                "s",
-                "its relaxation time",
-                0.1,
-                5.0,
-                1.0,
-                1.0,
-                1.0,
-                "log",
-                grid=(0.2, 0.5, 1.5),
+                "time", "s", "its relaxation time",
+                0.1, 5.0, 1.0, 1.0, 1.0, "log", grid=(0.2, 0.5, 1.5),
             ),
         ),
         source=(
@@ -58,7 +44,7 @@ class Viscoelasticity(Mechanism):
         # Its slow stress trades against C, and what is left of another mechanism's form decides.
         beside_error=0.2,
         equivalents=("second_compartment",),
-    )
+    )  # fmt: skip
 
     stateful = True
 

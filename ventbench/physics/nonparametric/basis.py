@@ -117,14 +117,35 @@ class BasisTerm(Mechanism):
         parameters = self.description.parameters
         return max(abs(float(values[p.name])) / (p.spread or 1.0) for p in parameters)
 
-    def decay(self, values: Values, taus: tuple[float, ...], time: Floats) -> Floats:
-        """Sum over the coefficients, each decaying with its time constant, at ``time``."""
-        rates = np.exp(-time[:, None] / np.asarray(taus))
-        return rates @ np.array([float(c) for c in self.coefficients(values)[: len(taus)]])
-
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Curves for a plot, given the own and the base parameters."""
         raise NotImplementedError
+
+
+class FilterBank(BasisTerm):
+    """First-order filters with fixed time constants, each weighed by a coefficient."""
+
+    #: Time constants, s.
+    taus: tuple[float, ...]
+    stateful = True
+
+    def step(self, state: Array, x: Array, length: Array) -> Array:
+        """Filters of ``x`` after an implicit step of ``length`` s."""
+        taus = per_state(self.taus, state)
+        return (taus * state + length * x) / (taus + length)
+
+    def weighed(self, values: Values, states: Array) -> Array:
+        """Sum of the filters ``(K, ...)``, weighed by the coefficients."""
+        return jnp.sum(self.stacked(values, states) * states, axis=0)
+
+    def decay(self, values: Values, time: Floats) -> Floats:
+        """Sum over the coefficients, each decaying with its time constant, at ``time``."""
+        rates = np.exp(-time[:, None] / np.asarray(self.taus))
+        return rates @ np.array([float(c) for c in self.coefficients(values)[: len(self.taus)]])
+
+    def lasting(self, x: Array) -> Array:
+        """Filters of what has lasted for long, ``(K, ...)``."""
+        return jnp.stack([x] * len(self.taus))
 
 
 def coefficients(

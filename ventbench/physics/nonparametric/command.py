@@ -12,6 +12,7 @@ from ventbench.physics.mechanism import Description, Values
 from ventbench.physics.nonparametric.basis import (
     BasisTerm,
     Curve,
+    FilterBank,
     PiecewiseLinear,
     coefficients,
     per_state,
@@ -73,7 +74,7 @@ class ValveShape(BasisTerm):
 _MEMORY_TAUS = (0.02, 0.06, 0.2, 0.7)
 
 
-class CommandMemory(BasisTerm):
+class CommandMemory(FilterBank):
     """A bank of first-order filters on the flow of the valve.
 
     A lasting flow is passed as it is: its factor is the gain. A dead time is met in part only.
@@ -97,24 +98,23 @@ class CommandMemory(BasisTerm):
         confusable=("valve_lag", "valve_delay", "supply_droop", "valve_hysteresis"),
     )
     rank = 2
-    stateful = True
+    taus = _MEMORY_TAUS
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
         """The resting flow in all filters, L/s."""
-        return jnp.stack([flow + 0.0 * pressure] * len(_MEMORY_TAUS))
+        return self.lasting(flow + 0.0 * pressure)
 
     def inflow(
         self, values: Values, flow: Array, state: Array, length: Array
     ) -> tuple[Array, Array]:
         """Implicit step of all filters."""
-        taus = per_state(_MEMORY_TAUS, state)
-        after = (taus * state + length * flow) / (taus + length)
-        return flow + jnp.sum(self.stacked(values, state) * (after - flow), axis=0), after
+        after = self.step(state, flow, length)
+        return flow + self.weighed(values, after - flow), after
 
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Answer of the flow to a step of the command."""
         t = np.linspace(0.0, 2.0, 401)
-        missing = self.decay(values, _MEMORY_TAUS, t)
+        missing = self.decay(values, t)
         return (Curve(t, -missing, "time after a step, s", "flow that is missing (-), share"),)
 
 

@@ -13,6 +13,7 @@ from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.nonparametric.basis import (
     BasisTerm,
     Curve,
+    FilterBank,
     PiecewiseQuadratic,
     coefficients,
     per_state,
@@ -83,7 +84,7 @@ class RecoilShape(BasisTerm):
 _MEMORY_TAUS = (0.05, 0.2, 0.7, 2.5)
 
 
-class RecoilMemory(BasisTerm):
+class RecoilMemory(FilterBank):
     """Maxwell elements beside the elastance, with fixed times.
 
     One that is much faster than a sample would be resistance, one slower than a breath compliance:
@@ -107,11 +108,11 @@ class RecoilMemory(BasisTerm):
         signature="Pressure creeps while volume is held, and lags behind slow changes.",
         confusable=("viscoelasticity", "leak"),
     )
-    stateful = True
+    taus = _MEMORY_TAUS
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
         """No stress, cmH2O."""
-        return jnp.stack([0.0 * (flow + pressure)] * len(_MEMORY_TAUS))
+        return self.lasting(0.0 * (flow + pressure))
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Stresses after the step: what is left of them, and what the flow adds."""
@@ -129,7 +130,7 @@ class RecoilMemory(BasisTerm):
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Stress after a volume that would raise a linear lung by 10 cmH2O."""
         t = np.linspace(0.0, 5.0, 501)
-        stress = 10.0 * self.decay(values, _MEMORY_TAUS, t)
+        stress = 10.0 * self.decay(values, t)
         unit = "stress after a step of 10 cmH2O x C, cmH2O"
         return (Curve(t, stress, "time after a step, s", unit, (0,)),)
 

@@ -13,9 +13,9 @@ from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.nonparametric.basis import (
     BasisTerm,
     Curve,
+    FilterBank,
     PiecewiseLinear,
     coefficients,
-    per_state,
 )
 
 #: p - PEEP where the factor bends, cmH2O; where it is 1, the conductance is 1 / R_ex.
@@ -74,7 +74,7 @@ class OutletShape(BasisTerm):
 _MEMORY_TAUS = (0.015, 0.04, 0.12)
 
 
-class OutletMemory(BasisTerm):
+class OutletMemory(FilterBank):
     """A bank of first-order filters on the opening of the valve, which closes promptly.
 
     A conductance below zero is zero, so that an answer that overshoots downwards is a dead time.
@@ -101,29 +101,26 @@ class OutletMemory(BasisTerm):
         signature="Error at the start of expiration, whatever the inspiration was.",
         confusable=("exhalation_valve_delay", "inertance"),
     )
-    stateful = True
+    taus = _MEMORY_TAUS
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
         """Open."""
-        return jnp.stack([1.0 + 0.0 * (flow + pressure)] * len(_MEMORY_TAUS))
+        return self.lasting(1.0 + 0.0 * (flow + pressure))
 
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Opening at the end of the step."""
         states = self.next_state(values, view.state, view.flow, view)
-        shift = jnp.sum(self.stacked(values, states) * (states - view.opened), axis=0)
-        opened = jnp.maximum(view.opened + shift, 0.0)
+        opened = jnp.maximum(view.opened + self.weighed(values, states - view.opened), 0.0)
         return network.plus(outlet=view.outlet * (opened - view.opened))
 
     def next_state(self, values: Values, state: Array, flow: Array, view: View) -> Array:
         """How far filters of the command are open, 0..1; they close at once."""
-        taus = per_state(_MEMORY_TAUS, state)
-        after = (taus * state + view.length * view.opened) / (taus + view.length)
-        return jnp.minimum(after, view.opened)
+        return jnp.minimum(self.step(state, view.opened, view.length), view.opened)
 
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Opening over time."""
         t = np.linspace(0.0, 0.5, 251)
-        shut = np.minimum(self.decay(values, _MEMORY_TAUS, t), 1.0)
+        shut = np.minimum(self.decay(values, t), 1.0)
         return (Curve(t, shut, "time after the command to open, s", "share that is still shut"),)
 
 

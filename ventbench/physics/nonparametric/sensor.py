@@ -13,9 +13,9 @@ from ventbench.physics.mechanism import Description, Values
 from ventbench.physics.nonparametric.basis import (
     BasisTerm,
     Curve,
+    FilterBank,
     PiecewiseLinear,
     coefficients,
-    per_state,
 )
 
 #: Pressures where the curve bends, cmH2O.
@@ -91,7 +91,7 @@ class SensorShape(BasisTerm):
 _MEMORY_TAUS = (0.02, 0.08, 0.3)
 
 
-class SensorMemory(BasisTerm):
+class SensorMemory(FilterBank):
     """A bank of first-order filters on the reading; a lasting pressure is shown as it is."""
 
     description = Description(
@@ -112,25 +112,23 @@ class SensorMemory(BasisTerm):
         confusable=("sensor_lag", "circuit_compliance"),
     )
     rank = 1
-    stateful = True
+    taus = _MEMORY_TAUS
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
         """Pressure that the sensor shows in all filters, cmH2O."""
-        return jnp.stack([pressure + 0.0 * flow] * len(_MEMORY_TAUS))
+        return self.lasting(pressure + 0.0 * flow)
 
     def reading(
         self, values: Values, pressure: Array, state: Array, length: Array
     ) -> tuple[Array, Array]:
         """Implicit step of all filters."""
-        taus = per_state(_MEMORY_TAUS, state)
-        after = (taus * state + length * pressure) / (taus + length)
-        shift = jnp.sum(self.stacked(values, state) * (after - pressure), axis=0)
-        return pressure + shift, after
+        after = self.step(state, pressure, length)
+        return pressure + self.weighed(values, after - pressure), after
 
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Error of the reading after a step of the pressure."""
         t = np.linspace(0.0, 1.0, 401)
-        missing = self.decay(values, _MEMORY_TAUS, t)
+        missing = self.decay(values, t)
         unit = "error after a step of 10 cmH2O, cmH2O"
         return (Curve(t, -10.0 * missing, "time after a step, s", unit),)
 

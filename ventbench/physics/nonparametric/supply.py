@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Values
-from ventbench.physics.nonparametric.basis import BasisTerm, Curve, coefficients, per_state
+from ventbench.physics.nonparametric.basis import Curve, FilterBank, coefficients
 
 #: Time constants, s, and the flow whose effect the coefficients are, L/s.
 _TAUS = (0.3, 1.0, 3.0)
 _FLOW = 0.5
 
 
-class SupplyMemory(BasisTerm):
+class SupplyMemory(FilterBank):
     """A factor of the flow that depends on the flow before; to first order, any such factor."""
 
     description = Description(
@@ -37,25 +36,23 @@ class SupplyMemory(BasisTerm):
         confusable=("supply_droop", "valve_curve"),
     )
     rank = 3
-    stateful = True
+    taus = _TAUS
 
     def initial_state(self, values: Values, flow: Array, pressure: Array) -> Array:
         """The resting flow in all filters, L/s."""
-        return jnp.stack([flow + 0.0 * pressure] * len(_TAUS))
+        return self.lasting(flow + 0.0 * pressure)
 
     def inflow(
         self, values: Values, flow: Array, state: Array, length: Array
     ) -> tuple[Array, Array]:
         """Implicit step of all filters."""
-        taus = per_state(_TAUS, state)
-        after = (taus * state + length * flow) / (taus + length)
-        factor = 1.0 + jnp.sum(self.stacked(values, state) * after, axis=0) / _FLOW
-        return flow * factor, after
+        after = self.step(state, flow, length)
+        return flow * (1.0 + self.weighed(values, after) / _FLOW), after
 
     def curves(self, values: Values, base: Mapping[str, float]) -> tuple[Curve, ...]:
         """Flow at a constant command, over time."""
         t = np.linspace(0.0, 2.0, 401)
-        y = self.decay(values, _TAUS, np.zeros(1)) - self.decay(values, _TAUS, t)
+        y = self.decay(values, np.zeros(1)) - self.decay(values, t)
         return (Curve(t, y, "time since 0.5 L/s began, s", "flow that is gained, share", (0,)),)
 
 

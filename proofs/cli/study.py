@@ -179,10 +179,9 @@ def networks(
     Example: `python -m proofs study networks --recordings ../shared/recordings`
     """
     from proofs.studies import networks as work
-    from ventbench.train import learned as simulator
 
     folder = recordings_folder(recordings)
-    _check(only, work.variants(simulator.ARCHITECTURE))
+    _check(only, work.variants(work.ARCHITECTURE))
     with bars() as shown:
         task = shown.add_task("networks", total=1.0)
         breaths = work.compare(

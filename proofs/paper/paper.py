@@ -21,6 +21,7 @@ from proofs.paper import controller_sections as controllers
 from proofs.paper import published
 from proofs.paper import simulator_sections as simulators
 from proofs.paper.report import Reproduction
+from proofs.studies.networks import MEASURED
 from ventbench.base.errors import InputError
 from ventbench.base.executor import executor, results
 from ventbench.entries.scoring import score
@@ -28,7 +29,6 @@ from ventbench.plants import frozen
 from ventbench.plants.stacking import take
 from ventbench.task.lungs import LUNG_IDS, lung
 from ventbench.train import pid_grid
-from ventbench.train.learned import MEASURED
 
 Floats = NDArray[np.float64]
 
@@ -181,7 +181,7 @@ def _studies(
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
     """Run the studies of minutes again, as JSON values; ``parallel``: workers and scheduler."""
     from proofs.studies import controllers, networks, samples
-    from ventbench.train.learned import ARCHITECTURE
+    from proofs.studies.networks import ARCHITECTURE
     from ventbench.train.residual import ResidualConfig
 
     kept: dict[str, dict[str, Any]] = {}

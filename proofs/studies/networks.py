@@ -22,14 +22,29 @@ from ventbench.base.executor import InProcess, executor, results
 from ventbench.base.resume import WorkFolder
 from ventbench.plants.learned import Architecture
 from ventbench.plants.stacking import VmappedPlant
-from ventbench.recordings import Breaths
+from ventbench.recordings import Breaths, join, load
 from ventbench.task.lungs import LUNG_IDS, RECORDED_LUNGS
 from ventbench.task.metrics import bootstrap
-from ventbench.train import learned as simulator
-from ventbench.train.learned import LearnedConfig
+from ventbench.train.learned import LearnedConfig, fit
+from ventbench.train.rigs.data import assign_folds
 
 #: Name of the variant that all others are compared with.
 BASE = "base"
+
+#: Files of the public recordings that the networks learn from.
+MEASURED, RECONSTRUCTED = "pvp_quicklung.csv", "pvp_quicklung_reconstructed.csv"
+
+#: Weight of a reconstructed breath; a measured one has 1.
+RECONSTRUCTED_WEIGHT = 0.4
+
+#: Members of the ensemble and folds of the cross-validation, and the seed of the folds.
+MEMBERS, SEED = 5, 0
+
+#: The paper's networks, smaller: there are far fewer breaths than the paper had.
+ARCHITECTURE = Architecture(width=48, depth=4)
+
+#: Measured and reconstructed breaths, and the fold of each measured one.
+TrainingData = tuple[Breaths, Breaths, np.ndarray]
 
 
 def variants(base: Architecture) -> dict[str, Architecture]:
@@ -48,9 +63,9 @@ def compare(
     folder: Path,
     out: Path,
     *,
-    base: Architecture = simulator.ARCHITECTURE,
+    base: Architecture = ARCHITECTURE,
     config: LearnedConfig | None = None,
-    members: int = simulator.MEMBERS,
+    members: int = MEMBERS,
     only: Sequence[str] | None = None,
     workers: int = 0,
     scheduler: str | None = None,
@@ -80,12 +95,11 @@ def compare(
         OSError: if a file cannot be read or written.
     """
     config = config or LearnedConfig()
-    data = simulator.load_recordings(folder, members)
-    scored = np.isin(data.measured.lung_ids, LUNG_IDS)
-    judged, fold = data.measured.select(scored), data.fold[scored]
-    hashes = {
-        name: files.sha256(folder / name) for name in (simulator.MEASURED, simulator.RECONSTRUCTED)
-    }
+    measured, reconstructed = load(folder / MEASURED), load(folder / RECONSTRUCTED)
+    data = measured, reconstructed, assign_folds(measured, count=members, seed=SEED)
+    scored = np.isin(measured.lung_ids, LUNG_IDS)
+    judged, fold = measured.select(scored), data[-1][scored]
+    hashes = {name: files.sha256(folder / name) for name in (MEASURED, RECONSTRUCTED)}
     chosen = {k: v for k, v in variants(base).items() if only is None or k in (BASE, *only)}
     about = {
         "architecture": asdict(base), "config": asdict(config), "recordings": hashes,
@@ -129,7 +143,7 @@ def summary(breaths: pd.DataFrame) -> pd.DataFrame:
 
 
 def _judged(
-    data: simulator.TrainingRecordings, judged: Breaths, fold: np.ndarray,
+    data: TrainingData, judged: Breaths, fold: np.ndarray,
     architecture: Architecture, config: LearnedConfig, members: int, checkpoint: Path,
     tell: Tell | None,
 ) -> list[float]:  # fmt: skip
@@ -138,8 +152,25 @@ def _judged(
     return _errors(nets, judged, fold).tolist()
 
 
+def _train(
+    data: TrainingData, lung: str, number: int, architecture: Architecture,
+    config: LearnedConfig, checkpoint: Path,
+) -> Any:  # fmt: skip
+    """Train network ``number`` of a lung: its member does not see the fold of its own number."""
+    measured, reconstructed, fold = data
+    own = (measured.lung_ids == lung) & (fold != number // len(RECORDED_LUNGS))
+    breaths = [measured.select(own), reconstructed.select(reconstructed.lung_ids == lung)]
+    weights = (1.0, RECONSTRUCTED_WEIGHT)
+    both = join(breaths)
+    return fit(
+        both.u_in, both.u_out, both.dt, both.pressure, architecture=architecture, config=config,
+        seed=number, checkpoint=checkpoint,
+        weight=np.concatenate([np.full(len(b), w) for b, w in zip(breaths, weights, strict=True)]),
+    )  # fmt: skip
+
+
 def _nets(
-    data: simulator.TrainingRecordings, architecture: Architecture, config: LearnedConfig,
+    data: TrainingData, architecture: Architecture, config: LearnedConfig,
     count: int, checkpoint: Path, tell: Tell,
 ) -> Any:  # fmt: skip
     """Networks of the scored lungs, leaves ``(members, 6, ...)``."""
@@ -150,10 +181,7 @@ def _nets(
         for name in LUNG_IDS:
             at = ids.index(name)
             number = member * len(ids) + at
-            net = simulator.train_network(
-                data, RECORDED_LUNGS[at], number, architecture, config, checkpoint
-            )
-            nets.append(net)
+            nets.append(_train(data, name, number, architecture, config, checkpoint))
             tell((member + len(nets) / len(LUNG_IDS)) / count)
         members.append(jax.tree.map(lambda *leaves: np.stack(leaves), *nets))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *members)

@@ -182,7 +182,7 @@ def some_breaths(draw) -> Breaths:
     )
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(some_breaths(), st.sampled_from(["a.csv", "a.csv.gz", "a.parquet"]))
 def test_round_trip(breaths, name):
     with tempfile.TemporaryDirectory() as folder:

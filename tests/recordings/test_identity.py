@@ -101,7 +101,7 @@ def test_through_a_file_of_two_decimals(breaths, tmp_path):
     assert found.certain.all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([1e-3, 0.04, 1.0, 30.0]))
 def test_none_within_the_tolerance_is_missed_and_none_beyond_is_matched(seed, scale):
     """Anything that a copy may be off, in steps and levels that lie on edges of cells as well."""

@@ -344,7 +344,7 @@ HEADERS = {"time": ["Time", "t", "Zeit", "time_step"], "flow": ["Flow", "flow", 
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t", "|"])
-@settings(max_examples=8, deadline=None, derandomize=True)
+@settings(max_examples=8, derandomize=True)
 @given(data=st.data())
 def test_the_same_breaths_come_out(tmp_path_factory, separator, data):
     """Any separator, decimal mark, header, unit, order, encoding and line end."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ventbench.recordings import check, iter_breaths, load, load_respiraworks, split_by_breath
+from ventbench.recordings import check, iter_breaths, load, load_respiraworks
 from ventbench.recordings.times import interval_table
 
 
@@ -50,15 +50,6 @@ def test_the_reconstructed_breaths(public_recordings):
     assert int(np.isfinite(breaths.pressure).sum()) == 13_013
     assert report.blank_pressures == 599 * 80 - 13_013
     assert not breaths.time_inferred.any()
-
-
-def test_a_split_of_the_measured_breaths(public_recordings):
-    breaths = load(public_recordings / "pvp_quicklung.csv")
-    split = split_by_breath(breaths)
-    assert 141 * 0.15 < len(split.held_out_ids) < 141 * 0.25
-    train, held_out = split.apply(breaths)
-    assert set(held_out.lung_ids) == set(train.lung_ids)
-    assert len(set(held_out.lung_ids)) == 9
 
 
 def test_respiraworks(public_recordings):

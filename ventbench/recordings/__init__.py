@@ -1,4 +1,4 @@
-"""Recordings of breaths: the public schema, checks, CSV and Parquet in and out, splits."""
+"""Recordings of breaths: the public schema, checks, CSV and Parquet in and out."""
 
 from ventbench.recordings.breaths import Breaths as Breaths
 from ventbench.recordings.breaths import join as join
@@ -19,9 +19,4 @@ from ventbench.recordings.roles import find_saturation as find_saturation
 from ventbench.recordings.roles import require_roles as require_roles
 from ventbench.recordings.schema import COLUMNS as COLUMNS
 from ventbench.recordings.schema import Column as Column
-from ventbench.recordings.split import Split as Split
-from ventbench.recordings.split import folds as folds
-from ventbench.recordings.split import load_split as load_split
-from ventbench.recordings.split import save_split as save_split
-from ventbench.recordings.split import split_by_breath as split_by_breath
 from ventbench.recordings.write import write as write

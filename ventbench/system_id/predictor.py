@@ -12,6 +12,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import jaxlib.version
 import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
@@ -61,9 +62,10 @@ _ACTS = 1e-6
 #: faster here, by 15 % for 40 breaths (``benchmarks/derivatives.py``).
 _COMPILER = {
     "xla_cpu_copy_insertion_use_region_analysis": True,
-    "xla_cpu_use_fusion_emitters": False,
     "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
 }
+if jaxlib.version.__version_info__ < (0, 11):  # later ones have no others
+    _COMPILER["xla_cpu_use_fusion_emitters"] = False
 
 _STATIC = ("names", "substeps", "memory", "flow", "skip_idle")
 

@@ -25,8 +25,6 @@ from ventbench.plants.learned import (
     Normalisation,
     learned,
 )
-from ventbench.recordings import Breaths, folds, join, load
-from ventbench.task.lungs import RECORDED_LUNGS, Lung
 
 Floats = NDArray[np.floating]
 
@@ -414,80 +412,3 @@ def fit(
     stored.delete()
     (general, boundary), _ = carry
     return dataclasses.replace(plant, general=general, boundary=boundary)
-
-
-#: Files of the public recordings that the networks learn from.
-MEASURED, RECONSTRUCTED = "pvp_quicklung.csv", "pvp_quicklung_reconstructed.csv"
-
-#: Weight of a reconstructed breath; a measured one has 1.
-RECONSTRUCTED_WEIGHT = 0.4
-
-#: Members of the ensemble and folds of the cross-validation, and the seed of the folds.
-MEMBERS, SEED = 5, 0
-
-#: The paper's networks, smaller: there are far fewer breaths than the paper had.
-ARCHITECTURE = Architecture(width=48, depth=4)
-
-
-@dataclasses.dataclass(frozen=True)
-class TrainingRecordings:
-    """Recordings that the simulators are trained on.
-
-    Attributes:
-        measured: m breaths.
-        reconstructed: breaths whose pressures were computed from the commands.
-        fold: fold of each measured breath, ``(m,)``.
-        seed: seed of the folds.
-    """
-
-    measured: Breaths
-    reconstructed: Breaths
-    fold: NDArray[np.int64]
-    seed: int
-
-
-def load_recordings(folder: Path, members: int = MEMBERS) -> TrainingRecordings:
-    """Read the public recordings and deal the measured ones out to folds.
-
-    Raises:
-        InputError: if a file is malformed.
-        OSError: if one cannot be read.
-    """
-    measured, reconstructed = load(folder / MEASURED), load(folder / RECONSTRUCTED)
-    return TrainingRecordings(
-        measured, reconstructed, folds(measured, count=members, seed=SEED), SEED
-    )
-
-
-def train_network(
-    data: TrainingRecordings, setting: Lung, number: int, architecture: Architecture,
-    config: LearnedConfig, checkpoint: Path,
-) -> Learned:  # fmt: skip
-    """Train one of the paper's networks.
-
-    Args:
-        data: all recordings.
-        setting: one of the recorded lung settings.
-        number: number of the network: that of the setting among all, plus their count times the
-            member; also the seed. A member does not see the measured breaths of the fold of its
-            number.
-        architecture: sizes of the network.
-        config: settings of the training.
-        checkpoint: see :func:`fit`.
-    """
-    member = number // len(RECORDED_LUNGS)
-    measured = data.measured.select((data.measured.lung_ids == setting.id) & (data.fold != member))
-    more = data.reconstructed.select(data.reconstructed.lung_ids == setting.id)
-    breaths = join([measured, more])
-    weight = np.append(np.ones(len(measured)), np.full(len(more), RECONSTRUCTED_WEIGHT))
-    return fit(
-        breaths.u_in,
-        breaths.u_out,
-        breaths.dt,
-        breaths.pressure,
-        architecture=architecture,
-        config=config,
-        seed=number,
-        weight=weight,
-        checkpoint=checkpoint,
-    )

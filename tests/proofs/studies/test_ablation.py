@@ -22,7 +22,6 @@ from ventbench.plants.single_compartment import single_compartment
 from ventbench.plants.stacking import stack
 from ventbench.recordings import write
 from ventbench.task.lungs import LUNGS
-from ventbench.train import learned as simulator
 from ventbench.train.learned import LearnedConfig
 from ventbench.train.residual import ResidualConfig
 
@@ -62,7 +61,7 @@ def test_each_variant_differs_in_one_thing():
         wanted = 0 if name in ("base", "direct") else 2 if name == "twice as far back" else 1
         assert len(changed) == wanted
         assert one.direct == (name == "direct")
-    base = simulator.ARCHITECTURE
+    base = networks.ARCHITECTURE
     for name, one in networks.variants(base).items():
         changed = [k for k, v in asdict(one).items() if v != asdict(base)[k]]
         assert len(changed) == (name != networks.BASE)
@@ -136,8 +135,8 @@ def test_the_table_of_controllers_pairs_seeds():
 def test_networks_of_another_process_are_those_of_this_one(tmp_path):
     folder = tmp_path / "recordings"
     folder.mkdir()
-    write(synthetic(each=2), folder / simulator.MEASURED)
-    write(synthetic(each=1, seed=1, first_id=1000), folder / simulator.RECONSTRUCTED)
+    write(synthetic(each=2), folder / networks.MEASURED)
+    write(synthetic(each=1, seed=1, first_id=1000), folder / networks.RECONSTRUCTED)
 
     def compare(out: str, workers: int) -> pd.DataFrame:
         return networks.compare(
@@ -152,9 +151,9 @@ def test_networks_of_another_process_are_those_of_this_one(tmp_path):
 def test_networks_are_compared(tmp_path):
     folder, out = tmp_path / "recordings", tmp_path / "out"
     folder.mkdir()
-    write(synthetic(each=4), folder / simulator.MEASURED)
+    write(synthetic(each=4), folder / networks.MEASURED)
     more = synthetic(each=2, seed=1, first_id=1000)
-    write(more, folder / simulator.RECONSTRUCTED)
+    write(more, folder / networks.RECONSTRUCTED)
     told = []
 
     def compare() -> pd.DataFrame:

@@ -27,7 +27,8 @@ from ventbench.recordings.foreign.breath_onsets import (
     find_breaths,
     recognise,
 )
-from ventbench.recordings.foreign.tables import Table, read_table
+from ventbench.recordings.foreign.formats import read_table
+from ventbench.recordings.foreign.tables import Table
 from ventbench.recordings.foreign.units import Conversion, conversion, in_file_unit, stem
 from ventbench.recordings.roles import SLOW, check_roles, few_breaths, opposite_sign
 from ventbench.recordings.schema import COLUMNS
@@ -109,8 +110,8 @@ def import_recording(
     """Read a recording of another laboratory.
 
     Args:
-        path: text with any separator (also gzipped), a spreadsheet, Parquet or MATLAB up to
-            version 7.
+        path: text with any separator (also gzipped), a spreadsheet, Parquet, MATLAB, EDF, BDF, the
+            header (.hea) of a WFDB record, or PIRDS as JSON.
         columns: role of each column, ``{"Paw": "pressure"}``; the roles are ``time``,
             ``pressure``, ``flow``, ``volume``, ``u_in``, ``u_out``, ``R``, ``C``, ``breath``,
             ``group`` (a breath ends where it changes), ``target`` (inspiration is where it is

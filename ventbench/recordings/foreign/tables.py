@@ -1,4 +1,4 @@
-"""Tables of numbers from text of any dialect, spreadsheets, Parquet and MATLAB files.
+"""Tables of numbers from text of any dialect and from spreadsheets.
 
 Text is split once, by the separator and the decimal mark that make most cells numbers. The first
 three lines of numbers in a row begin the data; names and units stand above them. What stands
@@ -46,7 +46,7 @@ _CLOCK = re.compile(
 )
 
 #: Names of a sampling rate, Hz, and of an interval, above a table or beside it.
-_RATES = ("fs", "rate", "samplingrate", "samplerate", "freq", "frequency", "samplingfrequency")
+RATES = ("fs", "rate", "samplingrate", "samplerate", "freq", "frequency", "samplingfrequency")
 
 #: Share of the lines that may be no rows before a file is refused, and number of lines anyway.
 _STRAY, _STRAY_LINES = 0.01, 20
@@ -84,42 +84,8 @@ class Table:
         return f"row {row + 1}" if self.lines is None else f"line {self.lines[row]}"
 
 
-def read_table(
-    path: str | Path, *, separator: str | None = None, decimal: str | None = None
-) -> Table:
-    """Read a table.
-
-    Args:
-        path: text (also gzipped), a spreadsheet (.xlsx), Parquet or MATLAB (up to version 7).
-        separator: separator of the cells; found out if None.
-        decimal: ``"."`` or ``","``; found out if None.
-
-    Raises:
-        InputError: if the file cannot be read, or holds no table of numbers.
-    """
-    file, path = str(path), Path(path)
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "does not exist"
-        raise InputError(f"{file} {what}; name a CSV, Parquet or .mat file")
-    with open(path, "rb") as stream:
-        first = stream.read(128)
-    if not first:
-        raise InputError(f"{file} is empty")
-    if first.startswith(b"PAR1"):
-        return _parquet(file)
-    if first.startswith(b"MATLAB 5.0"):
-        return _matlab(file)
-    if first.startswith(b"\x89HDF") or first.startswith(b"MATLAB 7.3"):
-        raise InputError(
-            f"{file} is HDF5 (MATLAB 7.3 or a log of PyTables); save it with `save(..., '-v7')` in "
-            "MATLAB, or export the table as CSV"
-        )
-    if first.startswith(b"PK\x03\x04"):
-        return _spreadsheet(file)
-    return _text(file, separator, decimal)
-
-
-def _text(file: str, separator: str | None, decimal: str | None) -> Table:
+def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
+    """Read text of any dialect, also gzipped; see :func:`~.formats.read_table`."""
     text, encoding = _decoded(file)
     text = text.replace("\r\n", "\n").replace("\r", "\n").replace("\N{MINUS SIGN}", "-")
     lines = text.split("\n")
@@ -310,7 +276,7 @@ def _rate(above: list[_Row], mark: str) -> float | None:
         line = re.split(r"[\s,;:=|]+", " ".join(cells).replace(mark, ".").strip(" #%\"'"))
         for k in range(1, len(line)):
             name = re.sub(r"[^a-z]|hz", "", "".join(line[:k]).lower())
-            if name in _RATES and re.fullmatch(r"\d+\.?\d*", line[k]) and float(line[k]) > 0:
+            if name in RATES and re.fullmatch(r"\d+\.?\d*", line[k]) and float(line[k]) > 0:
                 return float(line[k]) * (1000.0 if line[k + 1 : k + 2] == ["kHz"] else 1.0)
     return None
 
@@ -432,7 +398,8 @@ def _delimited_breaths(file: str, lines: list[str], encoding: str) -> Table:
     return Table(file, columns, units, numbers.astype(np.int64), 50.0, tuple(notes))
 
 
-def _spreadsheet(file: str) -> Table:
+def read_spreadsheet(file: str) -> Table:
+    """Read the first sheet of a spreadsheet."""
     import zipfile
 
     import pandas as pd
@@ -448,93 +415,3 @@ def _spreadsheet(file: str) -> Table:
     cells = frame.astype(str).mask(frame.isna(), "").to_numpy(str)
     rows = [(k + 1, list(row)) for k, row in enumerate(cells.tolist()) if any(row)]
     return _table(file, rows, ".", "First sheet of a spreadsheet")
-
-
-def _parquet(file: str) -> Table:
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    try:
-        frame = parquet.read_table(file).to_pandas()
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(f"{file} cannot be read ({str(error).splitlines()[0]})") from None
-    columns, units = {}, {}
-    for header in frame.columns:
-        name, unit = unit_of(str(header))
-        values = frame[header]
-        kind = values.dtype.kind
-        if kind == "M":
-            columns[name] = values.to_numpy("datetime64[ns]").astype(np.int64) * 1e-9
-        elif kind in "iufb":
-            columns[name] = values.to_numpy(float)
-        else:
-            columns[name] = values.astype(str).to_numpy(str)
-        if unit:
-            units[name] = unit
-    if not columns or len(frame) == 0:
-        raise InputError(f"{file} holds no rows")
-    return Table(file, columns, units, None, None, ("Parquet.",))
-
-
-def _matlab(file: str) -> Table:
-    from scipy.io import loadmat
-
-    try:
-        content = loadmat(file, simplify_cells=True)
-    except (ValueError, NotImplementedError, OSError, TypeError) as error:
-        raise InputError(f"{file} cannot be read as a MATLAB file ({error})") from None
-    flat: dict[str, NDArray[Any]] = {}
-    scalars: dict[str, float] = {}
-    for name, value in content.items():
-        if not name.startswith("__"):
-            _flatten(name, value, flat, scalars)
-    if not flat:
-        raise InputError(
-            f"{file} holds no column of numbers (variables: "
-            f"{', '.join(n for n in content if not n.startswith('__')) or 'none'}); a MATLAB table "
-            "object must be saved as a struct or as columns"
-        )
-    length = Counter(len(v) for v in flat.values()).most_common(1)[0][0]
-    longest = max(len(v) for v in flat.values())
-    same = [name for name, v in flat.items() if len(v) == longest]
-    length = longest if len(same) > 1 else length
-    columns = {name: v for name, v in flat.items() if len(v) == length}
-    # Short names, where they are unique: `data.Paw` is `Paw`.
-    last = Counter(name.rpartition(".")[2] for name in columns)
-    columns = {
-        name.rpartition(".")[2] if last[name.rpartition(".")[2]] == 1 else name: v
-        for name, v in columns.items()
-    }
-    others = [name for name, v in flat.items() if len(v) != length]
-    notes = [f"MATLAB file with {len(columns)} columns of {length} rows."]
-    if others:
-        notes.append(f"Columns of other lengths were left out ({', '.join(others[:5])}).")
-    named = {re.sub(r"[^a-z]", "", n.rpartition(".")[2].lower()): v for n, v in scalars.items()}
-    rate = next((named[name] for name in _RATES if named.get(name, 0.0) > 0.0), None)
-    return Table(file, columns, {}, None, rate, tuple(notes))
-
-
-def _flatten(
-    name: str, value: Any, flat: dict[str, NDArray[Any]], scalars: dict[str, float]
-) -> None:
-    """Collect the columns and single numbers of a MATLAB variable."""
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            _flatten(f"{name}.{key}", inner, flat, scalars)
-        return
-    if isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
-        for key in value[0]:  # an array of records
-            _flatten(f"{name}.{key}", [row.get(key) for row in value], flat, scalars)
-        return
-    try:
-        array = np.squeeze(np.asarray(value, float))
-    except (TypeError, ValueError):
-        return
-    if array.ndim == 0:
-        scalars[name] = float(array)
-    elif array.ndim == 1 and len(array) > 1:
-        flat[name] = array
-    elif array.ndim == 2:
-        rows = array if array.shape[0] >= array.shape[1] else array.T
-        for k in range(rows.shape[1]):
-            flat[f"{name}.{k + 1}"] = rows[:, k]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +17,6 @@ from numpy.typing import NDArray
 from ventbench.base.errors import InputError
 from ventbench.plants.sessions import Sessions
 from ventbench.recordings import Breaths, RecordingError, join, load
-from ventbench.recordings import folds as assign_folds
 from ventbench.recordings.identity import repetitions
 from ventbench.task.lungs import Lung, lung
 from ventbench.train.rigs.parameters import Groups
@@ -105,6 +105,36 @@ def load_rig_recordings(folder: Path, *, folds: int, seed: int) -> RigRecordings
     fold = fold[np.searchsorted(first, repeat[first[:count]])]
     labels = tuple(sorted({lung(name) for name in breaths.lung_ids.tolist()}))
     return RigRecordings(breaths, count, fold, labels, sources, tuple(skipped))
+
+
+def assign_folds(breaths: Breaths, *, count: int = 5, seed: int = 0) -> NDArray[np.int64]:
+    """Assign the breaths of each lung to the folds of a cross-validation, in turn.
+
+    The breaths of a lung are ordered by the SHA-256 of ``{seed}:{breath_id}:{lung}``, so that the
+    order in which they come does not matter.
+
+    Args:
+        breaths: ids must differ.
+        count: number of folds, at least 2.
+        seed: any whole number.
+
+    Returns:
+        Fold of each breath, 0 to ``count - 1``, shape ``(n,)``.
+
+    Raises:
+        InputError: if there are fewer than two folds, or an id occurs twice.
+    """
+    if count < 2:
+        raise InputError(f"a cross-validation needs at least 2 folds, not {count}")
+    if len(np.unique(breaths.breath_id)) < len(breaths):
+        raise InputError("breath ids are there more than once; give each breath an id of its own")
+    fold = np.empty(len(breaths), np.int64)
+    for name, index in breaths.by_lung_index.items():
+        ids = breaths.breath_id[index].tolist()
+        hashes = [hashlib.sha256(f"{seed}:{i}:{name}".encode()).digest() for i in ids]
+        order = sorted(range(len(ids)), key=hashes.__getitem__)
+        fold[index[order]] = np.arange(len(ids)) % count
+    return fold
 
 
 def _other_schema(error: RecordingError) -> bool:

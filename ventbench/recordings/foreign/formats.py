@@ -1,0 +1,304 @@
+"""Tables of numbers from files of every kind: recognised by their first bytes, read by a library.
+
+Parquet (pyarrow), MATLAB (scipy, pymatreader), EDF and BDF (pyedflib), WFDB (wfdb), and PIRDS, the
+Public Invention Respiratory Data Standard, version 0.3, as JSON. Nothing is resampled.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.base.errors import InputError, require
+from ventbench.recordings.foreign.breath_onsets import USUAL
+from ventbench.recordings.foreign.tables import RATES, Table, read_spreadsheet, read_text
+from ventbench.recordings.foreign.units import spelled, stem, unit_of
+
+#: Roles of PIRDS types, and what their integers are divided by to be cmH2O, L/min and mL; relative
+#: pressure before absolute.
+_PIRDS = (
+    ("pressure", "D", 10.0),
+    ("pressure", "P", 10.0),
+    ("flow", "F", 1000.0),
+    ("volume", "V", 1.0),
+)
+
+#: Places of PIRDS sensors, the nearer to the patient first.
+_PLACES = "AIDE"
+
+
+def read_table(
+    path: str | Path, *, separator: str | None = None, decimal: str | None = None
+) -> Table:
+    """Read a table.
+
+    Args:
+        path: text (also gzipped), a spreadsheet (.xlsx), Parquet, MATLAB, EDF, BDF, the header
+            (.hea) of a WFDB record, or PIRDS as JSON.
+        separator: separator of the cells; found out if None.
+        decimal: ``"."`` or ``","``; found out if None.
+
+    Raises:
+        InputError: if the file cannot be read, or holds no table of numbers.
+    """
+    file, path = str(path), Path(path)
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise InputError(f"{file} {what}; name a CSV, Parquet or .mat file")
+    with open(path, "rb") as stream:
+        first = stream.read(128)
+    if not first:
+        raise InputError(f"{file} is empty")
+    if first.startswith(b"PAR1"):
+        return _parquet(file)
+    if first.startswith(b"MATLAB 5.0"):
+        return _matlab(file)
+    if first.startswith(b"MATLAB 7.3"):
+        return _matlab_hdf5(file)
+    if first.startswith(b"\x89HDF"):
+        raise InputError(
+            f"{file} is HDF5 without MATLAB's header (a log of PyTables?); save it with "
+            "`save(..., '-v7')` in MATLAB, or export the table as CSV"
+        )
+    if first.startswith((b"0       ", b"\xffBIOSEMI")):
+        return _edf(file)
+    if path.suffix == ".hea":
+        return _wfdb(file)
+    if first.startswith(b"PK\x03\x04"):
+        return read_spreadsheet(file)
+    if first.lstrip()[:1] in (b"{", b"[") and b'"event"' in first:
+        return _pirds(file)
+    return read_text(file, separator, decimal)
+
+
+def _parquet(file: str) -> Table:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    try:
+        frame = parquet.read_table(file).to_pandas()
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(f"{file} cannot be read ({str(error).splitlines()[0]})") from None
+    columns, units = {}, {}
+    for header in frame.columns:
+        name, unit = unit_of(str(header))
+        values = frame[header]
+        kind = values.dtype.kind
+        if kind == "M":
+            columns[name] = values.to_numpy("datetime64[ns]").astype(np.int64) * 1e-9
+        elif kind in "iufb":
+            columns[name] = values.to_numpy(float)
+        else:
+            columns[name] = values.astype(str).to_numpy(str)
+        if unit:
+            units[name] = unit
+    if not columns or len(frame) == 0:
+        raise InputError(f"{file} holds no rows")
+    return Table(file, columns, units, None, None, ("Parquet.",))
+
+
+def _matlab(file: str) -> Table:
+    from scipy.io import loadmat
+
+    try:
+        content = loadmat(file, simplify_cells=True)
+    except (ValueError, NotImplementedError, OSError, TypeError) as error:
+        raise InputError(f"{file} cannot be read as a MATLAB file ({error})") from None
+    return _variables(file, content)
+
+
+def _matlab_hdf5(file: str) -> Table:
+    """MATLAB 7.3, which is HDF5 behind a header."""
+    require("pymatreader", "h5py", extra="formats", what="MATLAB 7.3 files")
+    from pymatreader import read_mat
+
+    try:
+        content = read_mat(file)
+    except (ValueError, NotImplementedError, OSError, TypeError, KeyError) as error:
+        raise InputError(
+            f"{file} cannot be read as a MATLAB 7.3 file ({error}); save it with "
+            "`save(..., '-v7')` in MATLAB"
+        ) from None
+    return _variables(file, content)
+
+
+def _variables(file: str, content: dict[str, Any]) -> Table:
+    """The columns among a MATLAB file's variables."""
+    flat: dict[str, NDArray[Any]] = {}
+    scalars: dict[str, float] = {}
+    for name, value in content.items():
+        if not name.startswith("__"):
+            _flatten(name, value, flat, scalars)
+    if not flat:
+        raise InputError(
+            f"{file} holds no column of numbers (variables: "
+            f"{', '.join(n for n in content if not n.startswith('__')) or 'none'}); a MATLAB table "
+            "object must be saved as a struct or as columns"
+        )
+    length = Counter(len(v) for v in flat.values()).most_common(1)[0][0]
+    longest = max(len(v) for v in flat.values())
+    same = [name for name, v in flat.items() if len(v) == longest]
+    length = longest if len(same) > 1 else length
+    columns = {name: v for name, v in flat.items() if len(v) == length}
+    # Short names, where they are unique: `data.Paw` is `Paw`.
+    last = Counter(name.rpartition(".")[2] for name in columns)
+    columns = {
+        name.rpartition(".")[2] if last[name.rpartition(".")[2]] == 1 else name: v
+        for name, v in columns.items()
+    }
+    others = [name for name, v in flat.items() if len(v) != length]
+    notes = [f"MATLAB file with {len(columns)} columns of {length} rows."]
+    if others:
+        notes.append(f"Columns of other lengths were left out ({', '.join(others[:5])}).")
+    named = {re.sub(r"[^a-z]", "", n.rpartition(".")[2].lower()): v for n, v in scalars.items()}
+    rate = next((named[name] for name in RATES if named.get(name, 0.0) > 0.0), None)
+    units = {name: unit for name in columns if (unit := unit_of(name)[1])}
+    return Table(file, columns, units, None, rate, tuple(notes))
+
+
+def _flatten(
+    name: str, value: Any, flat: dict[str, NDArray[Any]], scalars: dict[str, float]
+) -> None:
+    """Collect the columns and single numbers of a MATLAB variable."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _flatten(f"{name}.{key}", inner, flat, scalars)
+        return
+    if isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
+        for key in value[0]:  # an array of records
+            _flatten(f"{name}.{key}", [row.get(key) for row in value], flat, scalars)
+        return
+    try:
+        array = np.squeeze(np.asarray(value, float))
+    except (TypeError, ValueError):
+        return
+    if array.ndim == 0:
+        scalars[name] = float(array)
+    elif array.ndim == 1 and len(array) > 1:
+        flat[name] = array
+    elif array.ndim == 2:
+        rows = array if array.shape[0] >= array.shape[1] else array.T
+        for k in range(rows.shape[1]):
+            flat[f"{name}.{k + 1}"] = rows[:, k]
+
+
+def _channels(
+    file: str,
+    kind: str,
+    names: Sequence[str],
+    units: Sequence[str],
+    rates: Sequence[float],
+    values: Sequence[NDArray[Any]],
+) -> Table:
+    """The channels that share the pressure's rate, or else the commonest."""
+    rate = next(
+        (r for name, r in zip(names, rates, strict=True) if USUAL.get(stem(name)) == "pressure"),
+        Counter(rates).most_common(1)[0][0] if rates else 0.0,
+    )
+    columns: dict[str, NDArray[Any]] = {}
+    spelt: dict[str, str] = {}
+    for name, unit, signal_rate, signal in zip(names, units, rates, values, strict=True):
+        if signal_rate != rate:
+            continue
+        while name in columns:
+            name += "_"
+        columns[name] = np.asarray(signal, float)
+        if unit and unit != "NU":  # WFDB's "no units"
+            spelt[name] = spelled(unit)
+    if not columns or not len(next(iter(columns.values()))):
+        raise InputError(f"{file} holds no signal; name the file of the waveforms")
+    notes = [f"{kind} with {len(columns)} signals at {rate:g} Hz."]
+    left = [f"{n} ({r:g} Hz)" for n, r in zip(names, rates, strict=True) if r != rate]
+    if left:
+        notes.append(f"Signals of other rates were left out ({', '.join(left)}).")
+    return Table(file, columns, spelt, None, float(rate), tuple(notes))
+
+
+def _edf(file: str) -> Table:
+    require("pyedflib", extra="formats", what="EDF files")
+    from pyedflib import highlevel
+
+    try:
+        signals, headers, _ = highlevel.read_edf(file)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{file} cannot be read as EDF ({error}); it must be continuous (EDF, EDF+C or BDF)"
+        ) from None
+    names, units, rates = (
+        [header[key] for header in headers] for key in ("label", "dimension", "sample_frequency")
+    )
+    return _channels(file, "EDF", names, units, rates, list(signals))
+
+
+def _wfdb(file: str) -> Table:
+    with warnings.catch_warnings():  # of pandas, about what wfdb does with its tables
+        warnings.simplefilter("ignore", DeprecationWarning)
+        require("wfdb", extra="formats", what="WFDB records")
+        import wfdb
+
+        try:
+            record = wfdb.rdrecord(file.removesuffix(".hea"), smooth_frames=False)
+        except (OSError, ValueError, IndexError) as error:
+            raise InputError(
+                f"{file} cannot be read as a WFDB record ({error}); its signal files "
+                "must lie beside it"
+            ) from None
+    if not isinstance(record, wfdb.Record):
+        raise InputError(f"{file} is a record of segments; name the header of one of them")
+    rates = [record.fs * samples for samples in record.samps_per_frame or ()]
+    return _channels(
+        file, "WFDB", record.sig_name or (), record.units or (), rates, record.e_p_signal or ()
+    )
+
+
+def _pirds(file: str) -> Table:
+    """A JSON list of events, or an event a line; sensors are aligned by their milliseconds."""
+    text = Path(file).read_text(encoding="utf-8", errors="replace")
+    try:
+        events = json.loads(text)
+    except json.JSONDecodeError:
+        events = []
+        for k, line in enumerate(text.splitlines()):
+            if line.strip(" \t,[]"):
+                try:
+                    events.append(json.loads(line.strip(" \t,")))
+                except json.JSONDecodeError as error:
+                    raise InputError(
+                        f"{file}, line {k + 1} is no JSON event ({error.msg})"
+                    ) from None
+    events = events if isinstance(events, list) else [events]
+    sensors: dict[tuple[str, str, int], dict[float, float]] = {}
+    for k, event in enumerate(events):
+        try:
+            if event["event"] == "M":
+                key = (str(event["type"]), str(event["loc"]), int(event["num"]))
+                sensors.setdefault(key, {})[float(event["ms"])] = float(event["val"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{file}, event {k + 1} is no PIRDS event ({type(error).__name__}: {error}); a "
+                "measurement has event, type, loc, num, ms and val"
+            ) from None
+    chosen: dict[str, tuple[tuple[str, str, int], float]] = {}
+    for role, kind, scale in _PIRDS:
+        sensing = [key for key in sensors if key[0] == kind and key[1] in _PLACES]
+        if sensing and role not in chosen:
+            chosen[role] = min(sensing, key=lambda key: (_PLACES.index(key[1]), key[2])), scale
+    if "pressure" not in chosen:
+        raise InputError(f"{file}: no measurement of type D or P, which are pressures")
+    times = np.array(sorted(sensors[chosen["pressure"][0]]))
+    columns = {"time": times} | {
+        role: np.array([sensors[key].get(ms, np.nan) for ms in times]) / scale
+        for role, (key, scale) in chosen.items()
+    }
+    which = ", ".join(f"{role} {t} of {loc}{num}" for role, ((t, loc, num), _) in chosen.items())
+    units = {"time": "ms", "pressure": "cmH2O", "flow": "L/min", "volume": "mL"}
+    units = {name: units[name] for name in columns}
+    return Table(file, columns, units, None, None, (f"PIRDS, {len(events)} events: {which}.",))

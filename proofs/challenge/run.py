@@ -278,6 +278,7 @@ def child() -> None:
 def _lock_down(told: dict[str, Any]) -> list[str]:
     from ventbench.sandbox.child import privileges
     from ventbench.sandbox.child.lockdown import FLOOR, CellLimits, Lockdown
+    from ventbench.sandbox.reader import libraries
 
     if not told["stranger"]:
         import resource
@@ -291,8 +292,7 @@ def _lock_down(told: dict[str, Any]) -> list[str]:
     for module in told["preload"]:
         importlib.import_module(module)
     root = Path(__file__).resolve().parents[2]  # holds answers of others, too
-    libraries = [path for path in sys.path if os.path.isdir(path) and Path(path).resolve() != root]
-    readable = [told["case"], *libraries, str(root / "ventbench"), str(root / "data")]
+    readable = [told["case"], *libraries(), str(root / "ventbench"), str(root / "data")]
     limits = CellLimits(told["memory"], told["seconds"], threads=True)
     layers = Lockdown(readable, [str(root)]).finish(limits, _PIPE + 1)
     lacking = [" or ".join(line) for line in FLOOR if not set(line) & set(layers)]

@@ -56,6 +56,13 @@ _BOOT = (
 )
 
 
+def libraries() -> list[str]:
+    """Folders on the search path that belong to Python, and none that ``PYTHONPATH`` adds."""
+    ours = [Path(prefix).resolve() for prefix in (sys.prefix, sys.base_prefix)]
+    folders = [Path(path).resolve() for path in sys.path if os.path.isdir(path)]
+    return [str(x) for x in folders if any(x.is_relative_to(prefix) for prefix in ours)]
+
+
 class UnreadableError(Exception):
     """Files that cannot be read within the limits; the text continues "the submission ..."."""
 
@@ -87,7 +94,7 @@ def read_apart(
     request = {
         "function": function,
         "arguments": [real, *arguments],
-        "readable": [real, ROOT, SITE, *(path for path in sys.path if os.path.isdir(path))],
+        "readable": [real, ROOT, SITE, *libraries()],
         "site": SITE,
         "memory": memory,
         "cpu_s": cpu_s,

@@ -234,7 +234,8 @@ def test_a_file_that_was_changed_into_no_answer_is_a_lost_case(answered, tmp_pat
     assert "probability is 7" in reveal([folder], [SECRET], "asks").cases[0, "case_0001"].problem
 
 
-def test_a_stranger_reads_and_writes_nothing_else(tmp_path):
+def test_a_stranger_reads_and_writes_nothing_else(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)  # what PYTHONPATH adds is not theirs to read
     kept = tmp_path / "secret.txt"
     kept.write_text("seed")
     mine, case = tmp_path / "mine", tmp_path / "case"

@@ -1,4 +1,4 @@
-"""The best PID of the paper's grid on each lung, tuned on the rigs of version 2."""
+"""The best PID of the paper's grid on each lung, tuned on the rigs."""
 
 TIME_CONSTANT = 0.5  # s, of both averages
 

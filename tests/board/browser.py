@@ -26,7 +26,7 @@ _OPTIONS = (
     "--disable-dev-shm-usage",
     "--remote-debugging-pipe",
 )
-_PATIENCE_S = 60.0
+_PATIENCE_S = 600.0
 
 
 def find() -> str | None:
@@ -170,7 +170,7 @@ def browser(path: str, folder: Path) -> Iterator[Page]:
         yield page
         page._session = None
         page.call("Browser.close")
-        process.wait(20)
+        process.wait(_PATIENCE_S)
     finally:
         if process.poll() is None:
             process.kill()

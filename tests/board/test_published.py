@@ -6,9 +6,11 @@ import runpy
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ventbench.base.errors import InputError
+from ventbench.board import comparison, ranking, store
 from ventbench.board.verify import verify
 from ventbench.plants import frozen
 
@@ -62,8 +64,8 @@ def test_no_byte_of_the_simulators_may_change(tmp_path: Path) -> None:
             flip(copy / name, place)
             report = verify(FOLDER, load)
             assert report.replayed == 0
-            (problem,) = set(report.problems)
-            assert problem.startswith("simulators: ")
+            said = {x for x in report.problems if x.startswith("simulators: ")}  # and of rounds
+            (problem,) = said
             assert name == frozen.MANIFEST or name in problem
             flip(copy / name, place)
 
@@ -79,3 +81,27 @@ def test_tables_of_the_docs_are_those_of_the_records(page: str) -> None:
         tool = runpy.run_path(str(root / "benchmarks" / "board_tables.py"))
         table = tool["markdown"]()
     assert table in (root / page).read_text("utf-8"), "run the benchmark with --write"
+
+
+def test_only_unseen_draws_of_a_round_count() -> None:
+    board = ranking.board(store.load(FOLDER))
+    tracks = [track for track in board if track.round is not None and track.ranked]
+    assert len(tracks) >= 2
+    for track in tracks:
+        rigs = track.ranked[0].record.headroom
+        seen = np.flatnonzero(~rigs.ranked)
+        assert 0 < len(seen) < rigs.ranked.size
+        again = comparison.ranks(
+            np.stack([np.delete(r.record.headroom.normalised[1:], seen, 0).mean(axis=2).T
+                      for r in track.ranked]),
+            np.delete(rigs.session, seen, 1), matters=comparison.POINTS,
+        )  # fmt: skip
+        assert again.rank.tolist() == [row.rank for row in track.ranked]
+        for row in track.ranked:
+            assert row.error is not None
+            unseen = np.delete(row.record.drawn, seen, 0)
+            assert row.error.value == pytest.approx(unseen.mean(), abs=1e-12)
+            assert row.error.low < row.error.value < row.error.high
+            means = np.delete(row.record.headroom.normalised[1:], seen, 0)
+            assert row.normalised is not None
+            assert row.normalised.score.value == pytest.approx(means.mean(), abs=1e-9)

@@ -113,13 +113,18 @@ def test_a_record_holds_rigs_and_normalised_scores(drafts, score):
     assert record.ranked_values.shape == (6, draw_tables.COUNT)
 
 
-def test_replay_finds_a_changed_normalised_error(drafts, simulators, score):
+def test_replay_finds_changed_errors_and_rigs(drafts, simulators, score):
     record = opened(drafts["pid_robust"])
     (found,) = replay(simulators, record.pips, [score.requested], score.rig_draws)
     assert differences(record, found) == []
-    better = dataclasses.replace(record.headroom, error=record.headroom.error - 1e-6)
-    changed = dataclasses.replace(record, headroom=better)
-    assert any("headroom.error" in text for text in differences(changed, found))
+    rigs = record.headroom
+    for key, better in (
+        ("headroom.error", dataclasses.replace(rigs, error=rigs.error - 1e-6)),
+        ("rigs.session", dataclasses.replace(rigs, session=np.zeros_like(rigs.session))),
+        ("rigs.member", dataclasses.replace(rigs, member=rigs.member + 1)),
+    ):
+        changed = dataclasses.replace(record, headroom=better)
+        assert [key in text for text in differences(changed, found)] == [True], key
 
 
 @pytest.mark.parametrize(

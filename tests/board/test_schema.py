@@ -171,7 +171,7 @@ def test_a_message_names_a_hostile_key_printably_and_briefly(drafts) -> None:
     assert len(str(caught.value)) < 400
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.binary(max_size=80))
 def test_any_bytes_are_a_record_or_an_input_error(content: bytes) -> None:
     for read in (record.from_bytes, canonical.parse):

@@ -286,6 +286,15 @@ def test_what_is_left_after_the_correction_is_shown(found: Diagnosis, tmp_path: 
     assert "Nothing: no range of any quantity has a significant error." in clean
 
 
+def test_the_first_line_counts_expirations_too(found: Diagnosis) -> None:
+    errors = found.open_loop
+    worse = {"expiration": {"refit": errors.after, "after": errors.refit}}
+    made = dataclasses.replace(found, open_loop=dataclasses.replace(errors, groups=worse))
+    (line,) = [more for question, _, more in report.facts(made) if "worth" in question]
+    assert line.startswith("error in inspiration")
+    assert line.endswith(f"; expiration {errors.after.rmse:.2f} → {errors.refit.rmse:.2f}")
+
+
 def test_rerun(found: Diagnosis, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="needs the extra ventbench[view]")
     path = write_rerun(tmp_path / "diagnosis.rrd", found)

@@ -49,7 +49,7 @@ def browse(browser: str, folder: Path, page: Path, *options: str) -> tuple[str, 
         [browser, *QUIET, f"--user-data-dir={folder / 'profile'}", *options, page.as_uri()],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
         check=True,
     )
     return done.stdout, done.stderr
@@ -113,7 +113,7 @@ def test_rerun_viewer(best: Trajectories, robust: Trajectories, tmp_path: Path) 
         )
     try:
         client = connect(experimental, command[-1], viewer, log)
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 600
         views = []
         while not views and time.monotonic() < deadline:
             time.sleep(0.3)
@@ -130,14 +130,14 @@ def test_rerun_viewer(best: Trajectories, robust: Trajectories, tmp_path: Path) 
     finally:
         with contextlib.suppress(ProcessLookupError):  # it has ended by itself
             os.killpg(viewer.pid, signal.SIGTERM)
-        viewer.wait(30)
+        viewer.wait(600)
     pixels = colors(picture)
     for color in ((0xE2, 0x60, 0x3C), (0x6F, 0x83, 0xDE), (0x12, 0xA0, 0x73)):
         assert (np.abs(pixels - color).max(axis=1) < 12).sum() > 200, "PIPs and scored bar"
 
 
 def connect(experimental: Any, port: str, viewer: subprocess.Popen[bytes], log: Path) -> Any:
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 600
     while time.monotonic() < deadline:
         if viewer.poll() is not None or "panicked" in log.read_text(errors="replace"):
             said = log.read_text(errors="replace")

@@ -200,8 +200,9 @@ def _stability(track: Track) -> list[dict[str, str]]:
     if len(track.ranked) < 2:
         return []
     records = [row.record for row in track.ranked]
-    cells = np.stack([record.headroom.normalised[1:] for record in records])
-    rig = records[0].headroom.session
+    ranked = records[0].headroom.ranked
+    cells = np.stack([record.headroom.normalised[1:][ranked] for record in records])
+    rig = records[0].headroom.session[:, ranked]
     shown = []
     for kind, taus in comparison.agreement(cells, rig, records[0].lungs, records[0].pips).items():
         least = min(taus, key=lambda name: taus[name])

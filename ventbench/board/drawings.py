@@ -244,7 +244,7 @@ def _stairs(heights: list[int]) -> str:
 
 def profile(record: Record) -> dict[str, str] | None:
     """Performance profile of an entry: a path in a box of 200 by 40, and the share below 100."""
-    cells = record.headroom.normalised[1:]
+    cells = record.headroom.normalised[1:][record.headroom.ranked]
     if not np.isfinite(cells).all():
         return None
     shares = comparison.profile(cells)

@@ -332,7 +332,7 @@ def record_index(folder: Path | str | None = None) -> list[dict[str, Any]]:
 
 
 def cell_means(record: Record, lung: str) -> dict[str, float | None]:
-    """Normalised scores over draws of one lung by PIP, or of all lungs.
+    """Normalised scores over the ranked draws of one lung by PIP, or of all lungs.
 
     Args:
         record: of an entry.
@@ -344,7 +344,7 @@ def cell_means(record: Record, lung: str) -> dict[str, float | None]:
     Raises:
         InputError: if the record has no such lung.
     """
-    means = record.headroom.normalised[1:].mean(axis=0)
+    means = record.headroom.normalised[1:][record.headroom.ranked].mean(axis=0)
     if lung == "all":
         named = dict(zip(record.lungs, means.mean(axis=1).tolist(), strict=True))
     elif lung in record.lungs:

@@ -337,11 +337,17 @@ def rank(entries: Sequence[Entry], track: str, *, ranks: bool = True) -> list[Ro
     return rows
 
 
-def ranks_of(entries: Sequence[Entry], values: Sequence[Floats], matters: float = POINTS) -> Ranks:
-    """Ranks of entries by values of shape ``(L, k)`` on their first k draws, less is better."""
+def ranks_of(entries: Sequence[Entry], values: Sequence[Floats]) -> Ranks:
+    """Ranks of entries by their errors of the ranked draws, ``(L, k)``; less is better."""
+    rigs = entries[0].record.headroom
+    return _ranks(entries, values, rigs.session[:, rigs.ranked], POINTS)
+
+
+def _ranks(
+    entries: Sequence[Entry], values: Sequence[Floats], rig: NDArray[np.int64], matters: float
+) -> Ranks:
     names = [entry.record.name for entry in entries]
     source = [names.index(x.source) if x.source in names else None for x in entries]
-    rig = entries[0].record.headroom.session[:, : values[0].shape[1]]
     return comparison.ranks(np.stack(values), rig, source, matters=matters)
 
 
@@ -350,7 +356,7 @@ def _row(
 ) -> Row:
     record, error = entry.record, None
     if compared is not None:
-        values = record.drawn.mean(axis=2).T
+        values = record.drawn[record.headroom.ranked].mean(axis=2).T
         error = _interval(values, _resampled(record, values))
     nominal = float(record.nominal.mean())
     return Row(entry, rank, ranks, compared, error, nominal, worst(record))
@@ -367,8 +373,9 @@ def _comparisons(records: Sequence[Record], base: int | None) -> list[Comparison
             to_baseline = _interval(own - values[base], means[i] - means[base])
         if i:
             to_above = _interval(own - values[i - 1], means[i] - means[i - 1])
-        headroom = records[i].headroom
-        middle = Interval(*comparison.interquartile_mean(headroom.normalised[1:], headroom.session))
+        rigs = records[i].headroom
+        cells, rig = rigs.normalised[1:][rigs.ranked], rigs.session[:, rigs.ranked]
+        middle = Interval(*comparison.interquartile_mean(cells, rig))
         compared.append(Comparison(_interval(own, means[i]), to_baseline, to_above, middle))
     return compared
 
@@ -432,7 +439,8 @@ def _stress_rows(rows: Sequence[Row], evidence: Evidence) -> list[StressRow]:
     ranks = {}
     if fit:
         values = [row.tables.by_lung_and_draw for row in fit]
-        made = ranks_of([row.row.entry for row in fit], values, CMH2O)
+        rig = fit[0].row.record.headroom.session[:, : values[0].shape[1]]  # of the first draws
+        made = _ranks([row.row.entry for row in fit], values, rig, CMH2O)
         for i, row in enumerate(fit):
             ranks[row.name] = int(made.rank[i]), (int(made.best[i]), int(made.worst[i]))
     shown = []

@@ -98,6 +98,8 @@ class Replayed:
         u_in: commands of that inspiration as applied, %, shape ``(L, P, S)``.
         first: first command of each run, %, shape ``(1 + K, L, P)``.
         controllable: error without the first step, cmH2O, shape ``(1 + K, L, P)``.
+        session: rig of each draw, shape ``(L, K)``.
+        member: member of the ensemble, shape ``(L, K)``.
     """
 
     nominal: Floats
@@ -112,6 +114,8 @@ class Replayed:
     u_in: Floats
     first: Floats
     controllable: Floats
+    session: NDArray[np.int64]
+    member: NDArray[np.int64]
 
 
 @jax.jit
@@ -248,10 +252,12 @@ def replay(
         pressure = pressures(simulators, pips, padded, draws)
         spreads = spread(simulators, pips, padded[:, :, 0])
         for n, commands in enumerate(batch):
-            yield _measure(cells, commands, pressure[n], spreads[n])
+            yield _measure(cells, draws, commands, pressure[n], spreads[n])
 
 
-def _measure(cells: Scenario, requested: Floats, pressure: Floats, spread: Floats) -> Replayed:
+def _measure(
+    cells: Scenario, draws: Draws, requested: Floats, pressure: Floats, spread: Floats
+) -> Replayed:
     pip, dt = np.asarray(cells.pip), np.asarray(cells.dt)
     errors = run_error(pressure, pip[..., None, None])
     gate = passes_safety_gate(pressure, pip[..., None], dt[..., None])
@@ -269,6 +275,8 @@ def _measure(cells: Scenario, requested: Floats, pressure: Floats, spread: Float
         u_in=np.clip(requested[:, 0, :, TRACE_BREATH], 0.0, protocol.U_MAX),
         first=np.moveaxis(requested[..., 0, 0], 1, 0),
         controllable=np.moveaxis(controllable_error(pressure, pip[..., None, None]), 1, 0),
+        session=draws.rig,
+        member=draws.member,
     )
 
 
@@ -307,6 +315,9 @@ def differences(record: Record, replayed: Replayed) -> list[str]:
         ("trace.pressure_centi_cmH2O", record.pressure, replayed.pressure, _CENTI),
         ("trace.u_in_tenths_percent", record.u_in, replayed.u_in, _TENTH),
         ("headroom.error", record.headroom.error, replayed.controllable, TOLERANCE),
+        # They decide which draws rank, and what the tests of ranks take as a unit.
+        ("rigs.session", record.headroom.session, replayed.session, 0.0),
+        ("rigs.member", record.headroom.member, replayed.member, 0.0),
     )
     texts = [text for check in checks if (text := _difference(*check)) is not None]
     for key, recorded, given in (

@@ -149,12 +149,6 @@ def _what_changed(content: bytes) -> str:
     return ""
 
 
-def newest_of(store: Store, record: Record) -> Record | None:
-    """The newest record of the same entry and track; None if there is none."""
-    of_entry = [entry for entry in store.scores if entry.key == record.key]
-    return of_entry[-1] if of_entry else None
-
-
 def find_record(
     store: Store, sha256: str, kind: type[Record | HardwareRecord] | None = None
 ) -> Record | HardwareRecord:

@@ -209,14 +209,19 @@ def _check_ranks(leaderboard: Store, by_draw: Mapping[str, Floats]) -> list[str]
 
 
 def _rounds(folder: Path, load: Load, report: Report) -> Iterator[Round]:
-    """Read the rounds, newest first, and note what is wrong with them."""
-    newest = True
+    """Read the rounds, newest first, and note what is wrong with them.
+
+    Entries stay as they were ranked until the next round is open.
+    """
+    made: list[Round] = []
     for name in rounds.names(folder):
         try:
-            yield (own := rounds.load(folder, name))
+            made.append(rounds.load(folder, name))
         except (InputError, OSError) as error:
             report.problems.append(str(error))
-            continue
+    made.sort(key=lambda x: x.opened.closes, reverse=True)
+    for at, own in enumerate(made):
+        yield own
         if own.frozen is None:
             continue
         simulators = _loaded(load, report)
@@ -225,13 +230,11 @@ def _rounds(folder: Path, load: Load, report: Report) -> Iterator[Round]:
         for key in rounds.protocol_differences(own, simulators.about()):
             report.problems.append(f"{own.folder}: this ventbench has another protocol: {key}")
         available = list(folders([folder.parent / "submissions"]))
-        for entry in own.frozen.entries:
-            if not newest:
-                break
+        for entry in own.frozen.entries if at == 0 else ():
             named = [x for x in available if x.name == entry.name]
             if named and all(combined_hash(file_hashes(x)) != entry.sha256 for x in named):
                 report.problems.append(
-                    f"{named[0]} is not what was frozen in round {name}, {entry.sha256[:12]}"
+                    f"{named[0]} is not what was frozen in round {own.name}, {entry.sha256[:12]}"
                 )
         if own.result is not None:
             report.problems += _wrong_bounds(own, simulators)

@@ -24,27 +24,17 @@ from ventbench.trajectories import Trajectories
 
 
 def write_rerun(path: Path | str, runs: Sequence[Trajectories]) -> Path:
-    """Write a rerun recording with its blueprint.
-
-    Args:
-        path: target, ``.rrd`` by custom.
-        runs: the run to look at, then references to compare it with (such as the PID).
-
-    Returns:
-        The path.
-
-    Raises:
-        InputError: if there is no run, the runs do not match, or the extra is missing.
-        OSError: if the file cannot be written.
-    """
-    path = Path(path)
+    """Write a rerun recording with its blueprint, ``.rrd`` by custom; see :func:`write_report`."""
     check(runs)
     errors.require("rerun")
     from ventbench.pages import rerun_log
 
-    content = rerun_log.recording(runs)
-    files.write_atomically(path, lambda file: file.write(content))
-    return path
+    return _write(path, rerun_log.recording(runs))
+
+
+def _write(path: Path | str, content: bytes) -> Path:
+    files.write_atomically(Path(path), lambda file: file.write(content))
+    return Path(path)
 
 
 def write_report(
@@ -69,37 +59,18 @@ def write_report(
             the extra is missing.
         OSError: if the file cannot be written.
     """
-    path = Path(path)
     check(runs)
     errors.require("jinja2")
-    from ventbench.pages import report
-
-    files.write_text(path, report.html(runs, scores))
-    return path
+    return _write(path, html(runs, scores).encode())
 
 
 def write_figure(path: Path | str, runs: Sequence[Trajectories]) -> Path:
-    """Write the small multiples as a PNG, 1800 pixels wide.
-
-    Args:
-        path: target, ``.png`` by custom.
-        runs: the run to look at, then references.
-
-    Returns:
-        The path.
-
-    Raises:
-        InputError: if there is no run, the runs do not match, or the extra is missing.
-        OSError: if the file cannot be written.
-    """
-    path = Path(path)
+    """Write the small multiples as a PNG, 1800 pixels wide; see :func:`write_report`."""
     check(runs)
     errors.require("matplotlib")
     from ventbench.pages import figure
 
-    content = figure.png(runs)
-    files.write_atomically(path, lambda file: file.write(content))
-    return path
+    return _write(path, figure.png(runs))
 
 
 def has_display() -> bool:

@@ -104,12 +104,18 @@ def facts(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
         told.append(("How sure?", decided.removeprefix("each at "), f"{each}on {breaths}"))
         if sure.startswith("uncertain"):
             told[-1] = ("How sure?", "uncertain", sure.removeprefix("uncertain: "))
-    after = _number(errors.after.rmse)
+    after, out = _number(errors.after.rmse), errors.groups.get("expiration", {})
     if diagnosis.verdict == "nothing_missing":
-        told.append(("How far off?", f"{after} cmH2O", f"root mean square on {count} breaths"))
+        also = f"; expiration {_number(out['after'].rmse)}" if "after" in out else ""
+        about = f"in inspiration, root mean square on {count} breaths{also}"
+        told.append(("How far off?", f"{after} cmH2O", about))
     else:
         worth = f"{_number(errors.refit.rmse)} → {after} cmH2O"
-        told.append(("What is mending it worth?", worth, f"error on {count} breaths set aside"))
+        about = f"error in inspiration on {count} breaths set aside"
+        if {"refit", "after"} <= out.keys():
+            ends = (_number(out[stage].rmse) for stage in ("refit", "after"))
+            about += f"; expiration {' → '.join(ends)}"
+        told.append(("What is mending it worth?", worth, about))
     noise = f"beyond the measurement's noise of {_number(errors.noise_floor)}"
     if errors.gain_error:
         noise += f" and the {_number(errors.gain_error)} of the valve's scattering gain"

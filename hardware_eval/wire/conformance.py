@@ -120,6 +120,7 @@ def conformance(
 def _judged(host: Probe, text: str, check: Callable[[Probe], None]) -> Clause:
     reason = ""
     for _ in range(_ATTEMPTS):
+        before = None
         try:
             host.hear(0.01)
             host.heard.clear()
@@ -133,7 +134,7 @@ def _judged(host: Probe, text: str, check: Callable[[Probe], None]) -> Clause:
             continue
         except DiffersError as error:
             reason = str(error)
-            if _by_itself(host, before):
+            if before is None or _by_itself(host, before):
                 continue
             return Clause(text, False, reason)
         except UntriedError as error:

@@ -47,7 +47,7 @@ def _damaged(frame: bytes, damage: str, where: int) -> bytes:
     return frame
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 1), damages), min_size=1, max_size=40)
 )

@@ -266,7 +266,7 @@ def test_the_board_serves_one_host_after_another() -> None:
     url = f"socket://127.0.0.1:{server.getsockname()[1]}"
     try:
         for _ in range(2):
-            client = Client(Link(url), timeout=20.0)
+            client = Client(Link(url), timeout=600.0)
             assert client.hello().name == "bench"
             assert client.arm().mode is Mode.RUNNING
             client._transport.close()

@@ -30,7 +30,7 @@ from hardware_eval.wire.parser import LinkError, RefusedError
 from tests.hardware_eval.stand_in import Bench
 
 #: Patience with a busy machine, s.
-PATIENCE = 60.0
+PATIENCE = 600.0
 
 
 @pytest.mark.parametrize("normally_open", [True, False])

@@ -39,7 +39,7 @@ from ventbench.cli import app as ventbench
 LUNG, OTHER = "R20C50", "R5C20"
 
 #: Patience with a busy machine, s; bytes that do not come by then are lost.
-PATIENCE = 60.0
+PATIENCE = 600.0
 
 
 class DeviceOnTerminal(LoopbackDevice):

@@ -48,7 +48,7 @@ from hardware_eval.wire.parser import (
 )
 
 #: Enough to find what a table forgets; the benchmark of hostile frames has the million.
-QUICK = settings(max_examples=40, deadline=None)
+QUICK = settings(max_examples=40)
 
 u8, u16, u32 = (st.integers(0, 2**bits - 1) for bits in (8, 16, 32))
 percent = st.integers(0, 10_000).map(lambda n: n / 100)

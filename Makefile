@@ -15,6 +15,16 @@ READY := $(VENV)/.ready
 DEMO := $(VENV)/bin/ventbench score submissions/pid_best submissions/pid_robust \
 	--out runs/demo --report
 
+# Tests start Python hundreds of times: what it has compiled is kept, also where a shell says not to.
+unexport PYTHONDONTWRITEBYTECODE
+
+# Tests take memory in huge pages where the kernel gives them on request, and keep what they took: on
+# a virtual machine a page of 4 KiB can cost 100 microseconds, and JAX takes 40,000 to start.
+test test-slow: export PYTHONMALLOC := malloc
+test test-slow: export GLIBC_TUNABLES := glibc.malloc.hugetlb=1:glibc.malloc.tcache_count=1000:$\
+	glibc.malloc.top_pad=16777216:glibc.malloc.trim_threshold=268435456:$\
+	glibc.malloc.mmap_threshold=33554432
+
 .DEFAULT_GOAL := help
 .PHONY: help setup demo check test test-slow lint format docs lock bench wheel clean
 
@@ -71,20 +81,23 @@ clean: ## remove what was built; .venv, runs and records stay
 	rm -rf build dist .pytest_cache .ruff_cache .hypothesis
 	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# Wheels only, each with a hash: nothing is built, so no build tool is fetched unpinned either.
-# A Python without ensurepip (Debian's, bare) makes a .venv without pip and installs from outside.
+# Wheels only, each with a hash: nothing is built, so no build tool is fetched unpinned either. Pip
+# installs the lock's uv, which installs the rest: from its cache in seconds, else in a minute.
+# A Python without pip of its own puts it into .venv.
 $(READY): pyproject.toml requirements.lock ventbench/__init__.py
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 		found=$$($(PYTHON) --version 2>/dev/null) || found="no Python"; \
 		echo "ventbench needs Python 3.11 or newer; '$(PYTHON)' is $$found." >&2; \
 		echo "Name another one: make setup PYTHON=python3.12" >&2; exit 1; }
-	@$(PY) -c '' 2>/dev/null || $(PYTHON) -m venv --clear $(VENV) >/dev/null 2>&1 \
-		|| $(PYTHON) -m venv --clear --without-pip $(VENV)
-	@echo "Installing the packages of requirements.lock into $(VENV): a minute or a few."
+	@$(PY) -c '' 2>/dev/null || $(PYTHON) -m venv --clear --without-pip $(VENV)
+	@echo "Installing the packages of requirements.lock into $(VENV): a minute or two."
 	@set -e; \
-	if $(PY) -m pip --version >/dev/null 2>&1; then pip="$(PY) -m pip"; \
-	else pip="$(PYTHON) -m pip --python $(PY)"; fi; \
-	install="$$pip install --quiet --disable-pip-version-check --progress-bar off"; \
+	pip="$(PYTHON) -m pip --python $(PY)"; \
+	$$pip --version >/dev/null 2>&1 || { $(PY) -m ensurepip >/dev/null; pip="$(PY) -m pip"; }; \
+	sed -n '/^uv==/,/[^\]$$/p' requirements.lock > $(VENV)/uv.txt; \
+	$$pip install --quiet --disable-pip-version-check --progress-bar off \
+		--require-hashes --only-binary :all: --requirement $(VENV)/uv.txt; \
+	install="$(PY) -m uv pip install --quiet --python $(PY)"; \
 	$$install --require-hashes --only-binary :all: --requirement requirements.lock; \
 	$$install --no-deps --no-build-isolation --editable .
 	@touch $@

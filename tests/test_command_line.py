@@ -39,7 +39,7 @@ class Drops:
 @cli.app.command()
 def work() -> None:
     Drops()
-    time.sleep(60)
+    time.sleep(600)
 
 cli.main()
 """
@@ -47,7 +47,7 @@ cli.main()
 
 def _run(script, *arguments):
     command = [sys.executable, "-c", script, "work", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=50)
+    return subprocess.run(command, capture_output=True, text=True, timeout=600)
 
 
 def test_ctrl_c_says_that_the_same_command_continues(tmp_path):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from proofs.studies.networks import MEASURED
 from ventbench import open_loop_report
 from ventbench.base.errors import InputError
 from ventbench.base.precision import float64
@@ -22,7 +23,6 @@ from ventbench.plants.stacking import nominal_plants
 from ventbench.recordings import Breaths, load, make_breaths, write
 from ventbench.task.lungs import LUNG_IDS, RECORDED_LUNGS, lung
 from ventbench.task.rollouts import open_loop
-from ventbench.train.learned import MEASURED
 
 single_compartments = partial(nominal_plants, single_compartment)
 

@@ -149,7 +149,7 @@ def test_results_of_jobs_are_in_the_order_of_their_arguments(workers):
 
     def job(number):
         if workers and number == 0:
-            assert second.wait(20.0)  # the first ends last
+            assert second.wait(600.0)  # the first ends last
         if number == 1:
             second.set()
         return number * number
@@ -170,7 +170,7 @@ def test_results_are_in_the_order_of_the_items(monkeypatch, count):
 
 def test_two_run_at_the_same_time(monkeypatch):
     monkeypatch.setenv(THREADS, "2")
-    both = threading.Barrier(2, timeout=20.0)  # broken if one had to wait for the other
+    both = threading.Barrier(2, timeout=600.0)  # broken if one had to wait for the other
     assert sorted(parallel_map(lambda _: both.wait(), range(2))) == [0, 1]
 
 

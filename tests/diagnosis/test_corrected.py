@@ -73,7 +73,7 @@ def test_strengths_of_rigs_stand_only_where_no_error_rises():
     assert chosen == {"R5C50": "rigs", "R20C50": "refit"}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(st.floats(0.0, 3.0), min_size=2, max_size=2),
     st.lists(st.floats(0.0, 3.0), min_size=2, max_size=2),

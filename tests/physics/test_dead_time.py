@@ -30,7 +30,7 @@ def found(start, length, past):
         return np.asarray(weights)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.floats(-0.3, 0.03),
     st.floats(0.001, 0.05),

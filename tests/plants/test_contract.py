@@ -156,7 +156,7 @@ def test_settles_when_the_valve_closes(name):
 
 
 @every_plant
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(
     u_in=hnp.arrays(np.float32, (T,), elements=st.floats(0, 100, width=32)),
     u_out=hnp.arrays(np.int8, (T,), elements=st.integers(0, 1)),

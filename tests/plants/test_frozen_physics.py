@@ -77,7 +77,7 @@ def test_settles_when_the_valve_closes(six):
         assert stiff_to_soft == sorted(stiff_to_soft, reverse=True)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     u_in=hnp.arrays(float, (1, T), elements=st.floats(0, 100)),
     u_out=hnp.arrays(np.int8, (1, T), elements=st.integers(0, 1)),

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from proofs.studies.networks import MEASURED, RECONSTRUCTED
 from ventbench import open_loop_report
 from ventbench.base.precision import float64
 from ventbench.plants import frozen
@@ -18,7 +19,6 @@ from ventbench.plants.two_balloon import two_balloon
 from ventbench.recordings import load
 from ventbench.recordings.identity import fingerprints
 from ventbench.task.lungs import LUNG_IDS
-from ventbench.train.learned import MEASURED, RECONSTRUCTED
 from ventbench.train.rigs.data import load_rig_recordings
 
 single_compartments = partial(nominal_plants, single_compartment)

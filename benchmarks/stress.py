@@ -46,6 +46,7 @@ def table(scores: list[dict[str, Any]]) -> str:
         row("survived", lambda e: f"{e['survived']:.1%}"),
         row(f"unsafe of {scores[0]['stressed_runs']} runs", lambda e: f"{e['unsafe_runs']}"),
         row("worst condition, cmH2O", lambda e: f"{e['worst_error']:.1f}"),
+        row("stressors held out of tuning, cmH2O", lambda e: f"{e['held_out_score']:.2f}"),
     ]
     for category in (*CATEGORIES, "pairs"):
 

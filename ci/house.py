@@ -16,14 +16,14 @@ ROOT = Path(__file__).parents[1]
 
 #: Most lines of Python: of the product, of the proofs beside it; most modules of the product.
 # Raised for rounds, ranks over all pairs and the one gate: what they replace was smaller.
-LINES = {"ventbench + hardware_eval": 69_000, "proofs": 9_700}
-MODULES = 317
+LINES = {"ventbench + hardware_eval": 68_580, "proofs": 9_700}
+MODULES = 316
 
 #: Most lines of one module, and most modules that lie loose in ``ventbench/``.
 LONGEST, LOOSE = 580, 8
 
 #: Most words of Markdown (as ``wc -w`` counts), and the folders that hold it beside the root.
-WORDS = 31_200
+WORDS = 29_200
 PROSE = ("docs", "examples", "hardware_eval", "proofs", "submissions", "tests", "ventbench")
 
 #: A branch on a number of the protocol: there is one protocol.

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import resource
 import shutil
 import signal
 import subprocess
@@ -76,6 +77,9 @@ def _running(image: Path, tmp_path: Path) -> Iterator[Logged]:
     firmware = Logged(image, given, time.monotonic())
     emulator = Emulator(firmware, link=tmp_path / "lung")
     firmware.start(lambda: emulator.port.inbox.put(b""))
+    # Should it get into a loop, or outlive this test, it does not take the processor with it.
+    longest = (realtime.LONGEST_RUN_S * 1_000_000,) * 2
+    resource.prlimit(firmware.processes["device"], resource.RLIMIT_RTTIME, longest)
     for task in Path(f"/proc/{firmware.processes['device']}/task").iterdir():
         with contextlib.suppress(OSError):  # where it is granted
             os.sched_setscheduler(
@@ -84,10 +88,12 @@ def _running(image: Path, tmp_path: Path) -> Iterator[Logged]:
     stop = threading.Event()
     thread = threading.Thread(target=emulator.run, args=(stop.is_set,))
     thread.start()
-    yield firmware
-    stop.set()
-    thread.join()
-    firmware.close()
+    try:
+        yield firmware
+    finally:
+        stop.set()
+        thread.join()
+        firmware.close()
 
 
 def _until(done: Callable[[], object]) -> None:

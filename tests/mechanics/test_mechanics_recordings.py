@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from ventbench import mechanics
@@ -78,6 +79,17 @@ def test_another_label_is_refused(public_recordings):
         assert found.settings[0].id == f"R{run.R:g}C{run.C:g}"
         tried += 1
     assert tried == 5
+
+
+def test_a_table_has_a_line_a_run(public_recordings, tmp_path):
+    table = pd.read_parquet(public_recordings / "respiraworks_quicklung.parquet")
+    without, clean = "2020-07-01-Control-Tests-AIR", "2020-06-17-covent-tests-QuickLung"
+    few = table[(table["run"] == without) | ((table["run"] == clean) & (table["test"] == 1))]
+    few.to_parquet(tmp_path / "few.parquet")
+    lines = mechanics.survey_table(mechanics.survey(tmp_path / "few.parquet")).splitlines()
+    assert len(lines) == 2 + 9
+    assert sum("no flow, no volume" in line for line in lines) == 8
+    assert all(line.count("|") == 9 for line in lines)
 
 
 def test_the_table(surveyed):

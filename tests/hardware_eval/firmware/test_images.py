@@ -78,9 +78,10 @@ def _running(image: Path, tmp_path: Path) -> Iterator[Logged]:
     emulator = Emulator(firmware, link=tmp_path / "lung")
     firmware.start(lambda: emulator.port.inbox.put(b""))
     # Should it get into a loop, or outlive this test, it does not take the processor with it.
-    longest = (realtime.LONGEST_RUN_S * 1_000_000,) * 2
-    resource.prlimit(firmware.processes["device"], resource.RLIMIT_RTTIME, longest)
-    for task in Path(f"/proc/{firmware.processes['device']}/task").iterdir():
+    longest = realtime.LONGEST_RUN_S * 1_000_000
+    device = firmware.processes["device"]
+    resource.prlimit(device, resource.RLIMIT_RTTIME, (longest, longest))
+    for task in Path(f"/proc/{device}/task").iterdir():
         with contextlib.suppress(OSError):  # where it is granted
             os.sched_setscheduler(
                 int(task.name), os.SCHED_FIFO, os.sched_param(realtime.DEVICE_PRIORITY)

@@ -25,6 +25,7 @@ from ventbench.board.canonical import ATTESTATIONS, RECORDS
 from ventbench.board.record import AnyRecord, Record, RecordStress
 from ventbench.board.replay import (
     BATCH,
+    Replayed,
     ReplayPlants,
     deviation,
     differences,
@@ -37,7 +38,7 @@ from ventbench.entries import reference as references
 from ventbench.entries.folder import Submission, combined_hash, file_hashes, open_submission
 from ventbench.entries.reference import published, reference_of
 from ventbench.entries.runner import Runner
-from ventbench.entries.runs import Runs
+from ventbench.entries.runs import Runs, pip_columns
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import protocol, stressors
@@ -325,11 +326,34 @@ def _replay_batch(
         report.replayed += 1
         report.deviation = max(report.deviation, deviation(score, replayed))
         path = folder / RECORDS / f"{score.sha256}{canonical.RECORD_SUFFIX}"
-        report.problems += [f"{path}, {text}" for text in differences(score, replayed)]
+        texts = differences(score, replayed) + unstressed_difference(score, replayed)
+        report.problems += [f"{path}, {text}" for text in texts]
         own, failed = score.headroom, np.isnan(score.drawn)
         values = normalised(replayed.controllable, own.attainable, own.pid)[1:]
         by_draw[score.sha256] = np.where(failed, np.nan, values).mean(axis=2).T[:, own.ranked]
     return by_draw
+
+
+def unstressed_difference(record: Record, replayed: Replayed) -> list[str]:
+    """Say where runs of the stress track without a stressor are not those of the same draws.
+
+    They are the same cells, so that a record whose other figures replay holds these twice.
+    """
+    if record.stress is None:
+        return []
+    tables = record.stress.tables
+    draws = np.flatnonzero(record.headroom.ranked)[: tables.pips.shape[1]]
+    at = draws, np.arange(len(record.lungs))[:, None], pip_columns(*tables.pips.shape)
+    pairs = {
+        "errors": (tables.error[0], replayed.drawn[at], STRESS_TOLERANCE),
+        "peak_centi_cmH2O": (tables.peak[0], replayed.peak[1:][at], 0.011),
+    }
+    return [
+        f"key stress.{key}: without a stressor not what the same draws give, by up to "
+        f"{np.nanmax(np.abs(own - given)):.3g}"
+        for key, (own, given, tolerance) in pairs.items()
+        if np.any(np.abs(own - given) > tolerance)  # a failed run has no error
+    ]
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ RIG = {
 EDGE = 3.0
 
 #: Least change of a quantity of the rig that is shown, relative.
-SHOWN = 0.01
+SHOWN = 0.02
 
 #: PIPs that are tried, cmH2O: the ends of the protocol's.
 PIPS = (protocol.PIPS[0], protocol.PIPS[-1])

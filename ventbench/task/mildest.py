@@ -25,7 +25,7 @@ LEVELS, FINENESS = (0.5, 1.0), 32
 
 #: Rounds of the search over directions, directions of each, and the factor below the present
 #: severity at which they are asked as well.
-ROUNDS, DIRECTIONS, BELOW = 10, 12, 0.85
+ROUNDS, DIRECTIONS, BELOW = 20, 12, 0.85
 
 #: Share of the coordinates that change in a direction, and the first and last standard deviation of
 #: the change over the largest coordinate.
@@ -133,8 +133,9 @@ def mildest(margin: Margin, space: Space, settings: Sequence[float]) -> Found:
     steepest = np.einsum("jla,jl->la", alone, rise[same, every])
     numbers = np.random.default_rng(0)
     for width in np.geomspace(*WIDTHS, ROUNDS):
-        step = width * numbers.normal(size=(DIRECTIONS, lungs, size))
-        step *= numbers.random(step.shape) < CHANGED
+        # The same changes for all lungs: none depends on which others are searched.
+        step = width * numbers.normal(size=(DIRECTIONS, 1, size))
+        step = step * (numbers.random(step.shape) < CHANGED)
         fresh = direction + step * np.abs(direction).max(axis=-1, keepdims=True)
         fresh[0], fresh[1] = direction, steepest
         fresh = space.directions(fresh)

@@ -14,6 +14,7 @@ from ventbench.board import (
     create,
     frames,
     pages,
+    rerun,
     rounds,
     store,
     verify,
@@ -213,19 +214,22 @@ def test_stress_tables_are_checked(drafts, change, message):
 @pytest.fixture
 def again(drafts, stressed, score):
     """What an honest second run of `pid_robust` gives: more digits than its record has."""
-    recorded, made = opened(drafts["pid_robust"]).stress.tables, stressed(score, 2.0)
+    stress = opened(drafts["pid_robust"]).stress
+    assert stress is not None
+    recorded, made = stress.tables, stressed(score, 2.0)
     made.error[0], made.peak[0] = recorded.error[0], recorded.peak[0]
     return dataclasses.replace(made, volume=recorded.volume + 0.4, alarm_s=recorded.alarm_s)
 
 
 def test_a_second_stress_run_is_compared(drafts, again):
     recorded = opened(drafts["pid_robust"]).stress
-    assert verify.stress_difference(recorded, again) == ""
+    assert recorded is not None
+    assert rerun.stress_difference(recorded, again) == ""
     for key, text in (("error", "stress.errors"), ("volume", "stress.volume_mL")):
         moved = dataclasses.replace(again, **{key: getattr(again, key) + 2.0})
-        assert verify.stress_difference(recorded, moved).startswith(text)
+        assert rerun.stress_difference(recorded, moved).startswith(text)
     newer = dataclasses.replace(recorded, stressors=recorded.stressors + 1)
-    assert "stressors are version" in verify.stress_difference(newer, again)
+    assert "stressors are version" in rerun.stress_difference(newer, again)
 
 
 def forge(board, draft, where, folder):
@@ -248,21 +252,21 @@ def test_a_forged_stress_figure_is_found(
 ):
     """Without a stressor by the replay of the same draws, with one by the second run."""
     monkeypatch.setattr(
-        verify, "run_protocol", lambda *_, **__: dataclasses.replace(score, stressed=again)
+        rerun, "run_protocol", lambda *_, **__: dataclasses.replace(score, stressed=again)
     )
 
     def second(folder, sha256):
-        (outcome,) = verify.rerun(
+        (outcome,) = rerun.rerun(
             folder, records=[sha256], load=lambda: simulators, runner=InProcessRunner
         )
         return outcome
 
     honest = second(board, opened(drafts["pid_robust"]).sha256)
-    assert honest.state == verify.REPRODUCED, honest
+    assert honest.state == rerun.REPRODUCED, honest
     for name, where in (("without", (0, 2, 3)), ("with", (40, 2, 3))):
         folder, sha256 = forge(board, drafts["pid_robust"], where, tmp_path / name)
         outcome = second(folder, sha256)
-        assert outcome.state == verify.DIFFERENT
+        assert outcome.state == rerun.DIFFERENT
         assert outcome.detail.startswith("stress.errors: differs by up to 0.01")
         text = "key stress.errors: without a stressor not what the same draws give, by up to 0.01"
         found = [x for x in verify.verify(folder, lambda: simulators).problems if text in x]

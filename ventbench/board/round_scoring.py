@@ -21,7 +21,7 @@ from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.executor import results
 from ventbench.base.resume import WorkFolder
-from ventbench.board import attestation, canonical, create, rounds, schema, store, verify
+from ventbench.board import attestation, canonical, create, rerun, rounds, schema, store
 from ventbench.board.replay import ReplayPlants
 from ventbench.board.rounds import BOUNDS, RESULT, Result, Round
 from ventbench.entries import reference as references
@@ -72,7 +72,7 @@ def code_of(own: Round, places: Iterable[Path]) -> dict[str, Path]:
     assert own.frozen is not None
     wanted = {entry.name: entry.sha256 for entry in own.frozen.entries}
     found: dict[str, Path] = {}
-    for folder in verify.folders(list(places)):
+    for folder in rerun.folders(list(places)):
         sha256 = wanted.get(folder.name)
         if sha256 is not None and combined_hash(file_hashes(folder)) == sha256:
             found.setdefault(folder.name, folder.resolve())
@@ -110,8 +110,8 @@ def score(
     work: Path,
     *,
     places: Iterable[Path],
-    load: Load = verify.frozen_simulators,
-    runner: Callable[[], Runner] = verify.sandboxed,
+    load: Load = rerun.frozen_simulators,
+    runner: Callable[[], Runner] = rerun.sandboxed,
     secret: str | None = None,
     starts: tuple[int, ...] = attainable.STARTS,
     progress: Progress | None = None,

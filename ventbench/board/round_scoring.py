@@ -33,6 +33,10 @@ from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import attainable, protocol
 
+#: Processor time of a plain entry on a track, sandbox included, s; the robustness track has the
+#: stressed runs too. By ``benchmarks/executor_scaling.py``; networks take up to twice as long.
+SECONDS = {"performance": 13.0, "robustness": 58.0}
+
 Load = Callable[[], ReplayPlants]
 Progress = Callable[[str, int, int], None]
 
@@ -61,6 +65,11 @@ def plan(own: Round) -> list[tuple[str, str]]:
     if own.state != "drawn" or own.frozen is None:
         raise InputError(f"round {own.name} is {own.state}; it is scored once it is drawn")
     return [(entry.name, track) for entry in own.frozen.entries for track in entry.tracks]
+
+
+def processor_time(runs: Iterable[tuple[str, str]]) -> float:
+    """Estimate what runs of :func:`plan` take besides the bounds, by :data:`SECONDS`, s."""
+    return sum(SECONDS[track] for _, track in runs)
 
 
 def code_of(own: Round, places: Iterable[Path]) -> dict[str, Path]:

@@ -13,8 +13,10 @@ from typer.testing import CliRunner
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.entries.adversary import EDGE, RIG, _Bench, adversary
+from ventbench.entries.errors import Failure
 from ventbench.entries.folder import as_submission
 from ventbench.entries.runner import InProcessRunner
+from ventbench.entries.stepping import PlantError, ProtocolRun
 from ventbench.physics.parameters import VALVE_GAIN
 from ventbench.plants.population import NAMES, to_vector
 from ventbench.plants.rigs import load_rigs
@@ -76,6 +78,42 @@ def test_rigs_are_as_far_from_the_middle_as_their_severity_says() -> None:
         assert said["rig's resistance"].startswith(f"{math.exp(vectors[0, k, at]):.3g} instead")
     middle = jax.tree.map(lambda leaf: np.asarray(leaf)[0, 0], rigs.plants)
     assert np.abs(to_vector(middle)[at] - rigs.population.mean[0][at]) < 1.0
+
+
+def test_physics_that_cannot_be_is_left_out(monkeypatch) -> None:
+    """And pressures count once they are held for longer than 0.1 s."""
+    rigs = load_rigs("physics")
+    bench = _Bench(
+        as_submission(lambda o: 1.0), InProcessRunner(), None, rigs, [0, 5],
+        (stressor("supply_high"),), False,
+    )  # fmt: skip
+    points, pip = np.linspace(0.1, 1.0, 12).reshape(6, 2, 1), np.full((6, 2), PIP)
+    pressure = np.full((12, 3, 34), 5.0)
+    pressure[2, 1, 7:11] = LIMIT + 4.0  # four samples, and three
+    pressure[4, 1, 7:10] = LIMIT + 4.0
+    zero = np.zeros_like(pressure)
+
+    def run(plants, *_, **__):
+        gain = plants.physics.parameters()["gain"]
+        broken = np.flatnonzero(gain[:, 0, 0] / gain[:, 0, 1] > 1.5**0.95)
+        if broken.size:
+            raise PlantError(int(broken[0]))
+        return ProtocolRun(pressure, zero, zero, None, {(6,): Failure("act", "x")}, np.ones(1))
+
+    monkeypatch.setattr("ventbench.entries.adversary.step_through", run)
+    excess = bench._batch(points, pip).ravel()
+    expected = np.full(12, 5.0 - LIMIT)
+    expected[[2, 6, 11]] = 4.0, np.inf, -np.inf
+    np.testing.assert_allclose(excess, expected)
+    monkeypatch.setattr(
+        "ventbench.entries.adversary.step_through", lambda *_, **__: _raise(PlantError(3))
+    )
+    with pytest.raises(PlantError):
+        bench._batch(0.0 * points, pip)
+
+
+def _raise(error: Exception) -> None:
+    raise error
 
 
 def test_what_is_not_there_is_refused() -> None:

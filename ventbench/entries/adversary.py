@@ -26,7 +26,7 @@ from ventbench.entries.folder import Submission, as_submission
 from ventbench.entries.runner import Runner, runner_of
 from ventbench.entries.runs import number
 from ventbench.entries.scoring import enter
-from ventbench.entries.stepping import step_through
+from ventbench.entries.stepping import PlantError, step_through
 from ventbench.physics.catalogue import parameter
 from ventbench.plants.catalog import Given
 from ventbench.plants.corrected import stressed_plants
@@ -244,10 +244,20 @@ class _Bench:
                 lambda *own: jnp.asarray(np.stack(own, 1).reshape(-1, *own[0].shape[1:]), float),
                 *each,
             )
-            run = step_through(
-                plants, nominal_scenario(pip.ravel()), self._runner, self._entry, self._tasks,
-                changing=True,
-            )  # fmt: skip
+            try:
+                run = step_through(
+                    plants, nominal_scenario(pip.ravel()), self._runner, self._entry, self._tasks,
+                    changing=True,
+                )  # fmt: skip
+            except PlantError as error:  # such physics cannot be: the search goes round it
+                broken = divmod(error.index, len(self.lungs))
+                if not points[broken].any():
+                    raise
+                points = points.copy()
+                points[broken] = 0.0
+                excess = self._batch(points, pip)
+                excess[broken] = -np.inf
+                return excess
         # Of each window as long as the gate forbids, the lowest pressure; of these the highest.
         forbidden = math.floor(protocol.SAFETY_TIME / protocol.DT + 1e-9) + 1
         windows = np.lib.stride_tricks.sliding_window_view(run.pressure, forbidden, axis=-1)

@@ -1,7 +1,8 @@
 """Records come alone: no change adds one together with what decides whether it counts.
 
-Keys, second runs, bench logs, and the files that fix a round before it is scored must have been
-reviewed before; else whoever proposes a record could vouch for it in the same breath.
+Keys, second runs, bench logs, the files that fix a round before it is scored, and the code that
+judges records must have been reviewed before; else whoever proposes a record could vouch for it in
+the same breath.
 """
 
 from __future__ import annotations
@@ -17,6 +18,9 @@ from ventbench.board import canonical
 TITLE = "Records apart from what vouches for them"
 LEADERBOARD = "leaderboard"
 
+#: Folders with the code that judges: the pinned key of the beacon, the gate, replay and workflows.
+JUDGES = (".github/", "ci/", "ventbench/board/")
+
 #: Files of a round that are written with its records.
 _WITH_RECORDS = set(canonical.ROUND_FILES[-2:])
 
@@ -27,10 +31,12 @@ def problems(paths: Iterable[str]) -> list[str]:
     Args:
         paths: that it adds, changes or removes, from the root of the repository.
     """
+    paths = list(paths)
     inside = [Path(x).relative_to(LEADERBOARD) for x in paths if x.startswith(f"{LEADERBOARD}/")]
     records = [path for path in inside if path.parts[0] == canonical.RECORDS]
-    deciding = [
-        path
+    deciding = [path for path in paths if path.startswith(JUDGES)]
+    deciding += [
+        f"{LEADERBOARD}/{path}"
         for path in inside
         if path.name == canonical.ATTESTATIONS
         or (path.parts[0] == canonical.ROUNDS and path.name not in _WITH_RECORDS)
@@ -38,8 +44,7 @@ def problems(paths: Iterable[str]) -> list[str]:
     if not records or not deciding:
         return []
     return [
-        f"{LEADERBOARD}/{path} changes together with {len(records)} files of records: propose it "
-        "by itself first"
+        f"{path} changes together with {len(records)} files of records: propose it by itself first"
         for path in sorted(deciding)
     ]
 

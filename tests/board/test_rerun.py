@@ -11,8 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from ventbench.base.errors import InputError
-from ventbench.board import store
-from ventbench.board import verify as rerun
+from ventbench.board import rerun, store
 from ventbench.board.verify import verify
 from ventbench.cli import app
 from ventbench.entries.runner import InProcessRunner

@@ -14,11 +14,13 @@ from ventbench.board import (
     create,
     frames,
     pages,
+    rerun,
     rounds,
     store,
     verify,
 )
 from ventbench.board.replay import differences, replay
+from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.runs import DRAWS, Runs, pip_columns
 from ventbench.task import draws as draw_tables
 from ventbench.task import protocol
@@ -43,6 +45,11 @@ def stressed():
         error = level + random.uniform(0.0, 1.0, shape)
         apart = np.random.default_rng(5).normal(size=shape[1:])
         error += noise * (apart - apart.mean())
+        # Without a stressor they are runs of the draws.
+        at = np.arange(6)[:, None], np.arange(DRAWS), pip_columns(6, DRAWS)
+        error[0] = np.moveaxis(score.drawn, 0, 1)[at]
+        peak = 30.0 + error
+        peak[0] = score.runs.peak.reshape(6, -1, 6)[:, 1:][at]
         commands = np.full((*shape, protocol.BREATHS, protocol.INSPIRATION_STEPS), level)
         return Runs(
             conditions=chosen,
@@ -54,7 +61,7 @@ def stressed():
             safe=np.ones(shape, bool),
             survived=error < 1.8,
             alarm_s=0.1 * error,
-            peak=30.0 + error,
+            peak=peak,
             volume=400.0 + error,
             draw=np.arange(1, DRAWS + 1),
             requested=commands,
@@ -204,16 +211,66 @@ def test_stress_tables_are_checked(drafts, change, message):
         opened(made)
 
 
-def test_a_second_stress_run_is_compared(drafts, stressed, score):
-    recorded = opened(drafts["soft"]).stress
+@pytest.fixture
+def again(drafts, stressed, score):
+    """What an honest second run of `pid_robust` gives: more digits than its record has."""
+    stress = opened(drafts["pid_robust"]).stress
+    assert stress is not None
+    recorded, made = stress.tables, stressed(score, 2.0)
+    made.error[0], made.peak[0] = recorded.error[0], recorded.peak[0]
+    return dataclasses.replace(made, volume=recorded.volume + 0.4, alarm_s=recorded.alarm_s)
+
+
+def test_a_second_stress_run_is_compared(drafts, again):
+    recorded = opened(drafts["pid_robust"]).stress
     assert recorded is not None
-    again = stressed(score, 1.0)
-    assert verify.stress_difference(recorded, again) == ""
+    assert rerun.stress_difference(recorded, again) == ""
     for key, text in (("error", "stress.errors"), ("volume", "stress.volume_mL")):
         moved = dataclasses.replace(again, **{key: getattr(again, key) + 2.0})
-        assert verify.stress_difference(recorded, moved).startswith(text)
+        assert rerun.stress_difference(recorded, moved).startswith(text)
     newer = dataclasses.replace(recorded, stressors=recorded.stressors + 1)
-    assert "stressors are version" in verify.stress_difference(newer, again)
+    assert "stressors are version" in rerun.stress_difference(newer, again)
+
+
+def forge(board, draft, where, folder):
+    """A leaderboard in which one stress figure of a record is a little lower."""
+    values = json.loads(draft.content)
+    condition, lung, draw = where
+    values["stress"]["errors"][condition][lung][draw] -= 0.01
+    content = canonical.canonical(values)
+    shutil.copytree(board, folder)
+    for path in (folder / "records").glob(f"{opened(draft).sha256}.*"):
+        if path.suffix == ".json":
+            path.unlink()
+    (folder / "records" / f"{canonical.digest(content)}.json").write_bytes(content)
+    accept(folder)  # whoever forges also vouches
+    return folder, canonical.digest(content)
+
+
+def test_a_forged_stress_figure_is_found(
+    board, drafts, again, score, simulators, tmp_path, monkeypatch
+):
+    """Without a stressor by the replay of the same draws, with one by the second run."""
+    monkeypatch.setattr(
+        rerun, "run_protocol", lambda *_, **__: dataclasses.replace(score, stressed=again)
+    )
+
+    def second(folder, sha256):
+        (outcome,) = rerun.rerun(
+            folder, records=[sha256], load=lambda: simulators, runner=InProcessRunner
+        )
+        return outcome
+
+    honest = second(board, opened(drafts["pid_robust"]).sha256)
+    assert honest.state == rerun.REPRODUCED, honest
+    for name, where in (("without", (0, 2, 3)), ("with", (40, 2, 3))):
+        folder, sha256 = forge(board, drafts["pid_robust"], where, tmp_path / name)
+        outcome = second(folder, sha256)
+        assert outcome.state == rerun.DIFFERENT
+        assert outcome.detail.startswith("stress.errors: differs by up to 0.01")
+        text = "key stress.errors: without a stressor not what the same draws give, by up to 0.01"
+        found = [x for x in verify.verify(folder, lambda: simulators).problems if text in x]
+        assert len(found) == (name == "without")
 
 
 def test_a_record_needs_all_stressors_or_none(simulators, score, stressed):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -11,15 +12,17 @@ import msgspec
 import numpy as np
 import pytest
 import tomli_w
+from typer.testing import CliRunner
 
 from ci import propose
 from ci.git import Git
 from ventbench.base.errors import InputError
-from ventbench.base.executor import executor
+from ventbench.base.executor import executor, results
 from ventbench.board import canonical, gate, round_scoring, rounds, store
 from ventbench.board.gate import PRACTICE
 from ventbench.board.rounds import Request
 from ventbench.board.verify import verify
+from ventbench.cli import app
 from ventbench.entries import reference as references
 from ventbench.entries.folder import as_submission
 from ventbench.entries.runner import InProcessRunner
@@ -31,6 +34,8 @@ from ventbench.task import protocol
 from . import referee
 from .conftest import FROZEN, ROUND, SECRET, entry_folder, opened, put
 from .test_verify import flip
+
+SPEED = Path(__file__).parents[2] / "docs" / "speed.md"
 
 #: What names the rigs of rounds that are never scored.
 ABOUT = {"version": 2}
@@ -276,7 +281,9 @@ def test_code_that_changed_after_the_freeze_is_not_scored(fresh: Path, simulator
         round_scoring.code_of(rounds.load(fresh, "r2"), [fresh.parent / "submissions"])
 
 
-def test_a_thousand_entries_are_planned(fresh: Path) -> None:
+@pytest.fixture
+def thousand(fresh: Path) -> list[tuple[str, str]]:
+    """The plan of a round of 1,000 entries on both tracks."""
     own = freeze(fresh)
     table = msgspec.to_builtins(own.frozen, builtin_types=(datetime,))
     entry = {**table["entries"][0], "account": "eve", "tracks": ["performance", "robustness"]}
@@ -284,8 +291,40 @@ def test_a_thousand_entries_are_planned(fresh: Path) -> None:
     (own.folder / rounds.FROZEN).write_text(tomli_w.dumps(table))
     own = rounds.load(fresh, "r2")
     rounds.draw(fresh, "r2", referee.value(SECRET, own.number))
-    runs = round_scoring.plan(rounds.load(fresh, "r2"))
-    assert len(runs) == len(set(runs)) == 2000
+    return round_scoring.plan(rounds.load(fresh, "r2"))
+
+
+def test_a_thousand_entries_are_planned(thousand: list[tuple[str, str]], fresh: Path) -> None:
+    assert len(thousand) == len(set(thousand)) == 2000
+    ended = CliRunner().invoke(
+        app, ["round", "score", "r2", "--plan", "--folder", str(fresh), "--json", "-"]
+    )
+    assert ended.exit_code == 0, ended.output
+    table = json.loads(ended.stdout)
+    assert [tuple(run) for run in table["runs"]] == thousand
+    # 1,000 entries on both tracks, at the cost that docs/speed.md has of 10,000 on each.
+    hours = re.search(
+        r"10,000 entries take (\d+) core-hours on one track, (\d+)", SPEED.read_text()
+    )
+    assert hours is not None
+    assert table["processor_s"] / 360 == pytest.approx(sum(map(int, hours.groups())), rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")  # of Dask's own, about ports and closing
+def test_a_thousand_entries_pass_through_dask(
+    thousand: list[tuple[str, str]], tmp_path: Path
+) -> None:
+    distributed = pytest.importorskip("distributed", reason="the extra ventbench[dask] is missing")
+    started = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None,
+        local_directory=str(tmp_path),
+    )  # fmt: skip
+    jobs = {f"{entry}-{track}": (entry, track) for entry, track in thousand}
+    with started as cluster, executor(0, cluster.scheduler_address) as pool:
+        found = list(results(pool, "{}-{}".format, jobs))
+    assert sorted(name for name, _ in found) == sorted(jobs)
+    assert all(name == result for name, result in found)
 
 
 class LookUp:

@@ -25,7 +25,7 @@ def test_reference_physics_has_the_rigs_own_parameters() -> None:
 
 
 def test_a_condition_changes_its_parameters_in_its_breaths_only() -> None:
-    rigs = jax.tree.map(lambda leaf: leaf[:, None], frozen.load().plants)
+    rigs = jax.tree.map(lambda leaf: leaf[None, :, None], frozen.load().plants)
     every = conditions()
     stressed = stressed_plants(rigs, LUNGS, every).physics
     names = stressed.names

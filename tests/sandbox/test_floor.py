@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hardware_eval.results.evaluate import make_runner
-from ventbench.board import verify
+from ventbench.board import rerun
 from ventbench.cli import app
 from ventbench.entries import contract
 from ventbench.sandbox import runner as runner_module
@@ -83,7 +83,7 @@ def test_below_the_floor_the_missing_layer_is_named_first(what, missing):
         lambda: contract.check("pid_best"),
         lambda: contract.assert_ready("pid_best"),
         lambda: make_runner(sandbox=True),
-        verify.sandboxed,
+        rerun.sandboxed,
         *(
             lambda words=words: CliRunner().invoke(app, words.split(), catch_exceptions=False)
             for words in (
@@ -91,6 +91,7 @@ def test_below_the_floor_the_missing_layer_is_named_first(what, missing):
                 "score pid_best --plant physics",
                 "score pid_robust --stress 1",
                 "transfer pid_best",
+                "adversary pid_robust --plant physics",
             )
         ),
     ],

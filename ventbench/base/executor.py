@@ -138,23 +138,20 @@ def results(
         InputError: if a worker process has died.
         Exception: whatever a job raises.
     """
-    # One at a time where a job runs as it is handed in, so that its result is told before the next.
-    window = 1 if isinstance(pool, InProcess) else max(len(jobs), 1)
-    waiting, running = list(jobs.items())[::-1], {}
-    while waiting or running:
-        while waiting and len(running) < window:
-            name, arguments = waiting.pop()
-            running[pool.submit(function, *arguments)] = name
-        done, _ = futures.wait(running, return_when=futures.FIRST_COMPLETED)
-        for future in done:
-            try:
-                result = future.result()
-            except futures.BrokenExecutor as error:
-                raise InputError(
-                    "a worker process died (out of memory?); what was finished is kept: run the "
-                    "same command again, with fewer --workers"
-                ) from error
-            yield running.pop(future), result
+    if isinstance(pool, InProcess):  # each is told before the next begins
+        for name, arguments in jobs.items():
+            yield name, pool.submit(function, *arguments).result()
+        return
+    running = {pool.submit(function, *arguments): name for name, arguments in jobs.items()}
+    for future in futures.as_completed(running):
+        try:
+            result = future.result()
+        except futures.BrokenExecutor as error:
+            raise InputError(
+                "a worker process died (out of memory?); what was finished is kept: run the same "
+                "command again, with fewer --workers"
+            ) from error
+        yield running.pop(future), result
 
 
 def in_order(

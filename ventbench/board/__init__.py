@@ -10,7 +10,7 @@
 - :mod:`~ventbench.board.ranking`: which record of an entry counts, ranks, intervals, differences;
 - :mod:`~ventbench.board.frames`: the columns of the board, its CSV and pandas frames;
 - :mod:`~ventbench.board.build`: the site, with :mod:`~ventbench.board.pages`;
-- :mod:`~ventbench.board.verify`: everything again, and the code of records, too.
+- :mod:`~ventbench.board.verify`: everything again; :mod:`~ventbench.board.rerun`: code, too.
 
 :func:`load_board` and :func:`load_cells` give the board as pandas frames.
 """

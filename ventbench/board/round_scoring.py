@@ -21,7 +21,7 @@ from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.executor import results
 from ventbench.base.resume import WorkFolder
-from ventbench.board import attestation, canonical, create, rounds, schema, store, verify
+from ventbench.board import attestation, canonical, create, rerun, rounds, schema, store
 from ventbench.board.replay import ReplayPlants
 from ventbench.board.rounds import BOUNDS, RESULT, Result, Round
 from ventbench.entries import reference as references
@@ -32,6 +32,10 @@ from ventbench.entries.runs import DRAWS
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import attainable, protocol
+
+#: Processor time of a plain entry on a track, sandbox included, s; the robustness track has the
+#: stressed runs too. By ``benchmarks/executor_scaling.py``; networks take up to twice as long.
+SECONDS = {"performance": 13.0, "robustness": 58.0}
 
 Load = Callable[[], ReplayPlants]
 Progress = Callable[[str, int, int], None]
@@ -63,6 +67,11 @@ def plan(own: Round) -> list[tuple[str, str]]:
     return [(entry.name, track) for entry in own.frozen.entries for track in entry.tracks]
 
 
+def processor_time(runs: Iterable[tuple[str, str]]) -> float:
+    """Estimate what runs of :func:`plan` take besides the bounds, by :data:`SECONDS`, s."""
+    return sum(SECONDS[track] for _, track in runs)
+
+
 def code_of(own: Round, places: Iterable[Path]) -> dict[str, Path]:
     """Find the folder of every frozen entry by its hash.
 
@@ -72,7 +81,7 @@ def code_of(own: Round, places: Iterable[Path]) -> dict[str, Path]:
     assert own.frozen is not None
     wanted = {entry.name: entry.sha256 for entry in own.frozen.entries}
     found: dict[str, Path] = {}
-    for folder in verify.folders(list(places)):
+    for folder in rerun.folders(list(places)):
         sha256 = wanted.get(folder.name)
         if sha256 is not None and combined_hash(file_hashes(folder)) == sha256:
             found.setdefault(folder.name, folder.resolve())
@@ -110,8 +119,8 @@ def score(
     work: Path,
     *,
     places: Iterable[Path],
-    load: Load = verify.frozen_simulators,
-    runner: Callable[[], Runner] = verify.sandboxed,
+    load: Load = rerun.frozen_simulators,
+    runner: Callable[[], Runner] = rerun.sandboxed,
     secret: str | None = None,
     starts: tuple[int, ...] = attainable.STARTS,
     progress: Progress | None = None,

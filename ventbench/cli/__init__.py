@@ -20,6 +20,7 @@ from ventbench.cli import (
     round,
     score,
     simulators,
+    stress,
     train,
     tune,
     view,
@@ -53,6 +54,7 @@ def _root(
 
 
 score.register(app)
+stress.register(app)
 tune.register(app)
 simulators.register(app)
 train.register(app)

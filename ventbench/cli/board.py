@@ -228,22 +228,22 @@ def _rerun(
     scheduler: str | None,
 ) -> None:  # fmt: skip
     """Run code again; note in the report what came of it."""
-    from ventbench.board import verify as verifier
+    from ventbench.board import rerun
 
     with notes().status("running code again") as status:
 
-        def note(outcome: verifier.Outcome) -> None:
-            if outcome.state == verifier.REPRODUCED:
+        def note(outcome: rerun.Outcome) -> None:
+            if outcome.state == rerun.REPRODUCED:
                 report.reproduced += 1
             status.update(f"{report.reproduced} records reproduced")
 
-        outcomes = verifier.rerun(
+        outcomes = rerun.rerun(
             folder, records=records, sources=sources, jobs=jobs, scheduler=scheduler,
             progress=note,
         )  # fmt: skip
     report.second_runs = [str(x) for x in outcomes]
-    report.problems += [str(x) for x in outcomes if x.state == verifier.DIFFERENT]
-    report.notes += [str(x) for x in outcomes if x.state == verifier.NOT_RERUN]
+    report.problems += [str(x) for x in outcomes if x.state == rerun.DIFFERENT]
+    report.notes += [str(x) for x in outcomes if x.state == rerun.NOT_RERUN]
 
 
 def _summary(console: Console, report: Report) -> None:

@@ -143,7 +143,7 @@ def score(
         ),
     ] = None,
     plan: Annotated[
-        bool, typer.Option("--plan", help="Only list what there is to run, and what is done.")
+        bool, typer.Option("--plan", help="Only say what there is to run, and how long it takes.")
     ] = False,
     workers: Workers = 0,
     scheduler: Scheduler = None,
@@ -167,8 +167,13 @@ def score(
     own = rounds.load(folder, name)
     if plan:
         runs = round_scoring.plan(own)
-        emit({"runs": runs}, json)
-        typer.echo(f"{len(runs)} runs of {len({x for x, _ in runs})} entries", err=str(json) == "-")
+        seconds = round_scoring.processor_time(runs)
+        emit({"runs": runs, "processor_s": seconds}, json)
+        typer.echo(
+            f"{len(runs)} runs of {len({x for x, _ in runs})} entries: about "
+            f"{seconds / 3600:.1f} h of processor time, and the bounds of the draws",
+            err=str(json) == "-",
+        )
         return
     tasks = {}
     with bars() as shown, executor(workers, scheduler) as pool:

@@ -1,4 +1,4 @@
-"""``ventbench score``, ``stressors``, ``transfer``, ``new`` and ``check``: work on submissions."""
+"""``ventbench score``, ``transfer``, ``new`` and ``check``: work on submissions."""
 
 from __future__ import annotations
 
@@ -374,32 +374,6 @@ def _keep(out: Path, scores: list[Score], report: bool) -> list[Path]:
     return written
 
 
-def stressors(json: JsonFile = None) -> None:
-    """List the stressors, which are missing physics, and their strengths.
-
-    Example: `ventbench stressors`
-    """
-    import dataclasses
-
-    from rich.console import Console
-    from rich.table import Table
-
-    from ventbench.task.stressors import PAIRS, STRESSORS, VERSION
-
-    lines = [dataclasses.asdict(line) for line in STRESSORS]
-    emit({"version": VERSION, "stressors": lines, "pairs": [list(pair) for pair in PAIRS]}, json)
-    table = Table(title=f"Stressors, version {VERSION}")
-    for name in ("category", "stressor", "what happens", "changes", "mild", "strong"):
-        table.add_column(name, justify="right" if name in ("mild", "strong") else "left")
-    for line in STRESSORS:
-        strengths = (f"{value:.3g}" for value in (line.mild, line.strong))
-        how = {"add": "", "scale": " (factor)", "label": " (label)"}[line.rule]
-        table.add_row(line.category, line.name, line.title, line.strength + how, *strengths)
-    console = Console(stderr=str(json) == "-")
-    console.print(table)
-    console.print("Pairs, both mild: " + ", ".join(" + ".join(pair) for pair in PAIRS))
-
-
 def transfer(
     names: Annotated[
         list[str],
@@ -530,7 +504,6 @@ def check(
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     app.command()(score)
-    app.command()(stressors)
     app.command()(transfer)
     app.command()(new)
     app.command()(check)

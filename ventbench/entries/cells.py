@@ -63,7 +63,7 @@ class Cells:
             Plants as of :func:`~ventbench.plants.corrected.stressed_plants`, and cells of batch
             shape ``(S * L,)``; there must be one PIP.
         """
-        one = jax.tree.map(lambda leaf: np.asarray(leaf)[:, draw : draw + 1, 0], self.plants)
+        one = jax.tree.map(lambda leaf: np.asarray(leaf)[None, :, draw : draw + 1, 0], self.plants)
         plants = stressed_plants(one, self.lungs, self.conditions)
         scenario = jax.tree.map(
             lambda leaf: np.concatenate([np.asarray(leaf)[:, draw, 0]] * len(self.conditions)),

@@ -15,6 +15,7 @@ from typing import Any
 
 import flax.struct
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import NDArray
@@ -111,7 +112,7 @@ class Stressed:
     def init(self, pressure: Array, peep: Array | None = None) -> tuple[tuple[Any, Any], Signals]:
         """Lung at rest at a true pressure; see :class:`~ventbench.task.interfaces.Plant`."""
         behind = pressure if peep is None else peep
-        shown = self.physics.reading_of(pressure)
+        shown = self.physics.reading_of(jnp.stack([pressure, pressure]))
         state, _ = self.physics.init(shown, behind)
         simulator, seen = self.simulator.init(pressure, behind)
         flow = None if seen.flow is None else 0.0 * seen.flow
@@ -167,7 +168,8 @@ def stressed_plants(
     """Put every lung under every condition.
 
     Args:
-        plant: scored plants, leaves ``(L, n, ...)``: n cells of each lung.
+        plant: scored plants, leaves ``(1, L, n, ...)``: n cells of each lung; or ``(S, L, n, ...)``
+            where each condition has its own.
         lungs: labels, length L.
         conditions: S of them.
 
@@ -175,22 +177,25 @@ def stressed_plants(
         A plant for each cell and breath of a run: leaves ``(S * L * n, BREATHS, ...)``, of the
         physics ``(S * L * n, BREATHS, 2)``.
     """
-    leaves = jax.tree.leaves(plant)
-    cells = tuple(np.shape(leaves[0])[:2])
+    count = np.shape(jax.tree.leaves(plant)[0])[2]
+    cells = (len(conditions), len(lungs), count)
     base = {
-        name: np.broadcast_to(_trailing(value, 2), cells)
+        name: np.broadcast_to(value[:, None] if value.ndim == 1 else value, cells)
         for name, value in reference_physics(plant, lungs).items()
     }
     names = _parameters(base, conditions)
     base = {name: base.get(name, np.full(cells, parameter(name).neutral)) for name in names}
-    size = (protocol.BREATHS, len(conditions), *cells)
-    before = {name: np.broadcast_to(value, size) for name, value in base.items()}
+    before = {
+        name: np.broadcast_to(value, (protocol.BREATHS, *cells)) for name, value in base.items()
+    }
     after = {name: value.copy() for name, value in before.items()}
     labels = np.array([[lung.R, lung.C] for lung in lungs])[:, :, None]
     for index, condition in enumerate(conditions):
-        for name in condition.stressors:
+        shares = condition.shares or (1.0,) * len(condition.stressors)
+        for name, share in zip(condition.stressors, shares, strict=True):
             own = {path: value[:, index] for path, value in after.items()}
-            _apply(stressor(name), condition.severity or "mild", own, labels)
+            if share:
+                _apply(stressor(name), condition.severity or "mild", share, own, labels)
 
     both: Any = tuple(
         np.stack([x[name].reshape(protocol.BREATHS, -1).T for x in (after, before)], axis=-1)
@@ -199,22 +204,26 @@ def stressed_plants(
 
     def repeated(leaf: Any) -> Any:
         leaf = np.asarray(leaf)
-        every = np.broadcast_to(leaf[:, :, None], (size[1], *size[2:], size[0], *leaf.shape[2:]))
-        return every.reshape(-1, size[0], *leaf.shape[2:])
+        rest = leaf.shape[3:]
+        every = np.broadcast_to(leaf[:, :, :, None], (*cells, protocol.BREATHS, *rest))
+        return every.reshape(-1, protocol.BREATHS, *rest)
 
     return Stressed(jax.tree.map(repeated, plant), Physics(both, names))
 
 
-def _apply(line: Stressor, severity: Severity, own: dict[str, Floats], labels: Floats) -> None:
+def _apply(
+    line: Stressor, severity: Severity, part: float, own: dict[str, Floats], labels: Floats
+) -> None:
     """Change parameters of one condition in place.
 
     Args:
         line: the stressor.
         severity: its severity.
+        part: share of its strength.
         own: parameters by path, ``(BREATHS, L, n)``.
         labels: R and C that the labels say, ``(L, 2, 1)``.
     """
-    strength, share = line.at(severity), np.reshape(line.breaths, (-1, 1, 1))
+    strength, share = line.at(severity), part * np.reshape(line.breaths, (-1, 1, 1))
     if line.rule == "add":
         own[line.strength] += share * strength
     else:
@@ -235,8 +244,3 @@ def _parameters(base: dict[str, Floats], conditions: Sequence[Condition]) -> tup
         used |= {line.strength, *line.settings("mild")}
     owners = {path.rpartition(".")[0] for path in used}
     return tuple(path for path in paths(tuple(sorted(owners - {""}))) if path in used)
-
-
-def _trailing(value: Floats, axes: int) -> Floats:
-    """Give an array of leading axes as many axes as wanted."""
-    return value.reshape(*value.shape, *(1,) * (axes - value.ndim))

@@ -83,12 +83,15 @@ class Condition:
     """What a run is stressed with: nothing, a stressor, or a pair.
 
     Attributes:
-        stressors: none, one or two names.
+        stressors: none, one or two names; more where :attr:`shares` are given.
         severity: of all of them; None without a stressor.
+        shares: share of the strength of each, 0..1, on a logarithmic scale where the strength is a
+            factor or a label; empty for all of it.
     """
 
     stressors: tuple[str, ...] = ()
     severity: Severity | None = None
+    shares: tuple[float, ...] = ()
 
     @property
     def id(self) -> str:

@@ -1,0 +1,292 @@
+"""An adversary: the mildest plausible physics under which an entry is unsafe.
+
+A point of the search (:mod:`ventbench.task.mildest`) has a share of the strong strength of each
+stressor, 0 to 1, and moves of quantities of the rig, in units of :data:`EDGE` standard deviations
+of the population. Its severity is its distance from the rig in the middle of the population
+without a stressor: the root of the squares of all shares and of the rig's Mahalanobis distance over
+:data:`EDGE`. Severity 1 is the end of the range. A run is unsafe by the protocol's gate, or where
+the controller fails.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from ventbench.base import precision
+from ventbench.base.errors import InputError
+from ventbench.entries.folder import Submission, as_submission
+from ventbench.entries.runner import Runner, runner_of
+from ventbench.entries.runs import number
+from ventbench.entries.scoring import enter
+from ventbench.entries.stepping import PlantError, step_through
+from ventbench.physics.catalogue import parameter
+from ventbench.plants.catalog import Given
+from ventbench.plants.corrected import stressed_plants
+from ventbench.plants.population import NAMES, from_vector
+from ventbench.plants.rigs import Rigs, load_rigs
+from ventbench.task import protocol
+from ventbench.task.environment import nominal_scenario
+from ventbench.task.metrics.score import safety_limit
+from ventbench.task.mildest import BATCH, Space, mildest
+from ventbench.task.stressors import STRESSORS, Condition, Stressor, stressor
+
+Floats = NDArray[np.float64]
+
+#: Quantities of a rig that are moved, the factor from the population's unit, and the unit shown.
+RIG = {
+    "resistance": (1.0, "cmH2O/(L/s) at 0.5 L/s"),
+    "elastance": (1.0, "cmH2O/L"),
+    "valve_size": (1.0, "L/s at 20 %"),
+    "valve_delay": (1e3, "ms"),
+    "valve_lag": (1e3, "ms"),
+    "sensor_lag": (1e3, "ms"),
+}
+
+#: Standard deviations of the population from its middle to the end of the range.
+EDGE = 3.0
+
+#: Least change of a quantity of the rig that is shown, relative.
+SHOWN = 0.02
+
+#: PIPs that are tried, cmH2O: the ends of the protocol's.
+PIPS = (protocol.PIPS[0], protocol.PIPS[-1])
+
+
+@dataclass(frozen=True)
+class Critical:
+    """The mildest unsafe physics of a lung that was found.
+
+    Attributes:
+        lung: id.
+        severity: 0 to 1; None if nothing unsafe was found up to the end of the range.
+        pip: cmH2O.
+        excess: highest pressure that was held for longer than the gate allows, less what is safe,
+            cmH2O; of severity 1 where nothing was found; None where the controller failed.
+        physics: what deviates, in physical units, by name.
+        alone: critical severity of each coordinate alone, by name; only those that were found.
+    """
+
+    lung: str
+    severity: float | None
+    pip: float
+    excess: float | None
+    physics: dict[str, str]
+    alone: dict[str, float]
+
+    def lines(self) -> list[str]:
+        """Say it to a person: what was found, then each physics that is enough alone."""
+        if self.severity is None:
+            assert self.excess is not None
+            return [
+                f"{self.lung}: nothing unsafe up to severity 1; the worst stays "
+                f"{-self.excess:.1f} cmH2O below the limit, at PIP {self.pip:g}"
+            ]
+        what = "the controller fails" if self.excess is None else "unsafe"
+        first = f"{self.lung}: {what} at severity {self.severity:.2f}, PIP {self.pip:g}"
+        if not self.physics:
+            return [f"{first}, without any stressor"]
+        alone = sorted(self.alone.items(), key=lambda x: x[1])
+        return [
+            f"{first}:",
+            *(f"  {name}: {value}" for name, value in self.physics.items()),
+            *(f"  alone: {name} at {value:.2f}" for name, value in alone),
+        ]
+
+
+def adversary(
+    submission: Any,
+    *,
+    simulator: Given = "frozen",
+    track: str | None = None,
+    lungs: Sequence[str] = (),
+    stressors: Sequence[str] = (),
+    sandbox: bool = True,
+) -> list[Critical]:
+    """Search for the mildest plausible physics under which a controller is unsafe.
+
+    Args:
+        submission: see :func:`ventbench.score`.
+        simulator: simulators with plants; only the frozen ones have a population of rigs.
+        track: ``"performance"`` or ``"robustness"``; the first that the submission enters if not
+            given.
+        lungs: ids; all if empty.
+        stressors: names of those that may act; all, and the rig, if empty.
+        sandbox: run a folder in locked-down processes; see :func:`ventbench.score`.
+
+    Returns:
+        One result a lung, in the order of the simulators.
+
+    Raises:
+        SubmissionError: if there is no such submission, or it cannot be run on the track.
+        SandboxError: if this machine cannot run submissions apart.
+        InputError: if there are no such simulators, lungs or stressors.
+
+    Examples:
+        >>> from ventbench.entries.adversary import adversary
+        >>> (found,) = adversary(lambda o: 30.0, simulator="physics", lungs=["R20C10"],
+        ...                      stressors=["supply_high"])
+        >>> found.severity
+        0.0
+    """
+    entry, rigs = as_submission(submission), load_rigs(simulator)
+    lines = tuple(stressor(name) for name in stressors) or STRESSORS
+    known = [lung.id for lung in rigs.lungs]
+    for name in lungs:
+        if name not in known:
+            raise InputError(f"no lung {name!r} in these simulators; choose of {', '.join(known)}")
+    chosen = [k for k, name in enumerate(known) if not lungs or name in lungs]
+    bench = _Bench(
+        entry, runner_of(entry, sandbox=sandbox), track, rigs, chosen, lines, not stressors
+    )
+    found = mildest(bench.margin, bench.space, PIPS)
+    names = [*(line.name for line in lines), *(f"{name} of the rig" for name in bench.quantities)]
+    signs = np.where(bench.space.signed, " up", "")
+    titles = [f"{name}{sign}" for name, sign in zip(names, signs, strict=True)]
+    titles += [f"{name} of the rig down" for name in bench.quantities]
+    return [
+        Critical(
+            lung=bench.lungs[k].id,
+            severity=number(found.severity[k]),
+            pip=float(found.setting[k]),
+            excess=number(found.margin[k]),
+            physics=bench.physics(found.point[k], k),
+            alone={
+                title: float(value)
+                for title, value in zip(titles, found.alone[:, k], strict=True)
+                if np.isfinite(value)
+            },
+        )
+        for k in range(len(chosen))
+    ]
+
+
+class _Bench:
+    """Runs an entry at points of the search.
+
+    Attributes:
+        lungs: L of them.
+        lines: stressors.
+        quantities: of :data:`RIG`; none where there is no population.
+        space: the coordinates: stressors, then quantities.
+    """
+
+    def __init__(
+        self, entry: Submission, runner: Runner, track: str | None, rigs: Rigs,
+        chosen: Sequence[int], lines: Sequence[Stressor], rig: bool,
+    ) -> None:  # fmt: skip
+        self._entry, self._runner = entry, runner
+        self.lungs, self.lines = [rigs.lungs[k] for k in chosen], lines
+        names = [lung.id for lung in self.lungs]
+        self._tasks = enter(entry, track, names, runner)[1] * BATCH
+        self._population = rigs.population
+        self.quantities = tuple(RIG) if rig and rigs.population is not None else ()
+        count, rest = len(lines), len(self.quantities)
+        metric = np.tile(np.eye(count + rest), (len(chosen), 1, 1))
+        if rigs.population is not None:
+            self._mean = rigs.population.mean[chosen]
+            index = [NAMES.index(name) for name in self.quantities]
+            factor = rigs.population.factor[chosen]
+            # The likeliest rig with a quantity that is so many standard deviations off.
+            self._moves = factor[:, index] / np.linalg.norm(
+                factor[:, index], axis=-1, keepdims=True
+            )
+            self._factor = factor
+            metric[:, count:, count:] = np.einsum("lap,lbp->lab", self._moves, self._moves)
+        else:
+            self._plants = jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], rigs.plants)
+        strengths = [line.strength for line in lines]
+        group = [strengths.index(strength) for strength in strengths]
+        self.space = Space(
+            metric,
+            np.array([*group, *range(count, count + rest)]),
+            np.array([False] * count + [True] * rest),
+        )
+
+    def vectors(self, points: Floats) -> Floats:
+        """Rigs of the population at points ``(..., L, A)``, by their numbers ``(..., L, p)``."""
+        normal = EDGE * np.einsum("...la,lap->...lp", points[..., len(self.lines) :], self._moves)
+        return self._mean + np.einsum("lpq,...lq->...lp", self._factor, normal)
+
+    def margin(self, points: Floats, pip: Floats) -> Floats:
+        """Run points; see :data:`Margin`."""
+        parts = []
+        for first in range(0, len(points), BATCH):
+            # The last batch is padded, so that all compile once.
+            at = np.minimum(np.arange(first, first + BATCH), len(points) - 1)
+            parts.append(self._batch(points[at], pip[at]))
+        return np.concatenate(parts)[: len(points)]
+
+    def _batch(self, points: Floats, pip: Floats) -> Floats:
+        if self._population is None:
+            wide = (len(points), len(self.lungs))
+            every: Any = jax.tree.map(
+                lambda x: np.broadcast_to(x, wide + x.shape[1:]), self._plants
+            )
+        else:
+            every = from_vector(self.vectors(points), np)
+        names = tuple(line.name for line in self.lines)
+        each = []
+        for k, lung in enumerate(self.lungs):
+            shares = points[:, k, : len(names)].tolist()
+            own = jax.tree.map(lambda leaf, k=k: leaf[:, k, None, None], every)
+            conditions = [Condition(names, "strong", tuple(share)) for share in shares]
+            each.append(stressed_plants(own, [lung], conditions))
+        with precision.float64():
+            plants: Any = jax.tree.map(
+                lambda *own: jnp.asarray(np.stack(own, 1).reshape(-1, *own[0].shape[1:]), float),
+                *each,
+            )
+            try:
+                run = step_through(
+                    plants, nominal_scenario(pip.ravel()), self._runner, self._entry, self._tasks,
+                    changing=True,
+                )  # fmt: skip
+            except PlantError as error:  # such physics cannot be: the search goes round it
+                broken = divmod(error.index, len(self.lungs))
+                if not points[broken].any():
+                    raise
+                points = points.copy()
+                points[broken] = 0.0
+                excess = self._batch(points, pip)
+                excess[broken] = -np.inf
+                return excess
+        # Of each window as long as the gate forbids, the lowest pressure; of these the highest.
+        forbidden = math.floor(protocol.SAFETY_TIME / protocol.DT + 1e-9) + 1
+        windows = np.lib.stride_tricks.sliding_window_view(run.pressure, forbidden, axis=-1)
+        excess = windows.min(axis=-1).max(axis=(-2, -1)) - safety_limit(pip.ravel())
+        excess[[at for (at,) in run.failures]] = np.inf
+        return excess.reshape(pip.shape)
+
+    def physics(self, point: Floats, k: int) -> dict[str, str]:
+        """What deviates at a point ``(A,)`` of a lung, in physical units, by name."""
+        said, lung = {}, self.lungs[k]
+        for line, share in zip(self.lines, point, strict=False):
+            if not share:
+                continue
+            about = parameter(line.strength)
+            if line.rule == "scale":
+                said[line.name] = f"{line.strength} x {line.strong**share:.3g}"
+                continue
+            value = share * line.strong
+            if line.rule == "label":
+                label = lung.R if line.strength == "R" else lung.C
+                value = label * (line.strong / label) ** share
+            said[line.name] = f"{line.strength} {value:.3g} {about.unit}"
+        if point[len(self.lines) :].any():
+            points = np.zeros((len(self.lungs), len(point)))
+            points[k] = point
+            moved, middle = self.vectors(points)[k], self._mean[k]
+            for name in self.quantities:
+                at, (factor, unit) = NAMES.index(name), RIG[name]
+                now, usual = (factor * math.exp(x[at]) for x in (moved, middle))
+                if abs(moved[at] - middle[at]) > SHOWN:
+                    said[f"rig's {name}"] = f"{now:.3g} instead of {usual:.3g} {unit}"
+        return said

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -73,6 +75,11 @@ DEVICE_PRIORITY = PRIORITY + 1
 DEADMAN_PRIORITY = PRIORITY + 2
 
 
+#: Processor time without a pause, s, after which a process is no longer real-time: it is in a loop,
+#: and nothing else on its processor gets on, the shell that would end it included.
+LONGEST_RUN_S = 5
+
+
 def prefer(level: int = DEVICE_PRIORITY) -> str | None:
     """Ask for real-time scheduling (``SCHED_FIFO``) of all threads of this process, a device.
 
@@ -87,6 +94,7 @@ def prefer(level: int = DEVICE_PRIORITY) -> str | None:
         threads = [int(entry.name) for entry in Path("/proc/self/task").iterdir()]
     except OSError:
         threads = [0]
+    _limit_runs()
     try:
         for thread in threads:
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(level))
@@ -105,12 +113,32 @@ def take_priority() -> bool:
     """
     if not hasattr(os, "sched_setscheduler"):
         return False
+    _limit_runs()
     try:
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(0, policy, os.sched_param(PRIORITY))
     except OSError:
         return False
     return True
+
+
+def _limit_runs() -> None:
+    """Have the system tell this process when it is in a loop; what it has started is ended then."""
+    if threading.current_thread() is not threading.main_thread():
+        return  # a handler is set by the main thread alone, and without one the process would end
+    import resource  # not on every system
+
+    signal.signal(signal.SIGXCPU, _give_up)
+    hard = resource.getrlimit(resource.RLIMIT_RTTIME)[1]
+    soft = LONGEST_RUN_S * 1_000_000
+    resource.setrlimit(resource.RLIMIT_RTTIME, (soft if hard < 0 else min(soft, hard), hard))
+
+
+def _give_up(number: int, frame: object) -> None:
+    """Go back to ordinary scheduling, with all threads."""
+    for entry in Path("/proc/self/task").iterdir():
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(int(entry.name), os.SCHED_OTHER, os.sched_param(0))
 
 
 def has_priority() -> bool:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import select
 import socket
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hardware_eval.bench.loop import BreathLog, EmergencyStop
-from hardware_eval.bench.plan import PlannedRun
+from hardware_eval.bench.loop import BreathLog, EmergencyStop, Operator, View
+from hardware_eval.bench.plan import Plan, PlannedRun
 from hardware_eval.emulation.faults import parse
 from ventbench.task import protocol
 
@@ -142,6 +144,48 @@ class ConsoleOperator:
                 sender.sendto(text.encode(), str(self._control))
             return
         print(f"\a{_BY_HAND[perturbation][0 if on else 1]}", flush=True)
+
+
+class Blind:
+    """Operator and view that call entries by numbers, whatever is asked, told or shown.
+
+    Attributes:
+        called: what each entry is called, by its name.
+    """
+
+    def __init__(self, operator: Operator, view: View, plan: Plan) -> None:
+        """Draw the numbers from the plan's seed, so that a session that continues keeps them."""
+        order = np.random.default_rng([plan.seed, 1]).permutation(len(plan.entries))
+        self.called = {
+            name: f"entry {k + 1}" for k, name in zip(order, sorted(plan.entries), strict=True)
+        }
+        names = "|".join(re.escape(x) for x in sorted(self.called, key=len, reverse=True))
+        self._names = re.compile(rf"(?<![\w-])(?:{names})(?![\w-])")
+        self._operator, self._view = operator, view
+
+    def hidden(self, text: str) -> str:
+        """A text without names of entries."""
+        return self._names.sub(lambda found: self.called[found[0]], text)
+
+    def confirm(self, question: str) -> bool:
+        """Ask."""
+        return self._operator.confirm(self.hidden(question))
+
+    def tell(self, text: str) -> None:
+        """Say something."""
+        self._operator.tell(self.hidden(text))
+
+    def stop(self) -> bool:
+        """Whether the emergency stop has been pressed."""
+        return self._operator.stop()
+
+    def disturb(self, perturbation: str, on: bool) -> None:
+        """Open a leak or pinch the tube now, or undo it."""
+        self._operator.disturb(perturbation, on)
+
+    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
+        """Show a breath."""
+        self._view.breath(replace(run, entry=self.hidden(run.entry)), breath, done, total)
 
 
 class TerminalView:

@@ -44,6 +44,9 @@ if TYPE_CHECKING:
 #: Files of an evaluation in its folder.
 LOG, RECORDING = "raw.jsonl", "recording.csv.gz"
 
+#: Kinds of runs whose lung is as its label says.
+UNDISTURBED = ("ramp", "scored", "control")
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -53,7 +56,8 @@ class Evaluation:
         complete: whether the plan is done.
         reason: why not; empty if it is.
         log: the raw recording.
-        recording: all whole breaths in the public schema; None if there is none.
+        recording: all whole breaths of an undisturbed tube in the public schema; None if there is
+            none.
         records: path of each entry's hardware record; empty until the plan is done.
         stopped: entries that have no score, as a run of theirs failed, and why, by name.
         unrun: those of them of which every run failed, so that there is nothing for the board.
@@ -198,6 +202,13 @@ def open_entries(names: Sequence[str], track: str | None) -> tuple[list[Submissi
     return opened, track
 
 
+def begun_plan(out: Path) -> Mapping[str, Any] | None:
+    """The plan that a folder's log begins with; None before the first session."""
+    if not (out / LOG).exists():
+        return None
+    return next((x["plan"] for x in lines(out / LOG) if x["type"] == "plan"), None)
+
+
 def controllers(
     submissions: Sequence[Submission], track: str, runner: Any, *, real_time: bool
 ) -> Callable[[PlannedRun], LiveController]:
@@ -269,11 +280,11 @@ def evaluate(
     """
     runner = make_runner(sandbox)
     log_path = out / LOG
-    begun = log_path.exists() and any(x["type"] == "plan" for x in lines(log_path))
-    if dry and not begun:
+    simulated: list[tuple[str, str, float, float]] = []
+    if dry and begun_plan(out) is None:
         operator.tell("dry run on the frozen simulators")
-        problems = session.dry_run(
-            plan, controllers(submissions, plan.track, runner, real_time=False), settings
+        problems, simulated = session.dry_run(
+            plan, controllers(submissions, plan.track, runner, real_time=False), settings, rest
         )
         if problems:
             raise InputError(
@@ -286,6 +297,7 @@ def evaluate(
         "notes": notes,
         "entries": {x.manifest.name: x.sha256 for x in submissions},
         "sandbox": None if runner.sandbox is None else dict(runner.sandbox),
+        "simulated": simulated,
     }
     bench = Bench(line.client, line.clock, settings, operator, view, rest)
     make = controllers(submissions, plan.track, runner, real_time=line.real)
@@ -296,7 +308,7 @@ def evaluate(
         )  # fmt: skip
     written: Path | None = None
     with contextlib.suppress(InputError):  # no whole breath yet
-        breaths = recording(log_path)
+        breaths = recording(log_path, kinds=UNDISTURBED)
         written = out / RECORDING
         write(breaths, written)
     made: dict[str, Path] = {}

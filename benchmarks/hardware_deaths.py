@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import multiprocessing
 import os
 import random
 import re
@@ -24,7 +25,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -137,9 +137,14 @@ class EmulatedDevice:
     def end(self) -> None:
         """End it, and wait until its electronics have ended."""
         self._process.terminate()
-        self._process.communicate()
+        try:
+            self._process.communicate(timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.communicate()
+        end = time.monotonic() + PATIENCE
         with contextlib.suppress(ProcessLookupError):
-            while True:
+            while time.monotonic() < end:  # where nobody collects orphans they seem to live on
                 os.kill(self._ids["electronics"], 0)
                 time.sleep(0.02)
 
@@ -208,48 +213,49 @@ def kill_one(
 
 
 def work(
-    kills: int, folder: Path, extra: list[str], death: str, unvented: bool,
-    delays: list[tuple[float, bool]], late: list[int],
-) -> None:  # fmt: skip
+    kills: int, folder: Path, extra: list[str], death: str, unvented: bool
+) -> tuple[list[tuple[float, bool]], int]:
     """Let things die at one emulator until there are enough delays."""
     device = EmulatedDevice(folder, extra)
-    for _ in range(kills):
-        while (done := kill_one(device, death, unvented)) is None:
-            late.append(1)
-        delays.append(done)
+    delays: list[tuple[float, bool]] = []
+    late = 0
+    while len(delays) < kills:
+        done = kill_one(device, death, unvented)
+        if done is None:
+            late += 1
+        else:
+            delays.append(done)
     device.end()
+    return delays, late
 
 
 def deaths(
     death: str, normally_open: bool, kills: int, emulators: int, folder: Path, extra: list[str]
 ) -> dict[str, Any]:
     """Let one thing die again and again: a row of the table."""
-    delays: list[tuple[float, bool]] = []
-    late: list[int] = []
     if not normally_open:
         extra = [*extra, "--normally-closed"]
     unvented = death == "supply" and not normally_open
-    threads = [
-        threading.Thread(
-            target=work,
-            args=(len(range(k, kills, emulators)), folder / f"{death}-{normally_open}-{k}", extra,
-                  death, unvented, delays, late),
+    shares = [len(range(k, kills, emulators)) for k in range(emulators)]
+    # Processes and no threads: each forks its hosts.
+    with multiprocessing.get_context("fork").Pool(emulators) as pool:
+        parts = pool.starmap(
+            work,
+            [
+                (share, folder / f"{death}-{normally_open}-{k}", extra, death, unvented)
+                for k, share in enumerate(shares)
+            ],
+            chunksize=1,
         )
-        for k in range(emulators)
-    ]  # fmt: skip
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    if len(delays) < kills:
-        raise SystemExit(f"{death}: an emulator ended after {len(delays)} of {kills} deaths")
+    delays = [each for part, _ in parts for each in part]
+    late = sum(part for _, part in parts)
     milliseconds = 1e3 * np.array([delay for delay, _ in delays])
     return {
         "death": death, "valve": "open" if normally_open else "closed", "kills": kills,
         "vents": not unvented, "bound_ms": 1e3 * LIMITS[death],
         "within": int(np.sum(milliseconds <= 1e3 * LIMITS[death])),
         "median_ms": float(np.median(milliseconds)), "worst_ms": float(milliseconds.max()),
-        "held_up": int(sum(held for _, held in delays)), "not_counted": len(late),
+        "held_up": int(sum(held for _, held in delays)), "not_counted": late,
         "delays_ms": sorted(milliseconds.round(2).tolist()),
     }  # fmt: skip
 

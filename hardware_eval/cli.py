@@ -15,7 +15,7 @@ from typing import Annotated
 
 import typer
 
-from hardware_eval.commands import Port, Yes, keys, register
+from hardware_eval.commands import Calibrated, Port, Yes, calibration_of, keys, numbers, register
 from ventbench import __version__
 from ventbench.base.errors import InputError
 from ventbench.base.text import plain
@@ -122,6 +122,7 @@ def run(
         str | None,
         typer.Option(metavar="FILE|live", help="Also show breaths in rerun: a file, or live."),
     ] = None,
+    calibration: Calibrated = None,
     control: Control = None,
     yes: Yes = False,
     json: JsonFile = None,
@@ -141,7 +142,7 @@ def run(
     from ventbench.base import files
     from ventbench.task import protocol
 
-    chosen = [*(pip or ()), *_numbers("--pips", pips)] or list(protocol.PIPS)
+    chosen = [*(pip or ()), *numbers("--pips", pips)] or list(protocol.PIPS)
     entries, track = ev.open_entries(submissions, track)
     if seed is None:
         begun = ev.begun_plan(out)
@@ -156,12 +157,13 @@ def run(
     def before_lung(bench: Bench, mounted: str) -> str:
         if not selftest:
             return ""
-        sheet = run_selftest(bench, mounted)
+        sheet = run_selftest(bench, mounted, valve=calibrated.valve if calibrated else None)
         files.write_json(out / f"selftest-{mounted}.json", sheet.as_dict())
         print(sheet, flush=True)
         return "" if sheet.go else "the self-test says no-go: " + "; ".join(sheet.problems())
 
     line = ev.connect(port)
+    calibrated = calibration_of(line, calibration)
     person = ConsoleOperator(yes=yes, control=control, device=line.device)
     masked = Blind(person, views, plan)
     try:
@@ -170,7 +172,7 @@ def run(
                 entries, line, out, masked if blind else person, plan=plan,
                 view=masked if blind else views, sandbox=not in_process,
                 dry=dry_run, before_lung=before_lung, settings=settings, operator_name=operator,
-                notes=notes, rest=rest,
+                notes=notes, rest=rest, calibration=calibrated,
             )  # fmt: skip
     finally:
         line.client.close()
@@ -201,13 +203,6 @@ def run(
             print(f"next: ventbench board add {path}", file=shown)
     if done.stopped:
         raise typer.Exit(1)
-
-
-def _numbers(option: str, text: str | None) -> list[float]:
-    try:
-        return [float(part) for part in text.split(",")] if text else []
-    except ValueError:
-        raise InputError(f"{option} {text!r}: write numbers separated by commas") from None
 
 
 @app.command(
@@ -241,6 +236,7 @@ def selftest(
         str, typer.Option(help="Label of the mounted lung.", autocompletion=options.known_lungs)
     ],
     plant: Annotated[str, typer.Option(help="Simulators that know the lungs.")] = "frozen",
+    calibration: Calibrated = None,
     json: JsonFile = None,
 ) -> None:
     """Test sensor, valves, tubes, clock and lung; exit code 1 if it is no-go.
@@ -257,11 +253,13 @@ def selftest(
     label = scored_lung(lung).id
     person = ConsoleOperator(yes=True)
     line = ev.connect(port)
+    calibrated = calibration_of(line, calibration)
     try:
         with keys(person):
             sheet = run_selftest(
-                Bench(line.client, line.clock, DEFAULT, person), label, simulator=plant
-            )
+                Bench(line.client, line.clock, DEFAULT, person), label, simulator=plant,
+                valve=calibrated.valve if calibrated else None,
+            )  # fmt: skip
     finally:
         line.client.close()
     emit(sheet.as_dict(), json)

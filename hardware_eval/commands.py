@@ -1,4 +1,4 @@
-"""Commands around a run: the trial that sessions make up; and what all commands share."""
+"""Commands before and after runs, calibration and trial; and what all commands share."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ventbench.cli.options import JsonFile, emit
+from ventbench.base.errors import InputError
+from ventbench.cli.options import JsonFile, emit, known_lungs
 
 if TYPE_CHECKING:
+    from hardware_eval.bench.calibrate import Calibration
     from hardware_eval.bench.console import ConsoleOperator
+    from hardware_eval.results.evaluate import Line
 
 Port = Annotated[
     str,
@@ -41,6 +44,12 @@ def keys(person: ConsoleOperator) -> Iterator[None]:
             raise typer.Exit(1) from None
 
 
+Calibrated = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Calibration of this device, by `calibrate`."),
+]
+
+
 def trial(
     sessions: Annotated[
         list[Path],
@@ -61,6 +70,86 @@ def trial(
     print(done, file=sys.stderr if str(json) == "-" else sys.stdout)
 
 
+def calibrate(
+    part: Annotated[str, typer.Argument(help="zero, span, valve, peep, flow or leak.")],
+    port: Port,
+    lung: Annotated[
+        str, typer.Option(help="Label of the mounted lung.", autocompletion=known_lungs)
+    ] = "R5C20",
+    reference: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIST",
+            help="Reference values in the order of setting, up and down: pressures of span, flows "
+            "of flow, openings of valve, PEEP by an instrument.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="The device's calibration; parts are added to it.")
+    ] = Path("calibration.json"),
+    yes: Yes = False,
+    json: JsonFile = None,
+) -> None:
+    """Measure a part of a bench's calibration, with intervals, and keep it in a dated file.
+
+    The valve of a device without a flow sensor is read from a meter, opening by opening.
+
+    Example: `ventbench-hardware calibrate span --port /dev/ttyACM0 --reference 0,20,40,20,0`
+    """
+    from hardware_eval.bench import calibrate as calibration
+    from hardware_eval.bench.console import ConsoleOperator
+    from hardware_eval.bench.loop import Bench
+    from hardware_eval.bench.safety import DEFAULT
+    from hardware_eval.results import evaluate as ev
+    from ventbench.task.lungs import scored_lung
+
+    values = numbers("--reference", reference)
+    label = scored_lung(lung).id
+    line = ev.connect(port)
+    person = ConsoleOperator(yes=yes)
+    bench = Bench(line.client, line.clock, DEFAULT, person)
+    try:
+        device = calibration.device_of(line.client)
+        kept = calibration.load(out, device, stale=True).parts if out.exists() else {}
+        with keys(person):
+            made = calibration.measure(
+                bench, part, lung=label, reference=values, ask=None if yes else person.number
+            )
+    finally:
+        line.client.close()
+    saved = calibration.Calibration(device, {**kept, part: made}).save(out)
+    emit({"part": part, "fit": vars(made.fit), "file": str(out), "sha256": saved.sha256}, json)
+    to = sys.stderr if str(json) == "-" else sys.stdout
+    print(made, file=to)
+    if part == "leak":
+        print(f"leak: {calibration.lost_flow(made, label)} mL/s of {label}", file=to)
+    print(f"{out}: {', '.join(saved.parts)}; SHA-256 {saved.sha256}", file=to)
+
+
+def calibration_of(line: Line, path: Path | None) -> Calibration | None:
+    """The calibration that a command is given.
+
+    Raises:
+        InputError: if it is stale, was changed, or is of another device than the line's.
+    """
+    from hardware_eval.bench import calibrate as calibration
+
+    return None if path is None else calibration.load(path, calibration.device_of(line.client))
+
+
+def numbers(option: str, text: str | None) -> list[float]:
+    """Numbers separated by commas.
+
+    Raises:
+        InputError: if they are none.
+    """
+    try:
+        return [float(part) for part in text.split(",")] if text else []
+    except ValueError:
+        raise InputError(f"{option} {text!r}: write numbers separated by commas") from None
+
+
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     app.command()(trial)
+    app.command()(calibrate)

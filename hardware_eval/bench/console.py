@@ -18,6 +18,7 @@ import numpy as np
 from hardware_eval.bench.loop import BreathLog, EmergencyStop, Operator, View
 from hardware_eval.bench.plan import Plan, PlannedRun
 from hardware_eval.emulation.faults import parse
+from ventbench.base.errors import InputError
 from ventbench.task import protocol
 
 if TYPE_CHECKING:
@@ -109,6 +110,32 @@ class ConsoleOperator:
         answer = self._pressed(None)
         print(answer.decode("ascii", "replace"), flush=True)
         return answer.lower() == b"y"
+
+    def number(self, question: str) -> float:
+        """Ask for a number within :meth:`keys`; keys that come before the question are stops.
+
+        Raises:
+            EmergencyStop: as :meth:`confirm`, or if the terminal has gone.
+            InputError: if there is no terminal, or it is no number.
+        """
+        print(question, end="", flush=True)
+        if self._terminal is None:
+            raise InputError(f"{question}there is no terminal to answer at")
+        if self._pressed(self._reaction):
+            print("stop (a key came before the question)", flush=True)
+            raise EmergencyStop
+        typed = b""
+        while not typed.endswith((b"\n", b"\r")):
+            keys = self._pressed(None)
+            if keys == _GONE:
+                raise EmergencyStop
+            typed = typed[:-1] if keys in (b"\x7f", b"\x08") else typed + keys
+            print(keys.decode("ascii", "replace"), end="", flush=True)
+        try:
+            return float(typed)
+        except ValueError:
+            said = typed.decode("ascii", "replace").strip()
+            raise InputError(f"{said!r} is no number; run the command again") from None
 
     def stop(self) -> bool:
         """Whether a key has been pressed, or the terminal has gone."""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from hardware_eval.bench import session
+from hardware_eval.bench.calibrate import Calibration
 from hardware_eval.bench.controllers import (
     ControllerFailedError,
     LiveController,
@@ -255,6 +256,7 @@ def evaluate(
     notes: str = "",
     rest: float = REST_S,
     prepare_run: Callable[[PlannedRun], None] = lambda run: None,
+    calibration: Calibration | None = None,
 ) -> Evaluation:
     """Run a plan, or what is left of it, and make the records once it is done.
 
@@ -273,6 +275,7 @@ def evaluate(
         notes: for the record.
         rest: time at rest before each run, s.
         prepare_run: see :func:`hardware_eval.bench.session.run_plan`.
+        calibration: of the device, for the record.
 
     Raises:
         InputError: if the log is of another plan, or the dry run finds the plan unsafe.
@@ -291,8 +294,11 @@ def evaluate(
                 "the dry run on the simulators stopped: " + "; ".join(problems) + ". Nothing was "
                 "sent to the bench; --no-dry-run skips this"
             )
+    device = device_about(line)
+    if calibration is not None:
+        device["about"]["calibration_file"] = calibration.about()
     about = {
-        "device": device_about(line),
+        "device": device,
         "operator": operator_name,
         "notes": notes,
         "entries": {x.manifest.name: x.sha256 for x in submissions},

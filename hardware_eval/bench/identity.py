@@ -67,8 +67,8 @@ def identified(
     except InputError as error:
         return False, False, str(error)
     found = min(each, key=lambda x: x.noise)
-    if not measured and not math.isfinite(found.match.fitted_R):
-        return None, False, "unknown: the valve's flow does not explain the pressure"
+    if not math.isfinite(found.match.fitted_R):
+        return None, False, "unknown: the flow does not explain the pressure"
     match = found.match
 
     def widened(ends: tuple[float, float]) -> tuple[float, float]:
@@ -76,10 +76,10 @@ def identified(
 
     R = Estimate(match.fitted_R, "cmH2O/(L/s)", widened(match.ci95_R))
     C = Estimate(match.fitted_C, "mL/cmH2O", widened(match.ci95_C))
-    holds = match.informative and fits(lambda flow: R, C, label)
+    holds = fits(lambda flow: R, C, label)
     settings = [x.id for x in matching_settings(lambda flow: R, C)]
     told = f"R {value_text(R.value, R.ci95)}, C {value_text(C.value, C.ci95)}"
-    if not measured and not match.informative:
+    if not match.informative:
         return None, False, f"{told}: too wide to tell"
     if not holds:
         told += f": may be {' or '.join(settings)}" if settings else ": no lung that is known"

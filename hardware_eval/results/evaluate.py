@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import re
 import signal
@@ -22,7 +21,7 @@ from hardware_eval.bench.controllers import (
     SubmissionController,
 )
 from hardware_eval.bench.loop import REST_S, Bench, Operator, View
-from hardware_eval.bench.plan import Plan, PlannedRun, make_plan, progress
+from hardware_eval.bench.plan import Plan, PlannedRun
 from hardware_eval.bench.raw_log import RawLog, lines, recording
 from hardware_eval.bench.safety import DEFAULT, SafetySettings
 from hardware_eval.realtime import Clock, RealClock
@@ -359,34 +358,3 @@ def _quick_switches() -> Iterator[None]:
         yield
     finally:
         sys.setswitchinterval(interval)
-
-
-def status(out: Path) -> dict[str, Any]:
-    """How far the plan of a folder has come, as JSON values.
-
-    Raises:
-        InputError: if there is no plan.
-    """
-    logged = list(lines(out / LOG))
-    plan = records.plan_of(logged, str(out / LOG))
-    state = progress(plan, logged)
-    return {
-        "runs": len(plan.runs),
-        "done": len(state.done),
-        "breaths": sum(line["type"] == "breath" for line in logged),
-        "timing": dataclasses.asdict(records.jitter(out / LOG)),
-    }
-
-
-__all__ = [
-    "Evaluation",
-    "Line",
-    "connect",
-    "controllers",
-    "device_about",
-    "evaluate",
-    "make_plan",
-    "make_runner",
-    "open_entries",
-    "status",
-]

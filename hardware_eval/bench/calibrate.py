@@ -336,11 +336,18 @@ class Calibration:
 
     @property
     def valve(self) -> tuple[float, float, float] | None:
-        """Flow of the valve and its 95 % interval, mL/s per %; None if it was not calibrated."""
+        """Flow of the valve, mL/s per %, mean and range; None if it was not calibrated.
+
+        The range is over openings, directions and two standard errors of each: a valve that is not
+        linear has a wide one.
+        """
         if "valve" not in self.parts:
             return None
-        slope = self.parts["valve"].fit.slope
-        return slope.value, slope.low, slope.high
+        part = self.parts["valve"]
+        opening, flow, error = map(np.array, (part.reference, part.reading, part.error))
+        flow, error, opening = flow[opening > 0], error[opening > 0], opening[opening > 0]
+        low, high = (flow - 2.0 * error) / opening, (flow + 2.0 * error) / opening
+        return float(np.mean(flow / opening)), float(low.min()), float(high.max())
 
     def about(self) -> dict[str, Any]:
         """What a record says of it."""

@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from hardware_eval.bench.drive import Driven
 from ventbench.base.errors import InputError
 from ventbench.mechanics import identify
-from ventbench.mechanics.labels import Estimate, fits, matching_settings, value_text
+from ventbench.mechanics.labels import (
+    INFORMATIVE,
+    Estimate,
+    fits,
+    matching_settings,
+    value_text,
+)
 from ventbench.recordings.breaths import make_breaths
 from ventbench.task import protocol
 from ventbench.task.lungs import lung as parse_lung
@@ -35,7 +41,7 @@ def identified(
     Args:
         probes: whole breaths, four at least.
         lung: the label.
-        valve: flow of the valve and its 95 % interval, mL/s per %; for devices without a flow.
+        valve: flow of the valve and its range, mL/s per %; for devices without a flow.
 
     Returns:
         Whether the label holds, None if nothing tells; whether it is the only known one that does;
@@ -79,7 +85,7 @@ def identified(
     holds = fits(lambda flow: R, C, label)
     settings = [x.id for x in matching_settings(lambda flow: R, C)]
     told = f"R {value_text(R.value, R.ci95)}, C {value_text(C.value, C.ci95)}"
-    if not match.informative:
+    if not match.informative or not C.ci95[1] <= INFORMATIVE * C.ci95[0]:
         return None, False, f"{told}: too wide to tell"
     if not holds:
         told += f": may be {' or '.join(settings)}" if settings else ": no lung that is known"

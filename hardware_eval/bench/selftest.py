@@ -230,7 +230,7 @@ def selftest(
         bench: device, clock, safety, operator.
         lung: its label.
         simulator: the simulators that know the lungs; see :func:`ventbench.load_simulators`.
-        valve: calibrated flow of the valve and its 95 % interval, mL/s per %; used where the device
+        valve: calibrated flow of the valve and its range, mL/s per %; used where the device
             measures no flow.
 
     Raises:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +116,10 @@ def test_the_emulated_bench_is_calibrated_and_the_file_is_kept_for_it(
     saved = Calibration(own, parts).save(path)
     kept = load(path, own, now=DAY + datetime.timedelta(days=29))
     assert kept == saved
-    assert kept.valve == (slope.value, slope.low, slope.high)
+    assert kept.valve == pytest.approx((slope.value,) * 3, rel=0.01)
+    bent = replace(parts["valve"], reading=(228.0, 500.0, 228.0))  # not linear: 22.8 to 16.7
+    mean, low, high = Calibration(own, {"valve": bent}).valve or (0.0,) * 3
+    assert low < 16.7 < mean < 22.8 < high
     assert kept.about()["dates"]["peep"] == DAY.isoformat()
     with pytest.raises(InputError, match=r"31 days old.*calibrate valve"):
         load(path, own, now=DAY + datetime.timedelta(days=31))

@@ -8,21 +8,19 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import secrets
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from hardware_eval.commands import Calibrated, Port, Yes, calibration_of, keys, numbers, register
 from ventbench import __version__
 from ventbench.base.errors import InputError
 from ventbench.base.text import plain
 from ventbench.cli import options
 from ventbench.cli.options import JsonFile, emit
-
-if TYPE_CHECKING:
-    from hardware_eval.bench.console import ConsoleOperator
 
 app = typer.Typer(
     name="ventbench-hardware",
@@ -32,14 +30,6 @@ app = typer.Typer(
     rich_markup_mode="markdown",
 )
 
-Port = Annotated[
-    str,
-    typer.Option(
-        help="Serial port of the device, such as /dev/ttyACM0, socket://HOST:PORT, the path that "
-        "`emulate` prints, or virtual:R20C50, an emulated lung in this process, faster than real "
-        "time."
-    ),
-]
 Lungs = Annotated[
     list[str],
     typer.Option(
@@ -49,28 +39,12 @@ Lungs = Annotated[
         autocompletion=options.known_lungs,
     ),
 ]
-Yes = Annotated[
-    bool, typer.Option("--yes", help="Confirm every question; for an emulator, not for a bench.")
-]
 Control = Annotated[
     Path | None,
     typer.Option(
         metavar="SOCKET", help="Control socket of an emulator, which then disturbs the tube itself."
     ),
 ]
-
-
-@contextlib.contextmanager
-def _keys(person: ConsoleOperator) -> Iterator[None]:
-    """Any key is the emergency stop; it ends the command with exit code 1."""
-    from hardware_eval.bench.loop import EmergencyStop
-
-    with person.keys():
-        try:
-            yield
-        except EmergencyStop:
-            print("stopped: the operator pressed the emergency stop", file=sys.stderr)
-            raise typer.Exit(1) from None
 
 
 def _version(value: bool) -> None:
@@ -118,7 +92,12 @@ def run(
     control_every: Annotated[
         int, typer.Option(min=0, help="Scored runs between two control runs of the PID; 0: none.")
     ] = 10,
-    seed: Annotated[int, typer.Option(help="Seed of the order of the runs.")] = 0,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of the order of the runs; drawn if not given.")
+    ] = None,
+    blind: Annotated[
+        bool, typer.Option("--blind", help="Call entries by numbers until the plan is done.")
+    ] = False,
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="Log, recording and records; a plan continues.")
     ] = Path("runs/hardware"),
@@ -143,6 +122,7 @@ def run(
         str | None,
         typer.Option(metavar="FILE|live", help="Also show breaths in rerun: a file, or live."),
     ] = None,
+    calibration: Calibrated = None,
     control: Control = None,
     yes: Yes = False,
     json: JsonFile = None,
@@ -153,7 +133,7 @@ def run(
 
     Example: `ventbench-hardware run submissions/pid_best --port /dev/ttyACM0 --lung R20C50`
     """
-    from hardware_eval.bench.console import ConsoleOperator, RerunView, TerminalView, Views
+    from hardware_eval.bench.console import Blind, ConsoleOperator, RerunView, TerminalView, Views
     from hardware_eval.bench.loop import Bench
     from hardware_eval.bench.plan import make_plan
     from hardware_eval.bench.safety import SafetySettings
@@ -162,8 +142,11 @@ def run(
     from ventbench.base import files
     from ventbench.task import protocol
 
-    chosen = [*(pip or ()), *_numbers("--pips", pips)] or list(protocol.PIPS)
+    chosen = [*(pip or ()), *numbers("--pips", pips)] or list(protocol.PIPS)
     entries, track = ev.open_entries(submissions, track)
+    if seed is None:
+        begun = ev.begun_plan(out)
+        seed = secrets.randbits(32) if begun is None else int(begun["seed"])
     plan = make_plan(
         [x.manifest.name for x in entries], lung, track=track, pips=chosen, repeats=repeats,
         control_every=control_every, perturbations=perturb or (), seed=seed,
@@ -174,26 +157,30 @@ def run(
     def before_lung(bench: Bench, mounted: str) -> str:
         if not selftest:
             return ""
-        sheet = run_selftest(bench, mounted)
+        sheet = run_selftest(bench, mounted, valve=calibrated.valve if calibrated else None)
         files.write_json(out / f"selftest-{mounted}.json", sheet.as_dict())
         print(sheet, flush=True)
         return "" if sheet.go else "the self-test says no-go: " + "; ".join(sheet.problems())
 
     line = ev.connect(port)
+    calibrated = calibration_of(line, calibration)
     person = ConsoleOperator(yes=yes, control=control, device=line.device)
+    masked = Blind(person, views, plan)
     try:
-        with _keys(person):
+        with keys(person):
             done = ev.evaluate(
-                entries, line, out, person, plan=plan, view=views, sandbox=not in_process,
+                entries, line, out, masked if blind else person, plan=plan,
+                view=masked if blind else views, sandbox=not in_process,
                 dry=dry_run, before_lung=before_lung, settings=settings, operator_name=operator,
-                notes=notes, rest=rest,
+                notes=notes, rest=rest, calibration=calibrated,
             )  # fmt: skip
     finally:
         line.client.close()
+    reason = masked.hidden(done.reason) if blind else done.reason
     emit(
         {
             "complete": done.complete and not done.stopped,
-            "reason": done.reason,
+            "reason": reason,
             "log": str(done.log),
             "recording": None if done.recording is None else str(done.recording),
             "records": {name: str(path) for name, path in done.records.items()},
@@ -203,10 +190,12 @@ def run(
     )
     shown = sys.stderr if str(json) == "-" else sys.stdout
     if not done.complete:
-        print(f"stopped: {plain(done.reason)}", file=shown)
+        print(f"stopped: {plain(reason)}", file=shown)
         print(f"what is done is in {done.log}; the same command continues", file=shown)
         raise typer.Exit(1)
     for name, path in done.records.items():
+        if blind:
+            print(f"{masked.called[name]} is {name}", file=shown)
         print(f"{name}: record {path}", file=shown)
         if name in done.stopped:
             print(f"{name}: no score: {plain(done.stopped[name])}", file=shown)
@@ -214,13 +203,6 @@ def run(
             print(f"next: ventbench board add {path}", file=shown)
     if done.stopped:
         raise typer.Exit(1)
-
-
-def _numbers(option: str, text: str | None) -> list[float]:
-    try:
-        return [float(part) for part in text.split(",")] if text else []
-    except ValueError:
-        raise InputError(f"{option} {text!r}: write numbers separated by commas") from None
 
 
 @app.command(
@@ -254,6 +236,7 @@ def selftest(
         str, typer.Option(help="Label of the mounted lung.", autocompletion=options.known_lungs)
     ],
     plant: Annotated[str, typer.Option(help="Simulators that know the lungs.")] = "frozen",
+    calibration: Calibrated = None,
     json: JsonFile = None,
 ) -> None:
     """Test sensor, valves, tubes, clock and lung; exit code 1 if it is no-go.
@@ -270,11 +253,13 @@ def selftest(
     label = scored_lung(lung).id
     person = ConsoleOperator(yes=True)
     line = ev.connect(port)
+    calibrated = calibration_of(line, calibration)
     try:
-        with _keys(person):
+        with keys(person):
             sheet = run_selftest(
-                Bench(line.client, line.clock, DEFAULT, person), label, simulator=plant
-            )
+                Bench(line.client, line.clock, DEFAULT, person), label, simulator=plant,
+                valve=calibrated.valve if calibrated else None,
+            )  # fmt: skip
     finally:
         line.client.close()
     emit(sheet.as_dict(), json)
@@ -405,7 +390,7 @@ def collect(
     line = ev.connect(port)
     try:
         about = {"device": ev.device_about(line)}
-        with _keys(person), contextlib.ExitStack() as stack:
+        with keys(person), contextlib.ExitStack() as stack:
             if not person.confirm(f"set the lung to {label} and connect it. Is it set?"):
                 raise typer.Exit(1)
             shown = stack.enter_context(bars())
@@ -487,6 +472,9 @@ def replay(
     print(report, file=sys.stderr if str(json) == "-" else sys.stdout)
     if report.problems:
         raise typer.Exit(1)
+
+
+register(app)
 
 
 def main() -> None:

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import select
 import socket
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hardware_eval.bench.loop import BreathLog, EmergencyStop
-from hardware_eval.bench.plan import PlannedRun
+from hardware_eval.bench.loop import BreathLog, EmergencyStop, Operator, View
+from hardware_eval.bench.plan import Plan, PlannedRun
 from hardware_eval.emulation.faults import parse
+from ventbench.base.errors import InputError
 from ventbench.task import protocol
 
 if TYPE_CHECKING:
@@ -108,6 +111,32 @@ class ConsoleOperator:
         print(answer.decode("ascii", "replace"), flush=True)
         return answer.lower() == b"y"
 
+    def number(self, question: str) -> float:
+        """Ask for a number within :meth:`keys`; keys that come before the question are stops.
+
+        Raises:
+            EmergencyStop: as :meth:`confirm`, or if the terminal has gone.
+            InputError: if there is no terminal, or it is no number.
+        """
+        print(question, end="", flush=True)
+        if self._terminal is None:
+            raise InputError(f"{question}there is no terminal to answer at")
+        if self._pressed(self._reaction):
+            print("stop (a key came before the question)", flush=True)
+            raise EmergencyStop
+        typed = b""
+        while not typed.endswith((b"\n", b"\r")):
+            keys = self._pressed(None)
+            if keys == _GONE:
+                raise EmergencyStop
+            typed = typed[:-1] if keys in (b"\x7f", b"\x08") else typed + keys
+            print(keys.decode("ascii", "replace"), end="", flush=True)
+        try:
+            return float(typed)
+        except ValueError:
+            said = typed.decode("ascii", "replace").strip()
+            raise InputError(f"{said!r} is no number; run the command again") from None
+
     def stop(self) -> bool:
         """Whether a key has been pressed, or the terminal has gone."""
         return self._terminal is not None and bool(self._pressed(0.0))
@@ -142,6 +171,48 @@ class ConsoleOperator:
                 sender.sendto(text.encode(), str(self._control))
             return
         print(f"\a{_BY_HAND[perturbation][0 if on else 1]}", flush=True)
+
+
+class Blind:
+    """Operator and view that call entries by numbers, whatever is asked, told or shown.
+
+    Attributes:
+        called: what each entry is called, by its name.
+    """
+
+    def __init__(self, operator: Operator, view: View, plan: Plan) -> None:
+        """Draw the numbers from the plan's seed, so that a session that continues keeps them."""
+        order = np.random.default_rng([plan.seed, 1]).permutation(len(plan.entries))
+        self.called = {
+            name: f"entry {k + 1}" for k, name in zip(order, sorted(plan.entries), strict=True)
+        }
+        names = "|".join(re.escape(x) for x in sorted(self.called, key=len, reverse=True))
+        self._names = re.compile(rf"(?<![\w-])(?:{names})(?![\w-])")
+        self._operator, self._view = operator, view
+
+    def hidden(self, text: str) -> str:
+        """A text without names of entries."""
+        return self._names.sub(lambda found: self.called[found[0]], text)
+
+    def confirm(self, question: str) -> bool:
+        """Ask."""
+        return self._operator.confirm(self.hidden(question))
+
+    def tell(self, text: str) -> None:
+        """Say something."""
+        self._operator.tell(self.hidden(text))
+
+    def stop(self) -> bool:
+        """Whether the emergency stop has been pressed."""
+        return self._operator.stop()
+
+    def disturb(self, perturbation: str, on: bool) -> None:
+        """Open a leak or pinch the tube now, or undo it."""
+        self._operator.disturb(perturbation, on)
+
+    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
+        """Show a breath."""
+        self._view.breath(replace(run, entry=self.hidden(run.entry)), breath, done, total)
 
 
 class TerminalView:

@@ -7,7 +7,6 @@ that stand in :data:`LIMITS` with their reasons; the sheet says go or no-go.
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -17,18 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware_eval import realtime
-from hardware_eval.bench import safety
-from hardware_eval.bench.loop import (
-    ON_TIME_S,
-    Bench,
-    EmergencyStop,
-    answer_by,
-    is_held_up,
-    no_collection,
-)
-from hardware_eval.bench.safety import VALVE_GAIN, SafetySample
-from hardware_eval.wire.parser import LinkError, NoAnswerError, RefusedError
+from hardware_eval.bench.drive import Commands, Driven, drive
+from hardware_eval.bench.identity import identified
+from hardware_eval.bench.loop import ON_TIME_S, Bench
+from hardware_eval.bench.safety import VALVE_GAIN
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNGS
 from ventbench.task.lungs import lung as parse_lung
@@ -82,7 +73,13 @@ LIMITS: dict[str, Limit] = {
     ),
     "lung": Limit(
         0.0, 1.15, "of the best lung's error",
-        "Open-loop error of the label's frozen simulator against that of the lung that fits best.",
+        "Open-loop error of the label's frozen simulator against that of the lung that fits best; "
+        "decides where R and C do not.",
+    ),
+    "identity": Limit(
+        1.0, 1.0, "label held",
+        "R and C by pressure and flow, measured or of a calibrated valve, with 95 % intervals: the "
+        "label holds within the tolerance of test lungs. Simulators have no say in it.",
     ),
     "on_time": Limit(
         0.98, 1.0, "of steps", "Share of steps that begin within 2 ms of their deadline.",
@@ -189,111 +186,6 @@ def _number(value: float) -> float | None:
     return round(value, 4) if math.isfinite(value) else None
 
 
-#: Chooses valves from the step and the pressure.
-Commands = Callable[[int, float], tuple[float, int]]
-
-
-@dataclass(frozen=True)
-class Driven:
-    """What came of driving the valves; arrays of shape ``(T,)``.
-
-    Attributes:
-        time, pressure, flow, u_in, u_out, late, busy: s, cmH2O, mL/s, %, 0/1, s, s; flow is NaN
-            where it is not measured.
-        trips: messages of the safety checks that tripped; the lung was vented then.
-        held_up: whether host or line, too slow for the loop, ended it, and nothing else.
-        missed: answers that did not come in time.
-    """
-
-    time: Floats
-    pressure: Floats
-    flow: Floats
-    u_in: Floats
-    u_out: Floats
-    late: Floats
-    busy: Floats
-    trips: tuple[str, ...]
-    held_up: bool
-    missed: int
-
-
-def drive(bench: Bench, lung: str, commands: Commands, steps: int, *, pip: float) -> Driven:
-    """Drive the valves step by step, watched; the lung is vented before and after.
-
-    Where the device did not answer a step in time, the pressure is that between its neighbours.
-
-    Args:
-        bench: device, clock, safety.
-        lung: label, for the checks.
-        commands: called with the step and the pressure, cmH2O.
-        steps: how many.
-        pip: highest pressure that is meant, cmH2O, for the checks.
-
-    Raises:
-        EmergencyStop: if the operator pressed the key.
-        LinkError: if the device is lost.
-    """
-    client, clock = bench.client, bench.clock
-    rows: list[tuple[float, ...]] = []
-    watched = safety.init(parse_lung(lung))
-    last: tuple[float, int] = (0.0, 1)
-    trips: tuple[str, ...] = ()
-    held_up, missed = False, 0
-    with contextlib.ExitStack() as stack:
-        stack.callback(_vent, bench)
-        client.vent()
-        clock.sleep_until(clock.now() + bench.rest)
-        stack.enter_context(no_collection())
-        stack.enter_context(realtime.priority())
-        start = clock.now() + protocol.DT
-        try:
-            client.arm()
-        except RefusedError as error:
-            trips, steps = (f"the device cannot be armed: {error}",), 0
-        for step in range(steps):
-            deadline = start + step * protocol.DT
-            clock.sleep_until(deadline)
-            began = clock.now()
-            if bench.operator.stop():
-                raise EmergencyStop
-            pressure = flow = applied = math.nan
-            answered = False
-            with contextlib.suppress(NoAnswerError):
-                reading = client.heartbeat()
-                pressure, flow, applied = reading.pressure, reading.flow, reading.u_in
-                answered = True
-            missed += not answered
-            late = began - deadline
-            sample = SafetySample(began, pressure, flow, *last, pip, late, applied, answered)
-            watched = safety.step(bench.settings, watched, sample)
-            if watched.trips:
-                trips = tuple(trip.message for trip in watched.trips)
-                held_up = all(trip.check in safety.TIMING_CHECKS for trip in watched.trips)
-                break
-            wanted, u_out = commands(step, pressure) if math.isfinite(pressure) else last
-            u_in, _ = safety.limit_command(bench.settings, last[0], wanted)
-            try:
-                client.command(u_in, u_out, answer_by(deadline, clock.now()))
-            except RefusedError as error:
-                trips, held_up = (str(error),), is_held_up(error.refusal.flags)
-                break
-            except NoAnswerError:
-                missed += 1
-            last = (u_in, u_out)
-            rows.append((began - start, pressure, flow, *last, late, clock.now() - began, answered))
-    columns = np.array(rows, float).reshape(-1, 8).T
-    time, heard = columns[0], columns[7] > 0.0
-    if heard.any():
-        for column in columns[1:3]:
-            column[~heard] = np.interp(time[~heard], time[heard], column[heard])
-    return Driven(*columns[:7], trips, held_up, missed)  # type: ignore[arg-type]
-
-
-def _vent(bench: Bench) -> None:
-    with contextlib.suppress(LinkError):  # then the watchdog does
-        bench.client.vent()
-
-
 #: Integrating probes reach these pressures, cmH2O, with these gains (P, I), %/cmH2O: gentle on
 #: every lung, and slow enough that a stiff lung under a soft label does not overshoot.
 _PROBES = ((15.0, 1.0, 2.0), (25.0, 1.0, 2.0), (15.0, 3.0, 1.0), (25.0, 0.3, 4.0))
@@ -326,7 +218,10 @@ _ATTEMPTS = 10
 _MISSED = 0.05
 
 
-def selftest(bench: Bench, lung: str, *, simulator: Any = "frozen") -> Sheet:
+def selftest(
+    bench: Bench, lung: str, *, simulator: Any = "frozen",
+    valve: tuple[float, float, float] | None = None,
+) -> Sheet:  # fmt: skip
     """Test a bench with a mounted lung.
 
     Takes about 40 s; longer where host or line are held up, as a part that they end is repeated.
@@ -335,6 +230,8 @@ def selftest(bench: Bench, lung: str, *, simulator: Any = "frozen") -> Sheet:
         bench: device, clock, safety, operator.
         lung: its label.
         simulator: the simulators that know the lungs; see :func:`ventbench.load_simulators`.
+        valve: calibrated flow of the valve and its range, mL/s per %; used where the device
+            measures no flow.
 
     Raises:
         EmergencyStop: if the operator pressed the key.
@@ -375,7 +272,10 @@ def selftest(bench: Bench, lung: str, *, simulator: Any = "frozen") -> Sheet:
     if probes and not any(x.trips for x in driven):
         errors = _errors(probes, simulator)
         R, C, gain = _mechanics(probes, lung)
-        findings += _lung(lung, errors, R, C, gain)
+        holds, alone, told = identified(probes, lung, valve)
+        known = math.nan if holds is None else float(holds)
+        findings.append(Finding("identity", known, holds is not False, told))
+        findings += _lung(lung, errors, R, C, gain, alone)
     busy = any(x.held_up for x in driven)
     findings.append(
         Finding(
@@ -423,6 +323,11 @@ def _fill_and_hold() -> Commands:
         return max(1.0 * (_HELD - pressure) + 2.0 * total, 0.0), 0
 
     return commands
+
+
+def closed_lung() -> tuple[Commands, int, int]:
+    """Commands that fill a lung and close it; the step from which it is still; and all steps."""
+    return _fill_and_hold(), _FILL + 15, _FILL + _WATCH
 
 
 def _closed(held: Driven, noise: float) -> list[Finding]:
@@ -522,7 +427,9 @@ def _mechanics(probes: list[Driven], lung: str) -> tuple[float, float, float]:
     return R, C, given / max(nominal, 1e-9) if measured else parse_lung(lung).C / C
 
 
-def _lung(lung: str, errors: dict[str, float], R: float, C: float, gain: float) -> list[Finding]:
+def _lung(
+    lung: str, errors: dict[str, float], R: float, C: float, gain: float, alone: bool
+) -> list[Finding]:
     nearest = min(errors, key=lambda name: errors[name])
     ratio = errors[lung] / max(errors[nearest], 1e-9)
     # Of two simulators that are both within the noise of a sensor neither is wrong.
@@ -531,8 +438,9 @@ def _lung(lung: str, errors: dict[str, float], R: float, C: float, gain: float) 
     if nearest != lung:
         told += f", {errors[nearest]:.2f} as {nearest}: is the lung set to {nearest}?"
     label = parse_lung(lung)
+    decided = Finding("lung", ratio, True, told + "; R and C are the label's")
     return [
-        _finding("lung", ratio, told),
+        decided if alone else _finding("lung", ratio, told),
         _finding("resistance", max(R, 0.0) / label.R, f"R {R:.1f}, C {C:.1f} by least squares"),
         _finding("valve_gain", gain, f"the valve gives {gain:.2f} of 22.8 mL/s per %"),
     ]

@@ -12,6 +12,7 @@ from typing import Any
 
 from hardware_eval.bench.controllers import ControllerFailedError, MakeController, control_pid
 from hardware_eval.bench.loop import (
+    REST_S,
     Bench,
     BreathLog,
     EmergencyStop,
@@ -234,23 +235,29 @@ def _run_line(run: PlannedRun, attempt: int, status: str, reason: str) -> dict[s
     return {"type": "run", **about, **label, "repeat": run.repeat}
 
 
-def dry_run(plan: Plan, make_controller: MakeController, settings: SafetySettings) -> list[str]:
+def dry_run(
+    plan: Plan, make_controller: MakeController, settings: SafetySettings, rest: float = REST_S
+) -> tuple[list[str], list[tuple[str, str, float, float]]]:
     """Run every distinct run of a plan once on the frozen simulators, by the same code.
 
-    Repetitions are left out: on a simulator they are the same.
+    Repetitions are left out: on a simulator they are the same. Lungs start as on the bench, vented
+    for the same time.
 
     Args:
         plan: what is to run on the bench.
         make_controller: makes the controller of a run.
         settings: of the safety.
+        rest: time at rest before each run, s.
 
     Returns:
-        What went wrong, one sentence each; empty if the plan is safe there.
+        What went wrong, one sentence each, empty if the plan is safe there; and entry, lung, PIP
+        and error, cmH2O, of each run that completed.
     """
     from hardware_eval.emulation.loopback import loopback
     from hardware_eval.emulation.simulated import simulated_lung
 
     problems: list[str] = []
+    errors: list[tuple[str, str, float, float]] = []
     seen: set[tuple[Any, ...]] = set()
     mounted, bench = "", None
     for run in plan.runs:
@@ -262,7 +269,7 @@ def dry_run(plan: Plan, make_controller: MakeController, settings: SafetySetting
             device, mounted = loopback(simulated_lung(run.lung)), run.lung
             client = Client(device, device.clock)
             client.hello()
-            bench = Bench(client, device.clock, settings, SilentOperator(), rest=1.0)
+            bench = Bench(client, device.clock, settings, SilentOperator(), rest=rest)
         try:
             controller = control_pid(run) if run.entry == CONTROL else make_controller(run)
         except ControllerFailedError as error:
@@ -274,4 +281,6 @@ def dry_run(plan: Plan, make_controller: MakeController, settings: SafetySetting
             controller.close()
         if result.status != "complete":
             problems.append(f"{run.entry} on {run.lung} at PIP {run.pip:g}: {result.reason}")
-    return problems
+        elif run.kind != "control":
+            errors.append((run.entry, run.lung, run.pip, round(result.error, 6)))
+    return problems, errors

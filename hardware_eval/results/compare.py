@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from hardware_eval.bench.loop import BreathLog
 from hardware_eval.bench.plan import PlannedRun, progress
 from hardware_eval.bench.raw_log import breaths, lines, recording
-from hardware_eval.results.evaluate import LOG
+from hardware_eval.results.evaluate import LOG, UNDISTURBED
 from hardware_eval.results.record import Jitter, jitter, plan_of
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -333,9 +333,9 @@ def recorded_breaths(path: Path, log: Path | None = None) -> Breaths:
         InputError: if the log is not there, or not the one that the record names.
     """
     if path.is_dir():
-        return recording(path / LOG)
+        path = path / LOG
     if path.name.endswith(".jsonl"):
-        return recording(path)
+        return recording(path, kinds=(*UNDISTURBED, "explore"))
     if not path.name.endswith(".json"):
         return load(path)
     loaded = records.load(path)
@@ -346,7 +346,7 @@ def recorded_breaths(path: Path, log: Path | None = None) -> Breaths:
         raise InputError(f"{log} is not there: give --log FILE, the raw recording of {path}")
     if files.sha256(log) != loaded.header.recording.sha256:
         raise InputError(f"{log} is not the raw recording that {path} names by its hash")
-    return recording(log, kinds=("ramp", "scored", "control"))
+    return recording(log, kinds=UNDISTURBED)
 
 
 def joined(parts: list[Breaths]) -> Breaths:

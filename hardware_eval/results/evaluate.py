@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import re
 import signal
@@ -15,13 +14,14 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from hardware_eval.bench import session
+from hardware_eval.bench.calibrate import Calibration
 from hardware_eval.bench.controllers import (
     ControllerFailedError,
     LiveController,
     SubmissionController,
 )
 from hardware_eval.bench.loop import REST_S, Bench, Operator, View
-from hardware_eval.bench.plan import Plan, PlannedRun, make_plan, progress
+from hardware_eval.bench.plan import Plan, PlannedRun
 from hardware_eval.bench.raw_log import RawLog, lines, recording
 from hardware_eval.bench.safety import DEFAULT, SafetySettings
 from hardware_eval.realtime import Clock, RealClock
@@ -44,6 +44,9 @@ if TYPE_CHECKING:
 #: Files of an evaluation in its folder.
 LOG, RECORDING = "raw.jsonl", "recording.csv.gz"
 
+#: Kinds of runs whose lung is as its label says.
+UNDISTURBED = ("ramp", "scored", "control")
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -53,7 +56,8 @@ class Evaluation:
         complete: whether the plan is done.
         reason: why not; empty if it is.
         log: the raw recording.
-        recording: all whole breaths in the public schema; None if there is none.
+        recording: all whole breaths of an undisturbed tube in the public schema; None if there is
+            none.
         records: path of each entry's hardware record; empty until the plan is done.
         stopped: entries that have no score, as a run of theirs failed, and why, by name.
         unrun: those of them of which every run failed, so that there is nothing for the board.
@@ -198,6 +202,13 @@ def open_entries(names: Sequence[str], track: str | None) -> tuple[list[Submissi
     return opened, track
 
 
+def begun_plan(out: Path) -> Mapping[str, Any] | None:
+    """The plan that a folder's log begins with; None before the first session."""
+    if not (out / LOG).exists():
+        return None
+    return next((x["plan"] for x in lines(out / LOG) if x["type"] == "plan"), None)
+
+
 def controllers(
     submissions: Sequence[Submission], track: str, runner: Any, *, real_time: bool
 ) -> Callable[[PlannedRun], LiveController]:
@@ -244,6 +255,7 @@ def evaluate(
     notes: str = "",
     rest: float = REST_S,
     prepare_run: Callable[[PlannedRun], None] = lambda run: None,
+    calibration: Calibration | None = None,
 ) -> Evaluation:
     """Run a plan, or what is left of it, and make the records once it is done.
 
@@ -262,6 +274,7 @@ def evaluate(
         notes: for the record.
         rest: time at rest before each run, s.
         prepare_run: see :func:`hardware_eval.bench.session.run_plan`.
+        calibration: of the device, for the record.
 
     Raises:
         InputError: if the log is of another plan, or the dry run finds the plan unsafe.
@@ -269,23 +282,27 @@ def evaluate(
     """
     runner = make_runner(sandbox)
     log_path = out / LOG
-    begun = log_path.exists() and any(x["type"] == "plan" for x in lines(log_path))
-    if dry and not begun:
+    simulated: list[tuple[str, str, float, float]] = []
+    if dry and begun_plan(out) is None:
         operator.tell("dry run on the frozen simulators")
-        problems = session.dry_run(
-            plan, controllers(submissions, plan.track, runner, real_time=False), settings
+        problems, simulated = session.dry_run(
+            plan, controllers(submissions, plan.track, runner, real_time=False), settings, rest
         )
         if problems:
             raise InputError(
                 "the dry run on the simulators stopped: " + "; ".join(problems) + ". Nothing was "
                 "sent to the bench; --no-dry-run skips this"
             )
+    device = device_about(line)
+    if calibration is not None:
+        device["about"]["calibration_file"] = calibration.about()
     about = {
-        "device": device_about(line),
+        "device": device,
         "operator": operator_name,
         "notes": notes,
         "entries": {x.manifest.name: x.sha256 for x in submissions},
         "sandbox": None if runner.sandbox is None else dict(runner.sandbox),
+        "simulated": simulated,
     }
     bench = Bench(line.client, line.clock, settings, operator, view, rest)
     make = controllers(submissions, plan.track, runner, real_time=line.real)
@@ -296,7 +313,7 @@ def evaluate(
         )  # fmt: skip
     written: Path | None = None
     with contextlib.suppress(InputError):  # no whole breath yet
-        breaths = recording(log_path)
+        breaths = recording(log_path, kinds=UNDISTURBED)
         written = out / RECORDING
         write(breaths, written)
     made: dict[str, Path] = {}
@@ -341,34 +358,3 @@ def _quick_switches() -> Iterator[None]:
         yield
     finally:
         sys.setswitchinterval(interval)
-
-
-def status(out: Path) -> dict[str, Any]:
-    """How far the plan of a folder has come, as JSON values.
-
-    Raises:
-        InputError: if there is no plan.
-    """
-    logged = list(lines(out / LOG))
-    plan = records.plan_of(logged, str(out / LOG))
-    state = progress(plan, logged)
-    return {
-        "runs": len(plan.runs),
-        "done": len(state.done),
-        "breaths": sum(line["type"] == "breath" for line in logged),
-        "timing": dataclasses.asdict(records.jitter(out / LOG)),
-    }
-
-
-__all__ = [
-    "Evaluation",
-    "Line",
-    "connect",
-    "controllers",
-    "device_about",
-    "evaluate",
-    "make_plan",
-    "make_runner",
-    "open_entries",
-    "status",
-]

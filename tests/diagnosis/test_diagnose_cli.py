@@ -87,6 +87,11 @@ def test_files_and_the_words(recording, tmp_path, calls):
     assert again.splitlines()[0] == text.splitlines()[0]
     assert calls[1]["lung"] is None
     assert not calls[1]["patient"]
+    session = tmp_path / "session"  # as `ventbench-hardware run` leaves it
+    session.mkdir()
+    write(made.breaths(n=6), session / "recording.csv.gz")
+    run(session, "--out", out)
+    assert len(calls.pop()["breaths"]) == 6
     run(recording, "--patient", "--out", out)
     assert calls[2]["patient"]
     run(recording, "--passive", "--out", out)  # what earlier versions asked for a test lung

@@ -42,9 +42,14 @@ def test_run_makes_a_record_and_replay_agrees(on_line: Line, tmp_path: Path) -> 
     done = invoke(
         "run", "pid_best", "--port", "p", "--lung", "R5C20", "--pips", "10", "--repeats", "1",
         "--control-every", "0", "--no-dry-run", "--no-selftest", "--in-process", "--rest", "0.5",
-        "--yes", "--out", str(out), "--json", str(result),
+        "--yes", "--out", str(out), "--json", str(result), "--blind",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
+    # Who stands at the bench learns at the end which entry it was.
+    blinded, _, revealed = done.output.partition("entry 1 is pid_best")
+    assert "entry 1" in blinded
+    assert "pid_best" not in blinded
+    assert "pid_best: record" in revealed
     told = json.loads(result.read_text())
     made = record.load(Path(told["records"]["pid_best"]))
     assert isinstance(made, HardwareRecord)
@@ -52,6 +57,12 @@ def test_run_makes_a_record_and_replay_agrees(on_line: Line, tmp_path: Path) -> 
     again = invoke("replay", str(out), "--record", told["records"]["pid_best"])
     assert again.exit_code == 0, again.output
     assert "2 of 2 runs are done" in again.output
+    # The drawn seed is the plan's, so that the same command finds it done.
+    assert evaluate.begun_plan(out) is not None
+    analysed = invoke("trial", str(out))
+    assert analysed.exit_code == 0, analysed.output
+    assert f"pid_best: error {made.score:.3f}" in analysed.output
+    assert "no whole dry run" in analysed.output
 
 
 def test_without_a_terminal_and_without_yes_nothing_moves(on_line: Line, tmp_path: Path) -> None:

@@ -161,6 +161,9 @@ def _table(lungs: tuple[Mechanics, ...]) -> Any:
     return table
 
 
+#: What a session on a bench, and a collection, calls its recording.
+SESSION = "recording.csv.gz"
+
 #: Share of a diagnosis before which its remaining time is a guess.
 _TOO_EARLY = 0.15
 
@@ -171,7 +174,11 @@ if TYPE_CHECKING:
 
 def diagnose(
     recordings: Annotated[
-        Path, typer.Argument(help="CSV, CSV.GZ or Parquet file in the public schema.")
+        Path,
+        typer.Argument(
+            help="CSV, CSV.GZ or Parquet file in the public schema, or the folder of a session on "
+            "a bench."
+        ),
     ],
     out: Annotated[
         Path, typer.Option(metavar="DIR", callback=claim_out, help="Folder for the results.")
@@ -236,6 +243,8 @@ def diagnose(
     if patient and passive:
         raise InputError("--patient and --passive contradict each other; choose one of them")
     errors.require("jinja2", "rerun")
+    if recordings.is_dir() and (recordings / SESSION).is_file():
+        recordings = recordings / SESSION
     said = notes()
     with progress_bars() as shown:
         reading = counted(shown, f"reading {recordings}")

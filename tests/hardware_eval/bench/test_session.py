@@ -308,9 +308,10 @@ def test_an_operator_who_does_not_confirm_ends_the_session(
 
 def test_a_dry_run_finds_a_controller_that_is_unsafe(plan: Plan) -> None:
     calm = make_plan(["pid"], [LUNG], pips=(10.0,), repeats=5, control_every=0)
-    problems = session.dry_run(calm, lambda run: Scripted(lambda step, u: 100.0), DEFAULT)
+    problems, errors = session.dry_run(calm, lambda run: Scripted(lambda step, u: 100.0), DEFAULT)
     assert len(problems) == 1
     assert "over pressure" in problems[0]
+    assert errors == []
 
 
 def test_a_result_without_scored_breaths_has_no_error() -> None:

@@ -1,0 +1,416 @@
+"""Calibration of a bench: measured series, a weighted line through each, one dated file.
+
+Every part is a series of readings against a reference, some of them reached from below and some
+from above, and gets the same analysis (:func:`fit`). What the wire measures is read from it; what
+it does not, a person reads from an instrument. The file names the device and is refused when it is
+of another one, was changed, or is stale.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from hardware_eval.bench.drive import Commands, Driven, drive
+from hardware_eval.bench.loop import Bench
+from hardware_eval.bench.selftest import closed_lung
+from hardware_eval.wire.client import Client
+from hardware_eval.wire.messages import Capability, Reading
+from ventbench.base import files
+from ventbench.base.errors import InputError
+from ventbench.task import protocol
+from ventbench.task.lungs import lung as parse_lung
+
+Floats = NDArray[np.float64]
+
+FORMAT = "ventbench-calibration-1"
+
+#: Age from which a part is stale, days.
+STALE = 30.0
+
+#: What can be calibrated, and the units of reference and reading.
+PARTS = {
+    "zero": ("cmH2O", "cmH2O"), "span": ("cmH2O", "cmH2O"), "peep": ("cmH2O", "cmH2O"),
+    "valve": ("%", "mL/s"), "flow": ("mL/s", "mL/s"), "leak": ("s", "cmH2O"),
+}  # fmt: skip
+
+#: Openings of the valve, %, upwards; downwards they are the same.
+OPENINGS = (5.0, 10.0, 20.0, 30.0, 40.0)
+
+#: Means of a vented sensor that are taken one after another, and the readings of each.
+_MEANS, _READINGS = 10, 30
+
+#: Least error of a mean by rounding on the wire: cmH2O, mL/s.
+_PRESSURE_ERROR, _FLOW_ERROR = 0.003, 0.3
+
+#: Steps of a puff: at rest, at a larger opening if it comes from above, at its own; steps that
+#: count. Factor of the larger opening. Time for which an opening is held for a person to read, s.
+_LEAD, _ABOVE, _OWN, _COUNT, _LARGER, _HOLD_S = 3, 2, 3, 2, 1.5, 3.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value and its 95 % interval; NaN where the series does not tell."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.4g} ({self.low:.4g} to {self.high:.4g})"
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The line through a series.
+
+    Attributes:
+        intercept: reading where the reference is 0.
+        slope: reading per reference; NaN if the reference is the same throughout.
+        hysteresis: mean reading from above less that from below; NaN if only one is there.
+        residual: standard deviation of the readings about the line.
+    """
+
+    intercept: Estimate
+    slope: Estimate
+    hysteresis: Estimate
+    residual: float
+
+
+def _student(value: float, error: float, freedom: float) -> Estimate:
+    half = float(stats.t.ppf(0.975, freedom)) * error if freedom > 0 else math.nan
+    return Estimate(value, value - half, value + half)
+
+
+def fit(reference: Floats, reading: Floats, error: Floats, above: Floats) -> Fit:
+    """Fit a line by least squares, weighted by the readings' errors.
+
+    The errors count if the readings scatter no more than they say; else the scatter does.
+
+    Args:
+        reference: shape ``(n,)``.
+        reading: shape ``(n,)``.
+        error: standard error of each reading, shape ``(n,)``, above 0.
+        above: 1 where the reference was approached from above, else 0, shape ``(n,)``.
+    """
+    level = np.ptp(reference) == 0.0
+    columns = [np.ones_like(reference)] if level else [np.ones_like(reference), reference]
+    design = np.column_stack(columns) / error[:, None]
+    solution, *_ = np.linalg.lstsq(design, reading / error, rcond=None)
+    residual = reading - np.column_stack(columns) @ solution
+    freedom = len(reading) - len(columns)
+    scatter = float(np.sum((residual / error) ** 2)) / max(freedom, 1)
+    covariance = np.linalg.inv(design.T @ design) * max(scatter, 1.0)
+    found = [
+        _student(float(x), math.sqrt(v), freedom)
+        for x, v in zip(solution, np.diag(covariance), strict=True)
+    ]
+    unknown = Estimate(math.nan, math.nan, math.nan)
+    both = [x for x in np.unique(reference) if len(set(above[reference == x])) == 2]
+    apart = np.array(
+        [
+            reading[(reference == x) & (above == 1)].mean()
+            - reading[(reference == x) & (above == 0)].mean()
+            for x in both
+        ]
+    )
+    hysteresis = unknown
+    if len(apart) > 1:
+        each = float(apart.std(ddof=1)) / math.sqrt(len(apart))
+        hysteresis = _student(float(apart.mean()), each, len(apart) - 1)
+    spread = math.sqrt(float(residual @ residual) / max(freedom, 1))
+    return Fit(found[0], unknown if level else found[1], hysteresis, spread)
+
+
+@dataclass(frozen=True)
+class Part:
+    """One calibrated part.
+
+    Attributes:
+        kind: a key of :data:`PARTS`.
+        date: when, UTC, ISO 8601.
+        reference, reading, error, above: the series, see :func:`fit`; units in :data:`PARTS`.
+        by_hand: whether a person read the values.
+    """
+
+    kind: str
+    date: str
+    reference: tuple[float, ...]
+    reading: tuple[float, ...]
+    error: tuple[float, ...]
+    above: tuple[int, ...]
+    by_hand: bool
+
+    @property
+    def fit(self) -> Fit:
+        """The line through it."""
+        return fit(*(np.array(x, float) for x in (self.reference, self.reading, self.error,
+                                                   self.above)))  # fmt: skip
+
+    def __str__(self) -> str:
+        own, (x, y) = self.fit, PARTS[self.kind]
+        parts = [f"{self.kind}: {own.intercept} {y} at 0 {x}"]
+        if math.isfinite(own.slope.value):
+            parts.append(f"{own.slope} {y} per {x}")
+        if math.isfinite(own.hysteresis.value):
+            parts.append(f"from above {own.hysteresis} {y} more")
+        return f"{'; '.join(parts)}; residual {own.residual:.2g} {y}"
+
+
+def _vented(bench: Bench, readings: int) -> tuple[Floats, Floats]:
+    """Pressures and flows of a vented device, one each control step."""
+    client, clock, taken = bench.client, bench.clock, list[Reading]()
+    client.vent()
+    start = clock.now()
+    for step in range(readings):
+        clock.sleep_until(start + step * protocol.DT)
+        taken.append(client.heartbeat())
+    return np.array([x.pressure for x in taken]), np.array([x.flow for x in taken])
+
+
+def _mean(values: Floats, least: float) -> tuple[float, float]:
+    if not np.isfinite(values).all():
+        raise InputError("the device gives no reading here; see `ventbench-hardware selftest`")
+    scatter = float(values.std(ddof=1)) / math.sqrt(len(values))
+    return float(values.mean()), max(scatter, least)
+
+
+def _above(reference: Sequence[float]) -> tuple[int, ...]:
+    return tuple(int(k > 0 and x < reference[k - 1]) for k, x in enumerate(reference))
+
+
+def measure(
+    bench: Bench,
+    kind: str,
+    *,
+    lung: str,
+    reference: Sequence[float] = (),
+    ask: Callable[[str], float] | None = None,
+    now: datetime.datetime | None = None,
+) -> Part:
+    """Measure one part; a device that moves its valves does so watched, as in a self-test.
+
+    Args:
+        bench: device, clock, safety, operator.
+        kind: a key of :data:`PARTS`.
+        lung: label of the mounted lung, for ``valve`` and ``leak``.
+        reference: the reference's values: pressures of ``span``, cmH2O, flows of ``flow``, mL/s,
+            openings of ``valve``, %, in the order in which they are set; PEEP by an instrument.
+        ask: asks a person for a number; needed for the valve of a device without a flow sensor.
+        now: the time; that of the computer if not given.
+
+    Raises:
+        InputError: if the device or the references cannot tell, or a check or the person stops it.
+        EmergencyStop: if the operator pressed the key.
+        LinkError: if the device is lost.
+    """
+    if kind not in PARTS:
+        raise InputError(f"{kind!r} cannot be calibrated; choose {', '.join(PARTS)}")
+    welcome = bench.client.welcome or bench.client.hello()
+    has_flow = bool(welcome.capabilities & Capability.FLOW)
+    by_hand = False
+
+    def confirmed(question: str) -> None:
+        if not bench.operator.confirm(question):
+            raise InputError(f"{kind}: not confirmed; nothing was measured")
+
+    if kind in ("zero", "peep"):
+        confirmed("open the sensor's tube to air. Is it open?" if kind == "zero"
+                  else f"set the lung to {lung}, PEEP valve as in use. Does it rest?")  # fmt: skip
+        level = reference[0] if reference else 0.0
+        rows = [_mean(_vented(bench, _READINGS)[0], _PRESSURE_ERROR) for _ in range(_MEANS)]
+        points = [(0.0, value - level, error) for value, error in rows]
+    elif kind in ("span", "flow"):
+        unit, flow = PARTS[kind][0], kind == "flow"
+        if flow and not has_flow:
+            raise InputError("flow: this device measures none")
+        if len(set(reference)) < 2:
+            raise InputError(f"{kind}: give two references at least, such as --reference 0,20,40")
+        points = []
+        for value in reference:
+            what = "send" if flow else "apply"
+            confirmed(f"{what} {value:g} {unit} {'through' if flow else 'to'} the sensor. Steady?")
+            read = _vented(bench, 2 * _READINGS)[int(flow)]
+            points.append((value, *_mean(read, _FLOW_ERROR if flow else _PRESSURE_ERROR)))
+    elif kind == "valve":
+        openings = [float(x) for x in reference] or [*OPENINGS, *OPENINGS[::-1]]
+        if len(set(openings)) < 2 or min(openings) < 0.0 or max(openings) > protocol.U_MAX:
+            raise InputError("valve: give two openings at least, within 0 to 100 %")
+        by_hand = not has_flow
+        if by_hand and ask is None:
+            raise InputError("valve: the device measures no flow, and nobody is there to read it")
+        confirmed(f"set the lung to {lung} and connect it. Is it set?" if has_flow
+                  else "flow meter at the valve, tube open, no lung. Is it so?")  # fmt: skip
+        points = []
+        for opening, above in zip(openings, _above(openings), strict=True):
+            if has_flow:
+                flows = _puffed(bench, lung, opening, bool(above)).flow[-_COUNT:]
+                points.append((opening, *_mean(flows, _FLOW_ERROR)))
+            elif ask is not None:
+                _held_open(bench, lung, opening, bool(above))
+                flow = ask(f"the meter's steady flow at {opening:g} %, mL/s: ")
+                points.append((opening, flow, max(0.02 * abs(flow), 1.0)))  # as meters state it
+    else:
+        confirmed(f"set the lung to {lung} and connect it. Is it set?")
+        commands, fill, steps = closed_lung()
+        closed = _watched(drive(bench, lung, commands, steps, pip=30.0), kind)
+        time, pressure = closed.time[fill:], closed.pressure[fill:]
+        noise = max(float(np.std(np.diff(pressure))) / math.sqrt(2.0), _PRESSURE_ERROR)
+        points = [(t - time[0], p, noise) for t, p in zip(time, pressure, strict=True)]
+    columns = zip(*points, strict=True)
+    xs, ys, errors = (tuple(round(float(x), 6) for x in column) for column in columns)
+    date = (now or datetime.datetime.now(datetime.UTC)).isoformat(timespec="seconds")
+    above = (0,) * len(xs) if kind in ("zero", "peep", "leak") else _above(xs)
+    return Part(kind, date, xs, ys, errors, above, by_hand)
+
+
+def _watched(done: Driven, kind: str) -> Driven:
+    if done.trips:
+        raise InputError(f"{kind}: stopped by a check: {done.trips[0]}")
+    return done
+
+
+def _puffed(bench: Bench, lung: str, opening: float, above: bool) -> Driven:
+    """A puff into the lung; its last steps have the opening's steady flow."""
+    larger = min(_LARGER * opening, protocol.U_MAX)
+
+    def commands(step: int, pressure: float) -> tuple[float, int]:
+        if step < _LEAD:
+            return 0.0, 1
+        return (larger if above and step < _LEAD + _ABOVE else opening), 0
+
+    steps = _LEAD + _ABOVE + _OWN + 1
+    return _watched(drive(bench, lung, commands, steps, pip=45.0), "valve")
+
+
+def _held_open(bench: Bench, lung: str, opening: float, above: bool) -> None:
+    """Hold an opening for a person to read, tube and expiratory valve open."""
+    steps, larger = round(_HOLD_S / protocol.DT), min(_LARGER * opening, protocol.U_MAX)
+    held: Commands = lambda step, pressure: (larger if above and step < 10 else opening, 1)  # noqa: E731
+    # At an open tube there is no pressure, as it should be.
+    low = replace(bench.settings.low_pressure, duration=math.inf)
+    opened = replace(bench, settings=replace(bench.settings, low_pressure=low), rest=0.5)
+    _watched(drive(opened, lung, held, steps, pip=30.0), "valve")
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibration of a device.
+
+    Attributes:
+        device: what the device says that it is: ``device_id`` and ``calibration``, hexadecimal.
+        parts: by kind.
+        sha256: of the content; identifies the calibration in records.
+    """
+
+    device: dict[str, str]
+    parts: dict[str, Part]
+    sha256: str = ""
+
+    def _content(self) -> dict[str, Any]:
+        parts = {}
+        for kind, part in self.parts.items():
+            line = part.fit
+            found = {name: vars(getattr(line, name)) for name in ("intercept", "slope",
+                                                                  "hysteresis")}  # fmt: skip
+            parts[kind] = {**vars(part), "units": PARTS[kind], **found, "residual": line.residual}
+        content = {"format": FORMAT, "device": self.device, "parts": parts}
+        return json.loads(json.dumps(files.json_values(content)))
+
+    def save(self, path: Path) -> Calibration:
+        """Write it; returns it with its hash."""
+        content = self._content()
+        digest = _digest(content)
+        files.write_json(path, {**content, "sha256": digest})
+        return replace(self, sha256=digest)
+
+    @property
+    def valve(self) -> tuple[float, float, float] | None:
+        """Flow of the valve, mL/s per %, mean and range; None if it was not calibrated.
+
+        The range is over openings, directions and two standard errors of each: a valve that is not
+        linear has a wide one.
+        """
+        if "valve" not in self.parts:
+            return None
+        part = self.parts["valve"]
+        opening, flow, error = map(np.array, (part.reference, part.reading, part.error))
+        flow, error, opening = flow[opening > 0], error[opening > 0], opening[opening > 0]
+        low, high = (flow - 2.0 * error) / opening, (flow + 2.0 * error) / opening
+        return float(np.mean(flow / opening)), float(low.min()), float(high.max())
+
+    def about(self) -> dict[str, Any]:
+        """What a record says of it."""
+        return {"sha256": self.sha256, "dates": {k: x.date for k, x in self.parts.items()}}
+
+
+def _digest(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def device_of(client: Client) -> dict[str, str]:
+    """What a device says that it is."""
+    welcome = client.welcome or client.hello()
+    return {"device_id": welcome.device_id.hex(), "calibration": welcome.calibration.hex()}
+
+
+def load(
+    path: Path, device: dict[str, str], *, now: datetime.datetime | None = None, stale: bool = False
+) -> Calibration:
+    """Read a calibration.
+
+    Args:
+        path: of the file.
+        device: of :func:`device_of`.
+        now: the time; that of the computer if not given.
+        stale: take stale parts too, to renew them one by one.
+
+    Raises:
+        InputError: if it is none, was changed, is of another device, or is stale.
+    """
+    try:
+        content = json.loads(path.read_text("utf-8"))
+        digest = content.pop("sha256")
+        parts = {
+            kind: Part(
+                kind, x["date"], tuple(x["reference"]), tuple(x["reading"]), tuple(x["error"]),
+                tuple(x["above"]), x["by_hand"],
+            )
+            for kind, x in content["parts"].items()
+        }  # fmt: skip
+        dates = {kind: datetime.datetime.fromisoformat(x.date) for kind, x in parts.items()}
+        own = content["device"]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path} is no calibration ({error}); make one by `calibrate`") from None
+    if digest != _digest(content) or content.get("format") != FORMAT:
+        raise InputError(f"{path} was changed after it was measured; measure it again")
+    if own != device:
+        raise InputError(
+            f"{path} is of device {own['device_id']} or of other settings of it, not of this "
+            f"{device['device_id']}; calibrate this one"
+        )
+    now = now or datetime.datetime.now(datetime.UTC)
+    for kind, date in dates.items():
+        age = (now - date).total_seconds() / 86400.0
+        if not stale and not -1.0 <= age <= STALE:
+            raise InputError(
+                f"{path}: {kind} is {age:.0f} days old, {STALE:g} are allowed; run "
+                f"`ventbench-hardware calibrate {kind}` again"
+            )
+    return Calibration(own, parts, digest)
+
+
+def lost_flow(leak: Part, lung: str) -> Estimate:
+    """Leak of a closed lung by its fall of pressure and the label's C, mL/s."""
+    slope, C = leak.fit.slope, parse_lung(lung).C
+    return Estimate(-C * slope.value, -C * slope.high, -C * slope.low)

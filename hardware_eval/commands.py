@@ -1,0 +1,155 @@
+"""Commands before and after runs, calibration and trial; and what all commands share."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ventbench.base.errors import InputError
+from ventbench.cli.options import JsonFile, emit, known_lungs
+
+if TYPE_CHECKING:
+    from hardware_eval.bench.calibrate import Calibration
+    from hardware_eval.bench.console import ConsoleOperator
+    from hardware_eval.results.evaluate import Line
+
+Port = Annotated[
+    str,
+    typer.Option(
+        help="Serial port of the device, such as /dev/ttyACM0, socket://HOST:PORT, the path that "
+        "`emulate` prints, or virtual:R20C50, an emulated lung in this process, faster than real "
+        "time."
+    ),
+]
+Yes = Annotated[
+    bool, typer.Option("--yes", help="Confirm every question; for an emulator, not for a bench.")
+]
+
+
+@contextlib.contextmanager
+def keys(person: ConsoleOperator) -> Iterator[None]:
+    """Any key is the emergency stop; it ends the command with exit code 1."""
+    from hardware_eval.bench.loop import EmergencyStop
+
+    with person.keys():
+        try:
+            yield
+        except EmergencyStop:
+            print("stopped: the operator pressed the emergency stop", file=sys.stderr)
+            raise typer.Exit(1) from None
+
+
+Calibrated = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Calibration of this device, by `calibrate`."),
+]
+
+
+def trial(
+    sessions: Annotated[
+        list[Path],
+        typer.Argument(help="Folders of finished sessions, or their raw.jsonl: one trial."),
+    ],
+    json: JsonFile = None,
+) -> None:
+    """Errors, gaps to simulation, success and rank agreement, with 95 % intervals.
+
+    Sessions of one trial have the same entries, PIPs and repeats, and mount lungs anew.
+
+    Example: `ventbench-hardware trial runs/monday runs/tuesday`
+    """
+    from hardware_eval.results.trial import analyse
+
+    done = analyse(sessions)
+    emit(done.as_dict(), json)
+    print(done, file=sys.stderr if str(json) == "-" else sys.stdout)
+
+
+def calibrate(
+    part: Annotated[str, typer.Argument(help="zero, span, valve, peep, flow or leak.")],
+    port: Port,
+    lung: Annotated[
+        str, typer.Option(help="Label of the mounted lung.", autocompletion=known_lungs)
+    ] = "R5C20",
+    reference: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIST",
+            help="Reference values in the order of setting, up and down: pressures of span, flows "
+            "of flow, openings of valve, PEEP by an instrument.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="The device's calibration; parts are added to it.")
+    ] = Path("calibration.json"),
+    yes: Yes = False,
+    json: JsonFile = None,
+) -> None:
+    """Measure a part of a bench's calibration, with intervals, and keep it in a dated file.
+
+    The valve of a device without a flow sensor is read from a meter, opening by opening.
+
+    Example: `ventbench-hardware calibrate span --port /dev/ttyACM0 --reference 0,20,40,20,0`
+    """
+    from hardware_eval.bench import calibrate as calibration
+    from hardware_eval.bench.console import ConsoleOperator
+    from hardware_eval.bench.loop import Bench
+    from hardware_eval.bench.safety import DEFAULT
+    from hardware_eval.results import evaluate as ev
+    from ventbench.task.lungs import scored_lung
+
+    values = numbers("--reference", reference)
+    label = scored_lung(lung).id
+    line = ev.connect(port)
+    person = ConsoleOperator(yes=yes)
+    bench = Bench(line.client, line.clock, DEFAULT, person)
+    try:
+        device = calibration.device_of(line.client)
+        kept = calibration.load(out, device, stale=True).parts if out.exists() else {}
+        with keys(person):
+            made = calibration.measure(
+                bench, part, lung=label, reference=values, ask=None if yes else person.number
+            )
+    finally:
+        line.client.close()
+    saved = calibration.Calibration(device, {**kept, part: made}).save(out)
+    emit({"part": part, "fit": vars(made.fit), "file": str(out), "sha256": saved.sha256}, json)
+    to = sys.stderr if str(json) == "-" else sys.stdout
+    print(made, file=to)
+    if part == "leak":
+        print(f"leak: {calibration.lost_flow(made, label)} mL/s of {label}", file=to)
+    print(f"{out}: {', '.join(saved.parts)}; SHA-256 {saved.sha256}", file=to)
+
+
+def calibration_of(line: Line, path: Path | None) -> Calibration | None:
+    """The calibration that a command is given.
+
+    Raises:
+        InputError: if it is stale, was changed, or is of another device than the line's.
+    """
+    from hardware_eval.bench import calibrate as calibration
+
+    return None if path is None else calibration.load(path, calibration.device_of(line.client))
+
+
+def numbers(option: str, text: str | None) -> list[float]:
+    """Numbers separated by commas.
+
+    Raises:
+        InputError: if they are none.
+    """
+    try:
+        return [float(part) for part in text.split(",")] if text else []
+    except ValueError:
+        raise InputError(f"{option} {text!r}: write numbers separated by commas") from None
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command()(trial)
+    app.command()(calibrate)

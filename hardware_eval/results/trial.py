@@ -1,0 +1,316 @@
+"""What a session says as a trial: scores, gaps and rank agreement with 95 % intervals.
+
+Three levels scatter. Repeats of one lung at one PIP differ; so do mountings of one lung, by supply,
+temperature and tubes; PIPs are those of the protocol and count as fixed. Two intervals follow:
+
+- *as mounted*: of the mean over these lungs as they stood. The variances of the cells' means add;
+  Student's t with the degrees of freedom of Welch and Satterthwaite.
+- *mounted anew*: of the gap, mean over lungs, if the lungs were set again. A lung's gap to the
+  simulation has the scatter of its mounting and of its repeats in it, so that the standard
+  deviation between lungs holds all levels (the mixed model's interval in a balanced design): t with
+  one degree of freedom less than there are mountings. What simulators miss of each lung counts as
+  scatter too, which makes it wide.
+
+Rank agreement is between the order in simulation and on the bench. Its interval is that of draws of
+all entries' means together, each with the distribution of *mounted anew*.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from hardware_eval.bench.raw_log import lines
+from hardware_eval.results.evaluate import LOG
+from hardware_eval.results.record import plan_of
+from ventbench.base import files
+from ventbench.base.errors import InputError
+
+Floats = NDArray[np.float64]
+
+#: Draws of the interval of rank agreement, and their seed.
+DRAWS, SEED = 4000, 0
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A value with its 95 % interval; NaN where there is none."""
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+
+    def __str__(self) -> str:
+        if math.isnan(self.low):
+            return f"{self.value:.3f}"
+        return f"{self.value:.3f} ({self.low:.3f} to {self.high:.3f})"
+
+
+def as_mounted(errors: Floats) -> tuple[Floats, Floats, Floats]:
+    """Mean over cells of repeats, its standard error and degrees of freedom.
+
+    Args:
+        errors: shape ``(..., cells, repeats)``, two repeats at least.
+
+    Returns:
+        Three arrays of shape ``(...)``; where no repeat differs the error is 0.
+    """
+    *_, cells, repeats = errors.shape
+    variance = errors.var(axis=-1, ddof=1) / repeats / cells**2
+    total = variance.sum(axis=-1)
+    freedom = total**2 / np.maximum((variance**2).sum(axis=-1) / (repeats - 1), 1e-300)
+    return errors.mean(axis=(-1, -2)), np.sqrt(total), np.maximum(freedom, 1.0)
+
+
+def mounted_anew(by_mounting: Floats) -> tuple[Floats, Floats, Floats]:
+    """Mean over mountings, its standard error and degrees of freedom.
+
+    Args:
+        by_mounting: shape ``(..., mountings)``, two at least.
+    """
+    count = by_mounting.shape[-1]
+    error = by_mounting.std(axis=-1, ddof=1) / math.sqrt(count)
+    return by_mounting.mean(axis=-1), error, np.full(error.shape, count - 1.0)
+
+
+def interval(mean: Any, error: Any, freedom: Any) -> Interval:
+    """The 95 % interval of a mean by Student's t."""
+    half = float(stats.t.ppf(0.975, freedom)) * float(error)
+    return Interval(float(mean), float(mean) - half, float(mean) + half)
+
+
+def kendall(simulated: Floats, measured: Floats) -> Floats:
+    """Kendall's tau-b of one order, ``(E,)``, with each of some, ``(..., E)``."""
+    first, second = np.triu_indices(len(simulated), 1)
+    own = np.sign(simulated[first] - simulated[second])
+    other = np.sign(measured[..., first] - measured[..., second])
+    pairs = np.sqrt((own**2).sum() * (other**2).sum(axis=-1))
+    return (own * other).sum(axis=-1) / np.maximum(pairs, 1e-300)
+
+
+def spearman(simulated: Floats, measured: Floats) -> Floats:
+    """Spearman's rho of one order, ``(E,)``, with each of some, ``(..., E)``."""
+    own = stats.rankdata(simulated)
+    other = stats.rankdata(measured, axis=-1)
+    own, other = own - own.mean(), other - other.mean(axis=-1, keepdims=True)
+    scale = np.sqrt((own**2).sum() * (other**2).sum(axis=-1))
+    return (own * other).sum(axis=-1) / np.maximum(scale, 1e-300)
+
+
+def agreement(
+    simulated: Floats, measured: Floats, *, draws: int = DRAWS, seed: int = SEED
+) -> dict[str, Interval]:
+    """Rank agreement of entries in simulation and on the bench, ``kendall`` and ``spearman``.
+
+    The drawn means share their mountings, so that what a mounting does to all entries changes no
+    order: a multivariate t about the measured means, with the covariance of the gaps.
+
+    Args:
+        simulated: score of each entry and mounting in simulation, ``(E, M)``, two entries at least.
+        measured: on the bench, ``(E, M)``; with one mounting there is no interval.
+        draws: number of draws.
+        seed: of the draws.
+    """
+    mountings = measured.shape[1]
+    own, means = simulated.mean(axis=1), measured.mean(axis=1)
+    drawn = means[None]
+    if mountings > 1:
+        random = np.random.default_rng(seed)
+        off = measured - simulated
+        off = off - off.mean(axis=1, keepdims=True)
+        normal = random.standard_normal((draws, mountings)) / math.sqrt(mountings)
+        scale = np.sqrt(random.chisquare(mountings - 1, (draws, 1)))
+        drawn = means + normal / scale @ off.T
+    found = {}
+    for name, measure in (("kendall", kendall), ("spearman", spearman)):
+        ends = np.quantile(measure(own, drawn), (0.025, 0.975)) if mountings > 1 else (np.nan,) * 2
+        found[name] = Interval(float(measure(own, means)), float(ends[0]), float(ends[1]))
+    return found
+
+
+@dataclass(frozen=True)
+class EntryTrial:
+    """What a trial says of one entry.
+
+    Attributes:
+        score: mean error, cmH2O, as mounted; NaN if a run failed.
+        gap: mean error less that in simulation, cmH2O, mounted anew; NaN without a dry run.
+        gaps: the same by mounting, cmH2O, as mounted.
+        success: share of scored runs that completed, by Clopper and Pearson.
+        successes: completed scored runs and all of them, by mounting.
+        repeat_sd: standard deviation of repeats, pooled, cmH2O.
+        mounting_sd: standard deviation of the gap between mountings beyond that, cmH2O.
+    """
+
+    score: Interval
+    gap: Interval
+    gaps: dict[str, Interval]
+    success: Interval
+    successes: dict[str, tuple[int, int]]
+    repeat_sd: float
+    mounting_sd: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What the sessions of a trial say.
+
+    Attributes:
+        entries: by name.
+        agreement: rank agreement of the entries with a score; empty for fewer than two.
+        missing: why something could not be said.
+    """
+
+    entries: dict[str, EntryTrial]
+    agreement: dict[str, Interval]
+    missing: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values."""
+
+        def plain(value: Any) -> Any:
+            if isinstance(value, (Interval, EntryTrial, Trial)):
+                value = vars(value)
+            if isinstance(value, dict):
+                return {key: plain(each) for key, each in value.items()}
+            return value
+
+        return files.json_values(plain(self))
+
+    def __str__(self) -> str:
+        rows = []
+        for name, x in self.entries.items():
+            done, runs = (sum(part) for part in zip(*x.successes.values(), strict=True))
+            rows.append(
+                f"{name}: error {x.score} cmH2O as mounted; {done} of {runs} runs succeeded "
+                f"({x.success.low:.1%} to {x.success.high:.1%})"
+            )
+            rows.append(
+                f"  gap to simulation {x.gap} cmH2O mounted anew; SD of repeats "
+                f"{x.repeat_sd:.3f}, of mountings {x.mounting_sd:.3f}"
+            )
+            for mounting, gap in x.gaps.items():
+                succeeded, of = x.successes[mounting]
+                rows.append(f"  {mounting}: gap {gap}, {succeeded} of {of} succeeded")
+        rows += [f"rank agreement, {name}: {value}" for name, value in self.agreement.items()]
+        return "\n".join([*rows, *self.missing])
+
+
+def analyse(logs: Sequence[Path]) -> Trial:
+    """Analyse the sessions of a trial, each of which mounts each of its lungs once.
+
+    Args:
+        logs: logs of finished plans with the same entries and PIPs, or their folders.
+
+    Raises:
+        InputError: if a log holds no plan, is not finished, or is of another trial.
+    """
+    measured, simulated, mountings = _tables([x / LOG if x.is_dir() else x for x in logs])
+    entries: dict[str, EntryTrial] = {}
+    missing: list[str] = []
+    for name, errors in measured.items():
+        entries[name] = _entry(errors, simulated[name], mountings)
+        if not np.isfinite(errors).all():
+            missing.append(f"{name} has no score: a run of it failed")
+    some = next(iter(measured.values()))
+    if not all(np.isfinite(table).all() for table in simulated.values()):
+        missing.append("no gap and no rank agreement: the log has no whole dry run")
+    if some.shape[-1] < 2:
+        missing.append("no interval as mounted: it needs two repeats at least")
+    if len(mountings) < 2:
+        missing.append("no interval mounted anew: it needs two lungs or sessions at least")
+    both = [
+        name for name in measured
+        if np.isfinite(measured[name]).all() and np.isfinite(simulated[name]).all()
+    ]  # fmt: skip
+    agrees: dict[str, Interval] = {}
+    if len(both) > 1:
+        agrees = agreement(
+            np.stack([simulated[name].mean(axis=1) for name in both]),
+            np.stack([measured[name].mean(axis=(1, 2)) for name in both]),
+        )
+    return Trial(entries, agrees, tuple(missing))
+
+
+def _entry(errors: Floats, simulated: Floats, mountings: Sequence[str]) -> EntryTrial:
+    """One entry: errors ``(M, P, K)``, NaN where a run failed; in simulation ``(M, P)``."""
+    repeats = errors.shape[-1]
+    unknown = Interval(math.nan)
+    by_mounting = errors.mean(axis=(1, 2)) - simulated.mean(axis=1)
+    gaps = {name: Interval(float(gap)) for name, gap in zip(mountings, by_mounting, strict=True)}
+    score, gap = Interval(float(errors.mean())), Interval(float(by_mounting.mean()))
+    within = between = math.nan
+    if repeats > 1:
+        flat = errors.reshape(1, -1, repeats)
+        score = interval(*(x[0] for x in as_mounted(flat)))
+        mean, error, freedom = as_mounted(errors - simulated[..., None])
+        gaps = {name: interval(mean[k], error[k], freedom[k]) for k, name in enumerate(mountings)}
+        within = float(np.sqrt(errors.var(axis=-1, ddof=1).mean()))
+        if len(mountings) > 1:
+            excess = by_mounting.var(ddof=1) - (error**2).mean()
+            between = float(np.sqrt(np.maximum(excess, 0.0)))
+    if len(mountings) > 1:
+        gap = interval(*mounted_anew(by_mounting))
+    done = np.isfinite(errors).sum(axis=(1, 2))
+    share = stats.binomtest(int(done.sum()), errors.size).proportion_ci(method="exact")
+    success = Interval(float(done.sum()) / errors.size, float(share.low), float(share.high))
+    each = errors[0].size
+    return EntryTrial(
+        score if math.isfinite(score.value) else unknown,
+        gap if math.isfinite(gap.value) else unknown, gaps, success,
+        {name: (int(n), each) for name, n in zip(mountings, done, strict=True)}, within, between,
+    )  # fmt: skip
+
+
+def _tables(logs: Sequence[Path]) -> tuple[dict[str, Floats], dict[str, Floats], list[str]]:
+    """Errors on the bench ``(M, P, K)`` and in simulation ``(M, P)`` by entry; the mountings."""
+    plans = []
+    measured: dict[str, list[Floats]] = {}
+    simulated: dict[str, list[Floats]] = {}
+    mountings: list[str] = []
+    hashes: dict[str, str] = {}
+    for session, log in enumerate(logs):
+        logged = list(lines(log))
+        plan = plan_of(logged, str(log))
+        plans.append((sorted(plan.entries), plan.pips, plan.repeats, plan.track))
+        if plans[-1] != plans[0]:
+            raise InputError(
+                f"{log} is of another trial than {logs[0]}: entries, PIPs, repeats or track differ"
+            )
+        ended = {
+            (x["entry"], x["lung"], x["pip"], x["repeat"]): x.get("error")
+            for x in logged
+            if x["type"] == "run" and x["kind"] == "scored" and x["status"] != "aborted"
+        }
+        predicted: dict[tuple[str, str, float], float] = {}
+        for line in logged:
+            if line["type"] == "session":
+                for name, digest in line["entries"].items():
+                    if hashes.setdefault(name, digest) != digest:
+                        raise InputError(f"{log}: the files of {name} changed; it is another entry")
+                predicted |= {(e, lung, pip): x for e, lung, pip, x in line.get("simulated", ())}
+        left = len(plan.entries) * len(plan.lungs) * len(plan.pips) * plan.repeats - len(ended)
+        if left:
+            raise InputError(f"{log}: {left} scored runs are left; `run` continues the plan")
+        for lung in sorted(plan.lungs):
+            mountings.append(lung if len(logs) == 1 else f"{lung} of session {session + 1}")
+            for name in plan.entries:
+                cells = [
+                    [ended[name, lung, pip, k] for k in range(1, plan.repeats + 1)]
+                    for pip in plan.pips
+                ]
+                measured.setdefault(name, []).append(np.array(cells, float))
+                guess = [predicted.get((name, lung, pip), math.nan) for pip in plan.pips]
+                simulated.setdefault(name, []).append(np.array(guess, float))
+    return (
+        {name: np.stack(tables) for name, tables in measured.items()},
+        {name: np.stack(tables) for name, tables in simulated.items()},
+        mountings,
+    )

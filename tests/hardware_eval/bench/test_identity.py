@@ -1,0 +1,83 @@
+"""R and C of the mounted lung on lungs by analysis, which no simulator of the library has seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hardware_eval.bench.drive import Driven
+from hardware_eval.bench.identity import identified
+from hardware_eval.bench.selftest import _PROBES, _probe
+from ventbench.task import protocol
+
+#: Settings of a QuickLung.
+SETTINGS = [(R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.0)]
+
+#: Steps of integration in a control step; expiratory valve, cmH2O/(L/s).
+FINE, OUTLET = 30, 4.0
+
+
+def probed(R: float, C: float, parabolic: bool, noise: float, seed: int) -> list[Driven]:
+    """The self-test's probes on a lung, by Euler's method; flow and pressure at each step.
+
+    A parabolic resistor has its label's R at 1 L/s.
+    """
+    draw, done = np.random.default_rng(seed), []
+    for pip, P, I in _PROBES:  # noqa: E741 - the field's names
+        commands, volume, rows, u_in, u_out = _probe(pip, P, I), 0.0, [], 0.0, 1
+        for step in range(protocol.BREATH_STEPS):
+            for _ in range(FINE):
+                elastic = volume / C
+                if u_out:
+                    flow = -1000.0 * elastic / (R + OUTLET)
+                    pressure = 5.0 - 1e-3 * OUTLET * flow
+                else:
+                    flow = 22.8 * u_in
+                    through = 1e-3 * flow
+                    drop = R * (through**2 if parabolic else through)
+                    pressure = 5.0 + elastic + drop
+                volume += flow * protocol.DT / FINE
+            read = pressure + noise * draw.standard_normal()
+            rows.append((0.03 * step, read, flow, u_in, u_out, 0.0, 0.0))
+            u_in, u_out = commands(step, read)
+            u_in = min(u_in, 100.0)
+        done.append(Driven(*np.array(rows, float).T, (), False, 0))  # type: ignore[arg-type]
+    return done
+
+
+@pytest.mark.parametrize(
+    ("trials", "settings"),
+    [(1, SETTINGS[4:5]), pytest.param(3, SETTINGS, marks=pytest.mark.slow)],
+    ids=["one", "all"],
+)
+def test_right_lungs_go_and_wrong_labels_do_not(
+    trials: int, settings: list[tuple[float, float]]
+) -> None:
+    refused, passed, wrong = [], [], 0
+    for R, C in settings:
+        for k in range(trials):
+            # A parabolic R of 50 would be told from flows far below 1 L/s; no scored lung has it.
+            parabolic = k % 2 == 1 and R < 50.0
+            probes = probed(R, C, parabolic, 0.1 + 0.1 * k, seed=k)
+            holds, alone, told = identified(probes, f"R{R:g}C{C:g}", None)
+            if not (holds and alone):
+                refused.append((R, C, k, holds, told))
+            other = SETTINGS[(SETTINGS.index((R, C)) + 1 + 3 * k) % 9]
+            wrong += 1
+            holds, _, told = identified(probes, f"R{other[0]:g}C{other[1]:g}", None)
+            if holds:
+                passed.append((R, C, other, told))
+    assert refused == []
+    assert len(passed) <= 0.05 * wrong, passed
+
+
+def test_without_flow_only_a_calibrated_valve_tells() -> None:
+    blind = [
+        replace(probe, flow=np.full_like(probe.flow, np.nan), u_in=np.append(probe.u_in[1:], 0.0))
+        for probe in probed(20.0, 20.0, False, 0.1, seed=0)
+    ]
+    assert identified(blind, "R20C20", None)[0] is None
+    assert identified(blind, "R20C20", (22.8, 22.4, 23.2))[0] is True
+    assert identified(blind, "R20C50", (22.8, 22.4, 23.2))[0] is False

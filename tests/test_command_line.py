@@ -1,8 +1,11 @@
 """What holds for every command: how it ends; and the command that looks at the machine."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -67,6 +70,22 @@ def test_ctrl_c_that_a_callback_drops_still_stops():
     ended = _run(DROPPED)
     assert ended.returncode == 130
     assert "Exception ignored" not in ended.stderr
+
+
+@pytest.mark.parametrize("package", ["ventbench", "hardware_eval"])
+def test_ctrl_c_while_packages_are_imported(tmp_path, package):
+    slow = "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)\n"
+    (tmp_path / "typer.py").write_text(slow)
+    path = os.pathsep.join([str(tmp_path), str(Path(cli.__file__).parents[2])])
+    ended = subprocess.run(
+        [sys.executable, "-m", package],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored behind a shell
+    )
+    program = {"hardware_eval": "ventbench-hardware"}.get(package, package)
+    assert (ended.returncode, ended.stderr) == (130, f"{program}: stopped\n")
 
 
 def test_python_m_ventbench():

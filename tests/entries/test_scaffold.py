@@ -39,7 +39,11 @@ def test_is_ready_and_scores(family, tmp_path, one_lung):
     assert report.ok, "\n".join(report.lines())
     assert report.notes[0].what == "key authors still says Your Name"
     result = run_protocol(
-        open_submission(str(folder)), Rigs(LUNGS[:1], one_lung), pips=(20.0,), track="robustness"
+        open_submission(str(folder)),
+        Rigs(LUNGS[:1], one_lung),
+        pips=(20.0,),
+        track="robustness",
+        runner=InProcessRunner(),
     )
     assert not result.failures
     # A lung that is left alone at PEEP would be 15 off.
@@ -53,6 +57,7 @@ def test_residual_starts_as_its_pi_controller(tmp_path, one_lung):
             Rigs(LUNGS[:1], one_lung),
             pips=(20.0,),
             track="robustness",
+            runner=InProcessRunner(),
         ).requested
 
     residual = scored(create("residual", "residual", tmp_path))

@@ -25,6 +25,7 @@ from ventbench.controllers.residual import (
     untrained,
 )
 from ventbench.entries.folder import open_submission
+from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
@@ -115,7 +116,9 @@ def test_the_submission_is_the_pure_controller(fields, tmp_path):
             one = pure[LUNG_IDS[k] if k < 2 else ALL]
             found, _ = rollouts.closed_loop(take(plants, k), one, cells)
             errors.append(run_error(found.pressure, np.asarray(cells.pip)[..., None, None]))
-    result = run_protocol(open_submission(str(folder)), rigs, draws=2, pips=(10, 35))
+    result = run_protocol(
+        open_submission(str(folder)), rigs, draws=2, pips=(10, 35), runner=InProcessRunner()
+    )
     assert not result.failures
     expected = np.stack(errors)
     np.testing.assert_allclose(result.nominal, expected[:, 0], rtol=0, atol=1e-9)

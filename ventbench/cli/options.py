@@ -276,7 +276,7 @@ def run(app: Callable[[], object], program: str, *, stopped: str = "") -> None:
         stopped: what is true after Ctrl-C, besides what a command keeps.
     """
     sys.unraisablehook = _interrupt_again
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, _interrupt)
     try:
         app()
@@ -288,6 +288,8 @@ def run(app: Callable[[], object], program: str, *, stopped: str = "") -> None:
         lines = [plain(line) for line in text.split("\n")]
         print(f"{program}:", "\n".join(lines), file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:  # before typer takes it, or behind it
+        _stop(program, stopped)
     except SystemExit as end:
         if end.code == INTERRUPTED:
             _stop(program, stopped)

@@ -431,19 +431,15 @@ def transfer(
 
     from ventbench.entries import scoring as transfers
     from ventbench.entries.folder import open_submission
-    from ventbench.entries.runner import CountingRunner, InProcessRunner, Runner
+    from ventbench.entries.runner import CountingRunner, runner_of
     from ventbench.plants.rigs import load_rigs
 
-    runner: Runner = InProcessRunner()
-    if not in_process:
-        from ventbench.sandbox.runner import SandboxRunner
-
-        runner = SandboxRunner()
     opened = [open_submission(name) for name in names]
     rigs, results = load_rigs(), []
     for entry in opened:
         chosen = track or entry.manifest.tracks[0]
         with bars() as shown:
+            runner = runner_of(entry, sandbox=not in_process)
             counting = CountingRunner(runner, counted(shown, f"running {entry.label}"))
             runs = transfers.transfer(entry, rigs, track=chosen, runner=counting)
         groups = transfers.by_group(runs, rigs)

@@ -253,7 +253,7 @@ def selftest(
     lung: Annotated[
         str, typer.Option(help="Label of the mounted lung.", autocompletion=options.known_lungs)
     ],
-    plant: Annotated[str, typer.Option(help="Simulators that know the lungs.")] = "frozen",
+    plant: options.PlantName = "frozen",
     json: JsonFile = None,
 ) -> None:
     """Test sensor, valves, tubes, clock and lung; exit code 1 if it is no-go.
@@ -334,9 +334,7 @@ def compare(
     log: Annotated[
         Path | None, typer.Option(help="Raw recording of the record, if it lies elsewhere.")
     ] = None,
-    plant: Annotated[
-        str, typer.Option(help="Simulators, as of every --plant of ventbench.")
-    ] = "frozen",
+    plant: options.PlantName = "frozen",
     out: Annotated[
         Path | None,
         typer.Option(
@@ -440,7 +438,11 @@ def demo(
     ] = False,
     breaths: Annotated[int, typer.Option(min=12, help="Breaths to explore.")] = 36,
     plant: Annotated[
-        str, typer.Option(help="Simulators that lack the concealed physics: physics or frozen.")
+        str,
+        typer.Option(
+            help="Simulators that lack the concealed physics: physics or frozen.",
+            autocompletion=options.known_plants,
+        ),
     ] = "physics",
     in_process: Annotated[
         bool,

@@ -474,6 +474,12 @@ def new(
     folder: Annotated[
         Path, typer.Option("--dir", metavar="DIR", help="Folder in which NAME/ is written.")
     ] = Path("."),
+    network: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Safetensors file of a trained network that it copies; see docs."
+        ),
+    ] = None,
 ) -> None:
     """Write a submission that can be scored at once; change it into your own.
 
@@ -481,7 +487,7 @@ def new(
     """
     from ventbench.entries import scaffold
 
-    path = scaffold.create(name, family, folder)
+    path = scaffold.create(name, family, folder, network)
     typer.echo(f"wrote {path}: " + ", ".join(sorted(entry.name for entry in path.iterdir())))
     typer.echo(f"next: ventbench check {path} && ventbench score {path}")
 

@@ -130,10 +130,7 @@ def run(
     largest_rise: Annotated[
         float, typer.Option(help="Largest rise of the command in one step, %.")
     ] = 100.0,
-    in_process: Annotated[
-        bool,
-        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
-    ] = False,
+    in_process: options.InProcess = False,
     dry_run: Annotated[
         bool, typer.Option(help="Run the plan on the frozen simulators first.")
     ] = True,
@@ -444,10 +441,7 @@ def demo(
             autocompletion=options.known_plants,
         ),
     ] = "physics",
-    in_process: Annotated[
-        bool,
-        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
-    ] = False,
+    in_process: options.InProcess = False,
     json: JsonFile = None,
 ) -> None:
     """Close the loop on an emulated lung that conceals physics: find it, correct, control better.

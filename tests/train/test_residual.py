@@ -20,7 +20,6 @@ from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import (
     Residual,
     inputs,
-    load_weights,
     save_weights,
     untrained,
 )
@@ -107,7 +106,10 @@ def test_the_submission_is_the_pure_controller(fields, tmp_path):
     )
     with precision.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS[:3]])
-        pure = load_weights(folder / "weights.npz")
+        pure = {
+            name: jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), controller(k, **fields))
+            for k, name in enumerate(names)
+        }
         rigs = Rigs(LUNGS[:3], plants)
         _, every = rigs.cells(rigs.draws(2, (10.0, 35.0)), (10.0, 35.0))
         errors = []
@@ -267,15 +269,13 @@ def test_settings_that_cannot_work_are_refused(field, value):
 def test_weights_are_read_as_they_were_written(tmp_path):
     one = controller(1, ahead=2, limit=30.0)
     save_weights(tmp_path / "w.npz", {"R5C10": one, ALL: controller(2)})
-    found = load_weights(tmp_path / "w.npz")
-    assert set(found) == {"R5C10", ALL}
-    assert (found["R5C10"].ahead, found["R5C10"].limit) == (2, 30.0)
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(found["R5C10"]), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-6)
-    arrays: dict[str, Any] = {"R5C10.gains": np.ones(3)}
-    np.savez(tmp_path / "x.npz", **arrays)
-    with pytest.raises(InputError, match=r"x\.npz holds no residual controllers"):
-        load_weights(tmp_path / "x.npz")
+    found = np.load(tmp_path / "w.npz")
+    assert {name.partition(".")[0] for name in found} == {"R5C10", ALL}
+    assert (found["R5C10.windows"][2], found["R5C10.limit"]) == (2, 30.0)
+    np.testing.assert_allclose(found["R5C10.gains"], [one.pid.P, one.pid.I, one.pid.D])
+    for k, (weights, biases) in enumerate(one.layers):
+        np.testing.assert_allclose(found[f"R5C10.w{k}"], weights, rtol=1e-6)
+        np.testing.assert_allclose(found[f"R5C10.b{k}"], biases, rtol=1e-6)
 
 
 #: A grid of two PIDs.
@@ -293,7 +293,7 @@ def test_the_command_trains_and_tells(monkeypatch, tmp_path):
     assert one["gains"] == [5.0, 5.0, 0.0]
     assert set(one["error"]) == {"R20C50"}
     assert result["recipe"]["updates"] == 3
-    assert set(load_weights(tmp_path / "weights.npz")) == {"R20C50"}
+    assert {name.partition(".")[0] for name in np.load(tmp_path / "weights.npz")} == {"R20C50"}
     assert not list((tmp_path / "parts").iterdir())
 
 

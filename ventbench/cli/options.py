@@ -91,6 +91,10 @@ Clip = Annotated[
     bool, typer.Option("--clip", help="Clip u_in to 0..100 % instead of refusing the file.")
 ]
 Pad = Annotated[bool, typer.Option("--pad", help="Accept breaths of unequal length.")]
+InProcess = Annotated[
+    bool,
+    typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
+]
 PlantName = Annotated[
     str,
     typer.Option(

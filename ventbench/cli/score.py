@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ventbench.cli.options import (
+    InProcess,
     JsonFile,
     PlantName,
     Scheduler,
@@ -91,10 +92,7 @@ def score(
             "controller is not told of; default: 6 with --draws 20, else 0.",
         ),
     ] = None,
-    in_process: Annotated[
-        bool,
-        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
-    ] = False,
+    in_process: InProcess = False,
     workers: Workers = 0,
     scheduler: Scheduler = None,
     json: JsonFile = None,
@@ -413,10 +411,7 @@ def transfer(
         Literal["performance", "robustness"] | None,
         typer.Option(help="Track to score; default: the first of the submission."),
     ] = None,
-    in_process: Annotated[
-        bool,
-        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
-    ] = False,
+    in_process: InProcess = False,
     json: JsonFile = None,
 ) -> None:
     """Score controllers on every rig and every member of the ensemble, without noise.
@@ -476,12 +471,16 @@ def new(
     ] = Path("."),
     network: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Safetensors file of a trained network that it copies; see docs."
-        ),
+        typer.Option(metavar="FILE", help="Safetensors file of a trained network, see above."),
     ] = None,
 ) -> None:
     """Write a submission that can be scored at once; change it into your own.
+
+    --network copies dense layers that were trained on observations of ventbench/Ventilator-v1, one
+    or several, the newest last: the state of a policy of PyTorch, Stable-Baselines3 or flax, with
+    some inputs as check.input and the actions that it gives for them as check.output, such as
+    `save_file({**net.state_dict(), "check.input": x, "check.output": net(x)}, FILE)`. What stands
+    between the layers is found out; a copy that is off by more than 1e-6 is refused.
 
     Example: `ventbench new demo && ventbench check demo && ventbench score demo`
     """
@@ -499,10 +498,7 @@ def check(
             help="Folder or name of a bundled submission.", autocompletion=known_entries
         ),
     ],
-    in_process: Annotated[
-        bool,
-        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
-    ] = False,
+    in_process: InProcess = False,
     json: JsonFile = None,
 ) -> None:
     """Report every problem that keeps a submission from the leaderboard.

@@ -43,17 +43,10 @@ _EXPORT = """
 ## Your own weights
 
 `network.py` reads `weights.npz`: arrays `w0`, `b0`, `w1`, `b1`, ... of dense layers with ReLU
-between them, where layer k does `x @ wk + bk`. From a trained flax model, for instance:
-
-```python
-layers = [params["Dense_0"], params["Dense_1"], params["Dense_2"]]
-arrays = {f"{n}{k}": layer[key] for k, layer in enumerate(layers)
-          for n, key in (("w", "kernel"), ("b", "bias"))}
-numpy.savez("weights.npz", **{name: numpy.asarray(a, "float32") for name, a in arrays.items()})
-```
-
-PyTorch's `Linear.weight` is the transpose: save `layer.weight.detach().numpy().T`. Train with the
-inputs that `Features` makes, or change `Features`; the number of layers and units is free.
+between them, where layer k does `x @ wk + bk` (`Dense` of flax; the transpose of PyTorch's
+`Linear`). Train with the inputs that `Features` makes, or change `Features`; the number of layers
+and units is free. `ventbench new NAME --network FILE` copies a network that was trained on the
+Gymnasium environment.
 """
 
 _EXPORTED = """

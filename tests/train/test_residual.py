@@ -101,14 +101,13 @@ def test_the_submission_is_the_pure_controller(fields, tmp_path):
     folder = tmp_path / "residual_mlp"
     bundled = open_submission("residual_mlp").folder
     shutil.copytree(bundled, folder, ignore=shutil.ignore_patterns("__pycache__"))
-    save_weights(
-        folder / "weights.npz", {name: controller(k, **fields) for k, name in enumerate(names)}
-    )
+    made = {name: controller(k, **fields) for k, name in enumerate(names)}
+    save_weights(folder / "weights.npz", made)
     with precision.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS[:3]])
         pure = {
-            name: jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), controller(k, **fields))
-            for k, name in enumerate(names)
+            name: jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), one)
+            for name, one in made.items()
         }
         rigs = Rigs(LUNGS[:3], plants)
         _, every = rigs.cells(rigs.draws(2, (10.0, 35.0)), (10.0, 35.0))

@@ -1,5 +1,12 @@
 """``python -m hardware_eval`` is ``ventbench-hardware``."""
 
-from hardware_eval.cli import main
+from ventbench.__main__ import main as guarded
 
-main()
+
+def main() -> None:
+    """Entry point of the console script."""
+    guarded("ventbench-hardware", "hardware_eval.cli")
+
+
+if __name__ == "__main__":
+    main()

@@ -109,10 +109,7 @@ def run(
     largest_rise: Annotated[
         float, typer.Option(help="Largest rise of the command in one step, %.")
     ] = 100.0,
-    in_process: Annotated[
-        bool,
-        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
-    ] = False,
+    in_process: options.InProcess = False,
     dry_run: Annotated[
         bool, typer.Option(help="Run the plan on the frozen simulators first.")
     ] = True,
@@ -235,7 +232,7 @@ def selftest(
     lung: Annotated[
         str, typer.Option(help="Label of the mounted lung.", autocompletion=options.known_lungs)
     ],
-    plant: Annotated[str, typer.Option(help="Simulators that know the lungs.")] = "frozen",
+    plant: options.PlantName = "frozen",
     calibration: Calibrated = None,
     json: JsonFile = None,
 ) -> None:
@@ -319,9 +316,7 @@ def compare(
     log: Annotated[
         Path | None, typer.Option(help="Raw recording of the record, if it lies elsewhere.")
     ] = None,
-    plant: Annotated[
-        str, typer.Option(help="Simulators, as of every --plant of ventbench.")
-    ] = "frozen",
+    plant: options.PlantName = "frozen",
     out: Annotated[
         Path | None,
         typer.Option(
@@ -425,12 +420,13 @@ def demo(
     ] = False,
     breaths: Annotated[int, typer.Option(min=12, help="Breaths to explore.")] = 36,
     plant: Annotated[
-        str, typer.Option(help="Simulators that lack the concealed physics: physics or frozen.")
+        str,
+        typer.Option(
+            help="Simulators that lack the concealed physics: physics or frozen.",
+            autocompletion=options.known_plants,
+        ),
     ] = "physics",
-    in_process: Annotated[
-        bool,
-        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
-    ] = False,
+    in_process: options.InProcess = False,
     json: JsonFile = None,
 ) -> None:
     """Close the loop on an emulated lung that conceals physics: find it, correct, control better.

@@ -1,18 +1,22 @@
 """What holds for every command: how it ends; and the command that looks at the machine."""
 
 import json
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
+from hardware_eval import cli as hardware
 from ventbench import cli
 from ventbench.base.errors import InputError
 from ventbench.sandbox.runner import SandboxRunner
 
 STOPPED = """
 import sys
+from hardware_eval import cli as hardware
 from ventbench import cli
 
 @cli.app.command()
@@ -28,6 +32,7 @@ cli.main()
 
 DROPPED = """
 import signal, sys, time
+from hardware_eval import cli as hardware
 from ventbench import cli
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a shell runs this behind
@@ -69,6 +74,21 @@ def test_ctrl_c_that_a_callback_drops_still_stops():
     assert "Exception ignored" not in ended.stderr
 
 
+@pytest.mark.parametrize("package", ["ventbench", "hardware_eval"])
+def test_ctrl_c_while_packages_are_imported(tmp_path, package):
+    slow = "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)\n"
+    (tmp_path / "typer.py").write_text(slow)
+    path = os.pathsep.join([str(tmp_path), str(Path(cli.__file__).parents[2])])
+    script = "import runpy, signal\n"  # the signal is ignored where a shell runs this behind
+    script += "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    script += f"runpy.run_module({package!r}, run_name='__main__')\n"
+    environment = {**os.environ, "PYTHONPATH": path}
+    command = [sys.executable, "-c", script]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True)
+    program = {"hardware_eval": "ventbench-hardware"}.get(package, package)
+    assert (ended.returncode, ended.stderr) == (130, f"{program}: stopped\n")
+
+
 def test_python_m_ventbench():
     command = [sys.executable, "-m", "ventbench", "--version"]
     assert subprocess.run(command, capture_output=True, text=True).stdout.startswith("ventbench ")
@@ -90,6 +110,28 @@ def test_doctor_names_what_is_missing(monkeypatch):
     ended = CliRunner().invoke(cli.app, ["doctor"])
     assert ended.exit_code == 1
     assert "not official: the sandbox lacks seccomp" in " ".join(ended.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("program", "words", "wanted"),
+    [
+        ("ventbench", "score pid_r", "pid_robust"),
+        ("ventbench", "tune pid --lung R5C1", "R5C10"),
+        ("ventbench", "train ppo --lung R20C1", "R20C10"),
+        ("ventbench", "open-loop --plant two", "two_balloon"),
+        ("ventbench-hardware", "run ppo", "ppo"),
+        ("ventbench-hardware", "compare --plant phy", "physics"),
+    ],
+)
+def test_names_are_completed(program, words, wanted):
+    apps = {"ventbench": cli.app, "ventbench-hardware": hardware.app}
+    variables = {
+        f"_{program.replace('-', '_').upper()}_COMPLETE": "complete_bash",
+        "COMP_WORDS": f"{program} {words}",
+        "COMP_CWORD": str(len(words.split())),
+    }
+    ended = CliRunner().invoke(apps[program], prog_name=program, env=variables)
+    assert wanted in ended.stdout.split()
 
 
 def test_completion_is_offered():

@@ -2,6 +2,8 @@
 
 import ast
 import importlib.util
+import inspect
+import json
 import os
 import subprocess
 import sys
@@ -11,11 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ventbench
 from ventbench.controllers.pid import PID
 from ventbench.task.interfaces import Observation
 
 ROOT = Path(__file__).parents[1]
 SCRIPTS = sorted((ROOT / "examples").glob("*.py"))
+NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 
 #: Arguments that make a script short, and what it needs besides ventbench.
 SHORT = {"beat_the_pid": ["3"], "train_ppo_jax": ["2"], "train_stable_baselines3": ["5"]}
@@ -25,7 +29,42 @@ NEEDS = {"train_stable_baselines3": "stable_baselines3"}
 def test_the_readme_lists_every_script():
     listed = (ROOT / "examples" / "README.md").read_text("utf-8")
     assert len(SCRIPTS) >= 4
-    assert not [path.name for path in SCRIPTS if f"[{path.name}]({path.name})" not in listed]
+    assert len(NOTEBOOKS) == 2
+    paths = [*SCRIPTS, *NOTEBOOKS]
+    assert not [path.name for path in paths if f"[{path.name}]({path.name})" not in listed]
+
+
+def as_script(notebook: Path) -> str:
+    """Its code cells in order; what the last line of each gives is shown as a notebook shows it."""
+    found = json.loads(notebook.read_text("utf-8"))
+    assert (found["nbformat"], found["nbformat_minor"]) == (4, 5)
+    parts = ["def show(x):\n    print(getattr(x, '_repr_html_', x.__repr__)())"]
+    for cell in found["cells"]:
+        assert not cell.get("outputs"), "outputs are not kept"
+        if cell["cell_type"] == "code":
+            body = ast.parse("".join(cell["source"])).body
+            if isinstance(body[-1], ast.Expr):
+                shown = ast.Call(ast.Name("show", ast.Load()), [body[-1].value], [])
+                body[-1] = ast.Expr(shown)
+            parts.append(ast.unparse(ast.Module(body, [])))
+    return "\n".join(parts)
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_call_what_there_is(notebook):
+    """Quickly; the whole run is below."""
+    calls = [
+        node for node in ast.walk(ast.parse(as_script(notebook))) if isinstance(node, ast.Call)
+    ]
+    ours = 0
+    for call in calls:
+        name = ast.unparse(call.func)
+        if name.startswith("ventbench."):
+            function = getattr(ventbench, name.removeprefix("ventbench."))
+            keywords = {x.arg: None for x in call.keywords if x.arg}
+            inspect.signature(function).bind(*call.args, **keywords)
+            ours += 1
+    assert ours >= 4
 
 
 def test_the_corrected_pid_without_a_correction_is_the_pid():
@@ -52,13 +91,17 @@ def test_the_corrected_pid_without_a_correction_is_the_pid():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("script", [*SCRIPTS, *NOTEBOOKS], ids=lambda path: path.stem)
 def test_each_runs(script, tmp_path):
     needed = NEEDS.get(script.stem)
     if needed and importlib.util.find_spec(needed) is None:
         pytest.skip(f"needs {needed}, which is no dependency of ventbench")
     for name in ("data", "submissions"):
         (tmp_path / name).symlink_to(ROOT / name)
+    if script.suffix == ".ipynb":
+        written = tmp_path / f"{script.stem}.py"
+        written.write_text(as_script(script), "utf-8")
+        script = written
     ended = subprocess.run(
         [sys.executable, str(script), *SHORT.get(script.stem, [])],
         cwd=tmp_path,

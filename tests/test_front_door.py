@@ -16,6 +16,10 @@ import pytest
 
 import ventbench
 from ventbench.controllers.pid import PID
+from ventbench.entries import scoring
+from ventbench.entries.folder import open_submission
+from ventbench.plants.rigs import load_rigs
+from ventbench.sandbox.configuration import SandboxError
 
 TESTS = Path(__file__)
 ROOT = TESTS.parents[1]
@@ -140,6 +144,25 @@ REFUSED = {
         TypeError,
         "give a whole number",
     ),
+    "no text": (lambda: DOOR.simulate([8.0], lung=3), TypeError, "lung is of type int; give text"),
+    "no names": (
+        lambda: DOOR.rollout(PID(1.0, 5.0), lungs=[1, "R5C10"]),
+        TypeError,
+        "lungs is of type list; give a list, each text or None",
+    ),
+    "no rate": (lambda: DOOR.import_recording("a.csv", rate="5"), TypeError, "a number or None"),
+    "no mapping": (
+        lambda: DOOR.import_recording("a.csv", units={"flow": 3}),
+        TypeError,
+        "units is of type dict; give a mapping to text or None",
+    ),
+    "no mark": (
+        lambda: DOOR.import_recording(DOOR.example("sound"), decimal="comma"),
+        ValueError,
+        "decimal 'comma': give marks",
+    ),
+    "no commands": (lambda: DOOR.simulate({}), TypeError, "controls is of type dict"),
+    "no plan": (lambda: DOOR.isolability([8.0]), TypeError, "a CSV file of them"),
     "no pytree": (lambda: DOOR.rollout(3, simulator="physics"), TypeError, "init and step"),
     "no pip": (
         lambda: DOOR.rollout(PID(1.0, 5.0), simulator="physics", lungs="R20C50", pips=[0]),
@@ -165,6 +188,23 @@ def test_bad_input_is_refused_in_one_line_and_at_the_door(call):
     inside = [Path(entry.path) for entry in caught.traceback]
     assert set(inside) <= {ROOT / "ventbench" / "__init__.py", TESTS}
     assert caught.value._render_traceback_() == [f"{type(caught.value).__name__}: {caught.value}"]
+
+
+def test_a_folder_runs_apart_unless_told_otherwise(monkeypatch):
+    class Refuses:
+        def __init__(self):
+            raise SandboxError("apart")
+
+    monkeypatch.setattr("ventbench.sandbox.runner.SandboxRunner", Refuses)
+    entry, rigs = open_submission("pid_best"), load_rigs("physics")
+    frozen_rigs = load_rigs()
+    for work in (
+        lambda: DOOR.score("pid_best", simulator="physics"),
+        lambda: scoring.run_protocol(entry, rigs),
+        lambda: scoring.transfer(entry, frozen_rigs),
+    ):
+        with pytest.raises(SandboxError, match="apart"):
+            work()
 
 
 def test_a_controller_that_fails_on_one_lung_is_not_safe_there():
@@ -219,8 +259,10 @@ def test_a_wrong_table_says_where():
 def test_names_of_the_package_are_those_of_its_users():
     assert dir(ventbench) == sorted(ventbench.__all__)
     for value in (
-        ventbench.load_simulators("frozen"), ventbench.simulate([8.0] * 20, simulator="physics")
-    ):  # fmt: skip
+        ventbench.load_simulators("frozen"),
+        ventbench.simulate([8.0] * 20, simulator="physics"),
+        ventbench.import_recording(ventbench.example("concealed")),
+    ):
         assert len(repr(value)) < 120
 
 

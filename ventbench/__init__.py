@@ -107,14 +107,19 @@ def __getattr__(name: str) -> Any:
 
 
 def _refusing_at_the_door(name: str, function: FunctionType) -> Any:
-    """Keep frames of the package out of the traceback of bad input, which the message explains."""
-    from ventbench.base.errors import InputError
+    """Check types; keep frames of the package out of the traceback of what the message explains."""
+    import inspect
+
+    from ventbench.base.errors import InputError, check_types
+
+    signature = inspect.signature(function)
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         try:
+            check_types(signature, args, kwargs)
             return function(*args, **kwargs)
-        except InputError as error:
+        except (InputError, OSError) as error:
             raise error.with_traceback(None)  # noqa: B904
 
     # By these, it is found again where it is unpickled.

@@ -1,5 +1,26 @@
-"""``python -m ventbench``: the command line."""
+"""``python -m ventbench``, and the console scripts: the command line behind a guard for Ctrl-C."""
 
-from ventbench.cli import main
+import os
+import signal
+from importlib import import_module
 
-main()
+
+def main(program: str = "ventbench", module: str = "ventbench.cli") -> None:
+    """Import a command line and run it; Ctrl-C ends the import with one line and 130.
+
+    Args:
+        program: what the line begins with.
+        module: whose ``main`` runs the commands.
+    """
+
+    def stop(*_: object) -> None:
+        os.write(2, f"{program}: stopped\n".encode())
+        os._exit(130)
+
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, stop)
+    import_module(module).main()
+
+
+if __name__ == "__main__":
+    main()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ventbench.base.errors import InputError
+from ventbench.base.errors import InputError, InputTypeError
 from ventbench.plants.catalog import Given, load_simulators
 from ventbench.recordings import Breaths, load
 from ventbench.task import protocol
@@ -191,7 +191,11 @@ def simulate_breaths(
 
 
 def _controls(u_in: ArrayLike) -> Controls:
-    values = np.asarray(u_in, float)
+    try:
+        values = np.asarray(u_in, float)
+    except (TypeError, ValueError):
+        wanted = "u_in, %, one number a sample, a CSV file, or ventbench.simulation.Controls"
+        raise InputTypeError("controls", u_in, wanted) from None
     if values.ndim != 1 or not values.size:
         raise InputError(f"u_in has shape {values.shape}; give one command a sample, shape (T,)")
     wrong = ~((values >= 0) & (values <= protocol.U_MAX))

@@ -20,6 +20,7 @@ from ventbench.entries import reference as references
 from ventbench.entries.errors import Failure
 from ventbench.entries.folder import open_submission, resolve
 from ventbench.entries.result import Score
+from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.runs import CellFailure, Runs
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants import frozen
@@ -112,7 +113,11 @@ def scores(
     found = {}
     for name in ("pid_best", "pid_robust"):
         result = run_protocol(
-            open_submission(name), simulators.scored(), drawn=drawn, reference=reference
+            open_submission(name),
+            simulators.scored(),
+            drawn=drawn,
+            reference=reference,
+            runner=InProcessRunner(),
         )
         rigs = dataclasses.replace(result.protocol.rigs, sha256=frozen.load().manifest_sha256)
         protocol = dataclasses.replace(result.protocol, rigs=rigs)

@@ -356,7 +356,9 @@ def test_a_table_of_public_files_is_worse_than_the_pid_in_a_round(entered: Path)
         ("round", rigs.draws(2, pips, seed=seed, name=ROUND)),
     ):
         for entry in (as_submission(LookUp), as_submission("pid_best")):
-            result = run_protocol(entry, rigs, track="performance", drawn=drawn, pips=pips)
+            result = run_protocol(
+                entry, rigs, track="performance", drawn=drawn, pips=pips, runner=InProcessRunner()
+            )
             assert result.failures == ()
             means[name, entry.manifest.name] = result.drawn.mean()
     assert means["development", "lookup"] < means["development", "pid_best"], "control"

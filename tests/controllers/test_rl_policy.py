@@ -20,6 +20,7 @@ from ventbench.controllers.rl_policy import (
     save_weights,
 )
 from ventbench.entries.folder import open_submission
+from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
 from ventbench.plants.single_compartment import single_compartment
@@ -64,7 +65,9 @@ def test_numpy_and_jax_act_alike(name, track, tmp_path):
     with precision.float64():
         plants = stack([single_compartment(lung) for lung in LUNGS])
         rigs = Rigs(LUNGS, plants)
-        found = run_protocol(open_submission(str(folder)), rigs, track=track, draws=1)
+        found = run_protocol(
+            open_submission(str(folder)), rigs, track=track, draws=1, runner=InProcessRunner()
+        )
         _, every = rigs.cells(rigs.draws(1), PIPS)
         for i, lung in enumerate(LUNG_IDS):
             policy = made[lung if track == "performance" else "all"]

@@ -51,7 +51,9 @@ def pure_errors(plants, cells, gains):
 
 @pytest.fixture(scope="module")
 def best(plants):
-    return run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), draws=20)
+    return run_protocol(
+        open_submission("pid_best"), Rigs(LUNGS, plants), draws=20, runner=InProcessRunner()
+    )
 
 
 def test_nominal_is_that_of_the_pure_pid(plants, best):
@@ -70,7 +72,12 @@ def test_draws_are_those_of_the_pure_pid(plants, best):
 
 def test_robust_pid(plants):
     for track in ("robustness", "performance"):
-        found = run_protocol(open_submission("pid_robust"), Rigs(LUNGS, plants), track=track)
+        found = run_protocol(
+            open_submission("pid_robust"),
+            Rigs(LUNGS, plants),
+            track=track,
+            runner=InProcessRunner(),
+        )
         with precision.float64():
             cells = environment.nominal_scenario(np.array(protocol.PIPS))
         expected = pure_errors(plants, cells, [(10.0, 2.0, 9.0)] * 6)
@@ -115,7 +122,9 @@ def test_secondary_figures_are_those_of_the_lung(best, plants):
 
 
 def test_deterministic(best, plants):
-    again = run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), draws=20)
+    again = run_protocol(
+        open_submission("pid_best"), Rigs(LUNGS, plants), draws=20, runner=InProcessRunner()
+    )
     first, second = best.to_json(), again.to_json()
     assert set(first.pop("timing")) == set(second.pop("timing"))
     assert first == second
@@ -149,7 +158,9 @@ def test_parts(best, plants):
     drawn = Rigs(LUNGS, plants).draws(2, (35.0, 10.0))
     own = dataclasses.replace(drawn, cells=jax.tree.map(lambda x: x[[5, 0]], drawn.cells))
     own = dataclasses.replace(own, rig=drawn.rig[[5, 0]], member=drawn.member[[5, 0]])
-    found = run_protocol(open_submission("pid_best"), rigs, drawn=own, pips=[35.0, 10.0])
+    found = run_protocol(
+        open_submission("pid_best"), rigs, drawn=own, pips=[35.0, 10.0], runner=InProcessRunner()
+    )
     np.testing.assert_allclose(found.nominal, best.nominal[[5, 0]][:, [5, 0]], atol=1e-12)
     np.testing.assert_allclose(found.drawn, best.drawn[:2, [5, 0]][:, :, [5, 0]], atol=1e-12)
     result = found.to_json()
@@ -159,7 +170,9 @@ def test_parts(best, plants):
 
 
 def test_without_draws(plants):
-    result = run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants)).to_json()
+    result = run_protocol(
+        open_submission("pid_best"), Rigs(LUNGS, plants), runner=InProcessRunner()
+    ).to_json()
     assert result["draws"] is None
     assert result["lungs"]["R5C10"]["draws"] is None
 
@@ -168,8 +181,12 @@ def test_compiles_once(plants):
     compiled: list[Any] = [stepping._inspire, stepping._observe]
     for function in compiled:
         function.clear_cache()
-    run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), draws=1)
-    run_protocol(open_submission("pid_robust"), Rigs(LUNGS, plants), draws=1)
+    run_protocol(
+        open_submission("pid_best"), Rigs(LUNGS, plants), draws=1, runner=InProcessRunner()
+    )
+    run_protocol(
+        open_submission("pid_robust"), Rigs(LUNGS, plants), draws=1, runner=InProcessRunner()
+    )
     assert [function._cache_size() for function in compiled] == [1, 1]
 
 
@@ -189,7 +206,13 @@ def test_what_a_submission_is_told(make, plants, track, known):
                 return 2.0 * len(self.seen) - 20.0
         """
     folder = make(source)
-    run_protocol(open_submission(str(folder)), Rigs(LUNGS, plants), track=track, draws=1)
+    run_protocol(
+        open_submission(str(folder)),
+        Rigs(LUNGS, plants),
+        track=track,
+        draws=1,
+        runner=InProcessRunner(),
+    )
     runs = [json.loads(line) for line in (folder.parent / "log").read_text().splitlines()]
     assert len(runs) == 6 * 2 * 6
     for index, (task, seen) in enumerate(runs):
@@ -218,7 +241,11 @@ def test_failed_cells(make, plants):
         return 3.0
         """
     found = run_protocol(
-        open_submission(str(make(act=act))), Rigs(LUNGS, plants), track="performance", draws=1
+        open_submission(str(make(act=act))),
+        Rigs(LUNGS, plants),
+        track="performance",
+        draws=1,
+        runner=InProcessRunner(),
     )
     result = found.to_json()
     assert result["score"] is None
@@ -242,7 +269,7 @@ def test_failed_cells(make, plants):
 def test_failure_in_a_draw(make, plants):
     act = "return 3.0 if observation.target in (10, 15, 20, 25, 30, 35) else None"
     result = run_protocol(
-        open_submission(str(make(act=act))), Rigs(LUNGS, plants), draws=2
+        open_submission(str(make(act=act))), Rigs(LUNGS, plants), draws=2, runner=InProcessRunner()
     ).to_json()
     assert result["score"] is None
     assert result["draws"]["score"] is None
@@ -255,7 +282,9 @@ def test_failure_in_a_draw(make, plants):
 
 def test_all_cells_fail_before_the_first_step(make, plants):
     source = "class Controller:\n def reset(self): pass\n def act(self, o): return 0.0\n"
-    result = run_protocol(open_submission(str(make(source))), Rigs(LUNGS, plants)).to_json()
+    result = run_protocol(
+        open_submission(str(make(source))), Rigs(LUNGS, plants), runner=InProcessRunner()
+    ).to_json()
     assert len(result["failures"]) == 36
     assert "raised TypeError in reset (lung hidden)" in result["failures"][0]["message"]
 
@@ -263,7 +292,10 @@ def test_all_cells_fail_before_the_first_step(make, plants):
 def test_unsafe_lung(make, plants):
     act = "return 100.0 if self.task.lung == 'R5C10' else 0.0"
     found = run_protocol(
-        open_submission(str(make(act=act))), Rigs(LUNGS, plants), track="performance"
+        open_submission(str(make(act=act))),
+        Rigs(LUNGS, plants),
+        track="performance",
+        runner=InProcessRunner(),
     )
     np.testing.assert_array_equal(found.safe, [False] + [True] * 5)
     result = found.to_json()
@@ -273,7 +305,9 @@ def test_unsafe_lung(make, plants):
 
 def test_clipping(make, plants):
     act = "return -1.0 if observation.time == 0 else 101.0 if observation.time > 0.95 else 1.0"
-    result = run_protocol(open_submission(str(make(act=act))), Rigs(LUNGS, plants)).to_json()
+    result = run_protocol(
+        open_submission(str(make(act=act))), Rigs(LUNGS, plants), runner=InProcessRunner()
+    ).to_json()
     assert result["lungs"]["R5C10"]["clipped"] == {
         "below": 18, "above": 36, "commands": 612, "share": 54 / 612,
     }  # fmt: skip
@@ -282,23 +316,30 @@ def test_clipping(make, plants):
 
 def test_wrong_track(plants):
     with pytest.raises(SubmissionError, match="enters performance; it cannot be scored for robus"):
-        run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), track="robustness")
+        run_protocol(
+            open_submission("pid_best"),
+            Rigs(LUNGS, plants),
+            track="robustness",
+            runner=InProcessRunner(),
+        )
 
 
 def test_too_many_draws(plants):
     with pytest.raises(InputError, match="20 development draws"):
-        run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), draws=21)
+        run_protocol(
+            open_submission("pid_best"), Rigs(LUNGS, plants), draws=21, runner=InProcessRunner()
+        )
 
 
 def test_plants_of_other_lungs(plants):
     with pytest.raises(ValueError, match="not stacked over 2 lungs"):
-        run_protocol(open_submission("pid_best"), Rigs(LUNGS[:2], plants))
+        run_protocol(open_submission("pid_best"), Rigs(LUNGS[:2], plants), runner=InProcessRunner())
 
 
 def test_broken_simulator_is_no_score(plants):
     broken = dataclasses.replace(plants, C=np.array([10.0, 20.0, np.nan, 10.0, 20.0, 50.0]))
     with pytest.raises(FloatingPointError, match="simulator 2 answered with NaN"):
-        run_protocol(open_submission("pid_best"), Rigs(LUNGS, broken))
+        run_protocol(open_submission("pid_best"), Rigs(LUNGS, broken), runner=InProcessRunner())
 
 
 def test_code_that_cannot_be_imported(make, plants):
@@ -379,13 +420,18 @@ def test_jax_in_a_submission_is_as_elsewhere(make, plants):
         return jnp.asarray(observation.pressure)
         """
     part = jax.tree.map(lambda leaf: leaf[:1], plants)
-    found = run_protocol(open_submission(str(make(act=act))), Rigs(LUNGS[:1], part), pips=[10.0])
+    found = run_protocol(
+        open_submission(str(make(act=act))),
+        Rigs(LUNGS[:1], part),
+        pips=[10.0],
+        runner=InProcessRunner(),
+    )
     assert found.failures == ()
 
 
 def test_nothing_is_left_on_the_search_path(plants):
     before = list(sys.path)
-    run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants))
+    run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), runner=InProcessRunner())
     assert sys.path == before
 
 

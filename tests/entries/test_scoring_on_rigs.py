@@ -10,6 +10,7 @@ import pytest
 from ventbench.base import precision
 from ventbench.controllers.pid import PID
 from ventbench.entries.folder import open_submission, submission_of
+from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants import frozen
 from ventbench.plants.rigs import load_rigs, rigs_of
@@ -31,7 +32,9 @@ def rigs():
 
 @pytest.fixture(scope="module")
 def result(rigs):
-    return run_protocol(open_submission("pid_robust"), rigs, draws=4, pips=PIPS)
+    return run_protocol(
+        open_submission("pid_robust"), rigs, draws=4, pips=PIPS, runner=InProcessRunner()
+    )
 
 
 def compiled(rigs, draws):
@@ -73,7 +76,9 @@ def test_draws_run_on_the_rigs_that_they_name(rigs, result):
     # The second rig of a lung is another plant: the same deviations on the first give other errors.
     first = np.zeros_like(drawn.rig) + np.array([own[0] for own in rigs.sessions])[:, None]
     forced = dataclasses.replace(drawn, rig=first, member=np.zeros_like(drawn.member))
-    again = run_protocol(open_submission("pid_robust"), rigs, drawn=forced, pips=PIPS)
+    again = run_protocol(
+        open_submission("pid_robust"), rigs, drawn=forced, pips=PIPS, runner=InProcessRunner()
+    )
     changed = np.any(again.drawn != result.drawn, axis=2).T
     elsewhere = (drawn.rig != forced.rig) | (drawn.member > 0)
     np.testing.assert_array_equal(changed, elsewhere)
@@ -104,6 +109,8 @@ def test_simulators_with_one_rig_can_be_scored():
 @pytest.mark.slow
 def test_the_frozen_rigs_can_be_scored():
     official = rigs_of(frozen.load())
-    result = run_protocol(open_submission("pid_robust"), official, draws=2, pips=PIPS)
+    result = run_protocol(
+        open_submission("pid_robust"), official, draws=2, pips=PIPS, runner=InProcessRunner()
+    )
     errors, _ = compiled(official, 2)
     np.testing.assert_allclose(result.drawn, np.moveaxis(errors[:, 1:], 1, 0), atol=1e-9)

@@ -22,6 +22,7 @@ from ventbench.entries.cells import Cells, protocol_of
 from ventbench.entries.errors import SubmissionError
 from ventbench.entries.folder import open_submission, submission_of
 from ventbench.entries.result import Score
+from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.runs import Runs
 from ventbench.entries.scoring import run_protocol, runs_of
 from ventbench.entries.stepping import ProtocolRun
@@ -271,7 +272,7 @@ def test_the_chart_has_every_condition(score: Score, tmp_path: Path) -> None:
 
 def test_an_entry_that_must_be_told_its_lung_is_refused() -> None:
     with pytest.raises(SubmissionError, match="does not tell the lung"):
-        run_protocol(open_submission("pid_best"), load_rigs(), stress=1)
+        run_protocol(open_submission("pid_best"), load_rigs(), stress=1, runner=InProcessRunner())
 
 
 @pytest.mark.slow

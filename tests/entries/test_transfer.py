@@ -8,6 +8,7 @@ import pytest
 
 from ventbench.base.errors import InputError
 from ventbench.entries.folder import open_submission
+from ventbench.entries.runner import InProcessRunner
 from ventbench.entries.scoring import GROUPS, by_group, run_protocol, transfer
 from ventbench.plants.rigs import load_rigs
 
@@ -23,7 +24,7 @@ def rigs():
 
 @pytest.fixture(scope="module")
 def result(rigs):
-    return by_group(transfer(open_submission("pid_robust"), rigs), rigs)
+    return by_group(transfer(open_submission("pid_robust"), rigs, runner=InProcessRunner()), rigs)
 
 
 def errors(result, group):
@@ -31,7 +32,7 @@ def errors(result, group):
 
 
 def test_reference_rig_is_the_nominal_score(rigs, result):
-    score = run_protocol(open_submission("pid_robust"), rigs)
+    score = run_protocol(open_submission("pid_robust"), rigs, runner=InProcessRunner())
     np.testing.assert_allclose(errors(result, "reference rig"), score.nominal.mean(axis=1))
     assert result["reference rig"]["error_cmH2O"] == pytest.approx(score.score)
 
@@ -54,4 +55,4 @@ def test_json_has_null_where_there_is_no_plant(result):
 
 def test_simulators_with_one_rig_have_nothing_to_transfer_to():
     with pytest.raises(InputError, match="one rig a lung"):
-        transfer(open_submission("pid_robust"), load_rigs("physics"))
+        transfer(open_submission("pid_robust"), load_rigs("physics"), runner=InProcessRunner())

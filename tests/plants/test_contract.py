@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike
 from ventbench.base.precision import float64
 from ventbench.entries import scoring
 from ventbench.entries.folder import open_submission
+from ventbench.entries.runner import InProcessRunner
 from ventbench.physics import physics
 from ventbench.plants import frozen
 from ventbench.plants.catalog import load_simulators
@@ -345,5 +346,7 @@ def test_a_new_family_is_one_file_and_one_line(make_recording, tmp_path, monkeyp
         again = load_simulators(tmp_path / name).pressures(recording)
         np.testing.assert_array_equal(again, answers)
     rigs = Rigs(simulators.lungs, simulators.stacked)
-    score = scoring.run_protocol(open_submission("pid_best"), rigs, pips=(10.0,))
+    score = scoring.run_protocol(
+        open_submission("pid_best"), rigs, pips=(10.0,), runner=InProcessRunner()
+    )
     assert np.isfinite(score.score)

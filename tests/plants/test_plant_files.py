@@ -15,6 +15,7 @@ from ventbench.base import files as whole_files
 from ventbench.base import precision
 from ventbench.base.errors import InputError
 from ventbench.cli import app
+from ventbench.entries.runner import InProcessRunner
 from ventbench.physics import physics
 from ventbench.plants import frozen, plant_files
 from ventbench.plants.corrected import Corrected
@@ -205,6 +206,7 @@ def test_score_on_the_plants_of_a_file(tmp_path: Path) -> None:
     wanted = run_protocol(
         open_submission("pid_best"),
         Rigs(tuple(map(lung, plants)), stack_heterogeneous(list(plants.values()))),
+        runner=InProcessRunner(),
     )
     assert plain["score"] == pytest.approx(wanted.score, abs=1e-12)
     code, text = run(*options)

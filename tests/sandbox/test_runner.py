@@ -45,7 +45,9 @@ def test_scores_are_those_of_the_plain_process():
         submission = open_submission(name)
         runner = SandboxRunner(allowance=PATIENT)
         apart = run_protocol(submission, Rigs(LUNGS, plants), draws=1, pips=(20.0,), runner=runner)
-        plain = run_protocol(submission, Rigs(LUNGS, plants), draws=1, pips=(20.0,))
+        plain = run_protocol(
+            submission, Rigs(LUNGS, plants), draws=1, pips=(20.0,), runner=InProcessRunner()
+        )
         assert not apart.failures
         np.testing.assert_array_equal(apart.nominal, plain.nominal)
         np.testing.assert_array_equal(apart.drawn, plain.drawn)

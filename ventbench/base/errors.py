@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import os
+import re
+from collections.abc import Mapping
+from inspect import Signature
+from numbers import Integral, Real
+from typing import Any
 
 
 class InputError(ValueError):
@@ -27,6 +33,62 @@ class InputTypeError(InputError, TypeError):
 
     def __init__(self, what: str, given: object, wanted: str):
         super().__init__(f"{what} is of type {type(given).__name__}; give {wanted}")
+
+
+#: What values of an annotation are, in words.
+_WORDS = {
+    "None": "None", "str": "text", "Path": "a path", "bool": "True or False",
+    "int": "a whole number", "float": "a number",
+}  # fmt: skip
+_MANY = re.compile(r"(Sequence|Iterable|Mapping)\[(?:str, )?(\w+)\]")
+
+
+def check_types(signature: Signature, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
+    """Check arguments whose annotation is of plain types: text, paths, numbers, many of these.
+
+    Args:
+        signature: of the function, its annotations as text.
+        args: by position.
+        kwargs: by name.
+
+    Raises:
+        InputTypeError: if one is of another type.
+        TypeError: if the function takes no such arguments.
+    """
+    for name, value in signature.bind(*args, **kwargs).arguments.items():
+        parts = re.split(r" \| (?![^\[]*\])", str(signature.parameters[name].annotation))
+        if any(_is(value, part) is not False for part in parts):
+            continue
+        words = []
+        for part in parts:
+            many = _MANY.fullmatch(part)
+            kind = "a mapping to" if many and many[1] == "Mapping" else "a list, each"
+            words.append(f"{kind} {_WORDS[many[2]]}" if many else _WORDS[part])
+        raise InputTypeError(name, value, " or ".join(words))
+
+
+def _is(value: Any, part: str) -> bool | None:
+    """Whether a value is of a type; None where the type is not plain."""
+    many = _MANY.fullmatch(part)
+    if many and many[2] in _WORDS:
+        if many[1] == "Mapping":
+            return isinstance(value, Mapping) and all(_is(x, many[2]) for x in value.values())
+        if not hasattr(value, "__len__"):
+            return hasattr(value, "__iter__")  # read once only: not here
+        one_text = isinstance(value, str) and many[2] == "str"
+        return one_text or (
+            not isinstance(value, Mapping | str) and all(_is(x, many[2]) for x in value)
+        )
+    truth = type(value).__name__ in ("bool", "bool_")  # also numpy's, which is imported elsewhere
+    kinds = {
+        "None": value is None,
+        "str": isinstance(value, str),
+        "Path": isinstance(value, os.PathLike),
+        "bool": truth,
+        "int": isinstance(value, Integral) and not truth,
+        "float": isinstance(value, Real) and not truth,
+    }
+    return kinds.get(part)
 
 
 def require(*modules: str, extra: str = "view", what: str = "pictures") -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ventbench.cli.options import JsonFile, Scheduler, bars, counted, emit, notes
+from ventbench.cli.options import JsonFile, Scheduler, bars, counted, emit, known_lungs, notes
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -264,7 +264,11 @@ def show(
     folder: Folder = FOLDER,
     lung: Annotated[
         str | None,
-        typer.Option(metavar="LUNG", help="Show the cells of one lung by PIP, or `all` lungs."),
+        typer.Option(
+            metavar="LUNG",
+            help="Show the cells of one lung by PIP, or `all` lungs.",
+            autocompletion=known_lungs,
+        ),
     ] = None,
     json: JsonFile = None,
 ) -> None:

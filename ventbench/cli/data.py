@@ -7,7 +7,17 @@ from typing import Annotated
 
 import typer
 
-from ventbench.cli.options import Clip, JsonFile, Pad, PlantName, bars, counted, emit, waiting
+from ventbench.cli.options import (
+    Clip,
+    JsonFile,
+    Pad,
+    PlantName,
+    bars,
+    counted,
+    emit,
+    known_lungs,
+    waiting,
+)
 
 #: Breaths that are explored side by side.
 _TOGETHER = 60
@@ -190,7 +200,9 @@ def _offsets(given: list[str] | None) -> dict[str, float]:
 @app.command()
 def explore(
     out: Annotated[Path, typer.Argument(help="CSV, CSV.GZ or Parquet file to write.")],
-    lung: Annotated[str, typer.Option(help="Lung setting, such as R20C50.")] = "R20C50",
+    lung: Annotated[
+        str, typer.Option(help="Lung setting, such as R20C50.", autocompletion=known_lungs)
+    ] = "R20C50",
     plant: PlantName = "frozen",
     breaths: Annotated[
         int, typer.Option(min=1, help="Number of breaths; the PIPs alternate.")

@@ -17,6 +17,7 @@ from ventbench.cli.options import (
     claim_out,
     counted,
     emit,
+    known_lungs,
     notes,
 )
 from ventbench.cli.options import bars as progress_bars
@@ -201,7 +202,10 @@ def diagnose(
         ),
     ] = "auto",
     lung: Annotated[
-        str | None, typer.Option(metavar="R20C50", help="Only the breaths of this lung.")
+        str | None,
+        typer.Option(
+            metavar="R20C50", help="Only the breaths of this lung.", autocompletion=known_lungs
+        ),
     ] = None,
     patient: Annotated[
         bool,
@@ -335,7 +339,9 @@ def isolability(
             metavar="FILE", help="CSV file of planned breaths: u_in, u_out, time_step, breath_id."
         ),
     ],
-    lung: Annotated[str, typer.Option(metavar="R20C50", help="Label of the lung.")] = "R20C50",
+    lung: Annotated[
+        str, typer.Option(metavar="R20C50", help="Its label.", autocompletion=known_lungs)
+    ] = "R20C50",
     sensors: Annotated[
         str, typer.Option(metavar="pressure,flow", help="What is measured.")
     ] = "pressure",

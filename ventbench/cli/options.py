@@ -91,6 +91,10 @@ Clip = Annotated[
     bool, typer.Option("--clip", help="Clip u_in to 0..100 % instead of refusing the file.")
 ]
 Pad = Annotated[bool, typer.Option("--pad", help="Accept breaths of unequal length.")]
+InProcess = Annotated[
+    bool,
+    typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
+]
 PlantName = Annotated[
     str,
     typer.Option(
@@ -276,7 +280,7 @@ def run(app: Callable[[], object], program: str, *, stopped: str = "") -> None:
         stopped: what is true after Ctrl-C, besides what a command keeps.
     """
     sys.unraisablehook = _interrupt_again
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, _interrupt)
     try:
         app()
@@ -288,6 +292,8 @@ def run(app: Callable[[], object], program: str, *, stopped: str = "") -> None:
         lines = [plain(line) for line in text.split("\n")]
         print(f"{program}:", "\n".join(lines), file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:  # before typer takes it, or behind it
+        _stop(program, stopped)
     except SystemExit as end:
         if end.code == INTERRUPTED:
             _stop(program, stopped)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ventbench.cli.options import (
+    InProcess,
     JsonFile,
     PlantName,
     Scheduler,
@@ -91,10 +92,7 @@ def score(
             "controller is not told of; default: 6 with --draws 20, else 0.",
         ),
     ] = None,
-    in_process: Annotated[
-        bool,
-        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
-    ] = False,
+    in_process: InProcess = False,
     workers: Workers = 0,
     scheduler: Scheduler = None,
     json: JsonFile = None,
@@ -387,10 +385,7 @@ def transfer(
         Literal["performance", "robustness"] | None,
         typer.Option(help="Track to score; default: the first of the submission."),
     ] = None,
-    in_process: Annotated[
-        bool,
-        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
-    ] = False,
+    in_process: InProcess = False,
     json: JsonFile = None,
 ) -> None:
     """Score controllers on every rig and every member of the ensemble, without noise.
@@ -405,19 +400,15 @@ def transfer(
 
     from ventbench.entries import scoring as transfers
     from ventbench.entries.folder import open_submission
-    from ventbench.entries.runner import CountingRunner, InProcessRunner, Runner
+    from ventbench.entries.runner import CountingRunner, runner_of
     from ventbench.plants.rigs import load_rigs
 
-    runner: Runner = InProcessRunner()
-    if not in_process:
-        from ventbench.sandbox.runner import SandboxRunner
-
-        runner = SandboxRunner()
     opened = [open_submission(name) for name in names]
     rigs, results = load_rigs(), []
     for entry in opened:
         chosen = track or entry.manifest.tracks[0]
         with bars() as shown:
+            runner = runner_of(entry, sandbox=not in_process)
             counting = CountingRunner(runner, counted(shown, f"running {entry.label}"))
             runs = transfers.transfer(entry, rigs, track=chosen, runner=counting)
         groups = transfers.by_group(runs, rigs)
@@ -452,14 +443,24 @@ def new(
     folder: Annotated[
         Path, typer.Option("--dir", metavar="DIR", help="Folder in which NAME/ is written.")
     ] = Path("."),
+    network: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Safetensors file of a trained network, see above."),
+    ] = None,
 ) -> None:
     """Write a submission that can be scored at once; change it into your own.
+
+    --network copies dense layers that were trained on observations of ventbench/Ventilator-v1, one
+    or several, the newest last: the state of a policy of PyTorch, Stable-Baselines3 or flax, with
+    some inputs as check.input and the actions that it gives for them as check.output, such as
+    `save_file({**net.state_dict(), "check.input": x, "check.output": net(x)}, FILE)`. What stands
+    between the layers is found out; a copy that is off by more than 1e-6 is refused.
 
     Example: `ventbench new demo && ventbench check demo && ventbench score demo`
     """
     from ventbench.entries import scaffold
 
-    path = scaffold.create(name, family, folder)
+    path = scaffold.create(name, family, folder, network)
     typer.echo(f"wrote {path}: " + ", ".join(sorted(entry.name for entry in path.iterdir())))
     typer.echo(f"next: ventbench check {path} && ventbench score {path}")
 
@@ -471,10 +472,7 @@ def check(
             help="Folder or name of a bundled submission.", autocompletion=known_entries
         ),
     ],
-    in_process: Annotated[
-        bool,
-        typer.Option("--in-process", help="Run without the sandbox; only for code that you trust."),
-    ] = False,
+    in_process: InProcess = False,
     json: JsonFile = None,
 ) -> None:
     """Report every problem that keeps a submission from the leaderboard.

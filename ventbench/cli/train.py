@@ -14,6 +14,7 @@ from ventbench.cli.options import (
     bars,
     claim_out,
     emit,
+    known_lungs,
     recordings_folder,
 )
 
@@ -21,7 +22,11 @@ train = typer.Typer(name="train", help="Train simulators and controllers.", no_a
 
 Lung = Annotated[
     str | None,
-    typer.Option(metavar="ID", help="Train only the network for this lung, such as R20C50."),
+    typer.Option(
+        metavar="ID",
+        help="Train only the network for this lung, such as R20C50.",
+        autocompletion=known_lungs,
+    ),
 ]
 All = Annotated[
     bool,
@@ -117,16 +122,8 @@ def population(
 
 @train.command()
 def residual(
-    lung: Annotated[
-        str | None,
-        typer.Option(metavar="ID", help="Train only the network for this lung, such as R20C50."),
-    ] = None,
-    every: Annotated[
-        bool,
-        typer.Option(
-            "--all", help="Train only one network for all six lungs, which is not told the lung."
-        ),
-    ] = False,
+    lung: Lung = None,
+    every: All = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of weights and deviations.")] = 0,
     updates: Annotated[
         int | None, typer.Option(min=1, help="Updates of each network; default: 3000.")

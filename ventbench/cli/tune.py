@@ -17,6 +17,7 @@ from ventbench.cli.options import (
     claim_out,
     counted,
     emit,
+    known_lungs,
 )
 
 #: Cells of the second optimiser: every so many of all.
@@ -126,7 +127,10 @@ def _group() -> None:
 @app.command()
 def pid(
     lung: Annotated[
-        str | None, typer.Option(metavar="LUNG", help="Only this lung, such as R20C50.")
+        str | None,
+        typer.Option(
+            metavar="LUNG", help="Only this lung, such as R20C50.", autocompletion=known_lungs
+        ),
     ] = None,
     every: Annotated[
         bool,

@@ -19,7 +19,6 @@ import numpy as np
 from jax import Array
 
 from ventbench.base import files
-from ventbench.base.errors import InputError
 from ventbench.controllers.pid import PID, PIDState
 from ventbench.task import protocol, waveform
 from ventbench.task.interfaces import Observation
@@ -236,37 +235,3 @@ def save_weights(path: Path, controllers: Mapping[str, Residual]) -> None:
             arrays[f"{name}.w{k}"] = np.asarray(weights, np.float32)
             arrays[f"{name}.b{k}"] = np.asarray(biases, np.float32)
     files.write_atomically(path, lambda file: np.savez(file, **arrays))
-
-
-def load_weights(path: Path) -> dict[str, Residual]:
-    """Read what :func:`save_weights` wrote, with leaves of the precision that is in force.
-
-    Raises:
-        InputError: if it is not such a file.
-        OSError: if it cannot be read.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            names = [key.removesuffix(".gains") for key in arrays.files if key.endswith(".gains")]
-            return {name: _read_network(arrays, name) for name in names}
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} holds no residual controllers: {error!r}") from error
-
-
-def _read_network(arrays: Any, name: str) -> Residual:
-    count = sum(key.startswith(f"{name}.w") for key in arrays.files) - 1  # without `windows`
-    dtype = jnp.zeros(()).dtype
-    layers = tuple(
-        (jnp.asarray(arrays[f"{name}.w{k}"], dtype), jnp.asarray(arrays[f"{name}.b{k}"], dtype))
-        for k in range(count)
-    )
-    P, I, D = arrays[f"{name}.gains"]  # noqa: E741
-    pressures, commands, ahead = (int(size) for size in arrays[f"{name}.windows"])
-    return Residual(
-        PID(P, I, D),
-        layers,
-        pressures=pressures,
-        commands=commands,
-        ahead=ahead,
-        limit=float(arrays[f"{name}.limit"]),
-    )

@@ -19,11 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from ventbench.base.errors import InputError
+from ventbench.base.errors import InputError, InputTypeError
 from ventbench.diagnosis.candidate_breaths import Rig, families
 from ventbench.diagnosis.settings import DEFAULT
 from ventbench.physics.catalogue import library, mechanism, parameter, paths, strength_path
 from ventbench.physics.parameters import REFITTED
+from ventbench.recordings.breaths import Breaths
 from ventbench.simulation import Controls, read_controls
 from ventbench.system_id import START, Data, Noise, Predictor, parameter_values
 from ventbench.system_id.data import Floats
@@ -81,6 +82,13 @@ class Isolability:
     unseen: tuple[Pair, ...]
     groups: tuple[tuple[str, ...], ...]
 
+    def __repr__(self) -> str:
+        """Lung, sensors and groups."""
+        groups = "; ".join(" ~ ".join(names) for names in self.groups if len(names) > 1) or "none"
+        return (
+            f"<Isolability of {self.lung}, {' and '.join(self.sensors)}: not told apart {groups}>"
+        )
+
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""
         pairs = [{"names": list(names), "nats": value} for names, value in self.nats.items()]
@@ -88,7 +96,7 @@ class Isolability:
 
 
 def isolability(
-    controls: Controls | Sequence[Controls] | Path | str,
+    controls: Controls | Sequence[Controls] | Breaths | Path | str,
     *,
     lung: str = "R20C50",
     sensors: Sequence[str] = ("pressure",),
@@ -99,8 +107,8 @@ def isolability(
     """Tell which mechanisms planned breaths can tell apart.
 
     Args:
-        controls: planned breaths: one, several, or a CSV file of them (``u_in``, and perhaps
-            ``u_out``, ``time_step`` and ``breath_id``).
+        controls: planned breaths: one, several, those of a recording, or a CSV file of them
+            (``u_in``, and perhaps ``u_out``, ``time_step`` and ``breath_id``).
         lung: label of the lung.
         sensors: ``"pressure"``, ``"flow"`` or both.
         noise: standard deviations, cmH2O and mL/s, by sensor; 0.25 and 20 if not given.
@@ -121,7 +129,15 @@ def isolability(
     for name in chosen:
         mechanism(name)  # says what there is if the name is wrong
     planned = read_plan(controls) if isinstance(controls, str | Path) else controls
-    planned = [planned] if isinstance(planned, Controls) else list(planned)
+    if isinstance(planned, Breaths):
+        rows = zip(planned.time, planned.u_in, planned.u_out, planned.valid, strict=True)
+        planned = [Controls(t[own], u[own], np.asarray(out[own], float)) for t, u, out, own in rows]
+    planned = [planned] if isinstance(planned, Controls) else planned
+    if not isinstance(planned, list | tuple) or not all(isinstance(x, Controls) for x in planned):
+        wanted = "breaths, a CSV file of them, or ventbench.simulation.Controls"
+        raise InputTypeError("controls", controls, wanted)
+    if not planned:
+        raise InputError("no breath is planned: controls is empty")
     label = parse_lung(lung)
     dt = float(np.median(np.concatenate([breath.dt for breath in planned])))
     rig = Rig(label.R, label.C, float(parameter("gain").neutral), protocol.PEEP)

@@ -1,4 +1,9 @@
-"""``ventbench new``: a submission that scores at once, to be changed into one's own."""
+"""``ventbench new``: a submission that scores at once, to be changed into one's own.
+
+A network that another library trained becomes one as it is: its dense layers are found in a
+safetensors file by name and shape, and the copy in numpy must give the actions that the library
+itself gave for some inputs, which lie in the file as ``check.input`` and ``check.output``.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +15,15 @@ import shutil
 import tempfile
 import unicodedata
 from importlib import resources
+from itertools import product
 from pathlib import Path
 from string import Template
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ventbench.base.errors import InputError
+from ventbench.base.errors import InputError, require
 from ventbench.entries.folder import CONTROLLER, bundled
 from ventbench.entries.manifest import AUTHOR, FAMILIES, MANIFEST, NAME, NAME_RULE
 from ventbench.task.interfaces import API_VERSION
@@ -36,36 +43,86 @@ _EXPORT = """
 ## Your own weights
 
 `network.py` reads `weights.npz`: arrays `w0`, `b0`, `w1`, `b1`, ... of dense layers with ReLU
-between them, where layer k does `x @ wk + bk`. From a trained flax model, for instance:
-
-```python
-layers = [params["Dense_0"], params["Dense_1"], params["Dense_2"]]
-arrays = {f"{n}{k}": layer[key] for k, layer in enumerate(layers)
-          for n, key in (("w", "kernel"), ("b", "bias"))}
-numpy.savez("weights.npz", **{name: numpy.asarray(a, "float32") for name, a in arrays.items()})
-```
-
-PyTorch's `Linear.weight` is the transpose: save `layer.weight.detach().numpy().T`. Train with the
-inputs that `Features` makes, or change `Features`; the number of layers and units is free.
+between them, where layer k does `x @ wk + bk` (`Dense` of flax; the transpose of PyTorch's
+`Linear`). Train with the inputs that `Features` makes, or change `Features`; the number of layers
+and units is free. `ventbench new NAME --network FILE` copies a network that was trained on the
+Gymnasium environment.
 """
+
+_EXPORTED = """
+## The network
+
+`weights.npz` and `network.py` give the {count} actions of `{file}` to {off:.0e}.
+"""
+
+#: What may stand between layers, and behind the last one, as numpy says it.
+ACTIVATIONS = {
+    "tanh": "np.tanh(x)",
+    "relu": "np.maximum(x, 0.0)",
+    "elu": "np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0)))",
+    "leaky relu": "np.maximum(x, 0.01 * x)",
+    "silu": "x / (1.0 + np.exp(-x))",
+    "sigmoid": "1.0 / (1.0 + np.exp(-x))",
+}
+OUTPUTS = {"nothing": "x", "tanh": "np.tanh(x)", "clip": "np.clip(x, -1.0, 1.0)"}
+
+#: Numbers of an observation of ``ventbench/Ventilator-v1``; largest deviation of the copy.
+_OBSERVED, _TOLERANCE = 15, 1e-6
+
+_LAYER = re.compile(r"(.*?)\.?(weight|kernel)")
+_NO_ACTOR = re.compile(r"(^|[._])(value|critic|vf|qf|q_net|target|log_std)")
+
+_GYMNASIUM = '''"""What the network is shown, and the network: a few dense layers in numpy."""
+
+from pathlib import Path
+
+import numpy as np
+
+
+class Features:
+    """Observations as of ventbench/Ventilator-v1, the newest last; zeros before the first."""
+
+    def __init__(self):
+        """Begin a run."""
+        self.seen = np.zeros(({frames}, 15))
+
+    def __call__(self, observation):
+        """Return the inputs: pressures in 40 cmH2O, the command in -1..1, time, control step."""
+        now = [
+            observation.pressure / 40,
+            observation.target / 40,
+            *(target / 40 for target in observation.targets_ahead),
+            observation.previous_u_in / 50 - 1,
+            observation.time,
+            observation.dt / 0.03,
+        ]
+        self.seen = np.vstack([self.seen[1:], now])
+        return self.seen.ravel()
+
+
+'''
 
 # Units of each hidden layer; inputs as in templates/network.py; the PI that ppo and dqn start as.
 _HIDDEN, _INPUTS, _P, _I = 16, 6, 1.0, 10.0
 
 
-def create(name: str, family: str = "pid", out: Path | str = ".") -> Path:
+def create(
+    name: str, family: str = "pid", out: Path | str = ".", network: Path | str | None = None
+) -> Path:
     """Write a new submission.
 
     Args:
         name: what the entry and its folder are called.
         family: one of :data:`~ventbench.entries.manifest.FAMILIES`.
         out: folder to write it into; created if missing.
+        network: safetensors file of a trained network, see :func:`exported`.
 
     Returns:
         The new folder, ``out/name``.
 
     Raises:
-        InputError: if the name or family is not allowed, or the folder exists.
+        InputError: if the name or family is not allowed, the folder exists, or the network cannot
+            be copied.
         OSError: if it cannot be written.
     """
     _check_name(name)
@@ -79,7 +136,7 @@ def create(name: str, family: str = "pid", out: Path | str = ".") -> Path:
     folder.parent.mkdir(parents=True, exist_ok=True)
     draft = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{name}."))
     try:
-        for file, content in contents(name, family).items():
+        for file, content in contents(name, family, network).items():
             (draft / file).write_bytes(content)
         draft.chmod(0o777 & ~_umask())
         draft.rename(folder)  # all of it or nothing
@@ -89,13 +146,16 @@ def create(name: str, family: str = "pid", out: Path | str = ".") -> Path:
     return folder
 
 
-def contents(name: str, family: str) -> dict[str, bytes]:
+def contents(name: str, family: str, exported_from: Path | str | None = None) -> dict[str, bytes]:
     """Files of a new submission, by name.
 
     Args:
         name: what the entry is called; allowed.
         family: the entry's family; known.
+        exported_from: safetensors file of a network; it is no ``"pid"`` then but ``"other"``.
     """
+    if exported_from is not None:
+        return _exported_files(name, "other" if family == "pid" else family, Path(exported_from))
     known = (_TEMPLATES / f"{family}.py").is_file()
     controller = _template(f"{family if known else 'pid'}.py")
     files = {CONTROLLER: controller.encode()}
@@ -103,18 +163,142 @@ def contents(name: str, family: str) -> dict[str, bytes]:
     if network:
         files["network.py"] = _template("network.py").encode()
         files[WEIGHTS] = _npz(initial_weights(family))
+    data = "none yet: this is what ventbench new wrote"
+    return _described(files, name, family, FAMILIES[family], data, _EXPORT if network else "")
+
+
+def _described(
+    files: dict[str, bytes], name: str, family: str, description: str, data: str, weights: str
+) -> dict[str, bytes]:
+    """Add manifest and README."""
     values = {
         "name": name,
         "author": AUTHOR,
         "family": family,
         "api_version": API_VERSION,
-        "description": FAMILIES[family],
-        "weights": _EXPORT if network else "",
+        "description": description,
+        "data": data,
+        "weights": weights,
     }
     files[MANIFEST] = Template(_template(MANIFEST)).substitute(values).encode()
     values["files"] = "\n".join(f"| `{k}` | {v} |" for k, v in _FILES.items() if k in files)
     files["README.md"] = Template(_template("README.md")).substitute(values).encode()
     return files
+
+
+def _exported_files(name: str, family: str, path: Path) -> dict[str, bytes]:
+    arrays, source, off, count = exported(path)
+    files = {
+        CONTROLLER: _template("ppo.py").replace("; it starts as a PI controller", "").encode(),
+        "network.py": source.encode(),
+        WEIGHTS: _npz(arrays),
+    }
+    layers = len(arrays) // 2
+    description = f"A network of {layers} dense layers that another library trained."
+    data = "not said yet: what the network was trained on"
+    told = _EXPORTED.format(count=count, file=path.name, off=off)
+    return _described(files, name, family, description, data, told)
+
+
+def exported(path: Path) -> tuple[dict[str, NDArray[np.floating]], str, float, int]:
+    """Copy a trained network of dense layers.
+
+    Its inputs are those of ``ventbench/Ventilator-v1``, once or several times, the newest last; its
+    one output is the action, which is clipped to -1..1. Layers are matrices called ``weight``
+    (outputs, inputs), as of PyTorch, or ``kernel`` (inputs, outputs), as of flax; those of critics
+    are left out. What stands between them is found out by the check.
+
+    Args:
+        path: safetensors file with ``check.input``, ``(n, inputs)``, and ``check.output``,
+            ``(n,)`` or ``(n, 1)``, beside the layers.
+
+    Returns:
+        Weights ``w0``, ``b0``, ..., the module that computes actions by them, its largest deviation
+        from ``check.output``, relative where that is above 1, and n.
+
+    Raises:
+        InputError: if the file is none of such a network, or the copy deviates by more than 1e-6.
+    """
+    require("safetensors", extra="gym", what="networks of others")
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    try:
+        found = load_file(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file") from None
+    except (SafetensorError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: no safetensors file of numpy's types ({error}); write it by save_file"
+        ) from None
+    arrays = _layers(found, path)
+    inputs, depth = len(arrays["w0"]), len(arrays) // 2
+    if inputs % _OBSERVED:
+        raise InputError(
+            f"{path}: the network has {inputs} inputs; an observation of Ventilator-v1 has "
+            f"{_OBSERVED}. Use `ventbench new --family ppo` and write your own Features"
+        )
+    if not {"check.input", "check.output"} <= set(found):
+        raise InputError(
+            f"{path}: check.input and check.output are missing; save some inputs (n, {inputs}) and "
+            "the actions that the network gives for them beside its weights"
+        )
+    given, wanted = found["check.input"].astype(float), found["check.output"].astype(float).ravel()
+    if given.shape != (len(wanted), inputs) or not np.isfinite(given).all():
+        raise InputError(f"{path}: check.input is {given.shape}, not finite numbers (n, {inputs})")
+    off, between, behind = np.inf, "", ""
+    for hidden, last in product(ACTIVATIONS, OUTPUTS):
+        x = given
+        with np.errstate(over="ignore"):
+            for k in range(depth):
+                expression = ACTIVATIONS[hidden] if k < depth - 1 else OUTPUTS[last]
+                x = eval(expression, {"np": np, "x": x @ arrays[f"w{k}"] + arrays[f"b{k}"]})
+        error = np.max(np.abs(x[:, 0] - wanted) / np.maximum(1.0, np.abs(wanted)))
+        if error < off:
+            off, between, behind = float(error), hidden, last
+    if not off <= _TOLERANCE:
+        raise InputError(
+            f"{path}: no copy gives check.output to {_TOLERANCE:g}; the nearest, with {between} "
+            f"between layers and {behind} behind, is {off:.1e} off. Known are "
+            f"{', '.join(ACTIVATIONS)}; float64 tells rounding from another network"
+        )
+    code = _template("network.py").partition("def activation")
+    code = code[1] + code[2].replace(ACTIVATIONS["relu"], ACTIVATIONS[between])
+    code = code.replace("return x @ w + b", f"x = x @ w + b\n        return {OUTPUTS[behind]}")
+    return arrays, _GYMNASIUM.format(frames=inputs // _OBSERVED) + code, off, len(wanted)
+
+
+def _layers(found: dict[str, NDArray[Any]], path: Path) -> dict[str, NDArray[np.floating]]:
+    """Weights ``w0``, ``b0``, ... from the input to the one output."""
+
+    def order(name: str) -> list[Any]:
+        return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
+
+    layers = []
+    for name in sorted(found, key=order):
+        layer = _LAYER.fullmatch(name)
+        if layer is None or _NO_ACTOR.search(name):
+            continue
+        weight = found[name]
+        weight = weight.T if layer[2] == "weight" else weight
+        bias = found.get(f"{layer[1]}.bias".lstrip("."), np.zeros(weight.shape[-1], weight.dtype))
+        finite = np.isfinite(weight).all() and np.isfinite(bias).all()
+        if weight.ndim != 2 or bias.shape != weight.shape[1:] or not finite:
+            raise InputError(f"{path}: {name} of shape {weight.shape} is no finite dense layer")
+        layers.append((weight, bias))
+    layers.sort(key=lambda layer: layer[0].shape[1] == 1)  # heads have names of their own
+    widths = [len(weight) for weight, _ in layers]
+    if not layers or [*widths[1:], 1] != [weight.shape[1] for weight, _ in layers]:
+        shapes = ", ".join(str(weight.shape) for weight, _ in layers) or "none"
+        raise InputError(
+            f"{path}: dense layers (inputs, outputs) are {shapes}: no chain that ends in one "
+            "action; save the layers of the policy alone"
+        )
+    return {
+        f"{letter}{k}": np.ascontiguousarray(array)
+        for k, layer in enumerate(layers)
+        for letter, array in zip("wb", layer, strict=True)
+    }
 
 
 def initial_weights(family: str) -> dict[str, NDArray[np.float32]]:
@@ -164,7 +348,7 @@ def _template(name: str) -> str:
     return (_TEMPLATES / name).read_text()
 
 
-def _npz(arrays: dict[str, NDArray[np.float32]]) -> bytes:
+def _npz(arrays: dict[str, NDArray[Any]]) -> bytes:
     file = io.BytesIO()
     np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
     return file.getvalue()

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from ventbench.base import precision
-from ventbench.base.errors import InputError, InputTypeError
+from ventbench.base.errors import InputError
 from ventbench.entries.cells import Cells, protocol_of
 from ventbench.entries.errors import SubmissionError
 from ventbench.entries.folder import Submission, as_submission
@@ -23,7 +23,6 @@ from ventbench.entries.reference import Reference
 from ventbench.entries.result import Score
 from ventbench.entries.runner import (
     CountingRunner,
-    InProcessRunner,
     Progress,
     Runner,
     runner_of,
@@ -93,8 +92,6 @@ def score(
         False
     """
     entry = as_submission(submission)
-    if not isinstance(draws, int):
-        raise InputTypeError("draws", draws, "a whole number")
     runner: Runner = runner_of(entry, sandbox=sandbox)
     if progress is not None:
         runner = CountingRunner(runner, progress, sessions=1 + stress)
@@ -137,7 +134,8 @@ def run_protocol(
         pips: cmH2O.
         stress: how many draws to run under missing physics.
         stressors: names of the stressors; all conditions if empty.
-        runner: runs the controllers; in this process if not given.
+        runner: runs the controllers; if not given, the sandbox, and a class or function in this
+            process.
 
     Raises:
         SubmissionError: if the submission cannot be run at all, or does not enter the track.
@@ -146,7 +144,7 @@ def run_protocol(
         FloatingPointError: if a plant answers with NaN or infinity.
     """
     started = time.perf_counter()
-    runner = runner or InProcessRunner()
+    runner = runner or runner_of(submission, sandbox=True)
     names = tuple(lung.id for lung in rigs.lungs)
     track, tasks = enter(submission, track, names, runner)
     if stress and track != "robustness":
@@ -316,7 +314,8 @@ def transfer(
         submission: from :func:`ventbench.entries.folder.open_submission`.
         rigs: from :func:`ventbench.plants.rigs.load_rigs`.
         track: ``"performance"`` or ``"robustness"``; the manifest's first if not given.
-        runner: runs the controllers; in this process if not given.
+        runner: runs the controllers; if not given, the sandbox, and a class or function in this
+            process.
 
     Returns:
         Figures of all PIPs on all plants; where a lung has fewer than another, its reference runs
@@ -328,7 +327,7 @@ def transfer(
     """
     if rigs.sessions is None:
         raise InputError("these simulators have one rig a lung: there is nothing to transfer to")
-    runner = runner or InProcessRunner()
+    runner = runner or runner_of(submission, sandbox=True)
     track, tasks = enter(submission, track, tuple(lung.id for lung in rigs.lungs), runner)
     most = rigs.members - 1 + max(map(len, rigs.sessions))
     places = []

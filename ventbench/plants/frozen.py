@@ -98,6 +98,10 @@ class Frozen:
     seen: Seen
     population: RigPopulation | None = None
 
+    def __repr__(self) -> str:
+        """Lungs and folder."""
+        return f"<Frozen simulators of {', '.join(self.lung_ids)} in {self.folder}>"
+
     @property
     def lung_ids(self) -> tuple[str, ...]:
         """Lungs of :attr:`plants` in their order: the six, or those of other recordings."""

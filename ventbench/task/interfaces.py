@@ -145,16 +145,3 @@ class Controller(Protocol):
     def step(self, state: Any, observation: Observation) -> tuple[Any, Any]:
         """Return the next state and ``u_in``, %, shape ``(...)``; clipping is the caller's."""
         ...
-
-
-@runtime_checkable
-class SubmittedController(Protocol):
-    """The class ``Controller`` of a submission's ``controller.py``; needs no import of ours."""
-
-    def reset(self, task: Task) -> None:
-        """Prepare for a run of three breaths."""
-        ...
-
-    def act(self, observation: Observation) -> float:
-        """Return ``u_in``, %, for the next step."""
-        ...

@@ -140,6 +140,11 @@ class PIDGrid:
     gains: NDArray[np.float64]
     error: NDArray[np.float32]
 
+    def __repr__(self) -> str:
+        """Sizes."""
+        lungs, gains, pips = self.error.shape
+        return f"<PIDGrid of {lungs} lungs x {gains} gains x {pips} PIPs>"
+
     def best(self, lung: str | None = None) -> tuple[tuple[float, float, float], float]:
         """Gains with the lowest mean error on a lung, or over all lungs, and that error, cmH2O.
 

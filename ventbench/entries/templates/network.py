@@ -1,4 +1,4 @@
-"""What the network is shown, and the network: a few dense ReLU layers in numpy."""
+"""What the network is shown, and the network: a few dense layers in numpy."""
 
 from pathlib import Path
 
@@ -28,6 +28,11 @@ class Features:
         )
 
 
+def activation(x):
+    """Between layers."""
+    return np.maximum(x, 0.0)
+
+
 class Network:
     """Layers w0, b0, w1, b1, ... of an npz file; layer k does x @ wk + bk."""
 
@@ -39,6 +44,6 @@ class Network:
     def __call__(self, x):
         """Return the outputs for one input vector."""
         for w, b in self.layers[:-1]:
-            x = np.maximum(x @ w + b, 0.0)
+            x = activation(x @ w + b)
         w, b = self.layers[-1]
         return x @ w + b

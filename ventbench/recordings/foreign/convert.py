@@ -70,6 +70,10 @@ class Imported:
     warnings: tuple[str, ...]
     preview: str
 
+    def __repr__(self) -> str:
+        """Breaths and columns."""
+        return f"<Imported: {len(self.breaths)} breaths, columns {', '.join(self.columns)}>"
+
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""
         return {

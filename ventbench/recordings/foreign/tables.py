@@ -86,6 +86,10 @@ class Table:
 
 def read_text(file: str, separator: str | None, decimal: str | None) -> Table:
     """Read text of any dialect, also gzipped; see :func:`~.formats.read_table`."""
+    if decimal not in (None, ".", ",") or separator == "":
+        raise InputError(
+            f"separator {separator!r}, decimal {decimal!r}: give marks such as ; and ,"
+        )
     text, encoding = _decoded(file)
     text = text.replace("\r\n", "\n").replace("\r", "\n").replace("\N{MINUS SIGN}", "-")
     lines = text.split("\n")

@@ -72,6 +72,7 @@ def interval(fit: Fit, path: str, group: int = 0) -> ConfidenceInterval:
         )
         # The predictor smooths an edge over a substep, and resolves its time to half of it.
         reach = 0.5 * float(np.median(fit.problem.data.dt)) / fit.problem.predictor.substeps
+        reach *= parameter.unit == "s"
         ends = np.clip([estimate.low - reach, estimate.high + reach], parameter.low, parameter.high)
         return ConfidenceInterval(estimate.value, float(ends[0]), float(ends[1]))
     low, high = fit.ci95(path)[group]

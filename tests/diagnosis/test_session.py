@@ -20,7 +20,7 @@ from ventbench.diagnosis.selection.screening import screen_mechanisms
 from ventbench.physics import paths
 from ventbench.recordings import join
 from ventbench.recordings.breaths import Breaths
-from ventbench.system_id import make_data
+from ventbench.system_id import Noise, make_data
 
 from . import small
 
@@ -86,6 +86,20 @@ def test_a_step_is_promising_and_is_found_at_its_breath(name):
         assert BEFORE - 1 <= place <= BEFORE + 1
         change = STEPS[name][1]
         assert fitted.column(f"{name}.change")[0] == pytest.approx(change, rel=0.1, abs=0.02)
+
+
+def test_two_simulations_give_the_cost_of_every_place():
+    evaluator = small.split(stepped("zero_step"))
+    fitted = evaluator.fit(Hypothesis(("zero_step",)), Noise((0.2,), (0.0,)), iterations=2)
+    problem, x = fitted.problem, fitted.minimum.x.copy()
+    places, costs = problem.change_costs(x, "zero_step.at")
+    assert len(places) == len(problem.data) - 3
+    for place, cost in zip(places, costs, strict=True):
+        x[problem.unknowns.of("zero_step.at")] = place
+        assert cost == pytest.approx(problem.cost(x), rel=1e-9)
+    best = problem.at_likeliest_changes(x, 0.0)
+    assert best is not None
+    assert problem.cost(best) == pytest.approx(costs.min(), rel=1e-9)
 
 
 def test_a_step_is_no_drift_and_no_scatter():

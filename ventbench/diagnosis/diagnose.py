@@ -468,10 +468,12 @@ def _missing_mechanism(
     )
     changes = [p.name for p in mechanism(name).description.parameters if p.change_point]
     affected = None
-    for at in (values[short] for short in changes if short in values):
-        places = np.linspace(0.0, 1.0, len(breaths))
-        first = np.searchsorted(places, (at.value, *at.ci95)).clip(max=len(breaths) - 1)
-        affected = tuple(int(i) for i in breaths.breath_id[first])
+    if changes:
+        at, last = values[changes[0]], len(breaths) - 1
+        places = np.linspace(0.0, 1.0, len(breaths))  # as in the data of the fits
+        first = np.searchsorted(places, (at.value, *at.ci95)).clip(max=last)
+        now, low, high = (int(i) for i in breaths.breath_id[first])
+        affected = (now, low, high)
     return MissingMechanism(
         name=name,
         parameters=values,

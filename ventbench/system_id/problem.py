@@ -22,6 +22,9 @@ _START = Parameter(
     START, "cmH2O", "reading at the first sample", -50.0, 150.0, 5.0, 5.0, 5.0, scope="breath"
 )
 
+#: Where a change lies between two breaths, as a share: not where another one may be.
+BETWEEN = 0.49
+
 #: Starting pressure of a breath whose first pressure is not measured, cmH2O.
 _DEFAULT_START = 5.0
 
@@ -276,8 +279,8 @@ class Problem:
             path: parameter of a change point.
 
         Returns:
-            Positions that lie halfway between those of two breaths, and the cost of each, without
-            the prior; ``(k,)`` each. At least two breaths lie on either side, if there are four.
+            Positions between two breaths, and the cost of each, without the prior; ``(k,)`` each.
+            At least two breaths lie on either side, if there are four.
         """
         both = np.stack([self.values(x)] * 2)
         both[:, :, self.predictor.names.index(path)] = np.array([[2.0], [-1.0]])
@@ -287,7 +290,8 @@ class Problem:
         order = np.argsort(self.data.position)
         places, first = np.unique(self.data.position[order], return_index=True)
         costs = np.cumsum(before[order]) + after.sum() - np.cumsum(after[order])
-        costs, between = costs[first[1:] - 1], 0.5 * (places[1:] + places[:-1])
+        costs = costs[first[1:] - 1]
+        between = places[:-1] + BETWEEN * np.diff(places)
         inner = slice(1, -1) if len(between) > 2 else slice(None)
         return between[inner], costs[inner]
 

@@ -27,6 +27,7 @@ from ventbench.physics.catalogue import basis_terms, library, mechanism, paramet
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.system_id.data import Floats
 from ventbench.system_id.predictor import Predictor
+from ventbench.system_id.problem import BETWEEN
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,8 @@ def _change_gain(linearisation: Linearisation, changed: Floats) -> tuple[float, 
     nats = 0.5 * force**2 / power
     best = int(np.argmax(nats))
     k = places[best]
-    between = 0.5 * float(position[order][k] + position[order][k + 1])
+    later, earlier = position[order][k], position[order][k + 1]
+    between = float(earlier + BETWEEN * (later - earlier))
     price = float(np.log(len(places)))
     return max(float(nats[best]) - price, 0.0), float(force[best] / power[best]), between
 

@@ -167,9 +167,7 @@ def parameter_estimates(fitted: Fit, name: str) -> dict[str, Estimate]:
         path = f"{name}.{about.name}"
         if path not in fitted.problem.unknowns.paths:
             continue
-        if about.change_point:
-            values[about.name] = _change_point(fitted, path)
-        elif about.scope == "breath":
+        if about.scope == "breath":
             column = fitted.column(path)
             low, middle, high = np.quantile(column, [0.025, 0.5, 0.975])
             values[about.name] = Estimate(float(middle), about.unit, (float(low), float(high)))
@@ -180,15 +178,6 @@ def parameter_estimates(fitted: Fit, name: str) -> dict[str, Estimate]:
             middle = float(np.median([end.value for end in ends]))
             values[about.name] = Estimate(middle, about.unit, (low, high))
     return values
-
-
-def _change_point(fitted: Fit, path: str) -> Estimate:
-    """Where a change lies between two breaths, and the places that are not much less likely."""
-    places, costs = fitted.problem.change_costs(fitted.minimum.x, path)
-    value = float(fitted.value(path)[0])
-    weight = np.exp(costs.min(initial=0.0) - costs)
-    likely = places[weight > 0.05 * weight.max(initial=0.0)]
-    return Estimate(value, "1", (min([value, *likely]), max([value, *likely])))
 
 
 def with_form_error(

@@ -19,13 +19,13 @@ class ClockSkew(Mechanism):
         parameters=(
             Parameter(
                 "skew", "1", "share of the time by which pressure falls behind",
-                0.0, 0.04, 0.0, 0.006, 0.015, scan=(0.0, 0.003, 0.006, 0.012, 0.02, 0.03),
+                0.0, 0.04, 0.0, 0.01, 0.025, scan=(0.0, 0.003, 0.006, 0.012, 0.02, 0.03),
                 kinked=True, share=True,
             ),
         ),
         source=(
             "Quartz clocks agree to 0.01 %; those of operating systems, and rates that are given "
-            "as rounded numbers, to 0.1 to 2 %."
+            "as rounded numbers, to 0.1 to 4 %."
         ),
         signature=(
             "Early edges are on time; others come late in proportion to the time in the breath."

@@ -14,7 +14,7 @@ class GainStep(Mechanism):
         name="gain_step",
         title="step of the valve's gain",
         site="inspiratory valve",
-        equation="gain = gain (1 + change) after the position `at` of the recording",
+        equation="q = gain (1 + change) u_in after the position `at` of the recording",
         parameters=(
             Parameter(
                 "change", "1", "change, as a share of the gain before",

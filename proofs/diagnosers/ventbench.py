@@ -143,6 +143,9 @@ def _parameters(found: Any, names: dict[str, Any]) -> dict[str, dict[str, float]
         for missing in found.mechanisms
         for key, estimate in missing.parameters.items()
     }
+    for missing in found.mechanisms:
+        if missing.breaths is not None:
+            values[f"{missing.name}.breath"] = missing.breaths
     for match in found.lungs[:1]:
         values |= {"R": (match.fitted_R, *match.ci95_R), "C": (match.fitted_C, *match.ci95_C)}
     for change in found.changes:

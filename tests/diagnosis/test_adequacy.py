@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 
 from ventbench.diagnosis.adequacy import Adequacy, check_residuals, order_p_value, passes_fdr
-from ventbench.diagnosis.diagnose import diagnose
 from ventbench.diagnosis.identification import without_saturated
 from ventbench.diagnosis.settings import DEFAULT, ResidualSettings
-from ventbench.recordings import join
 
-from . import made, small
+from . import made
 
 BREATHS, LEVEL = 28, DEFAULT.residuals.veto_level
 GROUPS = np.zeros(BREATHS, np.int64)
@@ -117,19 +115,3 @@ def test_saturated_readings_are_left_out():
         same, nothing = without_saturated(whole)
         assert nothing is None
         assert same is whole
-
-
-@pytest.mark.slow
-def test_the_verdict_of_a_gain_that_rises():
-    usual = small.made()
-    raised = small.made(base=dataclasses.replace(small.RIG, gain=1.25 * small.RIG.gain), seed=1)
-    half = small.BREATHS // 2
-    first_half, second_half = (each.select(np.arange(half)) for each in (usual, raised))
-    both = join((first_half, small.numbered(second_half, half + 1)))
-    found = diagnose(both, settings=small.SETTINGS)
-    assert found.verdict == "unnamed"
-    (first,) = found.changes[:1]
-    assert (first.of, first.breath) == ("gain", half + 1)
-    assert first.size == pytest.approx(1.25, rel=0.05)
-    assert found.open_loop.gain_error == 0.0, "it is no scatter"
-    assert "the gain of the valve changes at breath 9 (x 1.2" in str(found).splitlines()[0]

@@ -61,6 +61,27 @@ PATTERNS = {
         "diagnosis/test_identification.py::test_breaths_that_judged_an_earlier_correction_judge_again",
         "diagnosis/test_identification.py::test_each_breath_has_one_use_where_there_are_enough",
     ),
+    "nothing is missing beside a change in mid-session": (
+        "diagnosis/test_session.py::test_a_step_is_no_drift_and_no_scatter",
+        "diagnosis/test_adequacy.py::test_a_gain_that_rises_in_mid_session_is_located_and_vetoes",
+    ),
+    "readings that saturate become physics": (
+        "diagnosis/test_adequacy.py::test_saturated_readings_are_left_out",
+        "recordings/test_kinds.py::test_saturation_is_the_share_of_samples",
+    ),
+    "clocks become valves and lags": (
+        "diagnosis/test_session.py::test_pressure_that_is_late_by_a_sample_makes_no_late_valves",
+        "diagnosis/test_session.py::test_clocks_that_run_apart_make_no_lags",
+    ),
+    "changes of the session become physics, and steps ramps": (
+        "diagnosis/test_session.py::test_a_drift_of_the_gain_is_no_step_and_no_drift_of_the_lung",
+        "diagnosis/test_session.py::test_a_step_is_promising_and_is_found_at_its_breath",
+    ),
+    "places that cannot be told apart, and breaths that are not told": (
+        "diagnosis/test_report_text.py::test_places_that_breaths_cannot_tell_apart_are_one_answer",
+        "diagnosis/test_session.py::test_the_verdict_says_what_changes_by_how_much_from_which_breath_on",
+    ),
+    "trapped gas becomes a leak": ("diagnosis/test_session.py::test_trapped_gas_is_no_leak",),
     "a sentence that contradicts its chart": (
         "diagnosis/test_residual_analysis.py::test_sentence_and_chart_have_one_mean",
     ),

@@ -377,3 +377,22 @@ def test_what_would_change_the_answer():
     assert any("More than the noise is unexplained" in text for text in texts)
     assert any("another kind" in text for text in report_text.would_change(made.nothing(12)))
     assert any("would give it a name" in text for text in report_text.would_change(made.unnamed()))
+
+
+def test_a_change_is_told_with_its_breaths_and_what_else_it_may_be():
+    values = {
+        "change": Estimate(-0.25, "1", (-0.26, -0.24)),
+        "at": Estimate(0.6, "1", (0.59, 0.62)),
+    }
+    step = MissingMechanism(
+        "gain_step", values, 0.9, ("gain_drift", "leak"), 40.0, worth=0.4, breaths=(37, 36, 38)
+    )
+    found = dataclasses.replace(made.diagnosis(12), mechanisms=(step,))
+    said = "the valve's gain falls by 25 % from breath 37 on"
+    assert report_text.verdict(found).startswith(
+        f"Missing in the physics simulator: {said}, or drift of the valve's gain (odds"
+    )
+    assert said in report_text.headline(found)
+    text = report_text.missing_mechanism(step)
+    assert "from breath 37 [36, 38] on; -25 % [-26, -24] (change, as a share" in text
+    assert "0.6" not in text

@@ -61,8 +61,7 @@ def recoil(volume, C, m):
 class Breath:
     """Right-hand side; states: volume, valve, supply, stress, airway, flow, sensor, second lag."""
 
-    def __init__(self, R, C, m, R_ex, peep, changed):
-        self.changed = changed  # C at this breath, of the recoil's curve
+    def __init__(self, R, C, m, R_ex, peep):
         self.R, self.C, self.m, self.R_ex, self.peep = R, C, m, R_ex, peep
         self.K2 = self.get("turbulent_resistance", "quadratic")
         self.power = m.get("turbulent_resistance", {}).get("exponent", 2.0)
@@ -94,8 +93,10 @@ class Breath:
         return e["amplitude"] * ((1 - relaxing) * sine + relaxing * muscle)
 
     def lost(self, p):
-        """Leak, L/s: by an orifice that is rounded off at 0.2 cmH2O."""
-        return self.get("leak", "conductance") / 1000 * p / np.sqrt(np.hypot(p, 0.2))
+        """Leaks, L/s: an orifice that is rounded off at 0.2 cmH2O, and one with a spring."""
+        above = max(p - self.get("relief_leak", "opening"), 0.0)
+        above *= self.get("relief_leak", "conductance") / 1000
+        return self.get("leak", "conductance") / 1000 * p / np.sqrt(np.hypot(p, 0.2)) + above
 
     def balance(self, t, y, wanted, opened):
         """Flow of the valve against the airway and against none, into the lung, out; pressures."""
@@ -109,7 +110,7 @@ class Breath:
         def fed(p):
             return through * np.sqrt(max(1 - p / self.source, 1e-9))
 
-        inside = recoil(volume, self.changed, self.m)
+        inside = recoil(volume, self.C, self.m)
         inside += stress - self.muscle(t)
 
         def into(p):
@@ -162,24 +163,41 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
     drifted = m.get("sensor_drift", {})
     fading = drifted.get("warming", 0.0)
     grown = (1 - np.exp(-fading * position)) / (1 - np.exp(-fading)) if fading else position
-    drift = drifted.get("drift", 0.0) * grown
+
+    def step(name):
+        own = m.get(name, {"at": 0.0, "change": 0.0})
+        return own["change"] if position > own["at"] else 0.0
+
+    drift = drifted.get("drift", 0.0) * grown + step("zero_step")
     bend = m.get("sensor_curve", {}).get("bend", 0.0)
 
     def shown(p):
         return p + 4 * bend * p / 40 * (1 - p / 40) + drift
 
     R = R * (1 + m.get("resistance_drift", {}).get("change", 0.0) * position)
-    changed = C * (1 + m.get("compliance_drift", {}).get("change", 0.0) * position)
-    rig = Breath(R, C, m, R_ex, peep, changed)
+    C = C * (1 + m.get("compliance_drift", {}).get("change", 0.0) * position)
+    R, C = R * (1 + step("resistance_step")), C * (1 + step("compliance_step"))
+    warm = m.get("gain_drift", {}).get("warming", 0.0)
+    since = (1 - np.exp(-warm * position)) / (1 - np.exp(-warm)) if warm else position
+    gain = gain * (1 + m.get("gain_drift", {}).get("change", 0.0) * since)
+    gain = gain * (1 + step("gain_step"))
+    rig = Breath(R, C, m, R_ex, peep)
     p0 = brentq(lambda p: shown(p) - start, -20.0, 60.0, xtol=1e-13) if bend else start - drift
-    v0 = brentq(lambda v: recoil(v, changed, m) - p0, -0.01, 0.0239 * changed, xtol=1e-14)
+    inside = p0 + rig.get("trapped_gas", "pressure")
+    v0 = brentq(lambda v: recoil(v, C, m) - inside, -0.01, 0.0239 * C, xtol=1e-14)
     times = np.concatenate([[0.0], np.cumsum(dt[:-1])])
     asked = [gain / 1000 * u for u in valve_positions(u_in, m)]
     late, late_out = rig.get("valve_delay", "delay"), rig.get("exhalation_valve_delay", "opening")
     rig.opening = late_out * rig.get("exhalation_valve_delay", "slow")
     late_out -= rig.opening
-    opens = times[1:][np.diff(u_out) > 0] + late_out
-    edges = set(times) | set(times + late) | set(times + late_out)
+    behind, skew = rig.get("clock_offset", "offset"), rig.get("clock_skew", "skew")
+
+    def arrives(t):
+        """When a command is seen in pressure, by the clock of pressure."""
+        return (t + behind) / (1 - skew)
+
+    opens = arrives(times[1:][np.diff(u_out) > 0] + late_out)
+    edges = set(times).union(*(arrives(times + x) for x in (0.0, late, late_out)))
     if "patient_effort" in m:
         e = m["patient_effort"]
         edges |= {e["onset"] + share * e["duration"] for share in (0.0, 2 / 3, 1.0)}
@@ -195,8 +213,9 @@ def breath(R, C, u_in, u_out, dt, start, m, *, peep=5.0, gain=22.8, R_ex=5.0, po
         if b - a < 1e-12:
             continue
         middle = (a + b) / 2
-        wanted = held(asked, 0.0, middle - late)
-        opened = held(u_out, 0.0, middle - late_out) and held(u_out, 0.0, middle)
+        told = middle * (1 - skew) - behind
+        wanted = held(asked, 0.0, told - late)
+        opened = held(u_out, 0.0, told - late_out) and held(u_out, 0.0, told)
         if opened and rig.opening:
             rig.opened_at = max(opens[opens < middle])
         found = solve_ivp(

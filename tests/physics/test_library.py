@@ -26,7 +26,8 @@ NAMES = """
 valve_delay valve_lag valve_dead_band valve_curve valve_hysteresis command_rounding supply_droop
 leak circuit_compliance inertance turbulent_resistance nonlinear_compliance viscoelasticity
 sensor_lag sensor_drift exhalation_valve_delay patient_effort supply_pressure compliance_drift
-resistance_drift sensor_curve
+resistance_drift sensor_curve gain_step gain_drift resistance_step compliance_step zero_step
+clock_offset clock_skew trapped_gas relief_leak
 """
 
 

@@ -53,7 +53,7 @@ from ventbench.diagnosis.simulator_comparison import (
     refit_at_simulator_parameters,
 )
 from ventbench.mechanics.labels import LungMatch
-from ventbench.physics.catalogue import parameter
+from ventbench.physics.catalogue import mechanism, parameter
 from ventbench.plants.catalog import Given, load_simulators
 from ventbench.plants.sessions import Sessions
 from ventbench.plants.simulators import Simulators
@@ -274,7 +274,7 @@ def diagnose(
     return Diagnosis(
         verdict=verdict,
         mechanisms=tuple(
-            _missing_mechanism(name, changed, recording_model, simulator_model)
+            _missing_mechanism(name, changed, recording_model, simulator_model, breaths)
             for name, changed in missing.items()
         ),
         nonparametric=term,
@@ -453,26 +453,37 @@ def _missing_mechanism(
     changed: bool,
     recording_model: IdentifiedModel,
     simulator_model: IdentifiedModel | None,
+    breaths: Breaths,
 ) -> MissingMechanism:
     conclusion = recording_model.conclusion
     alternatives = conclusion.alternatives.get(name, Alternatives((), 1.0, ()))
     own = {}
     if simulator_model is not None and changed:
         own = estimates.parameter_estimates(simulator_model.fit, name)
+    values = estimates.with_form_error(
+        estimates.parameter_estimates(recording_model.fit, name),
+        name,
+        recording_model.evaluator.settings.estimates,
+        alone=len(conclusion.names) == 1,
+    )
+    changes = [p.name for p in mechanism(name).description.parameters if p.change_point]
+    affected = None
+    if changes:
+        at, last = values[changes[0]], len(breaths) - 1
+        places = np.linspace(0.0, 1.0, len(breaths))  # as in the data of the fits
+        first = np.searchsorted(places, (at.value, *at.ci95)).clip(max=last)
+        now, low, high = (int(i) for i in breaths.breath_id[first])
+        affected = (now, low, high)
     return MissingMechanism(
         name=name,
-        parameters=estimates.with_form_error(
-            estimates.parameter_estimates(recording_model.fit, name),
-            name,
-            recording_model.evaluator.settings.estimates,
-            alone=len(conclusion.names) == 1,
-        ),
+        parameters=values,
         confidence=alternatives.confidence,
         alternatives=alternatives.names,
         nats=conclusion.held_out_gains.get(name, 0.0),
         changed=changed,
         simulator_values={key: estimate.value for key, estimate in own.items()},
         worth=conclusion.worths.get(name, float("nan")),
+        breaths=affected,
     )
 
 

@@ -205,7 +205,7 @@ def with_form_error(
         if about.name not in estimates:
             continue
         own = estimates[about.name]
-        if about.scope != "breath":
+        if about.scope != "breath" and not about.change_point:
             # A time that is written as 1 s when it does not matter is not off there.
             off = about.neutral if about is description.strength else 0.0
             low, high = _wider(own.value - off, own.ci95[0] - off, own.ci95[1] - off, share)

@@ -95,7 +95,9 @@ def fit(
         known=_known_minimum(problem, x, warm_start),
     )  # fmt: skip
     for _ in range(settings.fit.delay_rounds if delay_rounds is None else delay_rounds):
-        beyond = _beyond_the_cliff(problem, minimum, settings)
+        beyond = problem.at_likeliest_changes(minimum.x, settings.fit.delay_gain)
+        if beyond is None:
+            beyond = _beyond_the_cliff(problem, minimum, settings)
         if beyond is None:
             break
         other = minimise(

@@ -42,6 +42,8 @@ class MissingMechanism:
         simulator_values: parameters that the simulator has, by short name; empty if not changed.
         worth: root-mean-square error, cmH2O, by which held-out breaths are fitted worse without it;
             NaN if unknown.
+        breaths: of a change at a breath, the id of the first breath after it, and the ids between
+            which that lies with 95 %; else None.
     """
 
     name: str
@@ -52,6 +54,7 @@ class MissingMechanism:
     changed: bool = False
     simulator_values: dict[str, float] = field(default_factory=dict)
     worth: float = float("nan")
+    breaths: tuple[int, int, int] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,8 @@ Floats = NDArray[np.float64]
 #: Mechanisms of the ventilator's side, on which a prescribed flow has no bearing.
 VENTILATOR_SIDE = (
     "valve_delay", "valve_lag", "valve_dead_band", "valve_curve", "valve_hysteresis",
-    "command_rounding", "supply_droop", "supply_pressure", "exhalation_valve_delay",
+    "command_rounding", "supply_droop", "supply_pressure", "exhalation_valve_delay", "gain_step",
+    "gain_drift", "clock_offset", "clock_skew",
 )  # fmt: skip
 
 #: Nonparametric terms of the ventilator's side.

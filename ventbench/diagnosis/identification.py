@@ -31,6 +31,7 @@ from ventbench.plants.simulators import Simulators
 from ventbench.recordings.breaths import Breaths
 from ventbench.system_id import Fit
 from ventbench.system_id.data import Data, Floats
+from ventbench.system_id.problem import parameter_of
 from ventbench.task.interfaces import Plant
 
 #: A breath needs more inspiratory samples with a pressure than these.
@@ -261,13 +262,29 @@ def identify(
             if not _is_definite(fit, name) or _is_negligible(fit, conclusion, name, settings)
         ]
         if not vague:
-            return IdentifiedModel(evaluator, conclusion, fit, final)
+            return IdentifiedModel(evaluator, _with_changes_of(conclusion, fit), fit, final)
         # The least needed one first: the intervals of others may shrink once it has gone.
         name = min(vague, key=lambda name: conclusion.held_out_gains.get(name, 0.0))
         if _is_idle_form(conclusion, name, settings):
             conclusion = without_term(conclusion)
         else:
             conclusion = without_name(conclusion, name, narrow, evaluator)
+
+
+def _with_changes_of(conclusion: Conclusion, fit: Fit) -> Conclusion:
+    """The conclusion with each change between the breaths where the final fit has it.
+
+    Between two training breaths there may be several others, of which some come before a change.
+    """
+    full, named = conclusion.full, conclusion.named
+    layout, x = full.problem.unknowns, full.minimum.x.copy()
+    for path in layout.paths:
+        if parameter_of(path).change_point and path in fit.problem.unknowns.paths:
+            x[layout.of(path)] = fit.value(path)
+    if np.array_equal(x, full.minimum.x):
+        return conclusion
+    moved = replace(full, minimum=replace(full.minimum, x=x))
+    return replace(conclusion, full=moved, named=moved if named is full else named)
 
 
 def _is_idle_form(conclusion: Conclusion, name: str, settings: SelectionConfig) -> bool:

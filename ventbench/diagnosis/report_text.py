@@ -32,7 +32,7 @@ from ventbench.mechanics.labels import (
     Estimate,
     LungMatch,
 )
-from ventbench.physics import mechanism
+from ventbench.physics import mechanism, parameter
 
 #: Odds beyond these are called sure: no model is so right that larger ones mean anything.
 _SURE_ODDS = 1e6
@@ -86,7 +86,7 @@ def headline(findings: Findings) -> str:
         if findings.nonparametric is None and findings.changes:
             what = f"Missing in {simulator}: {change(findings.changes[0])}"
     else:
-        titles = [title(mechanism.name) for mechanism in findings.mechanisms]
+        titles = [told(missing) for missing in findings.mechanisms]
         several = f"{_NUMBERS.get(len(titles), str(len(titles)))} effects are missing in"
         what = f"Missing in {simulator}: {_listed(titles)}"
         if len(titles) >= _SEVERAL:
@@ -131,7 +131,7 @@ def verdict(findings: Findings) -> str:
             f"Something is missing in {simulator}, but the recording singles out neither a "
             "mechanism nor a place in the model"
         )
-    names = _listed([title(mechanism.name) for mechanism in findings.mechanisms])
+    names = _listed([told(missing, others=True) for missing in findings.mechanisms])
     rest = "" if term is None else ", and an effect that is not in the library"
     if findings.form is not None:
         several = len(findings.mechanisms) > 1
@@ -345,12 +345,38 @@ def title(name: str) -> str:
     return mechanism(name).description.title
 
 
+def told(missing: MissingMechanism, *, others: bool = False) -> str:
+    """A missing mechanism in words; of a change at a breath, what changes from which breath on.
+
+    Args:
+        missing: the mechanism.
+        others: whether to add what else a change in the session may be: a drift that is no worse is
+            one answer with the step.
+    """
+    text, about = title(missing.name), mechanism(missing.name)
+    if missing.breaths is not None:
+        strength = about.description.strength
+        size = missing.parameters[strength.name]
+        factor, unit = scaled(size, f"{missing.name}.{strength.name}")
+        how = "rises" if size.value > 0.0 else "falls"
+        by = f"{two_digits(abs(factor * size.value))} {unit}"
+        text = f"{text.removeprefix('step of ')} {how} by {by} from breath {missing.breaths[0]} on"
+    rivals = [name for name in missing.alternatives if others and about.uses_position]
+    rivals = [title(name) for name in rivals if mechanism(name).uses_position]
+    return f"{text}, or {_listed(rivals, 'or')}" if rivals else text
+
+
 def missing_mechanism(missing: MissingMechanism) -> str:
     """Values of a missing mechanism with their 95 % intervals, and how far its name is ahead."""
     about = mechanism(missing.name).description
     meanings = {parameter.name: parameter.meaning for parameter in about.parameters}
     values = []
+    if missing.breaths is not None:
+        first, low, high = missing.breaths
+        values.append(f"from breath {first} [{low}, {high}] on")
     for name, estimate in missing.parameters.items():
+        if missing.breaths is not None and parameter(f"{missing.name}.{name}").change_point:
+            continue  # which is told as a breath
         text, path = quantity(estimate, f"{missing.name}.{name}"), f"{missing.name}.{name}"
         if name in missing.simulator_values:
             other = quantity_like(missing.simulator_values[name], estimate, path)

@@ -226,6 +226,7 @@ def _mechanism(missing: MissingMechanism) -> dict[str, Any]:
         "worth": missing.worth,
         "changed": missing.changed,
         "simulator_has": missing.simulator_values,
+        "first_breath": missing.breaths,
     }
 
 

@@ -77,10 +77,12 @@ def characteristic(
         neutral = {p.name: jnp.asarray(float(p.neutral)) for p in about}
         times = [float(own[p.name]) for p in about if p.unit == "s"]
         end = float(np.clip(_TIMES * max(times, default=0.0), _SHORTEST, _LONGEST))
+        if _has(shown, "of_breath"):
+            return _in_session(shown, own, base)
         if _has(shown, "command") or _has(shown, "driven"):
             return _command(shown, own, largest_command)
         if _has(shown, "dead_time"):
-            return _late(float(jnp.asarray(shown.dead_time(own))), end)
+            return _late(float(jnp.asarray(shown.dead_time(own, jnp.asarray(1.0)))), end)
         if _has(shown, "outlet_dead_time"):
             return _late_outlet(shown, own, base, end)
         if _has(shown, "inflow"):
@@ -103,6 +105,28 @@ def _has(shown: Mechanism, hook: str) -> bool:
 
 def _floats(values: Array) -> Floats:
     return np.asarray(values, np.float64)
+
+
+#: Base parameters that may change from breath to breath.
+_OF_BREATH = {
+    "R": "resistance R, cmH2O/(L/s)",
+    "C": "compliance C, mL/cmH2O",
+    "gain": "gain of the valve, mL/s per %",
+    "offset": "recoil above the first reading, cmH2O",
+}
+
+
+def _in_session(shown: Mechanism, own: Values, base: Mapping[str, float]) -> Characteristic | None:
+    """The base parameter that a mechanism changes, over the recording."""
+    x = np.linspace(0.0, 1.0, _STATIC)
+    before = {name: jnp.full_like(x, value) for name, value in base.items()}
+    before["position"] = jnp.asarray(x)
+    after = shown.of_breath(own, before)
+    for name, label in _OF_BREATH.items():
+        without, acting = _floats(before[name]), _floats(after[name])
+        if np.max(np.abs(acting - without)) > _TINY:
+            return Characteristic(100 * x, without, acting, "share of the recording, %", label)
+    return None
 
 
 def _command(shown: Mechanism, own: Values, largest: float) -> Characteristic:
@@ -147,7 +171,8 @@ def _late_outlet(
     """Expiratory valve that is told to open, and later to close."""
     x = np.linspace(-0.2 * end, 2.2 * end, 2 * _STATIC)
     opening, closing = (
-        float(jnp.asarray(shown.outlet_dead_time(own, jnp.asarray(u_out)))) for u_out in (1.0, 0.0)
+        float(jnp.asarray(shown.outlet_dead_time(own, jnp.asarray(u_out), jnp.asarray(1.0))))
+        for u_out in (1.0, 0.0)
     )
     told = (x >= 0) & (x < end)
     done = ((x >= opening) & (x < end + closing)).astype(np.float64)
@@ -255,15 +280,6 @@ def _network(
             return None
         return Characteristic(x, a, b, x_label, y_label)
 
-    if shown.uses_position:
-        x = np.linspace(0.0, 1.0, _STATIC)
-        a, b = both(position=jnp.asarray(x))
-        share = "share of the recording, %"
-        return curve(
-            100 * x, a.resistance, b.resistance, share, "resistance R, cmH2O/(L/s)"
-        ) or curve(
-            100 * x, 1e3 / a.elastance, 1e3 / b.elastance, share, "compliance C, mL/cmH2O"
-        )  # fmt: skip
     pressure = np.linspace(0.0, _PRESSURE, _STATIC)
     a, b = both(pressure=jnp.asarray(pressure))
     p_label = "airway pressure, cmH2O"

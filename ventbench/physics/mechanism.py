@@ -107,6 +107,10 @@ class Mechanism:
     #: True if its effect depends on the position of the breath in the recording.
     uses_position: bool = False
 
+    def of_breath(self, values: Values, base: Values) -> Values:
+        """Base parameters as they are in a breath, given those of the model, by name."""
+        return base
+
     def driven(self, values: Values, u_in: Array) -> Array:
         """What a valve's driver makes of a command, %, before any part of the valve moves."""
         return u_in
@@ -115,11 +119,11 @@ class Mechanism:
         """Effective command of the inspiratory valve, %, and the new memory, once a sample."""
         return u_in, memory
 
-    def dead_time(self, values: Values) -> Array | float:
-        """Dead time that it adds to the inspiratory valve, s."""
+    def dead_time(self, values: Values, time: Array) -> Array | float:
+        """Dead time that it adds to the inspiratory valve, s, at a time in the breath, s."""
         return 0.0
 
-    def outlet_dead_time(self, values: Values, u_out: Array) -> Array | float:
+    def outlet_dead_time(self, values: Values, u_out: Array, time: Array) -> Array | float:
         """Dead time that it adds to the expiratory valve for the command ``u_out``, s."""
         return 0.0
 
@@ -256,5 +260,7 @@ def assemble(
             p.name: named.get(f"{name}.{p.name}", jnp.asarray(p.neutral)) for p in parameters
         }
     given = {name: named.get(name, jnp.asarray(value)) for name, value in _NEUTRAL_BASE.items()}
+    for name in chosen:
+        given = dict(library[name].of_breath(own[name], given))
     active = {name: is_active(library[name], own[name]) for name in chosen if skip_idle}
     return Assembly(given, {name: library[name] for name in chosen}, own, active)

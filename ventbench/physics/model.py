@@ -126,8 +126,11 @@ class Physics:
         flow, memory = solver.commanded(assembly, u_in + zero, state.memory)
         commanded = (flow, *state.commanded)
         opened = (u_out + zero, *state.opened)
-        delay = assembly.total(lambda mechanism, own: mechanism.dead_time(own))
-        outlet_delay = assembly.total(lambda mechanism, own: mechanism.outlet_dead_time(own, u_out))
+        time = state.time
+        delay = assembly.total(lambda mechanism, own: mechanism.dead_time(own, time))
+        outlet_delay = assembly.total(
+            lambda mechanism, own: mechanism.outlet_dead_time(own, u_out, time)
+        )
         lengths, open_for, commanded_flow = dead_time.windows(
             dt,
             state.past,

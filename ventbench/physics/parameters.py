@@ -45,6 +45,8 @@ class Parameter:
         uncertain: True for a shape parameter whose default is a guess. Final estimates free it, so
             that the interval of the strength allows for it.
         share: True for a dimensionless share, which reports show in percent.
+        change_point: True for the position in the recording, 0..1, from which on a change has set
+            in. The likelihood is constant between two breaths: a fit tries all of them.
     """
 
     name: str
@@ -66,6 +68,7 @@ class Parameter:
     discrete: bool = False
     uncertain: bool = False
     share: bool = False
+    change_point: bool = False
 
     def __post_init__(self) -> None:
         """Check what the transforms rely on.

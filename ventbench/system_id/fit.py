@@ -212,7 +212,10 @@ def _search(problem: Problem, x: Floats, given: Set[str], iterations: int) -> Mi
         if better is None:
             break
         minimum = _descend(problem, better, iterations)
-    return minimum if minimum.converged else _descend(problem, minimum.x, iterations)
+    moved = problem.at_likeliest_changes(minimum.x, _BETTER)
+    if moved is None and minimum.converged:
+        return minimum
+    return _descend(problem, minimum.x if moved is None else moved, iterations)
 
 
 def _other_values(problem: Problem, minimum: Minimum, paths: Sequence[str]) -> Floats | None:

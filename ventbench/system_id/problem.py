@@ -22,6 +22,9 @@ _START = Parameter(
     START, "cmH2O", "reading at the first sample", -50.0, 150.0, 5.0, 5.0, 5.0, scope="breath"
 )
 
+#: Where a change lies between two breaths, as a share: not where another one may be.
+BETWEEN = 0.49
+
 #: Starting pressure of a breath whose first pressure is not measured, cmH2O.
 _DEFAULT_START = 5.0
 
@@ -264,6 +267,57 @@ class Problem:
             smooth.cost, smooth.normal, x, low, high, tolerance=tolerance, iterations=iterations
         ).x
         return other if self.cost(other) < self.cost(x) else x
+
+    def change_costs(self, x: Floats, path: str) -> tuple[Floats, Floats]:
+        """Costs, nats, of a change between any two breaths, all else as at ``x``.
+
+        Whether a breath comes before or after the change is all that matters to it, so that two
+        simulations of it serve all places.
+
+        Args:
+            x: unknowns, ``(U,)``.
+            path: parameter of a change point.
+
+        Returns:
+            Positions between two breaths, and the cost of each, without the prior; ``(k,)`` each.
+            At least two breaths lie on either side, if there are four.
+        """
+        both = np.stack([self.values(x)] * 2)
+        both[:, :, self.predictor.names.index(path)] = np.array([[2.0], [-1.0]])
+        seen = self.predictor.predict_all(both)
+        white = np.stack([self._white(self._residual(each)) for each in seen])
+        before, after = np.sum(self.noise.loss(white), axis=(2, 3))
+        order = np.argsort(self.data.position)
+        places, first = np.unique(self.data.position[order], return_index=True)
+        costs = np.cumsum(before[order]) + after.sum() - np.cumsum(after[order])
+        costs = costs[first[1:] - 1]
+        between = places[:-1] + BETWEEN * np.diff(places)
+        inner = slice(1, -1) if len(between) > 2 else slice(None)
+        return between[inner], costs[inner]
+
+    def at_likeliest_changes(self, x: Floats, least: float) -> Floats | None:
+        """The point with each change between the breaths where it is likeliest, all else as it is.
+
+        Args:
+            x: unknowns, ``(U,)``.
+            least: nats by which another place must be likelier.
+
+        Returns:
+            The point; None if no change moves.
+        """
+        moved = None
+        for path in self.unknowns.paths:
+            if not parameter_of(path).change_point:
+                continue
+            own, point = self.unknowns.of(path), x if moved is None else moved
+            places, costs = self.change_costs(point, path)
+            if not len(places):
+                continue
+            here = int(np.argmin(np.abs(places - point[own])))
+            if costs.min() < costs[here] - least:
+                moved = point.copy()
+                moved[own] = places[int(np.argmin(costs))]
+        return moved
 
     def _residual(self, seen: Floats) -> Floats:
         return np.where(self.data.weight > 0, seen - self.data.measured, 0.0)

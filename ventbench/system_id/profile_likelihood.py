@@ -22,6 +22,9 @@ _STRIDE = 0.01
 #: nats, that the noise of a single sample may cause.
 _GRID, _FAR, _DIP = 101, 6.0, 8.0
 
+#: Nats by which a place of a change is left out of its interval: odds of 20 to one.
+_UNLIKELY = 3.0
+
 
 def profile_interval(fit: Fit, path: str, group: int = 0) -> tuple[float, float]:
     """Ends of the 95 % profile-likelihood interval of a free parameter, within its bounds.
@@ -63,8 +66,14 @@ def interval(fit: Fit, path: str, group: int = 0) -> ConfidenceInterval:
     the mean and the central 95 % of the profile likelihood over its whole plateau: in the narrow
     wall where an edge passes a sample, the model can fit the noise of that one sample, a dip of
     some nats without meaning. The interval of a dead time is wider by half a substep at either end.
+    That of a change point holds the places that are at most 20 times less likely than the best.
     """
     parameter = parameter_of(path)
+    if parameter.change_point:
+        value = float(fit.value(path)[group])
+        places, costs = fit.problem.change_costs(fit.minimum.x, path)
+        likely = [value, *places[costs < costs.min(initial=np.inf) + _UNLIKELY]]
+        return ConfidenceInterval(value, min(likely), max(likely))
     if parameter.kinked:
         value = float(fit.value(path)[group])
         estimate = _plateau(fit, path, group) or ConfidenceInterval(
@@ -72,6 +81,7 @@ def interval(fit: Fit, path: str, group: int = 0) -> ConfidenceInterval:
         )
         # The predictor smooths an edge over a substep, and resolves its time to half of it.
         reach = 0.5 * float(np.median(fit.problem.data.dt)) / fit.problem.predictor.substeps
+        reach *= parameter.unit == "s"
         ends = np.clip([estimate.low - reach, estimate.high + reach], parameter.low, parameter.high)
         return ConfidenceInterval(estimate.value, float(ends[0]), float(ends[1]))
     low, high = fit.ci95(path)[group]

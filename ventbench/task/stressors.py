@@ -291,6 +291,15 @@ def held_out() -> frozenset[str]:
 NOT_STRESSED: dict[str, str] = {
     "compliance_drift": "`position` and `recruitment` change C between breaths.",
     "resistance_drift": "`secretions` and `suction` change R between breaths.",
+    "compliance_step": "`position` changes C between two breaths.",
+    "resistance_step": "`secretions` and `suction` change R between two breaths.",
+    "gain_step": "`supply_high` has its size.",
+    "gain_drift": "`supply_high` has its size.",
+    "zero_step": "`sensor_high` and `sensor_low` have its size.",
+    "clock_offset": "`valve_delay` is the same to a controller, but for the expiratory valve.",
+    "clock_skew": "For version 2 of the table; within a breath it is a small `valve_delay`.",
+    "trapped_gas": "For version 2 of the table; runs start at rest.",
+    "relief_leak": "For version 2 of the table; `leak` loses as much.",
     "sensor_curve": "For version 2 of the table; `sensor_high` and `sensor_low` have its size.",
     "supply_pressure": "For version 2 of the table; `supply_droop` loses flow late as well.",
 }

@@ -23,6 +23,7 @@ from ventbench.diagnosis.selection.shape_parameters import (
     shapes_at_default,
 )
 from ventbench.diagnosis.settings import ForwardSelectionSettings
+from ventbench.physics.catalogue import mechanism
 from ventbench.system_id.data import Floats
 from ventbench.system_id.noise import Noise, robust_noise
 
@@ -90,10 +91,12 @@ def compare_candidates(
     # promises nothing may be right: where a refit has hidden a lag of the sensor in a resistance
     # near zero, no jump of the pressure is left that the lag could round.
     much = max(candidate.nats for candidate in chosen) >= settings.large_gain
+    # What changes from breath to breath hardly hides in a refit, nor behind effects in the breath.
+    first_ones = chosen[: settings.fitted_candidates]
     if not much:
-        chosen = chosen[: settings.fitted_candidates]
+        chosen = first_ones
     elif restarts:
-        chosen = candidates
+        chosen = [c for c in candidates if c in first_ones or not _changes(c)]
     # Noise that was estimated with an effect in the residual would hide the effect from its fit.
     white, first = replace(current.noise, ar=(0.0, 0.0)), warm_start or current
     models = _quick_fits(evaluator, current, chosen, white, first, rival, far=much and restarts)
@@ -174,7 +177,8 @@ def _quick_fits(
         starts: list[Start] = [candidate.start, *candidate.other_starts]
         if not varies_by_breath(candidate.name):
             starts += [candidate.start | shift for shift in shifts]
-            starts += [{}, label] if far else []
+            if far:  # a change is where screening has found it
+                starts += [candidate.start | label] if _changes(candidate) else [{}, label]
         elif far:
             # What all efforts have in common, a refitted R and C make up for.
             starts.append(candidate.start | label)
@@ -225,6 +229,11 @@ def _quick_fits(
     count = settings.forward.fitted_to_all
     kept = [m for k, m in enumerate(models) if k < count or criteria(m, noise_left) < limit]
     return parallel_map(partial(fit_to_all, evaluator, warm_start=warm_start), kept)
+
+
+def _changes(candidate: Candidate) -> bool:
+    """Whether a candidate changes in the course of the recording."""
+    return mechanism(candidate.name).uses_position
 
 
 def cost_of(model: FittedModel) -> float:

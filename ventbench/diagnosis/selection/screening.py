@@ -27,6 +27,7 @@ from ventbench.physics.catalogue import basis_terms, library, mechanism, paramet
 from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS
 from ventbench.system_id.data import Floats
 from ventbench.system_id.predictor import Predictor
+from ventbench.system_id.problem import BETWEEN
 
 
 @dataclass(frozen=True)
@@ -119,11 +120,18 @@ def _screen(
             trial[:, order.index(path)] = value
         work.append((k, linearisation, given))
         points.append(trial)
+    at = next((f"{name}.{p.name}" for p in others if p.change_point), None)
+    if at is not None:
+        for trial in points:
+            trial[:, order.index(at)] = -1.0  # all breaths come after the change
     predictions = predictor.predict_all(np.stack(points))
     for (k, linearisation, given), prediction in zip(work, predictions, strict=True):
         if not np.all(np.isfinite(prediction)):
             continue
-        nats, multiple = linearisation.gain(linearisation.template(prediction))
+        if at is None:
+            nats, multiple = linearisation.gain(linearisation.template(prediction))
+        else:
+            nats, multiple, given[at] = _change_gain(linearisation, prediction)
         if multiple <= 0:
             continue
         if all(given.get(path, neutral) == neutral for path, neutral in shapes.items()):
@@ -147,6 +155,38 @@ def _screen(
     if free and simulated != start:  # a threshold is where it is: no multiple of it says anything
         rest = (*rest, simulated)
     return Candidate(name, added, start, float(best[0]), float(best[1]), rest)
+
+
+def _change_gain(linearisation: Linearisation, changed: Floats) -> tuple[float, float, float]:
+    """What the best multiple of a change after any breath gains, less the price of the choice.
+
+    Args:
+        linearisation: the model to first order.
+        changed: prediction with the change in all breaths, ``(n, c, T)``.
+
+    Returns:
+        Nats, the multiple, and the position between two breaths.
+    """
+    white = linearisation.whiten(changed - linearisation.prediction)[:, None]
+    white = linearisation.without_own(white)[:, 0]
+    position, n = linearisation.problem.data.position, len(white)
+    order = np.argsort(position)[::-1]  # the last breath is always changed
+    basis = linearisation.shared_basis.reshape(-1, *white.shape)
+    absorbed = np.cumsum(np.einsum("snm,nm->ns", basis, white)[order], axis=0)
+    power = np.cumsum(np.sum(white**2, axis=1)[order]) - np.sum(absorbed**2, axis=1)
+    force = -np.cumsum(np.sum(linearisation.residual * white, axis=1)[order])
+    places = np.arange(1, n - 2)  # at least two breaths on either side
+    places = places[position[order][places] > position[order][places + 1]]
+    if not len(places):
+        return 0.0, 0.0, 0.5
+    power, force = np.maximum(power[places], 1e-12), force[places]
+    nats = 0.5 * force**2 / power
+    best = int(np.argmax(nats))
+    k = places[best]
+    later, earlier = position[order][k], position[order][k + 1]
+    between = float(earlier + BETWEEN * (later - earlier))
+    price = float(np.log(len(places)))
+    return max(float(nats[best]) - price, 0.0), float(force[best] / power[best]), between
 
 
 def nonparametric_terms(settings: SelectionConfig) -> tuple[str, ...]:

@@ -111,7 +111,7 @@ def other_dead_times(fitted: FittedModel) -> list[dict[str, float]]:
     others = []
     for path in fitted.hypothesis.paths:
         about = parameter_of(path)
-        if about.kinked and about.scan:
+        if about.kinked and about.scan and about.unit == "s":
             value = float(np.median(fitted.column(path)))
             near = {min(max(value + step, about.low), about.high) for step in (-interval, interval)}
             others += [{path: other} for other in sorted(near - {value})]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import Parameter
 
 
@@ -27,7 +26,7 @@ class ComplianceDrift(Mechanism):
             "test lungs settle as they warm up."
         ),
         signature="An error that grows with volume and with the number of the breath.",
-        confusable=("sensor_drift", "resistance_drift"),
+        confusable=("compliance_step", "sensor_drift", "resistance_drift"),
         detectable=None,
         least=0.03,
         least_reason="test lungs repeat their compliance to a few percent",
@@ -35,11 +34,10 @@ class ComplianceDrift(Mechanism):
 
     uses_position = True
 
-    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
-        """Change the slope of the recoil."""
-        more = 1.0 / (1.0 + values["change"] * view.position) - 1.0
-        added = view.elastance * more
-        return network.plus(recoil=added * view.volume, elastance=added)
+    def of_breath(self, values: Values, base: Values) -> Values:
+        """C at the breath."""
+        grown = 1.0 + values["change"] * base["position"]
+        return {**base, "C": base["C"] * grown}
 
 
 MECHANISM = ComplianceDrift()

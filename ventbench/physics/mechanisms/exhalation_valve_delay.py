@@ -54,7 +54,7 @@ class ExhalationValveDelay(Mechanism):
     )  # fmt: skip
     stateful = True
 
-    def outlet_dead_time(self, values: Values, u_out: Array) -> Array:
+    def outlet_dead_time(self, values: Values, u_out: Array, time: Array) -> Array:
         """Delay of the last command, s."""
         opening = values["opening"] * (1.0 - values["slow"])
         return u_out * opening + (1.0 - u_out) * values["closing"]

@@ -59,9 +59,7 @@ class NonlinearCompliance(Mechanism):
     def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
         """Tangent of the curve at the last volume, less the linear lung's.
 
-        The curve is that of the lung as it has become: mechanisms come in the order of their names,
-        and `compliance_drift` has changed the network's elastance before. Two changes of one linear
-        lung could add up to a recoil that falls as the lung fills.
+        The curve is that of the lung as it has become in the session.
         """
         k = values["stiffening"]
         linear = network.elastance * view.volume  # cmH2O

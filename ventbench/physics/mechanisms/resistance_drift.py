@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from ventbench.physics.mechanism import Description, Mechanism, Values
-from ventbench.physics.network import PneumaticNetwork, View
 from ventbench.physics.parameters import Parameter
 
 
@@ -26,7 +25,7 @@ class ResistanceDrift(Mechanism):
             "(Bates, Lung Mechanics, Cambridge 2009); a hose that kinks does so at once."
         ),
         signature="An error that grows with flow and with the number of the breath.",
-        confusable=("compliance_drift", "sensor_drift"),
+        confusable=("resistance_step", "compliance_drift", "sensor_drift"),
         detectable=None,
         least=0.05,
         least_reason="resistors repeat to a few percent",
@@ -34,9 +33,10 @@ class ResistanceDrift(Mechanism):
 
     uses_position = True
 
-    def network(self, values: Values, network: PneumaticNetwork, view: View) -> PneumaticNetwork:
-        """Add the grown part of the resistance."""
-        return network.plus(resistance=view.resistance * values["change"] * view.position)
+    def of_breath(self, values: Values, base: Values) -> Values:
+        """R at the breath."""
+        grown = 1.0 + values["change"] * base["position"]
+        return {**base, "R": base["R"] * grown}
 
 
 MECHANISM = ResistanceDrift()

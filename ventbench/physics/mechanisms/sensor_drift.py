@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 from jax import Array
 
 from ventbench.physics.mechanism import Description, Mechanism, Values
 from ventbench.physics.parameters import Parameter
-
-#: Added to the fading, so that a steady drift is no division by zero.
-_STEADY = 1e-4
+from ventbench.physics.session import WARMING, grown
 
 
 class SensorDrift(Mechanism):
@@ -32,10 +29,7 @@ class SensorDrift(Mechanism):
                 "gain", "1", "change of the gain over the recording",
                 -0.3, 0.3, 0.0, 0.0, 0.0, shape=True, share=True,
             ),
-            Parameter(
-                "warming", "1", "times that the drift fades by e in the recording; 0: it is steady",
-                0.0, 10.0, 0.0, 0.0, 0.0, shape=True,
-            ),
+            WARMING,
         ),
         source=(
             "Temperature and ageing of piezoresistive sensors between two zeroings: up to 3 "
@@ -44,7 +38,7 @@ class SensorDrift(Mechanism):
         signature=(
             "An error that grows with the number of the breath and is the same at all its samples."
         ),
-        confusable=("a PEEP that changes during the recording",),
+        confusable=("zero_step", "a PEEP that changes during the recording"),
         detectable=0.05,
         least=0.15,
         least_reason="two steps of a usual converter",
@@ -56,19 +50,13 @@ class SensorDrift(Mechanism):
 
     def sensor_output(self, values: Values, pressure: Array, position: Array) -> Array:
         """Drifted pressure."""
-        grown = _grown(values, position)
-        return pressure * (1.0 + values["gain"] * grown) + values["drift"] * grown
+        share = grown(values, position)
+        return pressure * (1.0 + values["gain"] * share) + values["drift"] * share
 
     def sensor_input(self, values: Values, shown: Array, position: Array) -> Array:
         """True pressure of a reading."""
-        grown = _grown(values, position)
-        return (shown - values["drift"] * grown) / (1.0 + values["gain"] * grown)
-
-
-def _grown(values: Values, position: Array) -> Array:
-    """Share of the drift that has set in."""
-    fading = values["warming"] + _STEADY
-    return jnp.expm1(-fading * position) / jnp.expm1(-fading)
+        share = grown(values, position)
+        return (shown - values["drift"] * share) / (1.0 + values["gain"] * share)
 
 
 MECHANISM = SensorDrift()

@@ -38,7 +38,7 @@ class ValveDelay(Mechanism):
         special_case_of=("command_memory", "command_plays", "supply_memory"),
     )  # fmt: skip
 
-    def dead_time(self, values: Values) -> Array:
+    def dead_time(self, values: Values, time: Array) -> Array:
         """The delay, s."""
         return values["delay"]
 

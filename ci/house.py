@@ -15,15 +15,16 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 #: Most lines of Python: of the product, of the proofs beside it; most modules of the product.
-# Raised for rounds, ranks over all pairs and the one gate: what they replace was smaller.
-LINES = {"ventbench + hardware_eval": 68_580, "proofs": 9_700}
-MODULES = 316
+# Raised for what nothing had done: mechanisms of the session and of the recording, an adversary,
+# trials and calibration of the bench, entries from networks of other libraries.
+LINES = {"ventbench + hardware_eval": 71_270, "proofs": 9_700}
+MODULES = 335
 
 #: Most lines of one module, and most modules that lie loose in ``ventbench/``.
 LONGEST, LOOSE = 580, 8
 
 #: Most words of Markdown (as ``wc -w`` counts), and the folders that hold it beside the root.
-WORDS = 29_200
+WORDS = 29_450
 PROSE = ("docs", "examples", "hardware_eval", "proofs", "submissions", "tests", "ventbench")
 
 #: A branch on a number of the protocol: there is one protocol.

@@ -179,14 +179,16 @@ def test_a_worse_mechanism_is_swapped_for_the_better_one(alike):
     assert kept.hypothesis.names == ("viscoelasticity",)
 
 
-def test_an_effect_like_no_other_has_no_alternative():
+def test_an_effect_like_no_other_has_no_near_alternative():
     evaluator = small.split(small.made(small.effect("viscoelasticity", ratio=0.7, time=1.0)))
     named, steps = forward_selection(evaluator, fit_with_noise(evaluator, Hypothesis()), print)
     named, other = find_alternatives(evaluator, named, steps)
-    # Pressure alone can never tell it from a second compartment.
-    assert other["viscoelasticity"].names == ("second_compartment",)
+    # Pressure alone can never tell it from a second compartment; a leak that opens at a pressure
+    # is a hundred times less likely by eight breaths.
+    assert "second_compartment" in other["viscoelasticity"].names
+    assert set(other["viscoelasticity"].names) <= {"second_compartment", "relief_leak"}
     assert other["viscoelasticity"].confidence > 0.99
-    assert other["viscoelasticity"].models == ()
+    assert {model.name for model in other["viscoelasticity"].models} <= {"relief_leak"}
 
 
 def test_an_exchange_needs_bic_and_held_out_breaths(alike):

@@ -24,7 +24,8 @@ MODULES = 335
 LONGEST, LOOSE = 580, 8
 
 #: Most words of Markdown (as ``wc -w`` counts), and the folders that hold it beside the root.
-WORDS = 29_450
+# Raised by the measured results of the world of faults, which a command writes.
+WORDS = 30_450
 PROSE = ("docs", "examples", "hardware_eval", "proofs", "submissions", "tests", "ventbench")
 
 #: A branch on a number of the protocol: there is one protocol.

@@ -266,6 +266,9 @@ def paired(ours: Mapping[Any, JudgedCase], other: Mapping[Any, JudgedCase]) -> d
 
 _NOTHING, _SEVERAL, _LOST = "nothing missing", "several names", "no answer"
 
+#: Most hypotheses of equal probability that are told one by one.
+_TOLD = 3
+
 
 def confusion(cases: Sequence[JudgedCase]) -> dict[str, dict[str, int]]:
     """Counts by truth, then by answer, over the cases with one effect or none."""
@@ -282,4 +285,6 @@ def full_answer(case: JudgedCase) -> str:
     """The likeliest hypotheses in words."""
     if case.problem:
         return _LOST
+    if len(case.leading) > _TOLD:
+        return f"{len(case.leading)} answers alike"
     return " or ".join(" + ".join(sorted(terms)) or _NOTHING for terms in case.leading)

@@ -195,8 +195,8 @@ def test_the_command_for_one_lung(small, tmp_path):
 
 
 @pytest.mark.parametrize("which", [[], ["--all", "--robust"], ["--lung", "R5C10", "--all"]])
-def test_the_command_wants_to_know_which_lungs(which):
-    run = CliRunner().invoke(app, ["tune", "pid", *which])
+def test_the_command_wants_to_know_which_lungs(which, tmp_path):
+    run = CliRunner().invoke(app, ["tune", "pid", *which, "--out", str(tmp_path)])
     assert isinstance(run.exception, InputError)
     assert "exactly one of" in str(run.exception)
 

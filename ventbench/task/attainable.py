@@ -28,14 +28,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import highspy
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.optimize import linprog
 
 from ventbench.base import precision
 from ventbench.task import environment as env
@@ -162,8 +161,9 @@ def attainable(
             best, witness = np.where(better, error, best), np.where(better[:, None], u_in, witness)
         miss = pip - pressures(plants, cells, witness)
         slopes = _in_batches(all_slopes, plants, cells, witness)
+        programs = LinearPrograms(COMMANDS)
         gains = [
-            np.mean(np.abs(miss[i])) - _program(miss[i], slopes[i], witness[i], radius)[1]
+            np.mean(np.abs(miss[i])) - programs.solve(miss[i], slopes[i], witness[i], radius)[1]
             for i, radius in enumerate(np.full(n, CERTIFICATE_RADIUS))
         ]
         full = np.full((n, COMMANDS), protocol.U_MAX)
@@ -183,7 +183,7 @@ def _descend(
     n = len(u_in)
     miss = pip - pressures(plants, cells, u_in)
     error = np.mean(np.abs(miss), axis=1)
-    radius, live = np.full(n, FIRST_RADIUS), np.arange(n)
+    radius, live, programs = np.full(n, FIRST_RADIUS), np.arange(n), LinearPrograms(COMMANDS)
     slopes = np.zeros((n, COMMANDS, COMMANDS))
     stale = np.ones(n, bool)
     for k in range(iterations):
@@ -194,7 +194,7 @@ def _descend(
             slopes[anew] = _in_batches(all_slopes, some, cell, u_in[anew])
         tried, predicted = u_in[live].copy(), np.zeros(len(live))
         for at, i in enumerate(live):
-            change, value = _program(miss[i], slopes[i], u_in[i], radius[i])
+            change, value = programs.solve(miss[i], slopes[i], u_in[i], radius[i])
             tried[at] = np.clip(u_in[i] + change, 0.0, protocol.U_MAX)
             predicted[at] = error[i] - value
         some, cell = jax.tree.map(lambda x, i=live: np.asarray(x)[i], (plants, cells))
@@ -213,28 +213,56 @@ def _descend(
     return error
 
 
-def _program(miss: Floats, slopes: Floats, u_in: Floats, radius: float) -> tuple[Floats, float]:
+class LinearPrograms:
     """Least mean of ``|miss - slopes change|`` within the valve's range and a trust region.
 
-    Args:
-        miss: target minus pressure, cmH2O, shape ``(m,)``.
-        slopes: derivative of each pressure by each command, cmH2O per %, shape ``(m, m)``.
-        u_in: commands, %, shape ``(m,)``.
-        radius: most that a command may change by, %.
+    One dual simplex for all programs of one size, of which building each is most of the work.
 
-    Returns:
-        Change of the commands, %, and the mean, cmH2O.
+    Args:
+        count: m, pressures and commands of a program.
     """
-    m = len(miss)
-    # miss - slopes change = above - below, with both parts at least zero.
-    constraint = sparse.hstack([slopes, sparse.eye(m), -sparse.eye(m)], format="csc")
-    cost = np.concatenate([np.zeros(m), np.full(2 * m, 1.0 / m)])
-    low, high = np.maximum(-radius, -u_in), np.minimum(radius, protocol.U_MAX - u_in)
-    bounds = np.vstack([np.column_stack([low, high]), np.tile([0.0, np.inf], (2 * m, 1))])
-    result = linprog(cost, A_eq=constraint, b_eq=miss, bounds=bounds, method="highs-ds")
-    if result.status != 0:  # degenerate to rounding: stay
-        return np.zeros(m), float(np.mean(np.abs(miss)))
-    return result.x[:m], float(result.fun)
+
+    def __init__(self, count: int):
+        self._solver = highspy.Highs()
+        self._solver.silent()
+        self._solver.setOptionValue("solver", "simplex")
+        # miss - slopes change = above - below, with both parts at least zero.
+        program = highspy.HighsLp()
+        program.num_col_, program.num_row_ = 3 * count, count
+        program.col_cost_ = np.repeat([0.0, 1.0 / count], [count, 2 * count])
+        matrix = program.a_matrix_
+        matrix.format_ = highspy.MatrixFormat.kColwise
+        full = count * np.arange(count)
+        matrix.start_ = np.concatenate([full, count**2 + np.arange(2 * count + 1)])
+        matrix.index_ = np.tile(np.arange(count), count + 2)
+        self._program, self._parts = program, np.repeat([1.0, -1.0], count)
+
+    def solve(
+        self, miss: Floats, slopes: Floats, u_in: Floats, radius: float
+    ) -> tuple[Floats, float]:
+        """Solve one program.
+
+        Args:
+            miss: target minus pressure, cmH2O, shape ``(m,)``.
+            slopes: derivative of each pressure by each command, cmH2O per %, shape ``(m, m)``.
+            u_in: commands, %, shape ``(m,)``.
+            radius: most that a command may change by, %.
+
+        Returns:
+            Change of the commands, %, and the mean, cmH2O.
+        """
+        program, m = self._program, len(miss)
+        low, high = np.maximum(-radius, -u_in), np.minimum(radius, protocol.U_MAX - u_in)
+        program.col_lower_ = np.concatenate([low, np.zeros(2 * m)])
+        program.col_upper_ = np.concatenate([high, np.full(2 * m, np.inf)])
+        program.row_lower_ = program.row_upper_ = miss
+        program.a_matrix_.value_ = np.concatenate([slopes.T.ravel(), self._parts])
+        self._solver.passModel(program)
+        self._solver.run()
+        if self._solver.getModelStatus() != highspy.HighsModelStatus.kOptimal:
+            return np.zeros(m), float(np.mean(np.abs(miss)))  # degenerate to rounding: stay
+        change = np.asarray(self._solver.getSolution().col_value)[:m]
+        return change, self._solver.getInfo().objective_function_value
 
 
 #: Random starts, and starts that open the valve for some steps.

@@ -18,6 +18,10 @@ from ventbench.sandbox.child.wire import Reply, WireError
 #: Of bytes that nothing had asked for, whether they are found with the reply or before the next.
 _UNASKED = "bytes came after the reply"
 
+#: How long answers of further cells are gathered after the first, s: a step of the plants costs
+#: the same for few cells as for many. Slow cells keep nobody waiting for longer.
+GATHERED_S = 0.05
+
 Floats, Integers = NDArray[np.float64], NDArray[np.int64]
 
 #: What became of a cell: its reply, a breach of the wire's rules, or None: its pipe has ended.
@@ -163,16 +167,17 @@ class Pipes:
             kind: what kind of reply is due, besides a failure.
             patience_s: how long to wait for the next cell to answer.
             deadline: when to stop waiting altogether, by the clock, s.
-            some: take what is there once there is any, and wait for nobody else.
+            some: take what is there once half have answered, or :data:`GATHERED_S` after the
+                first, and wait for nobody else.
 
         Returns:
             By cell, what came.
         """
         outcomes: dict[int, Outcome] = {}
-        progress = self._clock.now()
+        progress, asked, gathered = self._clock.now(), len(due), float("inf")
         while due:
-            wait = min(progress + patience_s, deadline) - self._clock.now()
-            if some and outcomes:
+            wait = min(progress + patience_s, deadline, gathered) - self._clock.now()
+            if some and 2 * len(outcomes) >= asked:
                 wait = 0.0
             events = self._clock.wait(self._selector, max(wait, 0.0), due, kind)
             if not events and wait <= 0:
@@ -191,6 +196,8 @@ class Pipes:
                     continue
                 # A cell that has answered and then ends, or writes more, is found here too.
                 outcomes[cell] = outcome
+                if some and len(outcomes) == 1:
+                    gathered = self._clock.now() + GATHERED_S
                 due.discard(cell)
                 progress = self._clock.now()
                 if not isinstance(outcome, Reply) or outcome.kind == wire.FAILED:

@@ -1,7 +1,14 @@
 """System identification: data, noise, predictions, least squares, fits and their intervals."""
 
 from ventbench.system_id.data import Data, make_data
-from ventbench.system_id.fit import Fit, fit, refit_breath_parameters
+from ventbench.system_id.fit import (
+    ConfidenceInterval,
+    Fit,
+    fit,
+    interval,
+    profile_interval,
+    refit_breath_parameters,
+)
 from ventbench.system_id.noise import Noise, robust_noise
 from ventbench.system_id.predictor import START, Predictor
 from ventbench.system_id.problem import (
@@ -11,7 +18,6 @@ from ventbench.system_id.problem import (
     make_unknowns,
     parameter_values,
 )
-from ventbench.system_id.profile_likelihood import ConfidenceInterval, interval, profile_interval
 
 __all__ = [
     "START",

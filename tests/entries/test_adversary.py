@@ -33,7 +33,9 @@ def test_a_held_valve_is_unsafe_at_the_supply_that_algebra_says(
     make, tmp_path, monkeypatch
 ) -> None:
     """A held flow Q gives PEEP + Q (R + t / C); the gate needs four samples, from t = 0.9 s on."""
-    monkeypatch.setattr("ventbench.task.mildest.ROUNDS", 2)  # one coordinate has no combinations
+    monkeypatch.setattr(
+        "ventbench.entries.adversary.ROUNDS", 2
+    )  # one coordinate has no combinations
     flow = (LIMIT - 5.0) / (R / 1e3 + 30 * 0.03 / C)
     u_in = flow / stressor("supply_high").strong ** SEVERITY / VALVE_GAIN
     entry = make(act=f"return {u_in!r}")

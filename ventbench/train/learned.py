@@ -201,11 +201,6 @@ class LearnedConfig:
         whole: share of the updates, at the end, with open-loop runs over the whole inspiration;
             between the two the horizon grows geometrically.
         softness: error below which the loss turns from absolute to square, cmH2O.
-        noise: standard deviation added to measured windows, cmH2O. The sensor's own 0.2 lowered the
-            error on recordings by 4 % but made other intervals four times worse on synthetic
-            breaths: the network then trusts the commands, which do not tell the time.
-        rising: weight of the penalty on steps at which pressure falls as the valve opens; 0 for
-            the paper's training, see :func:`~ventbench.plants.sensitivity.control_sensitivity`.
     """
 
     steps: int = 1500
@@ -215,8 +210,6 @@ class LearnedConfig:
     one_step: float = 0.2
     whole: float = 0.4
     softness: float = 0.2
-    noise: float = 0.0
-    rising: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse numbers that cannot work.
@@ -227,7 +220,7 @@ class LearnedConfig:
         for name in ("steps", "batch", "learning_rate", "softness"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"training: {name} = {getattr(self, name)} must be positive")
-        for name in ("weight_decay", "noise", "rising", "one_step", "whole"):
+        for name in ("weight_decay", "one_step", "whole"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"training: {name} = {getattr(self, name)} must not be negative")
         if self.one_step + self.whole > 1:
@@ -248,7 +241,6 @@ def open_loop_loss(
     plant: Learned,
     batch: WindowedInspirations,
     measured: Array,
-    noise: Array,
     config: LearnedConfig,
 ) -> Array:
     """Soft absolute error of the next pressures, cmH2O.
@@ -258,33 +250,25 @@ def open_loop_loss(
         plant: the rest of the plant.
         batch: breaths.
         measured: True where a run starts anew from the measured window, shape ``(n, T)``.
-        noise: noise that is added to measured windows, cmH2O, shape of ``batch.window``.
-        config: softness and penalty.
+        config: its softness.
     """
     plant = dataclasses.replace(plant, general=nets[0], boundary=nets[1])
     closed = jnp.zeros_like(batch.start)
 
-    def step(state: LearnedState, now: tuple[Array, ...]) -> tuple[LearnedState, Any]:
+    def step(state: LearnedState, now: tuple[Array, ...]) -> tuple[LearnedState, Array]:
         u_in, dt, window, take = now
         # What was not measured is what the run itself predicted.
         state = dataclasses.replace(state, pressures=jnp.where(take, window, state.pressures))
-        if config.rising == 0:
-            state, signals = plant.step(state, u_in, closed, dt)
-            return state, (signals.reading, closed)
-        (state, signals), (_, slopes) = jax.jvp(
-            lambda u: plant.step(state, u, closed, dt), (u_in,), (jnp.ones_like(u_in),)
-        )
-        return state, (signals.reading, slopes.reading)
+        state, signals = plant.step(state, u_in, closed, dt)
+        return state, signals.reading
 
     take = batch.known & measured[..., None]
-    steps = (batch.u_in, batch.dt, batch.window + noise, take)
-    _, (pressure, slope) = jax.lax.scan(
+    steps = (batch.u_in, batch.dt, batch.window, take)
+    _, pressure = jax.lax.scan(
         step, plant.init(batch.start)[0], jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), steps)
     )
     error = (pressure.T - batch.after) / config.softness
     cost = config.softness * (jnp.sqrt(1.0 + error**2) - 1.0)
-    # Slopes in units of the whole valve: cmH2O per 100 %.
-    cost = cost + config.rising * 100.0 * jnp.maximum(-slope.T, 0.0)
     return jnp.sum(batch.weight * cost) / jnp.maximum(jnp.sum(batch.weight), 1.0)
 
 
@@ -321,17 +305,14 @@ def _advance(
 
     def update(carry: tuple[Any, Any], number: Array) -> tuple[tuple[Any, Any], Array]:
         nets, state = carry
-        draw_key, phase_key, noise_key = jax.random.split(jax.random.fold_in(key, number), 3)
+        draw_key, phase_key, _ = jax.random.split(jax.random.fold_in(key, number), 3)
         rows = jax.random.randint(draw_key, (config.batch,), 0, data.count)
         batch = jax.tree.map(lambda x: x[rows] if x.ndim else x, data)
         reach = horizon(config, number / config.steps, length)
         phase = jax.random.randint(phase_key, (config.batch, 1), 0, reach)
         # A run over the whole inspiration takes no measured window but the start.
         measured = ((jnp.arange(length) + phase) % reach == 0) & (reach <= length)
-        noise = config.noise * jax.random.normal(noise_key, batch.window.shape)
-        loss, gradient = jax.value_and_grad(open_loop_loss)(
-            nets, plant, batch, measured, noise, config
-        )
+        loss, gradient = jax.value_and_grad(open_loop_loss)(nets, plant, batch, measured, config)
         updates, state = optimiser.update(gradient, state, nets)
         new = (optax.apply_updates(nets, updates), state)
         last = number >= config.steps
@@ -352,7 +333,6 @@ def fit(
     config: LearnedConfig | None = None,
     seed: int = 0,
     weight: Floats | None = None,
-    tau: float | None = None,
     checkpoint: Path | None = None,
     progress: Progress | None = None,
 ) -> Learned:
@@ -369,9 +349,8 @@ def fit(
         pressure: cmH2O, shape ``(n, T)``, NaN where blank.
         architecture: sizes of the network.
         config: settings of the training.
-        seed: seed of weights, batches and noise; each member of an ensemble has its own.
+        seed: seed of weights and batches; each member of an ensemble has its own.
         weight: weight of each breath, shape ``(n,)``.
-        tau: time constant of expiration, s; fitted to the expirations if not given.
         checkpoint: file that the training is saved to every ``CHUNK`` updates and resumed from;
             deleted at the end.
         progress: called after every ``CHUNK`` updates.
@@ -386,8 +365,7 @@ def fit(
     """
     architecture, config = architecture or Architecture(), config or LearnedConfig()
     data = inspirations(u_in, u_out, dt, pressure, architecture.pressures, weight)
-    if tau is None:
-        tau = expiratory_time_constant(u_out, dt, pressure)
+    tau = expiratory_time_constant(u_out, dt, pressure)
     init_key, train_key = jax.random.split(jax.random.key(seed))
     plant = learned(init_key, architecture, normalisation(data, tau))
     nets: Any = (plant.general, plant.boundary)

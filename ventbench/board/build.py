@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ventbench.base import files
+from ventbench.base.text import flatten
 from ventbench.board import canonical, comparison, drawings, frames, pages, ranking, store
 from ventbench.board.frames import Line
 from ventbench.board.gate import Evidence
@@ -130,7 +131,7 @@ def _index(
         tracks=[_track(track) for track in tracks],
         columns=SHOWN,
         aside=[_aside(line) for line in lines if line.status not in ("ranked", "practice")],
-        simulators=pages.flatten(header.simulators) if header else [],
+        simulators=flatten(header.simulators) if header else [],
         draws=header.draws if header else None,
         stress=[pages.stress_shown(row) for row in stressed],
         chart=pages.stress_chart(stressed),
@@ -330,7 +331,7 @@ def _provenance(header: ScoreHeader) -> list[tuple[str, list[tuple[str, str]]]]:
         ("Versions", header.versions),
         ("Timing", header.timing),
     )
-    flat = [(title, pages.flatten(values)) for title, values in groups]
+    flat = [(title, flatten(values)) for title, values in groups]
     return [(title, rows) for title, rows in flat if rows]
 
 

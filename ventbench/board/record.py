@@ -16,8 +16,8 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.board import canonical, schema
 from ventbench.entries.runs import Runs
@@ -25,8 +25,6 @@ from ventbench.task import draws, protocol
 from ventbench.task.metrics.score import normalised, passes_safety_gate
 from ventbench.task.stressors import VERSION as STRESSORS_VERSION
 from ventbench.task.stressors import condition_of
-
-Floats = NDArray[np.float64]
 
 #: What the key ``track`` says of every such record.
 TRACK = "hardware"
@@ -62,14 +60,14 @@ class RecordHeadroom:
         pid: error of the lung's best PID, cmH2O, of that shape.
     """
 
-    session: NDArray[np.int64]
-    member: NDArray[np.int64]
+    session: Ints
+    member: Ints
     error: Floats
     attainable: Floats
     pid: Floats
 
     @property
-    def ranked(self) -> NDArray[np.bool_]:
+    def ranked(self) -> Bools:
         """Whether each draw is on rigs that nobody trained on, shape ``(K,)``."""
         return draws.ranked(self.session)
 
@@ -125,7 +123,7 @@ class Record(schema.Submitted):
     pressure: Floats
     u_in: Floats
     peak: Floats
-    steps_above: NDArray[np.int64]
+    steps_above: Ints
     headroom: RecordHeadroom
     stress: RecordStress | None = None
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.board import attestation, canonical, ranking, rounds, store
 from ventbench.board.canonical import ATTESTATIONS, RECORDS
@@ -38,8 +38,6 @@ from ventbench.plants.rigs import rigs_of
 from ventbench.task import protocol
 from ventbench.task.draws import Draws
 from ventbench.task.metrics.score import normalised
-
-Floats = NDArray[np.float64]
 
 #: Most that errors of bounds may differ from what their commands give, cmH2O.
 BOUNDS_TOLERANCE = 1e-9

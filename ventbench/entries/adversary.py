@@ -22,9 +22,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 from ventbench.base import precision
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.entries.folder import Submission, as_submission
 from ventbench.entries.runner import Runner, runner_of
@@ -40,8 +40,6 @@ from ventbench.task import protocol
 from ventbench.task.environment import nominal_scenario
 from ventbench.task.metrics.score import safety_limit
 from ventbench.task.stressors import STRESSORS, Condition, Stressor, stressor
-
-Floats = NDArray[np.float64]
 
 #: Severities at which each coordinate is tried alone, and the part of the interval between a safe
 #: and an unsafe one to which the critical severity is found.
@@ -80,8 +78,8 @@ class Space:
     """
 
     metric: Floats
-    group: NDArray[np.int64]
-    signed: NDArray[np.bool_]
+    group: Ints
+    signed: Bools
 
     def directions(self, points: Floats) -> Floats:
         """Points of severity 1 in given directions, with the rules kept, shape ``(..., L, A)``."""
@@ -198,8 +196,6 @@ def _first(margin: Margin, rays: Floats, at: Floats, low: Floats, high: Floats) 
         low, high = (np.take_along_axis(edges, first + k, axis=0)[0] for k in (0, 1))
     return high
 
-
-Floats = NDArray[np.float64]
 
 #: Quantities of a rig that are moved, the factor from the population's unit, and the unit shown.
 RIG = {

@@ -13,8 +13,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.entries.reference import Reference, reference_of
 from ventbench.entries.runs import pip_columns
@@ -27,9 +27,6 @@ from ventbench.task.environment import Scenario
 from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import Lung
 from ventbench.task.stressors import Condition, conditions, stressor
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,8 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.entries.contract_runs import (
     STEPS,
     Answers,
@@ -42,8 +42,6 @@ from ventbench.entries.review import inspect_folder
 from ventbench.entries.runner import ControllerSession, Runner
 from ventbench.task import draws, protocol
 from ventbench.task.lungs import LUNGS
-
-Floats = NDArray[np.float64]
 
 #: Calls of ``act`` in a whole score, on how many processor cores, and the longest that they may
 #: take, s: half of what the sandbox allows, as the scorer's machine may be slower and busy.

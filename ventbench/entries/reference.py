@@ -21,9 +21,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ventbench.base import files, precision
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.executor import InProcess, results
 from ventbench.base.resume import ARRAY, WorkFolder, fingerprint
@@ -57,7 +58,6 @@ PID_GAINS = (
     (1.96, 23.0, 0.14),
 )
 
-Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 # Steps that the second start of a further breath opens the valve fully for.

@@ -12,16 +12,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats, Ints
 from ventbench.entries.errors import Failure
 from ventbench.entries.folder import Submission
 from ventbench.sandbox.child.cell import Cell, Failed, controller_class
 from ventbench.sandbox.pipes import Asked
 from ventbench.task import protocol
 from ventbench.task.interfaces import Observation, Task
-
-Floats, Integers = NDArray[np.float64], NDArray[np.int64]
 
 #: Called with rounds of commands that are done, and all of them.
 Progress = Callable[[int, int], None]
@@ -35,7 +33,7 @@ class ControllerSession(Protocol):
         """What went wrong up to now, by index of the cell; a failed cell stays failed."""
         ...
 
-    def ask(self, cells: Integers, observations: Floats) -> None:
+    def ask(self, cells: Ints, observations: Floats) -> None:
         """Give some controllers their next observation; each is asked by itself.
 
         Of each controller once for each step of each inspiration, in order, after its answer.
@@ -46,7 +44,7 @@ class ControllerSession(Protocol):
         """
         ...
 
-    def answers(self) -> tuple[Integers, Floats]:
+    def answers(self) -> tuple[Ints, Floats]:
         """Take the commands that have come, and wait for one if there is none.
 
         Returns:
@@ -132,7 +130,7 @@ class InProcessSession(Asked):
             except Failed as failed:
                 self.failures[index] = failed.failure
 
-    def ask(self, cells: Integers, observations: Floats) -> None:
+    def ask(self, cells: Ints, observations: Floats) -> None:
         """Ask some controllers for their next command; see :class:`ControllerSession`."""
         for index, row in zip(cells.tolist(), observations.tolist(), strict=True):
             self._answers[index] = 0.0
@@ -143,7 +141,7 @@ class InProcessSession(Asked):
                     self.failures[index] = failed.failure
                     del self._cells[index]
 
-    def answers(self) -> tuple[Integers, Floats]:
+    def answers(self) -> tuple[Ints, Floats]:
         """Take the commands; see :class:`ControllerSession`."""
         given, self._answers = self._answers, {}
         return np.array(list(given), np.int64), np.array(list(given.values()))
@@ -226,7 +224,7 @@ class _CountingSession(Asked):
     def failures(self) -> Mapping[int, Failure]:
         return self._session.failures
 
-    def answers(self) -> tuple[Integers, Floats]:
+    def answers(self) -> tuple[Ints, Floats]:
         cells, commands = self._session.answers()
         self._left -= len(cells)
         while self._left <= 0:

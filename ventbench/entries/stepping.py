@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
 from ventbench.base import precision
+from ventbench.base.arrays import Floats
 from ventbench.entries.cells import Cells
 from ventbench.entries.errors import Failure
 from ventbench.entries.folder import Submission
@@ -23,8 +23,6 @@ from ventbench.task import protocol, rollouts
 from ventbench.task.environment import Scenario
 from ventbench.task.interfaces import Plant, PlantT, Task
 from ventbench.task.rollouts import Script
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

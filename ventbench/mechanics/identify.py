@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.mechanics.labels import (
     Estimate,
@@ -133,8 +133,6 @@ def _symptom(breaths: Breaths) -> str:
             return f"the peak flow is {peak:.3g} mL/s; its unit may be another one"
     return f"pressure and {what} do not move together as those of one lung do"
 
-
-Floats = NDArray[np.float64]
 
 #: Units of R and C.
 _UNITS = ("cmH2O/(L/s)", "mL/cmH2O")

@@ -17,9 +17,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ventbench import palette
+from ventbench.base.arrays import Floats
 from ventbench.base.text import number
 from ventbench.pages import graphics, scores
-from ventbench.pages.scores import Floats, labels, shared_tracks
+from ventbench.pages.scores import labels, shared_tracks
 from ventbench.palette import BAND, INK, QUIET
 from ventbench.palette import LINE as RULE
 from ventbench.task import protocol

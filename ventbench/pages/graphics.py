@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ventbench.pages.scores import Floats
+from ventbench.base.arrays import Floats
 from ventbench.task import protocol
 from ventbench.trajectories import Trajectories
 

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ventbench import palette
 from ventbench.base import files
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError, require
 from ventbench.base.text import number
 from ventbench.task.stressors import CATEGORIES, SEVERITIES, stressor
@@ -58,9 +58,7 @@ def gain_map_png(grid: PIDGrid, *, each: bool = True, single: bool = True) -> by
     return _png(figure)
 
 
-def _row(
-    figure: Any, axes: Any, name: str, gains: NDArray[np.float64], error: NDArray[np.float64]
-) -> None:
+def _row(figure: Any, axes: Any, name: str, gains: Floats, error: Floats) -> None:
     best = int(np.argmin(error))
     shown = [d for d in SLICES if np.any(gains[:, 2] == d)]
     slices = [("best: ", float(gains[best, 2])), *(("", d) for d in shown)]
@@ -77,8 +75,8 @@ def _row(
 
 def _map(
     axis: Any,
-    gains: NDArray[np.float64],
-    error: NDArray[np.float64],
+    gains: Floats,
+    error: Floats,
     d: float,
     limits: tuple[float, float],
 ) -> Any:
@@ -197,9 +195,9 @@ _SMALL: dict[str, Any] = {"fontsize": 8.5, "va": "center"}
 
 
 def _title(names: tuple[str, ...]) -> str:
-    if len(names) > 1:
-        return " + ".join(name.replace("_", " ") for name in names)
-    return stressor(names[0]).title
+    if len(names) == 1:
+        return stressor(names[0]).title
+    return " + ".join(name.replace("_", " ") for name in names)
 
 
 def _cell(row: Mapping[str, Any]) -> str:

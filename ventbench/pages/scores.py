@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Bools, Floats
 from ventbench.base.errors import InputError
 from ventbench.base.text import flatten, number
 from ventbench.task import protocol
 from ventbench.task.metrics import bootstrap
 from ventbench.task.metrics.score import run_error
 from ventbench.trajectories import Trajectories
-
-Floats = NDArray[np.float64]
 
 #: Steps of a run.
 STEPS = protocol.BREATHS * protocol.BREATH_STEPS
@@ -96,7 +94,7 @@ def shared_tracks(runs: Sequence[Trajectories]) -> str:
     return f"{' and '.join(tracks)} {'track' if len(tracks) == 1 else 'tracks'}"
 
 
-def scored() -> NDArray[np.bool_]:
+def scored() -> Bools:
     """Scored steps of a run: inspirations of the scored breaths, shape ``(T,)``."""
     breath, phase = np.divmod(np.arange(STEPS), protocol.BREATH_STEPS)
     return np.isin(breath, protocol.SCORED_BREATHS) & (phase < protocol.INSPIRATION_STEPS)

@@ -10,15 +10,14 @@ import time
 from collections.abc import Callable, Mapping, Sequence, Set
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ventbench.base.arrays import Floats, Ints
 from ventbench.sandbox.child import wire
 from ventbench.sandbox.child.wire import Reply, WireError
 
 #: Of bytes that nothing had asked for, whether they are found with the reply or before the next.
 _UNASKED = "bytes came after the reply"
 
-Floats, Integers = NDArray[np.float64], NDArray[np.int64]
 
 #: What became of a cell: its reply, a breach of the wire's rules, or None: its pipe has ended.
 Outcome = Reply | WireError | None
@@ -27,11 +26,11 @@ Outcome = Reply | WireError | None
 class Asked:
     """Controllers that are asked each by itself; none waits for another."""
 
-    def ask(self, cells: Integers, observations: Floats) -> None:
+    def ask(self, cells: Ints, observations: Floats) -> None:
         """Give some controllers an observation each; see ``ControllerSession``."""
         raise NotImplementedError
 
-    def answers(self) -> tuple[Integers, Floats]:
+    def answers(self) -> tuple[Ints, Floats]:
         """Take what has been answered; see ``ControllerSession``."""
         raise NotImplementedError
 

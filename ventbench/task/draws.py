@@ -27,9 +27,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
 from ventbench.base import precision
+from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
 from ventbench.task import protocol
 from ventbench.task.environment import Scenario, nominal_scenario
@@ -115,8 +115,6 @@ _COMMITMENT = b"ventbench season 1\n"
 # It is part of the labels of the streams and of what records say of draws.
 _FORMAT = 2
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 PlantT = TypeVar("PlantT")
 
 
@@ -140,7 +138,7 @@ class Draws:
     cells: Scenario
     rig: Ints
     member: Ints
-    ranked: NDArray[np.bool_]
+    ranked: Bools
     drawn: Plant | None = None
 
     @property
@@ -258,7 +256,7 @@ def build(
     )
 
 
-def ranked(rig: Ints) -> NDArray[np.bool_]:
+def ranked(rig: Ints) -> Bools:
     """Whether each draw is ranked, shape ``(n,)``.
 
     In a round those are ranked that are on rigs that nobody trained on; in practice all are shown.
@@ -365,7 +363,7 @@ def plants_of(plants: PlantT, rig: Ints, member: Ints, drawn: PlantT | None = No
     return jax.tree.map(lambda leaf: leaf[:, :, None], chosen)
 
 
-def uniforms(seed: bytes, label: str, shape: int | tuple[int, ...]) -> NDArray[np.float64]:
+def uniforms(seed: bytes, label: str, shape: int | tuple[int, ...]) -> Floats:
     r"""Uniform numbers that follow from a seed and a label, the same on every machine.
 
     Block ``k = 0, 1, ...`` of the stream is HMAC-SHA256, with the seed as its key, of

@@ -23,9 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ventbench.base import files, precision
+from ventbench.base.arrays import Floats
 from ventbench.base.resume import Checkpoint, fingerprint
 from ventbench.controllers.pid import PID
 from ventbench.controllers.residual import Residual, save_weights, untrained
@@ -362,7 +363,7 @@ def train_residual(
     *,
     config: ResidualConfig | None = None,
     seed: int = 0,
-    gains: NDArray[np.float64] | None = None,
+    gains: Floats | None = None,
     simulator: Given = "frozen",
     progress: Progress | None = None,
 ) -> TrainedControllers:

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ventbench.base.arrays import Floats
 from ventbench.diagnosis.findings import BreathRequest, NonparametricTerm, Traces
 from ventbench.diagnosis.residual_analysis import Profile, profiles
 from ventbench.diagnosis.residual_axes import EDGE
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.pages import graphics
-from ventbench.pages.scores import Floats
 from ventbench.physics.characteristics import Characteristic
 
 #: Room for the labels: left, right, top, bottom, picture units.

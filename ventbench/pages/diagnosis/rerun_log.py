@@ -11,12 +11,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ventbench import palette
+from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.text import escape_markdown
 from ventbench.diagnosis import number_text, report_text
 from ventbench.diagnosis.result import Diagnosis
 from ventbench.pages.diagnosis.charts import STAGES, rmse
-from ventbench.pages.scores import Floats
 
 APPLICATION = "ventbench"
 

@@ -136,7 +136,6 @@ def stress_chart_png(scores: Sequence[Mapping[str, Any]]) -> bytes:
         raise InputError("no stress score to draw")
     require("matplotlib")
     from matplotlib.colors import LinearSegmentedColormap
-    from PIL import Image
 
     order = [*CATEGORIES, "pairs"]
     category = {
@@ -183,9 +182,15 @@ def stress_chart_png(scores: Sequence[Mapping[str, Any]]) -> bytes:
         "▲ n: runs with unsafe pressure.",
         fontsize=8.5, color=palette.QUIET,
     )  # fmt: skip
-    # 256 colours: a third of the size, and not to be told.
-    picture = Image.open(io.BytesIO(_png(figure))).convert("RGB")
-    small = picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    return few_colours(_png(figure))
+
+
+def few_colours(picture: bytes) -> bytes:
+    """A PNG in 256 colours: a third of the size, and not to be told."""
+    from PIL import Image
+
+    image = Image.open(io.BytesIO(picture)).convert("RGB")
+    small = image.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     output = io.BytesIO()
     small.save(output, format="PNG", optimize=True)
     return output.getvalue()

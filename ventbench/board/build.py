@@ -112,15 +112,7 @@ def _index(
     root: str,
     own: Round | None = None,
 ) -> str:
-    """Return the page of the board, or that of a round.
-
-    Args:
-        environment: of the templates.
-        leaderboard: all records.
-        tracks: that are shown.
-        root: relative address of the page of the board.
-        own: the round whose page it is.
-    """
+    """Return the page of the board, or that of a round; ``root`` leads to the page of the board."""
     lines = frames.lines(tracks)
     shown = own or next((track.round for track in tracks if track.round), None)
     header = lines[0].row.record.header if lines else None

@@ -418,12 +418,7 @@ def _interval(values: Floats, means: Floats) -> Interval:
 
 
 def _stress_rows(rows: Sequence[Row], evidence: Evidence) -> list[StressRow]:
-    """Entries that were run under the newest table of stressors, best first.
-
-    Args:
-        rows: entries of a track; those of other tables of stressors are left out.
-        evidence: what stands behind the records.
-    """
+    """Entries that ran under the newest table of stressors, best first; others are left out."""
     ran = [(row, own) for row in rows if (own := row.record.stress) is not None]
     newest = max((own.stressors for _, own in ran), default=0)
     current = [(row, own.tables) for row, own in ran if own.stressors == newest]

@@ -458,11 +458,6 @@ def timestamp(now: datetime | None = None) -> str:
 def _checked(content: HardwareContent, sha256: str, label: str) -> HardwareRecord:
     """Check what ties the keys of a hardware record together.
 
-    Args:
-        content: types and ranges are right.
-        sha256: of its bytes.
-        label: names the file in messages.
-
     Raises:
         InputError: naming the first key that is wrong.
     """
@@ -530,10 +525,7 @@ def _measured_problems(content: HardwareContent) -> list[str]:
     """What a hardware record says of its pressures and they do not, by key.
 
     Highest pressure, safety, the pressure before the first command acts, and that no two breaths of
-    a lung are equal to the last digit.
-
-    Args:
-        content: types, ranges and shapes are right.
+    a lung are equal to the last digit. Types, ranges and shapes must be right.
     """
     problems: list[str] = []
     seen: set[bytes] = set()

@@ -219,12 +219,7 @@ def _check_same(submission: Submission, score: Record) -> None:
 
 
 def stress_difference(recorded: RecordStress, again: Runs) -> str:
-    """Describe how runs of the stress track differ from the recorded ones; empty if they do not.
-
-    Args:
-        recorded: figures and hash of the commands.
-        again: the second run.
-    """
+    """Describe how runs of the stress track differ from the recorded ones; empty if they do not."""
     if recorded.stressors != stressors.VERSION:
         return f"stress: its stressors are version {recorded.stressors}, not {stressors.VERSION}"
     tables = recorded.tables

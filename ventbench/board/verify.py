@@ -111,10 +111,7 @@ def verify(folder: Path, load: Load, *, progress: Progress | None = None) -> Rep
 def _strange_files(folder: Path, entries: Sequence[AnyRecord], *, whole: bool) -> list[str]:
     """Files that belong to no record of the leaderboard: none of them may be published.
 
-    Args:
-        folder: of the leaderboard.
-        entries: that could be read.
-        whole: whether these are all; else nobody knows which commands the others name.
+    If the entries are not the whole, nobody knows which commands the others name.
     """
     plain, odd = canonical.walk(folder)
     problems = [f"{folder / name} is neither a plain file nor a folder; remove it" for name in odd]
@@ -167,9 +164,7 @@ def _check_replay(
 def _check_ranks(leaderboard: Store, by_draw: Mapping[str, Floats]) -> list[str]:
     """Ranks that recorded errors give and replayed ones do not: nobody gains by a rounding error.
 
-    Args:
-        leaderboard: all that could be read.
-        by_draw: replayed values that rank; a record without them keeps its own.
+    A record without replayed values, ``(L, k)`` by its hash, keeps its own.
     """
     problems = []
     for track in ranking.board(leaderboard):

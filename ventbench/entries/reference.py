@@ -295,13 +295,7 @@ def _part(own: Plant, cell: Scenario, gains: Floats, starts: tuple[int, ...]) ->
 
 
 def _inspirations(plants: Plant, cells: Scenario, breath: int) -> tuple[Plant, Scenario]:
-    """One scored inspiration of each cell, on one axis, with its plant.
-
-    Args:
-        plants: leaves ``(L, n, 1, ...)``.
-        cells: batch shape ``(L, n, P)``.
-        breath: which of the scored ones.
-    """
+    """One scored inspiration of each cell ``(L, n, P)``, on one axis, with its plant."""
     shape = np.shape(cells.pip)
     size, at = int(np.prod(shape)), protocol.SCORED_BREATHS[breath]
     each = jax.tree.map(

@@ -66,13 +66,7 @@ _FLOWS = (20.0, 4000.0)
 
 
 def problem_with(breaths: Breaths, resistance: Estimate, compliance: Estimate) -> str | None:
-    """Why R and C of a lung are not to be trusted, as a sentence; None if they are plausible.
-
-    Args:
-        breaths: breaths of the lung, with flow or volume.
-        resistance: R, cmH2O/(L/s).
-        compliance: C, mL/cmH2O.
-    """
+    """Why R and C of a lung are not to be trusted, as a sentence; None if they are plausible."""
     low, high = compliance.ci95
     possible = COMPLIANCES[0] <= compliance.value <= COMPLIANCES[1]
     possible &= RESISTANCES[0] <= resistance.value <= RESISTANCES[1]

@@ -72,7 +72,8 @@ def png(runs: Sequence[Trajectories]) -> bytes:
         f"{scores.shared_tracks(runs)}. Breath {graphics.BREATH + 1} on each lung at each PIP, "
         "against time, s. Black: target. Band: scored. Numbers: mean absolute error, cmH2O."
     )
-    figure.text(0.012, 1.0 - 0.5 / height, *_drawn([read]), color=palette.QUIET, **_SMALL)
+    (read,) = _drawn([read])
+    figure.text(0.012, 1.0 - 0.5 / height, read, color=palette.QUIET, **_SMALL)
     for k, name in enumerate(names):
         place = 0.012 + 0.98 * k / max(len(names), 4)
         figure.text(place, 1.0 - 0.68 / height, f"— {name}", color=_color(k), **_SMALL)

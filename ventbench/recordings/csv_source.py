@@ -153,11 +153,6 @@ def text_problems(
 ) -> tuple[list[RecordingProblem], int]:
     """List the cells that are not numbers and the rows that have too few or too many cells.
 
-    Args:
-        file: path.
-        kind: `csv` or `csv.gz`.
-        names: column names of the header.
-
     Returns:
         The first `SHOWN` problems, and the count of all.
     """

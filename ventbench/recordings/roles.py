@@ -187,11 +187,7 @@ def _ratio(a: Floats, b: Floats) -> Floats:
 
 
 def saturations(figures: Mapping[str, Floats]) -> tuple[Saturation, ...]:
-    """Levels at which sensors end: reached again and again, exactly, and left by small steps.
-
-    Args:
-        figures: of all breaths, from :func:`breath_figures`.
-    """
+    """Levels at which sensors end: reached again and again, exactly, and left by small steps."""
     found = []
     for name in ("pressure", "flow"):
         if not np.isfinite(figures.get(f"{name}_high", np.zeros(0))).any():

@@ -345,12 +345,7 @@ def ended(status: int | None) -> Verdict:
 
 
 def not_answered(outcome: Outcome, limit: str) -> Verdict:
-    """Verdict on a cell that was out of time.
-
-    Args:
-        outcome: what it said when it was asked where it is.
-        limit: how long was waited.
-    """
+    """Verdict on a cell that was out of time, by what it said when it was asked where it is."""
     _, _, detail, printed = _fields(outcome.text if isinstance(outcome, Reply) else b"")
     what = f"the controller did not answer within {limit}"
     return Verdict("timeout", what, _with_prints(detail, printed))

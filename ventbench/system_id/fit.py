@@ -198,13 +198,7 @@ def _search(problem: Problem, x: Floats, given: Set[str], iterations: int) -> Mi
     """Search from ``x``, then try the values of ``Parameter.scan`` with all else as minimum.
 
     The search continues from a value that is better, for all breaths or, if each breath has its own
-    value, for one breath.
-
-    Args:
-        problem: problem to solve.
-        x: start, ``(U,)``.
-        given: paths whose start the caller chose; they are not scanned.
-        iterations: most steps of each search.
+    value, for one breath. Paths whose start the caller gave are not scanned.
     """
     scanned = {p: parameter_of(p) for p in problem.unknowns.paths if parameter_of(p).scan}
     scanned = {p: parameter for p, parameter in scanned.items() if p not in given}

@@ -243,14 +243,9 @@ def open_loop_loss(
     measured: Array,
     config: LearnedConfig,
 ) -> Array:
-    """Soft absolute error of the next pressures, cmH2O.
+    """Soft absolute error of the next pressures, cmH2O, with the nets ``(general, boundary)``.
 
-    Args:
-        nets: the trained parts, ``(general, boundary)``.
-        plant: the rest of the plant.
-        batch: breaths.
-        measured: True where a run starts anew from the measured window, shape ``(n, T)``.
-        config: its softness.
+    A run starts anew from the measured window where ``measured`` is true, shape ``(n, T)``.
     """
     plant = dataclasses.replace(plant, general=nets[0], boundary=nets[1])
     closed = jnp.zeros_like(batch.start)

@@ -25,6 +25,12 @@ STAGES = (
     ("after", "corrected", "after"),
 )
 
+
+def stages(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    """Those of :data:`STAGES` that a diagnosis has; not all where nothing is missing."""
+    return [x for x in STAGES if x[0] != "after" or diagnosis.verdict != "nothing_missing"]
+
+
 #: Breaths that are shown of either kind.
 WORST = 3
 

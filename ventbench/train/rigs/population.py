@@ -181,11 +181,7 @@ def _units(breaths: _Breaths, rigs: Floats, design: Floats) -> Units:
 def design_of(lungs: Sequence[str]) -> Floats:
     """Design of rigs: own means of a lung's numbers, common means of a ventilator's.
 
-    Args:
-        lungs: id of each rig's lung, J of them.
-
-    Returns:
-        Shape ``(J, p, q)``; the lungs are in the order in which they come.
+    Shape ``(J, p, q)`` for the lungs of J rigs, in the order in which they come.
     """
     names, mine = list(dict.fromkeys(lungs)), len(LUNG)
     shared = len(NAMES) - mine

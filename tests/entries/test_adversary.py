@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.entries.adversary import EDGE, RIG, _Bench, adversary
+from ventbench.entries.cells import PlantError, ProtocolRun
 from ventbench.entries.errors import Failure
 from ventbench.entries.folder import as_submission
 from ventbench.entries.runner import InProcessRunner
-from ventbench.entries.stepping import PlantError, ProtocolRun
 from ventbench.physics.parameters import VALVE_GAIN
 from ventbench.plants.population import NAMES, to_vector
 from ventbench.plants.rigs import load_rigs

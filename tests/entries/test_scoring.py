@@ -13,7 +13,7 @@ from ventbench.base import precision
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
-from ventbench.entries import runner, stepping
+from ventbench.entries import cells, runner
 from ventbench.entries.errors import Failure, SubmissionError
 from ventbench.entries.folder import open_submission
 from ventbench.entries.runner import InProcessRunner
@@ -178,7 +178,7 @@ def test_without_draws(plants):
 
 
 def test_compiles_once(plants):
-    compiled: list[Any] = [stepping._inspire, stepping._observe]
+    compiled: list[Any] = [cells._inspire, cells._observe]
     for function in compiled:
         function.clear_cache()
     run_protocol(

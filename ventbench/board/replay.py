@@ -23,7 +23,7 @@ from ventbench.base.errors import InputError
 from ventbench.board.record import Record
 from ventbench.board.rounds import Round
 from ventbench.board.schema import ScoreHeader
-from ventbench.entries.stepping import as_float64
+from ventbench.entries.cells import as_float64
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import draws as draw_tables
 from ventbench.task import environment as env

@@ -26,11 +26,11 @@ import numpy as np
 from ventbench.base import precision
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
+from ventbench.entries.cells import PlantError, step_through
 from ventbench.entries.folder import Submission, as_submission
 from ventbench.entries.runner import Runner, runner_of
 from ventbench.entries.runs import number
 from ventbench.entries.scoring import enter
-from ventbench.entries.stepping import PlantError, step_through
 from ventbench.physics.catalogue import parameter
 from ventbench.plants.catalog import Given
 from ventbench.plants.corrected import stressed_plants

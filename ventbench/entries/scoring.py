@@ -15,7 +15,7 @@ import numpy as np
 
 from ventbench.base import precision
 from ventbench.base.errors import InputError
-from ventbench.entries.cells import Cells, protocol_of
+from ventbench.entries.cells import Cells, ProtocolRun, as_float64, protocol_of, replay, run_cells
 from ventbench.entries.errors import SubmissionError
 from ventbench.entries.folder import Submission, as_submission
 from ventbench.entries.manifest import TRACKS
@@ -28,7 +28,6 @@ from ventbench.entries.runner import (
     runner_of,
 )
 from ventbench.entries.runs import PLATEAU_SHARE, PLATEAU_TOLERANCE, CellFailure, Runs, number
-from ventbench.entries.stepping import ProtocolRun, as_float64, replay, run_cells
 from ventbench.plants.catalog import Given
 from ventbench.plants.rigs import Rigs, load_rigs
 from ventbench.task import draws, protocol

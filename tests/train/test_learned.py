@@ -10,13 +10,13 @@ from ventbench.plants.single_compartment import single_compartment
 from ventbench.task.lungs import lung
 from ventbench.task.rollouts import open_loop
 from ventbench.train.learned import (
-    CHUNK,
     LearnedConfig,
     expiratory_time_constant,
     fit,
     horizon,
     inspirations,
 )
+from ventbench.train.residual import CHUNK
 
 SHAPE = Architecture(pressures=3, controls=4, width=24, depth=3, boundary_width=8)
 #: Shared, so that it is compiled once.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from ventbench.plants.learned import (
     Normalisation,
     learned,
 )
+from ventbench.train.residual import FitProgress, chunk, optimiser, run_chunks
 
 Floats = NDArray[np.floating]
 
@@ -267,24 +267,6 @@ def open_loop_loss(
     return jnp.sum(batch.weight * cost) / jnp.maximum(jnp.sum(batch.weight), 1.0)
 
 
-#: Called with the number of updates done, the number of all updates, and the mean loss since the
-#: last call, cmH2O.
-Progress = Callable[[int, int, float], None]
-
-#: Updates compiled into one scan; a checkpoint or a Ctrl-C falls between two of them.
-CHUNK = 50
-
-
-def _optimiser(config: LearnedConfig) -> optax.GradientTransformation:
-    warm = max(config.steps // 50, 1)
-    schedule = optax.warmup_cosine_decay_schedule(
-        0.0, config.learning_rate, warm, max(config.steps, warm + 1)
-    )
-    return optax.chain(
-        optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=config.weight_decay)
-    )
-
-
 @partial(jax.jit, static_argnames="config")
 def _advance(
     carry: tuple[Any, Any],
@@ -295,7 +277,7 @@ def _advance(
     config: LearnedConfig,
 ) -> tuple[tuple[Any, Any], Array]:
     """``CHUNK`` updates, fewer at the end; returns the nets, the optimiser's state, mean loss."""
-    optimiser = _optimiser(config)
+    adam = optimiser(config.steps, config.learning_rate, config.weight_decay)
     length = data.u_in.shape[1]
 
     def update(carry: tuple[Any, Any], number: Array) -> tuple[tuple[Any, Any], Array]:
@@ -308,14 +290,10 @@ def _advance(
         # A run over the whole inspiration takes no measured window but the start.
         measured = ((jnp.arange(length) + phase) % reach == 0) & (reach <= length)
         loss, gradient = jax.value_and_grad(open_loop_loss)(nets, plant, batch, measured, config)
-        updates, state = optimiser.update(gradient, state, nets)
-        new = (optax.apply_updates(nets, updates), state)
-        last = number >= config.steps
-        return jax.tree.map(lambda a, b: jnp.where(last, a, b), (nets, carry[1]), new), loss
+        updates, state = adam.update(gradient, state, nets)
+        return (optax.apply_updates(nets, updates), state), loss
 
-    carry, losses = jax.lax.scan(update, carry, first + jnp.arange(CHUNK))
-    inside = first + jnp.arange(CHUNK) < config.steps
-    return carry, jnp.sum(losses * inside) / jnp.maximum(jnp.sum(inside), 1)
+    return chunk(update, carry, first, config.steps)
 
 
 def fit(
@@ -329,7 +307,7 @@ def fit(
     seed: int = 0,
     weight: Floats | None = None,
     checkpoint: Path | None = None,
-    progress: Progress | None = None,
+    progress: FitProgress | None = None,
 ) -> Learned:
     """Train a learned plant on recorded breaths.
 
@@ -364,24 +342,16 @@ def fit(
     init_key, train_key = jax.random.split(jax.random.key(seed))
     plant = learned(init_key, architecture, normalisation(data, tau))
     nets: Any = (plant.general, plant.boundary)
-    carry: Any = (nets, _optimiser(config).init(nets))
+    adam = optimiser(config.steps, config.learning_rate, config.weight_decay)
+    carry: Any = (nets, adam.init(nets))
     settings = {
         "architecture": dataclasses.asdict(architecture), "config": dataclasses.asdict(config),
         "seed": seed, "tau": tau, "data": fingerprint(data),
     }  # fmt: skip
     stored = Checkpoint(checkpoint, settings)
-    carry, first = stored.restore(carry)
-    while first < config.steps:
-        new, loss = _advance(carry, plant, data, train_key, jnp.asarray(first), config)
-        loss = float(loss)
-        if not np.isfinite(loss):
-            raise FloatingPointError(
-                f"training diverged between updates {first} and {first + CHUNK}"
-            )
-        carry, first = new, min(first + CHUNK, config.steps)
-        stored.save(carry, first)
-        if progress is not None:
-            progress(first, config.steps, loss)
+    (general, boundary), _ = run_chunks(
+        lambda carry, first: _advance(carry, plant, data, train_key, first, config),
+        carry, config.steps, stored, progress,
+    )  # fmt: skip
     stored.delete()
-    (general, boundary), _ = carry
     return dataclasses.replace(plant, general=general, boundary=boundary)

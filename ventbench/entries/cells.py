@@ -298,6 +298,7 @@ def step_through(
     tasks: Sequence[Task],
     *,
     changing: bool = False,
+    count: Callable[[], object] = lambda: None,
 ) -> ProtocolRun:
     """Run a submission on every lung and cell. Call it within ``precision.float64()``.
 
@@ -309,6 +310,7 @@ def step_through(
         submission: whose they are.
         tasks: what is told of each lung, length L.
         changing: the plants are others in each breath: leaves ``(L, BREATHS, ...)``.
+        count: called after each round: once every cell has one more command.
 
     Raises:
         SubmissionError: if the submission cannot be run at all.
@@ -350,7 +352,10 @@ def step_through(
                         varied, scenario, loop, u_in.reshape(batch), own.reshape(batch)
                     )
                     applied[own, given[own]] = _of_cells(now, batch)[own]
+            rounds = given.min()
             given[ready] += 1
+            for _ in range(given.min() - rounds):
+                count()
             for k, (_, rest) in enumerate(begun):
                 fresh = moved & (given % steps == 0) & (given // steps == k)
                 if fresh.any():
@@ -372,7 +377,11 @@ def step_through(
 
 
 def run_cells(
-    cells: Cells, runner: Runner, submission: Submission, tasks: Sequence[Task]
+    cells: Cells,
+    runner: Runner,
+    submission: Submission,
+    tasks: Sequence[Task],
+    count: Callable[[], object] = lambda: None,
 ) -> ProtocolRun:
     """Run a submission on cells, batch shape ``(S, L, n, P)``. Call it within ``float64()``.
 
@@ -384,6 +393,7 @@ def run_cells(
         runner: runs the controllers.
         submission: whose they are.
         tasks: what is told of each lung, length L.
+        count: see :func:`step_through`.
 
     Raises:
         SubmissionError: if the submission cannot be run at all.
@@ -392,14 +402,16 @@ def run_cells(
     lungs, conditions = len(cells.lungs), len(cells.conditions)
     if conditions == 1:
         plants = as_float64(cells.plants, lungs)
-        run = step_through(plants, cells.scenario, runner, submission, tasks)
+        run = step_through(plants, cells.scenario, runner, submission, tasks, count=count)
         return _reshaped(run, lambda x: x[None], lambda at: (0, *at))
     runs = []
     for draw in range(len(cells.draw)):
         plants, scenario = cells.stressed(draw)
         each = list(tasks) * conditions
         try:
-            run = step_through(plants, scenario, runner, submission, each, changing=True)
+            run = step_through(
+                plants, scenario, runner, submission, each, changing=True, count=count
+            )
         except PlantError as error:
             name = cells.conditions[error.index // lungs].id
             raise FloatingPointError(

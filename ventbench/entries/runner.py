@@ -8,7 +8,7 @@ time. Only numbers cross: a :class:`Task` for each cell at the start, then at ev
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,11 +18,7 @@ from ventbench.entries.errors import Failure
 from ventbench.entries.folder import Submission
 from ventbench.sandbox.child.cell import Cell, Failed, controller_class
 from ventbench.sandbox.pipes import Asked
-from ventbench.task import protocol
 from ventbench.task.interfaces import Observation, Task
-
-#: Called with rounds of commands that are done, and all of them.
-Progress = Callable[[int, int], None]
 
 
 class ControllerSession(Protocol):
@@ -185,49 +181,3 @@ def runner_of(submission: Submission, *, sandbox: bool) -> Runner:
     from ventbench.sandbox.runner import SandboxRunner
 
     return SandboxRunner()
-
-
-class CountingRunner:
-    """Runs controllers as another runner does, and tells after each round how far it is.
-
-    Args:
-        runner: does the work.
-        progress: called with rounds done and all rounds.
-        sessions: how many sessions the whole score starts, each of one run of all breaths.
-    """
-
-    def __init__(self, runner: Runner, progress: Progress, sessions: int = 1):
-        self._runner, self._progress, self._done = runner, progress, 0
-        self._total = sessions * protocol.BREATHS * protocol.INSPIRATION_STEPS
-
-    @property
-    def sandbox(self) -> Mapping[str, Any] | None:
-        """Layers for the record, or None."""
-        return self._runner.sandbox
-
-    def start(self, submission: Submission, tasks: Sequence[Task]) -> ControllerSession:
-        """Make and reset one fresh controller for each cell; see :class:`Runner`."""
-        return _CountingSession(self._runner.start(submission, tasks), self._count, len(tasks))
-
-    def _count(self) -> None:
-        self._done += 1
-        self._progress(self._done, self._total)
-
-
-class _CountingSession(Asked):
-    def __init__(self, session: ControllerSession, count: Callable[[], None], cells: int):
-        self._session, self._count, self._cells, self._left = session, count, cells, cells
-        self.ask = session.ask
-        self.close, self.processor_time = session.close, session.processor_time
-
-    @property
-    def failures(self) -> Mapping[int, Failure]:
-        return self._session.failures
-
-    def answers(self) -> tuple[Ints, Floats]:
-        cells, commands = self._session.answers()
-        self._left -= len(cells)
-        while self._left <= 0:
-            self._left += self._cells
-            self._count()
-        return cells, commands

@@ -59,8 +59,8 @@ def png(runs: Sequence[Trajectories]) -> bytes:
             upper, lower = axes[2 * i, j], axes[2 * i + 1, j]
             _panel(upper, lower, runs, (i, j), limits)
             upper.set_title(f"PIP {pips[j]:g}", loc="left", pad=3, **_SMALL)
-            for k, error in enumerate(reversed(numbers.cells[:, i, j].tolist())):
-                _right(upper, number(error), len(runs) - 1 - k, 0.17 * k)
+            for k, error in enumerate(numbers.cells[:, i, j].tolist()):
+                _number(upper, number(error), k, len(runs))
             if j == 0:
                 upper.set_ylabel(f"{lung}, cmH2O", **_SMALL | {"weight": "bold"})
                 lower.set_ylabel("u_in, %", **_SMALL)
@@ -114,12 +114,13 @@ def _panel(
     upper.plot(time, target, color=palette.INK, linewidth=1.1, zorder=1)
 
 
-def _right(axes: Axes, text: str, run: int, shift: float) -> None:
-    """A number over the right end of a panel, shifted to the left by a share of its width."""
-    weight = "bold" if run == 0 else "normal"
+def _number(axes: Axes, text: str, run: int, runs: int) -> None:
+    """The number of a run at the upper right of a panel, in rows of four."""
+    row, place = divmod(run, 4)
+    last = min(runs - 4 * row, 4) - 1
     axes.text(
-        1.0 - shift, 1.03, text, transform=axes.transAxes, ha="right", color=_color(run),
-        weight=weight, **_SMALL,
+        1.0 - 0.17 * (last - place), 1.03 - 0.13 * row, text, transform=axes.transAxes,
+        ha="right", color=_color(run), weight="bold" if run == 0 else "normal", **_SMALL,
     )  # fmt: skip
 
 

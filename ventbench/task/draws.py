@@ -76,28 +76,9 @@ OF_RIGS = ("r_scale", "c_scale", "delay")
 #: probability from 0 to 1: quantiles of the measured breaths of the scored rigs, which the manifest
 #: of the simulators holds too. Between neighbouring breaths no correlation was found.
 GAIN_QUANTILES = (
-    -0.41,
-    -0.294,
-    -0.152,
-    -0.093,
-    -0.081,
-    -0.046,
-    -0.033,
-    -0.02,
-    -0.011,
-    -0.001,
-    0.0,
-    0.001,
-    0.011,
-    0.021,
-    0.033,
-    0.039,
-    0.051,
-    0.081,
-    0.093,
-    0.122,
-    0.247,
-)
+    -0.41, -0.294, -0.152, -0.093, -0.081, -0.046, -0.033, -0.02, -0.011, -0.001, 0.0,
+    0.001, 0.011, 0.021, 0.033, 0.039, 0.051, 0.081, 0.093, 0.122, 0.247,
+)  # fmt: skip
 
 #: What kind of rig a draw is on.
 TRAINING, HELD_OUT, DRAWN = 0, 1, 2
